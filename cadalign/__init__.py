@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from cadalign.estimation.uncertainty.summary import Contribution, EvidenceSummary
     from cadalign.estimation.view import View
     from cadalign.evaluation.api import evaluate, simulate
-    from cadalign.geometry.alignment import Alignment
-    from cadalign.geometry.box import Box
+    from cadalign.geometry.alignment import Alignment, Box
     from cadalign.geometry.camera import Camera
     from cadalign.geometry.mesh import Material, Mesh
     from cadalign.geometry.symmetry import Symmetry

@@ -9,8 +9,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.errors import InputError, RenderError, TooFewVisibleError
-from cadalign.geometry.alignment import Alignment, model_rays
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Alignment, Box, model_rays
 from cadalign.geometry.camera import Camera
 from cadalign.render.raycast.posed import within_lens_field
 from cadalign.render.scene import Scene

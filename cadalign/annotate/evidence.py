@@ -19,7 +19,7 @@ from cadalign.io.evidence import LENGTHS, ImageEvidence, Size
 from cadalign.io.images import read_mask
 from cadalign.io.observation import Observation
 from cadalign.io.observation_file import StartFields
-from cadalign.retrieval.silhouettes import grab_cut
+from cadalign.retrieval.match import grab_cut
 
 Point2 = tuple[float, float]
 Segment = tuple[Point2, Point2]

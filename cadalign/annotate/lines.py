@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import BOX_EDGES, Box
+from cadalign.geometry.alignment import BOX_EDGES, Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.simplify import cluster, mesh_edges, simplify

@@ -16,13 +16,12 @@ from PIL import Image
 
 from cadalign.datasets.sfm.colmap import Colmap
 from cadalign.errors import DataError, InputError
-from cadalign.estimation.facing import require_perspective
 from cadalign.estimation.focal import FocalPrior
-from cadalign.geometry.camera import Camera
-from cadalign.io import camera_file
+from cadalign.geometry.camera import Camera, require_perspective
 from cadalign.io.documents import Document, in_file, read_document, written_path
 from cadalign.io.files import listed, read_bytes, reading, require_utf8, write_json
 from cadalign.io.images import PHOTO_ENDINGS, open_photo, photo_size, upright_pixels
+from cadalign.io.observation import read_camera as read_camera_file
 
 Pixel = tuple[float, float]
 Mark = Literal["done", "skipped"]
@@ -166,7 +165,7 @@ class Intrinsics:
 
 
 def read_camera(path: Path, size: tuple[int, int] | None = None) -> Camera:
-    """Read a camera as `camera_file` does, or the first one of a COLMAP model's folder.
+    """Read a camera as `cadalign.io.read_camera` does, or the first one of a COLMAP model's folder.
 
     ``size`` is the photos', for a file that holds a calibration matrix alone.
     """
@@ -174,7 +173,7 @@ def read_camera(path: Path, size: tuple[int, int] | None = None) -> Camera:
         in_folder = path.is_dir()
     if in_folder:
         return Colmap(path)[0].camera
-    return camera_file.read_camera(path, size=size)
+    return read_camera_file(path, size=size)
 
 
 def intrinsics_of(photo: PhotoFile, camera: Camera | None) -> Intrinsics:

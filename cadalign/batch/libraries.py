@@ -51,7 +51,7 @@ from cadalign.evaluation.runs.run import OnProgress, execute
 from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
 from cadalign.evaluation.runs.work import FAILED, OK, Columns, Plan, Row, Rows, fingerprint
 from cadalign.evaluation.summary import median
-from cadalign.geometry.box import extent
+from cadalign.geometry.alignment import extent
 from cadalign.io.documents import in_file
 from cadalign.io.files import dense_json
 from cadalign.io.observation import Observation

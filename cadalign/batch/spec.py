@@ -28,8 +28,7 @@ from cadalign.evaluation.summary import (
     median,
     median_of,
 )
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import extent
+from cadalign.geometry.alignment import Alignment, extent
 from cadalign.geometry.camera import Camera
 
 Statistics = Mapping[str, Callable[[Cells], float]]

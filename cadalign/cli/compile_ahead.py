@@ -11,8 +11,7 @@ import numpy as np
 
 from cadalign.estimation.options import METHODS, RansacOptions
 from cadalign.estimation.view import View
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.metrics import box_iou
 from cadalign.shapes.model import ShapeModel

@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats
 from cadalign.errors import CadalignError, DegenerateError, InputError
-from cadalign.estimation.facing import faced, turned_poses
 from cadalign.estimation.focal import check_estimable, log_focal_range
 from cadalign.estimation.focal_search import focal_views
 from cadalign.estimation.mistakes import (
@@ -36,7 +35,7 @@ from cadalign.estimation.options import (
 from cadalign.estimation.problems import Problems, are_in_one_plane, rays_of, whitening_of
 from cadalign.estimation.solve import solve_one
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
+from cadalign.geometry.camera import Camera, faced, turned_poses
 from cadalign.solvers.alignment import Objective
 from cadalign.solvers.constants import LINEAR, POSE_SIZE, SAMPLE_SIZES
 from cadalign.solvers.evidence import KeypointEvidence, LogFocalPrior, Views

@@ -13,7 +13,7 @@ from cadalign.arrays import as_floats, as_points, as_positive, read_only
 from cadalign.errors import InputError, quote, require_kind
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions
 from cadalign.estimation.symmetry import check_symmetry
-from cadalign.geometry.box import extent
+from cadalign.geometry.alignment import extent
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry
 

@@ -13,8 +13,7 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
 from cadalign.export.aligned_object import AlignedObject, ExportView
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import BOX_EDGES, Box
+from cadalign.geometry.alignment import BOX_EDGES, Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.pixels import rescaled_pixels

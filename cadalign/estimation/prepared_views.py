@@ -17,7 +17,6 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.estimation.estimates import mean_state
-from cadalign.estimation.facing import faced, rays_ahead, turned_alignment, turned_covariance
 from cadalign.estimation.model import is_exact_model
 from cadalign.estimation.options import pixel_information
 from cadalign.estimation.pack import evidence_of, tells_something
@@ -25,9 +24,15 @@ from cadalign.estimation.prior import ShapePrior, with_known_shape
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Stated, Statistics, ViewResult
 from cadalign.estimation.view import View
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import are_on_a_line
-from cadalign.geometry.camera import Camera, needs_facing
+from cadalign.geometry.alignment import Alignment, are_on_a_line
+from cadalign.geometry.camera import (
+    Camera,
+    faced,
+    needs_facing,
+    rays_ahead,
+    turned_alignment,
+    turned_covariance,
+)
 from cadalign.io.evidence import Size
 from cadalign.solvers.constants import LEAST_POINTS
 from cadalign.solvers.joint.search import refine_joint

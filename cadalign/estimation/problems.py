@@ -19,7 +19,7 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_points, is_number, worker_count
 from cadalign.errors import CadalignError, DegenerateError, InputError, quote, require_kind
 from cadalign.estimation.options import SIGMA_HELP, FitOptions, Sigma, pixel_information
-from cadalign.geometry.box import are_on_a_line
+from cadalign.geometry.alignment import are_on_a_line
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import check_pixels
 from cadalign.solvers.constants import NOT_FOUND, OUT_OF_RANGE, TOO_FEW
@@ -215,7 +215,7 @@ def _check_pair(
 def rays_of(points_2d: FloatArray, camera: Camera, *, clips: bool = False) -> FloatArray:
     """Normalised image coordinates (n, 2) of checked pixels (n, 2); see `rays_ahead`."""
     if camera.is_wide:
-        from cadalign.estimation.facing import rays_ahead  # wide lenses are rare
+        from cadalign.geometry.camera import rays_ahead  # wide lenses are rare
 
         return rays_ahead(points_2d, camera, clips=clips)
     if camera.distortion:

@@ -25,8 +25,7 @@ from cadalign.estimation.result_parts import (
     rms_of,
 )
 from cadalign.estimation.uncertainty.summary import Uncertainty, uncertainty_of
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box, extent
+from cadalign.geometry.alignment import Alignment, Box, extent
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 

@@ -26,8 +26,7 @@ from cadalign.estimation.uncertainty.summary import (
     uncertainty_of,
     weaknesses_of_keypoints,
 )
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box, extent
+from cadalign.geometry.alignment import Alignment, Box, extent
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import by_rotation
 

@@ -107,7 +107,7 @@ def _solve_facing(
 ) -> Solutions:
     """Solve in frames that face the keypoints of wide lenses."""
     # Only here: wide lenses are rare.
-    from cadalign.estimation.facing import faced, turned_covariance, turned_poses
+    from cadalign.geometry.camera import faced, turned_covariance, turned_poses
 
     every = range(len(problems))
     cameras = [faced(problems.camera(b), problems.points_2d[problems.rows(b)]) for b in every]

@@ -11,8 +11,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, as_floats, as_points, as_positive
 from cadalign.errors import InputError
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import extent
+from cadalign.geometry.alignment import Alignment, extent
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import nearest_rigid

@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING
 from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
-    from cadalign.geometry.alignment import Alignment
-    from cadalign.geometry.box import Box
+    from cadalign.geometry.alignment import Alignment, Box
     from cadalign.geometry.camera import Camera
     from cadalign.geometry.conventions import (
         alignment_from_opengl,

@@ -16,8 +16,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points
 from cadalign.errors import InputError, require_kind
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box, oriented_box
+from cadalign.geometry.alignment import Alignment, Box, oriented_box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import angles_between, dots, lengths
 from cadalign.geometry.symmetry import Symmetry

@@ -5,10 +5,9 @@ from typing import TYPE_CHECKING
 from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
-    from cadalign.io.camera_file import read_camera
     from cadalign.io.evidence import ImageEvidence, ObservedImage, Size
     from cadalign.io.meshes.files import load_mesh
-    from cadalign.io.observation import Observation
+    from cadalign.io.observation import Observation, read_camera
 
 __all__ = [
     "ImageEvidence",

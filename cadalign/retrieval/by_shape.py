@@ -33,7 +33,6 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets.models.shapenet import require_category
 from cadalign.errors import DegenerateError, InputError, require_kind
 from cadalign.estimation.align import align
-from cadalign.estimation.facing import turned_alignment
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.uncertainty.shape_posterior import (
     ShapePosterior,
@@ -42,7 +41,7 @@ from cadalign.estimation.uncertainty.shape_posterior import (
 )
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
+from cadalign.geometry.camera import Camera, turned_alignment
 from cadalign.retrieval.models import ModelTable
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import CandidateSet, Observed, Ranking

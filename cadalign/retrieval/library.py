@@ -218,7 +218,7 @@ class Library:
         mask : (h, w) bool, optional
             The object's pixels (of numbers, those above half of the largest possible one): reranks
             the best matches that have a mesh by their silhouettes; see
-            `cadalign.retrieval.silhouettes`.
+            `cadalign.retrieval.match`.
         image : (h, w, 3) or (h, w, 4) uint8, optional
             The image instead of a mask: its opacity, or a segmentation around the keypoints, is
             the mask.
@@ -276,6 +276,6 @@ class Library:
         matches = make_matches(self._table, candidates, observed, ranking, chosen.top, absent)
         if mask is None and image is None:
             return matches
-        from cadalign.retrieval.silhouettes import mask_of, rerank  # with OpenCV and the renderer
+        from cadalign.retrieval.match import mask_of, rerank  # with OpenCV and the renderer
 
         return rerank(self._table, matches, mask_of(mask, image, matches, camera), camera)

@@ -26,7 +26,7 @@ import pyarrow.compute as pc
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_only
 from cadalign.datasets import AnnotatedModel, Circle, RotationalSymmetry, Symmetries, load_mesh
 from cadalign.errors import CadalignError, DataError, InputError
-from cadalign.geometry.box import extent
+from cadalign.geometry.alignment import extent
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.files import Seal, as_path
 

@@ -19,8 +19,7 @@ from cadalign.io.observation import Observation
 from cadalign.render import draw_overlay
 from cadalign.render.drawing.canvas import ByteImage
 from cadalign.render.scene import LIGHT_GREY
-from cadalign.retrieval.match import Match
-from cadalign.retrieval.silhouettes import cast_match
+from cadalign.retrieval.match import Match, cast_match
 from cadalign.web import asset, fill
 
 _MATCHES = "matches.json"

@@ -26,13 +26,12 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats, as_points, worker_count
 from cadalign.datasets.models.shapenet import require_category
 from cadalign.errors import DegenerateError, InputError, quote, require_kind
-from cadalign.estimation.facing import faced, turned_alignment
 from cadalign.estimation.fit import fit_batch
 from cadalign.estimation.options import LOSSES, Sigma
 from cadalign.estimation.problems import rays_of, whitening_of
 from cadalign.estimation.uncertainty.residuals import bent
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
+from cadalign.geometry.camera import Camera, faced, turned_alignment
 from cadalign.geometry.pixels import perspective
 from cadalign.retrieval.kernels import LEAST_SHARED, Candidates, Query, bound_all, search_all
 from cadalign.retrieval.match import Match

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import InputError
-from cadalign.geometry.box import extent
+from cadalign.geometry.alignment import extent
 from cadalign.shapes.parts import (
     AXES,
     BOX_ROWS,

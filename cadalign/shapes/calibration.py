@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.geometry.box import are_on_a_line
+from cadalign.geometry.alignment import are_on_a_line
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.parts import (

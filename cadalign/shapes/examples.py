@@ -13,7 +13,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, as_points, read_only
 from cadalign.errors import DataError, InputError, quote, require_kind
-from cadalign.geometry.box import extent
+from cadalign.geometry.alignment import extent
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.files import as_path, require_utf8
 from cadalign.shapes.parts import (

@@ -19,7 +19,7 @@ from msgspec import Meta
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import DataError, InputError
-from cadalign.geometry.box import BOX_EDGES, bounds_corners
+from cadalign.geometry.alignment import BOX_EDGES, bounds_corners
 from cadalign.io.documents import Count, Document, PathText, in_file
 from cadalign.io.files import Seal, as_path, printable, read_bytes, refuse_input, write_whole
 from cadalign.shapes.parts import BOX_ROWS, ShapeComponent

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.errors import InputError
-from cadalign.geometry.box import bounds_corners
+from cadalign.geometry.alignment import bounds_corners
 from cadalign.geometry.mesh import Mesh
 from cadalign.shapes.parts import checked_box
 

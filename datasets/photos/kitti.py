@@ -29,7 +29,7 @@ from cadalign.datasets.photos.kitti_keypoints import (
 )
 from cadalign.datasets.photos.photo import Photo, PhotoObject, Truth, existing
 from cadalign.errors import DataError, InputError, quote
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Box
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file
 from cadalign.io.files import as_path, damaged, listed, read_text

@@ -28,7 +28,7 @@ from cadalign.datasets.photos.photo import (
 )
 from cadalign.datasets.photos.scannet import read_matrix
 from cadalign.errors import DataError, InputError
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.documents import (

@@ -12,8 +12,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points
 from cadalign.errors import DataError, InputError
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry

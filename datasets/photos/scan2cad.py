@@ -36,8 +36,7 @@ from cadalign.datasets.photos.photo import (
 )
 from cadalign.datasets.photos.scannet import ScanNetFrame, list_frames
 from cadalign.errors import DataError, InputError, quote
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.geometry.symmetry import SCAN2CAD_FOLDS, Symmetry

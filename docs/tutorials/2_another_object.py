@@ -21,8 +21,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import cadalign
+from cadalign import Box
 from cadalign.datasets import KeypointNet, write_sample_dataset
-from cadalign.geometry.box import Box
 from cadalign.render import Angles, Scene, draw_overlay, pose_in_view, visible_keypoints
 
 folder = Path(tempfile.mkdtemp())

@@ -12,8 +12,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError, unknown
 from cadalign.estimation.result import Result
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.evidence import ObservedImage

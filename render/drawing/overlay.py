@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
-from cadalign.geometry.box import BOX_EDGES, Box
+from cadalign.geometry.alignment import BOX_EDGES, Box
 from cadalign.geometry.camera import Camera
 from cadalign.render.drawing.canvas import ByteImage, Canvas, Color, LegendEntry
 from cadalign.render.drawing.layers import (

@@ -16,7 +16,6 @@ from benchmarks.section import BenchmarkData, Row, Table, Tables
 from cadalign import Alignment, Camera, RansacOptions
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
-from cadalign.estimation.facing import faced, turned_alignment
 from cadalign.estimation.options import BOUNDING_PRIOR
 from cadalign.estimation.problems import whitening_of
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
@@ -28,6 +27,7 @@ from cadalign.evaluation.simulation import (
     random_rotation,
     simulate_problem,
 )
+from cadalign.geometry.camera import faced, turned_alignment
 from cadalign.solvers.alignment import evaluate_cost, keypoint_objective
 from cadalign.solvers.linear import aepnp
 from cadalign.solvers.minimal import ap4p

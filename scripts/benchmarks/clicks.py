@@ -15,7 +15,7 @@ from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Alignment, Model, View, align
 from cadalign.metrics import rotation_error
 from cadalign.render import Scene, cast_geometry
-from cadalign.retrieval.silhouettes import grab_cut
+from cadalign.retrieval.match import grab_cut
 
 _FEWEST = 3
 _MARGIN = 0.05  # of a box that is dragged around an object, relative to its larger side

@@ -24,7 +24,7 @@ from cadalign.evaluation.instances.instance import (
 )
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound
 from cadalign.evaluation.metrics.errors import alignment_errors, overlap
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Box
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.evidence import Size

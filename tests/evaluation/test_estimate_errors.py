@@ -10,8 +10,7 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.evaluation.instances.instance import HULL, KEYPOINT_CAMERA, Instance
 from cadalign.evaluation.metrics.errors import estimate_errors
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.geometry.symmetry_group import SymmetryGroup
 

@@ -19,7 +19,7 @@ from cadalign.evaluation.instances.instance import (
 from cadalign.evaluation.methods import LIMIT, fit_methods, fit_options
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, limit_estimate
 from cadalign.evaluation.simulation import simulate_problem
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.metrics import rotation_error
 from cadalign.geometry.symmetry_group import SymmetryGroup

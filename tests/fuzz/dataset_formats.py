@@ -21,9 +21,9 @@ from cadalign import Alignment, Camera, Model, Result, ShapeModel, Size, View, a
 from cadalign.datasets import load_mesh
 from cadalign.datasets.detections.coco import decode_segmentation
 from cadalign.datasets.photos.kitti_keypoints import car_shape
-from cadalign.io.camera_file import read_camera
 from cadalign.io.documents import read_json
 from cadalign.io.images import read_grey, read_photo
+from cadalign.io.observation import read_camera
 from cadalign.shapes.outputs import SEAL
 
 _CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from cadalign import Alignment, Box
 from cadalign.errors import InputError
 from cadalign.evaluation.simulation import random_rotation
-from cadalign.geometry.box import BOX_EDGES
+from cadalign.geometry.alignment import BOX_EDGES
 
 SEEDS = st.integers(0, 2**32 - 1)
 

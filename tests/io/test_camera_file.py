@@ -10,7 +10,7 @@ import pytest
 
 from cadalign import Camera, Observation
 from cadalign.errors import DataError, InputError
-from cadalign.io.camera_file import read_camera
+from cadalign.io.observation import read_camera
 
 MATRIX = [[500.0, 0.0, 319.5], [0.0, 510.0, 239.5], [0.0, 0.0, 1.0]]
 CAMERA = Camera(640, 480, 500, 510, 319.5, 239.5)

@@ -38,11 +38,10 @@ from cadalign.datasets.photos.scannet import read_matrix
 from cadalign.datasets.sfm.unpickling import load_pickle
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.io.camera_file import read_camera
 from cadalign.io.evidence import ImageEvidence
 from cadalign.io.files import open_input, read_bytes, read_text
 from cadalign.io.images import photo_size, read_grey, read_photo
-from cadalign.io.observation import Observation
+from cadalign.io.observation import Observation, read_camera
 
 BYTES = 2**33
 

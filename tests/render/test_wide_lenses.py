@@ -13,7 +13,7 @@ from support.renderers import renderer_or_skip
 from cadalign import Alignment, Camera, Mesh, Model, Result, View, align, fit
 from cadalign.cli import main
 from cadalign.export.scene_parts import photo_plane
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Box
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.evidence import ObservedImage
 from cadalign.io.observation import Observation

@@ -26,9 +26,8 @@ from cadalign.estimation.contours.silhouettes import (
     eye_of,
     overlaps,
 )
-from cadalign.estimation.facing import turned_alignment
 from cadalign.geometry.alignment import Alignment, model_rays
-from cadalign.geometry.camera import Camera
+from cadalign.geometry.camera import Camera, turned_alignment
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import angle_between
 from cadalign.geometry.symmetry import Symmetry

@@ -13,7 +13,6 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.estimates import pose_and_lengths
-from cadalign.estimation.facing import turned_covariance
 from cadalign.estimation.pack import SingleBasis
 from cadalign.estimation.prior import has_scale_prior
 from cadalign.estimation.uncertainty.summary import (
@@ -22,7 +21,7 @@ from cadalign.estimation.uncertainty.summary import (
     Uncertainty,
     uncertainty_of,
 )
-from cadalign.geometry.camera import Camera
+from cadalign.geometry.camera import Camera, turned_covariance
 from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import (
     Evidence,

@@ -116,7 +116,7 @@ def posterior_covariance(result: FittedKeypoints) -> FloatArray:
     assert result.fisher_covariance is not None
     if needs_facing([result.camera]):
         # Wide lenses are rare.
-        from cadalign.estimation.facing import faced, turned_alignment, turned_covariance
+        from cadalign.geometry.camera import faced, turned_alignment, turned_covariance
 
         kept = result.points_3d[result.inliers]
         camera = faced(result.camera, result.camera.project(result.alignment.apply(kept)))

@@ -20,12 +20,12 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError, quote
-from cadalign.estimation.facing import faced, turned_alignment
 from cadalign.estimation.options import LOSSES
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.problems import rays_of, whitening_of
 from cadalign.estimation.uncertainty.residuals import loss_slopes, whitening_matrices
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import faced, turned_alignment
 from cadalign.geometry.pixels import perspective
 from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.model import ShapeModel

@@ -20,8 +20,7 @@ from cadalign.datasets.models.keypoints import symmetry_group
 from cadalign.errors import CadalignError, TooFewVisibleError
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_views
 from cadalign.evaluation.runs.work import Row
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import perspective
 from cadalign.geometry.symmetry_group import SymmetryGroup

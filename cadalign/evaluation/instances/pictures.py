@@ -20,8 +20,7 @@ from cadalign.errors import DataError, RenderError
 from cadalign.evaluation.instances.instance import Instance, KeypointTask
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.simplify import cluster, mesh_edges, simplify

@@ -33,8 +33,7 @@ from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANG
 from cadalign.evaluation.methods import Method
 from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
 from cadalign.evaluation.runs.work import Row
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.metrics import rotation_error
 from cadalign.retrieval.absence import SAME_SHAPE, distances, shape_distance
 from cadalign.retrieval.library import Library

@@ -35,8 +35,7 @@ from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import Outcome, Row, fingerprint
 from cadalign.evaluation.shape_files import LearnedFiles
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.metrics import (
     rotation_error,
     translation_error,

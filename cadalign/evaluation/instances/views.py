@@ -46,7 +46,7 @@ from cadalign.evaluation.metrics.errors import estimate_errors, overlap_up_to_sc
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import FAILED, Columns, Outcome, Row, fingerprint, reason_of
 from cadalign.evaluation.shape_files import NO_SHAPES, ShapeFiles
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Box
 
 KeypointView = tuple[KeypointTask, Instance]
 """A view of a model as an instance of the benchmark: its task, and what it shows."""

@@ -6,11 +6,16 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
-from cadalign.estimation.facing import faced, turned_alignment, turned_covariance
 from cadalign.estimation.options import Sigma
 from cadalign.estimation.problems import focal_slopes, full_covariance, whitening_of
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera, needs_facing
+from cadalign.geometry.camera import (
+    Camera,
+    faced,
+    needs_facing,
+    turned_alignment,
+    turned_covariance,
+)
 from cadalign.geometry.pixels import perspective
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.shapes.parts import probability_within

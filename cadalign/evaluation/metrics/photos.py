@@ -27,8 +27,7 @@ from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics.errors import overlap_up_to_scale
 from cadalign.evaluation.runs.work import FAILED, Columns, Row
 from cadalign.evaluation.summary import known, median_of
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.metrics import box_iou
 from cadalign.geometry.symmetry import Symmetry, symmetric_rotation_error
 

@@ -18,8 +18,7 @@ from cadalign.evaluation import metrics
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics.photos import MetricSet
 from cadalign.evaluation.runs.work import Row
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.metrics import scale_error
 from cadalign.geometry.symmetry import Symmetry, symmetric_rotation_error
 

@@ -23,8 +23,7 @@ from cadalign.evaluation.photos import protocols
 from cadalign.evaluation.photos.protocols import KeypointOptions, Protocol
 from cadalign.evaluation.photos.target import Cad, PhotoTarget, rectangle_of
 from cadalign.evaluation.runs.work import LeftOutError
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.render.viewpoints import visible_keypoints

@@ -22,8 +22,7 @@ from cadalign.evaluation.runs.work import (
     fingerprint,
     fingerprint_of_files,
 )
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import farthest_rows, random_points
 from cadalign.render.scene import Scene

@@ -10,7 +10,7 @@ import pytest
 from cadalign import Camera, Model, ShapeModel, View, align
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.errors import DegenerateError, InputError
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Box
 from cadalign.metrics import box_iou_up_to_scale
 from cadalign.render import Scene, Viewpoint, cast_geometry, sample_view
 from cadalign.shapes.examples import Example, examples_of

@@ -17,8 +17,7 @@ from cadalign.evaluation.metrics.photos import (
     nine_dof_iou,
     shares_of,
 )
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.symmetry import Symmetry
 
 DIMS = np.array([1.5, 1.6, 4.0])

@@ -40,7 +40,7 @@ from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.summary import Summary
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Box
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("no_figures")]
 

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
     from cadalign.datasets.models.shapenet import SYNSETS, ShapeNet, ShapeNetModel
     from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, PhotoSummary
-    from cadalign.datasets.photos.kitti import KittiCars
     from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
     from cadalign.datasets.photos.photo import CadModel, Photo, PhotoKeypoints, PhotoObject, Truth
     from cadalign.datasets.photos.pix3d import Pix3D
@@ -48,7 +47,6 @@ __all__ = [
     "ImageKeypoints",
     "KeypointNet",
     "Keypoints",
-    "KittiCars",
     "ModelKeypoint",
     "ModelKeypoints",
     "Pascal3D",

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from cadalign.datasets.photos import kitti, pascal3d, pix3d, scan2cad
+from cadalign.datasets.photos import pascal3d, pix3d, scan2cad
 from cadalign.datasets.photos.dataset import PhotoDataset
 from cadalign.datasets.sfm import blind_pnp, colmap
 from cadalign.datasets.sfm.correspondences import CorrespondenceSet
@@ -17,7 +17,6 @@ from cadalign.io.files import as_path
 PHOTO_FORMATS = (
     scan2cad.FORMAT,
     pix3d.FORMAT,
-    kitti.FORMAT,
     pascal3d.FORMAT,
     pascal3d.DETECTIONS,
 )
@@ -30,8 +29,8 @@ def open_photos(path: str | os.PathLike[str]) -> PhotoDataset:
     Parameters
     ----------
     path : str or path-like
-        The folder; see the classes for what may lie in it: `Scan2CAD`, `Pix3D`, `KittiCars`,
-        `Pascal3D`, `Pascal3DDetections`.
+        The folder; see the classes for what may lie in it: `Scan2CAD`, `Pix3D`, `Pascal3D`,
+        `Pascal3DDetections`.
 
     Returns
     -------
@@ -45,9 +44,9 @@ def open_photos(path: str | os.PathLike[str]) -> PhotoDataset:
 
     Examples
     --------
-    >>> dataset = cadalign.datasets.open("KITTI/training")  # doctest: +SKIP
+    >>> dataset = cadalign.datasets.open("pix3d")  # doctest: +SKIP
     >>> dataset  # doctest: +SKIP
-    KittiCars('KITTI/training'): 7481 photos
+    Pix3D('pix3d'): 10069 photos
     """
     folder = as_path(path)
     if "\0" in str(path) or not folder.is_dir():

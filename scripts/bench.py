@@ -24,7 +24,7 @@ import tyro
 from benchmarks.accuracy import solvers, unknown_focal, wide_lenses
 from benchmarks.annotator import annotator
 from benchmarks.cameras import photo_lenses
-from benchmarks.cars import real_detections
+from benchmarks.cars import real_cars, real_detections
 from benchmarks.clicks import clicks, outline_methods
 from benchmarks.coverage import coverage
 from benchmarks.evidence import evidence
@@ -72,6 +72,7 @@ ON_REQUEST: dict[str, Callable[..., Tables]] = {
     "photo_times": photo_times,
     "clicks": clicks,
     "outlines": outline_methods,
+    "kitti": real_cars,
     "detections": real_detections,
     "unseen_retrieval": unseen_retrieval,
     "similar": similar,

@@ -1,7 +1,7 @@
 """Shape models that runs are given, find or learn, by category.
 
 `ShapeFiles` are given to runs on KeypointNet; `learn` makes `LearnedFiles` of a split of it, with a
-library of its models; `shapes_of` are given to runs on photos, or found in the data set's folder.
+library of its models; `shapes_of` are given to runs on photos.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cadalign.datasets import AnnotatedModel, KeypointNet
-from cadalign.datasets.photos.kitti_keypoints import car_shape
 from cadalign.errors import DataError, InputError, quote
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import fingerprint
@@ -168,8 +167,8 @@ def _open_library(path: str) -> Library:
     return Library.open(path)
 
 
-def shapes_of(files: Sequence[Path], folder: Path) -> tuple[ShapeModel, ...]:
-    """The shape models of some files, and of the folder for a category that they lack.
+def shapes_of(files: Sequence[Path]) -> tuple[ShapeModel, ...]:
+    """The shape models of some files.
 
     Raises InputError if two files are of the same category; and DataError if one cannot be read.
     """
@@ -179,9 +178,6 @@ def shapes_of(files: Sequence[Path], folder: Path) -> tuple[ShapeModel, ...]:
     if twice is not None:
         what, fix = f"two files are of the category {quote(twice)}", "give one for each category"
         raise InputError(what, where="shape", fix=fix)
-    found = car_shape(folder)
-    if found is not None and found.category not in counts:
-        given.append(found)
     return tuple(given)
 
 

@@ -53,7 +53,7 @@ class PhotoSummary:
     with_model: int
     """Objects with a CAD model."""
     with_pose: int
-    """Objects with a pose, of which a box is enough."""
+    """Objects with a pose."""
     with_mask: int
     """Objects with a mask."""
     problems: tuple[str, ...]
@@ -95,7 +95,6 @@ class PhotoDataset(ABC):
         self.root = root
         self.names = tuple(names)
         """The photos' names, in the annotations' order."""
-        self._kept: tuple[Path, Any] | None = None
         self.problems = problems or {}
         """Why records or objects could not be read, of those read so far, by name."""
         if self.problems and not self.names:
@@ -157,7 +156,7 @@ class PhotoDataset(ABC):
                 truth = found.truth
                 having["keypoints"] += found.keypoints is not None
                 having["model"] += found.model is not None
-                having["pose"] += not (truth.cam_from_model is None and truth.box is None)
+                having["pose"] += truth.cam_from_model is not None
                 having["mask"] += found.mask_path is not None
             if progress is not None:
                 progress(photos)
@@ -183,13 +182,6 @@ class PhotoDataset(ABC):
             where = f"{self.root}, {self.names[index]}"
             where += f": {error.where}" if error.where else ""
             raise DataError(error.what, where=where, fix=error.fix) from None
-
-    def _read_once(self, path: Path, read: Callable[[Path], T]) -> T:
-        """Read what several photos lie in, such as a scene; kept until another is asked for."""
-        if self._kept is None or self._kept[0] != path:
-            self._kept = path, read(path)
-        found: T = self._kept[1]
-        return found
 
     def _tell(self, name: str, error: DataError) -> None:
         if name not in self.problems and len(self.problems) <= _LOGGED:
@@ -260,11 +252,6 @@ def read_list(path: Path) -> list[Raw]:
     Raises DataError if it cannot be read, is no valid JSON (cut short, say), or holds no list.
     """
     return list(_decode(read_bytes(path), list[Raw], "a list", path))
-
-
-def read_table(path: Path) -> dict[str, Raw]:
-    """Read a JSON file that holds an object, its values not yet parsed; see `read_list`."""
-    return dict(_decode(read_bytes(path), dict[str, Raw], "an object", path))
 
 
 def parse(raw: Raw, kind: type[T] | Any, *, path: Path, where: str) -> T | Any:

@@ -14,13 +14,12 @@ from fuzz.format import Format
 from PIL import Image
 from scipy.io import savemat
 from support.gltf_files import write_gltf
-from support.photo_data import matrix_text, read_whole, write_photo, write_text
+from support.photo_data import read_whole, write_photo, write_text
 from support.photo_sets import WRITERS
 
 from cadalign import Alignment, Camera, Model, Result, ShapeModel, Size, View, align
 from cadalign.datasets import load_mesh
 from cadalign.datasets.detections.coco import decode_segmentation
-from cadalign.datasets.photos.kitti_keypoints import car_shape
 from cadalign.io.documents import read_json
 from cadalign.io.images import read_grey, read_photo
 from cadalign.io.observation import read_camera
@@ -39,7 +38,6 @@ _CHANGED = {
         "scans/scene0000_00/intrinsic/intrinsic_color.txt",
         "scans/scene0000_00/pose/0.txt",
     ),
-    "KITTI": ("cars.json",),
     "PASCAL3D+": ("Annotations/chair_pascal/1.mat", "CAD/chair.mat"),
 }
 
@@ -58,19 +56,6 @@ def _photo_set(kind: str, changed: str) -> Format:
 # --- data sets of which no tiny whole one is written elsewhere ---------------------------------
 
 
-def _write_kitti_labels(changed: str) -> Callable[[Path], Path]:
-    car = "Car 0.00 1 -1.5 100 50 200 150 1.5 1.6 4.0 2.0 1.7 20.0 0.0"
-
-    def write(folder: Path) -> Path:
-        training = folder / "set" / "training"
-        write_text(training / "label_2" / "000007.txt", f"{car}\nDontCare -1 -1 -10\n{car} 0.9\n")
-        write_text(training / "calib" / "000007.txt", "P2: 700 0 600 70 0 700 170 7 0 0 1 0.5\n")
-        write_photo(training / "image_2" / "000007.png", 64, 48)
-        return training / changed
-
-    return write
-
-
 def _write_detections(folder: Path) -> Path:
     """Photos of PASCAL3D+ with detected keypoints."""
     root = folder / "set"
@@ -83,21 +68,6 @@ def _write_detections(folder: Path) -> Path:
     savemat(root / "annot" / "valid.mat", {"annot": lists}, do_compression=True)
     write_photo(root / "images" / "a.jpg")
     return root / "annot" / "valid.mat"
-
-
-def _write_car_shape(changed: str) -> Callable[[Path], Path]:
-    points = np.random.default_rng(1).uniform(-1, 1, (14, 3)) * [0.8, 2, 0.7]
-    names = [f"k{number}" for number in range(14)]
-
-    def write(folder: Path) -> Path:
-        tracks = {"names": names, "model_xyz": points.tolist()}
-        write_text(folder / "car_tracks.json", json.dumps(tracks))
-        write_text(folder / "meanShape_2.txt", matrix_text(points))
-        modes = np.random.default_rng(2).normal(size=(5, 42))
-        write_text(folder / "vectors2.txt", matrix_text(modes))
-        return folder / changed
-
-    return write
 
 
 # --- shapes, results, estimates, masks, cameras ------------------------------------------------
@@ -211,20 +181,6 @@ def _write_scene(folder: Path) -> Path:
 
 FORMATS = (
     *(_photo_set(kind, changed) for kind, names in _CHANGED.items() for changed in names),
-    Format(
-        "KITTI labels",
-        _write_kitti_labels("label_2/000007.txt"),
-        lambda path: read_whole(path.parents[2]),
-    ),
-    Format(
-        "KITTI calibration",
-        _write_kitti_labels("calib/000007.txt"),
-        lambda path: read_whole(path.parents[2]),
-    ),
-    *(
-        Format(f"KITTI {name}", _write_car_shape(name), lambda path: car_shape(path.parent))
-        for name in ("car_tracks.json", "meanShape_2.txt", "vectors2.txt")
-    ),
     Format("PASCAL3D+ detections", _write_detections, lambda path: read_whole(path.parents[1])),
     Format("shape", _write_shape, ShapeModel.open),
     Format("forged shape", _write_shape, ShapeModel.open, _seal_shape),

@@ -19,7 +19,6 @@ from cadalign.datasets import (
     BlindPnP,
     Colmap,
     KeypointNet,
-    KittiCars,
     ModelKeypoints,
     Pascal3D,
     Pascal3DDetections,
@@ -31,8 +30,7 @@ from cadalign.datasets import (
     open_photos,
     read_image_keypoints,
 )
-from cadalign.datasets.photos.dataset import read_list, read_table
-from cadalign.datasets.photos.kitti import read_labels
+from cadalign.datasets.photos.dataset import read_list
 from cadalign.datasets.photos.mat_files import read_structs
 from cadalign.datasets.photos.scannet import read_matrix
 from cadalign.datasets.sfm.unpickling import load_pickle
@@ -70,9 +68,7 @@ READERS = [
     *same(".pkl", read=load_pickle),
     *same(".mat", read=lambda path: read_structs(path, "record")),
     *same(".json", read=read_list),
-    *same(".json", read=read_table),
     *same(".txt", read=lambda path: read_matrix(path, (3, 3))),
-    *same(".txt", read=lambda path: read_labels(path, tracking=False)),
 ]
 
 
@@ -150,7 +146,7 @@ class Opened:
     [
         *dict.fromkeys(each.read for each in READERS),
         *(KeypointNet, ShapeNet, Scan2CAD, Pix3D, Pascal3D, Pascal3DDetections),
-        *(KittiCars, Colmap, BlindPnP, open_correspondences),
+        *(Colmap, BlindPnP, open_correspondences),
         *(open_photos, ModelKeypoints.load, Result.load, Results.open),
         *(FocalPrior.from_exif, photo_size),
     ],

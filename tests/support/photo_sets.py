@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -109,37 +110,6 @@ def write_scan2cad(root: Path, *, frames: int = 2) -> Path:
     return root
 
 
-def write_kitti(root: Path, *, cars: int = 3) -> Path:
-    """Cars whose keypoints lie where those of the mean car do."""
-    sides = np.array([1.6, 3.9, 1.5])  # width, length, height
-    points = POINTS / SIDES * sides
-    entries = []
-    for number in range(cars):
-        yaw, bottom = 0.4 + number, np.array([1.0, 1.6, 12.0 + number])
-        c, s = np.cos(yaw), np.sin(yaw)
-        about_y = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-        # The car's left, rear and up at a yaw of 0: it heads along the camera's x.
-        axes = about_y @ np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
-        placed = points @ axes.T + bottom - [0, sides[2] / 2, 0]
-        pixels = CAMERA.project(placed)
-        image = f"images/{number}.png"
-        write_photo(root / image, 320, 240)
-        marks = [
-            {"name": name, "xyz": xyz.tolist(), "uv": uv.tolist(), "score": 0.9}
-            for name, xyz, uv in zip(NAMES, points, pixels, strict=True)
-        ]
-        entries.append(
-            {
-                "image": image, "K": CAMERA.matrix.tolist(),
-                "bbox": [*pixels.min(axis=0).tolist(), *pixels.max(axis=0).tolist()],
-                "dims_hwl": sides[[2, 0, 1]].tolist(), "location_bottom_centre": bottom.tolist(),
-                "rotation_y": yaw, "keypoints": marks,
-            }
-        )  # fmt: skip
-    write_json(root / "cars.json", entries)
-    return root
-
-
 def write_pascal3d(root: Path) -> Path:
     """One photo of PASCAL3D+ with the box as its model, z up."""
     points = POINTS[:, [0, 2, 1]]
@@ -169,6 +139,27 @@ def write_pascal3d(root: Path) -> Path:
     return root
 
 
+def write_detections(root: Path, *, photos: int) -> Path:
+    """Photos of PASCAL3D+ with detected keypoints of the box, and without poses."""
+    write_pascal3d(root)
+    shutil.rmtree(root / "Annotations")
+    pixels = pixels_of(pose(0))
+    marks = [
+        {"name": name, "uv": uv.tolist(), "confidence": 0.9}
+        for name, uv in zip(NAMES, pixels, strict=True)
+    ]
+    names = [str(number) for number in range(photos)]
+    for name in names:
+        write_photo(root / "Images" / f"{name}.jpg", 320, 240)
+        observation = {"image": f"../Images/{name}.jpg", "keypoints": marks}
+        write_json(root / "observations" / f"{name}.json", observation)
+    lists = {"imgname": np.array(names, dtype=object), "cad_index": np.ones(photos)}
+    lists["class"] = np.array(["chair"] * photos, dtype=object)
+    (root / "annot").mkdir()
+    savemat(root / "annot" / "valid.mat", {"annot": lists})
+    return root
+
+
 def _write_record(path: Path, found: dict[str, Any]) -> None:
     objects = np.array([found], dtype=object)
     record = {"filename": "1.jpg", "imgsize": [320.0, 240.0, 3.0], "objects": objects}
@@ -178,7 +169,6 @@ def _write_record(path: Path, found: dict[str, Any]) -> None:
 WRITERS = {
     "Pix3D": write_pix3d,
     "Scan2CAD": write_scan2cad,
-    "KITTI": write_kitti,
     "PASCAL3D+": write_pascal3d,
 }
 """What writes a data set of each kind."""

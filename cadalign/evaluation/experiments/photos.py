@@ -19,10 +19,7 @@ from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import VIEW_NAMES
 from cadalign.evaluation.methods import PNP_METHODS
 from cadalign.evaluation.metrics import BOX_IOU
-from cadalign.evaluation.metrics.photos import DEPTH as DEPTH_ERROR
 from cadalign.evaluation.metrics.photos import (
-    IOU_3D,
-    KITTI,
     NINE_DOF,
     ROTATION,
     VIEWPOINT,
@@ -65,7 +62,7 @@ COLUMNS: Columns = (
 class PhotosOptions(FunctionOptions, PhotoOptions, protocols.KeypointOptions):
     """Evaluate methods on photos of real objects, by the metrics of their data set.
 
-    The folder may hold Scan2CAD, PASCAL3D+, ObjectNet3D, Pix3D or KITTI. Keypoints
+    The folder may hold Scan2CAD, PASCAL3D+, ObjectNet3D or Pix3D. Keypoints
     are the annotated or detected ones; where there are none, visible points of the model's mesh are
     projected with the true pose, with noise, and called simulated. The model's width (x) is given,
     as one image leaves size open; with a shape model in metres it is estimated. The
@@ -114,7 +111,7 @@ GALLERY = (
 )
 """Errors of single objects."""
 # The data sets' own first.
-_OWN_FIRST = (SCAN2CAD, KITTI, VIEWPOINT, NINE_DOF)
+_OWN_FIRST = (SCAN2CAD, VIEWPOINT, NINE_DOF)
 HEADLINE = (
     *(metrics.INSTANCES, metrics.FAILED, metrics.LEFT_OUT, metrics.KEYPOINTS),
     *(metric for each in _OWN_FIRST for metric in each.headline),
@@ -200,9 +197,7 @@ def _mean(found: Sequence[Summary]) -> Summary:
 
 _CURVES = (
     (ROTATION, np.array([0.2, 0.5, 1, 2, 3, 5, 7.5, 10, 15, 20, 30, 45, 90])),
-    (replace(DEPTH_ERROR, log=False), np.array([1, 2, 3, 5, 7.5, 10, 15, 20, 30])),
     (replace(BOX_IOU, log=False), np.arange(0, 1.01, 0.05)),
-    (replace(IOU_3D, log=False), np.arange(0, 1.01, 0.05)),
 )
 
 plots = partial(cumulative_curves, curves=_CURVES, of="on photos")
@@ -222,7 +217,7 @@ def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
 
     dataset = reopened(options.root)
     protocol = protocols.protocol_of(dataset.kind)
-    shapes = shapes_of(options.shape, dataset.root)
+    shapes = shapes_of(options.shape)
     if not options.methods:
         methods = protocols.default_methods(
             with_evidence=tuple(dict.fromkeys((protocols.RIGID, protocol.best))),

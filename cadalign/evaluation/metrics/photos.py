@@ -1,4 +1,4 @@
-"""Metrics of photos: sets of them, and those of PASCAL3D+, of boxes with nine degrees, of KITTI.
+"""Metrics of photos: sets of them, and those of PASCAL3D+ and of boxes with nine degrees.
 
 A set is what a data set's protocol measures of each object, and shows of many. A new metric of
 photos is a column and a line of one set, in the module with its formula; a new set is a module, and
@@ -7,8 +7,6 @@ its place in `cadalign.evaluation.photos.protocols`.
 Tulsiani, Malik, "Viewpoints and Keypoints", CVPR 2015, section 4.1: accuracy at pi/6, median error.
 Wang et al., "Normalized Object Coordinate Space for Category-Level 6D Object Pose and Size
 Estimation" (NOCS), CVPR 2019, section 5: IoU at 25, 50 and 75 %, and degrees and cm.
-Geiger et al., "Are we ready for Autonomous Driving?", CVPR 2012, and the benchmark's evaluation:
-yaw, depth, and the overlap of boxes in space and from above.
 """
 
 from __future__ import annotations
@@ -21,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cadalign.arrays import BoolArray
-from cadalign.datasets.photos.kitti_keypoints import car_box, yaw_of_car
 from cadalign.evaluation import metrics
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics.errors import overlap_up_to_scale
@@ -34,9 +31,6 @@ from cadalign.geometry.symmetry import Symmetry, symmetric_rotation_error
 if TYPE_CHECKING:
     from cadalign.evaluation.photos.target import PhotoTarget
     from cadalign.evaluation.runs.tables import Cells
-
-
-PERCENTILE = 90
 
 
 @dataclass(frozen=True)
@@ -57,7 +51,6 @@ class MetricSet:
     model, the true one, and the estimated box."""
     columns: tuple[str, ...]  # columns of the result table, numbers
     medians: tuple[Metric, ...]  # columns whose medians are shown
-    tails: tuple[tuple[Metric, Metric], ...] = ()  # 90th percentiles, each of a column
     rates: tuple[Rate, ...] = ()
     shares: tuple[Metric, ...] = ()
     """Columns between 0 and 1 whose means over all objects are shown."""
@@ -91,13 +84,9 @@ def score_alignment(
 
 
 def medians_of(sets: Sequence[MetricSet], solved: Cells, *further: Metric) -> dict[str, float]:
-    """Medians, and 90th percentiles, over the objects that did not fail."""
+    """Medians over the objects that did not fail."""
     medians = (*(metric for each in sets for metric in each.medians), *further)
-    found = {metric.key: median_of(solved[metric.key]) for metric in medians}
-    for metric, column in (pair for each in sets for pair in each.tails):
-        values = known(solved[column.key])
-        found[metric.key] = float(np.percentile(values, PERCENTILE)) if len(values) else np.nan
-    return found
+    return {metric.key: median_of(solved[metric.key]) for metric in medians}
 
 
 def measured_columns(sets: Sequence[MetricSet], cells: Cells) -> frozenset[str]:
@@ -259,98 +248,4 @@ NINE_DOF = MetricSet(
         *(metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
     ),
     console=(TRANSLATION, _DEGREE_CM[10.0, 10.0], _IOUS[0.5]),
-)
-
-# KITTI --------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class KittiErrors:
-    """Errors and overlaps of one car."""
-
-    yaw_deg: float  # difference of the headings [degrees], 0 to 180
-    depth: float  # difference of the centres' depths [m]
-    depth_relative: float  # the same as a fraction of the true depth
-    iou_3d: float  # intersection over union of the boxes
-    iou_bev: float  # the same of their footprints: from a bird's eye
-
-
-def kitti_errors(*, est: Box, gt: Box) -> KittiErrors:
-    """Errors of a car's box in the frame of the camera.
-
-    The boxes' axes are the car's: x to its left, y to its rear, z up (see
-    `cadalign.datasets.KittiCars`). KITTI knows cars by their yaw alone: an estimate that is tilted
-    counts as the upright box of its heading, centre and extents.
-
-    Raises InputError if a box has no volume.
-
-    Examples
-    --------
-    >>> gt = car_box(np.array([1.5, 1.6, 4.0]), np.array([0.0, 1.5, 10.0]), 0.0)
-    >>> est = car_box(np.array([1.5, 1.6, 4.0]), np.array([0.0, 1.5, 10.8]), 0.1)
-    >>> errors = kitti_errors(est=est, gt=gt)
-    >>> round(errors.yaw_deg, 3), round(errors.depth, 3), round(errors.depth_relative, 3)
-    (5.73, 0.8, 0.08)
-    """
-    turn = yaw_of_car(est.rotation) - yaw_of_car(gt.rotation)
-    depth = float(abs(est.center[2] - gt.center[2]))
-    return KittiErrors(
-        yaw_deg=float(np.degrees(abs(np.arctan2(np.sin(turn), np.cos(turn))))),
-        depth=depth,
-        depth_relative=depth / float(gt.center[2]),
-        iou_3d=box_iou(est=_upright(est), gt=_upright(gt)),
-        iou_bev=box_iou(est=_footprint(est), gt=_footprint(gt)),
-    )
-
-
-def _upright(box: Box) -> Box:
-    width, length, height = box.extents
-    bottom = box.center + np.array([0, height / 2, 0])
-    return car_box(np.array([height, width, length]), bottom, yaw_of_car(box.rotation))
-
-
-def _footprint(box: Box) -> Box:
-    """The prism of height 1 on the footprint: volumes of prisms are areas of footprints."""
-    width, length, _ = box.extents
-    bottom = np.array([box.center[0], 0.0, box.center[2]])
-    return car_box(np.array([1.0, width, length]), bottom, yaw_of_car(box.rotation))
-
-
-YAW = Metric("yaw_error_deg", "yaw error", "deg", symbol="yaw", limit=30.0)
-YAW_90 = replace(
-    YAW,
-    key="yaw_error_deg_90",
-    label="90th percentile of the yaw error",
-    head="yaw error, 90 %",
-    symbol="yaw90",
-)
-DEPTH = Metric(
-    "depth_error_relative", "depth error", "%", 1, factor=100.0, symbol="depth %", limit=50.0
-)
-IOU_3D = replace(metrics.BOX_IOU, key="iou_3d", label="3D IoU", head="3D IoU", symbol="IoU3D")
-IOU_BEV = replace(
-    metrics.BOX_IOU, key="iou_bev", label="bird's-eye IoU", head="bird's-eye IoU", symbol="BEV"
-)
-
-
-def _measure_kitti(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
-    if target.gt_box is None:
-        return {}
-    errors = kitti_errors(est=box, gt=target.gt_box)
-    return {
-        YAW.key: errors.yaw_deg,
-        "depth_error": errors.depth,
-        DEPTH.key: errors.depth_relative,
-        IOU_3D.key: errors.iou_3d,
-        IOU_BEV.key: errors.iou_bev,
-    }
-
-
-KITTI = MetricSet(
-    _measure_kitti,
-    columns=(YAW.key, "depth_error", DEPTH.key, IOU_3D.key, IOU_BEV.key),
-    medians=(YAW, DEPTH, IOU_3D, IOU_BEV),
-    tails=((YAW_90, YAW),),
-    headline=(YAW, YAW_90, DEPTH, IOU_3D, IOU_BEV),
-    console=(YAW, YAW_90, DEPTH, IOU_3D, IOU_BEV),
 )

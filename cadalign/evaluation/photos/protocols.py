@@ -9,13 +9,12 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from cadalign.datasets.photos.kitti import KittiCars
 from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
 from cadalign.datasets.photos.pix3d import Pix3D
 from cadalign.datasets.photos.scan2cad import Scan2CAD
 from cadalign.errors import InputError, quote
 from cadalign.evaluation.methods import SHAPE
-from cadalign.evaluation.metrics.photos import KITTI, NINE_DOF, VIEWPOINT, MetricSet
+from cadalign.evaluation.metrics.photos import NINE_DOF, VIEWPOINT, MetricSet
 from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
 from cadalign.evaluation.options import ExperimentOptions
 
@@ -126,7 +125,7 @@ class KeypointOptions(ExperimentOptions):
             raise InputError(f"{self.min_score} is not a score", where="min_score")
 
 
-SETS = (VIEWPOINT, NINE_DOF, SCAN2CAD, KITTI)
+SETS = (VIEWPOINT, NINE_DOF, SCAN2CAD)
 """All sets of metrics, in the order of the result table's columns."""
 
 
@@ -148,7 +147,6 @@ _PROTOCOLS = {
     # Annotators' points on scan and model are about 5 cm apart, 8 px in an image of 480.
     Scan2CAD.kind: Protocol((VIEWPOINT, SCAN2CAD, NINE_DOF), SIMILAR, sigma_of_width=1 / 60),
     Pix3D.kind: Protocol((VIEWPOINT, NINE_DOF), RIGID),
-    KittiCars.kind: Protocol((VIEWPOINT, KITTI), SHAPE, up_axis="z"),
     Pascal3D.kind: Protocol((VIEWPOINT,), SIMILAR, up_axis="z"),
     Pascal3DDetections.kind: Protocol((VIEWPOINT,), SIMILAR, up_axis="z"),
 }

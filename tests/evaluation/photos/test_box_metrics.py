@@ -1,4 +1,4 @@
-"""KITTI's, NOCS's and PASCAL3D+'s metrics on truth and on synthetic errors of known scores."""
+"""NOCS's and PASCAL3D+'s metrics on truth and on synthetic errors of known scores."""
 
 from __future__ import annotations
 
@@ -6,84 +6,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import cadalign.datasets
-from cadalign.datasets.photos.kitti_keypoints import car_box
 from cadalign.evaluation.metrics.photos import (
     NINE_DOF,
     VIEWPOINT,
     MetricSet,
     degree_cm,
-    kitti_errors,
     nine_dof_iou,
     shares_of,
 )
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.symmetry import Symmetry
-
-DIMS = np.array([1.5, 1.6, 4.0])
-
-
-def car(x=0.0, y=1.5, z=10.0, yaw=0.0):
-    return car_box(DIMS, np.array([x, y, z]), yaw)
-
-
-# --- KITTI -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("yaw", [-2.0, 0.0, 1.0])
-def test_a_true_car_is_perfect(yaw):
-    errors = kitti_errors(est=car(yaw=yaw), gt=car(yaw=yaw))
-    assert (errors.yaw_deg, errors.depth, errors.depth_relative) == (0, 0, 0)
-    assert errors.iou_3d == pytest.approx(1)
-    assert errors.iou_bev == pytest.approx(1)
-
-
-def test_a_car_moved_along_and_up():
-    """1 m along its 4 m: footprints share 3 of 5 m. 0.5 m up: 1 m of 1.5 m is shared.
-
-    Volumes: 3 * 1.6 * 1 = 4.8 of 2 * 9.6 - 4.8 = 14.4.
-    """
-    errors = kitti_errors(est=car(x=1.0, y=1.0), gt=car())
-    assert errors.iou_bev == pytest.approx(3 / 5)
-    assert errors.iou_3d == pytest.approx(4.8 / 14.4)
-    assert errors.depth == 0
-
-
-def test_a_car_turned():
-    """By 90 deg: footprints cross in 1.6 x 1.6 = 2.56 of 2 * 6.4 - 2.56 = 10.24 square metres."""
-    errors = kitti_errors(est=car(yaw=np.pi / 2), gt=car())
-    assert errors.yaw_deg == pytest.approx(90)
-    assert errors.iou_bev == pytest.approx(0.25)
-    assert errors.iou_3d == pytest.approx(0.25)
-    back = kitti_errors(est=car(yaw=np.pi), gt=car())
-    assert back.yaw_deg == pytest.approx(180)
-    assert back.iou_3d == pytest.approx(1)
-
-
-def test_yaw_is_the_short_way_round_and_depth_is_relative():
-    """-179 and 179 deg are 2 deg apart; 1 m of 10 m are 10 %."""
-    errors = kitti_errors(est=car(z=11.0, yaw=np.radians(-179)), gt=car(yaw=np.radians(179)))
-    assert errors.yaw_deg == pytest.approx(2)
-    assert errors.depth == pytest.approx(1)
-    assert errors.depth_relative == pytest.approx(0.1)
-
-
-def test_a_tilted_car_counts_by_its_heading():
-    tilt = Rotation.from_rotvec([0, 0, 0.3]).as_matrix()  # raises the nose
-    tilted = Box(car().center, tilt @ car().rotation, car().extents)
-    errors = kitti_errors(est=tilted, gt=car())
-    assert errors.yaw_deg == pytest.approx(0, abs=1e-9)
-    assert errors.iou_3d == pytest.approx(1)
-
-
-def test_the_sample_cars_against_themselves(real_data):
-    dataset = cadalign.datasets.open(real_data / "real" / "kitti_cars")
-    for name in dataset.names[:3]:
-        (found,) = dataset[name].objects
-        errors = kitti_errors(est=found.truth.box, gt=found.truth.box)
-        assert errors.yaw_deg == errors.depth == 0
-        assert errors.iou_3d == pytest.approx(1)
-
 
 # --- nine degrees of freedom -----------------------------------------------------------------
 

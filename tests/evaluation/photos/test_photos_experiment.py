@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.files import replaced, write_json
 from support.pages import embedded_payload
 from support.photo_sets import (
     POINTS,
     WRITERS,
     pose,
-    write_kitti,
+    write_detections,
     write_pix3d,
     write_scan2cad,
 )
@@ -47,13 +48,11 @@ pytestmark = [pytest.mark.long, pytest.mark.usefixtures("no_figures")]
 PERFECT = {
     "rotation_error_deg": 0.0, "translation_cm": 0.0, "box_iou": 1.0, "box_iou_up_to_scale": 1.0,
     "scan2cad_translation_m": 0.0, "scan2cad_scale": 0.0, "scan2cad_aligned": 1.0,
-    "scan2cad_aligned_axes": 1.0, "yaw_error_deg": 0.0, "depth_error": 0.0,
-    "depth_error_relative": 0.0, "iou_3d": 1.0, "iou_bev": 1.0,
+    "scan2cad_aligned_axes": 1.0,
 }  # fmt: skip
 OWN = {
     "Pix3D": {"rotation_error_deg", "box_iou"},
     "Scan2CAD": {"rotation_error_deg", "box_iou", "scan2cad_aligned", "scan2cad_aligned_axes"},
-    "KITTI": {"yaw_error_deg", "depth_error_relative", "iou_3d", "iou_bev"},
     "PASCAL3D+": {"rotation_error_deg"},
 }
 """Some metrics of each data set's own."""
@@ -101,7 +100,7 @@ class TestTruth:
             assert row["status"] == "ok", row["reason"]
             assert row["rotation_error_deg"] < 1.0
             assert row["rms_px"] < 0.6
-            assert row["source"] == ("detected" if kind == "KITTI" else "annotated")
+            assert row["source"] == "annotated"
 
 
 def score_poses(dataset: PhotoDataset, poses: dict[tuple[str, str], Alignment]) -> list[Any]:
@@ -230,11 +229,12 @@ class TestMethods:
         assert rows_of(one, "rigid")[:1] == rows_of(other, "rigid")
 
     def test_few_keypoints_are_left_out(self, tmp_path: Path) -> None:
-        root = write_kitti(tmp_path / "data")
-        cars = json.loads((root / "cars.json").read_text())
-        for mark in cars[1]["keypoints"][:5]:
-            mark["score"] = 0.3
-        write_json(root / "cars.json", cars)
+        root = write_detections(tmp_path / "data", photos=3)
+        path = root / "observations" / "1.json"
+        observation = json.loads(path.read_text())
+        for mark in observation["keypoints"][:5]:
+            mark["confidence"] = 0.3
+        write_json(path, observation)
         found = done(root, tmp_path / "run", methods=("rigid",))
         assert [row["status"] for row in found.results.to_pylist()] == ["ok", "left out", "ok"]
         assert rows_of(found, "rigid")[1]["reason"] == "5 keypoints are fewer than 6"
@@ -350,17 +350,18 @@ class TestRuns:
         assert "similar_sigma is 0.04 there and 0.1 now" in text
 
     def test_changed_annotations_are_refused(self, tmp_path: Path) -> None:
-        root = write_kitti(tmp_path / "data")
+        root = write_pix3d(tmp_path / "data")
         done(root, tmp_path / "run", methods=("rigid",))
-        cars = json.loads((root / "cars.json").read_text())
-        for car in cars:
-            car["rotation_y"] += 0.5
-        write_json(root / "cars.json", cars)
+        entries = json.loads((root / "pix3d.json").read_text())
+        turn = Rotation.from_rotvec([0.0, 0.5, 0.0]).as_matrix()
+        for entry in entries:
+            entry["rot_mat"] = (entry["rot_mat"] @ turn).tolist()
+        write_json(root / "pix3d.json", entries)
         options = PhotosOptions(root, methods=("rigid",))
         text = refusal_text(lambda: run(options, RunFolder(tmp_path / "run"), workers=0, dask=None))
         assert "holds a run with another configuration: annotations is" in text
         run(options, RunFolder(tmp_path / "again"), workers=0, dask=None)
-        errors = SPEC.open(tmp_path / "again").results["yaw_error_deg"].to_numpy()
+        errors = SPEC.open(tmp_path / "again").results["rotation_error_deg"].to_numpy()
         assert (errors > 20).all()  # of the changed file, which is read anew
 
     @pytest.mark.parametrize("kind", WRITERS)
@@ -426,7 +427,7 @@ class TestPage:
         shown = SPEC.shown_columns(SPEC.summarize(found), [found])
         keys = {column.key for column in shown}
         assert "accuracy_pi_6" in keys
-        assert not keys & {"scan2cad_aligned", "yaw_error_deg"}
+        assert "scan2cad_aligned" not in keys
 
     def test_categories_may_have_the_names_of_summaries(self, tmp_path: Path) -> None:
         root = write_pix3d(tmp_path / "data", photos=3)

@@ -172,17 +172,6 @@ def test_focal_length_or_field_of_view_is_given_in_the_command(
         assert message in capsys.readouterr().err
 
 
-def test_robust_fit_draws_by_the_scores(folder: Path) -> None:
-    points_2d = POINTS_2D.copy()
-    points_2d[:8] += 60.0
-    scores = np.where(np.arange(24) < 8, 0.1, 0.9)
-    camera = Camera.without_focal(640, 480)
-    Observation(POINTS_3D, points_2d, camera, scores=scores).save(folder / "spoiled.json")
-    result = fitted(folder, "spoiled", "--robust")
-    assert result.inliers.tolist() == [False] * 8 + [True] * 16
-    assert result.camera.fx == pytest.approx(620, rel=0.1)
-
-
 def test_scores_can_weigh_instead(folder: Path) -> None:
     observe(
         folder, "--image", str(folder / "photo.jpg"), "--weigh", "--sigma", "2", "--min-score", ".5"

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import os
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -319,24 +316,3 @@ def test_a_mistake_made_twice_is_undone() -> None:
     np.testing.assert_allclose(mistake.undo_3d(mistake.undo_3d(CHAIR)), CHAIR)
     twice = mistake.undo_2d(mistake.undo_2d(pixels, CENTRED), CENTRED)
     np.testing.assert_allclose(twice, pixels)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("category", ["chair", "bottle", "airplane", "mug"])
-def test_real_keypoints(category: str) -> None:
-    folder = os.environ.get("CADALIGN_DATA")
-    if not folder:
-        pytest.skip("CADALIGN_DATA is not set")
-    annotations = Path(folder) / "keypointnet" / "annotations" / f"{category}.json"
-    models = [
-        np.array([keypoint["xyz"] for keypoint in model["keypoints"]])
-        for model in json.loads(annotations.read_text(encoding="utf-8"))
-    ]
-    models = [points for points in models if len(points) >= 9]
-    problems = [seen(seed, models[7 * seed % len(models)]) for seed in range(30)]
-    for mistake in NAMES:
-        silent = [not problem.mistaken(mistake).complaint() for problem in problems]
-        assert np.mean(silent) <= 0.02
-    enough = [(seed, each) for seed, each in enumerate(problems) if len(each.points_2d) > 7]
-    alarms = [warning_of(spoiled(each, seed)) for seed, each in enough]
-    assert np.mean([bool(alarm) for alarm in alarms]) <= 0.01

@@ -707,14 +707,3 @@ def test_scores_of_real_chairs_are_calibrated(chairs: Library) -> None:
         right.append(is_same_shape(chairs[best.category, best.model_id], model))
         scores.append(best.score)
     assert np.mean(scores) == pytest.approx(np.mean(right), abs=0.12)
-
-
-@pytest.mark.long
-def test_the_list_is_exact_in_a_library_of_real_chairs(chairs: Library) -> None:
-    for place, noise_px in enumerate((1.0, 3.0, 5.0)):
-        model = list(chairs)[100 * place]
-        seen = observe_model(model, RetrievalTask(*model.key, noise_px, 8), seed=1)
-        arguments = (seen.points_2d, seen.ids, KEYPOINT_CAMERA)
-        found = chairs.retrieve(*arguments, sigma=noise_px)
-        every = chairs.retrieve(*arguments, sigma=noise_px, exhaustive=True)
-        assert names(found) == names(every)

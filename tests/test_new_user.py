@@ -76,11 +76,6 @@ def test_package_and_command_are_those_of_the_wheel(user: Environment) -> None:
     assert "fit" in user.run("cadalign", ["--help"])
 
 
-def test_listing_names_what_is_public(user: Environment) -> None:
-    listed = python(user, "import cadalign; print(*dir(cadalign))").split()
-    assert listed == sorted([*cadalign.__all__, "__version__"])
-
-
 @pytest.mark.long
 def test_help_describes_arguments_result_and_errors(user: Environment) -> None:
     shown = python(user, "import cadalign; help(cadalign.fit)")

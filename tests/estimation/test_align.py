@@ -240,22 +240,6 @@ class TestSeveralViews:
         motion = together.poses[1].rotation @ together.poses[0].rotation.T
         assert np.abs(motion - turned(30)[:3, :3]).max() < 0.02
 
-    @pytest.mark.long
-    def test_errors_are_at_the_bound(self) -> None:
-        points, truth = keypoints(), truth_of((1.4, 0.7, 1.9))
-        poses = [np.eye(4), turned(25)]
-        squares = []
-        for seed in range(60):
-            rng = np.random.default_rng(seed)
-            views = [
-                seen(points, truth, pose, cam_from_rig=pose, noise=rng.normal(0, 1, (10, 2)))
-                for pose in poses
-            ]
-            result = align(Model(points_3d=points), views)
-            error = np.log(result.stretch / truth.scale)
-            squares.append(error**2 / result.covariance.diagonal()[6:])
-        assert 0.6 < np.mean(squares) < 1.5
-
 
 class TestOtherEvidence:
     def test_depth_determines_the_size(self) -> None:
@@ -265,18 +249,6 @@ class TestOtherEvidence:
         view = seen(points, truth, np.eye(4), depth=depth, depth_sigma=0.005)
         result = align(Model(points_3d=points), view)
         assert np.allclose(result.alignment.scale, truth.scale, rtol=1e-4)
-
-    def test_gravity_sharpens_the_rotation(self) -> None:
-        points, truth = keypoints(6), truth_of()
-        rng = np.random.default_rng(0)
-        up = truth.rotation @ [0, 1, 0]
-        noise = rng.normal(0, 2, (6, 2))
-        without = align(Model(points_3d=points), seen(points, truth, np.eye(4), noise=noise))
-        view = seen(points, truth, np.eye(4), noise=noise, up=up, up_sigma_deg=0.3)
-        result = align(Model(points_3d=points), view)
-        assert result.std.rotation_deg < 0.8 * without.std.rotation_deg
-        angle = np.degrees(np.arccos(result.alignment.rotation[:, 1] @ up))
-        assert angle < 1.5
 
 
 class TestOutliers:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 from support.covariances import of_unknowns
 
-from cadalign import Camera, RansacOptions, Result, fit, fit_batch
+from cadalign import Camera, RansacOptions, Result, fit
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.evaluation.simulation import Problem, simulate_problem
 from cadalign.io.observation import Observation
@@ -240,19 +240,3 @@ def test_covariance_that_overflows_is_refused() -> None:
     camera = Camera(640, 480, 1048204.971549734, 245403.3967991035, 319.5, 239.5)
     with pytest.raises(DegenerateError, match="beyond the range"):
         fit(points_3d, points_2d, camera, stretch="none", stretch_sigma=0.001, sigma=None)
-
-
-def test_batches_estimate_the_same_noise() -> None:
-    problems = [
-        simulate_problem(np.random.default_rng(seed), points=8, noise_px=1.0) for seed in range(5)
-    ]
-    options: dict[str, Any] = {"sigma": None, "loss": "cauchy"}
-    batch = fit_batch(
-        [p.points_3d for p in problems],
-        [p.points_2d for p in problems],
-        problems[0].camera,
-        **options,
-    )
-    for b, problem in enumerate(problems):
-        single = fit(problem.points_3d, problem.points_2d, problem.camera, **options)
-        np.testing.assert_array_equal(batch.fisher_covariance[b], single.fisher_covariance)

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import pickle
-from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from support.problems import with_outliers
 
-import cadalign
-from cadalign import Alignment, Camera, RansacOptions, fit, fit_batch
+from cadalign import Camera, RansacOptions, fit, fit_batch
 from cadalign.errors import DegenerateError, InputError, NoConsensusError
 from cadalign.evaluation.simulation import Problem, simulate_problem
-from cadalign.geometry.metrics import rotation_error, scale_error
+from cadalign.geometry.metrics import rotation_error
 
 CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)
 
@@ -82,17 +78,6 @@ def test_the_same_seed_gives_the_same_result() -> None:
     assert results[0].stats.iterations == results[1].stats.iterations
     assert results[0].stats.hypotheses == results[1].stats.hypotheses
     assert results[0].stats.hypotheses != results[2].stats.hypotheses
-
-
-def test_threads_do_not_change_the_result() -> None:
-    cases = [spoiled(seed, points=60, outliers=40) for seed in range(4)]
-    points_3d, points_2d = [c[0].points_3d for c in cases], [c[1] for c in cases]
-    one, two = (
-        fit_batch(points_3d, points_2d, CAMERA, ransac=RansacOptions(seed=3), workers=workers)
-        for workers in (1, 2)
-    )
-    np.testing.assert_array_equal(one.inliers, two.inliers)
-    np.testing.assert_array_equal(one.rotation, two.rotation)
 
 
 @pytest.mark.parametrize("shape", ["sigmas", "covariances"])
@@ -255,48 +240,6 @@ def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError) as refusal:
         RansacOptions(**options)
     assert str(refusal.value) == message
-
-
-@cache
-def sfm_images(real_data: Path) -> list[Any]:
-    from cadalign.datasets import Colmap
-
-    return list(Colmap(real_data / "sfm/maupertuis_colmap"))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("share", "draws", "wanted", "max_iterations"),
-    [(0.0, 20, 0.995, 10_000), (0.25, 20, 0.995, 10_000), (0.5, 20, 0.995, 10_000)]
-    + [(0.8, 20, 0.98, 10_000), (0.9, 4, 0.9, 200_000)],
-)
-def test_real_correspondences(share: float, draws: int, wanted: float, max_iterations: int) -> None:
-    folder = os.environ.get("CADALIGN_DATA")
-    if not folder:
-        pytest.skip("CADALIGN_DATA is not set")
-    rng = np.random.default_rng(1)
-    succeeded = []
-    for draw in range(draws):
-        for image in sfm_images(Path(folder)):
-            scale = np.array([1.0, *rng.uniform(0.5, 2.0, 2)])
-            gt = Alignment(image.cam_from_world.rotation, image.cam_from_world.translation, scale)
-            points_2d = image.points_2d.copy()
-            count = len(points_2d)
-            wrong = rng.choice(count, round(share * count), replace=False)
-            size = [image.camera.width - 1, image.camera.height - 1]
-            points_2d[wrong] = rng.uniform([0, 0], size, (len(wrong), 2))
-            options = RansacOptions(seed=draw, max_iterations=max_iterations)
-            try:
-                est = fit(
-                    image.points_3d / scale, points_2d, image.camera, ransac=options
-                ).alignment
-            except cadalign.CadalignError:
-                succeeded.append(False)
-                continue
-            succeeded.append(
-                rotation_error(est=est, gt=gt) < 0.5 and scale_error(est=est, gt=gt).max() < 0.01
-            )
-    assert np.mean(succeeded) >= wanted
 
 
 def test_scores_that_are_all_alike_guide_nothing() -> None:

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from cadalign.cli import main
-from cadalign.errors import CadalignError, DataError
+from cadalign.errors import CadalignError
 from cadalign.evaluation.api import run, simulate
 from cadalign.evaluation.experiments.simulation import SweepOptions, sweep_benchmark
 from cadalign.evaluation.runs.folder import RunFolder
@@ -179,11 +179,3 @@ def test_whatever_a_lost_cluster_raises_is_told_in_the_same_words(
     chunks = [(0, [0])]
     with pytest.raises(CadalignError, match="the Dask cluster has gone away"):
         next(on_dask(sweep_benchmark(KIND.kind, seed=0), chunks, address="tcp://127.0.0.1:1"))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://x"])
-def test_an_address_where_no_scheduler_is_gives_an_error(address: str) -> None:
-    with pytest.raises(DataError, match="no Dask scheduler answers") as caught:
-        next(on_dask(sweep_benchmark(KIND.kind, seed=0), [], address=address, timeout=1.0))
-    assert caught.value.where == address

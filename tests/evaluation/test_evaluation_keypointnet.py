@@ -158,11 +158,6 @@ def test_bad_options_are_named(sample_root: Path, options: dict[str, Any], messa
         evaluate(sample_root, **options)
 
 
-def test_a_folder_without_annotations_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="no annotations"):
-        evaluate(tmp_path)
-
-
 @pytest.mark.long
 def test_overlays_are_drawn_and_no_half_files_left(sample_root: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"

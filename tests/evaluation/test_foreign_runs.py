@@ -39,6 +39,12 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture
+def run(finished: Path, tmp_path: Path) -> Path:
+    """A copy of the sweep that may be changed."""
+    return Path(shutil.copytree(finished, tmp_path / "run"))
+
+
 @pytest.fixture(scope="module")
 def halved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sweep with one of its two chunks."""
@@ -114,13 +120,11 @@ _ANEW = "; remove it and start the same run again: what is missing is done anew"
 )
 def test_a_foreign_or_damaged_table_of_results_is_refused(
     finished: Path,
-    tmp_path: Path,
+    run: Path,
     capsys: pytest.CaptureFixture[str],
     change: Change,
     text: str | None,
 ) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(finished, run)
     change(run)
     for arguments in (["report", run], ["report", run, "--format", "md"]):
         line = refusal_line(capsys, *arguments)
@@ -134,11 +138,7 @@ def test_a_foreign_or_damaged_table_of_results_is_refused(
     assert (run / "results.parquet").read_bytes() == (finished / "results.parquet").read_bytes()
 
 
-def test_empty_cells_of_a_text_are_refused(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(finished, run)
+def test_empty_cells_of_a_text_are_refused(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = pq.read_table(run / "results.parquet")
     cells = pa.array([None, *table["method"].to_pylist()[1:]], pa.string())
     index = table.column_names.index("method")
@@ -146,11 +146,7 @@ def test_empty_cells_of_a_text_are_refused(
     assert "the column 'method' has empty cells" in refusal_line(capsys, "report", run)
 
 
-def test_damaged_timings_may_be_removed(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(finished, run)
+def test_damaged_timings_may_be_removed(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cut_timings(run)
     line = refusal_line(capsys, "report", run)
     assert line.endswith("; remove it: the run is shown without times")
@@ -196,14 +192,11 @@ def test_an_unfinished_run_with_a_missing_part_is_shown(
     ],
 )
 def test_a_hostile_run_file_is_refused_by_field(
-    finished: Path,
-    tmp_path: Path,
+    run: Path,
     capsys: pytest.CaptureFixture[str],
     fields: dict[str, Any],
     text: str,
 ) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(finished, run)
     config = json.loads((run / "run.json").read_text()) | fields
     (run / "run.json").write_text(json.dumps(config))
     line = refusal_line(capsys, "report", run)
@@ -212,19 +205,15 @@ def test_a_hostile_run_file_is_refused_by_field(
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"tasks": ' + "9" * 5000 + "}", "\xff", "[1]"])
 def test_a_run_file_that_is_none_is_refused(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str
+    run: Path, capsys: pytest.CaptureFixture[str], text: str
 ) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(finished, run)
     (run / "run.json").write_text(text, encoding="latin-1")
     line = refusal_line(capsys, "report", run)
     assert line.startswith(f"{run / 'run.json'}: ")
     assert len(line) < 600
 
 
-def test_odd_values_of_a_run_file_do_no_harm(finished: Path, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(finished, run)
+def test_odd_values_of_a_run_file_do_no_harm(run: Path) -> None:
     config = json.loads((run / "run.json").read_text())
     config |= {"noise_px": "loud", "root": 7, "seed": [None], "versions": {"cadalign": {}}}
     (run / "run.json").write_text(json.dumps(config))

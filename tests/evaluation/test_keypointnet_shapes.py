@@ -159,54 +159,37 @@ def command(root: Path, out: Path, shape: Path) -> list[Any]:
     return ["evaluate", "keypointnet", root, "--shape", shape, "--out", out, *options]
 
 
-def test_shapes_of_other_categories(
+def test_shapes_that_cannot_be_used_are_refused(
     root: Path, shapes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert refusal_line(capsys, *command(root, tmp_path / "run", shapes)) == (
-        f"{shapes}: has shapes of car, chair; the run is on bottle; "
-        "give the shape of one of the run's categories"
-    )
-
-
-def test_folder_without_shapes(
-    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "empty").mkdir()
-    assert refusal_line(capsys, *command(root, tmp_path / "run", tmp_path / "empty")) == (
-        f"{tmp_path / 'empty'}: the folder has no .shape files; "
-        "write them with `cadalign shape learn`"
-    )
-
-
-def test_file_that_is_missing(
-    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    missing = tmp_path / "none.shape"
-    assert refusal_line(capsys, *command(root, tmp_path / "run", missing)) == (
-        f"{missing}: no such file"
-    )
-
-
-def test_two_shapes_of_a_category(
-    root: Path, shapes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = tmp_path / "shapes"
-    folder.mkdir()
+    empty, twice, named = (tmp_path / name for name in ("empty", "twice", "bottle.shape"))
+    empty.mkdir()
+    twice.mkdir()
     for name in ("first", "second"):
-        (folder / f"{name}.shape").write_bytes((shapes / "chair.shape").read_bytes())
-    assert refusal_line(capsys, *command(root, tmp_path / "run", folder)) == (
-        f"{folder / 'second.shape'}: of the category chair, as first.shape; "
-        "keep one file for each category"
-    )
-
-
-def test_shape_whose_keypoints_have_names(
-    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+        (twice / f"{name}.shape").write_bytes((shapes / "chair.shape").read_bytes())
     rng = np.random.default_rng(0)
     models = [Example(f"{k}", list("abcd"), rng.normal(size=(4, 3))) for k in range(8)]
-    ShapeModel.learn(models, category="bottle").save(tmp_path / "bottle.shape")
-    assert refusal_line(capsys, *command(root, tmp_path / "run", tmp_path / "bottle.shape")) == (
-        f"{tmp_path / 'bottle.shape'}: its keypoints have names, those of the data set semantic "
-        "ids; learn it from the data set"
-    )
+    ShapeModel.learn(models, category="bottle").save(named)
+    for file, text in (
+        (
+            shapes,
+            f"{shapes}: has shapes of car, chair; the run is on bottle; "
+            "give the shape of one of the run's categories",
+        ),
+        (
+            empty,
+            f"{empty}: the folder has no .shape files; write them with `cadalign shape learn`",
+        ),
+        (tmp_path / "none.shape", f"{tmp_path / 'none.shape'}: no such file"),
+        (
+            twice,
+            f"{twice / 'second.shape'}: of the category chair, as first.shape; "
+            "keep one file for each category",
+        ),
+        (
+            named,
+            f"{named}: its keypoints have names, those of the data set semantic ids; "
+            "learn it from the data set",
+        ),
+    ):
+        assert refusal_line(capsys, *command(root, tmp_path / "run", file)) == text

@@ -189,12 +189,6 @@ class TestOwnModel:
         with pytest.raises(DegenerateError, match="nonzero on the object, not around it"):
             align(Model(mesh=body()), View(CAMERA.resized(160, 120), mask=mask))
 
-    def test_dilated_mask(self) -> None:
-        truth = posed(4, (1.0, 0.8, 1.2))
-        mask = cv2.dilate(mask_of(body(), truth).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        found = align(Model(mesh=body()), View(CAMERA, mask=mask))
-        assert rotation_error(est=found.alignment, gt=truth) < 4.0
-
     @pytest.mark.parametrize("seed", [0, 4])
     def test_mask_that_is_cut_out_generously(self, seed: int) -> None:
         """Its contour lies farther from the rims than noise alone would take it."""

@@ -252,21 +252,9 @@ class TestStarts:
 
 
 class TestBadInput:
-    @pytest.mark.parametrize(
-        ("mask", "words"),
-        [
-            (np.ones((480, 639), dtype=bool), "639 x 480"),
-            (np.full((480, 640), 1.5), r"\[0, 1\]"),
-            (np.full((480, 640), np.nan), "mask"),
-            (np.zeros((480, 640), dtype=bool), "no pixel"),
-            (np.ones((480, 640), dtype=bool), "covers all"),
-        ],
-    )
-    def test_is_refused_and_named(self, sample_root: Path, mask: np.ndarray, words: str) -> None:
-        case = chair(sample_root)
-        with pytest.raises(InputError, match=words) as caught:
-            align(case.model, case.view(mask=mask))
-        assert "mask" in str(caught.value)
+    def test_values_that_are_not_finite(self, sample_root: Path) -> None:
+        with pytest.raises(InputError, match="mask"):
+            chair(sample_root).view(mask=np.full((480, 640), np.nan))
 
     def test_a_path_that_is_no_image(self, sample_root: Path, tmp_path: Path) -> None:
         path = tmp_path / "mask.png"
@@ -280,8 +268,3 @@ class TestBadInput:
         for model, view in ((case.model, case.view()), (similar, case.view(mask=case.mask))):
             with pytest.raises(InputError, match="expected a view with a mask, and an exact model"):
                 contour_bound(model, view, case.truth)
-
-    def test_a_model_without_a_mesh_is_told_what_to_do(self, sample_root: Path) -> None:
-        case = chair(sample_root)
-        with pytest.raises(InputError, match="load_mesh"):
-            align(Model(points_3d=case.model.points_3d), case.view(mask=case.mask))

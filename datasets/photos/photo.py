@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
@@ -113,9 +113,7 @@ class Truth:
     @property
     def rotation(self) -> FloatArray | None:
         """The rotation from model to camera, (3, 3) float; None where it is not known."""
-        if self.cam_from_model is not None:
-            return self.cam_from_model.rotation
-        return None if self.box is None else self.box.rotation
+        return None if self.cam_from_model is None else self.cam_from_model.rotation
 
 
 _no_symmetry = cache(Symmetry.none)
@@ -170,13 +168,6 @@ class Photo:
     has it."""
     problems: tuple[DataError, ...] = ()
     """Why further objects of this photo could not be read."""
-
-    @property
-    def known_camera(self) -> Camera:
-        """The camera; raises InputError where there is none."""
-        if self.camera is None:
-            raise InputError("the camera of this photo is not known", where=self.name)
-        return self.camera
 
     def read_image(self) -> ByteImage:
         """Read the photo's pixels, (h, w, 3) uint8; raises DataError if there are none."""

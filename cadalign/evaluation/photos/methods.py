@@ -82,7 +82,6 @@ def sight(target: PhotoTarget, protocol: Protocol, options: KeypointOptions) -> 
         raise LeftOutError(f"{len(names)} keypoints are fewer than {options.min_keypoints}")
     bounds, gt = target.bounds, target.gt
     assert bounds is not None  # of the keypoints at least
-    has_stretch = gt is not None and target.found.truth.cam_from_model is not None
     sighting = Sighting(
         target=target,
         camera=camera,
@@ -92,7 +91,7 @@ def sight(target: PhotoTarget, protocol: Protocol, options: KeypointOptions) -> 
         sigma=_sigma(target, protocol, options, source),
         model=model,
         bounds=bounds,
-        width=float(gt.scale[0]) if gt is not None and has_stretch else 1.0,
+        width=1.0 if gt is None else float(gt.scale[0]),
         protocol=protocol,
     )
     return sighting if camera.focal_known else _calibrated(sighting)

@@ -14,7 +14,6 @@ from cadalign.datasets.photos.dataset import PhotoDataset
 from cadalign.datasets.photos.photo import CadModel, NamedPoints, Photo, PhotoObject
 from cadalign.errors import DataError
 from cadalign.evaluation.benchmark import Case, Tasks
-from cadalign.evaluation.instances.record import box_alignment
 from cadalign.evaluation.runs.work import (
     UNREADABLE,
     LeftOutError,
@@ -158,23 +157,13 @@ class PhotoTarget:
 
     @property
     def bounds(self) -> FloatArray | None:
-        """The box (2, 3) of the CAD model; of an object without one, that of its truth."""
-        bounds = None if self.cad is None else self.cad.bounds
-        box = self.found.truth.box
-        if bounds is None and box is not None:
-            bounds = np.array([-box.extents / 2, box.extents / 2])
-        return bounds
+        """The box (2, 3) of the CAD model."""
+        return None if self.cad is None else self.cad.bounds
 
     @property
     def gt(self) -> Alignment | None:
-        """The true alignment; where a box is known only, that of the model's box with it."""
-        truth = self.found.truth
-        if truth.cam_from_model is not None or truth.box is None or self.bounds is None:
-            return truth.cam_from_model
-        box = truth.box
-        pose = Alignment(box.rotation, box.center, np.ones(3))
-        own = np.array([-box.extents / 2, box.extents / 2])
-        return box_alignment(pose, own, model_bounds=self.bounds)
+        """The true alignment."""
+        return self.found.truth.cam_from_model
 
     @property
     def gt_box(self) -> Box | None:

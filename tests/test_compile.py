@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import io
-import json
 import os
-import platform
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from llvmlite import binding
 from support.forked import Program
 
 from cadalign.compile import files
@@ -209,38 +206,6 @@ def test_damaged_code_is_compiled_anew_and_told_in_one_line(
     told = f"{cache}: some of the compiled code is damaged; it is compiled anew"
     assert run() == ("0\n", [told])
     assert run() == ("1\n", [])
-
-
-SHIPPED = """
-import pathlib, shutil, sys
-from cadalign.compile import files
-files.SHIPPED = pathlib.Path({shipped!r})
-"""
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("needs", "found"), [("fma", 1), ("feature-of-2099", 0)])
-def test_shipped_code_is_used_by_any_processor_that_can(
-    tmp_path: Path, needs: str, found: int
-) -> None:
-    built = {"NUMBA_CACHE_DIR": str(tmp_path / "built"), "NUMBA_CPU_FEATURES": ""}
-    name = "x86-64-v3" if platform.machine() in ("x86_64", "AMD64") else "generic"
-    write(tmp_path / "a", "1.0")
-    assert call_anew(tmp_path / "a", "kernels", 2.0, **built, NUMBA_CPU_NAME=name) == 0
-    features = [needs] if needs in binding.get_host_cpu_features() or not found else []
-    target = {
-        "triple": binding.get_process_triple(),
-        "cpu": name,
-        "features": "",
-        "needs": features,
-    }
-    (tmp_path / "built" / "target.json").write_text(json.dumps(target))
-    write(tmp_path / "b", "1.0")
-    source = tmp_path / "b" / "kernels.py"
-    top = SHIPPED.format(shipped=str(tmp_path / "built"))
-    (tmp_path / "b" / "main.py").write_text(f"{top}from kernels import one\n")
-    assert source.is_file()
-    assert call(tmp_path / "b", "main", 2.0, tmp_path / "empty") == found
 
 
 class Terminal(io.StringIO):

@@ -164,18 +164,16 @@ def examine() -> Health:
 
 def compiled_cache() -> str:
     """Describe the cache of compiled solvers: its folder, and how many functions it holds."""
-    from cadalign.compile.files import SHIPPED, can_write, kernel_folder, usable_target
+    from cadalign.compile.files import can_write, kernel_folder
 
     folder = kernel_folder()
     count = sum(1 for _ in folder.rglob("*.nbi")) if folder.is_dir() else 0
-    shipped = sum(1 for _ in SHIPPED.glob("*.nbi")) if usable_target(SHIPPED) else 0
-    came = f"{shipped} functions came with the installation; " if shipped else ""
     if count:
-        return f"{came}{count} functions kept in {folder}"
+        return f"{count} functions kept in {folder}"
     if can_write(folder):
-        return f"{came}none yet; they will be kept in {folder}"
+        return f"none yet; they will be kept in {folder}"
     fix = "set NUMBA_CACHE_DIR, or every process compiles anew"
-    return f"{came}{folder} cannot be written to; {fix}"
+    return f"{folder} cannot be written to; {fix}"
 
 
 def require_cache() -> None:

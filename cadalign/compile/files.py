@@ -9,7 +9,6 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import io
-import json
 import logging
 import os
 import pickle
@@ -41,14 +40,6 @@ _COMPILERS = tuple(Path(__file__).parent / name for name in ("decorators.py", "f
 _IMPORT = re.compile(
     r"^from (cadalign[\w.]*) import (\([^)]*\)|[^\n(]*)|^import (cadalign[\w.]*)", re.M
 )
-SHIPPED = Path(__file__).parent / "kernels"
-"""Compiled kernels of the installation: `scripts/build_wheel.py` puts them into a wheel.
-
-They are compiled for a level of the instruction set (x86-64-v3: what desktop and server processors
-have had since 2013 or so) in place of one processor; where the processor has less, the kernels are
-compiled on first use as they are without.
-"""
-TARGET = "target.json"
 logger = logging.getLogger("cadalign")
 _CHECKSUM_BYTES = 16
 _UNUSED_DAYS = 60
@@ -103,24 +94,36 @@ def _file_of(module: str) -> Iterator[Path]:
             yield path
 
 
-@cache
-def usable_target(folder: Path) -> tuple[str, str, str] | None:
-    """Target of the shipped kernels, None if this processor does not run them."""
-    path = folder / TARGET
-    if not path.is_file():
-        return None
-    from llvmlite import binding
-
-    target = json.loads(path.read_text())
-    has = binding.get_host_cpu_features()
-    same = target["triple"] == binding.get_process_triple()
-    if not same or not all(has.get(feature) for feature in target["needs"]):
-        return None
-    return target["triple"], target["cpu"], target["features"]
-
-
-class CodeFiles(IndexDataCacheFile):
+class KernelFiles(IndexDataCacheFile):
     """Index and code of one kernel; reading them imports nothing that only compiling needs."""
+
+    def load(self, key: Any) -> Any:
+        """Compiled code for a signature and a processor, None if there is none yet."""
+        try:
+            return super().load(key)
+        except OSError:  # a folder that cannot be read
+            return None
+
+    def save(self, key: Any, data: Any) -> None:
+        """Save compiled code, one process at a time, before the index that names it.
+
+        Numba writes the index first and without a lock: of processes that compile at the same time,
+        one could read code of an older version, or that of another signature. Where nothing can be
+        written, every process compiles for itself (`cadalign doctor` says so).
+        """
+        try:
+            os.makedirs(self._cache_path, exist_ok=True)
+            with open(f"{self._index_path}.lock", "a") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                names = self._load_index()
+                taken = set(names.values())
+                free = (self._data_name(number) for number in count(1))
+                name = names.get(key) or next(name for name in free if name not in taken)
+                self._save_data(name, data)
+                self._save_index({**names, key: name})
+            _remove_unused(Path(self._cache_path))
+        except OSError:
+            return
 
     def _load_index(self) -> dict[Any, str]:
         """Names of the files of code by signature and processor."""
@@ -281,48 +284,6 @@ def _sources_of(signature: Any) -> tuple[str, ...]:
     kinds = [getattr(kind, "instance_class", None) for kind in signature]
     modules = [sys.modules[kind.__module__].__file__ for kind in kinds if kind is not None]
     return tuple(source_hash(Path(file)) for file in modules if file is not None)
-
-
-class KernelFiles(CodeFiles):
-    """Index and code of one kernel; code that came with the installation is found, too."""
-
-    def load(self, key: Any) -> Any:
-        """Compiled code for a signature and a processor, None if there is none yet."""
-        try:
-            found = super().load(key)
-        except OSError:  # a folder that cannot be read
-            found = None
-        return self._load_shipped(key) if found is None else found
-
-    def _load_shipped(self, key: Any) -> Any:
-        """Code of the installation for a signature, None if it has none for this processor."""
-        target = usable_target(SHIPPED)
-        if target is None:
-            return None
-        signature, _, *rest = key
-        shipped = CodeFiles(str(SHIPPED), Path(self._index_name).stem, self._source_stamp)
-        return shipped.load((signature, target, *rest))
-
-    def save(self, key: Any, data: Any) -> None:
-        """Save compiled code, one process at a time, before the index that names it.
-
-        Numba writes the index first and without a lock: of processes that compile at the same time,
-        one could read code of an older version, or that of another signature. Where nothing can be
-        written, every process compiles for itself (`cadalign doctor` says so).
-        """
-        try:
-            os.makedirs(self._cache_path, exist_ok=True)
-            with open(f"{self._index_path}.lock", "a") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX)
-                names = self._load_index()
-                taken = set(names.values())
-                free = (self._data_name(number) for number in count(1))
-                name = names.get(key) or next(name for name in free if name not in taken)
-                self._save_data(name, data)
-                self._save_index({**names, key: name})
-            _remove_unused(Path(self._cache_path))
-        except OSError:
-            return
 
 
 @cache

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import runpy
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -18,9 +18,14 @@ PACKAGES = (("cadalign", ""), ("datasets", "cadalign/"), ("render", "cadalign/")
 
 
 def build_wheel(folder: Path) -> Path:
-    """Build a wheel from what `scripts/build_wheel.py` copies."""
+    """Build a wheel from a copy, so that nothing old in `build/` gets into it."""
     source = folder / "source"
-    runpy.run_path(str(ROOT / "scripts" / "build_wheel.py"))["copy_source"](source)
+    source.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    ignored = shutil.ignore_patterns("__pycache__", "node_modules")
+    for name, _ in PACKAGES:
+        shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=ignored)
     done = subprocess.run(
         _build_command(source, folder / "out"), capture_output=True, text=True, check=False
     )

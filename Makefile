@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo paper test test-fast lint format fuzz mutants bench docs web clean
+.PHONY: help demo paper test test-fast lint format fuzz bench docs web clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -32,9 +32,6 @@ test-fast: $(VENV)/.installed-dev  ## run the 3,300 tests that take a minute tog
 fuzz: $(VENV)/.installed-dev  ## call fit, every reader and the commands with random input (COUNT=20000)
 	for what in fits batches readers; do PYTHONPATH=tests $(BIN)/python -m fuzz $$what $(or $(COUNT),20000) || exit 1; done
 	PYTHONPATH=tests $(BIN)/python -m fuzz commands $$(($(or $(COUNT),20000) / 20))
-
-mutants: $(VENV)/.installed-dev  ## change the code at random places and count what tests notice (COUNT=200, ROOMS="geometry io")
-	$(BIN)/python scripts/mutants.py --count $(or $(COUNT),200) $(if $(ROOMS),--rooms $(ROOMS))
 
 bench: $(VENV)/.installed-dev  ## measure accuracy and speed; fail where a ratio is 20 % worse than stored (SECTIONS="cold calls")
 	$(BIN)/python -m pytest tests/estimation/test_benchmarks.py --benchmark-enable --benchmark-columns=median,iqr

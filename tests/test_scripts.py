@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import importlib
 import json
 import runpy
@@ -69,44 +68,6 @@ def test_the_worked_photo_aligns_as_its_page_says(
     printed = capsys.readouterr().out
     for line in page.partition("```text\n")[2].partition("```")[0].splitlines():
         assert line in printed
-
-
-def test_mutants_are_programs_that_differ(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(ROOT / "scripts")
-    mutants = importlib.import_module("mutants")
-    (path,) = [path for path in mutants.sources(("geometry",)) if path.name == "rotations.py"]
-    places = list(mutants.places_of(path))
-    assert len(places) > 30
-    original = (ROOT / path).read_text(encoding="utf-8")
-    for _, place, _ in places[::3]:
-        mutant = mutants.mutated(path, place)
-        assert ast.dump(ast.parse(mutant.text)) != ast.dump(ast.parse(original))
-        assert mutants.difference(mutant).count("\n+") >= 1
-
-
-def test_mutants_leave_settings_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.syspath_prepend(ROOT / "scripts")
-    mutants = importlib.import_module("mutants")
-    monkeypatch.setattr(mutants, "ROOT", tmp_path)
-    settings = "_MOST = 3\n@dataclass(frozen=True)\nclass A:\n    x: int\n"
-    (tmp_path / "a.py").write_text(settings + "def f(x):\n    return zip(x, strict=True), x + 1\n")
-    places = list(mutants.places_of(Path("a.py")))
-    found = [
-        (mutants.mutated(path, place).text.splitlines()[-1].strip(), is_number)
-        for path, place, is_number in places
-    ]
-    assert found == [
-        ("return zip(x, strict=True), (x - 1)", False),
-        ("return zip(x, strict=True), x + (2)", True),
-    ]
-
-
-def test_tests_of_a_mutant_are_taken_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(ROOT / "scripts")
-    mutants = importlib.import_module("mutants")
-    names = ["tests/io/b.py::q", "tests/io/b.py::p", "tests/cli/a.py::r", "tests/io/c.py::s"]
-    chosen = mutants.in_turns(names)
-    assert [name[-1] for name in chosen] == ["r", "p", "s", "q"]
 
 
 class TestComparingRatios:

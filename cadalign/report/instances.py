@@ -43,7 +43,7 @@ _OURS = ("picture_*.webp", "thumb_*.webp", "exhibits_*.js", "mesh_*.js")
 _PER_FILE = 64
 _COLUMNS = (
     *("id", "run", "category", "model", "view", "keypoints", "true_y", "true_z", "noise"),
-    *("visibility", "symmetry", "exhibit", "thumb"),
+    *("exhibit", "thumb"),
 )
 
 
@@ -98,8 +98,6 @@ def instance_table(
                     "true_y": cells["stretch_y"][row],
                     "true_z": cells["stretch_z"][row],
                     "noise": run.noise_px,
-                    "visibility": place_of(cells["visibility"][row]),
-                    "symmetry": place_of(cells["symmetry"][row]),
                     "exhibit": -1,
                     "thumb": -1,
                 }
@@ -122,9 +120,6 @@ def _cells(run: Run, metrics: Sequence[Metric]) -> dict[str, list[Any]]:
     cells: dict[str, list[Any]] = {}
     for name in ("category", "model_id", "view", "method", "status", "reason", "keypoints"):
         cells[name] = table[name].to_pylist()
-    for name in ("visibility", "symmetry"):
-        known = name in table.column_names
-        cells[name] = table[name].to_pylist() if known else [""] * len(table)
     for name in ("stretch_y", "stretch_z", *(metric.key for metric in metrics)):
         cells[name] = [None] * len(table)
         if name in table.column_names:

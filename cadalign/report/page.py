@@ -18,7 +18,7 @@ Its payload is one JSON object, which ``cadalign/web/report`` reads ::
       "tables": {
         "strings": [...],
         "instances": {"id", "run", "category", "model", "view", "keypoints", "true_y", "true_z",
-                      "noise", "visibility", "symmetry", "exhibit", "thumb"},
+                      "noise", "exhibit", "thumb"},
         "rows": {"instance", "method", "status", "reason", each metric's key}
       },
       "plots": [{"id", "title", "kind": "lines", "x": {"label", "unit", "log"}, "y",
@@ -27,12 +27,12 @@ Its payload is one JSON object, which ``cadalign/web/report`` reads ::
       "exhibits": {key: exhibit}, "meshes": {key: mesh}
     }
 
-``tables`` holds columns, each a list: ``category``, ``model``, ``visibility``, ``symmetry`` and
-``reason`` are places in ``strings`` (``reason`` -1 where there is none), ``method`` and ``run``
-places in the lists above, ``status`` is 1 for a failure. ``id`` is the same for the same instance
-of several runs; ``true_y`` and ``true_z`` are what the model was stretched by. Numbers of rows are
-as results have them: shown is the value times the metric's ``factor``. ``limit``, the cells of the
-headline and the values of ``plots`` are as shown. What is unknown or not finite is null.
+``tables`` holds columns, each a list: ``category``, ``model`` and ``reason`` are places in
+``strings`` (``reason`` -1 where there is none), ``method`` and ``run`` places in the lists above,
+``status`` is 1 for a failure. ``id`` is the same for the same instance of several runs; ``true_y``
+and ``true_z`` are what the model was stretched by. Numbers of rows are as results have them: shown
+is the value times the metric's ``factor``. ``limit``, the cells of the headline and the values of
+``plots`` are as shown. What is unknown or not finite is null.
 
 ``exhibit`` and ``thumb`` are keys, -1 for none. An exhibit is an instance record
 (`cadalign.evaluation.instances.record`) with the keys of its ``picture``, which has no boxes drawn
@@ -57,7 +57,6 @@ from pathlib import Path
 from typing import Any
 
 from cadalign.evaluation.methods import LIMIT
-from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.plots import Plot, look_of
 from cadalign.evaluation.runs.tables import Run
 from cadalign.io.files import (
@@ -69,11 +68,10 @@ from cadalign.io.files import (
     refuse_input,
     write_text,
 )
-from cadalign.report.headline import Headline, headline_of
+from cadalign.report.headline import headline_of
 from cadalign.report.instances import (
     INLINE_LIMIT,
     AssetStore,
-    InstanceTable,
     inline_bytes,
     instance_table,
 )
@@ -145,17 +143,18 @@ def write_report(
         store = AssetStore(page, folder)
         store.fill(found, table)
         media = store.to_dict()
-    payload = page_payload(
-        title=title or title_of(found),
-        summary=summary_of(found),
-        runs=[_run_dict(run) for run in found],
-        methods=[method_dict(name) for name in all_methods(found)],
-        headline=headline_of(found),
-        plots=_plots(found),
-        metrics=metrics,
-        table=table,
+    payload = {
+        "format": _FORMAT,
+        "title": title or title_of(found),
+        "summary": summary_of(found),
+        "runs": [_run_dict(run) for run in found],
+        "methods": [method_dict(name) for name in all_methods(found)],
+        "metrics": [metric.page() for metric in metrics],
+        "headline": headline_of(found).to_dict(),
+        "tables": None if table is None else table.to_dict(),
+        "plots": [plot.to_dict() for plot in _plots(found)],
         **media,
-    )
+    }
     write_text(page, render_page(payload))
     return Report(page, folder)
 
@@ -169,33 +168,6 @@ def render_page(payload: dict[str, Any]) -> str:
         payload=dense_json(payload).translate(_ESCAPES),
         script=asset("report.js"),
     )
-
-
-def page_payload(
-    *,
-    title: str,
-    summary: str,
-    runs: Sequence[dict[str, Any]],
-    methods: Sequence[dict[str, Any]],
-    headline: Headline,
-    plots: Sequence[Plot],
-    metrics: Sequence[Metric] = (),
-    table: InstanceTable | None = None,
-    **media: Any,
-) -> dict[str, Any]:
-    """The payload of a page; one without instances has no ``table`` and no ``media``."""
-    return {
-        "format": _FORMAT,
-        "title": title,
-        "summary": summary,
-        "runs": runs,
-        "methods": methods,
-        "metrics": [metric.page() for metric in metrics],
-        "headline": headline.to_dict(),
-        "tables": None if table is None else table.to_dict(),
-        "plots": [plot.to_dict() for plot in plots],
-        **media,
-    }
 
 
 def _run_dict(run: Run) -> dict[str, Any]:

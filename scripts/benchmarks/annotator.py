@@ -265,7 +265,7 @@ def _timed_clicks(
         )
         if click >= 3:  # the first ones warm up
             times.append(page.evaluate("window.painted[1]"))
-        page.evaluate("annotator.undo(), annotator.undo()")
+        page.evaluate("annotator.act({do: 'undo'}), annotator.act({do: 'undo'})")
         wait(f"{SETTLED} && annotator.state.pairs.length === {full - 1}")
     return times
 
@@ -280,7 +280,7 @@ def _panels(given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Ro
             shift, panels, serious = 0.0, 0, set[str]()
             for with_axe in (False, True):
                 own = original.copied_to(folder / f"{screen} {scheme} {with_axe}")
-                session, how = prepare(own, root), {"screen": screen, "scheme": scheme}
+                session, how = prepare(own), {"screen": screen, "scheme": scheme}
                 with _page(browser, session, WATCH_SHIFTS, **how) as page:
                     keyboard = Keyboard(page)
                     if with_axe:

@@ -245,10 +245,10 @@ def test_tabs_of_one_photo_add_to_each_other_and_are_undone_apart(
     for tab, step in ((first, [1, 0]), (second, [0, 1])):
         tab.page.evaluate("annotator.api.refresh()")  # as the tab does when it comes to the front
         tab.wait_for_state(lambda state: len(state["pairs"]) == 1)
-        tab.page.evaluate("step => { annotator.select(1); annotator.nudge(...step); }", step)
+        tab.page.evaluate("step => { annotator.select(1); annotator.mover.nudge(...step); }", step)
         tab.wait_for_state(lambda state: state["pairs"][0]["uv"] != [100, 100])
     second.wait_for_state(lambda state: state["pairs"][0]["uv"] == [101, 101])
-    second.page.evaluate("annotator.undo()")
+    second.page.evaluate("annotator.act({do: 'undo'})")
     second.wait_for_state(lambda state: state["pairs"][0]["uv"] != [101, 101])
     assert first.session.photos[0].document.pairs[0].uv == (101, 100)
     assert second.errors == []

@@ -48,13 +48,12 @@ def used(
     request: pytest.FixtureRequest,
     browser: Browser,
     original: Case,
-    root: Any,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Used]:
     """One session for all tests: what it takes is the way through the panels, not what is asked."""
     folder = tmp_path_factory.mktemp("used")
     width, height = request.param
-    with served(prepare(original.copied_to(folder / "photos"), root)) as access:
+    with served(prepare(original.copied_to(folder / "photos"))) as access:
         page = open_page(
             browser, access.url, width=width, height=height, scheme="light", scripts=(WATCH_SHIFTS,)
         )
@@ -83,7 +82,7 @@ def used(
 
 @pytest.mark.long
 def test_nothing_moves_in_a_session_of_keys_alone(used: Used) -> None:
-    assert len(set(used.visited)) == 21
+    assert len(set(used.visited)) == 19
     assert sum(each["value"] for each in used.moved) == 0, used.moved
     assert used.errors == []
 

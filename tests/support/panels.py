@@ -7,15 +7,11 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import cache
-from pathlib import Path
 from typing import Any
 
 from playwright.sync_api import Browser, Page
 
 from cadalign.annotate.session import Session
-from cadalign.datasets import KeypointNet
-from cadalign.retrieval import Library
 from support.annotating import IDLE, Case, wait
 
 SETTLED = f"{IDLE} && annotator.state.alignment.status !== 'preparing'"
@@ -43,8 +39,8 @@ _TWO_FRAMES = """async () => {
 }"""
 
 
-def prepare(case: Case, root: Path, *, photos: int = 3) -> Session:
-    """A folder of photos with a library of models and a detector's keypoints, opened."""
+def prepare(case: Case, *, photos: int = 3) -> Session:
+    """A folder of photos with a detector's keypoints, opened."""
     for number in range(2, photos + 1):
         shutil.copy(case.photo, case.folder / f"photo_{number}.png")
     names = [f"keypoint {number}" for number, _ in case.clicks]
@@ -56,16 +52,7 @@ def prepare(case: Case, root: Path, *, photos: int = 3) -> Session:
         "annotations": [{"id": 1, "image_id": 1, "category_id": 1, "keypoints": points}],
     }
     (case.folder / "found.json").write_text(json.dumps(found))
-    library = case.folder / "chairs.library"
-    _chairs(root).save(library)
-    return case.open(
-        image=case.folder, keypoints=None, detections=case.folder / "found.json", library=library
-    )
-
-
-@cache
-def _chairs(root: Path) -> Library:
-    return Library.from_dataset(KeypointNet(root).subset(categories=["chair"]))
+    return case.open(image=case.folder, detections=case.folder / "found.json")
 
 
 @dataclass
@@ -177,18 +164,7 @@ class Keyboard:
     def _dialogs(self) -> None:
         self.keys("w", then="document.querySelectorAll('dialog[open] .thumbs li').length > 0")
         self.look("work list")
-        self.keys("Escape", "q")
-        self.wait("document.querySelectorAll('dialog[open] .models li').length > 0")
-        self.look("models")
-        before = self.page.evaluate("annotator.model.mesh.uuid")
-        number = self.page.evaluate(
-            "annotator.library.models.findIndex((each) => !each.current) + 1"
-        )
-        self.keys(str(number), then=f"{SETTLED} && annotator.model.mesh.uuid !== '{before}'")
-        self.look("other model")
-        self.keys("q")
-        self.wait("document.querySelectorAll('dialog[open] .models li').length > 0")
-        self.keys("0")
+        self.keys("Escape")
         self.page.locator(MODEL).focus()
         self.page.evaluate("annotator.model.zoom(0.02)")
         self.keys("Enter")

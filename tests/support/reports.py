@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-from collections import defaultdict
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -31,6 +30,10 @@ PAPER = "AEPnP, stated in the paper"
 HEADED = METRICS[:5]
 SPREAD = {"optimal": 1.0, "aepnp": 3.0, "aepnp-paper": 9.0}
 _SEED = 7
+_COLUMNS = (
+    *("id", "run", "category", "model", "view", "keypoints", "true_y", "true_z", "noise"),
+    *("exhibit", "thumb"),
+)
 # A seat, a back, four legs: lowest corner and size of each.
 _PARTS = (
     ((-0.25, 0.0, -0.25), (0.5, 0.06, 0.5)),
@@ -127,8 +130,9 @@ class _Maker:
 
     def payload(self) -> dict[str, Any]:
         recipe = self.recipe
-        instances: dict[str, list[Any]] = defaultdict(list)
-        rows: dict[str, list[Any]] = defaultdict(list)
+        instances: dict[str, list[Any]] = {name: [] for name in _COLUMNS}
+        names = ("instance", "method", "status", "reason", *(metric.key for metric in METRICS))
+        rows: dict[str, list[Any]] = {name: [] for name in names}
         exhibits: dict[str, Any] = {}
         for run in range(recipe.runs):
             for index in range(recipe.instances):
@@ -235,8 +239,9 @@ class _Maker:
         }
 
     def _headline(self, rows: Any, instances: Any) -> dict[str, Any]:
-        if not rows:
-            return {"columns": [], "rows": []}
+        if not rows["instance"]:
+            none = ("columns", "rows", "failures", "skipped", "paper")
+            return {"group": "category", "note": "", **{name: [] for name in none}}
         table = pd.DataFrame(rows)
         for name in ("run", "category"):
             table[name] = [instances[name][i] for i in rows["instance"]]
@@ -267,6 +272,7 @@ class _Maker:
             "columns": columns,
             "rows": found,
             "failures": failures,
+            "skipped": [],
             "paper": [{"category": "chair", **stated}] if "chair" in self.recipe.categories else [],
             "note": "Medians.",
         }

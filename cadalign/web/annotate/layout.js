@@ -104,8 +104,8 @@ export class Layout {
     this.title.textContent = image.name;
     this.photos.hidden = image.count < 2;
     this.place.textContent = `${image.number + 1} of ${image.count}`;
-    this.done.setAttribute("aria-pressed", String(image.state === "done"));
-    this.skip.setAttribute("aria-pressed", String(image.state === "skipped"));
+    press(this.done, image.state === "done");
+    press(this.skip, image.state === "skipped");
     this.previous.disabled = image.number === 0;
     this.next.disabled = image.number === image.count - 1;
     this.undo.disabled = !state.can_undo;
@@ -130,25 +130,9 @@ export class Layout {
     this.help.scrollTop = 0;
   }
 
-  showTool(tool) {
-    this.tools.show(tool);
-  }
-
   showSnapping(on, active) {
-    this.snapping.setAttribute("aria-pressed", String(on));
+    press(this.snapping, on);
     this.snapping.classList.toggle("active", active);
-  }
-
-  showResult(on) {
-    this.result.setAttribute("aria-pressed", String(on));
-  }
-
-  showLoupe(on) {
-    this.loupe.setAttribute("aria-pressed", String(on));
-  }
-
-  nextMode() {
-    this.overlay.next();
   }
 
   /** Say something, or with "" nothing any more. */
@@ -164,13 +148,11 @@ function makeTools({ tool: onChoose }) {
     h("option", { value: name }, `${label} (${key.toUpperCase()})`),
   );
   const choice = h("select", { "aria-label": "What a click in the photo marks", onchange: () => onChoose(choice.value) }, options);
-  let how = h("span", { class: "soft" });
-  const root = h("div", { class: "marking" }, choice, how);
+  const root = h("div", { class: "marking" }, choice);
   const show = (name) => {
     choice.value = name;
-    const told = h("span", { class: "soft" }, TOOLS[name].how);
-    how.replaceWith(told);
-    how = told;
+    // A new element, which does not count as one that has moved.
+    root.replaceChildren(choice, h("span", { class: "soft" }, TOOLS[name].how));
   };
   show("points");
   return { root, show };
@@ -199,8 +181,13 @@ function makeOverlay(onChange) {
 /** A button that is on or off. */
 function toggle(text, onChange, attributes) {
   const made = button(text, () => onChange(made.getAttribute("aria-pressed") !== "true"), attributes);
-  made.setAttribute("aria-pressed", "false");
+  press(made, false);
   return made;
+}
+
+/** Show a toggle as on or off. */
+export function press(made, on) {
+  made.setAttribute("aria-pressed", String(on));
 }
 
 function savedText({ path, at, trouble }) {

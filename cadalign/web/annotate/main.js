@@ -3,7 +3,7 @@ import "../common/theme.css";
 import "./annotate.css";
 import { Api } from "./api.js";
 import { listen } from "./keys.js";
-import { Layout } from "./layout.js";
+import { Layout, press } from "./layout.js";
 import { ModelView } from "./model_view.js";
 import { Mover } from "./mover.js";
 import { Panel } from "./panel.js";
@@ -13,11 +13,6 @@ import { WorkList } from "./worklist.js";
 import { PhotoView } from "./photo_view.js";
 
 const POLL = 400; // while the solvers are being prepared [ms]
-// ShapeNet's models face -z, with y up; none is looked at straight along y, where left is undefined.
-const SIDES = {
-  front: [0, 0, -1], back: [0, 0, 1], left: [1, 0, 0], right: [-1, 0, 0],
-  top: [0, 1, -0.001], bottom: [0, -1, -0.001],
-};
 const SNAP = 14; // reach of snapping clicks on the screen [px]
 
 class App {
@@ -43,17 +38,17 @@ class App {
     this.worklist = new WorkList({ go: (number) => this.goTo(number), tell: (text) => this.layout.tell(text) });
     this.layout = new Layout(
       {
-        undo: () => this.undo(),
-        redo: () => this.redo(),
+        undo: () => act({ do: "undo" }),
+        redo: () => act({ do: "redo" }),
         previous: () => this.go(-1),
         next: () => this.go(1),
         tour: () => this.tour.start(),
         list: () => this.showPhotos(),
         mark: (mark) => this.mark(mark),
-        asPhoto: () => this.asPhoto(),
+        asPhoto: () => this.model.frameAsPhoto(),
         result: (on) => this.showResult(on),
         tool: (tool) => this.choose(tool),
-        another: () => this.another(),
+        another: () => act({ do: "another" }),
         snap: (on) => this.snap({ on }),
         loupe: (on) => this.magnify(on),
         overlay: (changed) => this.photo.setOverlay(changed),
@@ -152,33 +147,26 @@ class App {
   select(pair) {
     this.selected = pair;
     this.draw();
-    return true;
   }
 
   /** Select the pair some places on. */
   step(by) {
     const { pairs } = this.state;
-    if (!pairs.length) return true;
+    if (!pairs.length) return;
     const at = pairs.findIndex((pair) => pair.pair === this.selected);
     const next = at < 0 ? (by > 0 ? 0 : pairs.length - 1) : (at + by + pairs.length) % pairs.length;
-    return this.select(pairs[next].pair);
-  }
-
-  nudge(x, y) {
-    return this.mover.nudge(x, y);
+    this.select(pairs[next].pair);
   }
 
   deleteSelected() {
     if (this.selected === null) return false;
-    this.act({ do: "delete", pair: this.selected });
-    return true;
+    return this.act({ do: "delete", pair: this.selected });
   }
 
   placeMiddle() {
     const uv = this.photo.toPixel(this.photo.middle);
     if (this.photo.marking.active) this.photo.marking.confirm(this.photo.clamp(uv));
     else if (this.photo.contains(uv)) this.place(uv);
-    return true;
   }
 
   /** Place a point in the photo. */
@@ -189,15 +177,14 @@ class App {
   /** Choose what clicks in the photo mark. */
   choose(tool) {
     this.photo.marking.choose(tool);
-    this.layout.showTool(tool);
-    return true;
+    this.layout.tools.show(tool);
   }
 
   /** Give up what is begun, else the tool, else the selection. */
   escape() {
-    if (this.photo.marking.cancel()) return true;
-    if (this.photo.marking.active) return this.choose("points");
-    return this.select(null);
+    if (this.photo.marking.cancel()) return;
+    if (this.photo.marking.active) this.choose("points");
+    else this.select(null);
   }
 
   /** How far clicks snap in the photo [its px], and on the model [tangent]; 0 if they don't. */
@@ -217,22 +204,14 @@ class App {
   snap(changed) {
     Object.assign(this.snapping, changed);
     this.layout.showSnapping(this.snapping.on, this.isSnapping);
-    return true;
-  }
-
-  /** Let the photo itself count, or no more. */
-  usePhoto() {
-    this.act({ do: "use_photo", on: !this.state.evidence.photo });
-    return true;
   }
 
   /** Magnify about the pointer, or no more. */
   magnify(on = !this.photo.loupe.on) {
     this.photo.loupe.on = this.model.loupe.on = on;
-    this.layout.showLoupe(on);
+    press(this.layout.loupe, on);
     this.photo.invalidate();
     this.model.stage.invalidate();
-    return true;
   }
 
   async repick(pair, aim) {
@@ -247,64 +226,17 @@ class App {
     const chosen = pair ?? (having.find((each) => each.pair === this.selected) ?? having.at(-1))?.pair;
     if (chosen === undefined) this.layout.tell("No pair has a mirror image that is not marked.");
     else this.act({ do: "mirrored", pair: chosen });
-    return true;
   }
 
   suggested() {
     if (this.state?.suggestion) this.act({ do: "suggested", pair: this.selected });
-    return true;
-  }
-
-  undo() {
-    this.act({ do: "undo" });
-    return true;
-  }
-
-  redo() {
-    this.act({ do: "redo" });
-    return true;
-  }
-
-  fit() {
-    this.photo.fit();
-    this.model.frame();
-    return true;
-  }
-
-  asPhoto() {
-    this.model.frameAsPhoto();
-    return true;
   }
 
   /** Show the aligned model before the photo in 3D, or the model to click on again. */
   showResult(on = !this.model.result) {
     const shown = this.model.showResult(on, this.photo.picture);
-    this.layout.showResult(shown);
+    press(this.layout.result, shown);
     if (on && !shown) this.layout.tell("There is no stretched model to show yet.");
-    return true;
-  }
-
-  /** Look at the model from its front, back, left, right, top or bottom, as most models lie. */
-  lookFrom(side) {
-    this.model.frameFrom(SIDES[side]);
-    return true;
-  }
-
-  /** Hide the alignment over the photo while a key is held. */
-  hide(hidden) {
-    this.photo.setOverlay({ hidden });
-    return true;
-  }
-
-  /** Go on to the next way to draw the alignment. */
-  nextMode() {
-    this.layout.nextMode();
-    return true;
-  }
-
-  showHelp() {
-    this.layout.showHelp();
-    return true;
   }
 
   /** Go to the photo some places on, among those of the work list's filter. */
@@ -312,7 +244,8 @@ class App {
     const { image } = this.state ?? { image: { number: 0, count: 1 } };
     if (!this.worklist.filter.value) {
       const number = image.number + by;
-      return number >= 0 && number < image.count && this.goTo(number);
+      if (number < 0 || number >= image.count) return false;
+      return this.goTo(number);
     }
     this.worklist.next(image.number, by).then((number) => {
       if (number === null) this.layout.tell(`No other photo is "${this.worklist.filter.value}" in this direction.`);
@@ -323,25 +256,16 @@ class App {
 
   goTo(number) {
     location.hash = String(number + 1);
-    return true;
-  }
-
-  /** Begin another object of the photo, in a file of its own. */
-  another() {
-    this.act({ do: "another" });
-    return true;
   }
 
   /** Take all keypoints of a detector. */
   accept() {
     if (!this.state?.detected.length) return false;
-    this.act({ do: "accept" });
-    return true;
+    return this.act({ do: "accept" });
   }
 
   showPhotos() {
     if (this.state?.image.count > 1) this.worklist.open(this.state.image.number);
-    return true;
   }
 
   /** Mark the photo as done or skipped and go on, or take the mark back. */
@@ -350,7 +274,6 @@ class App {
     const isNew = state !== mark;
     const answer = await this.act({ do: "mark", mark: isNew ? mark : null });
     if (answer && isNew && number < count - 1) this.go(1);
-    return true;
   }
 }
 

@@ -15,6 +15,15 @@ export function kindOf(pair, selected) {
   return pair.off === null ? "pair" : "wrong";
 }
 
+/** Stroke the path, over a dark line that keeps it visible on any ground, wider by `extra`. */
+export function strokeTwice(context, style, width, extra, dark = 60) {
+  for (const [color, more] of [[`rgb(0 0 0 / ${dark}%)`, extra], [style, 0]]) {
+    context.strokeStyle = color;
+    context.lineWidth = width + more;
+    context.stroke();
+  }
+}
+
 /** Draw a disk with a label about (x, y). */
 export function drawBadge(context, kind, label, x, y) {
   const { fill, ring, radius } = KINDS[kind];
@@ -24,12 +33,7 @@ export function drawBadge(context, kind, label, x, y) {
     context.fillStyle = fill;
     context.fill();
   }
-  // A dark line under the light one keeps it visible on any ground.
-  for (const [style, width] of [["rgb(0 0 0 / 60%)", 4.5], [ring, 2]]) {
-    context.strokeStyle = style;
-    context.lineWidth = width;
-    context.stroke();
-  }
+  strokeTwice(context, ring, 2, 2.5);
   if (!label) return;
   context.fillStyle = "#ffffff";
   context.font = "600 12px system-ui, sans-serif";

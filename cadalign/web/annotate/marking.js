@@ -1,4 +1,5 @@
 // Marking a mask or vertical edges in the photo, in place of points.
+import { strokeTwice } from "./marker.js";
 
 const MASK = "#b04dff";
 const VERTICAL = "#4be38a";
@@ -127,20 +128,13 @@ export class Marking {
   stroke(context, path, color, width) {
     context.save();
     context.lineCap = context.lineJoin = "round";
-    for (const [style, extra] of [["rgb(0 0 0 / 60%)", 2.5], [color, 0]]) {
-      context.beginPath();
-      for (const uv of path) {
-        const { x, y } = this.view.toView(uv);
-        context.lineTo(x, y);
-      }
-      if (path.length === 1) {
-        const { x, y } = this.view.toView(path[0]);
-        context.lineTo(x + 0.1, y);
-      }
-      context.strokeStyle = style;
-      context.lineWidth = width + extra;
-      context.stroke();
+    context.beginPath();
+    for (const uv of path) {
+      const { x, y } = this.view.toView(uv);
+      context.lineTo(x, y);
+      if (path.length === 1) context.lineTo(x + 0.1, y);
     }
+    strokeTwice(context, color, width, 2.5);
     context.restore();
   }
 }

@@ -1,6 +1,6 @@
 // The photo: zoomed, panned, and drawn over with points and the alignment.
 import { failureOf } from "./api.js";
-import { drawBadge, kindOf } from "./marker.js";
+import { drawBadge, kindOf, strokeTwice } from "./marker.js";
 import { drawPhotoLoupe, Loupe } from "./loupe.js";
 import { Marking } from "./marking.js";
 import { PhotoGestures } from "./photo_gestures.js";
@@ -10,6 +10,7 @@ const MOST_ZOOM = 64;
 const REACH = 16;
 const PIXELS_FROM = 4; // from this zoom on, pixels are shown as squares
 const BADGE_OFFSET = 17;
+const FAINT = "rgb(255 150 225 / 30%)";
 const UNCERTAIN = "#ff96e1"; // estimated keypoints that are not marked, and their regions
 
 export class PhotoView {
@@ -147,15 +148,7 @@ export class PhotoView {
 
   /** The pair whose point is at a place of the view, if any. */
   pairAt(place) {
-    let best = null;
-    let least = REACH;
-    for (const pair of this.state?.pairs ?? []) {
-      if (!pair.uv) continue;
-      const own = this.toView(pair.uv);
-      const gap = Math.hypot(own.x - place.x, own.y - place.y);
-      if (gap < least) [best, least] = [pair, gap];
-    }
-    return best;
+    return this.nearest(this.state?.pairs.filter(({ uv }) => uv), place);
   }
 
   resize() {
@@ -196,8 +189,9 @@ export class PhotoView {
         this.drawAlignment(this.state.alignment, mode);
         this.context.globalAlpha = 1;
       }
-      for (const each of this.state.detected) this.drawDetected(each);
-      this.drawSuggestion(this.state.suggestion);
+      const { detected, suggestion } = this.state;
+      for (const { uv } of detected) this.drawDashed("detected", "?", uv);
+      if (suggestion) this.drawDashed("suggested", "", suggestion.uv);
       this.drawPairs(this.state.pairs);
     }
     const loupe = this.loupe.place();
@@ -213,18 +207,25 @@ export class PhotoView {
       const seen = this.shaded.draw(alignment, { scale: this.scale, offset: this.offset, width, height });
       this.context.drawImage(seen, 0, 0, width, height);
     }
-    for (const region of alignment.faint_regions) this.strokeRegion(region, "rgb(255 150 225 / 30%)", 0.8);
+    this.context.strokeStyle = FAINT;
+    this.context.lineWidth = 0.8;
+    for (const region of alignment.faint_regions) {
+      this.outline(region);
+      this.context.stroke();
+    }
     if (mode === "edges" || (mode === "shaded" && !isShaded)) this.strokeLines(alignment.lines, "#35d0ff", 1.2);
     this.strokeLines(alignment.box, "#ff5a63", 2);
-    for (const region of alignment.regions) this.strokeRegion(region, "rgb(0 0 0 / 35%)", 2.6);
-    for (const region of alignment.regions) this.strokeRegion(region, UNCERTAIN, 1.2);
+    for (const region of alignment.regions) {
+      this.outline(region);
+      strokeTwice(this.context, UNCERTAIN, 1.2, 1.4, 35);
+    }
     for (const { uv, state } of alignment.keypoints) {
       if (state === "unmarked") this.drawRing(this.toView(uv));
     }
   }
 
-  /** Stroke a closed curve given as x1, y1, x2, y2, ... in pixels. */
-  strokeRegion(values, style, width) {
+  /** Outline a closed curve given as x1, y1, x2, y2, ... in pixels. */
+  outline(values) {
     const { context } = this;
     context.beginPath();
     for (let k = 0; k < values.length; k += 2) {
@@ -232,9 +233,6 @@ export class PhotoView {
       context.lineTo(x, y);
     }
     context.closePath();
-    context.strokeStyle = style;
-    context.lineWidth = width;
-    context.stroke();
   }
 
   /** Where an estimated keypoint is that is not marked. */
@@ -242,11 +240,7 @@ export class PhotoView {
     const { context } = this;
     context.beginPath();
     context.arc(x, y, 3.5, 0, 2 * Math.PI);
-    for (const [style, width] of [["rgb(0 0 0 / 60%)", 3.6], [UNCERTAIN, 1.8]]) {
-      context.strokeStyle = style;
-      context.lineWidth = width;
-      context.stroke();
-    }
+    strokeTwice(context, UNCERTAIN, 1.8, 1.8);
   }
 
   /** Stroke lines given as x1, y1, x2, y2, ... in pixels. */
@@ -260,60 +254,43 @@ export class PhotoView {
       context.lineTo(to.x, to.y);
     }
     context.lineCap = "round";
-    for (const [color, extra] of [["rgb(0 0 0 / 45%)", 1.6], [style, 0]]) {
-      context.strokeStyle = color;
-      context.lineWidth = width + extra;
-      context.stroke();
-    }
+    strokeTwice(context, style, width, 1.6, 45);
   }
 
-  drawSuggestion(suggestion) {
-    if (!suggestion) return;
+  /** A dashed badge at a pixel: what a detector has found, or where a point is expected. */
+  drawDashed(kind, label, uv) {
+    const { x, y } = this.toView(uv);
     this.context.setLineDash([4, 3]);
-    const { x, y } = this.toView(suggestion.uv);
-    drawBadge(this.context, "suggested", "", x, y);
+    drawBadge(this.context, kind, label, x, y);
     this.context.setLineDash([]);
   }
 
   drawPairs(pairs) {
     for (const pair of pairs) {
-      if (pair.expected) this.drawExpected(pair);
+      if (pair.expected) this.drawDashed("suggested", String(pair.pair), pair.expected);
       if (!pair.uv) continue;
       const uv = this.dragged?.pair === pair.pair ? this.dragged.uv : pair.uv;
       const place = this.toView(uv);
       if (pair.residual && !this.dragged) {
         this.drawArrow(place, this.toView([uv[0] + pair.residual[0], uv[1] + pair.residual[1]]));
       }
-      this.drawCross(place, kindOf(pair, this.selected));
       const kind = kindOf(pair, this.selected);
+      this.drawCross(place, kind);
       drawBadge(this.context, kind, String(pair.pair), place.x + BADGE_OFFSET, place.y - BADGE_OFFSET);
     }
   }
 
-  /** A keypoint that a detector has found. */
-  drawDetected({ uv }) {
-    const { x, y } = this.toView(uv);
-    this.context.setLineDash([3, 3]);
-    drawBadge(this.context, "detected", "?", x, y);
-    this.context.setLineDash([]);
-  }
-
   /** The detector's keypoint at a place of the view, if any. */
   detectedAt(place) {
+    return this.nearest(this.state?.detected, place);
+  }
+
+  nearest(points = [], place) {
     const gap = ({ uv }) => {
       const own = this.toView(uv);
       return Math.hypot(own.x - place.x, own.y - place.y);
     };
-    const near = (this.state?.detected ?? []).filter((each) => gap(each) < REACH);
-    return near.sort((a, b) => gap(a) - gap(b))[0] ?? null;
-  }
-
-  /** Where the alignment puts a model point that is not placed in the photo yet. */
-  drawExpected({ pair, expected }) {
-    const { x, y } = this.toView(expected);
-    this.context.setLineDash([4, 3]);
-    drawBadge(this.context, "suggested", String(pair), x, y);
-    this.context.setLineDash([]);
+    return points.filter((each) => gap(each) < REACH).sort((a, b) => gap(a) - gap(b))[0] ?? null;
   }
 
   /** A cross that leaves the pixel itself free. */
@@ -326,11 +303,7 @@ export class PhotoView {
       context.lineTo(x + outer * dx, y + outer * dy);
     }
     const color = { selected: "#ffd23f", wrong: "#ff8a80" }[kind] ?? "#ffffff";
-    for (const [style, width] of [["rgb(0 0 0 / 75%)", 4], [color, 1.8]]) {
-      context.strokeStyle = style;
-      context.lineWidth = width;
-      context.stroke();
-    }
+    strokeTwice(context, color, 1.8, 2.2, 75);
   }
 
   /** From where a point was placed to where the alignment puts it. */
@@ -347,10 +320,6 @@ export class PhotoView {
       context.moveTo(to.x, to.y);
       context.lineTo(to.x - head * Math.cos(angle + turn), to.y - head * Math.sin(angle + turn));
     }
-    for (const [style, width] of [["rgb(0 0 0 / 70%)", 4.5], ["#ffb02e", 2.2]]) {
-      context.strokeStyle = style;
-      context.lineWidth = width;
-      context.stroke();
-    }
+    strokeTwice(context, "#ffb02e", 2.2, 2.3, 70);
   }
 }

@@ -41,3 +41,35 @@ export function debounced(action, wait) {
 export function button(text, onclick, attributes = {}) {
   return h("button", { type: "button", onclick, ...attributes }, text);
 }
+
+/**
+ * A table that scrolls in itself where it is too wide.
+ *
+ * @param {string} caption
+ * @param {Array} heads - texts of the columns, or [text, class]; false ones are left out
+ * @param {Node[]} rows
+ * @param {object} options
+ * @param {string} options.label - what a screen reader says of it, if not the caption
+ * @param {boolean} options.hidden - whether only a screen reader says the caption
+ */
+export function table(caption, heads, rows, { label = caption, hidden = false } = {}) {
+  const columns = heads.filter((head) => head !== false).map((head) => {
+    const [text, words] = [head].flat();
+    return h("th", { scope: "col", class: words }, text);
+  });
+  return h(
+    "div",
+    { class: "scroller", tabindex: 0, role: "region", "aria-label": label },
+    h(
+      "table",
+      {},
+      h("caption", { class: hidden && "visually-hidden" }, caption),
+      h("thead", {}, h("tr", {}, columns)),
+      h("tbody", {}, rows),
+    ),
+  );
+}
+
+/** A form's field: a control or several with their name. */
+export const field = (label, ...controls) =>
+  h("label", { class: "field" }, h("span", {}, label), controls);

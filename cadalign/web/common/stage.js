@@ -42,8 +42,7 @@ export class Stage {
 
     this.orbit();
     this.canvas.addEventListener("keydown", (event) => this.steer(event));
-    this.observer = new ResizeObserver(() => this.resize());
-    this.observer.observe(host);
+    new ResizeObserver(() => this.resize()).observe(host);
     this.resize();
   }
 
@@ -110,19 +109,5 @@ export class Stage {
     this.camera.aspect = clientWidth / clientHeight;
     this.camera.updateProjectionMatrix();
     this.invalidate();
-  }
-
-  /** Give back the graphics memory; browsers allow only some contexts at once. */
-  dispose() {
-    cancelAnimationFrame(this.pending);
-    this.observer.disconnect();
-    this.controls.dispose();
-    this.scene.traverse((object) => {
-      object.geometry?.dispose();
-      for (const material of [object.material ?? []].flat()) material.dispose();
-    });
-    this.renderer.dispose();
-    this.renderer.forceContextLoss();
-    this.canvas.remove();
   }
 }

@@ -9,10 +9,10 @@ export function refill(host, parts) {
 }
 
 /** A choice of one thing by radio buttons. */
-export function radios(legend, things, { checked, words, choose }) {
+export function radios(legend, things, { checked, words, choose, kind = "radios" }) {
   return h(
     "fieldset",
-    { class: "radios" },
+    { class: kind },
     h("legend", {}, legend),
     things.map((thing) =>
       h(

@@ -1,8 +1,8 @@
 // Two runs side by side: a paired plot, and the instances that changed most.
 import { themeColor } from "../common/colors.js";
-import { h } from "../common/dom.js";
+import { button, field, h } from "../common/dom.js";
 import { layoutOf, plain } from "./chart.js";
-import { select } from "./filters.js";
+import { methodOptions, metricOptions, runOptions, select } from "./filters.js";
 import { named, plural, quantity } from "./format.js";
 import { Panel } from "./plots.js";
 import { pairs } from "./selection.js";
@@ -19,11 +19,7 @@ export class Comparison {
     this.shown = PAGE;
     this.list = h("ol", { class: "pairs" });
     this.status = h("p", { class: "found", role: "status" });
-    this.more = h(
-      "button",
-      { type: "button", class: "quiet", onclick: () => this.extend() },
-      "Show more",
-    );
+    this.more = button("Show more", () => this.extend(), { class: "quiet" });
     this.note = h("figcaption");
     const host = h("div", {
       class: "plot square",
@@ -51,8 +47,7 @@ export class Comparison {
 
   form() {
     const { report, state } = this;
-    const runs = report.runs.map(({ name }, index) => [String(index), name]);
-    const field = (label, control) => h("label", { class: "field" }, h("span", {}, label), control);
+    const runs = runOptions(report);
     return h(
       "form",
       {
@@ -62,23 +57,8 @@ export class Comparison {
       },
       field("from", select(state, "a", runs)),
       field("to", select(state, "b", runs)),
-      field(
-        "by",
-        select(
-          state,
-          "by",
-          report.metrics.map((metric) => [metric.key, named(metric)]),
-        ),
-      ),
-      field(
-        "of",
-        select(
-          state,
-          "with",
-          report.fitted.map(({ key, label }) => [key, label]),
-          { fallback: this.method().key },
-        ),
-      ),
+      field("by", select(state, "by", metricOptions(report))),
+      field("of", select(state, "with", methodOptions(report), { fallback: this.method().key })),
     );
   }
 

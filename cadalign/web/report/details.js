@@ -1,5 +1,6 @@
 // The numbers of one instance: errors of every method, the estimate with its deviations, warnings.
-import { h } from "../common/dom.js";
+import { h, table } from "../common/dom.js";
+import { radios } from "./choices.js";
 import { named, number, quantity } from "./format.js";
 import { swatch } from "./swatch.js";
 
@@ -31,27 +32,8 @@ export function errorTable(report, instance, exhibit) {
             ],
       );
     });
-  const heads = [...metrics.map((metric) => named(metric)), "residual [px]"];
-  return h(
-    "div",
-    { class: "scroller", tabindex: 0, role: "region", "aria-label": "errors by method" },
-    h(
-      "table",
-      {},
-      h("caption", {}, "Errors"),
-      h(
-        "thead",
-        {},
-        h(
-          "tr",
-          {},
-          h("th", { scope: "col" }, "method"),
-          heads.map((head) => h("th", { scope: "col" }, head)),
-        ),
-      ),
-      h("tbody", {}, rows),
-    ),
-  );
+  const heads = ["method", ...metrics.map(named), "residual [px]"];
+  return table("Errors", heads, rows, { label: "errors by method" });
 }
 
 /** A method's estimate in an exhibit, if there is one. */
@@ -62,15 +44,8 @@ export const estimateOf = (exhibit, method) =>
 export function estimateTable(exhibit, estimate, label) {
   const { std, translation, scale } = estimate;
   const truth = exhibit.gt;
-  const row = (name, value, deviation, true_) =>
-    h(
-      "tr",
-      {},
-      h("th", { scope: "row" }, name),
-      h("td", {}, value),
-      h("td", {}, deviation),
-      h("td", {}, true_),
-    );
+  const row = (name, ...cells) =>
+    h("tr", {}, h("th", { scope: "row" }, name), cells.map((text) => h("td", {}, text)));
   // Deviations of the scale are relative; x is known unless the shape was estimated.
   const rows = [
     ...(estimate.warp ? [0, 1, 2] : [1, 2]).map((axis) =>
@@ -96,27 +71,8 @@ export function estimateTable(exhibit, estimate, label) {
       "",
     ),
   ];
-  return h(
-    "div",
-    { class: "scroller", tabindex: 0, role: "region", "aria-label": "estimate" },
-    h(
-      "table",
-      {},
-      h("caption", {}, `Estimate of ${label}`),
-      h(
-        "thead",
-        {},
-        h(
-          "tr",
-          {},
-          ["", "estimate", "predicted std. deviation", "truth"].map((head) =>
-            h("th", { scope: "col" }, head),
-          ),
-        ),
-      ),
-      h("tbody", {}, rows),
-    ),
-  );
+  const heads = ["", "estimate", "predicted std. deviation", "truth"];
+  return table(`Estimate of ${label}`, heads, rows, { label: "estimate" });
 }
 
 /** Warnings of an estimate, in the fit's own words. */
@@ -137,29 +93,16 @@ export function warningList({ warnings = [] }) {
 /** The other poses that explain the keypoints, to be drawn in place of the best. */
 export function alternativeChoice({ alternatives = [] }, chosen, choose) {
   if (!alternatives.length) return null;
-  const option = (index, ...words) =>
-    h(
-      "label",
-      { class: "option" },
-      h("input", {
-        type: "radio",
-        name: "alternative",
-        checked: index === chosen,
-        onchange: () => choose(index),
-      }),
-      words,
-    );
-  return h(
-    "fieldset",
-    { class: "alternatives" },
-    h("legend", {}, "Poses that explain the keypoints"),
-    option(0, "the best"),
-    alternatives.map(({ likelihood, scale }, index) =>
-      option(
-        index + 1,
-        `another: scale ${number(scale[1], 3)}, ${number(scale[2], 3)}; `,
-        `likelihood ${number(likelihood, likelihood < 0.001 ? undefined : 3)} of the best's`,
-      ),
-    ),
-  );
+  const words = (index) => {
+    if (!index) return "the best";
+    const { likelihood, scale } = alternatives[index - 1];
+    const share = number(likelihood, likelihood < 0.001 ? undefined : 3);
+    return `another: scale ${number(scale[1], 3)}, ${number(scale[2], 3)}; likelihood ${share} of the best's`;
+  };
+  return radios("Poses that explain the keypoints", [0, ...alternatives.map((_, at) => at + 1)], {
+    kind: "alternatives",
+    checked: (index) => index === chosen,
+    words,
+    choose,
+  });
 }

@@ -1,24 +1,20 @@
 // The switches that all parts of the page obey (methods, runs) and the gallery's form.
-import { debounced, h } from "../common/dom.js";
+import { button, debounced, field, h } from "../common/dom.js";
 import { named, plural } from "./format.js";
-import { EVERY } from "./selection.js";
+import { EVERY, FILTERS } from "./selection.js";
 import { runSwatch, swatch } from "./swatch.js";
 
 /** Buttons that take methods and runs in and out everywhere. */
 export function switches(report, state) {
   const buttons = [];
   const add = (list, word, ...words) => {
-    const button = h(
-      "button",
-      { type: "button", class: "chip", onclick: () => state.toggle(list, word) },
-      words,
-    );
-    buttons.push({ button, list, word });
-    return button;
+    const chip = button(words, () => state.toggle(list, word), { class: "chip" });
+    buttons.push({ chip, list, word });
+    return chip;
   };
   const update = () => {
-    for (const { button, list, word } of buttons) {
-      button.setAttribute("aria-pressed", String(!state.words(list).has(word)));
+    for (const { chip, list, word } of buttons) {
+      chip.setAttribute("aria-pressed", String(!state.words(list).has(word)));
     }
   };
   state.listen(update);
@@ -70,8 +66,10 @@ export function select(state, name, options, { fallback } = {}) {
   return control;
 }
 
-const field = (label, ...controls) =>
-  h("label", { class: "field" }, h("span", {}, label), controls);
+/** Values and names of what fields choose among. */
+export const metricOptions = ({ metrics }) => metrics.map((metric) => [metric.key, named(metric)]);
+export const methodOptions = ({ fitted }) => fitted.map(({ key, label }) => [key, label]);
+export const runOptions = ({ runs }) => runs.map(({ name }, index) => [String(index), name]);
 
 function numbers(state, title, low, high) {
   const box = (name, words) =>
@@ -99,27 +97,17 @@ function numbers(state, title, low, high) {
 
 /** The gallery's form: sorting, filters, search, and the three picks. */
 export function galleryForm(report, state) {
-  const metrics = report.metrics.map((metric) => [metric.key, named(metric)]);
+  const metrics = metricOptions(report);
+  const seed = () => String(1 + Math.floor(Math.random() * 1e6));
   const pick = (order, words) =>
-    h(
-      "button",
-      {
-        type: "button",
-        class: "pick",
-        "data-order": order,
-        onclick: () =>
-          state.set(
-            order === "random"
-              ? { order, seed: String(1 + Math.floor(Math.random() * 1e6)) }
-              : { order },
-          ),
-      },
-      words,
-    );
+    button(words, () => state.set(order === "random" ? { order, seed: seed() } : { order }), {
+      class: "pick",
+      "data-order": order,
+    });
   const picks = [pick("worst", "Worst"), pick("best", "Best"), pick("random", "Random")];
   const mark = () => {
-    for (const button of picks)
-      button.setAttribute("aria-pressed", String(button.dataset.order === state.get("order")));
+    for (const one of picks)
+      one.setAttribute("aria-pressed", String(one.dataset.order === state.get("order")));
   };
   state.listen(mark);
   mark();
@@ -133,18 +121,7 @@ export function galleryForm(report, state) {
   };
   state.listen(retitle);
   retitle();
-  const clear = () =>
-    state.set({
-      category: "",
-      method: "",
-      status: "",
-      kmin: "",
-      kmax: "",
-      emin: "",
-      emax: "",
-      q: "",
-      run: "",
-    });
+  const clear = () => state.set(Object.fromEntries(FILTERS.map((name) => [name, ""])));
   return h(
     "form",
     {
@@ -157,14 +134,9 @@ export function galleryForm(report, state) {
     metrics.length > 0 && field("by", select(state, "sort", metrics)),
     field(
       "of",
-      select(
-        state,
-        "method",
-        [...report.fitted.map(({ key, label }) => [key, label]), [EVERY, "all methods shown"]],
-        {
-          fallback: report.best?.key,
-        },
-      ),
+      select(state, "method", [...methodOptions(report), [EVERY, "all methods shown"]], {
+        fallback: report.best?.key,
+      }),
     ),
     report.categories.length > 1 &&
       field(
@@ -172,13 +144,7 @@ export function galleryForm(report, state) {
         select(state, "category", [["", "all"], ...report.categories.map((name) => [name, name])]),
       ),
     report.runs.length > 1 &&
-      field(
-        "run",
-        select(state, "run", [
-          ["", "all"],
-          ...report.runs.map(({ name }, index) => [String(index), name]),
-        ]),
-      ),
+      field("run", select(state, "run", [["", "all"], ...runOptions(report)])),
     field(
       "status",
       select(state, "status", [
@@ -194,19 +160,11 @@ export function galleryForm(report, state) {
       bound(
         state,
         "q",
-        h("input", {
-          type: "search",
-          placeholder: "search",
-          autocomplete: "off",
-          spellcheck: "false",
-        }),
-        {
-          event: "input",
-          wait: 150,
-        },
+        h("input", { type: "search", placeholder: "search", autocomplete: "off", spellcheck: "false" }),
+        { event: "input", wait: 150 },
       ),
     ),
-    h("button", { type: "button", class: "quiet", onclick: clear }, "Clear filters"),
+    button("Clear filters", clear, { class: "quiet" }),
   );
 }
 

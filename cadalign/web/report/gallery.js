@@ -4,7 +4,7 @@ import { foundWords, galleryForm } from "./filters.js";
 import { quantity } from "./format.js";
 import { overlay } from "./overlay.js";
 import { keyOf } from "./payload.js";
-import { criteria, select } from "./selection.js";
+import { FILTERS, criteria, select } from "./selection.js";
 import { swatch } from "./swatch.js";
 
 const WIDTH = 236; // what a card should have at least
@@ -14,19 +14,7 @@ const WORDS = 62; // height of a card's words without the errors
 const LINE = 22;
 const PRINTED = 12;
 const HEAD = 12; // cards that are always there
-const DECIDES = [
-  "sort",
-  "order",
-  "seed",
-  "category",
-  "method",
-  "status",
-  "q",
-  "run",
-  "hide",
-  "hideruns",
-];
-const RANGES = ["kmin", "kmax", "emin", "emax"];
+const DECIDES = [...FILTERS, "sort", "order", "seed", "hide", "hideruns"];
 
 export class Gallery {
   constructor(report, state, { open }) {
@@ -49,9 +37,7 @@ export class Gallery {
       this.list,
       h("p", { class: "print-only note" }, `Printed: the first ${PRINTED}.`),
     );
-    state.listen(
-      (names) => [...DECIDES, ...RANGES].some((name) => names.has(name)) && this.update(),
-    );
+    state.listen((names) => DECIDES.some((name) => names.has(name)) && this.update());
     addEventListener("scroll", () => this.ask(), { passive: true });
     new ResizeObserver(() => this.measure()).observe(this.list);
     addEventListener("beforeprint", () => this.print());

@@ -1,5 +1,5 @@
 // The headline table, the failures behind it, and the settings of the runs.
-import { h } from "../common/dom.js";
+import { h, table } from "../common/dom.js";
 import { count, number, plural } from "./format.js";
 import { swatch } from "./swatch.js";
 
@@ -32,7 +32,7 @@ function runFacts(run, runs) {
         )
       : unfinished &&
         h("p", { class: "warning" }, h("strong", {}, "Unfinished. "), "Numbers may still change.");
-  const facts = (run.settings ?? []).map(([name, value]) =>
+  const facts = run.settings.map(([name, value]) =>
     h("div", {}, h("dt", {}, name), h("dd", {}, String(value))),
   );
   const words = runs > 1 ? run.name : "Settings";
@@ -59,16 +59,16 @@ export function headline(report) {
     { id: "results", "aria-labelledby": "results-title" },
     h("h2", { id: "results-title" }, "Results"),
     tables(report, given),
-    h("p", { class: "note" }, given.rows.some(({ best }) => best?.length) && legend(given), given.note),
-    reasons(report, given.failures ?? [], "failed"),
-    reasons(report, given.skipped ?? [], "skipped"),
+    h("p", { class: "note" }, given.rows.some(({ best }) => best.length) && legend(given), given.note),
+    reasons(report, given.failures, "failed"),
+    reasons(report, given.skipped, "skipped"),
   );
 }
 
 /** The meaning of the marked cells. */
 const legend = ({ group }) => [
   h("b", { class: "best" }, "Bold on a tinted field"),
-  ` is the best of its ${group ?? "category"}. `,
+  ` is the best of its ${group}. `,
 ];
 
 const PHONE = 700; // pixels: below, a table is scrolled, its first column staying in view
@@ -86,7 +86,7 @@ function tables(report, given) {
     const room = scroller.clientWidth;
     if (room === width) return;
     width = room;
-    const whole = table(report, given);
+    const whole = resultTable(report, given);
     scroller.replaceChildren(whole);
     if (room < PHONE || whole.offsetWidth <= room) return;
     const widths = [...whole.tHead.rows[0].cells].map((cell) => cell.offsetWidth);
@@ -97,11 +97,11 @@ function tables(report, given) {
     const own = kept.map((column) => widths[names + given.columns.indexOf(column)]);
     scroller.replaceChildren(
       ...shared(kept, own, free).map((columns) =>
-        table(report, { ...given, columns, rows: told(given.rows, columns) }),
+        resultTable(report, { ...given, columns, rows: told(given.rows, columns) }),
       ),
     );
   }).observe(scroller);
-  scroller.append(table(report, given));
+  scroller.append(resultTable(report, given));
   return scroller;
 }
 
@@ -128,11 +128,11 @@ function shared(columns, widths, free) {
   return found;
 }
 
-function table(report, { columns, rows, paper = [], group = "category" }) {
+function resultTable(report, { columns, rows, paper, group }) {
   const several = report.runs.length > 1;
   // What holds for all comes first.
   const first = (name) => (name === "all" ? 0 : 1);
-  const names = [...new Set(rows.map((row) => row.category ?? ""))].sort(
+  const names = [...new Set(rows.map((row) => row.category))].sort(
     (a, b) => first(a) - first(b),
   );
   const bodies = names.map((name) =>
@@ -151,10 +151,10 @@ function table(report, { columns, rows, paper = [], group = "category" }) {
         ),
       inOrder(
         report,
-        rows.filter((row) => (row.category ?? "") === name),
+        rows.filter((row) => row.category === name),
       ).map((row) => bodyRow(report, columns, row, several)),
       paper
-        .filter((row) => (row.category ?? "") === name)
+        .filter((row) => row.category === name)
         .map((row) => paperRow(columns, row, several)),
     ),
   );
@@ -202,7 +202,7 @@ function bodyRow(report, columns, row, several) {
     several && h("td", { class: "words" }, report.runs[row.run]?.name),
     columns.map((column) => {
       const text = shown(column, row.cells[column.key]);
-      const best = row.best?.includes(column.key);
+      const best = row.best.includes(column.key);
       return h(
         "td",
         {},
@@ -246,36 +246,12 @@ function reasons(report, list, what) {
       ),
     );
   const heads = [
-    "reason",
-    "fits",
-    "method",
-    report.headline.group ?? "category",
-    several && "run",
-  ].filter(Boolean);
+    ["reason", "words"], "fits", ["method", "words"], [report.headline.group, "words"], several && ["run", "words"],
+  ];
   return h(
     "details",
     { class: "failures" },
     h("summary", {}, `${plural(total, "fit")} ${what}, by reason`),
-    h(
-      "div",
-      { class: "scroller", tabindex: 0, role: "region", "aria-label": `${what}, by reason` },
-      h(
-        "table",
-        {},
-        h("caption", { class: "visually-hidden" }, `Fits ${what}, by reason`),
-        h(
-          "thead",
-          {},
-          h(
-            "tr",
-            {},
-            heads.map((head) =>
-              h("th", { scope: "col", class: head === "fits" ? "" : "words" }, head),
-            ),
-          ),
-        ),
-        h("tbody", {}, rows),
-      ),
-    ),
+    table(`Fits ${what}, by reason`, heads, rows, { label: `${what}, by reason`, hidden: true }),
   );
 }

@@ -6,7 +6,7 @@ import "./narrow.css";
 import "./gallery.css";
 import "./viewer.css";
 import "./print.css";
-import { h } from "../common/dom.js";
+import { button, h } from "../common/dom.js";
 import { Comparison } from "./compare.js";
 import { switches } from "./filters.js";
 import { Gallery } from "./gallery.js";
@@ -38,7 +38,7 @@ const links = sections
   .map((section) => {
     const words = section.dataset.short ?? section.querySelector("h2").textContent;
     // The fragment holds the state, so these are not links to one.
-    return h("button", { type: "button", onclick: () => section.scrollIntoView() }, words);
+    return button(words, () => section.scrollIntoView());
   });
 const bar = h(
   "nav",

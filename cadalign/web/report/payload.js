@@ -16,36 +16,24 @@ export const keyOf = (instance) => `${instance.category}/${instance.model}/${ins
 
 export class Report {
   constructor(payload) {
-    this.payload = payload;
-    this.title = payload.title ?? "cadalign report";
-    this.summary = payload.summary ?? "";
-    this.runs = payload.runs ?? [];
-    this.methods = payload.methods ?? [];
-    this.metrics = payload.metrics ?? [];
-    this.headline = payload.headline ?? { columns: [], rows: [] };
-    this.linePlots = payload.plots ?? [];
-    const {
-      exhibit_files: files = [],
-      exhibits_per_file: each,
-      mesh_files: meshFiles = {},
-    } = payload;
-    this.exhibits = new Fetched(
-      payload.exhibits,
-      "cadalignExhibit",
-      (id) => files[Math.floor(id / each)],
-    );
-    this.meshes = new Fetched(payload.meshes, "cadalignMesh", (key) => meshFiles[key]);
+    const { title, summary, runs, methods, metrics, headline } = payload;
+    Object.assign(this, { title, summary, runs, methods, metrics, headline });
+    this.linePlots = payload.plots;
+    const fileOf = (id) => payload.exhibit_files?.[Math.floor(id / payload.exhibits_per_file)];
+    this.exhibits = new Fetched(payload.exhibits, "cadalignExhibit", fileOf);
+    this.meshes = new Fetched(payload.meshes, "cadalignMesh", (key) => payload.mesh_files?.[key]);
     this.pictures = payload.pictures ?? {};
     this.thumbs = payload.thumbs ?? {};
     this.method = new Map(this.methods.map((method) => [method.key, method]));
     this.metric = new Map(this.metrics.map((metric) => [metric.key, metric]));
-    this.instances = readInstances(payload.tables);
-    this.rows = this.readRows(payload.tables?.rows ?? {});
+    const tables = payload.tables ?? { strings: [], instances: { id: [] }, rows: { method: [] } };
+    this.instances = readInstances(tables);
+    this.rows = this.readRows(tables);
     this.categories = [...new Set(this.instances.map((instance) => instance.category))].sort();
     this.byKey = new Map(
       this.instances.map((instance) => [`${instance.run} ${keyOf(instance)}`, instance]),
     );
-    this.siblings = grouped(this.instances, (instance) => instance.id);
+    this.siblings = Map.groupBy(this.instances, ({ id }) => id);
     const used = new Set(this.rows.method);
     // A limit has numbers, but no poses: it stands in tables and plots only.
     this.measured = this.methods.filter((_, index) => used.has(index));
@@ -53,9 +41,8 @@ export class Report {
     this.best = this.bestMethod();
   }
 
-  readRows(table) {
-    const strings = this.payload.tables?.strings ?? [];
-    const count = table.instance?.length ?? 0;
+  readRows({ strings, rows: table }) {
+    const count = table.method.length;
     for (let row = 0; row < count; row++) {
       this.instances[table.instance[row]].rows.set(this.methods[table.method[row]].key, row);
     }
@@ -65,8 +52,8 @@ export class Report {
         (table[key] ?? []).map((value) => (value == null ? null : value * factor)),
       ]),
     );
-    const reason = (row) => (table.reason?.[row] >= 0 ? strings[table.reason[row]] : "");
-    return { count, method: table.method ?? [], status: table.status ?? [], reason, values };
+    const reason = (row) => strings[table.reason[row]] ?? "";
+    return { count, method: table.method, status: table.status, reason, values };
   }
 
   /** The method of the smallest median error: what the gallery begins with. */
@@ -164,33 +151,20 @@ function loadScript(source) {
   });
 }
 
-function readInstances(tables) {
-  const table = tables?.instances ?? {};
-  const strings = tables?.strings ?? [];
-  const ids = table.id ?? [];
-  return ids.map((id, index) => ({
+function readInstances({ strings, instances: table }) {
+  return table.id.map((id, index) => ({
     index,
     id,
-    run: table.run?.[index] ?? 0,
+    run: table.run[index],
     category: strings[table.category[index]],
     model: strings[table.model[index]],
-    view: table.view?.[index] ?? null,
-    keypoints: table.keypoints?.[index] ?? null,
-    trueY: table.true_y?.[index] ?? null,
-    trueZ: table.true_z?.[index] ?? null,
-    noise: table.noise?.[index] ?? null,
-    exhibit: table.exhibit?.[index] ?? -1,
-    thumb: table.thumb?.[index] ?? -1,
+    view: table.view[index],
+    keypoints: table.keypoints[index],
+    trueY: table.true_y[index],
+    trueZ: table.true_z[index],
+    noise: table.noise[index],
+    exhibit: table.exhibit[index],
+    thumb: table.thumb[index],
     rows: new Map(),
   }));
-}
-
-function grouped(things, keyed) {
-  const groups = new Map();
-  for (const thing of things) {
-    const key = keyed(thing);
-    if (groups.has(key)) groups.get(key).push(thing);
-    else groups.set(key, [thing]);
-  }
-  return groups;
 }

@@ -1,10 +1,10 @@
 // The section of plots: each is drawn when it comes into view, and again when what it shows changes.
 import { isPrinting, onThemeChange } from "../common/colors.js";
-import { h } from "../common/dom.js";
+import { field, h, table } from "../common/dom.js";
 import { CONFIG, layoutOf, plotly, tracesOf } from "./chart.js";
 import { plotsOf } from "./curves.js";
-import { select } from "./filters.js";
-import { count, named, number } from "./format.js";
+import { metricOptions, select } from "./filters.js";
+import { count, number } from "./format.js";
 
 const PAPER = 330; // width of a plot on paper [CSS px]: two beside each other on A4 and letter
 const ROWS = 12; // lines of a plot's table at most
@@ -61,16 +61,7 @@ export function plotSection(report, state) {
     { id: "plots", "aria-labelledby": "plots-title" },
     h("h2", { id: "plots-title" }, "Plots"),
     choosable &&
-      h(
-        "label",
-        { class: "field inline" },
-        h("span", {}, "metric"),
-        select(
-          state,
-          "metric",
-          report.metrics.map((metric) => [metric.key, named(metric)]),
-        ),
-      ),
+      field("metric", select(state, "metric", metricOptions(report))),
     h(
       "div",
       { class: "plots" },
@@ -113,7 +104,7 @@ function figure(report, state, plot, metricNow) {
   numbers.addEventListener("toggle", () => {
     while (numbers.children.length > 1) numbers.lastElementChild.remove();
     if (numbers.open)
-      numbers.append(table(report, plot.axes(metricNow()), linesNow(), title.textContent));
+      numbers.append(numberTable(report, plot.axes(metricNow()), linesNow(), title.textContent));
   });
   state.listen((names) => {
     if (names.has("metric") && !plot.fixed) retitle();
@@ -135,7 +126,7 @@ function figure(report, state, plot, metricNow) {
 }
 
 /** A plot as a table, for those who can't see it. */
-function table(report, { x, y }, lines, title) {
+function numberTable(report, { x, y }, lines, title) {
   const several = report.runs.length > 1;
   const rows = lines.flatMap((line) => {
     const each = Math.max(1, Math.ceil(line.x.length / ROWS));
@@ -153,30 +144,7 @@ function table(report, { x, y }, lines, title) {
       ),
     );
   });
-  const heads = [
-    "method",
-    several && "run",
-    x.label,
-    y.label,
-    lines.some((line) => line.counts) && "fits",
-  ];
-  return h(
-    "div",
-    { class: "scroller", tabindex: 0, role: "region", "aria-label": title },
-    h(
-      "table",
-      {},
-      h("caption", { class: "visually-hidden" }, title),
-      h(
-        "thead",
-        {},
-        h(
-          "tr",
-          {},
-          heads.filter(Boolean).map((head) => h("th", { scope: "col" }, head)),
-        ),
-      ),
-      h("tbody", {}, rows),
-    ),
-  );
+  const counted = lines.some((line) => line.counts);
+  const heads = ["method", several && "run", x.label, y.label, counted && "fits"];
+  return table(title, heads, rows, { hidden: true });
 }

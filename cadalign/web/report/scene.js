@@ -18,7 +18,6 @@ import { LineSegmentsGeometry } from "three/addons/lines/LineSegmentsGeometry.js
 import { themeColor } from "../common/colors.js";
 import { Stage } from "../common/stage.js";
 import { BOX_EDGES, anchorOf, cornersOf, matrixOf, shapeOf } from "./pose.js";
-import { wireOf } from "./mesh.js";
 
 const FRUSTUM = 0.35; // the camera's size, as a part of its distance
 const WAYS = { object: "The object", picture: "As in the picture", all: "With the camera" };
@@ -66,9 +65,9 @@ export class Scene3D {
 
   addModel(exhibit, pose, kind, mesh, layers) {
     const color = themeColor(kind);
+    const matrix = this.world.clone().multiply(matrix4(matrixOf(pose)));
     if (mesh) {
-      const matrix = this.world.clone().multiply(matrix4(matrixOf(pose)));
-      const { points, edges } = wireOf(mesh);
+      const { points, edges } = mesh.wire;
       const shaped = shapeOf(exhibit, pose, points);
       const solid = new Mesh(geometryOf(shaped, mesh.faces), surface(color, kind));
       // The true one is drawn over the predicted one, so that both are seen where they agree.
@@ -78,7 +77,6 @@ export class Scene3D {
         this.solids.add(placed(segments(shaped, edges, color, 1), matrix));
       }
     }
-    const matrix = this.world.clone().multiply(matrix4(matrixOf(pose)));
     if (exhibit.bounds) {
       this.solids.add(placed(segments(cornersOf(exhibit.bounds), BOX_EDGES, color, 2.5), matrix));
     }
@@ -113,18 +111,7 @@ export class Scene3D {
       at(-0.5, bottom),
       at(width / 2, -0.15 * height),
     ];
-    const edges = [
-      [0, 1],
-      [0, 2],
-      [0, 3],
-      [0, 4],
-      [1, 2],
-      [2, 3],
-      [3, 4],
-      [4, 1],
-      [1, 5],
-      [5, 2],
-    ];
+    const edges = [[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1], [1, 5], [5, 2]];
     this.eye.add(placed(segments(points, edges, themeColor("accent"), 2), this.world.clone()));
     this.eyeAt = new Vector3().applyMatrix4(this.world);
     this.eyeUp = new Vector3(0, -1, 0).transformDirection(this.world);

@@ -5,6 +5,9 @@ import { keyOf } from "./payload.js";
 /** The method's name that stands for all that are shown: the worst of them counts. */
 export const EVERY = "*";
 
+/** What the gallery's filters are called in the state. */
+export const FILTERS = ["category", "method", "status", "kmin", "kmax", "emin", "emax", "q", "run"];
+
 /** The choices of the gallery, read off the state; absent ones mean what reads best. */
 export function criteria(report, state) {
   const hidden = state.words("hide");

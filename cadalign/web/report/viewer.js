@@ -1,6 +1,6 @@
 // The dialog in which an instance opens: overlays, 3D view, numbers.
 import { onThemeChange } from "../common/colors.js";
-import { h } from "../common/dom.js";
+import { button, h } from "../common/dom.js";
 import {
   alternativeChoice,
   errorTable,
@@ -42,21 +42,10 @@ export class Viewer {
   build() {
     this.title = h("h2", { id: "viewer-title", tabindex: -1 });
     this.where = h("p", { class: "soft", role: "status" });
-    this.previous = h(
-      "button",
-      { type: "button", "aria-label": "previous instance", onclick: () => this.walk(-1) },
-      "\u2190",
-    );
-    this.next = h(
-      "button",
-      { type: "button", "aria-label": "next instance", onclick: () => this.walk(1) },
-      "\u2192",
-    );
-    const close = h(
-      "button",
-      { type: "button", "aria-label": "close", onclick: () => this.dialog.close() },
-      "\u2715",
-    );
+    const named = (name) => ({ "aria-label": name });
+    this.previous = button("\u2190", () => this.walk(-1), named("previous instance"));
+    this.next = button("\u2192", () => this.walk(1), named("next instance"));
+    const close = button("\u2715", () => this.dialog.close(), named("close"));
     this.choices = h("div", { class: "choices" });
     this.layers = h(
       "fieldset",
@@ -69,7 +58,7 @@ export class Viewer {
     this.views = h(
       "div",
       { class: "chips", role: "group", "aria-label": "viewpoint" },
-      this.viewButtons(),
+      VIEWS.map(([way, words]) => button(words, () => this.scene?.view(way), { class: "chip" })),
     );
     this.solid = h("figure", { class: "solid" }, this.canvas, h("figcaption", {}, this.views));
     this.numbers = h("div", { class: "details" });
@@ -108,12 +97,6 @@ export class Viewer {
         layerMark(kind),
         label,
       ),
-    );
-  }
-
-  viewButtons() {
-    return VIEWS.map(([way, words]) =>
-      h("button", { type: "button", class: "chip", onclick: () => this.scene?.view(way) }, words),
     );
   }
 
@@ -256,7 +239,7 @@ export class Viewer {
     if (!this.meshes.has(key)) {
       const packed = await this.report.meshes.get(key);
       const mesh = packed && unpackMesh(packed);
-      this.meshes.set(key, mesh && { ...mesh, wire: wireOf(mesh) });
+      this.meshes.set(key, mesh && { ...mesh, wire: wireOf(mesh) }); // points and edges for lines
     }
     return this.meshes.get(key);
   }

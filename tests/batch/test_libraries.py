@@ -63,15 +63,6 @@ def test_a_build_that_was_interrupted_goes_on(root: Path, tmp_path: Path) -> Non
     assert (tmp_path / "resumed").read_bytes() == (tmp_path / "whole").read_bytes()
 
 
-@pytest.mark.slow
-def test_processes_leave_the_bytes_as_they_are(root: Path, tmp_path: Path) -> None:
-    for workers in ("0", "1"):
-        out = ["--out", str(tmp_path / f"lib{workers}"), "--workers", workers]
-        assert main(["library", "build", str(root), *out]) == 0
-    assert (tmp_path / "lib0").read_bytes() == (tmp_path / "lib1").read_bytes()
-    assert not (tmp_path / "lib0_build").exists()
-
-
 def test_models_that_cannot_be_read_are_rows(
     root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

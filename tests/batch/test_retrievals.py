@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,14 +11,12 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from support.forked import MAIN, Program
 
 import cadalign
 from cadalign import Camera, Library, Observation, Result, Results
 from cadalign.batch.libraries import RetrieveRunOptions
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, write_sample_dataset
-from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.render import look_at
 
 CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
@@ -141,32 +138,6 @@ def test_what_is_for_one_is_refused_for_many(
 ) -> None:
     assert main(["retrieve", *case.arguments, "--mask", "m.png"]) == 1
     assert "--mask: is for one observation" in capsys.readouterr().err
-
-
-@pytest.mark.long
-def test_killed_and_shared_among_workers_it_gives_the_same_bytes(
-    case: Case, tmp_path: Path
-) -> None:
-    queries = tmp_path / "q.jsonl"
-    queries.write_text(3 * case.queries.read_text())
-    arguments = ["retrieve", str(queries), *case.arguments[1:], "--no-picture"]
-    calm, hit, one = (RunFolder(tmp_path / name) for name in ("calm", "hit", "one"))
-    for folder, workers in ((calm, "0"), (one, "1")):
-        assert main([*arguments, "--out", str(folder.path), "--workers", workers]) == 0
-    again = [*arguments, "--out", str(hit.path), "--workers"]
-    process = Program(MAIN, *again, "0")
-    end = time.monotonic() + 120
-    while len(list(hit.parts.glob("???????.parquet"))) < 3 and time.monotonic() < end:
-        assert process.poll() is None, "it ended before it was killed"
-        time.sleep(0.005)
-    process.kill()
-    process.wait()
-    assert not hit.is_finished
-    assert main([*again, "0"]) == 0
-    for name in ("results.parquet", "records.parquet", "results.csv", "run.json"):
-        expected = (calm.path / name).read_bytes()
-        assert (hit.path / name).read_bytes() == expected, name
-        assert (one.path / name).read_bytes() == expected, name
 
 
 def test_another_library_is_another_run(

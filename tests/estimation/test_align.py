@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.scenes import CAMERA, around, keypoints
 
 from cadalign import Alignment, Camera, Model, RansacOptions, Size, View, align, align_batch, fit
 from cadalign.errors import CadalignError, DegenerateError, InputError, NoConsensusError
@@ -16,25 +17,11 @@ from cadalign.metrics import rotation_error
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import BoxMargins, FewKeypoints
 
-CAMERA = Camera(640, 480, 900, 900, 319.5, 239.5)
 LOOK = np.array([[0.8, 0.0, 0.6], [0.36, -0.8, -0.48], [0.48, 0.6, -0.64]])
-
-
-def keypoints(count: int = 10, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(-0.5, 0.5, (count, 3))
 
 
 def truth_of(scale: Any = (1.0, 1.3, 0.8)) -> Alignment:
     return Alignment(LOOK, [0.1, -0.05, 5.0], scale)
-
-
-def turned(angle_deg: float) -> np.ndarray:
-    """A camera that went around a point 5 before the rig's."""
-    c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
-    pose = np.eye(4)
-    pose[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
-    pose[:3, 3] = np.array([0, 0, 5]) - pose[:3, :3] @ [0, 0, 5]
-    return pose
 
 
 def seen(points: np.ndarray, truth: Alignment, motion: np.ndarray, **options: Any) -> View:
@@ -167,7 +154,7 @@ class TestSimilarModel:
                 seen(
                     shape[some],
                     truth_of((1.0, 1.0, 1.0)),
-                    turned(30.0 * number),
+                    around(30.0 * number),
                     noise=rng.normal(0, 1, (7, 2)),
                     ids=some.tolist(),
                 )
@@ -211,7 +198,7 @@ class TestSimilarModel:
 class TestSeveralViews:
     def test_known_motion_determines_all_three_scales(self) -> None:
         points, truth = keypoints(), truth_of((1.4, 0.7, 1.9))
-        poses = [np.eye(4), turned(25)]
+        poses = [np.eye(4), around(25)]
         views = [seen(points, truth, pose, cam_from_rig=pose) for pose in poses]
         result = align(Model(points_3d=points), views)
         assert np.allclose(result.alignment.scale, truth.scale, rtol=1e-5)
@@ -220,7 +207,7 @@ class TestSeveralViews:
     def test_a_view_with_two_keypoints_sharpens_the_estimate(self) -> None:
         points, truth = keypoints(), truth_of((1.0, 1.0, 1.0))
         first = seen(points, truth, np.eye(4), cam_from_rig=np.eye(4))
-        second = seen(points[:2], truth, turned(40), cam_from_rig=turned(40))
+        second = seen(points[:2], truth, around(40), cam_from_rig=around(40))
         two = align(Model(points_3d=points), [first, second])
         alone = align(Model(points_3d=points), View(CAMERA, first.points_2d))
         assert two.std.scale[1] < alone.std.scale[1]
@@ -230,7 +217,7 @@ class TestSeveralViews:
         points, truth = keypoints(), truth_of()
         rng = np.random.default_rng(4)
         views = [
-            seen(points, truth, turned(angle), noise=rng.normal(0, 1, (10, 2)))
+            seen(points, truth, around(angle), noise=rng.normal(0, 1, (10, 2)))
             for angle in (0, 30, 60)
         ]
         together = align(Model(points_3d=points), views)
@@ -238,7 +225,7 @@ class TestSeveralViews:
         assert together.std.scale[1] < 0.8 * alone.std.scale[1]
         assert len(together.poses) == 3
         motion = together.poses[1].rotation @ together.poses[0].rotation.T
-        assert np.abs(motion - turned(30)[:3, :3]).max() < 0.02
+        assert np.abs(motion - around(30)[:3, :3]).max() < 0.02
 
 
 class TestOtherEvidence:
@@ -293,7 +280,7 @@ class TestOutliers:
 
 def test_a_batch_is_its_single_results_and_keeps_errors() -> None:
     model = spreads(0.03)
-    views = [seen(keypoints(), truth_of((1, 1, 1)), turned(angle)) for angle in (0, 5, 10)]
+    views = [seen(keypoints(), truth_of((1, 1, 1)), around(angle)) for angle in (0, 5, 10)]
     too_few = View(CAMERA, [[100.0, 100.0]])
     batch = align_batch(model, [*views, too_few], workers=2)
     assert isinstance(batch[3], DegenerateError)
@@ -304,7 +291,7 @@ def test_a_batch_is_its_single_results_and_keeps_errors() -> None:
 
 def test_a_batch_takes_a_size_and_a_start_for_each_object() -> None:
     model = spreads(0.03)
-    views = [seen(keypoints(), truth_of((1, 1, 1)), turned(angle)) for angle in (0, 5)]
+    views = [seen(keypoints(), truth_of((1, 1, 1)), around(angle)) for angle in (0, 5)]
     size = Size(width=3.0)
     four, two = (
         View(CAMERA, CAMERA.project(truth_of((1, 1, 1)).apply(keypoints()[:count])))
@@ -366,7 +353,7 @@ def test_keypoint_that_contradicts_a_learned_shape_is_named() -> None:
 def test_a_result_survives_json() -> None:
     model, rng = spreads(0.05), np.random.default_rng(0)
     noise = rng.normal(0, 3, (10, 2))
-    views = [seen(keypoints(), truth_of((1, 1, 1)), turned(a), noise=noise) for a in (0, 20)]
+    views = [seen(keypoints(), truth_of((1, 1, 1)), around(a), noise=noise) for a in (0, 20)]
     result = align(model, views)
     text = json.dumps(result.to_dict(), allow_nan=False)
     again = Result.from_dict(json.loads(text))

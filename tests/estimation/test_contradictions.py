@@ -114,24 +114,6 @@ def test_consistent_evidence_is_not_accused() -> None:
     assert sum(any("contradict" in text for text in each) for each in found) <= 1
 
 
-def test_two_sources_of_the_size_accuse_each_other() -> None:
-    points, truth, rng = keypoints(9), truth_of(), np.random.default_rng(0)
-    depth = 1000 * in_camera(points, truth, np.eye(4))[:, 2]
-    width = np.ptp(points[:, 0]) * truth.scale[0]
-    view = seen(points, truth, np.eye(4), rng, depth=depth)
-    warnings = align(Model(points_3d=points), view, size=Size(width=width)).warnings
-    assert any("views[0].depth" in text and "size" in text for text in warnings)
-    assert any("millimetres" in text for text in warnings)
-
-
-def test_depths_alone_in_another_unit_are_told() -> None:
-    points, truth, rng = keypoints(9), truth_of(), np.random.default_rng(0)
-    depth = 1000 * in_camera(points, truth, np.eye(4))[:, 2]
-    view = seen(points, truth, np.eye(4), rng, depth=depth)
-    warnings = align(Model(points_3d=points), view).warnings
-    assert any("millimetres" in text for text in warnings)
-
-
 def test_hidden_keypoints_in_a_depth_image_are_not_a_contradiction() -> None:
     points, truth = keypoints(12), truth_of()
     width = np.ptp(points[:, 0]) * truth.scale[0]

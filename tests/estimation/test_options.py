@@ -17,6 +17,7 @@ from cadalign import Camera, fit, fit_batch
 from cadalign.errors import CadalignError
 from cadalign.estimation import options
 from cadalign.estimation.options import FitOptions, RansacOptions
+from cadalign.retrieval.options import RetrievalOptions
 
 NOT_OPTIONS = {"ransac", "scores", "workers", "symmetry"}
 
@@ -33,7 +34,7 @@ def test_keywords_of_the_functions_are_the_fields_of_the_options(
     assert keywords == {field.name: field.default for field in fields(FitOptions)}
 
 
-@pytest.mark.parametrize("kind", [FitOptions, RansacOptions])
+@pytest.mark.parametrize("kind", [FitOptions, RansacOptions, RetrievalOptions])
 def test_every_option_has_its_help_below_it(kind: type) -> None:
     lines = "".join(map(inspect.getsource, kind.__mro__[:-1])).splitlines()
     for field in fields(kind):

@@ -21,14 +21,15 @@ from cadalign import Alignment, Camera, Model, Result, ShapeModel, Size, View, a
 from cadalign.datasets import load_mesh
 from cadalign.datasets.detections.coco import decode_segmentation
 from cadalign.io.documents import read_json
+from cadalign.io.files import Seal
 from cadalign.io.images import read_grey, read_photo
 from cadalign.io.observation import read_camera
 from cadalign.shapes.outputs import SEAL
 
-_CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
-_POINTS = np.random.default_rng(3).uniform(-0.4, 0.4, (8, 3))
-_POSE = Alignment(np.eye(3), np.array([0.0, 0.0, 3.0]), [1.0, 1.2, 0.8])
-_PIXELS = _CAMERA.project(_POSE.apply(_POINTS))
+CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+POINTS = np.random.default_rng(3).uniform(-0.4, 0.4, (8, 3))
+POSE = Alignment(np.eye(3), np.array([0.0, 0.0, 3.0]), [1.0, 1.2, 0.8])
+_PIXELS = CAMERA.project(POSE.apply(POINTS))
 
 # Of each data set of photos the files that a mutation may stand in.
 _CHANGED = {
@@ -75,25 +76,29 @@ def _write_detections(folder: Path) -> Path:
 
 def _write_shape(folder: Path) -> Path:
     directions = np.random.default_rng(0).normal(size=(2, 8, 3))
-    ShapeModel.from_basis(_POINTS, directions, [0.1, 0.1]).save(folder / "a.shape")
+    ShapeModel.from_basis(POINTS, directions, [0.1, 0.1]).save(folder / "a.shape")
     return folder / "a.shape"
 
 
-def _seal_shape(data: bytes) -> bytes:
-    """A shape file whose header tells the length and the checksum of what it holds."""
-    payload = data[64:]
-    checksum = hashlib.blake2b(payload, digest_size=32).digest()
-    header = struct.pack("<16sIIQ32s", SEAL.magic, SEAL.version, 0, len(payload), checksum)
-    return header + payload
+def sealed(seal: Seal) -> Callable[[bytes], bytes]:
+    """Let a file's header tell the length and the checksum of what it holds."""
+
+    def with_header(data: bytes) -> bytes:
+        payload = data[64:]
+        checksum = hashlib.blake2b(payload, digest_size=32).digest()
+        head = (seal.magic, seal.version, 0, len(payload), checksum)
+        return struct.pack("<16sIIQ32s", *head) + payload
+
+    return with_header
 
 
 def _write_result(folder: Path) -> Path:
     """The result of two views of a model of known size."""
     views = [
-        View(_CAMERA, _PIXELS, sigma=1.0),
-        View(_CAMERA, _PIXELS + 0.5, sigma=1.0),
+        View(CAMERA, _PIXELS, sigma=1.0),
+        View(CAMERA, _PIXELS + 0.5, sigma=1.0),
     ]
-    result = align(Model(points_3d=_POINTS), views, size=Size(width=1.0, sigma=0.1))
+    result = align(Model(points_3d=POINTS), views, size=Size(width=1.0, sigma=0.1))
     return write_text(folder / "fit.json", result.to_json())
 
 
@@ -114,9 +119,9 @@ def _write_matrix(ending: str) -> Callable[[Path], Path]:
     def write(folder: Path) -> Path:
         path = folder / f"K.{ending}"
         if ending == "npy":
-            np.save(path, _CAMERA.matrix)
+            np.save(path, CAMERA.matrix)
             return path
-        by_rows = {"matrix": _CAMERA.matrix.tolist(), "width": 64, "height": 48}
+        by_rows = {"matrix": CAMERA.matrix.tolist(), "width": 64, "height": 48}
         return write_text(
             path, json.dumps(by_rows) if ending == "json" else "60 0 31\n0 60 23\n0 0 1\n"
         )
@@ -131,7 +136,7 @@ def _read_camera(path: Path) -> object:
 # --- pictures and scenes -----------------------------------------------------------------------
 
 
-def _write_picture(ending: str) -> Callable[[Path], Path]:
+def write_picture(ending: str) -> Callable[[Path], Path]:
     def write(folder: Path) -> Path:
         pixels = np.random.default_rng(1).integers(0, 255, (20, 30, 3), dtype=np.uint8)
         Image.fromarray(pixels).save(folder / f"photo.{ending}")
@@ -150,7 +155,7 @@ def _write_scene(folder: Path) -> Path:
     """A scene with a texture, a strip, sparse positions and copies of a mesh."""
     more = np.array([2], "<u2").tobytes() + b"\0\0" + np.array([[5, 6, 7]], "<f4").tobytes()
     more += np.array([[0, 0], [1, 0], [1, 1], [0, 1]], "<f4").tobytes()
-    _write_picture("png")(folder)
+    write_picture("png")(folder)
     attributes = {"POSITION": 0, "TEXCOORD_0": 2}
     primitive = {"attributes": attributes, "indices": 1, "material": 0, "mode": 5}
     return write_gltf(
@@ -183,7 +188,7 @@ FORMATS = (
     *(_photo_set(kind, changed) for kind, names in _CHANGED.items() for changed in names),
     Format("PASCAL3D+ detections", _write_detections, lambda path: read_whole(path.parents[1])),
     Format("shape", _write_shape, ShapeModel.open),
-    Format("forged shape", _write_shape, ShapeModel.open, _seal_shape),
+    Format("forged shape", _write_shape, ShapeModel.open, sealed(SEAL)),
     Format(
         "result of views",
         _write_result,
@@ -197,7 +202,7 @@ FORMATS = (
         for ending in ("txt", "npy", "json")
     ),
     *(
-        Format(f"image {ending}", _write_picture(ending), read_photo)
+        Format(f"image {ending}", write_picture(ending), read_photo)
         for ending in ("webp", "bmp", "tiff", "gif", "tga", "ppm")
     ),
     Format("depth image", _write_depth, read_grey),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import hashlib
 import json
 import pickle
 import struct
@@ -15,11 +14,12 @@ from typing import Any
 import numpy as np
 import trimesh
 from fuzz import dataset_formats
+from fuzz.dataset_formats import CAMERA, POINTS, POSE, sealed, write_picture
 from fuzz.format import Format
 from PIL import Image
 
 import cadalign
-from cadalign import Alignment, Camera, FocalPrior, Library, Result, fit
+from cadalign import FocalPrior, Library, Result, fit
 from cadalign.datasets import (
     BlindPnP,
     Colmap,
@@ -32,12 +32,9 @@ from cadalign.io.images import photo_size, read_photo
 from cadalign.io.observation import Observation
 from cadalign.report import headline_text
 from cadalign.retrieval import LibraryModel
+from cadalign.retrieval.models import SEAL
 
 # --- formats ------------------------------------------------------------------------------------
-
-_CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
-_POINTS = np.random.default_rng(3).uniform(-0.4, 0.4, (8, 3))
-_POSE = Alignment(np.eye(3), np.array([0.0, 0.0, 3.0]), [1.0, 1.2, 0.8])
 
 
 def _text(name: str, text: str) -> Callable[[Path], Path]:
@@ -152,12 +149,6 @@ def _write_run(changed: str) -> Callable[[Path], Path]:
     return write
 
 
-def _write_image(folder: Path) -> Path:
-    rng = np.random.default_rng(1)
-    Image.fromarray(rng.integers(0, 255, (20, 30, 3), dtype=np.uint8)).save(folder / "photo.png")
-    return folder / "photo.png"
-
-
 _OBSERVATION = {
     "camera": {"model": "PINHOLE", "width": 64, "height": 48, "params": [60, 60, 32, 24]},
     "keypoints": [
@@ -170,7 +161,7 @@ _OBSERVATION = {
             "score": 0.5,
         }
         for k, (xyz, uv) in enumerate(
-            zip(_POINTS.tolist(), _CAMERA.project(_POSE.apply(_POINTS)).tolist(), strict=True)
+            zip(POINTS.tolist(), CAMERA.project(POSE.apply(POINTS)).tolist(), strict=True)
         )
     ],
 }
@@ -219,7 +210,7 @@ _KEYPOINTNET = [
                 "pcd_info": {"point_index": k},
                 "mesh_info": {"face_index": k, "face_uv": [0.2, 0.3, 0.5]},
             }
-            for k, xyz in enumerate(_POINTS.tolist())
+            for k, xyz in enumerate(POINTS.tolist())
         ],
         "symmetries": {
             "reflection": [{"kp_indexes": [0, 1]}],
@@ -231,7 +222,7 @@ _MODEL_KEYPOINTS = {
     "format": "cadalign model keypoints",
     "version": 1,
     "keypoints": [
-        {"name": f"k{k}", "xyz": xyz, "semantic_id": k} for k, xyz in enumerate(_POINTS.tolist())
+        {"name": f"k{k}", "xyz": xyz, "semantic_id": k} for k, xyz in enumerate(POINTS.tolist())
     ],
 }
 _CAMERAS = "# cameras\n1 PINHOLE 64 48 60 60 32 24\n2 OPENCV 64 48 60 60 32 24 .1 0 0 0\n"
@@ -269,9 +260,9 @@ def _colmap_binary(changed: str) -> Callable[[Path], Path]:
 def _write_blind_pnp(folder: Path) -> Path:
     root = folder / "nyu_train"
     root.mkdir()
-    rays = _CAMERA.normalize(_CAMERA.project(_POSE.apply(_POINTS)))
+    rays = CAMERA.normalize(CAMERA.project(POSE.apply(POINTS)))
     values = {
-        "matches": [np.hstack([rays, _POINTS])],
+        "matches": [np.hstack([rays, POINTS])],
         "R": [np.eye(3)],
         "t": [np.array([0, 0, 3.0])],
     }
@@ -281,29 +272,20 @@ def _write_blind_pnp(folder: Path) -> Path:
 
 
 def _write_fit(folder: Path) -> Path:
-    result = fit(_POINTS, _CAMERA.project(_POSE.apply(_POINTS)), _CAMERA)
+    result = fit(POINTS, CAMERA.project(POSE.apply(POINTS)), CAMERA)
     return _text("fit.json", result.to_json())(folder)
 
 
 def _write_library(folder: Path) -> Path:
-    bounds = np.array([_POINTS.min(axis=0), _POINTS.max(axis=0)])
-    models = [LibraryModel("box", f"{k}", _POINTS, np.arange(8), bounds) for k in range(3)]
+    bounds = np.array([POINTS.min(axis=0), POINTS.max(axis=0)])
+    models = [LibraryModel("box", f"{k}", POINTS, np.arange(8), bounds) for k in range(3)]
     Library.from_models(models).save(folder / "boxes.cadalign")
     return folder / "boxes.cadalign"
 
 
-def _seal_library(data: bytes) -> bytes:
-    """A library whose header tells the length and the checksum of what it holds."""
-    payload = data[64:]
-    checksum = hashlib.blake2b(payload, digest_size=32).digest()
-    return struct.pack("<16sIIQ32s", b"cadalign library", 1, 0, len(payload), checksum) + payload
-
-
 def _read_library(path: Path) -> object:
     library = Library.open(path)
-    return list(library), library.retrieve(
-        _CAMERA.project(_POSE.apply(_POINTS)), np.arange(8), _CAMERA
-    )
+    return list(library), library.retrieve(CAMERA.project(POSE.apply(POINTS)), np.arange(8), CAMERA)
 
 
 def _read_annotations(path: Path) -> object:
@@ -342,8 +324,8 @@ FORMATS = {
         Format("glb", _export("box.glb"), load_mesh),
         Format("gltf", _write_gltf, load_mesh),
         Format("off", _export("box.off"), load_mesh),
-        Format("image", _write_image, read_photo),
-        Format("sealed image", _write_image, read_photo, _seal_png),
+        Format("image", write_picture("png"), read_photo),
+        Format("sealed image", write_picture("png"), read_photo, _seal_png),
         Format("photo", _write_photo, _read_photo),
         Format("observation", _json("o.json", _OBSERVATION), Observation.load),
         Format("evidence", _json("e.json", _EVIDENCE), Observation.load),
@@ -352,23 +334,14 @@ FORMATS = {
         Format("keypointnet", _write_annotations, _read_annotations),
         Format("model keypoints", _json("m.keypoints.json", _MODEL_KEYPOINTS), ModelKeypoints.load),
         *(
-            Format(
-                f"colmap {name} text", _colmap_text(name), lambda path: _drain(Colmap(path.parent))
-            )
-            for name in ("cameras", "images", "points3D")
-        ),
-        *(
-            Format(
-                f"colmap {name} binary",
-                _colmap_binary(name),
-                lambda path: _drain(Colmap(path.parent)),
-            )
+            Format(f"colmap {name} {kind}", write(name), _read_colmap)
+            for kind, write in (("text", _colmap_text), ("binary", _colmap_binary))
             for name in ("cameras", "images", "points3D")
         ),
         Format("blind pnp", _write_blind_pnp, lambda path: _drain(BlindPnP(path.parent))),
         Format("fit", _write_fit, _read_fit),
         Format("library", _write_library, _read_library),
-        Format("forged library", _write_library, _read_library, _seal_library),
+        Format("forged library", _write_library, _read_library, sealed(SEAL)),
         *(
             Format(f"run {name}", _write_run(f"{name}"), lambda path: _read_run(path.parent))
             for name in ("run.json", "results.parquet", "timings.parquet")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
+import re
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -588,6 +590,7 @@ def test_keypoints_that_no_model_can_be_aligned_with_are_refused() -> None:
         ({"ids": IDS + 0.5}, "ids: float64 of shape"),
         ({"camera": "none"}, "camera: expected a cadalign.Camera, got str"),
         ({"top": 0}, "top: must be a whole number >= 1, not 0"),
+        ({"tops": 3}, "unknown option.*'tops'"),
         ({"method": "aepnp"}, "method: unknown method 'aepnp'; known are optimal, epnp"),
         ({"method": "epnp", "loss": "huber"}, "'epnp' supports neither loss nor stretch"),
         ({"method": "epnp", "stretch": "y"}, "'epnp' supports neither loss nor stretch"),
@@ -611,6 +614,11 @@ def test_invalid_arguments_are_refused(change: dict[str, Any], message: str) -> 
     arguments: dict[str, Any] = {"points_2d": PIXELS, "ids": IDS, "camera": CAMERA}
     with pytest.raises(InputError, match=message):
         LIBRARY.retrieve(**{**arguments, **change})
+
+
+def test_retrieve_names_every_option() -> None:
+    text = inspect.getdoc(Library.retrieve) or ""
+    assert all(re.search(rf"\b{field.name}\b", text) for field in fields(RetrievalOptions))
 
 
 # --- shapes ----------------------------------------------------------------------------------

@@ -301,17 +301,6 @@ class TestCommand:
         )
         assert line == "--shape: two files of the category 'table'"
 
-    def test_an_unknown_category_is_named(
-        self, folder: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        replace(SHAPE, category="mug").save(folder / "mug.shape")
-        line = refusal_line(
-            capsys,
-            *("retrieve", folder / "seen.json", "--library", folder / "tables.cadalign"),
-            *("--shape", folder / "mug.shape"),
-        )
-        assert line == "--shape: unknown category 'mug'; known are table"
-
 
 # --- without a focal length --------------------------------------------------------------------
 

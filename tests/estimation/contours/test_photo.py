@@ -221,10 +221,6 @@ class TestRefusals:
         with pytest.raises(InputError, match="the photo is 20 x 10, the camera 400 x 300"):
             View(CAMERA, image=np.zeros((10, 20, 3), np.uint8))
 
-    def test_of_floats(self) -> None:
-        with pytest.raises(InputError, match="expected an RGB image"):
-            View(CAMERA, image=np.zeros((300, 400)))
-
     def test_of_a_file_that_is_not_there(self, tmp_path: Path) -> None:
         with pytest.raises(DataError):
             View(CAMERA, image=tmp_path / "none.png")

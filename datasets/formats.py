@@ -7,19 +7,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from cadalign.datasets.photos import pascal3d, pix3d, scan2cad
 from cadalign.datasets.photos.dataset import PhotoDataset
+from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
+from cadalign.datasets.photos.pix3d import Pix3D
+from cadalign.datasets.photos.scan2cad import Scan2CAD
 from cadalign.datasets.sfm import blind_pnp, colmap
 from cadalign.datasets.sfm.correspondences import CorrespondenceSet
 from cadalign.errors import DataError, InputError
 from cadalign.io.files import as_path
 
-PHOTO_FORMATS = (
-    scan2cad.FORMAT,
-    pix3d.FORMAT,
-    pascal3d.FORMAT,
-    pascal3d.DETECTIONS,
-)
+PHOTO_FORMATS = (Scan2CAD, Pix3D, Pascal3D, Pascal3DDetections)
 """The known formats, in the order in which they are looked for."""
 
 
@@ -53,7 +50,7 @@ def open_photos(path: str | os.PathLike[str]) -> PhotoDataset:
         raise DataError("no such folder", where=repr(str(path)), fix="give a data set's folder")
     for each in PHOTO_FORMATS:
         if each.is_here(folder):
-            return each.open(folder)
+            return each(folder)
     what = "no data set of photos is recognised in this folder"
     fix = f"known are: {'; '.join(each.signature for each in PHOTO_FORMATS)}"
     raise DataError(what, where=str(folder), fix=fix)

@@ -86,6 +86,10 @@ class PhotoDataset(ABC):
 
     kind: str = "photos"
     """Name of the format."""
+    signature: str = ""
+    """What it is recognised by, for messages."""
+    marks: tuple[str, ...] = ()
+    """Patterns of files or folders of which a folder of this format has one."""
     patterns: tuple[str, ...] = ("*.json",)
     """Patterns of the annotations' files, below the folder."""
 
@@ -99,6 +103,11 @@ class PhotoDataset(ABC):
         """Why records or objects could not be read, of those read so far, by name."""
         if self.problems and not self.names:
             raise next(iter(self.problems.values()))
+
+    @classmethod
+    def is_here(cls, folder: Path) -> bool:
+        """True for a folder that holds this format."""
+        return any(next(folder.glob(pattern), None) is not None for pattern in cls.marks)
 
     @abstractmethod
     def read(self, index: int) -> Photo:
@@ -188,23 +197,6 @@ class PhotoDataset(ABC):
             more = " (further problems are counted only)" if len(self.problems) == _LOGGED else ""
             logger.warning("%s: left out: %s%s", self.kind, error, more)
         self.problems[name] = error
-
-
-@dataclass(frozen=True)
-class PhotoFormat:
-    """A format of data sets of photos: how it is recognised and read."""
-
-    signature: str
-    """What it is recognised by, for messages."""
-    is_here: Callable[[Path], bool]
-    """Whether a folder holds it."""
-    open: Callable[[Path], PhotoDataset]
-    """Makes the data set of the folder."""
-
-
-def has(*patterns: str) -> Callable[[Path], bool]:
-    """The test whether a folder has a file of one of these patterns."""
-    return lambda folder: any(next(folder.glob(pattern), None) is not None for pattern in patterns)
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, has, read_each
+from cadalign.datasets.photos.dataset import PhotoDataset, read_each
 from cadalign.datasets.photos.mat_files import MatStruct, read_structs
 from cadalign.datasets.photos.photo import (
     CadModel,
@@ -78,6 +78,8 @@ class Pascal3D(PhotoDataset):
     """
 
     kind = "PASCAL3D+"
+    signature = f"PASCAL3D+ or ObjectNet3D: {ANNOTATIONS} with .mat files"
+    marks = (f"{ANNOTATIONS}/*.mat", f"{ANNOTATIONS}/*/*.mat")
     patterns = (f"{ANNOTATIONS}/*.mat", f"{ANNOTATIONS}/*/*.mat", _CAD)
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
@@ -278,6 +280,8 @@ class Pascal3DDetections(PhotoDataset):
     """
 
     kind = "PASCAL3D+ photos with detected keypoints"
+    signature = f"PASCAL3D+ photos with detected keypoints: {DETECTED}/*.mat"
+    marks = (f"{DETECTED}/*.mat",)
     patterns = (f"{DETECTED}/*.mat", f"{_OBSERVATIONS}/*.json", _CAD)
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
@@ -331,15 +335,3 @@ class Pascal3DDetections(PhotoDataset):
             visible=np.ones(len(found), dtype=bool),
             scores=np.array(scores) if scores else None,
         )
-
-
-FORMAT = PhotoFormat(
-    f"PASCAL3D+ or ObjectNet3D: {ANNOTATIONS} with .mat files",
-    has(f"{ANNOTATIONS}/*.mat", f"{ANNOTATIONS}/*/*.mat"),
-    Pascal3D,
-)
-DETECTIONS = PhotoFormat(
-    f"PASCAL3D+ photos with detected keypoints: {DETECTED}/*.mat",
-    has(f"{DETECTED}/*.mat"),
-    Pascal3DDetections,
-)

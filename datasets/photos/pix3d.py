@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 from msgspec import field
 
-from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, has, parse, read_list
+from cadalign.datasets.photos.dataset import PhotoDataset, parse, read_list
 from cadalign.datasets.photos.photo import (
     CadModel,
     NamedPoints,
@@ -78,6 +78,8 @@ class Pix3D(PhotoDataset):
     """
 
     kind = "Pix3D"
+    signature = f"Pix3D: {ANNOTATIONS}"
+    marks = (ANNOTATIONS,)
     patterns = (ANNOTATIONS, "model/**/*.txt")
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
@@ -153,6 +155,3 @@ def _keypoints(entry: _Entry) -> PhotoKeypoints | None:
     mean = marked.sum(axis=0) / is_marked[:, rows].sum(axis=0)[:, None] - PIXEL_CENTRE
     names = tuple(str(row) for row in rows)
     return PhotoKeypoints(mean, names, np.ones(len(rows), dtype=bool))
-
-
-FORMAT = PhotoFormat(f"Pix3D: {ANNOTATIONS}", has(ANNOTATIONS), Pix3D)

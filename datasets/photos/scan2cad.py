@@ -17,8 +17,6 @@ from cadalign.arrays import FloatArray, is_whole
 from cadalign.datasets.models.shapenet import MESH_FILES, name_of_synset
 from cadalign.datasets.photos.dataset import (
     PhotoDataset,
-    PhotoFormat,
-    has,
     leaving_out,
     parse,
     read_each,
@@ -126,6 +124,8 @@ class Scan2CAD(PhotoDataset):
     """
 
     kind = "Scan2CAD"
+    signature = f"Scan2CAD: {FULL} or annot.json"
+    marks = (FULL, *_SAMPLES)
     patterns = (
         *("*.json", "samples/*.json"),
         *(f"{folder}/*/pose/*.txt" for folder in _FRAME_FOLDERS),
@@ -274,6 +274,3 @@ def _annotation_file(path: Path) -> tuple[Path, Path]:
         return path, found
     what = f"neither {FULL} nor {' nor '.join(_SAMPLES)} is here"
     raise DataError(what, where=str(path), fix="give the folder of Scan2CAD's annotations")
-
-
-FORMAT = PhotoFormat(f"Scan2CAD: {FULL} or annot.json", has(FULL, *_SAMPLES), Scan2CAD)

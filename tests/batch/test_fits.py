@@ -363,34 +363,6 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
         Results.open(tmp_path)
 
 
-def test_a_full_disk_is_one_clear_line_and_keeps_what_was_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    source = lines(tmp_path / "o.jsonl", 20)
-    import cadalign.evaluation.runs.run as engine
-
-    write, written = engine.write_rows, []
-
-    def write_until_full(path: Path, *rest: Any) -> None:
-        if len(written) > 30:
-            from cadalign.io.files import writing
-
-            with writing(path):
-                raise OSError(28, "No space left on device")
-        written.append(path)
-        write(path, *rest)
-
-    monkeypatch.setattr(engine, "write_rows", write_until_full)
-    with pytest.raises(DataError, match=r"No space left on device.*make room"):
-        cadalign.fit_many(source, out=tmp_path / "run", workers=0, method="aepnp")
-    monkeypatch.undo()
-    seen: list[Progress] = []
-    cadalign.fit_many(
-        source, out=tmp_path / "run", workers=0, method="aepnp", on_progress=seen.append
-    )
-    assert seen[0].done == 10
-
-
 def test_the_configuration_says_what_is_not_at_its_default() -> None:
     assert FitRunOptions(inputs=(Path("a"),)).as_config() == {
         "seed": 0,

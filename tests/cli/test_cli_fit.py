@@ -333,19 +333,6 @@ def test_photo_sizes_that_cannot_be_drawn(
     )
 
 
-def test_pipes_in_the_place_of_photo_and_model(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    os.mkfifo(tmp_path / "photo.png")
-    os.mkfifo(tmp_path / "model.obj")
-    path = write_observation(tmp_path / "chair.json", image=tmp_path / "photo.png")
-    assert refusal_line(capsys, "fit", path) == (
-        f"{tmp_path / 'photo.png'}: not a regular file; give a file, no pipe and no device"
-    )
-    path = write_observation(tmp_path / "chair.json", model=tmp_path / "model.obj")
-    assert refusal_line(capsys, "fit", path).startswith(f"{tmp_path / 'model.obj'}: ")
-
-
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
@@ -370,13 +357,6 @@ def test_paths_with_a_nul_in_the_file(
     path = write_observation(tmp_path / "chair.json")
     edit(path, lambda data: data.update({field: "a\0b.png"}))
     assert refusal_line(capsys, "fit", path) == f"{path}: {field}: 'a\\x00b.png' is not a path"
-
-
-def test_long_values_are_quoted_in_part(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for field, value in (("keypoints", "x" * 10**6), ("camera", {"model": "M" * 10**6})):
-        path = write_observation(tmp_path / "chair.json")
-        edit(path, lambda data, field=field, value=value: data.update({field: value}))  # type: ignore[misc]
-        assert len(refusal_line(capsys, "fit", path)) < 600 + len(str(path))
 
 
 def test_output_folder_that_cannot_be_made(

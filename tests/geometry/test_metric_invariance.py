@@ -7,11 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cadalign import Alignment, Box, Symmetry
+from cadalign import Alignment, Symmetry
 from cadalign.geometry.metrics import (
-    alignment_box_iou,
-    box_iou,
-    box_iou_up_to_scale,
     rotation_error,
     scale_error,
     translation_error,
@@ -72,38 +69,3 @@ def test_errors_are_those_of_equal_alignments_of_a_discrete_symmetry(
     other = turned(gt, 2 * np.pi * step / fold)
     np.testing.assert_allclose(errors(est, other, symmetry), expected, atol=1e-4)
     assert expected[0] <= rotation_error(est=est, gt=gt) + 1e-4
-
-
-@settings(deadline=None, max_examples=60)
-@given(alignments(), alignments(), rotations, vectors)
-def test_errors_and_overlaps_are_those_in_any_frame(
-    est: Alignment, gt: Alignment, rotation: np.ndarray, shift: np.ndarray
-) -> None:
-    def moved(alignment: Alignment) -> Alignment:
-        place = rotation @ alignment.translation + shift
-        return Alignment(rotation @ alignment.rotation, place, alignment.scale)
-
-    frames = {"est": moved(est), "gt": moved(gt)}
-    np.testing.assert_allclose(
-        errors(frames["est"], frames["gt"], None), errors(est, gt, None), atol=1e-4
-    )
-    overlap = alignment_box_iou(**frames, bounds=BOUNDS)
-    assert overlap == pytest.approx(alignment_box_iou(est=est, gt=gt, bounds=BOUNDS), abs=1e-6)
-
-
-@settings(deadline=None, max_examples=40)
-@given(alignments(), alignments(), st.floats(0.2, 5), rotations)
-def test_overlap_up_to_scale_is_symmetric_and_without_scale_or_frame(
-    est: Alignment, gt: Alignment, factor: float, rotation: np.ndarray
-) -> None:
-    first, second = Box.from_model(BOUNDS, est), Box.from_model(BOUNDS, gt)
-    expected = box_iou_up_to_scale(est=first, gt=second)
-
-    def seen(box: Box, scale: float) -> Box:
-        place = scale * (rotation @ np.asarray(box.center))
-        return Box(place, rotation @ box.rotation, scale * np.asarray(box.extents))
-
-    found = box_iou_up_to_scale(est=seen(first, factor), gt=seen(second, 1.0))
-    assert found == pytest.approx(expected, abs=1e-5)
-    assert box_iou_up_to_scale(est=second, gt=first) == pytest.approx(expected, abs=1e-5)
-    assert expected >= box_iou(est=first, gt=second) - 1e-6

@@ -202,11 +202,6 @@ def test_box_iou_of_a_square_prism_turned_about_its_axis(angle: float, length: f
     assert box_iou(est=est, gt=gt) == pytest.approx(octagon_iou(angle), abs=1e-10)
 
 
-def test_box_iou_at_45_degrees_is_that_of_the_regular_octagon() -> None:
-    area = 2 * (np.sqrt(2) - 1)
-    assert octagon_iou(45) == pytest.approx(area / (2 - area), abs=1e-15)
-
-
 def overlapping_boxes(seed: int) -> tuple[Box, Box]:
     rng = np.random.default_rng(seed)
     first = Box(rng.uniform(-1, 1, 3), random_rotation(rng), rng.uniform(0.3, 2, 3))
@@ -239,18 +234,6 @@ def test_box_iou_agrees_with_the_intersection_of_half_spaces(seed: int) -> None:
     intersection = volume_by_duality(est, gt)
     expected = intersection / (est.volume + gt.volume - intersection)
     assert box_iou(est=est, gt=gt) == pytest.approx(expected, abs=1e-9)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("seed", range(3))
-def test_box_iou_agrees_with_counting_random_points(seed: int) -> None:
-    est, gt = overlapping_boxes(seed)
-    rng = np.random.default_rng(seed)
-    points = est.center + (rng.uniform(-0.5, 0.5, (400_000, 3)) * est.extents) @ est.rotation.T
-    inside = (np.abs((points - gt.center) @ gt.rotation) <= gt.extents / 2).all(axis=1).mean()
-    intersection = inside * est.volume
-    expected = intersection / (est.volume + gt.volume - intersection)
-    assert box_iou(est=est, gt=gt) == pytest.approx(expected, abs=0.005)
 
 
 @pytest.mark.slow

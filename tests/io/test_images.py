@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
 from collections.abc import Callable
@@ -132,19 +131,6 @@ def test_missing_photo_and_folder_are_refused(
     assert str(caught.value) == f"{tmp_path / 'nothing.jpg'}: no such file"
     with pytest.raises(DataError, match=r"cannot be read \(Is a directory\)"):
         read(tmp_path)
-
-
-@pytest.mark.long
-@pytest.mark.filterwarnings("error")
-def test_damaged_exif_data_are_passed_over(tmp_path: Path) -> None:
-    path = write_photo(tmp_path / "photo.jpg", equivalent=26, focal=4.0, density=3000.0)
-    data = path.read_bytes()
-    start = data.index(b"Exif")
-    for place in range(start + 6, start + 120):
-        path.write_bytes(data[:place] + b"\xff" + data[place + 1 :])
-        for read in (read_photo, photo_size, FocalPrior.from_exif):
-            with contextlib.suppress(DataError):
-                read(path)
 
 
 @pytest.mark.long

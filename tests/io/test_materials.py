@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from pathlib import Path
 
@@ -65,14 +64,13 @@ def write_painted_ply(path: Path) -> Path:
     return path
 
 
-def write_crate_obj(folder: Path, *, missing: bool = False) -> Path:
+def write_crate_obj(folder: Path) -> Path:
     """A crate with stripes on its front, checks on its right side, and one plain green lid."""
     stripes = np.full((32, 32, 3), (240, 220, 60), np.uint8)
     stripes[:, ::8] = stripes[:, 1::8] = stripes[:, 2::8] = (150, 30, 30)
     checks = np.kron(np.indices((4, 4)).sum(axis=0) % 2, np.ones((8, 8)))
     checks = np.where(checks[:, :, None] > 0, (255, 255, 255), (20, 20, 120)).astype(np.uint8)
-    if not missing:
-        Image.fromarray(stripes).save(folder / "stripes.png")
+    Image.fromarray(stripes).save(folder / "stripes.png")
     Image.fromarray(checks).save(folder / "checks.png")
     (folder / "crate.mtl").write_text(
         "newmtl striped\nKd 1 1 1\nmap_Kd stripes.png\n"
@@ -190,16 +188,6 @@ def test_what_is_behind_glass_is_seen_through_it(renderer, tmp_path):
     assert ball[0] > ball[2] + 20
     corner = _color_at(frame, pose, (0.8, -0.7, 0.8))
     assert corner[2] >= corner[0]
-
-
-def test_a_missing_texture_is_warned_of_by_name_and_drawn_plain(tmp_path, caplog):
-    path = write_crate_obj(tmp_path, missing=True)
-    with caplog.at_level(logging.WARNING, logger="cadalign"):
-        _, pose, frame = _drawn(make_renderer("raycast"), path)
-    assert "stripes.png" in caplog.text
-    plain = _color_at(frame, pose, (-0.3, 0, 1))
-    assert np.ptp(plain) < 12
-    assert plain.min() > 60
 
 
 @pytest.mark.long

@@ -13,8 +13,7 @@ from typing import Any
 import pytest
 from support.forked import Program
 
-from cadalign.compile import files
-from cadalign.compile.decorators import kernels_needed
+from cadalign.compile import files, kernels_needed
 
 pytestmark = pytest.mark.slow
 

@@ -33,7 +33,7 @@ from numba.core.runtime.nrt import rtsys
 
 _PACKAGE = Path(__file__).parents[1]
 # What compiles, and what the files of code are like.
-_COMPILERS = tuple(Path(__file__).parent / name for name in ("decorators.py", "files.py"))
+_COMPILERS = tuple(Path(__file__).parent / name for name in ("__init__.py", "files.py"))
 
 # Imports at the left margin: what stands further right is for type checking or imported when
 # called, and no kernel can use it. Parsing properly would take longer than reading the code.

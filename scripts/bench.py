@@ -25,7 +25,7 @@ from benchmarks.accuracy import solvers, unknown_focal, wide_lenses
 from benchmarks.annotator import annotator
 from benchmarks.cameras import photo_lenses
 from benchmarks.cars import real_cars, real_detections
-from benchmarks.clicks import clicks, outline_methods
+from benchmarks.clicks import clicks
 from benchmarks.coverage import coverage
 from benchmarks.evidence import evidence
 from benchmarks.gradients import gradient_errors, torch_layer
@@ -71,7 +71,6 @@ ON_REQUEST: dict[str, Callable[..., Tables]] = {
     "photo": photos,
     "photo_times": photo_times,
     "clicks": clicks,
-    "outlines": outline_methods,
     "kitti": real_cars,
     "detections": real_detections,
     "unseen_retrieval": unseen_retrieval,

@@ -1,17 +1,16 @@
-"""Clicks needed on real photos, and other ways from rough clicks to an outline."""
+"""Clicks needed on real photos."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable
-from functools import partial
 
 import cv2
 import numpy as np
 
 from benchmarks import section
 from benchmarks.photo import PhotoClicks, drawn_clicks, real_cases
-from benchmarks.section import BenchmarkData, Row, Tables
+from benchmarks.section import BenchmarkData, Tables
 from cadalign import Alignment, Model, View, align
 from cadalign.metrics import rotation_error
 from cadalign.render import Scene, cast_geometry
@@ -19,9 +18,6 @@ from cadalign.retrieval.match import grab_cut
 
 _FEWEST = 3
 _MARGIN = 0.05  # of a box that is dragged around an object, relative to its larger side
-_BAND = 0.1  # about an estimated outline, relative to the larger side of its box
-_RAPID_STEPS = 20
-_RAPID_LINES, _RAPID_REACH = 100, 20  # search lines, and their length to either side [px]
 
 Estimator = Callable[[PhotoClicks], Alignment | None]
 
@@ -77,57 +73,12 @@ def _needed(clicks: PhotoClicks, method: Estimator, least: int, most: int, withi
     return enough
 
 
-def outline_methods(given: BenchmarkData, *, draws: int = 5) -> Tables:
-    """Six rough clicks refined by the photo, by GrabCut's mask, and by OpenCV's edge trackers.
-
-    GrabCut starts from a band about the outline that the clicks predict; its mask is evidence
-    beside the clicks. The trackers (`cv2.rapid`, of OpenCV's contributed modules, left out where
-    they are not installed) start from the clicks' estimate. Rigid models, photos of HANDAL and
-    LINEMOD.
-
-    Parameters
-    ----------
-    draws : int
-        Draws of the clicks on every photo.
-    """
-    methods: dict[str, Callable[[PhotoClicks], Alignment]] = {
-        "clicks": _by_clicks,
-        "the photo": _by_photo,
-        "GrabCut's mask": _by_grabcut,
-    }
-    if hasattr(cv2, "rapid"):
-        for name in ("Rapid", "OLS", "GOS"):
-            methods[name] = partial(_by_tracker, name)
-    found: dict[str, list[Row]] = defaultdict(list)
-    cases = ((case, draws) for case in real_cases(given, "bop_samples"))
-    for clicks in drawn_clicks(cases, given.seed, 3, stretched=False):
-        first = rotation_error(est=_by_clicks(clicks), gt=clicks.truth)
-        for name, method in methods.items():
-            wall, _, est = section.clocked(partial(method, clicks))
-            error = rotation_error(est=est, gt=clicks.truth)
-            row = {"R": error, "better": error < first, "seconds": wall}
-            found[f"{clicks.case.group}, {name}"].append(row)
-    rows = [{"photos": name, **section.summary(each)} for name, each in found.items()]
-    yield "rough clicks refined, rigid models: medians", rows
-
-
 def _by_clicks(clicks: PhotoClicks) -> Alignment:
     return clicks.aligned().alignment
 
 
 def _by_photo(clicks: PhotoClicks) -> Alignment:
     return clicks.aligned(image=clicks.case.pixels).alignment
-
-
-def _by_grabcut(clicks: PhotoClicks) -> Alignment:
-    pixels = _outline(clicks, _by_clicks(clicks)).astype(np.uint8)
-    width = max(int(_BAND * np.ptp(_box_of(pixels), axis=0).max()), 3)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * width + 1, 2 * width + 1))
-    labels = np.where(pixels > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    labels[cv2.dilate(pixels, disc) == 0] = cv2.GC_BGD
-    labels[cv2.erode(pixels, disc) > 0] = cv2.GC_FGD
-    mask = grab_cut(clicks.case.pixels, labels)
-    return clicks.aligned(mask=mask).alignment if mask.any() else _by_clicks(clicks)
 
 
 def _by_box(clicks: PhotoClicks) -> Alignment | None:
@@ -154,27 +105,3 @@ def _box_of(mask: np.ndarray) -> np.ndarray:
     """Left and top, right and bottom (2, 2)."""
     rows, columns = np.nonzero(mask)
     return np.array([[columns.min(), rows.min()], [columns.max(), rows.max()]])
-
-
-def _by_tracker(name: str, clicks: PhotoClicks) -> Alignment:
-    """By an edge tracker of OpenCV from the clicks' estimate, which is kept where it gets lost."""
-    mesh, camera, start = clicks.case.mesh, clicks.case.camera, _by_clicks(clicks)
-    image = np.ascontiguousarray(clicks.case.pixels[:, :, ::-1])
-    points, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32)
-    turn, shift = cv2.Rodrigues(start.rotation)[0], start.translation.reshape(3, 1).copy()
-    lines = image, _RAPID_LINES, _RAPID_REACH
-    try:
-        if name == "Rapid":
-            for _ in range(_RAPID_STEPS):
-                _, turn, shift, _ = cv2.rapid.rapid(
-                    *lines, points, faces, camera.matrix, turn, shift
-                )
-        else:
-            tracker = getattr(cv2.rapid, f"{name}Tracker").create(points, faces)
-            ends = (cv2.TERM_CRITERIA_MAX_ITER + cv2.TERM_CRITERIA_EPS, _RAPID_STEPS, 1.5)
-            _, turn, shift = tracker.compute(*lines, camera.matrix, turn, shift, termcrit=ends)
-    except cv2.error:
-        return start
-    if not (np.isfinite(turn).all() and np.isfinite(shift).all()):
-        return start
-    return Alignment(cv2.Rodrigues(turn)[0], shift.ravel(), np.ones(3))

@@ -21,7 +21,7 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel
 from cadalign.estimation.contours.photo_lines import bins_of, regions_of
 from cadalign.evaluation.metrics.cramer_rao import probability_level
-from cadalign.geometry.rotations import nearest_rotation, rotation_from_vector
+from cadalign.geometry.rotations import nearest_rotation
 from cadalign.io.images import read_photo
 from cadalign.io.meshes.files import load_mesh
 from cadalign.metrics import nearest_truth, rotation_error
@@ -29,9 +29,6 @@ from cadalign.render import RaycastRenderer, Scene, Studio, cast_geometry, sampl
 
 _CAMERA = Camera(640, 480, 800.0, 800.0, 319.5, 239.5)
 _LARGE = Camera(1632, 1224, 2040.0, 2040.0, 815.5, 611.5)
-_TURN_DEG, _SHIFT = 2.0, 0.01  # from frame to frame of a clip, relative to the distance
-_LOST_DEG = 10.0
-_SMOOTH_FRAMES, _RATE = 12, 30.0
 _CLICKS = 6
 _CLICK_SHARE = 4.0 / 640.0  # standard deviation of a click, relative to the photo's width
 _STRETCH_SIGMA = 0.3
@@ -74,19 +71,13 @@ def photos(given: BenchmarkData, *, composites: int = 200, draws: int = 10) -> T
         yield f"photos beside rough clicks, {title}: medians", table
 
 
-def photo_times(given: BenchmarkData, *, composites: int = 12, frames: int = 40) -> Tables:
-    """Time [s of a processor] that a photo takes beyond the keypoints, and by the photo alone.
-
-    Composites of 2 megapixels with six rough clicks; and a clip of 640 x 480 px in which an object
-    turns by 2 degrees and moves by 1 % of its distance from frame to frame, each frame aligned from
-    the pose of the last by its photo alone.
+def photo_times(given: BenchmarkData, *, composites: int = 12) -> Tables:
+    """Time [s of a processor] that a photo takes beyond six rough clicks.
 
     Parameters
     ----------
     composites : int
         Composites of 2 megapixels.
-    frames : int
-        Frames of each clip; there is one of each category.
     """
     rows: dict[str, list[Row]] = defaultdict(list)
     for number, case in enumerate(_composites(given, composites, _LARGE)):
@@ -103,8 +94,6 @@ def photo_times(given: BenchmarkData, *, composites: int = 12, frames: int = 40)
         late = float(np.percentile([row["processor"] for row in found], 90))
         table.append({"model": name, **section.summary(found), "processor, 90 %": late})
     yield "photos of 2 megapixels beside six clicks: medians", table
-    clips = list(_clips(given, frames)) if frames else []
-    yield "frame by frame, by photos of 640 x 480 px", [_frame_row(clip) for clip in clips]
 
 
 def _compared(clicks: PhotoClicks) -> Row:
@@ -318,65 +307,6 @@ def _blurred(drawn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     drawn = cv2.GaussianBlur(drawn, (0, 0), rng.uniform(0.4, 1.5))
     noisy = drawn + rng.normal(0, rng.uniform(2, 10), drawn.shape)
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
-
-
-@dataclass(frozen=True)
-class _Clip:
-    """A model that turns before a real photo: the truth and the picture of every frame."""
-
-    model: AnnotatedModel
-    mesh: Mesh
-    first: Alignment
-    truths: list[Alignment]
-    pictures: list[np.ndarray]
-
-    def error(self, number: int, est: Alignment) -> float:
-        """Rotation [deg] of a frame's pose, up to the model's symmetry."""
-        return rotation_error(est=est, gt=self.truths[number], symmetry=self.model.symmetry)
-
-
-def _clips(given: BenchmarkData, frames: int) -> Iterator[_Clip]:
-    """A clip of each category."""
-    scenes, behind = _scenery(given, _CAMERA)
-    by_category = {model.category: (model, scene) for model, scene in scenes}
-    for number, (model, scene) in enumerate(by_category.values()):
-        rng = np.random.default_rng([given.seed, 8, number])
-        how: dict[str, Any] = {"min_visible": 0, "fill": (0.4, 0.6), "roll": 15.0}
-        view = sample_view(scene, model.keypoints.xyz, _CAMERA, rng=rng, **how)
-        first, pixels = view.cam_from_model, behind[rng.integers(len(behind))]
-        axis = rng.normal(size=3)
-        turn = rotation_from_vector(np.radians(_TURN_DEG) * axis / np.linalg.norm(axis))
-        rotation, truths, pictures = first.rotation, [], []
-        for _ in range(frames):
-            shift = rng.normal(0, _SHIFT, 3) * np.linalg.norm(first.translation)
-            rotation = turn @ rotation
-            truths.append(Alignment(rotation, first.translation + shift * [1, 1, 0], np.ones(3)))
-            drawn = RaycastRenderer().render(scene, _CAMERA, truths[-1], samples=4)
-            pictures.append(_blurred(drawn.composite(pixels), rng))
-        yield _Clip(model, scene.mesh, first, truths, pictures)
-
-
-def _frame_row(clip: _Clip) -> Row:
-    """The time of a frame by its photo alone, from the pose of the last, and its errors."""
-    own, last = Model(mesh=clip.mesh, stretch="none"), clip.first
-    times, errors = [], []
-    for number, (truth, picture) in enumerate(zip(clip.truths, clip.pictures, strict=True)):
-        photo = View(_CAMERA, image=picture)
-        _, busy, result = section.clocked(partial(section.attempt, align, own, photo, init=last))
-        last = truth if result is None else result.alignment
-        times.append(1e3 * busy)
-        errors.append(clip.error(number, last))
-        if errors[-1] > _LOST_DEG:
-            last = truth
-    times, errors = times[1:], errors[1:]  # the first frame prepares the mesh
-    return {
-        "model": clip.model.category,
-        "frames": len(errors),
-        "ms": float(np.median(times)),
-        "ms, 90 %": float(np.percentile(times, 90)),
-        "R": float(np.median(errors)),
-        "lost": int((np.array(errors) > _LOST_DEG).sum()),
-    }
 
 
 def _hidden(

@@ -194,26 +194,11 @@ def test_wrong_words_are_refused(model, tmp_path, monkeypatch, arguments, error,
     assert not [path for path in tmp_path.iterdir() if path.suffix in (".png", ".mp4", ".jpeg")]
 
 
-def _write(tmp_path, text, name="bad.obj"):
-    path = tmp_path / name
-    path.write_text(text)
-    return path
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "is empty"),
-        ("v 0 0 0\n", "no faces"),
-        ("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "NaN or infinite|cannot read"),
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "names vertex 9"),
-    ],
-)
-def test_bad_meshes_are_refused_by_name(tmp_path, text, message):
-    path = _write(tmp_path, text)
-    with pytest.raises(DataError, match=message) as caught:
+def test_a_bad_mesh_is_refused_by_name(tmp_path):
+    path = tmp_path / "bad.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n")
+    with pytest.raises(DataError, match=r"bad\.obj: .*names vertex 9"):
         _run(path, "--out", tmp_path / "x.png")
-    assert "bad.obj" in str(caught.value)
 
 
 @pytest.mark.long

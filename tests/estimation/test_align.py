@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.scenes import CAMERA, around, keypoints
 
-from cadalign import Alignment, Camera, Model, RansacOptions, Size, View, align, align_batch, fit
+from cadalign import Alignment, Model, RansacOptions, Size, View, align, align_batch, fit
 from cadalign.errors import CadalignError, DegenerateError, InputError, NoConsensusError
 from cadalign.estimation.result import Result
 from cadalign.metrics import rotation_error
@@ -393,26 +393,8 @@ def test_a_damaged_result_is_refused_by_field() -> None:
         ),
         (lambda: View(CAMERA, [[1, 2], [3, 4]], ids=["a", "a"]), "ids: 'a' occurs twice"),
         (lambda: View(CAMERA, [[1, 2]], ids=["a", "b"]), "ids: 2 ids for 1 keypoints"),
-        (
-            lambda: View(CAMERA, [[1, 2]], cam_from_rig=2 * np.eye(4)),
-            "cam_from_rig: not a rigid motion",
-        ),
         (lambda: View(CAMERA, [[1, 2]], depth=[-1.0]), "depth: has values that are not positive"),
         (lambda: View(CAMERA, [[1, 2]], up=[0, 0, 0]), "up: a direction must not be zero"),
-        (
-            lambda: align(
-                Model(points_3d=np.eye(3)),
-                View(Camera.without_focal(640, 480), 9 * np.eye(3)[:, :2]),
-            ),
-            "camera: the focal length is unknown",
-        ),
-        (
-            lambda: align(
-                Model(points_3d=keypoints()),
-                [View(CAMERA, [[1, 2]], cam_from_rig=np.eye(4)), View(CAMERA, [[1, 2]])],
-            ),
-            "views[1].cam_from_rig: only some views have a known pose",
-        ),
         (lambda: Model(points_3d=keypoints(), shape_sigma=0.0), "shape_sigma: 0.0 is not positive"),
         (lambda: Model(points_3d=np.empty((0, 3))), "points_3d: a model needs keypoints"),
         (

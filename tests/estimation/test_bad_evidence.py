@@ -89,11 +89,6 @@ def changed(pose: np.ndarray, rows: slice | int, columns: slice | int, factor: f
             "cam_from_rig: NaN or infinite values in row 0; remove or repair these",
         ),
         (
-            lambda: align(PLAIN, View(CAMERA, mask=BODY)),
-            "views[0].mask: the model has no mesh, which a mask needs; "
-            "give it: Model(..., mesh=cadalign.load_mesh(path))",
-        ),
-        (
             lambda: align(MODEL, View(CAMERA, image=PHOTO)),
             "views[0].image: a photo without keypoints does not tell where its outline is to be "
             "sought; give `init`, at least 3 keypoints, or a mask",
@@ -126,11 +121,6 @@ def changed(pose: np.ndarray, rows: slice | int, columns: slice | int, factor: f
             ),
             "views[2]: tells nothing about the object; "
             "give keypoints, a mask or a direction, or leave the view away",
-        ),
-        (
-            lambda: align(PLAIN, [*rig(POINTS, truth_of(), [0]), View(CAMERA, PIXELS[:3])]),
-            "views[1].cam_from_rig: only some views have a known pose; "
-            "give it for all views, or for none",
         ),
         (
             lambda: View(CAMERA, PIXELS, depth_sigma="a"),

@@ -9,11 +9,10 @@ import pytest
 
 from cadalign import Camera, Model, ShapeModel, View, align
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
-from cadalign.errors import DegenerateError, InputError
 from cadalign.geometry.alignment import Box
 from cadalign.metrics import box_iou_up_to_scale
 from cadalign.render import Scene, Viewpoint, cast_geometry, sample_view
-from cadalign.shapes.examples import Example, examples_of
+from cadalign.shapes.examples import examples_of
 from cadalign.shapes.warp import linear_warp, warp_mesh
 
 pytestmark = pytest.mark.long
@@ -56,21 +55,6 @@ def test_a_learned_shape_is_better_with_a_mask(
     assert np.mean(joint) > np.mean(alone)
 
 
-def test_a_learned_shape_without_meshes_is_told_what_to_do() -> None:
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-0.5, 0.5, (8, 3))
-    examples = [
-        Example(f"model {k}", range(8), points * rng.uniform(0.8, 1.2, 3)) for k in range(20)
-    ]
-    shape = ShapeModel.learn(examples, category="thing", components=1)
-    pixels = CAMERA.project(points + [0, 0, 4])
-    mask = np.zeros((480, 640), dtype=bool)
-    mask[200:300, 250:400] = True
-    with pytest.raises(InputError, match="no training model has a mesh") as caught:
-        align(shape, View(CAMERA, pixels, ids=range(8), mask=mask))
-    assert "views[0].mask" in str(caught.value)
-
-
 def test_a_similar_model_follows_the_mask(sample_root: Path) -> None:
     model = KeypointNet(sample_root)["chair"][0]
     scene = Scene(model.load_mesh())
@@ -110,13 +94,6 @@ class TestLearnedWithoutAnnotatedMask:
         rng = np.random.default_rng(seed)
         shown = sample_view(scene, model.keypoints.xyz, CAMERA, rng=rng, min_visible=6, roll=10.0)
         return shown, cast_geometry(scene, CAMERA, shown.cam_from_model).mask
-
-    def test_a_mask_alone_is_too_little(
-        self, bottles: tuple[AnnotatedModel, ...], shape: ShapeModel
-    ) -> None:
-        _, mask = self.shown(bottles[1], 1)
-        with pytest.raises(DegenerateError, match="a mask without keypoints does not tell"):
-            align(shape, View(CAMERA, mask=mask))
 
     def test_a_photo_counts_beside_clicks(
         self, bottles: tuple[AnnotatedModel, ...], shape: ShapeModel

@@ -75,5 +75,5 @@ def _detected(
     for keypoint, (u, v), score in zip(wanted, found.points_2d.tolist(), scores, strict=True):
         inside = -0.5 <= u <= photo.width - 0.5 and -0.5 <= v <= photo.height - 0.5
         if keypoint is not None and inside and score != 0:
-            keypoints.append(Detected(keypoint, (u, v), score))
+            keypoints.append(Detected(keypoint, (u, v)))
     return tuple(keypoints)

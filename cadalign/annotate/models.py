@@ -272,11 +272,10 @@ class ObjectShape:
 
 @dataclass(frozen=True)
 class Detected:
-    """A keypoint of the model, where a detector puts it [px], and how sure."""
+    """A keypoint of the model, where a detector puts it [px]."""
 
     keypoint: int
     uv: tuple[float, float]
-    score: float | None = None
 
 
 @dataclass(eq=False)

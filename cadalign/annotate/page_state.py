@@ -40,7 +40,6 @@ def page_state(
                 "name": state.name,
                 "width": state.photo.width,
                 "height": state.photo.height,
-                "model": state.model.path.name,
                 "up_axis": state.stored.up_axis or "y",
                 "state": session.work_state(state),
             },
@@ -216,10 +215,8 @@ def _alignment(state: Annotation, live: LiveAlignment) -> dict[str, Any]:
         "also_used": ", ".join(live.also_used),
         "alignment": alignment.to_dict(),
         "eye": cad.to_display(alignment.inverse(np.zeros((1, 3)))[0]).tolist(),
-        "focal": camera.fx,
         "intrinsics": {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy},
         "camera_from_page": None if session.shape.is_estimated else matrix.ravel().tolist(),
-        "rms": result.rms,
         **drawing_of(live, session.shape, state.model.registry, state.document.keypoints),
     }
 

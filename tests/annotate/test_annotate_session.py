@@ -379,7 +379,7 @@ def test_without_a_camera_the_focal_length_is_estimated_and_the_file_says_so(
     true = case.instance.camera.fx
     result = session.live(session.photos[0])[0].result
     assert result is not None
-    assert abs(state["alignment"]["focal"] / true - 1) < 5 * result.std.focal
+    assert abs(state["alignment"]["intrinsics"]["fx"] / true - 1) < 5 * result.std.focal
     camera = Observation.load(case.observation).camera
     assert not camera.focal_known
     assert not page_state(case.open(camera=None), 0)["focal"]["known"]
@@ -393,12 +393,15 @@ def test_focal_length_can_be_said_to_be_known_and_not(case: Case) -> None:
     known = place_all(session, case)
     perform(session, 0, {"do": "focal", "known": False})
     estimated = page_state(session, 0)
-    assert estimated["alignment"]["focal"] != known["alignment"]["focal"]
+    assert estimated["alignment"]["intrinsics"]["fx"] != known["alignment"]["intrinsics"]["fx"]
     assert case.open().photos[0].document.focal.known is False  # the file says so
     perform(session, 0, {"do": "focal", "known": True})
-    assert page_state(session, 0)["alignment"]["focal"] == case.instance.camera.fx
+    assert page_state(session, 0)["alignment"]["intrinsics"]["fx"] == case.instance.camera.fx
     perform(session, 0, {"do": "undo"})
-    assert page_state(session, 0)["alignment"]["focal"] == estimated["alignment"]["focal"]
+    assert (
+        page_state(session, 0)["alignment"]["intrinsics"]["fx"]
+        == estimated["alignment"]["intrinsics"]["fx"]
+    )
 
 
 def test_camera_of_an_observation_is_used(case: Case) -> None:

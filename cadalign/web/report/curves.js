@@ -22,12 +22,8 @@ function groups(report, { pooled = false } = {}) {
 function endOf(report, metric) {
   if (metric.limit) return metric.limit;
   const values = report.rows.values.get(metric.key).filter((value) => value !== null);
-  return (
-    quantile(
-      values.sort((a, b) => a - b),
-      0.98,
-    ) || 1
-  );
+  values.sort((a, b) => a - b);
+  return quantile(values, 0.98) || 1;
 }
 
 function cumulativePlot(report) {
@@ -61,7 +57,8 @@ function cumulativePlot(report) {
   };
 }
 
-function againstPlot(report, { id, words, label, value, pooled }) {
+function againstPlot(report, { id, words, unit, value, pooled }) {
+  const label = named({ label: words, unit });
   return {
     id,
     title: (metric) => `${capital(metric.label)} against ${words}`,
@@ -78,16 +75,8 @@ function againstPlot(report, { id, words, label, value, pooled }) {
           points.map(([, y]) => y),
         );
         const of = (name) => bins.map((bin) => bin[name]);
-        return [
-          {
-            ...group,
-            x: of("x"),
-            y: of("middle"),
-            low: of("low"),
-            high: of("high"),
-            counts: of("n"),
-          },
-        ];
+        const [x, y, low, high, counts] = ["x", "middle", "low", "high", "n"].map(of);
+        return [{ ...group, x, y, low, high, counts }];
       }),
   };
 }
@@ -95,25 +84,10 @@ function againstPlot(report, { id, words, label, value, pooled }) {
 const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 
 const AGAINST = [
-  {
-    id: "keypoints",
-    words: "visible keypoints",
-    label: "visible keypoints",
-    value: (i) => i.keypoints,
-  },
-  { id: "noise", words: "noise", label: "noise [px]", value: (i) => i.noise, pooled: true },
-  {
-    id: "stretch-y",
-    words: "true stretch along y",
-    label: "true stretch along y",
-    value: (i) => i.trueY,
-  },
-  {
-    id: "stretch-z",
-    words: "true stretch along z",
-    label: "true stretch along z",
-    value: (i) => i.trueZ,
-  },
+  { id: "keypoints", words: "visible keypoints", value: (i) => i.keypoints },
+  { id: "noise", words: "noise", unit: "px", value: (i) => i.noise, pooled: true },
+  { id: "stretch-y", words: "true stretch along y", value: (i) => i.trueY },
+  { id: "stretch-z", words: "true stretch along z", value: (i) => i.trueZ },
 ];
 
 /** A plot that the payload brings as lines (sweeps of a simulation). */

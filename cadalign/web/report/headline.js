@@ -16,28 +16,20 @@ export function heading(report) {
 }
 
 function runFacts(run, runs) {
-  const unfinished = run.state !== "finished";
-  const progress =
-    unfinished && run.total
-      ? h(
-          "p",
-          { class: "warning" },
-          h("strong", {}, "Unfinished: "),
-          `${count(run.done)} of ${count(run.total)} instances are done. Numbers may still change. `,
-          h("progress", {
-            value: run.done,
-            max: run.total,
-            "aria-label": `progress of ${run.name}`,
-          }),
-        )
-      : unfinished &&
-        h("p", { class: "warning" }, h("strong", {}, "Unfinished. "), "Numbers may still change.");
+  const { done, total } = run;
+  const bar = { value: done, max: total, "aria-label": `progress of ${run.name}` };
+  const progress = run.state !== "finished" && [
+    h("strong", {}, total ? "Unfinished: " : "Unfinished. "),
+    total > 0 && `${count(done)} of ${count(total)} instances are done. `,
+    "Numbers may still change. ",
+    total > 0 && h("progress", bar),
+  ];
   const facts = run.settings.map(([name, value]) =>
     h("div", {}, h("dt", {}, name), h("dd", {}, String(value))),
   );
   const words = runs > 1 ? run.name : "Settings";
   return [
-    progress,
+    progress && h("p", { class: "warning" }, progress),
     facts.length > 0 &&
       h("details", { class: "facts" }, h("summary", {}, words), h("dl", {}, facts)),
   ];

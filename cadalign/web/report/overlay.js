@@ -89,15 +89,10 @@ function keypoints(exhibit, pose) {
 
 /** The marks of the layers, for their switches. */
 export function layerMark(kind) {
-  return h(
-    "span",
-    { class: "mark", "aria-hidden": "true" },
+  const mark =
     kind === "point"
-      ? svg(
-          "svg",
-          { viewBox: "0 0 22 10" },
-          svg("circle", { class: "seen", cx: 11, cy: 5, r: 3.5 }),
-        )
-      : svg("svg", { viewBox: "0 0 22 10" }, svg("path", { class: `box ${kind}`, d: "M1 5H21" })),
-  );
+      ? svg("circle", { class: "seen", cx: 11, cy: 5, r: 3.5 })
+      : svg("path", { class: `box ${kind}`, d: "M1 5H21" });
+  const drawing = svg("svg", { viewBox: "0 0 22 10" }, mark);
+  return h("span", { class: "mark", "aria-hidden": "true" }, drawing);
 }

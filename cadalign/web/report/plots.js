@@ -107,12 +107,9 @@ function figure(report, state, plot, metricNow) {
       numbers.append(numberTable(report, plot.axes(metricNow()), linesNow(), title.textContent));
   });
   state.listen((names) => {
-    if (names.has("metric") && !plot.fixed) retitle();
-    if (
-      ["hide", "hideruns"].some((name) => names.has(name)) ||
-      (names.has("metric") && !plot.fixed)
-    )
-      panel.refresh();
+    const isOther = names.has("metric") && !plot.fixed;
+    if (isOther) retitle();
+    if (isOther || names.has("hide") || names.has("hideruns")) panel.refresh();
   });
   retitle();
   return h(

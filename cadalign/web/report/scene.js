@@ -20,10 +20,11 @@ import { Stage } from "../common/stage.js";
 import { BOX_EDGES, anchorOf, cornersOf, matrixOf, shapeOf } from "./pose.js";
 
 const FRUSTUM = 0.35; // the camera's size, as a part of its distance
-const WAYS = { object: "The object", picture: "As in the picture", all: "With the camera" };
 
 /** The views of a scene, for the buttons that choose among them. */
-export const VIEWS = Object.entries(WAYS);
+export const VIEWS = [
+  ["object", "The object"], ["picture", "As in the picture"], ["all", "With the camera"],
+];
 
 export class Scene3D {
   /** Throws where the browser has no WebGL. */

@@ -51,7 +51,7 @@ export class Viewer {
       "fieldset",
       { class: "layers" },
       h("legend", { class: "visually-hidden" }, "layers"),
-      this.layerBoxes(),
+      LAYERS.map((layer) => this.layerBox(layer)),
     );
     this.flat = h("div", { class: "flat" });
     this.canvas = h("div", { class: "stage" });
@@ -88,16 +88,10 @@ export class Viewer {
     document.body.append(this.dialog);
   }
 
-  layerBoxes() {
-    return LAYERS.map(({ key, label, kind }) =>
-      h(
-        "label",
-        { class: "option" },
-        h("input", { type: "checkbox", value: key, onchange: () => this.toggleLayer(key) }),
-        layerMark(kind),
-        label,
-      ),
-    );
+  layerBox({ key, label, kind }) {
+    const onchange = () => this.toggleLayer(key);
+    const box = h("input", { type: "checkbox", value: key, onchange });
+    return h("label", { class: "option" }, box, layerMark(kind), label);
   }
 
   toggleLayer(key) {
@@ -218,18 +212,15 @@ export class Viewer {
   runChoice(instance) {
     const there = this.report.siblings.get(instance.id) ?? [];
     if (there.length < 2) return null;
+    const choose = ({ run }) => {
+      const beside = this.state.get("beside");
+      const other = beside === String(run) ? String(instance.run) : beside;
+      this.state.set({ openrun: String(run), beside: other, alt: "" });
+    };
     return radios("run", there, {
       checked: (one) => one === instance,
       words: (one) => [this.report.runs[one.run].name],
-      choose: (one) =>
-        this.state.set({
-          openrun: String(one.run),
-          beside:
-            this.state.get("beside") === String(one.run)
-              ? String(instance.run)
-              : this.state.get("beside"),
-          alt: "",
-        }),
+      choose,
     });
   }
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from cadalign.estimation.options import RansacOptions
     from cadalign.estimation.result import Result
     from cadalign.estimation.results import Results, to_dataframe
-    from cadalign.estimation.uncertainty.summary import Contribution, EvidenceSummary
+    from cadalign.estimation.uncertainty.summary import EvidenceSummary
     from cadalign.estimation.view import View
     from cadalign.evaluation.api import evaluate, simulate
     from cadalign.geometry.alignment import Alignment, Box
@@ -38,7 +38,6 @@ __all__ = [
     "Box",
     "CadalignError",
     "Camera",
-    "Contribution",
     "EvidenceSummary",
     "Example",
     "FocalPrior",

@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from benchmarks.evidence import SeenObject, bound_of, draw_object, evidence_for, moved
+from benchmarks.evidence import SeenObject, aligned, bound_of, draw_object, evidence_for, moved
 
-from cadalign import align
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
@@ -144,8 +143,8 @@ class TestEvidenceWithoutNoise:
     def test_bound_is_that_of_the_estimate(self, car: SeenObject, kind: str) -> None:
         """The estimate is the truth, where its stated covariance is the bound."""
         given = evidence_for(kind, car)
-        result = align(car.model, given.views, size=given.size)
-        bound = bound_of(result, given, car)
+        result, weighed = aligned(car.model, given)
+        bound = bound_of(weighed, given, car)
         assert np.linalg.eigvalsh(bound)[-1] > 0
         stated = np.sqrt(result.covariance.diagonal())
         np.testing.assert_allclose(np.sqrt(bound.diagonal()), stated, rtol=0.2, atol=1e-9)

@@ -64,9 +64,9 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
     """Align a model to what an observation file holds, and draw the result.
 
     Keypoints in one image, or in several views; masks, depth, gravity, the camera's height and
-    known lengths. Prints the alignment and, where there is more than keypoints of one image, the
-    standard deviations without each piece of evidence. --mask, --model and --camera without any
-    observation align the model to a mask alone, and write one, fit.observation.json. Writes
+    known lengths. Prints the alignment and how well each piece of evidence agrees with it. --mask,
+    --model and --camera without any observation align the model to a mask alone, and write one,
+    fit.observation.json. Writes
     fit.json and overlay.png, overlay_1.png and so on for further views. Many observations, as of
     several objects of one photo, are a run, which goes on where it was killed: it writes
     results.parquet and results.csv with a row for each, and report.html. Exit codes of a run: 0 all
@@ -133,7 +133,7 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
         if self.json:
             sys.stdout.write(fitted.text(out))
             return 0
-        answer(f"{fitted.result}{fitted.table}")
+        answer(str(fitted.result))
         if paths:
             listed = ", ".join(str(path) for path in paths)
             say(f"{'Picture' if len(paths) == 1 else 'Pictures'}: {listed}")
@@ -186,12 +186,7 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
         with named_as_flags(self, self.fitting, self.ransac):
             status = waiting("fitting")
             result, views = self.fit(observation, str(path), note=say, status=status)
-        found = FittedFile(
-            result,
-            sources,
-            is_tabulated=views is not None,
-            inputs=(*observation.files, *sources.values()),
-        )
+        found = FittedFile(result, sources, inputs=(*observation.files, *sources.values()))
         return found.drawn(observation, views=views, picture=self.picture, style=style)
 
     @property

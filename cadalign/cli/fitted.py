@@ -4,27 +4,22 @@ from __future__ import annotations
 
 import json
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from cadalign.cli.common import make_folder
 from cadalign.errors import DataError, InputError
 from cadalign.io.documents import read_json, written_path
-from cadalign.io.files import finite, keeping, remove_earlier, write_text
+from cadalign.io.files import keeping, remove_earlier, write_text
 
 if TYPE_CHECKING:
     from cadalign.arrays import BoolArray, FloatArray
     from cadalign.estimation.result import Result
-    from cadalign.estimation.uncertainty.summary import Contribution, Uncertainty
     from cadalign.estimation.view import View
     from cadalign.io.observation import Observation
     from cadalign.render import OverlayStyle
     from cadalign.render.drawing.canvas import ByteImage
-
-_HEADS = ("standard deviations", "rotation", "position", "x", "y", "z", "focal length")
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,21 +28,14 @@ class FittedFile:
 
     ``sources`` are the files of the observation, of the learned shape and of a mask alone, which
     fit.json states; ``inputs`` those and what the observation names, which are not written over.
-    ``overlays`` are those of the model that were asked for. ``is_tabulated`` adds the contributions
-    of the pieces of evidence.
+    ``overlays`` are those of the model that were asked for.
     """
 
     result: Result
     sources: dict[str, Path]
-    is_tabulated: bool
     inputs: tuple[Path, ...]
     pictures: tuple[ByteImage, ...] = ()
     overlays: tuple[ByteImage, ...] = ()
-
-    @property
-    def table(self) -> str:
-        """The contributions as text; empty without any."""
-        return tabulate_contributions(self.result) if self.is_tabulated else ""
 
     def text(self, out: Path) -> str:
         """The result as JSON for a folder, which its sources are relative to."""
@@ -55,8 +43,7 @@ class FittedFile:
             name: written_path(path.absolute(), folder=out.absolute())
             for name, path in self.sources.items()
         }
-        added = list_contributions(self.result) if self.is_tabulated else {}
-        return json.dumps(self.result.to_dict() | added | sources, indent=2) + "\n"
+        return json.dumps(self.result.to_dict() | sources, indent=2) + "\n"
 
     def write(self, out: Path, *, overlay: Path | None = None) -> list[Path]:
         """Write fit.json and the pictures to a folder; returns the pictures' paths.
@@ -157,63 +144,3 @@ def _write_pictures(path: Path, pictures: tuple[ByteImage, ...]) -> list[Path]:
     for each, picture in zip(paths, pictures, strict=True):
         write_image(each, picture)
     return paths
-
-
-def tabulate_contributions(result: Result) -> str:
-    """Table of standard deviations with all evidence and without each piece; empty for one piece.
-
-    Rotation [degrees], position [units of the translation], lengths along x, y, z [%] and, where
-    it is estimated, the focal length [%].
-    """
-    pieces = result.contributions()
-    if len(pieces) < 2 or result.std is None:
-        return ""
-    rows: list[tuple[str, ...]] = [_HEADS, ("with all evidence", *_cells(result.std))]
-    several = len(result.views) > 1
-    rows += [(f"without {_label(piece, several)}", *_cells(piece.without)) for piece in pieces]
-    if result.focal == "known":
-        rows = [row[:-1] for row in rows]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = [
-        "  ".join(
-            [row[0].ljust(widths[0])]
-            + [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)]
-        )
-        for row in rows
-    ]
-    return "\n" + "\n".join(f"  {line}" for line in lines)
-
-
-def list_contributions(result: Result) -> dict[str, Any]:
-    """The same for JSON, as ``contributions``; null for what is not determined."""
-    pieces = result.contributions()
-    if len(pieces) < 2:
-        return {}
-    return {
-        "contributions": [
-            {
-                "kind": piece.kind,
-                "view": piece.view,
-                "name": piece.name,
-                "std_without": finite(asdict(piece.without)),
-            }
-            for piece in pieces
-        ]
-    }
-
-
-def _label(piece: Contribution, several: bool) -> str:
-    """The kind of a piece and, of several views, the one in the file's ``views``."""
-    return (
-        f"{piece.kind} of views[{piece.view}]" if several and piece.view is not None else piece.kind
-    )
-
-
-def _cells(std: Uncertainty) -> tuple[str, ...]:
-    position = float(np.linalg.norm(std.translation))
-    lengths = [_text(100 * each, " %") for each in (*std.scale, std.focal)]
-    return _text(std.rotation_deg, " deg"), _text(position, ""), *lengths
-
-
-def _text(value: float, unit: str) -> str:
-    return f"{value:.2g}{unit}" if np.isfinite(value) else "unknown"

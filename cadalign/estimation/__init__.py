@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
     from cadalign.estimation.results import Results, to_dataframe
     from cadalign.estimation.uncertainty.summary import (
-        Contribution,
         EvidenceSummary,
         MaskResiduals,
         Misfit,
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Alternative",
-    "Contribution",
     "EvidenceSummary",
     "FitOptions",
     "FitStats",

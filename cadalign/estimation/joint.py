@@ -39,7 +39,7 @@ from cadalign.estimation.symmetry import (
     without_free_turns,
 )
 from cadalign.estimation.uncertainty.contradictions import warnings_of
-from cadalign.estimation.uncertainty.evidence import AnyBasis, Basis, summaries_of
+from cadalign.estimation.uncertainty.evidence import summaries_of
 from cadalign.estimation.uncertainty.misfit import unexplained
 from cadalign.estimation.uncertainty.shape_posterior import ShapeTails
 from cadalign.estimation.uncertainty.summary import (
@@ -93,7 +93,6 @@ def result_of(
     is_curved: bool,
     warnings: tuple[str, ...],
     evidence: tuple[EvidenceSummary, ...],
-    basis: AnyBasis | None,
     **of_result: Any,
 ) -> Result:
     """The result of likely estimates, the best first.
@@ -154,7 +153,6 @@ def result_of(
         ),
         evidence=evidence,
         degrees_of_freedom=prior.degrees_of_freedom,
-        basis=basis,
     )
     of_views = []
     for number, view in enumerate(views):
@@ -247,7 +245,6 @@ def result_of_minima(
         is_curved=symmetry is None and not is_exact(minimum.evidence),
         warnings=warnings if mistake is None else (mistake,),
         evidence=summaries_of(minimum.evidence, minimum.state, best.cameras),
-        basis=Basis(*widened(minimum.evidence, minimum.state, prior.inflation)),
         cost=minimum.cost,
         stats=stats,
         component=minimum.component,

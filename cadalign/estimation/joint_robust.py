@@ -13,7 +13,7 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
 from cadalign.estimation.options import MINIMAL_SOLVERS, RansacOptions
 from cadalign.estimation.starts import Start, Starts, in_rig, starts_of
-from cadalign.estimation.uncertainty.evidence import image_depths_at, seen_in_cameras
+from cadalign.estimation.uncertainty.evidence import image_depths_at
 from cadalign.solvers.constants import CAUCHY, LINEAR, SAMPLE_SIZES
 from cadalign.solvers.joint.evidence import (
     DEPTH_LOSS_SCALE,
@@ -22,6 +22,7 @@ from cadalign.solvers.joint.evidence import (
     kept_rows,
     log_focals_of,
     points_of,
+    seen_in_cameras,
 )
 from cadalign.solvers.joint.search import keypoints_of, refine_joint, score_state, search_joint
 from cadalign.solvers.ransac import rigid_hypotheses

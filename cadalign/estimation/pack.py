@@ -7,8 +7,6 @@ distances.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
@@ -16,12 +14,11 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.options import LOSSES, FitOptions
-from cadalign.estimation.prior import Lenses, ShapePrior, prior_of, rows_among, scale_priors
+from cadalign.estimation.prior import Lenses, ShapePrior, scale_priors
 from cadalign.estimation.problems import focal_slopes, rays_of, whitening_of
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
 from cadalign.io.evidence import LENGTHS, Size
-from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.evidence import (
     Directions,
     Evidence,
@@ -30,7 +27,6 @@ from cadalign.solvers.joint.evidence import (
     Rig,
     Shape,
     Sightings,
-    State,
     kept_rows,
     stacked,
 )
@@ -250,38 +246,6 @@ def seen_keypoints(view: View, pixels: FloatArray, rows: list[int], options: Fit
     whitening[:] = whitening_of(view.sigma, rays, view.camera)
     loss, scale = LOSSES[options.loss], float(options.loss_scale)
     return Seen(np.array(rows, dtype=np.int64), rays, whitening, loss, scale)
-
-
-@dataclass(frozen=True, eq=False)
-class SingleBasis:
-    """The evidence of one view and the state estimated from it, as `Basis`."""
-
-    model: ShapeModel
-    view: View
-    options: FitOptions
-    component: int
-    pose: FloatArray
-    force: FloatArray
-    numbers: tuple[int, ...] | None = None
-    turn: FloatArray | None = None
-    photos: frozenset[int] = frozenset()
-
-    @cached_property
-    def evidence(self) -> Evidence:
-        """The evidence in the form of the kernels."""
-        prior = prior_of(self.model)
-        first = evidence_of(prior, [self.view], options=self.options)
-        return first._replace(shape=prior.components[self.component])
-
-    @cached_property
-    def state(self) -> State:
-        """The state that was estimated."""
-        shape = self.evidence.shape
-        rows = rows_among(self.model.ids, self.view.keypoint_ids, "views[0].ids")
-        coefficients = np.tensordot(shape.modes[:, rows], self.force, 2)
-        displacements = np.zeros_like(shape.mean)
-        displacements[rows] = shape.spread[rows, None] ** 2 * self.force
-        return State(self.pose[None], np.zeros(0), np.zeros(3), coefficients, displacements)
 
 
 _CAMERA = -1  # in the place of a point's row

@@ -124,7 +124,6 @@ def align_without(
         "determine its pose"
         for number in left_out
     ]
-    basis = result.statistics.basis
     statistics = Stated.of(
         result.statistics,
         evidence=tuple(
@@ -132,7 +131,6 @@ def align_without(
             for each in result.evidence
         ),
         warnings=(*(_renumbered(text, used) for text in result.warnings), *warnings),
-        basis=basis and replace(basis, numbers=tuple(used)),
     )
     return replace(
         result,
@@ -350,11 +348,10 @@ def align_facing(
 
 def _turned(statistics: Statistics, turn: FloatArray) -> Stated:
     own, fisher = statistics.covariance, statistics.fisher_covariance
-    seen, basis = statistics.points_cam_covariance, statistics.basis
+    seen = statistics.points_cam_covariance
     return Stated.of(
         statistics,
         covariance=None if own is None else turned_covariance(own, turn),
         fisher_covariance=None if fisher is None else turned_covariance(fisher, turn),
-        basis=basis and replace(basis, turn=turn),
         points_cam_covariance=None if seen is None else turn @ seen @ turn.T,
     )

@@ -64,20 +64,15 @@ class ShapePrior:
 
         Raises InputError if the model has no such keypoint.
         """
-        return rows_among(self.ids, ids, where)
-
-
-def rows_among(known: Sequence[Hashable], ids: Sequence[Hashable], where: str) -> list[int]:
-    """Row numbers of keypoints among a model's; see `ShapePrior.rows_of`."""
-    place = {name: row for row, name in enumerate(known)}
-    missing = [name for name in ids if name not in place]
-    if missing:
-        listed = ", ".join(quote(name) for name in missing[:5])
-        names = ", ".join(quote(name) for name in known[:12])
-        more = ", ..." if len(known) > 12 else ""
-        fix = f"the model has {names}{more}" if names else "give the model points_3d="
-        raise InputError(f"the model has no keypoint {listed}", where=where, fix=fix)
-    return [place[name] for name in ids]
+        place = {name: row for row, name in enumerate(self.ids)}
+        missing = [name for name in ids if name not in place]
+        if missing:
+            listed = ", ".join(quote(name) for name in missing[:5])
+            names = ", ".join(quote(name) for name in self.ids[:12])
+            more = ", ..." if len(self.ids) > 12 else ""
+            fix = f"the model has {names}{more}" if names else "give the model points_3d="
+            raise InputError(f"the model has no keypoint {listed}", where=where, fix=fix)
+        return [place[name] for name in ids]
 
 
 def prior_of(model: object) -> ShapePrior:

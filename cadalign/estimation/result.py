@@ -18,7 +18,6 @@ from cadalign.estimation.result_data import ResultData
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from cadalign.estimation.uncertainty.summary import Contribution
     from cadalign.export.aligned_object import Frame
     from cadalign.geometry.mesh import Mesh
 
@@ -30,38 +29,6 @@ class Result(ResultData):
     What `cadalign.fit`, `cadalign.align`, batches, retrieval and the annotator return. Its values
     are those of `cadalign.estimation.result_data.ResultData`.
     """
-
-    def contributions(self) -> tuple[Contribution, ...]:
-        """Standard deviations without each piece of evidence; compare them with ``std``.
-
-        They are linearised at the estimate, infinite for what nothing else determines. Without the
-        known motion of its camera, a view has a pose of its own. Empty for the keypoints of one
-        view of an exact model, which nothing can be left out of.
-
-        Raises
-        ------
-        InputError
-            If the result was read from a file, which does not hold the evidence.
-
-        Examples
-        --------
-        >>> from cadalign import Alignment, Camera, Model, Size, View, align
-        >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
-        >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
-        >>> truth = Alignment(np.diag([-1.0, -1.0, 1.0]), [0.3, 0.2, 6.0], [1.2, 1.1, 0.9])
-        >>> view = View(camera, camera.project(truth.apply(corners)))
-        >>> result = align(Model(points_3d=corners), view, size=Size(width=1.2))
-        >>> [(each.name, round(each.without.scale[0], 3)) for each in result.contributions()]
-        [('views[0].points_2d', 0.01), ('size', inf)]
-        """
-        if self.statistics.basis is None:
-            if self.method != "align":
-                return ()
-            what = "the result holds no evidence: it was read from a file"
-            raise InputError(what, where="contributions", fix="align again")
-        from cadalign.estimation.uncertainty.evidence import contributions_of
-
-        return contributions_of(self.statistics.basis)
 
     def __str__(self) -> str:
         return _text_of(self)
@@ -256,5 +223,7 @@ def _text_of(result: ResultData) -> str:
         f"({', '.join(f'{value:.4g}' for value in other.alignment.scale)})"
         for other in result.alternatives
     )
+    if len(result.evidence) > 1:
+        lines.extend(f"  evidence     {each}" for each in result.evidence)
     lines.extend(f"  warning      {text}" for text in result.warnings)
     return "\n".join(lines)

@@ -32,7 +32,6 @@ from cadalign.geometry.rotations import by_rotation
 
 if TYPE_CHECKING:
     from cadalign.estimation.consensus import RobustSearch
-    from cadalign.estimation.uncertainty.evidence import AnyBasis
 
 T = TypeVar("T")
 
@@ -111,7 +110,6 @@ class Stated:
     misfit: Misfit | None = None
     evidence: tuple[EvidenceSummary, ...] = ()
     degrees_of_freedom: float | None = None
-    basis: AnyBasis | None = None
 
     @classmethod
     def of(cls, statistics: Statistics, **changes: Any) -> Stated:
@@ -129,7 +127,7 @@ class KeypointStatistics(FittedKeypoints):
 
     search: RobustSearch | None = None
     alternatives: tuple[Alternative, ...] = ()
-    points_covariance = points_cam_covariance = degrees_of_freedom = basis = None
+    points_covariance = points_cam_covariance = degrees_of_freedom = None
 
     @cached_property
     def covariance(self) -> FloatArray | None:

@@ -21,7 +21,7 @@ from cadalign.estimation.joint import Estimate, common_sigma, result_of
 from cadalign.estimation.mistakes import Explained, Mistake, find_in_all, larger_sizes
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions, RansacOptions
-from cadalign.estimation.pack import SingleBasis, seen_keypoints
+from cadalign.estimation.pack import seen_keypoints
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
@@ -33,7 +33,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import inflation_with
 from cadalign.solvers.constants import LEAST_POINTS, LINEAR
-from cadalign.solvers.marginal.equations import POSE, force_of
+from cadalign.solvers.marginal.equations import POSE
 from cadalign.solvers.marginal.posterior import posteriors_of
 from cadalign.solvers.marginal.problem import Mixture
 from cadalign.solvers.marginal.search import search_view
@@ -155,7 +155,6 @@ def align_single(
     in_camera = estimates[0].poses[0].apply(points)
     errors = in_camera[:, :2] / in_camera[:, 2:] - seen.rays
     component, cost = int(minima.label[0]), float(minima.costs[0])
-    pose, force = minima.states[0, :POSE].copy(), force_of(minima.states[0])
     warnings: tuple[str, ...] = ()
     if seen.loss == LINEAR:
         beside = (3 * np.array(rows)[:, None] + np.arange(3)).ravel()
@@ -186,7 +185,6 @@ def align_single(
         is_curved=bool(covariances.any()),
         warnings=warnings,
         evidence=(summary_of_keypoints(errors, seen.rays, seen.whitening, 0, view.camera),),
-        basis=SingleBasis(model, view, options, component, pose, force),
         cost=cost,
         stats=stats,
         component=component,

@@ -79,13 +79,10 @@ with_mask = cadalign.align(model, seen)
 report("keypoints, mask", with_mask)
 
 # %%
-# ``result.evidence`` states how well each piece fits, in its own unit and in standard deviations,
-# and ``result.contributions()`` what the uncertainties would be without it:
+# ``result.evidence`` states how well each piece fits, in its own unit and in standard deviations:
 
 for piece in with_mask.evidence:
     print(piece)
-for contribution in with_mask.contributions():
-    print(contribution)
 
 # %%
 # With a second photo

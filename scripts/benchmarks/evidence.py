@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Alignment, Model, Result, View, align
 from cadalign.arrays import BoolArray, FloatArray, IntArray, instance_rng
 from cadalign.datasets import AnnotatedModel, KeypointNet
+from cadalign.estimation import joint
 from cadalign.estimation.estimates import pose_and_border, pose_and_lengths
 from cadalign.evaluation.instances.instance import (
     KEYPOINT_CAMERA,
@@ -32,6 +34,9 @@ from cadalign.metrics import nearest_truth
 from cadalign.render import RaycastRenderer, cast_geometry, visible_keypoints
 from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.joint.covariance import joint_covariance
+from cadalign.solvers.joint.evidence import Evidence, State
+
+Weighed = tuple[Evidence, State]
 
 _DEPTH_SIGMA = 0.005  # relative
 _UP_SIGMA_DEG = 1.0
@@ -250,14 +255,14 @@ def _of_first(kinds: tuple[str, ...], seen: SeenObject) -> dict[str, Any]:
 
 def _measured(kind: str, seen: SeenObject) -> Row:
     given, instance = evidence_for(kind, seen), seen.instance
-    wall, _, result = section.clocked(partial(align, seen.model, given.views, size=given.size))
+    wall, _, (result, weighed) = section.clocked(partial(aligned, seen.model, given))
     est, gt = result.alignment, instance.gt
     if kind == _ALONE:  # keypoints distinguish poses of the same outline
         rigid = replace(gt, scale=np.ones(3))  # the object has the symmetry, not its model
         near = nearest_truth(est=est, gt=rigid, symmetry=seen.source.symmetry)
         gt = replace(near, scale=gt.scale)
     errors = alignment_errors(est=est, gt=gt, length=instance.diagonal)
-    bound = bound_of(result, given, seen)
+    bound = bound_of(weighed, given, seen)
     drawn = seen.rng_of("bound").multivariate_normal(np.zeros(9), bound, size=_DRAWS, method="eigh")
     ideal = float(np.median(np.degrees(np.linalg.norm(drawn[:, :3], axis=1))))
     est_box, gt_box = (Box.from_model(instance.bounds, each) for each in (est, gt))
@@ -272,21 +277,28 @@ def _measured(kind: str, seen: SeenObject) -> Row:
     }
 
 
-def bound_of(result: Result, given: Given, seen: SeenObject) -> FloatArray:
+def aligned(model: Model, given: Given) -> tuple[Result, Weighed | None]:
+    """The estimate, and the evidence and state that it states; None for one view's keypoints."""
+    with patch.object(joint, "summaries_of", wraps=joint.summaries_of) as stated:
+        result = align(model, given.views, size=given.size)
+    return result, stated.call_args and stated.call_args.args[:2]
+
+
+def bound_of(weighed: Weighed | None, given: Given, seen: SeenObject) -> FloatArray:
     """The Cramer-Rao bound (9, 9) of an estimate from such evidence, as `Result.covariance`.
 
     Contours have the measured standard deviation.
     """
-    basis, gt = result.statistics.basis, seen.instance.gt
-    if basis is None:
+    gt = seen.instance.gt
+    if weighed is None:
         points = np.asarray(seen.model.points_3d)[given.shots[0].rows]
         return cramer_rao_bound(points, KEYPOINT_CAMERA, gt, sigma=seen.sigma, focal="known")
-    sightings = basis.evidence.sightings
-    linear = sightings._replace(loss=np.full_like(sightings.loss, LINEAR))
-    known = basis.evidence._replace(sightings=linear)
-    truths = [moved(gt, shot.cam_from_first) for shot in given.shots[: len(basis.state.poses)]]
+    evidence, state = weighed
+    linear = np.full_like(evidence.sightings.loss, LINEAR)
+    known = evidence._replace(sightings=evidence.sightings._replace(loss=linear))
+    truths = [moved(gt, shot.cam_from_first) for shot in given.shots[: len(state.poses)]]
     poses = np.array([[*each.rotation.ravel(), *each.translation] for each in truths])
-    true_state = basis.state._replace(poses=poses, log_scales=np.log(gt.scale))
+    true_state = state._replace(poses=poses, log_scales=np.log(gt.scale))
     unknowns = pose_and_border(joint_covariance(known, true_state), 0)
     return pose_and_lengths(known, true_state, unknowns)
 

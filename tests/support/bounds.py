@@ -6,39 +6,33 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cadalign import Alignment
-from cadalign.estimation.estimates import pose_and_border, pose_and_lengths
-from cadalign.estimation.result import Result
+from cadalign import Alignment, Model, Size, View
+from cadalign.estimation.estimates import mean_state, pose_and_border, pose_and_lengths
+from cadalign.estimation.pack import evidence_of
+from cadalign.estimation.prior import prior_of
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.solvers.joint.covariance import joint_covariance
-from cadalign.solvers.joint.evidence import State
 
 
-def bound_of(result: Result, truths: Sequence[Alignment]) -> np.ndarray:
+def bound_of(
+    model: Model, views: Sequence[View], size: Size | None, truths: Sequence[Alignment]
+) -> np.ndarray:
     """Covariance (9, 9) of pose in the first camera and log lengths, at the true poses.
 
     ``truths`` are in the frame of each pose: the rig's, or each view's camera.
     """
-    basis = result.statistics.basis
-    assert basis is not None
-    poses = [np.concatenate([each.rotation.ravel(), each.translation]) for each in truths]
-    true_state = State(
-        np.array(poses),
-        np.zeros_like(basis.state.log_focals),
-        np.log(truths[0].scale),
-        np.zeros_like(basis.state.coefficients),
-        np.zeros_like(basis.state.displacements),
-    )
-    unknowns = pose_and_border(joint_covariance(basis.evidence, true_state), 0)
-    return pose_and_lengths(basis.evidence, true_state, unknowns)
+    evidence = evidence_of(prior_of(model), views, size)
+    poses = np.array([each.packed[:12] for each in truths])
+    state = mean_state(evidence, poses, np.log(truths[0].scale))
+    unknowns = pose_and_border(joint_covariance(evidence, state), 0)
+    return pose_and_lengths(evidence, state, unknowns)
 
 
-def whitened_square(result: Result, truths: Sequence[Alignment]) -> float:
+def whitened_square(found: Alignment, truth: Alignment, bound: np.ndarray) -> float:
     """Square of the error over the bound, divided by its number of unknowns: 1 on average."""
-    bound = bound_of(result, truths)
-    turn = vector_from_rotation(result.alignment.rotation @ truths[0].rotation.T)
-    shift = result.alignment.translation - truths[0].translation
-    error = np.concatenate([turn, shift, np.log(result.alignment.scale / truths[0].scale)])
+    turn = vector_from_rotation(found.rotation @ truth.rotation.T)
+    shift = found.translation - truth.translation
+    error = np.concatenate([turn, shift, np.log(found.scale / truth.scale)])
     free = bound.diagonal() > 0
     error, bound = error[free], bound[np.ix_(free, free)]
     return float(error @ np.linalg.solve(bound, error)) / int(free.sum())

@@ -65,17 +65,13 @@ class Refined(NamedTuple):
     warnings: list[str]
     residuals: tuple[MaskResiduals | None, ...] = ()
     """The contours of every view's mask."""
-    photos: frozenset[int] = frozenset()
-    """Views whose photos count."""
 
     def noted_in(self, result: Result) -> Result:
         """The result with what is known of the masks or photos."""
-        basis = result.statistics.basis
         statistics = Stated.of(
             result.statistics,
             evidence=(*result.evidence, *self.summaries),
             warnings=(*result.warnings, *self.warnings),
-            basis=basis and replace(basis, photos=self.photos or basis.photos),
         )
         residuals = self.residuals or result.mask_residuals
         return replace(result, mask_residuals=residuals, statistics=statistics)

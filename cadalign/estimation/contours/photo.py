@@ -182,7 +182,7 @@ def fit_photos(
         EvidenceSummary("photo", view, own.lines, own.rms_sigmas, own.rms, "px", own.share)
         for view, own in {**found, **left_out}.items()
     ]
-    return Refined(refined, summaries, warnings, photos=frozenset(found))
+    return Refined(refined, summaries, warnings)
 
 
 def _weak(found: dict[int, OutlineSupport]) -> list[str]:

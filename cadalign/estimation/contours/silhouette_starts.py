@@ -33,12 +33,18 @@ from cadalign.estimation.joint_robust import LEAST_SEEN, cost_of_hidden, hidden_
 from cadalign.estimation.model import Model
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.search import JointProblem, Minimum, find_minima
-from cadalign.estimation.uncertainty.evidence import seen_in_cameras
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import model_rays
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.solvers.joint.evidence import Evidence, ImageDepths, State, kept_rows, points_of
+from cadalign.solvers.joint.evidence import (
+    Evidence,
+    ImageDepths,
+    State,
+    kept_rows,
+    points_of,
+    seen_in_cameras,
+)
 from cadalign.solvers.joint.search import refine_joint, score_state
 
 _MEETS = 0.003  # standard deviation of a contour that meets the rim, relative to its size

@@ -14,22 +14,24 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cadalign.arrays import IntArray
 from cadalign.estimation.starts import starts_of
 from cadalign.estimation.uncertainty.evidence import (
     Piece,
     count_equations,
+    depths_of,
+    distances_beside,
     image_depths_at,
-    measured_factor,
+    offsets_of,
     pieces_of,
     redundancy_of,
     told_by,
-    without,
 )
 from cadalign.estimation.uncertainty.residuals import chi_square_quantile, chi_square_tail
 from cadalign.estimation.uncertainty.shape_posterior import ShapeTails, misfits
 from cadalign.estimation.uncertainty.summary import name_of
 from cadalign.solvers.joint.covariance import information_of, scaled_information
-from cadalign.solvers.joint.evidence import Evidence, State, kept_rows, packed
+from cadalign.solvers.joint.evidence import Evidence, Rig, State, kept_rows, packed
 from cadalign.solvers.joint.search import reduced, refine_joint, search_joint
 from cadalign.solvers.joint.system import Joint, joint_cost
 
@@ -85,7 +87,7 @@ def _contradictions(evidence: Evidence, state: State, cost: float) -> tuple[str,
         evidence = _without_hidden(evidence, state)
         cost, state, _, _ = refine_joint(evidence, 10 * _REFITTING, state)
     if len(pieces) > _MOST_TESTED:  # those of the largest own cost
-        trials = [without(evidence, state, piece) for piece in pieces]
+        trials = [_without(evidence, state, piece) for piece in pieces]
         rests = [joint_cost(Joint(rest, False), packed(start)) for rest, start in trials]
         pieces = [
             pieces[k] for k in sorted(np.argsort(rests, kind="stable")[:_MOST_TESTED].tolist())
@@ -123,7 +125,7 @@ def _is_suspicious(
     evidence: Evidence, state: State, cost: float, piece: Piece, level: float
 ) -> bool:
     """True if leaving out a piece, by a short refinement, saves more than is likely."""
-    rest, start = without(evidence, state, piece)
+    rest, start = _without(evidence, state, piece)
     lower, refitted, _, _ = refine_joint(rest, _REFITTING, start)
     if not cost - lower >= chi_square_quantile(1, level):  # of one equation; of more, more
         return False
@@ -162,7 +164,7 @@ def _searched(
     evidence: Evidence, state: State, cost: float, whole: tuple[int, int], piece: Piece
 ) -> _Trial | None:
     """The trial of a piece by a search, since the estimate may lie far from that without it."""
-    rest, start = without(evidence, state, piece)
+    rest, start = _without(evidence, state, piece)
     lower, refitted, _, _ = refine_joint(rest, 10 * _REFITTING, start)
     starts = starts_of(rest)
     minima = search_joint(rest, *starts)[0] if len(starts.poses) else None
@@ -203,7 +205,7 @@ def _determined(evidence: Evidence, state: State) -> tuple[int, int]:
 
 def _hint(evidence: Evidence, trial: _Trial) -> str:
     """A hint at another unit of measurements, or at another axis or sign; else nothing."""
-    factor = measured_factor(evidence, trial.state, trial.piece)
+    factor = _measured_factor(evidence, trial.state, trial.piece)
     if factor is not None and not _is_plausible(factor):
         return f": {name_of(*trial.piece)} is {factor:.3g} times what is expected, {_UNIT}"
     if trial.piece.kind != "gravity":
@@ -229,7 +231,7 @@ def _wrong_units(evidence: Evidence, state: State, contradicting: Sequence[str])
     The estimate may follow them, which then makes the object too large, or leave them out.
     """
     size = float(np.exp(state.log_scales.mean()))
-    factors = [(p, measured_factor(evidence, state, p)) for p in pieces_of(evidence)]
+    factors = [(p, _measured_factor(evidence, state, p)) for p in pieces_of(evidence)]
     measured = [(piece, factor) for piece, factor in factors if factor is not None]
     is_rig = (np.bincount(evidence.rig.pose) > 1).any()
     is_alone = len({piece.kind for piece, _ in measured}) == 1 and not is_rig
@@ -246,3 +248,44 @@ def _wrong_units(evidence: Evidence, state: State, contradicting: Sequence[str])
 
 def _is_plausible(factor: float) -> bool:
     return 1 / _WRONG_UNIT < factor < _WRONG_UNIT
+
+
+def _without(evidence: Evidence, state: State, piece: Piece) -> tuple[Evidence, State]:
+    """The evidence without a piece, and a state of its unknowns.
+
+    Without the known motion of its camera, a view has a pose of its own.
+    """
+    kind, view, sightings = piece.kind, piece.view, evidence.sightings
+    if view is None or kind == "camera height":
+        offsets = kept_rows(evidence.offsets, ~offsets_of(evidence, piece))
+        return evidence._replace(offsets=offsets), state
+    if kind == "gravity":
+        directions = kept_rows(evidence.directions, evidence.directions.image != view)
+        return evidence._replace(directions=directions), state
+    if kind == "rig":
+        pose: IntArray = evidence.rig.pose.copy()
+        own = state.poses[pose[view]]
+        pose[view] = len(state.poses)
+        rig = Rig(evidence.rig.cam_from_rig, pose)
+        return evidence._replace(rig=rig), state._replace(poses=np.vstack([state.poses, own]))
+    hidden = told_by(sightings)[kind] & (sightings.image == view)
+    if kind == "depth":
+        depths = kept_rows(evidence.image_depths, evidence.image_depths.image != view)
+        evidence = evidence._replace(image_depths=depths)
+        sightings = sightings._replace(depths=np.where(hidden[:, None], 0.0, sightings.depths))
+    else:
+        whitening = np.where(hidden[:, None], 0.0, sightings.whitening)
+        sightings = sightings._replace(whitening=whitening)
+    kept = ~hidden | np.any(list(told_by(sightings).values()), axis=0)
+    return evidence._replace(sightings=kept_rows(sightings, kept)), state
+
+
+def _measured_factor(evidence: Evidence, state: State, piece: Piece) -> float | None:
+    """Median of a piece's measured over expected depths or distances; None where it has none."""
+    if piece.kind == "depth" and piece.view is not None:
+        expected, measured, _ = depths_of(evidence, state, piece.view)
+    elif piece.view is None or piece.kind == "camera height":
+        expected, measured, _ = distances_beside(evidence, state, piece)
+    else:
+        return None
+    return float(np.median(measured / expected)) if len(measured) else None

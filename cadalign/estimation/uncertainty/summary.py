@@ -242,21 +242,9 @@ class EvidenceSummary:
         """
         return name_of(self.kind, self.view)
 
-
-@dataclass(frozen=True)
-class Contribution:
-    """Uncertainty of a joint estimate with all evidence but one piece."""
-
-    kind: str
-    view: int | None
-    """As of `EvidenceSummary`."""
-    without: Uncertainty
-    """Standard deviations without the piece, infinite for what nothing else determines."""
-
-    @property
-    def name(self) -> str:
-        """The argument that gave the piece."""
-        return name_of(self.kind, self.view)
+    def __str__(self) -> str:
+        unit = f" {self.unit}" if self.unit else ""
+        return f"{self.name}: rms {self.rms:.3g}{unit}, {self.rms_sigmas:.2g} sigma"
 
 
 def name_of(kind: str, view: int | None) -> str:

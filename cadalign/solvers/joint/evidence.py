@@ -209,6 +209,17 @@ def points_of(shape: Shape, state: State) -> FloatArray:
     return points
 
 
+def seen_in_cameras(
+    evidence: Evidence, state: State, points: FloatArray, image: IntArray
+) -> FloatArray:
+    """Points (N, 3) of the model in the cameras (N,) of views."""
+    rig = evidence.rig
+    for motion in (state.poses[rig.pose[image]], rig.cam_from_rig[image]):
+        turned = np.einsum("nij,nj->ni", motion[:, :9].reshape(-1, 3, 3), points)
+        points = turned + motion[:, 9:]
+    return points
+
+
 @inlined
 def exp_of(logs: FloatArray) -> Triple:
     """The scales of their logarithms (3,)."""

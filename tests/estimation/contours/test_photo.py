@@ -136,7 +136,7 @@ class TestPhoto:
         assert summary.share is not None
         assert summary.share > 0.9
         assert summary.rms < 1.0
-        names = [each.name for each in joint.contributions()]
+        names = [each.name for each in joint.evidence]
         assert names == ["views[0].points_2d", "views[0].image"]
         again = Result.from_dict(joint.to_dict())
         assert again.evidence == joint.evidence

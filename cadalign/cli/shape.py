@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
@@ -14,8 +14,9 @@ from cadalign.cli.options import named_as_flags
 from cadalign.cli.runs import progress_bar
 from cadalign.datasets import KeypointNet
 from cadalign.io.files import keeping, refuse_input
-from cadalign.shapes.model import ShapeModel
-from cadalign.shapes.outputs import draw_shape
+
+if TYPE_CHECKING:
+    from cadalign.shapes.model import ShapeModel
 
 _MODES = 5  # whose share of the variance is listed
 
@@ -49,6 +50,8 @@ class ShapeLearn:
             return self._learn(dataset)
 
     def _learn(self, dataset: KeypointNet) -> int:
+        from cadalign.shapes.model import ShapeModel  # not for help of a command
+
         with progress_bar(f"learning {self.category}") as on_progress:
             model = ShapeModel.from_dataset(
                 dataset,
@@ -75,6 +78,9 @@ class ShapeShow(JsonOption):
 
     def run(self) -> int:
         """Open the model and describe it; returns the exit code."""
+        from cadalign.shapes.model import ShapeModel
+        from cadalign.shapes.outputs import draw_shape
+
         model = ShapeModel.open(self.shape)
         if self.out is not None:
             make_folder_of(self.out)

@@ -20,12 +20,12 @@ from cadalign.io.files import once_per_file, time_of
 from cadalign.io.images import is_grey, open_photo, read_image, read_mask
 from cadalign.io.observation import Observation
 from cadalign.retrieval.options import RetrievalOptions
-from cadalign.shapes.model import ShapeModel
 
 if TYPE_CHECKING:
     from cadalign.render.drawing.canvas import ByteImage
     from cadalign.retrieval.library import Library
     from cadalign.retrieval.match import Match
+    from cadalign.shapes.model import ShapeModel
 
 
 logger = logging.getLogger("cadalign")
@@ -115,6 +115,8 @@ def _opened_shapes(
     files: Sequence[tuple[Path, int]],
 ) -> ShapeModel | dict[str, ShapeModel] | None:
     """The shape models of files: one, or several by category; None of no file."""
+    from cadalign.shapes.model import ShapeModel  # not for help of a command
+
     models = [ShapeModel.open(path) for path, _ in files]
     if len(models) < 2:
         return models[0] if models else None

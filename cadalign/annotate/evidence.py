@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -19,13 +19,13 @@ from cadalign.io.evidence import LENGTHS, ImageEvidence, Size
 from cadalign.io.images import read_mask
 from cadalign.io.observation import Observation
 from cadalign.io.observation_file import StartFields
-from cadalign.retrieval.match import grab_cut
 
 Point2 = tuple[float, float]
 Segment = tuple[Point2, Point2]
 
 _LONGEST_CUT = 800  # side of the photo in which a box is cut out [px]
 _LEAST_BOX = 4.0  # [px]
+_CUT_ROUNDS = 5
 _END_SIGMA = 1.0  # of the ends of a vertical edge [px]
 _ANY_PITCH = 1e6  # standard deviation of a camera's pitch of which nothing is known [degrees]
 _LEAST_UP_SIGMA = 0.5  # objects stand on floors that are not quite level [degrees]
@@ -219,3 +219,17 @@ def cut_out(photo: npt.NDArray[np.uint8], corners: npt.NDArray[np.float64]) -> B
         )
     whole = cv2.resize(255 * found, (width, height), interpolation=cv2.INTER_LINEAR)
     return np.asarray(whole >= 128)
+
+
+def grab_cut(pixels: npt.NDArray[Any], labels: npt.NDArray[Any]) -> BoolArray:
+    """Segment an image (h, w, 3) by its colours, from OpenCV's labels (h, w) of a part of it.
+
+    Rother, Kolmogorov, Blake, "GrabCut: interactive foreground extraction using iterated graph
+    cuts" (2004).
+    """
+    cv2.setRNGSeed(0)
+    bgr = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+    colors = np.zeros((2, 1, 65))
+    whole = (0, 0, 1, 1)  # not used with labels
+    cv2.grabCut(bgr, labels, whole, colors[0], colors[1], _CUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
+    return np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))

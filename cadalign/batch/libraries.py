@@ -16,7 +16,7 @@ observation, whose model has these columns besides:
 
 match_category, match_id, match_score
     The model of the library, and its probability; see `cadalign.Match.score`.
-match_log_likelihood, none_probability, silhouette_iou
+match_log_likelihood, none_probability
     As of `cadalign.Match`.
 mirrored, missing
     True if the labels are mirrored, and the number of keypoints that the model lacks.
@@ -183,7 +183,7 @@ class RetrieveRunOptions(ManyOptions):
     columns: ClassVar[Columns] = (
         *(("match_category", str), ("match_id", str), ("match_score", float)),
         *(("match_log_likelihood", float), ("none_probability", float)),
-        *(("silhouette_iou", float), ("mirrored", bool), ("missing", int)),
+        *(("mirrored", bool), ("missing", int)),
         *(("top_categories", list[str]), ("top_ids", list[str]), ("top_scores", list[float])),
     )
     record_columns: ClassVar[Columns] = (("matches", str),)
@@ -218,7 +218,6 @@ class RetrieveRunOptions(ManyOptions):
             "match_score": best.score,
             "match_log_likelihood": best.log_likelihood,
             "none_probability": best.none_probability,
-            "silhouette_iou": best.silhouette_iou,
             "mirrored": best.mirrored,
             "missing": len(best.missing_ids),
             "top_categories": [match.category for match in matches],

@@ -11,14 +11,13 @@ import tyro
 
 from cadalign.cli.common import make_folder, print_json, print_table, say, waiting
 from cadalign.cli.options import CameraOptions, FlaggedOptions, ManyCommand, named_as_flags
-from cadalign.errors import InputError
 from cadalign.estimation.options import Sigma
 from cadalign.io.documents import read_json
 from cadalign.io.files import keeping
 from cadalign.io.images import read_image
 from cadalign.io.observation import is_of_many, refuse_photo_or_mesh
 from cadalign.retrieval.options import RetrievalOptions
-from cadalign.retrieval.query import ObservationRetrieval, read_query, read_query_mask
+from cadalign.retrieval.query import ObservationRetrieval, read_query
 
 if TYPE_CHECKING:
     from cadalign.retrieval.match import Match
@@ -48,9 +47,6 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
     out: Path | None = None
     """Folder for matches.json, the matches' overlays and index.html; by default none is
     written. For many observations the run's, by default beside them."""
-    mask: Path | None = None
-    """Image of the object's pixels in white: ranks the matches again by their silhouettes; by
-    default the observation's."""
     workers: int | None = None
     """Threads for one observation, -1 (the default) for one per core. Processes for many, 0 for
     none; by default -1, for few observations 0."""
@@ -77,9 +73,6 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
         from cadalign.batch.libraries import RetrieveRunOptions
         from cadalign.cli.runs import inputs_of, run_command
 
-        if self.mask is not None:
-            fix = "give --silhouette, which takes each photo's opacity or cuts the object out"
-            raise InputError("is for one observation", where="--mask", fix=fix)
         given = {each.name: getattr(self, each.name) for each in fields(ObservationRetrieval)}
         given["ranking"] = RetrievalOptions(**vars(self.ranking))
         options = RetrieveRunOptions(
@@ -94,14 +87,13 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
         query = self.of_camera.applied_to(read_query(path), str(path))
         library, _ = self.opened()
         camera = query.camera
-        mask = None if self.mask is None else read_query_mask(self.mask, camera)
         # The table needs no photo, which may have been moved.
         photo = None
         if self.out is not None and query.image is not None:
             photo = read_image(query.image, camera)
         with waiting("retrieving (the first time after an installation takes a minute)"):
             workers = -1 if self.workers is None else self.workers
-            matches = self.retrieve(query, str(path), mask=mask, workers=workers)
+            matches = self.retrieve(query, str(path), workers=workers)
         found = matches[0].camera if matches else None
         if not camera.focal_known and found is not None:
             say(f"Focal length: estimated as {found.fx:.4g} px")
@@ -114,7 +106,7 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
                 say(absent)
         if self.out is not None:
             make_folder(self.out)
-            with keeping([path, *query.files, self.mask, self.library]):
+            with keeping([path, *query.files, self.library]):
                 page = write_retrieval(
                     self.out,
                     matches,
@@ -133,7 +125,7 @@ def _print_table(matches: Sequence[Match]) -> None:
     from cadalign.retrieval.page import score_text
 
     labels = ("", "category", "model")
-    heads: tuple[str, ...] = ("score", "log-lik.", "rms px", "kpts", "s_y", "s_z")
+    heads = ("score", "log-lik.", "rms px", "kpts", "s_y", "s_z")
     rows: list[tuple[str, ...]] = [
         (
             str(rank).rjust(len(str(len(matches)))),
@@ -148,9 +140,4 @@ def _print_table(matches: Sequence[Match]) -> None:
         )
         for rank, match in enumerate(matches, start=1)
     ]
-    overlaps = [match.silhouette_iou for match in matches]
-    if any(overlap is not None for overlap in overlaps):
-        heads += ("IoU",)
-        shown = ["-" if overlap is None else f"{overlap:.3f}" for overlap in overlaps]
-        rows = [(*row, overlap) for row, overlap in zip(rows, shown, strict=True)]
     print_table(ConsoleTable("", labels, heads, rows, "", narrow=True, grouped=False))

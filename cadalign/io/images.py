@@ -132,20 +132,10 @@ def read_grey(path: Path) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
     with open_photo(path) as image:
         mode = image.mode
         pixels = np.asarray(image.convert("L") if mode in ("1", "P") else image)
-    if pixels.ndim != 2 or not _is_grey(mode):
+    if pixels.ndim != 2 or not (mode.startswith("I") or mode in ("1", "L", "P")):
         fix = "give an image of one grey channel, of 8 or 16 bits"
         raise DataError(f"the image has the mode {brief(mode)}", where=str(path), fix=fix)
     return pixels if pixels.dtype == np.uint8 else pixels.astype(np.uint16)
-
-
-def is_grey(path: Path) -> bool:
-    """True for an image of one channel, which `read_grey` reads."""
-    with open_photo(path) as image:
-        return _is_grey(image.mode)
-
-
-def _is_grey(mode: str) -> bool:
-    return mode.startswith("I") or mode in ("1", "L", "P")
 
 
 def read_mask(path: Path) -> BoolArray:

@@ -184,8 +184,6 @@ class Library:
         *,
         shape: ShapeModel | Mapping[str, ShapeModel] | None = None,
         focal_prior: FocalPrior | None = None,
-        mask: npt.ArrayLike | None = None,
-        image: npt.ArrayLike | None = None,
         exclude: Collection[ModelKey] = (),
         workers: int = -1,
         **options: Any,
@@ -215,13 +213,6 @@ class Library:
             `cadalign.retrieval.by_shape`.
         focal_prior : FocalPrior, optional
             Prior on an unknown focal length, with ``shape``.
-        mask : (h, w) bool, optional
-            The object's pixels (of numbers, those above half of the largest possible one): reranks
-            the best matches that have a mesh by their silhouettes; see
-            `cadalign.retrieval.match`.
-        image : (h, w, 3) or (h, w, 4) uint8, optional
-            The image instead of a mask: its opacity, or a segmentation around the keypoints, is
-            the mask.
         exclude : collection of (str, str)
             Category and id of models to leave out; those that the library lacks make no difference.
         workers : int
@@ -273,9 +264,4 @@ class Library:
             observed = observe(points_2d, ids, camera, plain)
             candidates = gather_candidates(self._table, observed, plain, exclude, workers)
             ranking = rank_by_shape(self._table, candidates, observed, chosen, shapes)
-        matches = make_matches(self._table, candidates, observed, ranking, chosen.top, absent)
-        if mask is None and image is None:
-            return matches
-        from cadalign.retrieval.match import mask_of, rerank  # with OpenCV and the renderer
-
-        return rerank(self._table, matches, mask_of(mask, image, matches, camera), camera)
+        return make_matches(self._table, candidates, observed, ranking, chosen.top, absent)

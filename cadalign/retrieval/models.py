@@ -35,7 +35,6 @@ ModelKey = tuple[str, str]
 
 _ALONG = 0.9  # share of a mirrored pair's distance that must lie along one axis
 _LARGEST = 1e50  # coordinate
-_MOST_MESHES = 32  # that are kept
 _MOST_SYMMETRIES = 4096
 _AGAIN = "build it with: cadalign library build"
 SEAL = Seal(magic=b"cadalign library", version=1, noun="library file", fix=_AGAIN)
@@ -131,12 +130,6 @@ class ModelTable:
 
     def __init__(self, table: pa.Table) -> None:
         self.table = table.combine_chunks()
-        # Silhouettes are known by their mesh: that of a model comes up again in the next query.
-        self.mesh_at = lru_cache(_MOST_MESHES)(load_mesh)
-
-    def __reduce__(self) -> tuple[type[ModelTable], tuple[pa.Table]]:
-        """Copies for other processes have no meshes."""
-        return ModelTable, (self.table,)
 
     @classmethod
     def of(cls, models: Iterable[LibraryModel | AnnotatedModel]) -> ModelTable:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from contextlib import suppress
 from html import escape
@@ -10,19 +11,21 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.errors import DataError
+from cadalign.errors import CadalignError, DataError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import read_json
 from cadalign.io.files import made_folder, remove_earlier, write_json, write_text
 from cadalign.io.images import write_image
+from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
-from cadalign.render import draw_overlay
+from cadalign.render import Geometry, Scene, cast_geometry, draw_overlay
 from cadalign.render.drawing.canvas import ByteImage
 from cadalign.render.scene import LIGHT_GREY
-from cadalign.retrieval.match import Match, cast_match
+from cadalign.retrieval.match import Match
 from cadalign.web import asset, fill
 
 _MATCHES = "matches.json"
+logger = logging.getLogger("cadalign")
 
 
 def write_retrieval(
@@ -95,7 +98,7 @@ def draw_match(image: ByteImage, camera: Camera, match: Match) -> ByteImage:
         image,
         camera,
         est_box=match.box,
-        est_frame=cast_match(match, camera),  # without a mesh, keypoints and box are drawn
+        est_frame=_cast(match, camera),  # without a mesh, keypoints and box are drawn
         observed=match.points_2d,
         reprojected=match.points_2d + match.residuals,
     )
@@ -115,8 +118,6 @@ def _card(rank: int, match: Match) -> str:
         "shared keypoints": f"{match.shared} of {match.observed}",
         "log-likelihood": f"{match.log_likelihood:.1f}",
     }
-    if match.silhouette_iou is not None:
-        values["silhouette IoU"] = f"{match.silhouette_iou:.3f}"
     if match.mirrored:
         values["labels"] = "left and right exchanged"
     rows = [fill("retrieval_value.html", label=key, value=value) for key, value in values.items()]
@@ -135,3 +136,14 @@ def _card(rank: int, match: Match) -> str:
 def score_text(score: float) -> str:
     """Format a probability in percent."""
     return f"{100 * score:.1f} %" if score >= 0.0005 else "< 0.1 %"
+
+
+def _cast(match: Match, camera: Camera) -> Geometry | None:
+    """Cast rays at a match's mesh; None if there is none or, with a warning, it is unreadable."""
+    if match.mesh_path is None:
+        return None
+    try:
+        return cast_geometry(Scene(load_mesh(match.mesh_path)), camera, match.alignment)
+    except CadalignError as error:
+        logger.warning("no silhouette: %s", error)
+        return None

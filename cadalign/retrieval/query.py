@@ -1,4 +1,4 @@
-"""Queries: observations whose models are retrieved, the options of that, masks and opacity."""
+"""Queries: observations whose models are retrieved, and the options of that."""
 
 from __future__ import annotations
 
@@ -9,20 +9,15 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from cadalign.arrays import BoolArray, IntArray
+from cadalign.arrays import IntArray
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.focal import FocalPrior
-from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file
 from cadalign.io.files import once_per_file, time_of
-from cadalign.io.images import is_grey, open_photo, read_image, read_mask
 from cadalign.io.observation import Observation
 from cadalign.retrieval.options import RetrievalOptions
 
 if TYPE_CHECKING:
-    from cadalign.render.drawing.canvas import ByteImage
     from cadalign.retrieval.library import Library
     from cadalign.retrieval.match import Match
     from cadalign.shapes.model import ShapeModel
@@ -41,9 +36,6 @@ class ObservationRetrieval:
     """Files that `cadalign shape learn` wrote, one for each category: ranks their models by the
     shape estimated from the keypoints, for objects that are not in the library. An unknown focal
     length is estimated with it, with the photo's EXIF data as a prior."""
-    silhouette: bool = False
-    """Rank the matches again by the object's pixels: those of the photo's opacity, or what is
-    segmented around the keypoints; without it, by the observation's mask if it has one."""
     sigma: float | None = None
     """Standard deviation of the keypoints [px]; by default the file's, or 1."""
     ranking: RetrievalOptions = field(default_factory=RetrievalOptions)
@@ -61,26 +53,21 @@ class ObservationRetrieval:
         shapes = tuple((path, time_of(path)) for path in self.shape)
         return _opened_library(self.library), _opened_shapes(shapes)
 
-    def retrieve(
-        self, seen: Observation, where: str, *, mask: BoolArray | None = None, workers: int = -1
-    ) -> list[Match]:
+    def retrieve(self, seen: Observation, where: str, *, workers: int = -1) -> list[Match]:
         """Rank the library's models by an observation, which messages call ``where``.
 
-        ``mask``, by default the observation's, and ``workers`` are as for `Library.retrieve`.
+        ``workers`` are as for `Library.retrieve`.
 
         Raises
         ------
         CadalignError
-            As for `Library.retrieve`; or if the keypoints have no semantic ids, or the photo cannot
-            be read.
+            As for `Library.retrieve`; or if the keypoints have no semantic ids.
         """
         if seen.others:
             said = "%s: models are ranked by the first of its %d photos alone"
             logger.warning(said, where, len(seen.views))
         library, shape = self.opened()
         camera, ids = seen.camera, _semantic_ids(seen, where)
-        if mask is None and seen.evidence.mask is not None and not self.silhouette:
-            mask = read_mask(seen.evidence.mask)  # as a fit to the observation reads it
         if shape is None and not camera.focal_known:
             what = "the focal length is unknown, without which no model's pose is searched"
             fix = "rank by --shape, which estimates it, or give a calibrated camera"
@@ -97,8 +84,6 @@ class ObservationRetrieval:
             **vars(replace(self.ranking, sigma=sigma)),
             shape=shape,
             focal_prior=prior,
-            mask=mask,
-            image=read_opacity(seen.image, camera) if self.silhouette else None,
             workers=workers,
         )
 
@@ -148,30 +133,3 @@ def _semantic_ids(query: Observation, where: str) -> IntArray:
         with in_file(where):
             raise DataError("the keypoints have no semantic_id", fix=fix)
     return query.ids
-
-
-def read_query_mask(path: Path, camera: Camera) -> BoolArray:
-    """Read an object's pixels, (h, w) bool; raises as `read_image`.
-
-    Those of one channel are read as a fit reads them, of a coloured image they are the bright ones.
-    """
-    mask = read_mask(path) if is_grey(path) else None
-    if mask is not None and mask.shape == (camera.height, camera.width):
-        return mask
-    return np.asarray(read_image(path, camera).mean(axis=2) > 127.5)
-
-
-def read_opacity(path: Path | None, camera: Camera) -> ByteImage:
-    """Read a photo with its opacity if it has one, (h, w, 3 or 4) uint8, upright by EXIF."""
-    if path is None:
-        fix = "add the image to the observation, or give the object's pixels with --mask"
-        raise InputError("the observation names no image", where="--silhouette", fix=fix)
-    colors = read_image(path, camera)
-    from PIL import ImageOps
-
-    with open_photo(path) as image:
-        if not image.has_transparency_data:
-            return colors
-        # The transparent colour of a palette is no separate channel in the file.
-        opacity = ImageOps.exif_transpose(image).convert("RGBA").getchannel("A")
-        return np.dstack([colors, np.asarray(opacity)])

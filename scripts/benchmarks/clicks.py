@@ -12,9 +12,9 @@ from benchmarks import section
 from benchmarks.photo import PhotoClicks, drawn_clicks, real_cases
 from benchmarks.section import BenchmarkData, Tables
 from cadalign import Alignment, Model, View, align
+from cadalign.annotate.evidence import grab_cut
 from cadalign.metrics import rotation_error
 from cadalign.render import Scene, cast_geometry
-from cadalign.retrieval.match import grab_cut
 
 _FEWEST = 3
 _MARGIN = 0.05  # of a box that is dragged around an object, relative to its larger side

@@ -133,13 +133,6 @@ def test_a_query_that_fails_is_a_row(
     assert "1 of 5 retrieved, 4 failed" in capsys.readouterr().err
 
 
-def test_what_is_for_one_is_refused_for_many(
-    case: Case, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["retrieve", *case.arguments, "--mask", "m.png"]) == 1
-    assert "--mask: is for one observation" in capsys.readouterr().err
-
-
 def test_another_library_is_another_run(
     case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,23 +10,19 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
 from playwright.sync_api import Browser, expect
 from support.files import write_json
 from support.refusals import refusal_line
 
-from cadalign import Library, Match, Mesh, Result
+from cadalign import Library, Match, Result
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, write_sample_dataset
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA as CAMERA
-from cadalign.io.evidence import ImageEvidence
-from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 from cadalign.render import Frame, RaycastRenderer, Scene, look_at
-from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.page import draw_match, write_retrieval
-from cadalign.retrieval.query import read_opacity, read_query, read_query_mask
+from cadalign.retrieval.query import read_query
 
 
 @dataclass(frozen=True)
@@ -74,133 +69,6 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
     )
     observation.save(folder / "seen.json")
     return Case(folder, library, model.model_id, frame, observation)
-
-
-# --- silhouettes -----------------------------------------------------------------------------
-
-
-class TestSilhouettes:
-    @pytest.fixture(scope="class")
-    @staticmethod
-    def twins(tmp_path_factory: pytest.TempPathFactory) -> Library:
-        """Two models with the same keypoints: a full block and one with a corner cut off."""
-        folder = tmp_path_factory.mktemp("twins")
-        corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) - 0.5
-        full, cut = _hull(corners), _hull(np.delete(corners, 6, axis=0))
-        models = []
-        for name, mesh in (("a-cut", cut), ("b-full", full)):
-            path = folder / f"{name}.obj"
-            lines = [f"v {x} {y} {z}" for x, y, z in mesh.vertices.tolist()]
-            lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.faces.tolist()]
-            path.write_text("\n".join(lines) + "\n")
-            bounds = np.array([[-0.5] * 3, [0.5] * 3])
-            xyz = corners[:7] * [1.0, 0.8, 0.6]
-            models.append(LibraryModel("block", name, xyz, np.arange(7), bounds, mesh_path=path))
-        models.append(replace(models[0], model_id="c-bare", mesh_path=None))
-        return Library.from_models(models)
-
-    @staticmethod
-    def seen(library: Library, name: str) -> tuple[np.ndarray, Frame]:
-        model = library["block", name]
-        pose = look_at(azimuth=35.0, elevation=30.0, distance=4.5, scale=(1.0, 1.2, 1.1))
-        frame = RaycastRenderer().render(Scene(model.load_mesh()), CAMERA, pose)
-        return CAMERA.project(pose.apply(model.xyz)), frame
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize("name", ["a-cut", "b-full"])
-    def test_a_mask_tells_models_with_the_same_keypoints_apart(self, twins, name) -> None:
-        pixels, frame = self.seen(twins, name)
-        plain = twins.retrieve(pixels, np.arange(7), CAMERA)
-        assert [match.model_id for match in plain] == ["a-cut", "b-full", "c-bare"]
-        assert [match.score for match in plain] == pytest.approx([1 / 3] * 3)
-        ranked = twins.retrieve(pixels, np.arange(7), CAMERA, mask=frame.mask)
-        assert ranked[0].model_id == name
-        assert ranked[0].silhouette_iou is not None
-        assert ranked[0].silhouette_iou > 0.99
-        # Without a mesh: neither preferred nor rejected.
-        assert [match.model_id for match in ranked][1] == "c-bare"
-        assert ranked[1].silhouette_iou is None
-        assert sum(match.score for match in ranked) == pytest.approx(1.0)
-        gap = ranked[0].silhouette_iou - ranked[2].silhouette_iou
-        assert ranked[0].score / ranked[2].score == pytest.approx(np.exp(gap / 0.05))
-
-    @pytest.mark.long
-    def test_a_mask_may_hold_opacities(self, twins) -> None:
-        pixels, frame = self.seen(twins, "b-full")
-        by_mask = twins.retrieve(pixels, np.arange(7), CAMERA, mask=frame.mask)
-        for mask in (255 * frame.mask.astype(np.uint8), frame.mask.astype(float)):
-            ranked = twins.retrieve(pixels, np.arange(7), CAMERA, mask=mask)
-            assert [m.to_dict() for m in ranked] == [m.to_dict() for m in by_mask]
-        meshes = twins._table.mesh_at.cache_info()
-        assert meshes.misses == 2  # each is read once
-        pickle.loads(pickle.dumps(twins))
-
-    @pytest.mark.slow
-    def test_an_image_s_opacity_is_its_mask(self, twins) -> None:
-        pixels, frame = self.seen(twins, "b-full")
-        image = np.dstack([np.zeros((480, 640, 3)), 255 * frame.mask]).astype(np.uint8)
-        ranked = twins.retrieve(pixels, np.arange(7), CAMERA, image=image)
-        assert ranked[0].model_id == "b-full"
-        assert ranked[0].silhouette_iou > 0.99
-
-    @pytest.mark.long
-    @pytest.mark.parametrize("name", ["a-cut", "b-full"])
-    def test_the_object_is_cut_out_of_a_photo(self, twins, name) -> None:
-        pixels, frame = self.seen(twins, name)
-        rng = np.random.default_rng(0)
-        grass = np.array([70, 120, 60]) + 15 * rng.standard_normal((480, 640, 3))
-        image = np.where(frame.mask[..., None], frame.composite(), grass.clip(0, 255))
-        ranked = twins.retrieve(pixels, np.arange(7), CAMERA, image=image.astype(np.uint8))
-        assert ranked[0].model_id == name
-        assert ranked[0].silhouette_iou > 0.95
-
-    @pytest.mark.slow
-    def test_what_shows_nothing_or_does_not_fit_is_refused(self, twins) -> None:
-        pixels, _ = self.seen(twins, "b-full")
-
-        def retrieve(**options: Any) -> None:
-            twins.retrieve(pixels, np.arange(7), CAMERA, **options)
-
-        with pytest.raises(InputError, match="mask: contains no pixel of the object"):
-            retrieve(mask=np.zeros((480, 640), dtype=bool))
-        with pytest.raises(InputError, match=r"mask: shape \(640, 480\), but .* 480 high and 640"):
-            retrieve(mask=np.zeros((640, 480), dtype=bool))
-        with pytest.raises(InputError, match=r"image: float64 of shape \(480, 640, 3\), expected"):
-            retrieve(image=np.zeros((480, 640, 3)))
-        with pytest.raises(InputError, match=r"image: shape \(48, 64\), but"):
-            retrieve(image=np.full((48, 64, 4), 255, dtype=np.uint8))
-
-    def test_without_meshes_the_order_stays_and_a_warning_is_given(self, twins, caplog) -> None:
-        pixels, frame = self.seen(twins, "b-full")
-        bare = Library.from_models([replace(model, mesh_path=None) for model in twins])
-        plain = bare.retrieve(pixels, np.arange(7), CAMERA)
-        ranked = bare.retrieve(pixels, np.arange(7), CAMERA, mask=frame.mask)
-        assert [m.to_dict() for m in ranked] == [m.to_dict() for m in plain]
-        assert "none of the matches has a mesh" in caplog.text
-
-    def test_a_mesh_that_is_gone_does_not_stop_the_others(self, twins, caplog) -> None:
-        pixels, frame = self.seen(twins, "b-full")
-        gone = [
-            replace(model, mesh_path=Path("/nowhere.obj")) if model.model_id == "a-cut" else model
-            for model in twins
-        ]
-        ranked = Library.from_models(gone).retrieve(pixels, np.arange(7), CAMERA, mask=frame.mask)
-        overlaps = {match.model_id: match.silhouette_iou for match in ranked}
-        assert overlaps["b-full"] > 0.99
-        assert overlaps["a-cut"] is None
-        assert "no silhouette: /nowhere.obj: no such mesh file" in caplog.text
-
-
-def _hull(points: np.ndarray) -> Mesh:
-    from scipy.spatial import ConvexHull
-
-    hull = ConvexHull(points)
-    faces = hull.simplices.copy()
-    for face, normal in zip(faces, hull.equations[:, :3], strict=True):
-        a, b, c = points[face]
-        if np.cross(b - a, c - a) @ normal < 0:
-            face[[1, 2]] = face[[2, 1]]
-    return Mesh(points, faces)
 
 
 # --- the commands ----------------------------------------------------------------------------
@@ -329,34 +197,6 @@ def test_the_sigma_of_the_file_is_used(case: Case, capsys: pytest.CaptureFixture
     assert json.loads(capsys.readouterr().out) == expected
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("option", ["--mask", "--silhouette"])
-def test_silhouettes_are_compared(
-    case: Case, option: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    extra = [option, str(case.folder / "mask.png")] if option == "--mask" else [option]
-    assert main(["retrieve", *case.arguments, *extra]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].split()[-1] == "IoU"
-    assert float(lines[2].split()[-1]) > 0.9
-
-
-def test_the_mask_of_an_observation_is_used(
-    case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """As the option's is; an option comes before it."""
-    mask = case.folder / "mask.png"
-    replace(case.observation, evidence=ImageEvidence(mask=mask)).save(tmp_path / "seen.json")
-    library = ("--json", *case.arguments[1:])
-    for path, given in ((case.arguments[0], ("--mask", str(mask))), (tmp_path / "seen.json", ())):
-        assert main(["retrieve", str(path), *library, *given]) == 0
-    by_option, by_file = capsys.readouterr().out.split("]\n[")
-    assert json.loads(by_option + "]") == json.loads("[" + by_file)
-    assert json.loads(by_option + "]")[0]["silhouette_iou"] > 0.9
-    assert main(["retrieve", str(tmp_path / "seen.json"), *library, "--silhouette"]) == 0
-    assert json.loads(capsys.readouterr().out)[0]["silhouette_iou"] > 0.5
-
-
 def test_an_observation_of_a_mask_alone_is_refused(
     case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -366,72 +206,17 @@ def test_an_observation_of_a_mask_alone_is_refused(
     assert text == f"{path}: there are no keypoints"
 
 
-def test_a_mask_of_labels_is_read_as_a_fit_reads_it(tmp_path: Path) -> None:
-    mask = np.zeros((480, 640), dtype=np.uint8)
-    mask[90:150, 100:200] = 1
-    write_image(tmp_path / "labels.png", mask)
-    assert np.array_equal(read_query_mask(tmp_path / "labels.png", CAMERA), mask > 0)
-    write_image(tmp_path / "white.png", np.dstack([255 * mask] * 3))
-    assert np.array_equal(read_query_mask(tmp_path / "white.png", CAMERA), mask > 0)
-
-
-@pytest.mark.long
-def test_a_photo_with_opacity_needs_no_cutting_out(
-    case: Case, capsys: pytest.CaptureFixture[str]
-) -> None:
-    image = np.dstack([case.photo, 255 * case.frame.mask]).astype(np.uint8)
-    Image.fromarray(image).save(case.folder / "clear.png")
-    path = case.folder / "clear.json"
-    replace(case.observation, image=case.folder / "clear.png").save(path)
-    assert main(["retrieve", str(path), *case.arguments[1:], "--silhouette", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    expected = case.retrieve(mask=case.frame.mask)
-    assert found[0]["silhouette_iou"] == expected[0].silhouette_iou
-
-
-@pytest.mark.parametrize("orientation", [1, 3, 6])
-@pytest.mark.parametrize("mode", ["RGBA", "P"])
-def test_opacity_is_upright_and_may_be_of_a_palette(
-    case: Case, tmp_path: Path, mode: str, orientation: int
-) -> None:
-    quarter_turns = {1: 0, 3: 2, 6: 1}[orientation]  # what makes the stored pixels of upright ones
-    mask = np.rot90(case.frame.mask, quarter_turns)
-    colors = np.rot90(case.photo, quarter_turns)
-    exif = Image.Exif()
-    exif[0x0112] = orientation
-    path = tmp_path / "photo.png"
-    if mode == "RGBA":
-        stored = Image.fromarray(np.dstack([colors, 255 * mask]).astype(np.uint8))
-        stored.save(path, exif=exif)
-    else:
-        stored = Image.fromarray(mask.astype(np.uint8)).convert("P")
-        stored.putpalette([255, 255, 255, 200, 60, 30])
-        stored.save(path, transparency=0, exif=exif)
-    found = read_opacity(path, CAMERA)
-    assert found.shape == (480, 640, 4)
-    np.testing.assert_array_equal(found[..., 3] > 127, case.frame.mask)
-    if mode == "RGBA":
-        np.testing.assert_array_equal(found[..., :3], case.photo)
-
-
-def test_a_photo_without_opacity_has_three_channels(case: Case, tmp_path: Path) -> None:
-    path = tmp_path / "palette.png"
-    Image.fromarray(case.photo).convert("P").save(path)
-    assert read_opacity(path, CAMERA).shape == (480, 640, 3)
-
-
 @pytest.mark.long
 def test_a_photo_that_moved_is_missed_only_where_it_is_shown(
     case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, gone = tmp_path / "moved.json", tmp_path / "gone.png"
     replace(case.observation, image=gone).save(path)
-    arguments = [str(path), *case.arguments[1:], "--mask", str(case.folder / "mask.png")]
+    arguments = [str(path), *case.arguments[1:]]
     assert main(["retrieve", *arguments]) == 0
     assert case.model_id in capsys.readouterr().out
-    for option in (["--out", str(tmp_path / "out")], ["--silhouette"]):
-        text = refusal_line(capsys, "retrieve", *arguments, *option)
-        assert text == f"{gone}: no such file"
+    text = refusal_line(capsys, "retrieve", *arguments, "--out", str(tmp_path / "out"))
+    assert text == f"{gone}: no such file"
     assert not (tmp_path / "out").exists()
 
 
@@ -573,12 +358,6 @@ def test_what_the_library_refuses_is_one_line(
     assert nowhere.startswith(f"{tmp_path / 'no'}: no such library file; build it with")
     unknown = refusal_line(capsys, "retrieve", *case.arguments, "--category", "chiar")
     assert "did you mean 'chair'" in unknown
-    masked = refusal_line(capsys, "retrieve", *case.arguments, "--mask", str(tmp_path / "no.png"))
-    assert masked == f"{tmp_path / 'no.png'}: no such file"
-    path = tmp_path / "blind.json"
-    replace(case.observation, image=None).save(path)
-    blind = refusal_line(capsys, "retrieve", str(path), *case.arguments[1:], "--silhouette")
-    assert blind.startswith("--silhouette: the observation names no image; add the image")
     assert "no such folder" in refusal_line(capsys, "library", "build", str(tmp_path / "none"))
     (tmp_path / "lib").write_text("something else that is a file of more than sixty-four bytes ...")
     assert "not a library file" in refusal_line(capsys, "library", "show", str(tmp_path / "lib"))

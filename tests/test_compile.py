@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -71,7 +69,6 @@ def test_processes_that_compile_at_the_same_time_keep_each_others_code(tmp_path:
 
 SOURCES = """
 from cadalign.compile import kernel
-{imports}
 
 @kernel
 def one(x):
@@ -95,23 +92,9 @@ def call(folder: Path, module: str, value: float, cache: Path) -> int:
         return hits(Program(ANEW + CALL.format(folder=str(folder), module=module, value=value)))
 
 
-def call_anew(folder: Path, module: str, value: float, **environment: str) -> int:
-    """The same in an interpreter of its own, which reads Numba's settings when it starts."""
-    code = CALL.format(folder=str(folder), module=module, value=value)
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        env={**os.environ, **environment},
-    )
-    assert done.returncode == 0, done.stderr
-    return int(done.stdout)
-
-
 def write(folder: Path, term: str) -> None:
     folder.mkdir(exist_ok=True)
-    (folder / "kernels.py").write_text(SOURCES.format(imports="", term=term))
+    (folder / "kernels.py").write_text(SOURCES.format(term=term))
 
 
 @pytest.mark.long
@@ -183,7 +166,7 @@ def test_damaged_code_is_compiled_anew_and_told_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: Callable[[bytes], bytes], ending: str
 ) -> None:
     (tmp_path / "a").mkdir()
-    source = SOURCES.format(imports="", term="1.0")
+    source = SOURCES.format(term="1.0")
     # What another kernel calls has files of its own.
     (tmp_path / "a" / "kernels.py").write_text(
         source.replace("one", "inner")

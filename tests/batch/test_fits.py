@@ -34,17 +34,14 @@ CAMERA = Camera(640, 480, 700.0, 700.0, 319.5, 239.5)
 POINTS = np.random.default_rng(1).uniform(-1, 1, (8, 3))
 
 
-def observations(count: int, *, noise: float = 1.0) -> Iterator[Observation]:
+def observations(count: int) -> Iterator[Observation]:
     rng = np.random.default_rng(0)
     for _ in range(count):
         scale = np.array([1, *np.exp(rng.uniform(-0.3, 0.3, 2))])
-        pose = Alignment(cadalign_rotation(rng), [0.1, 0.2, 6.0], scale)
-        seen = CAMERA.project(pose.apply(POINTS)) + rng.normal(0, noise, (8, 2))
+        rotation = rotation_from_quat_wxyz(rng.normal(size=4))
+        pose = Alignment(rotation, [0.1, 0.2, 6.0], scale)
+        seen = CAMERA.project(pose.apply(POINTS)) + rng.normal(0, 1.0, (8, 2))
         yield Observation(POINTS, seen, CAMERA, ids=np.arange(8))
-
-
-def cadalign_rotation(rng: np.random.Generator) -> Any:
-    return rotation_from_quat_wxyz(rng.normal(size=4))
 
 
 def lines(path: Path, count: int) -> Path:

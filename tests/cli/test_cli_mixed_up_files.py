@@ -101,12 +101,6 @@ def test_folder_is_no_file_to_write(
     assert sorted(folder.rglob("*")) == before
 
 
-def test_folder_of_a_fit_is_exported(folder: Path) -> None:
-    assert main(["fit", "seen.json"]) == 0
-    assert main(["export", "seen_fit", "--to", "x.glb"]) == 0
-    assert Path("x.glb").stat().st_size
-
-
 def test_present_folder_is_fitted(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     here = folder / "here"
     here.mkdir()

@@ -53,9 +53,9 @@ def whitened(
     return seen.project(moved(alignment, step).apply(problem.points_3d)) - problem.points_2d
 
 
-def spoiled(problem: Problem, share: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def spoiled(problem: Problem, share: float) -> tuple[np.ndarray, np.ndarray]:
     """Image points of which some were moved by 15 px or more, and which these are."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     count = len(problem.points_2d)
     wrong = rng.permutation(count) < round(share * count)
     return with_outliers(problem.points_2d, np.flatnonzero(wrong), rng), wrong

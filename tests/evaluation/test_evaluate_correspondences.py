@@ -47,16 +47,16 @@ ANY = Path()  # replaced by `run`
 QUICK = CorrespondenceOptions(ANY, outliers=(0.0, 0.3), draws=2, methods=("epnp", "ransac-optimal"))
 
 
-def seen_image(name: str, seed: int, camera: Camera = CAMERA) -> Correspondences:
+def seen_image(name: str, seed: int) -> Correspondences:
     """A made image: points about the world's origin, 0.2 px noise."""
     made = simulate_problem(
         np.random.default_rng(seed),
         points=POINTS,
         noise_px=0.2,
-        camera=camera,
+        camera=CAMERA,
         stretch=(1.0, 1.0),
     )
-    return Correspondences(name, made.points_3d, made.points_2d, camera, made.alignment)
+    return Correspondences(name, made.points_3d, made.points_2d, CAMERA, made.alignment)
 
 
 def write_colmap(folder: Path, *, images: int = 2, broken: tuple[int, ...] = ()) -> Path:

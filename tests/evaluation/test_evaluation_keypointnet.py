@@ -236,8 +236,8 @@ def test_runs_without_translation_up_to_scale_still_open(annotated: Path, tmp_pa
     assert "up to scale" not in headline_text([run], format="md")
 
 
-def row(method: str, error: float | None, *, category: str = "chair") -> dict[str, Any]:
-    names = {"category": category, "model_id": "m", "view": 0, "method": method}
+def row(method: str, error: float | None) -> dict[str, Any]:
+    names = {"category": "chair", "model_id": "m", "view": 0, "method": method}
     if error is None:
         return {**names, "status": FAILED, "reason": "why"}
     numbers = dict.fromkeys(("rotation_error_deg", "sym_rotation_error_deg"), error)

@@ -28,7 +28,7 @@ POSE = Alignment.from_packed(
 )
 
 
-def make_table(number: int, category: str = "table", lack: tuple[int, ...] = ()) -> LibraryModel:
+def make_table(number: int, category: str = "table") -> LibraryModel:
     """A table of random width, height, depth, overhang and shelf, none a stretch of another."""
     rng = np.random.default_rng([number, 7])
     w, h, d = np.array([0.3, 0.25, 0.2]) * rng.uniform(0.6, 1.4, 3)
@@ -38,9 +38,8 @@ def make_table(number: int, category: str = "table", lack: tuple[int, ...] = ())
     feet = [(w * x * inset, -h, d * z * inset) for x, z in signs]
     middle = [(w * x * inset, h * (2 * shelf - 1), d * z * inset) for x, z in signs[:2]]
     xyz = np.array(top + feet + middle)
-    kept = np.array([row for row in range(len(xyz)) if row not in lack])
     bounds = np.array([xyz.min(axis=0), xyz.max(axis=0)])
-    return LibraryModel(category, f"{number:03d}", xyz[kept], kept, bounds)
+    return LibraryModel(category, f"{number:03d}", xyz, np.arange(len(xyz)), bounds)
 
 
 def learn(models: list[LibraryModel]) -> ShapeModel:

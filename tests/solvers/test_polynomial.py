@@ -11,11 +11,11 @@ from numpy.polynomial import polynomial as P
 from cadalign.solvers.polynomial import ROOTS_ROWS, real_roots
 
 
-def roots_of(coefficients: np.ndarray, *, reach: float = 1.0, touching: float = 1e-7) -> np.ndarray:
+def roots_of(coefficients: np.ndarray, *, reach: float = 1.0) -> np.ndarray:
     degree = len(coefficients) - 1
     memory = np.empty((ROOTS_ROWS + 1, 2 * degree))
     memory[1, : degree + 1] = coefficients
-    count = real_roots(memory, 1, degree, reach, touching)
+    count = real_roots(memory, 1, degree, reach, 1e-7)
     return np.sort(memory[2, :count])
 
 

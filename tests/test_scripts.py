@@ -138,7 +138,7 @@ class TestEvidenceWithoutNoise:
 
     @pytest.mark.parametrize(
         "kind",
-        ["keypoints", "gravity", "length", "depth", "views-2", "views-2-free", "gravity+length"],
+        ["keypoints", "gravity", "length", "depth", "views-2", "views-2-free"],
     )
     def test_bound_is_that_of_the_estimate(self, car: SeenObject, kind: str) -> None:
         """The estimate is the truth, where its stated covariance is the bound."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 from unittest.mock import patch
@@ -30,8 +30,7 @@ from cadalign.geometry.alignment import Box
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.evidence import Size
-from cadalign.metrics import nearest_truth
-from cadalign.render import RaycastRenderer, cast_geometry, visible_keypoints
+from cadalign.render import cast_geometry, visible_keypoints
 from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.joint.covariance import joint_covariance
 from cadalign.solvers.joint.evidence import Evidence, State
@@ -50,14 +49,7 @@ _DRAWS = 1000  # of an ideal estimator's errors
 DAMAGES = ("exact", "dilated", "eroded", "smoothed", "hidden", "hole", "blob")
 """Kinds of masks: without damage; with a contour 2 px outside or inside; with a contour that
 wanders by 2 px; a quarter hidden by a rectangle; with a hole; with a blob of the background."""
-_ALONE = "mask-alone"
-_COMBINED = {
-    "gravity+length": ("gravity", "length"),
-    "mask+gravity": ("mask", "gravity"),
-    "mask+depth": ("mask", "depth"),
-    "mask+views-2": ("mask", "views-2"),
-    "all": ("mask", "depth", "gravity", "length", "views-2"),
-}
+_ALL = ("mask", "depth", "gravity", "length", "views-2")
 _USUAL = (
     *("keypoints", "gravity", "length", "depth", "views-2-free", "views-5-free"),
     *("views-2", "views-5", "mask", "mask-dilated", "mask-hidden", "mask-smoothed", "all"),
@@ -80,9 +72,8 @@ def evidence(
     kinds : tuple[str, ...]
         keypoints: these alone; gravity, length (the height), depth (of the keypoints), mask (of the
         first view): these and one kind of evidence; views-2, views-5: views with known camera
-        motion, views-2-free, views-5-free with unknown motion; mask- with a name of `DAMAGES`;
-        gravity+length, mask+gravity, mask+depth, mask+views-2, all; image: the photo itself, the
-        object drawn before a random texture; mask-alone: the mask without any keypoint.
+        motion, views-2-free, views-5-free with unknown motion; mask- with a name of `DAMAGES`; all:
+        mask, depth, gravity, length, and two views.
     noise_px : float
         Noise of the keypoints.
     """
@@ -133,13 +124,6 @@ class SeenObject:
         """The object's mask in the first camera; see `damaged_mask`."""
         shown = self.instance.scene, KEYPOINT_CAMERA, self.instance.cam_from_model
         return damaged_mask(cast_geometry(*shown).mask, damage, self.rng_of(damage))
-
-    def photo(self) -> np.ndarray:
-        """The object in the first camera, before a random texture."""
-        shown = self.instance.scene, KEYPOINT_CAMERA, self.instance.cam_from_model
-        frame = RaycastRenderer().render(*shown, samples=4)
-        height, width = KEYPOINT_CAMERA.height, KEYPOINT_CAMERA.width
-        return frame.composite(_random_texture(height, width, self.rng_of("photo")))
 
 
 def draw_object(model: AnnotatedModel, view: int, *, noise_px: float, seed: int) -> SeenObject:
@@ -214,9 +198,7 @@ class Given(NamedTuple):
 
 def evidence_for(kind: str, seen: SeenObject) -> Given:
     """The views and the size of a kind of evidence."""
-    if kind == _ALONE:
-        return Given((View(KEYPOINT_CAMERA, mask=seen.mask()),), seen.shots[:1], None)
-    kinds = _COMBINED.get(kind, (kind,))
+    kinds = _ALL if kind == "all" else (kind,)
     counts = [int(each.split("-")[1]) for each in kinds if each.startswith("views-")]
     shots = seen.shots[: counts[0] if counts else 1]
     is_free = kind.endswith("-free")
@@ -248,8 +230,6 @@ def _of_first(kinds: tuple[str, ...], seen: SeenObject) -> dict[str, Any]:
     for kind in kinds:
         if kind.startswith("mask"):
             fields["mask"] = seen.mask(kind.removeprefix("mask").removeprefix("-") or "exact")
-    if "image" in kinds:
-        fields["image"] = seen.photo()
     return fields
 
 
@@ -257,10 +237,6 @@ def _measured(kind: str, seen: SeenObject) -> Row:
     given, instance = evidence_for(kind, seen), seen.instance
     wall, _, (result, weighed) = section.clocked(partial(aligned, seen.model, given))
     est, gt = result.alignment, instance.gt
-    if kind == _ALONE:  # keypoints distinguish poses of the same outline
-        rigid = replace(gt, scale=np.ones(3))  # the object has the symmetry, not its model
-        near = nearest_truth(est=est, gt=rigid, symmetry=seen.source.symmetry)
-        gt = replace(near, scale=gt.scale)
     errors = alignment_errors(est=est, gt=gt, length=instance.diagonal)
     bound = bound_of(weighed, given, seen)
     drawn = seen.rng_of("bound").multivariate_normal(np.zeros(9), bound, size=_DRAWS, method="eigh")
@@ -303,26 +279,13 @@ def bound_of(weighed: Weighed | None, given: Given, seen: SeenObject) -> FloatAr
     return pose_and_lengths(known, true_state, unknowns)
 
 
-# Photos and masks ---------------------------------------------------------------------------------
+# Masks ---------------------------------------------------------------------------------
 
 _SHIFT = 2  # [px], of a dilated or eroded contour
 _WANDER = 2.0  # [px], standard deviation of a smoothed contour
 _WANDER_LENGTH = 5.0  # [px], over which it wanders
 _HIDDEN = 0.25  # share of the area
 _SIZE = 0.13  # radius of holes and blobs, relative to the root of the area
-_GRAINS = (2.0, 8.0, 32.0)  # [px]
-_TEXTURE = 30.0  # standard deviation of a channel [grey levels]
-_COLOURED = 0.3  # part of it that is a channel's own
-
-
-def _random_texture(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
-    """A picture (h, w, 3) of a random colour with grains of several sizes."""
-    picture = np.zeros((height, width, 3)) + rng.uniform(60, 200, 3)
-    for grain in _GRAINS:
-        noise = rng.normal(size=(height, width, 1)) + _COLOURED * rng.normal(size=picture.shape)
-        blurred = cv2.GaussianBlur(noise, (0, 0), grain)
-        picture += _TEXTURE / len(_GRAINS) ** 0.5 * blurred / blurred.std()
-    return np.asarray(np.clip(picture, 0, 255), dtype=np.uint8)
 
 
 def damaged_mask(mask: np.ndarray, kind: str, rng: np.random.Generator) -> BoolArray:

@@ -7,7 +7,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -39,30 +38,20 @@ from support.panels import (
 from support.web import axe_script
 
 from benchmarks.section import BenchmarkData, Row, Tables, clocked
-from cadalign import Alignment, Camera, Material, Mesh
+from cadalign import Camera
 from cadalign.annotate.actions import perform
 from cadalign.annotate.evidence import encode_runs
-from cadalign.annotate.opening import open_session
-from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.session import Session
-from cadalign.datasets import KeypointNet, load_mesh, write_sample_dataset
-from cadalign.export import AlignedObject, ExportView, export_object
-from cadalign.io.images import read_photo, write_image
+from cadalign.datasets import write_sample_dataset
+from cadalign.io.images import read_photo
 from cadalign.render import (
-    RaycastRenderer,
-    Scene,
     cast_geometry,
-    contact_sheet,
-    frame_object,
-    look_at,
-    visible_keypoints,
 )
 
 SCREENS = {"desktop": (1600, 1000), "laptop": (1366, 768), "phone": (390, 844)}
 SCHEMES = ("light", "dark")
 SERIOUS = ("serious", "critical")
 CAMERA = Camera(1024, 768, 1100.0, 1100.0, 511.5, 383.5)
-PICTURED_PAIRS = 8
 
 # From the event of the mouse to the task after the frame in which its answer is painted.
 WATCH_PAINT = """
@@ -101,7 +90,7 @@ _LIST = """async () => {
 def annotator(
     given: BenchmarkData,
     *,
-    parts: tuple[str, ...] = ("times", "list", "panels", "kills", "pictures"),
+    parts: tuple[str, ...] = ("times", "list", "panels", "kills"),
     clicks: int = 30,
     photos: int = 200,
     kills: int = 100,
@@ -111,9 +100,7 @@ def annotator(
     - times: from the mouse event to the painted frame, with 20 pairs, without and with a mask;
     - list: a folder of 200 photos: the list, its thumbnails, and going from photo to photo;
     - panels: a session by keys alone through every panel: layout shifts, and what axe-core finds;
-    - kills: annotators killed at random moments, and what the next ones had lost;
-    - pictures: models white, black, with doubled faces, thin, transparent, textured, huge and tiny,
-      light and dark, on desktop, laptop and phone, as contact sheets.
+    - kills: annotators killed at random moments, and what the next ones had lost.
 
     Parameters
     ----------
@@ -131,7 +118,6 @@ def annotator(
         "list": partial(_list, photos),
         "panels": _panels,
         "kills": partial(_kills, kills),
-        "pictures": _pictures,
     }
     with tempfile.TemporaryDirectory() as folder, chromium() as browser:
         for part in parts:
@@ -300,84 +286,3 @@ def _panels(given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Ro
 
 def _serious(page: Page) -> set[str]:
     return {each["id"] for each in page.evaluate(AXE) if each["impact"] in SERIOUS}
-
-
-# Pictures -----------------------------------------------------------------------------------------
-
-
-def _pictures(given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
-    sessions = {
-        name: _pictured_session(mesh, _new(folder / name))
-        for name, mesh in _pictured_models(given.keypointnet)
-    }
-    sheets = given.out / "annotator"
-    sheets.mkdir(parents=True, exist_ok=True)
-    for screen, (width, height) in SCREENS.items():
-        share = min(1.0, 900 / width)
-        size = int(width * share), int(height * share)
-        for scheme in SCHEMES:
-            shots = []
-            for name, session in sessions.items():
-                path = folder / f"{screen} {scheme} {name}.png"
-                with _page(browser, session, screen=screen, scheme=scheme) as page:
-                    page.evaluate("annotator.photo.setOverlay({ mode: 'edges' })")
-                    page.wait_for_timeout(300)
-                    page.screenshot(path=path)
-                shots.append(np.asarray(Image.fromarray(read_photo(path)).resize(size)))
-            columns = 5 if width < 600 else 2
-            sheet = sheets / f"{screen}_{scheme}.png"
-            write_image(sheet, contact_sheet(shots, list(sessions), columns=columns))
-            yield {"picture": str(sheet), "models": len(shots)}
-
-
-def _pictured_models(root: Path | None) -> Iterator[tuple[str, Mesh]]:
-    """Ten models that are hard to see: ShapeNet's where they are here."""
-    with tempfile.TemporaryDirectory() as folder:
-        sample = KeypointNet(write_sample_dataset(Path(folder), per_category=1))
-        own = {model.category: load_mesh(model.mesh_path) for model in sample if model.mesh_path}
-    real: dict[str, Mesh] = {}
-    if root is not None:
-        for path in sorted(root.glob("models/*/*/models/model_normalized.obj")):
-            real[path.parts[-3][:6]] = load_mesh(path)
-    chair, bottle = own["chair"], own["bottle"]
-    yield "white, doubled faces", real.get("341c9b", _painted(chair, 1.0))
-    yield "black", _painted(real.get("1eaf8d", chair), 0.0)
-    yield "doubled faces, cup", real.get("1ea9ea", chair)
-    thin = real.get("341e24", chair)
-    yield "thin", replace(thin, vertices=thin.vertices * [1.0, 1.0, 0.01])
-    yield "transparent", real.get("437678", _painted(bottle, 0.9, opacity=0.3))
-    yield "glass", _painted(bottle, 0.9, opacity=0.25)
-    yield "textured", real.get("88382b", chair)
-    yield "many faces", real.get("4e2769", own["vessel"])
-    huge, tiny = real.get("b08727", own["car"]), real.get("1cf98e", bottle)
-    yield "huge", replace(huge, vertices=huge.vertices * 1e5)
-    yield "tiny", replace(tiny, vertices=tiny.vertices * 1e-5)
-
-
-def _painted(mesh: Mesh, grey: float, *, opacity: float = 1.0) -> Mesh:
-    material = Material("grey", (grey, grey, grey, opacity))
-    return Mesh(mesh.vertices, mesh.faces, polygon=mesh.polygon, materials=(material,))
-
-
-def _pictured_session(mesh: Mesh, folder: Path) -> Session:
-    scene = Scene(mesh)
-    turned = look_at(azimuth=215, elevation=25, distance=1.0)
-    pose = frame_object(scene.bounds, CAMERA, rotation=turned.rotation, fill=0.8)
-    frame = RaycastRenderer().render(scene, CAMERA, pose)
-    write_image(folder / "photo.png", frame.composite((196, 200, 190)))
-    at_rest = Alignment(np.eye(3), np.zeros(3), pose.scale)  # the mesh is written as it is
-    aligned = AlignedObject((ExportView(CAMERA, at_rest),), mesh=mesh)
-    export_object(folder / "model.obj", aligned, format="obj")
-    session = open_session(
-        SessionOptions(image=folder / "photo.png", model=folder / "model.obj", out=folder)
-    )
-    perform(session, 0, {"do": "focal", "known": True, "pixels": CAMERA.fx})
-    model = session.model.cad
-    seen = visible_keypoints(model.scene, model.sample_points, CAMERA, pose)
-    shown = [point for point, is_seen in zip(model.samples, seen, strict=True) if is_seen]
-    rng = np.random.default_rng(0)
-    for point in shown[:PICTURED_PAIRS]:
-        ((u, v),) = CAMERA.project(pose.apply([point.xyz])) + rng.normal(size=(1, 2))
-        place(session, session.model.registry.add(point), [float(u), float(v)])
-    session.warm_up()
-    return session

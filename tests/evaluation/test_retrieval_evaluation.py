@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import csv
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
 from cadalign import Box, Library
@@ -314,17 +312,6 @@ class TestSummaries:
             assert summary["reciprocal_rank"] == pytest.approx(
                 np.mean([0.0 if rank is None else 1 / rank for rank in ranks])
             )
-
-    def test_runs_without_boxes_up_to_scale_still_open(
-        self, finished: RunFolder, tmp_path: Path
-    ) -> None:
-        earlier = tmp_path / "run"
-        shutil.copytree(finished.path, earlier)
-        table = read_table(finished.results).drop_columns("box_iou_up_to_scale")
-        pq.write_table(table, earlier / "results.parquet")
-        summaries = SPEC.summarize(SPEC.open(earlier))
-        assert np.isnan([summary["box_iou_up_to_scale"] for summary in summaries]).all()
-        assert np.isfinite([summary["box_iou"] for summary in summaries]).all()
 
     @pytest.mark.long
     def test_table_and_figures_are_written(self, finished: RunFolder) -> None:

@@ -408,21 +408,6 @@ def test_a_saved_model_is_the_same(learned: ShapeModel, tmp_path: Path) -> None:
     assert opened.training.points_3d.tobytes() == learned.training.points_3d.tobytes()
 
 
-def test_a_file_without_inflation_is_read(learned: ShapeModel, tmp_path: Path) -> None:
-    file = tmp_path / "table.shape"
-    learned.save(file)
-    document = msgspec.msgpack.decode(SEAL.unwrap(file.read_bytes(), "table.shape"))
-    del document["inflation"]
-    del document["degrees_of_freedom"]
-    del document["box_margins"]
-    del document["few_keypoints"]
-    SEAL.write(file, msgspec.msgpack.encode(document))
-    assert ShapeModel.open(file).inflation == 1
-    assert ShapeModel.open(file).degrees_of_freedom is None
-    assert ShapeModel.open(file).box_margins is None
-    assert ShapeModel.open(file).few_keypoints is None
-
-
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
 def test_an_inflation_that_is_no_factor_is_refused(learned: ShapeModel, value: float) -> None:
     with pytest.raises(InputError, match="inflation"):

@@ -6,8 +6,6 @@ the benchmark's script.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -30,11 +28,6 @@ MAX_TRANSLATION = 0.2
 MAX_ROTATION_DEG = 20.0
 MAX_SCALE = 0.2
 """Fraction."""
-BENCHMARK_CATEGORIES = frozenset(
-    {"bathtub", "bookshelf", "cabinet", "chair", "display", "sofa", "table", "trash bin"}
-)
-"""Categories of which the benchmark reports each; all others are pooled."""
-OTHER = "other"
 
 
 @dataclass(frozen=True)
@@ -65,42 +58,15 @@ class Scan2CadErrors:
 
 @dataclass(frozen=True, eq=False)
 class PlacedModel:
-    """A model placed in a scene, estimated or true."""
+    """A true model placed in a scene."""
 
     category: str
     alignment: Alignment  # in metres
-    model_id: str | None = None
-    """The model's id; estimates of a model count as often as the scene has it at most."""
     symmetry: Symmetry = field(default_factory=Symmetry.none)
-    """Motions that take a true model to itself."""
+    """Motions that take the model to itself."""
     center: FloatArray = field(default_factory=lambda: np.zeros(3))
-    """(3,), of a true model: the point of the model whose positions are compared [model units]. The
+    """(3,), the point of the model whose positions are compared [model units]. The
     benchmark's script takes minus the centre of the model's box."""
-
-
-@dataclass(frozen=True)
-class Scan2CadAccuracy:
-    """Share of the true models that an estimate is aligned with."""
-
-    aligned: dict[str, int]  # numbers of aligned models by category
-    total: dict[str, int]  # and all of them
-
-    @property
-    def by_category(self) -> dict[str, float]:
-        """The accuracy of each category, a fraction."""
-        return {name: self.aligned[name] / count for name, count in self.total.items()}
-
-    @property
-    def category_average(self) -> float:
-        """The mean over categories; NaN without any model."""
-        shares = list(self.by_category.values())
-        return float(np.mean(shares)) if shares else float("nan")
-
-    @property
-    def instance_average(self) -> float:
-        """The share of all models; NaN without any."""
-        total = sum(self.total.values())
-        return sum(self.aligned.values()) / total if total else float("nan")
 
 
 def scan2cad_errors(*, est: Alignment, gt: PlacedModel) -> Scan2CadErrors:
@@ -123,54 +89,6 @@ def scan2cad_errors(*, est: Alignment, gt: PlacedModel) -> Scan2CadErrors:
         scale=float(np.abs(np.mean(est.scale / gt.alignment.scale) - 1)),
         scale_axes=scale_error(est=est, gt=gt.alignment),
     )
-
-
-def scan2cad_accuracy(
-    scenes: Iterable[tuple[Sequence[PlacedModel], Sequence[PlacedModel]]],
-    *,
-    categories: Collection[str] = BENCHMARK_CATEGORIES,
-) -> Scan2CadAccuracy:
-    """Alignment accuracy over scenes, pairs of estimates and truths in one frame.
-
-    Estimates are taken in their order. Each is matched with the first true model of its category,
-    not matched before, that it is aligned with. ``categories`` are reported, the others pooled as
-    "other".
-
-    Examples
-    --------
-    >>> chair = PlacedModel("chair", Alignment(np.eye(3), [0, 0, 2], [1, 1, 1]))
-    >>> scan2cad_accuracy([([chair], [chair, chair])]).by_category
-    {'chair': 0.5}
-    """
-    aligned: Counter[str] = Counter()
-    total: Counter[str] = Counter()
-    for estimates, truths in scenes:
-        total.update(_reported(each.category, categories) for each in truths)
-        aligned.update(_reported(name, categories) for name in _matched(estimates, truths))
-    return Scan2CadAccuracy({name: aligned[name] for name in total}, dict(total))
-
-
-def _matched(estimates: Sequence[PlacedModel], truths: Sequence[PlacedModel]) -> list[str]:
-    """Categories of the true models that an estimate is aligned with."""
-    left = list(truths)
-    allowed = Counter(each.model_id for each in truths)
-    found = []
-    for each in estimates:
-        if each.model_id is not None:
-            if not allowed[each.model_id]:
-                continue
-            allowed[each.model_id] -= 1
-        for number, truth in enumerate(left):
-            if truth.category != each.category:
-                continue
-            if scan2cad_errors(est=each.alignment, gt=truth).is_aligned:
-                found.append(left.pop(number).category)
-                break
-    return found
-
-
-def _reported(category: str, categories: Collection[str]) -> str:
-    return category if category in categories else OTHER
 
 
 TRANSLATION = Metric("scan2cad_translation_m", "translation error", "m", 3, symbol="t m")

@@ -80,9 +80,7 @@ def default_methods(
     evidence: Collection[str],
     has_shape: bool,
 ) -> tuple[str, ...]:
-    """The methods for data that have some evidence, which the given bases get, where they can.
-
-    A shape model has no mesh for a mask.
+    """The methods for data that have some evidence, which the given bases get.
 
     Examples
     --------
@@ -92,8 +90,7 @@ def default_methods(
     bases = [base for base in BASES if has_shape or base != SHAPE]
     more = []
     for base in (each for each in with_evidence if each in bases):
-        useless = {MASK} if base == SHAPE else set()
-        kinds = [kind for kind in EVIDENCE if kind in evidence and kind not in useless]
+        kinds = [kind for kind in EVIDENCE if kind in evidence]
         sets = [[kind] for kind in kinds] + ([kinds] if len(kinds) > 1 else [])
         more += ["+".join((base, *each)) for each in sets]
     return (*bases, *more)

@@ -35,7 +35,7 @@ from benchmarks.photo import photo_times, photos
 from benchmarks.retrieval import retrieval, unseen_retrieval
 from benchmarks.runs import evaluation, fits, ransac
 from benchmarks.section import BenchmarkData, NotGivenError, Row, Tables
-from benchmarks.shapes import align, focal_shapes, similar
+from benchmarks.shapes import align, focal_shapes
 from benchmarks.speed import calls, cold, rendering
 from benchmarks.warned import warned
 from rich.console import Console
@@ -74,7 +74,6 @@ ON_REQUEST: dict[str, Callable[..., Tables]] = {
     "kitti": real_cars,
     "detections": real_detections,
     "unseen_retrieval": unseen_retrieval,
-    "similar": similar,
     "warned": warned,
 }
 SECTIONS = USUAL | ON_REQUEST

@@ -139,11 +139,6 @@ class ResultData:
         return tuple(view.camera for view in self.views)
 
     @property
-    def observed(self) -> tuple[FloatArray, ...]:
-        """Observed keypoints (n_v, 2) of every view [px]."""
-        return tuple(view.points_2d for view in self.views)
-
-    @property
     def residuals(self) -> FloatArray:
         """Projected minus observed keypoints (n, 2) of all views, one after the other [px].
 

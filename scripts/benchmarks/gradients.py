@@ -42,8 +42,7 @@ def torch_layer(
 ) -> Tables:
     """Forward and backward pass of a batch of fits, beside Gauss-Newton unrolled in PyTorch.
 
-    The unrolled one starts from the fit itself, perturbed: it searches nothing. Where PyPose is
-    installed, its EPnP of the models, stretched as they truly are, stands beside them.
+    The unrolled one starts from the fit itself, perturbed: it searches nothing.
 
     Parameters
     ----------
@@ -73,10 +72,6 @@ def torch_layer(
         return _gauss_newton(places, seen, camera, start, iterations).sum()
 
     ways = {"layer": layer, "unrolled": unrolled}
-    rigid = _pypose_solver(camera)
-    if rigid is not None:
-        scales = torch.tensor(np.array([each.alignment.scale for each in drawn]))
-        ways["PyPose"] = lambda seen: rigid(places * scales[:, None], seen).tensor().sum()
 
     def seconds_of(way: Callable[[Any], Any]) -> float:
         seen = pixels.clone().requires_grad_()
@@ -89,18 +84,7 @@ def torch_layer(
     name = f"{problems} fits of {points} points with gradients"
     ratio = found["layer"] / found["unrolled"]
     row = section.figure(name, 1e3 * found["layer"], "ms", ratio, "unrolled Gauss-Newton")
-    others = {f"{each}, ms": 1e3 * found[each] for each in ways if each != "layer"}
-    yield "PyTorch", [row | others]
-
-
-def _pypose_solver(camera: Camera) -> Any:
-    """PyPose's EPnP without refinement, which takes minutes; None where it is not installed."""
-    try:
-        import pypose
-        import torch
-    except ImportError:
-        return None
-    return pypose.module.EPnP(intrinsics=torch.tensor(np.array(camera.matrix)), refine=False)
+    yield "PyTorch", [row | {"unrolled, ms": 1e3 * found["unrolled"]}]
 
 
 def _gauss_newton(points: Any, pixels: Any, camera: Camera, start: Any, iterations: int) -> Any:

@@ -12,14 +12,13 @@ import cadalign
 from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign.arrays import FloatArray, instance_rng
-from cadalign.datasets import AnnotatedModel, KeypointNet
+from cadalign.datasets import KeypointNet
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.unseen import UnseenObject
 from cadalign.evaluation.simulation import Problem
 from cadalign.geometry.rotations import rotation_from_vector
-from cadalign.metrics import box_iou, rotation_error
-from cadalign.render import look_at
+from cadalign.metrics import rotation_error
 from cadalign.solvers.projection import projection_jacobian
 
 _SECOND_VIEW = rotation_from_vector(np.array([0.0, np.radians(25.0), 0.0]))
@@ -29,7 +28,6 @@ _UNKNOWN = cadalign.Camera.without_focal(_NEAR.width, _NEAR.height)
 _POINTS = 14
 _MODE_LENGTH, _RESIDUAL = 0.06, 0.005
 _ERRORS = ("R", "t", "f", "shape")
-_LEAST_KEYPOINTS = 6
 
 
 # Times --------------------------------------------------------------------------------------------
@@ -252,78 +250,3 @@ def _unseen_errors(
 def _held(deviations: Sequence[float]) -> float:
     """Share of focal lengths within their 95 % interval [%]."""
     return section.percent(np.abs(deviations) < section.WITHIN_95)
-
-
-# Similar models -----------------------------------------------------------------------------------
-
-
-def similar(
-    given: BenchmarkData,
-    *,
-    sigmas: tuple[float, ...] = (np.inf, 0.5, 0.3, 0.2, 0.1),
-    objects: int = 150,
-    noise_px: float = 2.0,
-) -> Tables:
-    """Fits with a model that is only similar: which prior on the stretch helps.
-
-    Models of KeypointNet are seen with all keypoints and aligned with another model of their
-    category, drawn at random: `fit` with the noise estimated from the residuals, as `cadalign fit
-    --similar`. Median rotation errors [deg], with the IoU of the keypoints' boxes at equal depths.
-
-    Parameters
-    ----------
-    sigmas : tuple[float, ...]
-        Standard deviations of the logarithm of the stretch; inf for no prior.
-    objects : int
-        Objects of each category.
-    noise_px : float
-        Noise of the keypoints [px].
-    """
-    dataset, rows = KeypointNet(given.needed()), []
-    for category in dataset.categories:
-        usable = [each for each in dataset[category] if len(each.keypoints.xyz) >= _LEAST_KEYPOINTS]
-        pairs = []
-        for each in usable[:: max(1, len(usable) // objects)]:
-            model, seen = _pair(each, [other for other in usable if other is not each], noise_px)
-            if len(model) >= _LEAST_KEYPOINTS:
-                pairs.append((model, seen))
-        row: Row = {"category": category, "objects": len(pairs)}
-        for sigma in sigmas:
-            errors = [_similar_errors(*each, sigma) for each in pairs]
-            name = "none" if np.isinf(sigma) else f"{sigma:g}"
-            row[name] = tuple(np.nanmedian(errors, axis=0).tolist())
-        rows.append(row)
-    yield "Median rotation error in degrees (box IoU), by prior", rows
-
-
-def _pair(
-    seen: AnnotatedModel, others: Sequence[AnnotatedModel], noise_px: float
-) -> tuple[FloatArray, Problem]:
-    rng = instance_rng(0, seen.category, seen.model_id, "similar")
-    other = others[int(rng.integers(len(others)))].keypoints
-    own = dict(zip(seen.keypoints.ids.tolist(), seen.keypoints.xyz, strict=True))
-    kept = [row for row, name in enumerate(other.ids.tolist()) if name in own]
-    points = np.array([own[name] for name in other.ids[kept].tolist()]).reshape(-1, 3)
-    pose = look_at(
-        azimuth=rng.uniform(0, 360), elevation=rng.uniform(0, 60), distance=rng.uniform(1.5, 3)
-    )
-    return other.xyz[kept], section.seen_in(KEYPOINT_CAMERA, pose, points, noise_px, rng)
-
-
-def _similar_errors(model: FloatArray, seen: Problem, sigma: float) -> tuple[float, float]:
-    """Rotation error [degrees] and IoU of the keypoints' boxes at equal depths of their centres."""
-    prior = None if np.isinf(sigma) else sigma
-    result = section.attempt(
-        cadalign.fit, model, seen.points_2d, seen.camera, sigma=None, stretch_sigma=prior
-    )
-    if result is None:
-        return 180.0, 0.0
-    est_box, gt_box = (
-        cadalign.Box.from_model([points.min(0), points.max(0)], pose)
-        for points, pose in ((model, result.alignment), (seen.points_3d, seen.alignment))
-    )
-    factor = np.linalg.norm(gt_box.center) / np.linalg.norm(est_box.center)
-    placed = cadalign.Box(factor * est_box.center, est_box.rotation, factor * est_box.extents)
-    thick = min(est_box.extents.min(), gt_box.extents.min()) > 1e-6
-    iou = box_iou(est=placed, gt=gt_box) if thick else np.nan
-    return rotation_error(est=result.alignment, gt=seen.alignment), iou

@@ -38,7 +38,7 @@ def test_results_are_saved_and_loaded(fitted: Result, aligned: Result, tmp_path:
     again = Result.load(tmp_path / "align.json")
     assert again.to_dict() == aligned.to_dict()
     assert again.cameras == (CAMERA,)
-    np.testing.assert_array_equal(again.observed[0], SEEN)
+    np.testing.assert_array_equal(again.views[0].points_2d, SEEN)
 
 
 def test_residuals_of_masks_are_saved_and_loaded(fitted: Result) -> None:

@@ -51,7 +51,7 @@ def test_a_view_that_determines_no_pose_is_left_out_and_named(count: int) -> Non
     assert [each.view for each in result.evidence] == [0, 2]
     written = Result.from_dict(result.to_dict())
     assert written.cameras == tuple(view.camera for view in (views[0], weak, views[1]))
-    assert [len(points) for points in result.observed] == [8, count, 8]
+    assert [len(view.points_2d) for view in result.views] == [8, count, 8]
 
 
 def test_keypoints_on_a_line_determine_no_pose() -> None:

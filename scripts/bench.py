@@ -25,13 +25,12 @@ from benchmarks.accuracy import solvers, unknown_focal, wide_lenses
 from benchmarks.annotator import annotator
 from benchmarks.cameras import photo_lenses
 from benchmarks.cars import real_cars, real_detections
-from benchmarks.clicks import clicks
 from benchmarks.coverage import coverage
 from benchmarks.evidence import evidence
 from benchmarks.gradients import gradient_errors, torch_layer
 from benchmarks.masks import mask_alone, masks
 from benchmarks.mistakes import mistakes
-from benchmarks.photo import photo_times, photos
+from benchmarks.photo import clicks, photo_times, photos
 from benchmarks.retrieval import retrieval, unseen_retrieval
 from benchmarks.runs import evaluation, fits, ransac
 from benchmarks.section import BenchmarkData, NotGivenError, Row, Tables

@@ -23,7 +23,6 @@ from typing import Annotated, Any
 import tyro
 from benchmarks.accuracy import solvers, unknown_focal, wide_lenses
 from benchmarks.annotator import annotator
-from benchmarks.cameras import photo_lenses
 from benchmarks.cars import real_cars, real_detections
 from benchmarks.coverage import coverage
 from benchmarks.evidence import evidence
@@ -34,7 +33,7 @@ from benchmarks.photo import clicks, photo_times, photos
 from benchmarks.retrieval import retrieval, unseen_retrieval
 from benchmarks.runs import evaluation, fits, ransac
 from benchmarks.section import BenchmarkData, NotGivenError, Row, Tables
-from benchmarks.shapes import align, focal_shapes
+from benchmarks.shapes import align, focal_shapes, photo_lenses
 from benchmarks.speed import calls, cold, rendering
 from benchmarks.warned import warned
 from rich.console import Console

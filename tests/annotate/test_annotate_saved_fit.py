@@ -74,7 +74,6 @@ def test_fit_of_the_observation_gives_the_pages_numbers(
         assert read.warnings == page.warnings
     shown = page_state(session, 0)["alignment"]
     assert flat(shown["alignment"]) == flat(page.alignment.to_dict())
-    assert shown["rms"] == page.rms
 
 
 def test_stored_options_that_the_page_does_not_use_are_named(

@@ -100,7 +100,6 @@ def test_fit_of_the_observation_gives_the_pages_numbers(
         )
     shown = page_state(session, 0)["alignment"]
     assert flat(shown["alignment"]) == flat(page.alignment.to_dict())
-    assert shown["rms"] == page.rms
 
 
 def test_page_shows_box_lines_keypoints_and_regions(case: Case, shape_file: Path) -> None:
@@ -217,7 +216,6 @@ def test_unknown_focal_length_is_estimated_with_the_shape(
     assert found.focal_prior == session.photos[0].intrinsics.likely_focal
     assert fact["note"] == "estimated"
     assert fact["value"].startswith(f"{found.camera.fx:.0f} ± ")
-    assert shown["focal"] == found.camera.fx
     off = np.log(found.camera.fx / case.instance.camera.fx)
     assert abs(off) < 3 * found.std.focal
     assert page_state(session, 0)["priors"]["has_focal"]

@@ -6,7 +6,9 @@ plain NumPy, for all problems of a row at once; nothing of them is shared with t
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,13 +16,14 @@ from scipy.spatial.transform import Rotation
 
 from cadalign import Alignment, Camera, fit, fit_batch
 from cadalign.errors import DegenerateError
-from cadalign.evaluation.simulation import Problem, simulate_problem
+from cadalign.evaluation.simulation import Problem, random_rotation, simulate_problem
 from cadalign.geometry.metrics import rotation_error, scale_error, translation_error
 
 pytestmark = pytest.mark.slow
 
 PROBLEMS = 2000
 DRAWS = 40
+KEYPOINT_CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 AMONG = 1e-2  # radians, and relative scales; two minima closer than that are the same
 
 
@@ -159,6 +162,36 @@ def test_errors_are_at_the_cramer_rao_bound(points: int, noise_px: float) -> Non
     # Where errors are near Gaussian, a quarter of the draws knows their median to 4 %.
     count = PROBLEMS if points < 1000 else PROBLEMS // 4
     assert_at_the_limit(simulated_row(points, noise_px, count=count), noise_px)
+
+
+def real_problems(real_data: Path, category: str, count: int) -> Iterator[Problem]:
+    """Views of annotated models of a category with 7 keypoints or more that span a volume."""
+    from cadalign.datasets import KeypointNet
+
+    models = []
+    for model in KeypointNet(real_data / "keypointnet").subset(categories=[category]):
+        xyz = model.keypoints.xyz
+        spread = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
+        if len(xyz) >= 7 and spread[2] > 0.05 * spread[0]:
+            models.append(xyz)
+    rng = np.random.default_rng(0)
+    for number in range(count):
+        xyz = models[number % len(models)]
+        xyz = xyz[rng.permutation(len(xyz))[:7]]
+        scale = np.array([1.0, *rng.uniform(0.5, 2, 2)])
+        gt = Alignment(random_rotation(rng), [*rng.uniform(-0.2, 0.2, 2), 2.5], scale)
+        points_3d = xyz / scale
+        points_2d = KEYPOINT_CAMERA.project(gt.apply(points_3d))
+        points_2d += rng.standard_normal(points_2d.shape)
+        yield Problem(points_3d, points_2d, KEYPOINT_CAMERA, gt, None)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("category", ["chair", "airplane"])
+def test_errors_on_real_keypoints_are_at_the_cramer_rao_bound(
+    real_data: Path, category: str
+) -> None:
+    assert_at_the_limit(list(real_problems(real_data, category, PROBLEMS)), 1.0)
 
 
 # --- the optimum -----------------------------------------------------------------------------

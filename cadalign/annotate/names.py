@@ -9,7 +9,6 @@ session that names the photo is found under either name. Further objects of the 
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import os
 import re
@@ -25,7 +24,7 @@ from cadalign.annotate.photos import FILE
 from cadalign.datasets.models.model_keypoints import SUFFIX
 from cadalign.errors import DataError, InputError
 from cadalign.io.documents import path_from, read_json
-from cadalign.io.files import checksum, read_bytes, writing
+from cadalign.io.files import checksum, locked, read_bytes
 from cadalign.io.images import PHOTO_ENDINGS
 
 _MOST_BYTES = 255  # of a file's name, in the common file systems
@@ -37,17 +36,8 @@ _LOCK = ".annotate-lock"
 @contextmanager
 def only_annotator(folder: Path) -> Iterator[None]:
     """Keep other annotators off a folder; a killed process holds no lock. Raises DataError."""
-    with writing(folder):
-        lock = (folder / _LOCK).open("a")
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise DataError(
-                "another annotator has this folder open",
-                where=str(folder),
-                fix=f"go on in its page or end it, or {_OTHER_FOLDER}",
-            ) from None
+    what = "another annotator has this folder open"
+    with locked(folder / _LOCK, what, fix=f"go on in its page or end it, or {_OTHER_FOLDER}"):
         yield
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import io
 import json
@@ -97,6 +98,22 @@ def refuse_input(path: Path) -> None:
     if os.path.realpath(path) in (_kept.get() or ()):
         what = "what is to be written is made from this file"
         raise DataError(what, where=printable(path), fix="give another name")
+
+
+@contextmanager
+def locked(path: Path, what: str, *, fix: str) -> Iterator[None]:
+    """Hold a folder's lock file; a killed process holds none.
+
+    Raises a DataError of the folder, which says ``what``, if another process holds it.
+    """
+    with writing(path.parent):
+        lock = path.open("a")
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise DataError(what, where=str(path.parent), fix=fix) from None
+        yield
 
 
 def remove_earlier(folder: Path, files: Iterable[Path]) -> None:

@@ -70,15 +70,13 @@ class PhotoTasks(Tasks[PhotoTask]):
 
 
 opened = lru_cache(maxsize=1)(open_photos)
+"""The data set of a folder, listed once in every process."""
 
 
 def reopened(root: Path) -> PhotoDataset:
     """`opened`, listed anew: a session may have changed its files."""
     opened.cache_clear()
     return opened(root)
-
-
-"""The data set of a folder, listed once in every process."""
 
 
 @dataclass(frozen=True)

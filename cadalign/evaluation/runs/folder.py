@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import platform
 import shutil
@@ -17,7 +16,14 @@ from msgspec import Meta, field
 
 from cadalign.errors import DataError
 from cadalign.io.documents import Count, ForeignDocument, convert, in_file
-from cadalign.io.files import made_folder, read_text, reading, refuse_nul, write_json, writing
+from cadalign.io.files import (
+    locked,
+    made_folder,
+    read_text,
+    reading,
+    refuse_nul,
+    write_json,
+)
 
 _FORMAT = 1
 _LONGEST_VALUE = 80
@@ -117,17 +123,8 @@ class RunFolder:
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Keep other processes out; a killed process holds no lock."""
-        with writing(self.path):
-            lock = (self.path / _LOCK).open("a")
-        with lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise DataError(
-                    "another process is working on this run",
-                    where=str(self.path),
-                    fix="wait for it, or give another folder (--out)",
-                ) from None
+        what = "another process is working on this run"
+        with locked(self.path / _LOCK, what, fix="wait for it, or give another folder (--out)"):
             yield
 
     def read_config(self) -> dict[str, Any] | None:

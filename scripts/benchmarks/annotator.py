@@ -23,7 +23,6 @@ from support.annotating import (
     served,
 )
 from support.chromium import chromium
-from support.killing import kill_at_random
 from support.panels import (
     AXE,
     MODEL,
@@ -90,17 +89,15 @@ _LIST = """async () => {
 def annotator(
     given: BenchmarkData,
     *,
-    parts: tuple[str, ...] = ("times", "list", "panels", "kills"),
+    parts: tuple[str, ...] = ("times", "list", "panels"),
     clicks: int = 30,
     photos: int = 200,
-    kills: int = 100,
 ) -> Tables:
     """The annotator's page in a real Chromium; it needs the tests' packages and Chromium.
 
     - times: from the mouse event to the painted frame, with 20 pairs, without and with a mask;
     - list: a folder of 200 photos: the list, its thumbnails, and going from photo to photo;
-    - panels: a session by keys alone through every panel: layout shifts, and what axe-core finds;
-    - kills: annotators killed at random moments, and what the next ones had lost.
+    - panels: a session by keys alone through every panel: layout shifts, and what axe-core finds.
 
     Parameters
     ----------
@@ -110,14 +107,11 @@ def annotator(
         Clicks that are timed.
     photos : int
         Photos in the folder.
-    kills : int
-        Annotators to kill.
     """
     measures: dict[str, Callable[[BenchmarkData, Browser, Path], Iterator[Row]]] = {
         "times": partial(_times, clicks),
         "list": partial(_list, photos),
         "panels": _panels,
-        "kills": partial(_kills, kills),
     }
     with tempfile.TemporaryDirectory() as folder, chromium() as browser:
         for part in parts:
@@ -185,19 +179,6 @@ def _list(photos: int, given: BenchmarkData, browser: Browser, folder: Path) -> 
         "first thumbnails ms": pictured[0],
         "switch ms": float(np.median(switched)),
         "switch p95 ms": float(np.percentile(switched, 95)),
-    }
-
-
-def _kills(kills: int, given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
-    rounds = list(kill_at_random(_case(given, folder), rounds=kills, seed=given.seed))
-    for each in rounds:
-        if each.lost:
-            print("lost", each.action, each.differences)
-    yield {
-        "kills": len(rounds),
-        "during an action": sum(each.was_busy for each in rounds),
-        "answered actions": sum(each.answered for each in rounds),
-        "lost": sum(each.lost for each in rounds),
     }
 
 

@@ -1,4 +1,4 @@
-"""Killed at random moments, the annotator loses nothing."""
+"""Stopped in the middle of an action, the annotator loses nothing."""
 
 from __future__ import annotations
 
@@ -8,28 +8,41 @@ from typing import Any
 
 import pytest
 from support.annotating import Case, place_all
-from support.killing import content, kill_at_random
 
 from cadalign.annotate.actions import perform
 from cadalign.annotate.page_state import page_state
 from cadalign.io import files
 
 
-@pytest.mark.long
-def test_killed_at_random_moments_it_loses_nothing(case: Case) -> None:
-    rounds = list(kill_at_random(case, rounds=3, seed=1))
-    lost = [(each.found, each.expected) for each in rounds if each.lost]
-    assert lost == []
-    assert sum(each.answered for each in rounds) > 0
-
-
 class Stop(BaseException):
     """The end of a process in the middle of a write."""
 
 
+def content(state: dict[str, Any]) -> dict[str, Any]:
+    """What a person has put in, of a state of the page."""
+    pairs = [[pair["uv"], pair["keypoint"], pair["name"]] for pair in state["pairs"]]
+    evidence = state["evidence"]
+    return {
+        "pairs": sorted(map(json.dumps, pairs)),
+        "evidence": [evidence["mask"] is not None, evidence["lengths"]],
+        "mark": state["image"]["state"],
+    }
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
-    "action", ["place_keypoint", "release", "move", "delete", "undo", "rename"]
+    "action",
+    [
+        "place_keypoint",
+        "release",
+        "move",
+        "delete",
+        "undo",
+        "rename",
+        "mask_load",
+        "lengths",
+        "mark",
+    ],
 )
 def test_stopped_before_any_write_an_action_is_done_or_not(
     case: Case, action: str, monkeypatch: pytest.MonkeyPatch
@@ -41,6 +54,9 @@ def test_stopped_before_any_write_an_action_is_done_or_not(
         "move": {"pair": 5, "uv": [50.0, 60.0]},
         "delete": {"pair": 5},
         "rename": {"pair": 1, "name": "knee"},
+        "mask_load": {"runs": [1000, 5000, 640 * 480 - 6000]},
+        "lengths": {"height": 2.0},
+        "mark": {"mark": "done"},
     }
     write, written = files.write_whole, [0]
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.annotating import Case, fitted, flat, place, place_all
+from support.annotating import Case, agree_with_fit, place, place_all
 
 from cadalign import Size, Symmetry, View, align
 from cadalign.annotate.actions import perform
@@ -87,7 +87,6 @@ def test_evidence_is_kept_used_as_by_fit_and_named(
     observed(case, *pieces).save(case.observation)
     before = stored(case)
     session = case.open(keypoints=None)
-    state = session.photos[0]
     perform(session, 0, {"do": "move", "pair": 1, "uv": [200, 200]})
     perform(session, 0, {"do": "undo"})
     after = stored(case)
@@ -95,15 +94,7 @@ def test_evidence_is_kept_used_as_by_fit_and_named(
         data.pop("model", None)
     assert after == before
 
-    live, _ = session.live(state)
-    assert isinstance(live, LiveAlignment)
-    assert live.result is not None
-    command = fitted(case, capsys)
-    page = live.result.to_dict()
-    for name in ("alignment", "covariance", "std", "stretch", "points_3d"):
-        np.testing.assert_allclose(flat(page[name]), flat(command[name]), rtol=1e-9, atol=1e-12)
-    assert page["warnings"] == command["warnings"]
-    shown = page_state(session, 0)["alignment"]
+    shown = agree_with_fit(session, case, capsys)
     words = {"up": "gravity", "size": "known width and height"}
     words |= {"keypoint depths": "depth", "depth image": "depth"}
     words |= {"camera_height": "camera height"}

@@ -302,31 +302,6 @@ def test_without_visible_keypoints_a_corner_is_suggested() -> None:
 # --- derivatives -----------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-@given(st.integers(0, 10_000))
-@settings(max_examples=20)
-def test_projection_jacobian_matches_differences(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    rotation *= np.sign(np.linalg.det(rotation))
-    pose = Alignment(rotation, [0.2, -0.3, 6.0], [1.0, *rng.uniform(0.6, 1.6, 2)])
-    points = rng.uniform(-1, 1, (5, 3))
-
-    def project(step: np.ndarray) -> np.ndarray:
-        x, y, z = step[:3]
-        turn = np.array([[1, -z, y], [z, 1, -x], [-y, x, 1.0]])
-        linear = turn @ pose.rotation * (pose.scale * np.exp(step[6:9]))
-        camera = LENS_CAMERA.with_focal(LENS_CAMERA.fx * np.exp(step[9]))
-        return camera.project(points @ linear.T + pose.translation + step[3:6])
-
-    jacobian = projection_jacobian(points, LENS_CAMERA, pose)
-    for unknown in range(10):
-        step = np.zeros(10)
-        step[unknown] = 1e-6
-        difference = (project(step) - project(-step)) / 2e-6
-        np.testing.assert_allclose(jacobian[:, :, unknown], difference, rtol=1e-5, atol=1e-4)
-
-
 def test_projection_jacobian_refuses_what_it_cannot_do() -> None:
     pose = Alignment(np.eye(3), [0, 0, 4], [1, 1, 1])
     with pytest.raises(InputError, match=r"^points_3d: a point lies behind the camera$"):

@@ -73,7 +73,7 @@ def test_help_opens_at_its_beginning_and_covers_no_photo(page: Page) -> None:
     expect(title).to_be_hidden()
 
 
-def test_every_key_is_listed_and_controls_have_tooltips_or_texts(page: Page) -> None:
+def test_every_key_is_listed(page: Page) -> None:
     keys = re.findall(r'key: "(\w)"', (SCRIPTS / "marking.js").read_text())
     keys += re.findall(r"\b(\w): \(app\b", (SCRIPTS / "keys.js").read_text())
     page.keyboard.press("?")
@@ -82,7 +82,3 @@ def test_every_key_is_listed_and_controls_have_tooltips_or_texts(page: Page) -> 
     assert len(set(keys)) > 12
     assert {key.upper() for key in keys} <= words
     page.keyboard.press("Escape")
-    for name in page.locator("button:visible, select:visible").evaluate_all(
-        "(all) => all.map((c) => c.title || c.ariaLabel || c.textContent)"
-    ):
-        assert name.strip()

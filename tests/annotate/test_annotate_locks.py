@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from support.annotating import Case, place
 from support.forked import MAIN, Program
-from support.refusals import refusal_line, refusal_text
+from support.refusals import refusal_line
 
 from cadalign.annotate.actions import perform
 from cadalign.annotate.page_state import page_state
@@ -209,20 +209,3 @@ def test_renamed_photo_is_told_and_its_pairs_go_on(case: Case) -> None:
     assert len(page_state(again, 0)["pairs"]) == 2
     perform(again, 0, {"do": "delete", "pair": 2})
     assert Observation.load(case.observation).image == renamed
-
-
-def test_tabs_share_one_annotation(case: Case) -> None:
-    """What one tab does is no answer to the state that another shows, but adds to it."""
-    session = case.open()
-    shown = page_state(session, 0)  # by a tab that is not refreshed
-    assert shown["pairs"] == []
-    place(session, 0, [10, 20])
-    place(session, 1, [30, 40])
-    perform(session, 0, {"do": "place_uv", "uv": [50, 60], "pair": None})
-    perform(session, 0, {"do": "delete", "pair": 2})
-    assert refusal_text(lambda: perform(session, 0, {"do": "move", "pair": 2, "uv": [1, 2]})) == (
-        "pair: there is no pair 2; reload the page"
-    )
-    perform(session, 0, {"do": "undo"})
-    pairs = page_state(case.open(), 0)["pairs"]
-    assert [pair["uv"] for pair in pairs] == [(10, 20), (30, 40), (50, 60)]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.annotating import Case, fitted, flat, place_all
+from support.annotating import Case, agree_with_fit, place_all
 from support.refusals import refusal_text
 
 from cadalign import Camera
@@ -55,18 +55,6 @@ def box(u: int, v: int) -> np.ndarray:
     mask = np.zeros((480, 640), dtype=bool)
     mask[v - 8 : v + 9, u - 8 : u + 9] = True
     return mask
-
-
-def agree_with_fit(
-    session: Session, case: Case, capsys: pytest.CaptureFixture[str]
-) -> dict[str, Any]:
-    """The page's alignment, which `cadalign fit` must find in the saved file."""
-    live, _ = session.live(session.photos[0])
-    assert live.result is not None, live.message
-    command, page = fitted(case, capsys), live.result.to_dict()
-    for name in ("alignment", "covariance", "std", "stretch"):
-        np.testing.assert_allclose(flat(page[name]), flat(command[name]), rtol=1e-9, atol=1e-12)
-    return dict(page_state(session, 0)["alignment"])
 
 
 def test_runs_are_those_of_the_pixels() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,9 +12,7 @@ from hypothesis import strategies as st
 from cadalign import Alignment, Camera, Mesh
 from cadalign.annotate.lines import Wireframe, box_lines
 from cadalign.annotate.model import ClickableModel, display_bytes, find_rim
-from cadalign.datasets import KeypointNet, ModelKeypoints, load_mesh
-from cadalign.errors import DataError, InputError
-from cadalign.geometry.simplify import simplify
+from cadalign.errors import InputError
 
 SQUARE = [[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]
 
@@ -136,30 +133,6 @@ def test_samples_are_corners_far_from_each_other() -> None:
 # --- what is shown ---------------------------------------------------------------------------
 
 
-def test_small_meshes_are_shown_as_they_are() -> None:
-    mesh = box_mesh()
-    small = simplify(mesh, max_faces=12)
-    assert small.vertices is mesh.vertices
-    assert small.faces is mesh.faces
-
-
-@pytest.mark.parametrize("limit", [1, 50, 2000])
-def test_simplified_meshes_keep_to_the_limit_and_near_the_surface(limit: int) -> None:
-    mesh = sphere(80)
-    small = simplify(mesh, max_faces=limit)
-    assert 0 < len(small.faces) <= limit
-    assert len(small.source) == len(small.faces)
-    assert len(np.unique(np.sort(small.faces, axis=1), axis=0)) == len(small.faces)
-    if limit == 2000:
-        assert len(small.faces) > 0.5 * limit
-        radius = np.linalg.norm(small.vertices[small.faces].reshape(-1, 3) - [3, -1, 2], axis=1)
-        assert radius.min() > 0.97
-        assert radius.max() < 1.001
-        # Each stands for a triangle of the full mesh that lies there.
-        gaps = mesh.triangles[small.source].mean(1) - small.vertices[small.faces].mean(1)
-        assert np.linalg.norm(gaps, axis=1).max() < 0.1
-
-
 def test_display_bytes_hold_triangles_normals_and_colours() -> None:
     model = ClickableModel(box_mesh())
     data = display_bytes(model)
@@ -232,16 +205,3 @@ def test_lines_behind_the_camera_are_left_out() -> None:
 
 
 # --- the keypoints that come with a model ----------------------------------------------------
-
-
-@pytest.mark.long
-def test_keypointnet_annotations_of_the_model_are_taken(sample_root: Path) -> None:
-    annotated = KeypointNet(sample_root)["chair", "sample_chair_000"]
-    assert annotated.mesh_path is not None
-    mesh = load_mesh(annotated.mesh_path)
-    file = sample_root / "annotations" / "chair.json"
-    points = ModelKeypoints.load(file, mesh=mesh, model=annotated.mesh_path).keypoints
-    assert [point.semantic_id for point in points] == annotated.keypoints.ids.tolist()
-    np.testing.assert_array_equal([point.xyz for point in points], annotated.keypoints.xyz)
-    with pytest.raises(DataError, match="has no annotations of a model whose id occurs in"):
-        ModelKeypoints.load(file, mesh=mesh, model=Path("other.ply"))

@@ -370,26 +370,6 @@ def test_a_finger_places_a_point(browser: Browser, case: Case) -> None:
     context.close()
 
 
-def test_outliers_save_errors_and_misses_are_shown(opened: tuple[Driver, Case, Access]) -> None:
-    driver, case, _ = opened
-    page = driver.page
-    place_all(driver.session, case, count=10)
-    u, v = case.clicks[4][1]
-    perform(driver.session, 0, {"do": "move", "pair": 5, "uv": [u + 45, v]})
-    page.evaluate("annotator.api.refresh()")
-    driver.wait_for_state(lambda state: len(state["pairs"]) == 10)
-    row = page.locator("tr.wrong")
-    expect(row).to_have_count(1)
-    named = re.compile("^Pair 5 contradicts the others: .* px off$", re.DOTALL)
-    expect(row).to_have_text(named, use_inner_text=True)
-    box = page.locator("section[aria-label=Model] canvas").bounding_box()
-    assert box is not None
-    page.mouse.click(box["x"] + 8, box["y"] + box["height"] - 8)
-    driver.wait(
-        "document.querySelector('[role=alert]').textContent === 'That click missed the model.'"
-    )
-
-
 def test_page_says_when_the_server_is_gone(browser: Browser, case: Case) -> None:
     context = browser.new_context()
     with served(case.open()) as access:
@@ -426,29 +406,6 @@ def test_photos_of_a_folder_come_in_turn(browser: Browser, case: Case) -> None:
         assert driver.errors == []
     context.close()
     assert "unfinished" in (case.folder / "second.json").read_text()
-
-
-@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
-def test_every_control_has_a_name_and_nothing_sticks_out(
-    browser: Browser, case: Case, width: int, scheme: Any
-) -> None:
-    session = case.open()
-    place_all(session, case, count=6)
-    context = browser.new_context(viewport={"width": width, "height": 844}, color_scheme=scheme)
-    with served(session) as access:
-        driver = Driver(context.new_page(), session)
-        driver.open(access)
-        page = driver.page
-        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-        controls = ("button", "input", "[role=application]", "summary")
-        names = page.locator(", ".join(f"{each}:visible" for each in controls)).evaluate_all(
-            "all => all.map(c => c.ariaLabel || c.labels?.[0]?.textContent || c.textContent)"
-        )
-        assert len(names) > 20
-        assert all(name.strip() for name in names)
-        assert page.locator("h1").count() == 1
-        assert driver.errors == []
-    context.close()
 
 
 def test_shape_is_drawn_and_an_unknown_point_identified(browser: Browser, case: Case) -> None:

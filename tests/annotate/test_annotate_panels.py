@@ -73,6 +73,8 @@ def used(
                 for each in page.evaluate(AXE, rules):
                     if each["impact"] in SERIOUS:
                         found.setdefault(each["id"], (scheme, panel, each["nodes"]))
+            if page.evaluate("document.documentElement.scrollWidth > innerWidth"):
+                found.setdefault("beyond the window", panel)
 
         keyboard = Keyboard(page, check)
         keyboard.session()

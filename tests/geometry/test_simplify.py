@@ -61,10 +61,17 @@ def test_opposite_vertices_are_those_of_both_triangles() -> None:
 
 
 @pytest.mark.parametrize("most", [20, 300, 3000])
-def test_simplification_uses_most_of_what_is_allowed(most: int) -> None:
+def test_simplification_uses_most_of_what_is_allowed_and_stays_near(most: int) -> None:
     ball = trimesh.creation.icosphere(subdivisions=5)
-    small = simplify(Mesh(np.array(ball.vertices), np.array(ball.faces)), max_faces=most)
+    mesh = Mesh(np.array(ball.vertices), np.array(ball.faces))
+    small = simplify(mesh, max_faces=most)
     assert 0.4 * most < len(small.faces) <= most
+    assert len(np.unique(np.sort(small.faces, axis=1), axis=0)) == len(small.faces)
+    radius = np.linalg.norm(small.vertices[small.faces], axis=2)
+    assert 1 - 8 / most < radius.min()
+    assert radius.max() < 1.001
+    gaps = mesh.triangles[small.source].mean(axis=1) - small.vertices[small.faces].mean(axis=1)
+    assert np.linalg.norm(gaps, axis=1).max() < 5 / np.sqrt(most)  # each lies where its source does
 
 
 def test_a_fan_that_no_grid_divides_keeps_its_largest_triangles() -> None:

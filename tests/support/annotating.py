@@ -263,6 +263,19 @@ def fitted(
     return dict(json.loads(capsys.readouterr().out))
 
 
+def agree_with_fit(
+    session: Session, case: Case, capsys: pytest.CaptureFixture[str], *, rtol: float = 1e-9
+) -> dict[str, Any]:
+    """The page's alignment, which `cadalign fit` must find in the saved file, too."""
+    live, _ = session.live(session.photos[0])
+    assert live.result is not None, live.message
+    command, page = fitted(case, capsys), live.result.to_dict()
+    for name in ("alignment", "covariance", "std", "stretch"):
+        np.testing.assert_allclose(flat(command[name]), flat(page[name]), rtol=rtol, atol=1e-9)
+    assert command["warnings"] == page["warnings"]
+    return dict(page_state(session, 0)["alignment"])
+
+
 def flat(value: Any) -> list[float]:
     """All numbers of nested lists and objects."""
     if isinstance(value, dict):

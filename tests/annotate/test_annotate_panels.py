@@ -17,9 +17,6 @@ from cadalign.datasets import write_sample_dataset
 
 DESKTOP, PHONE = (1280, 800), (390, 844)
 SERIOUS = ("serious", "critical")
-COLOURS = ["color-contrast", "link-in-text-block"]
-ONLY_COLOURS: dict[str, Any] = {"runOnly": COLOURS}
-NO_COLOURS: dict[str, Any] = {"rules": {name: {"enabled": False} for name in COLOURS}}
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +40,10 @@ class Used:
     found: dict[str, Any]
 
 
-@pytest.fixture(scope="module", params=[DESKTOP, PHONE], ids=["desktop", "phone"])
+# Colours do not depend on the window's size, nor all else on the scheme.
+@pytest.fixture(
+    scope="module", params=[(DESKTOP, "light"), (PHONE, "dark")], ids=["desktop", "phone"]
+)
 def used(
     request: pytest.FixtureRequest,
     browser: Browser,
@@ -52,27 +52,20 @@ def used(
 ) -> Iterator[Used]:
     """One session for all tests: what it takes is the way through the panels, not what is asked."""
     folder = tmp_path_factory.mktemp("used")
-    width, height = request.param
+    (width, height), scheme = request.param
     with served(prepare(original.copied_to(folder / "photos"))) as access:
         page = open_page(
-            browser, access.url, width=width, height=height, scheme="light", scripts=(WATCH_SHIFTS,)
+            browser, access.url, width=width, height=height, scheme=scheme, scripts=(WATCH_SHIFTS,)
         )
         errors: list[str] = []
         found: dict[str, Any] = {}
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.evaluate(axe_script())
 
-        # What has not to do with colours is the same in both schemes, and colours at any size.
-        desktop = [("dark", ONLY_COLOURS), ("light", {})]
-        schemes = desktop if request.param == DESKTOP else [("light", NO_COLOURS)]
-
         def check(panel: str) -> None:
-            for scheme, rules in schemes:
-                if len(schemes) > 1:
-                    page.emulate_media(color_scheme=scheme)
-                for each in page.evaluate(AXE, rules):
-                    if each["impact"] in SERIOUS:
-                        found.setdefault(each["id"], (scheme, panel, each["nodes"]))
+            for each in page.evaluate(AXE, {}):
+                if each["impact"] in SERIOUS:
+                    found.setdefault(each["id"], (panel, each["nodes"]))
             if page.evaluate("document.documentElement.scrollWidth > innerWidth"):
                 found.setdefault("beyond the window", panel)
 

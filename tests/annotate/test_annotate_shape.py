@@ -59,8 +59,7 @@ def options_of(kind: str, shape_file: Path) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("kind", ["learned", "similar"])
-@pytest.mark.parametrize("weighted", [False, True])
-@pytest.mark.parametrize("count", [None, 6])
+@pytest.mark.parametrize(("weighted", "count"), [(False, None), (True, 6)])
 def test_fit_of_the_observation_gives_the_pages_numbers(
     case: Case,
     capsys: pytest.CaptureFixture[str],

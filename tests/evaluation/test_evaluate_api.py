@@ -43,14 +43,6 @@ def test_every_experiment_has_a_specification_with_its_name() -> None:
 
 
 @pytest.mark.long
-def test_retrieval(sample_root: Path) -> None:
-    table = evaluate(sample_root, "retrieval", keypoints=[8], noises_px=[1.0], methods=["optimal"])
-    assert set(table.protocol) == {"leave-in", "leave-out"}
-    assert (table[table.protocol == "leave-in"]["rank"] == 1).all()
-    assert (table.seconds[table.status == "ok"] > 0).all()
-
-
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("experiment", "options"),
     [
@@ -75,18 +67,6 @@ def test_workers_of_a_cluster_may_have_been_started_elsewhere(
     rows = plan.experiment.evaluate(plan.tasks[:1]).rows
     assert [row["status"] for row in rows] == ["ok"]
     assert plan.config["root"] == str(tmp_path / "data")
-
-
-@pytest.mark.long
-def test_the_demonstration(sample_root: Path, tmp_path: Path) -> None:
-    table = evaluate(sample_root, "demo", categories=["car"], per_category=1, out=tmp_path)
-    assert table.status.tolist() == ["ok"]
-    assert len(list((tmp_path / "overlays").iterdir())) == 1
-
-
-def test_the_simulation() -> None:
-    table = evaluate(experiment="simulate", sweep="points", values=[8], runs=2, methods=["aepnp"])
-    assert table.points.tolist() == [8, 8]
 
 
 def test_what_is_wrong_is_named(tmp_path: Path) -> None:

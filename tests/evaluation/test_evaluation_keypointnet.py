@@ -141,8 +141,6 @@ def test_a_run_does_not_go_on_with_other_annotations(annotated: Path, tmp_path: 
     [
         ({"categories": ["chiar"]}, "did you mean 'chair'"),
         ({"split": "trian"}, "unknown split"),
-        ({"methods": ["optimum"]}, "did you mean 'optimal'"),
-        ({"methods": []}, "none is given"),
         ({"noise_px": float("nan")}, "not a noise level"),
         ({"noise_px": -1.0}, "not a noise level"),
         ({"min_visible": 0}, "min_visible"),
@@ -263,25 +261,6 @@ def test_a_category_where_all_failed_has_empty_cells() -> None:
     summaries = summaries_of([row("optimal", None)])
     assert [column.text(summaries[0][column.key]) for column in TABLE] == ["-"] * 6
     assert summary_csv(summaries, rename={}).splitlines()[1].startswith("chair,optimal,1,1,,,")
-
-
-@pytest.mark.long
-def test_the_optimum_beats_the_published_solver_and_is_at_the_limit(real_data: Path) -> None:
-    table = evaluate(
-        real_data / "keypointnet",
-        methods=["optimal", "aepnp-paper", "limit"],
-        visibility="hull",
-        categories=["chair", "bottle", "airplane", "mug", "bathtub", "guitar"],
-        max_models=150,
-    )
-    solved = table[table.status == OK]
-    medians = solved.groupby(["category", "method"])[[*METRICS]].median()
-    for category in solved.category.unique():
-        optimal, paper, limit = (
-            medians.loc[category, name] for name in ("optimal", "aepnp-paper", "limit")
-        )
-        assert (optimal < paper).all(), category
-        assert optimal.rotation_error_deg < 1.15 * limit.rotation_error_deg, category
 
 
 def test_overlays_of_models_without_meshes_are_refused_before_the_run(

@@ -20,9 +20,8 @@ from support.solving import BAD, joint, linear, weighted
 import cadalign
 from cadalign import Alignment, Camera, Model
 from cadalign.cli import main
-from cadalign.errors import DataError, InputError
+from cadalign.errors import InputError
 from cadalign.evaluation.experiments.photos import PhotosOptions
-from cadalign.evaluation.functions import choose_methods
 from cadalign.evaluation.methods import PNP_METHODS, MethodInput
 from cadalign.evaluation.plots import look_of
 from cadalign.evaluation.simulation import simulate_problem
@@ -306,13 +305,6 @@ def test_a_missing_poselib_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "poselib", None)
     table = simulate(["poselib"])
     assert set(table.reason) == {"PoseLib is not installed; pip install poselib"}
-
-
-def test_built_in_methods_are_chosen_by_name() -> None:
-    names = ["optimal", "aepnp", "ransac-optimal", "limit"]
-    assert [method.name for method in choose_methods(names)] == names
-    with pytest.raises(DataError):
-        cadalign.evaluate("no_such_folder", methods=names)
 
 
 @pytest.mark.long

@@ -17,7 +17,6 @@ from support.solving import broken, depth_error
 import cadalign
 from cadalign.cli import main
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation import metrics as room
 from cadalign.evaluation.functions import FunctionMetric
 from cadalign.evaluation.metrics import BOX_IOU, ROTATION, Metric
 from cadalign.evaluation.metrics.photos import score_columns
@@ -180,11 +179,6 @@ def test_sets_of_metrics_have_columns_of_their_own() -> None:
         assert {metric.key for metric in each.shares} <= set(each.columns)
 
 
-def test_the_table_is_found_where_it_was() -> None:
-    assert room.Metric is Metric
-    assert room.ROTATION is ROTATION
-
-
 @pytest.mark.long
 def test_the_how_to_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = Path(__file__).parents[2] / "docs" / "how_to" / "own_metric.md"
@@ -193,13 +187,6 @@ def test_the_how_to_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     space: dict[str, Any] = {}
     exec(block, space)
     assert np.isfinite(space["table"].upright_error).all()
-
-
-def test_functions_are_metrics_by_their_names() -> None:
-    assert simulate(metrics=[depth_error]).depth_error.notna().all()
-    assert simulate(metrics=depth_error, methods="epnp").method.tolist() == ["epnp"] * 3
-    with pytest.raises(InputError, match="metrics: a function that is called <lambda>"):
-        simulate(metrics=[lambda *, est: 0.0])
 
 
 @pytest.mark.parametrize(

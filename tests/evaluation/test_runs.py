@@ -202,13 +202,6 @@ def test_a_run_of_another_version_is_refused(tmp_path: Path) -> None:
         run_squares(tmp_path, Squares())
 
 
-@pytest.mark.parametrize("content", ["", "{", "[1]"])
-def test_a_damaged_run_file_is_refused(tmp_path: Path, content: str) -> None:
-    (tmp_path / "run.json").write_text(content)
-    with pytest.raises(DataError, match=r"run\.json"):
-        run_squares(tmp_path, Squares())
-
-
 def test_results_without_a_run_file_are_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "results.parquet").touch()
     with pytest.raises(DataError, match="holds results, but no run"):

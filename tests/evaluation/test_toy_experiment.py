@@ -17,7 +17,6 @@ import tyro
 import cadalign
 from cadalign.arrays import instance_rng
 from cadalign.cli import main
-from cadalign.errors import DataError
 from cadalign.evaluation import registry
 from cadalign.evaluation.api import run
 from cadalign.evaluation.metrics import CATEGORY, FAILED, INSTANCES, Metric
@@ -25,7 +24,6 @@ from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.plots import Plot, Trace
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.runs.work import Columns, Outcome, Plan, Rows
 from cadalign.evaluation.summary import medians
@@ -163,29 +161,6 @@ def test_it_is_a_command(root: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_random_streams_stay_what_they_are_from_version_to_version() -> None:
     assert instance_rng(0, "chair", "88382b87").integers(0, 1000, 3).tolist() == [731, 850, 330]
     assert instance_rng(2**40, "").integers(0, 1000, 3).tolist() == [98, 254, 354]
-
-
-@pytest.mark.slow
-def test_an_interrupted_run_goes_on_to_the_same_bytes(root: Path, tmp_path: Path) -> None:
-    options = MiddleOptions(root)
-    whole, cut = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "cut")
-    run(options, whole, workers=0, dask=None)
-
-    def stop(progress: Progress) -> None:
-        if progress.done >= 8:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        run(options, cut, workers=0, dask=None, on_progress=stop)
-    assert not cut.is_finished
-    unfinished = write_report([cut.path], tmp_path / "unfinished.html").path
-    assert "8 of 18 tasks are done" in unfinished.read_text()
-    seen: list[int] = []
-    run(options, cut, workers=0, dask=None, on_progress=lambda progress: seen.append(progress.done))
-    assert seen[0] == 8
-    assert cut.results.read_bytes() == whole.results.read_bytes()
-    with pytest.raises(DataError, match="draws is 5 there and 6 now"):
-        run(MiddleOptions(root, draws=6), cut, workers=0, dask=None)
 
 
 def test_it_has_a_table_a_page_figures_and_a_data_frame(root: Path, tmp_path: Path) -> None:

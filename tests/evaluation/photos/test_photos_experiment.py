@@ -38,7 +38,6 @@ from cadalign.evaluation.photos.methods import PhotoEstimate, Sighting
 from cadalign.evaluation.photos.objects import PhotoObjects
 from cadalign.evaluation.photos.target import PhotoTasks, farthest_points, opened
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.summary import Summary
 from cadalign.geometry.alignment import Box
@@ -315,40 +314,6 @@ class TestBadRecords:
 
 
 class TestRuns:
-    def test_a_killed_run_goes_on_to_the_same_bytes(self, tmp_path: Path) -> None:
-        root = write_pix3d(tmp_path / "data", photos=6)
-        options = PhotosOptions(root, methods=("rigid",))
-        whole, killed = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "killed")
-        run(options, whole, workers=0, dask=None)
-
-        def kill(progress: Progress) -> None:
-            if 0 < progress.done < progress.total:
-                raise KeyboardInterrupt
-
-        with pytest.raises(KeyboardInterrupt):
-            run(options, killed, workers=0, dask=None, on_progress=kill)
-        assert not killed.is_finished
-        run(options, killed, workers=0, dask=None)
-        assert killed.results.read_bytes() == whole.results.read_bytes()
-        assert killed.records.read_bytes() == whole.records.read_bytes()
-
-    @pytest.mark.long
-    def test_workers_make_the_same_table(self, tmp_path: Path) -> None:
-        root = write_pix3d(tmp_path / "data", photos=6)
-        for name, workers in (("none", 0), ("one", 1)):
-            folder = RunFolder(tmp_path / name)
-            run(PhotosOptions(root, methods=("rigid",)), folder, workers=workers, dask=None)
-        assert (tmp_path / "none/results.parquet").read_bytes() == (
-            tmp_path / "one/results.parquet"
-        ).read_bytes()
-
-    def test_another_run_in_the_same_folder_is_refused(self, tmp_path: Path) -> None:
-        root = write_pix3d(tmp_path / "data", photos=2)
-        done(root, tmp_path / "run", methods=("rigid",))
-        options = PhotosOptions(root, methods=("rigid",), similar_sigma=0.1)
-        text = refusal_text(lambda: run(options, RunFolder(tmp_path / "run"), workers=0, dask=None))
-        assert "similar_sigma is 0.04 there and 0.1 now" in text
-
     def test_changed_annotations_are_refused(self, tmp_path: Path) -> None:
         root = write_pix3d(tmp_path / "data")
         done(root, tmp_path / "run", methods=("rigid",))

@@ -243,22 +243,6 @@ def test_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert refusal_line(capsys, "fit", str(path)) == f"{path}: no such file"
 
 
-def test_keypoints_in_one_plane(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    points_3d = PROBLEM.points_3d.copy()
-    points_3d[:, 2] = 0.1
-    points_2d = PROBLEM.camera.project(PROBLEM.alignment.apply(points_3d))
-    flat = Problem(points_3d, points_2d, PROBLEM.camera, PROBLEM.alignment, None)
-    path = write_observation(tmp_path / "chair.json", flat)
-    assert refusal_line(capsys, "fit", str(path), "--method", "aepnp") == (
-        "points_3d: the points lie in the plane z = 0.1; "
-        "a linear solver needs keypoints that span a volume"
-    )
-    assert refusal_line(capsys, "fit", str(path)) == (
-        "points_3d: the scale s_z is not determined: the points lie in the plane z = 0.1; "
-        "add keypoints elsewhere, hold scales fixed with stretch=, or give stretch_sigma"
-    )
-
-
 @pytest.mark.parametrize(
     ("flags", "text"),
     [
@@ -298,34 +282,16 @@ def test_photo_that_cannot_be_used(tmp_path: Path, capsys: pytest.CaptureFixture
     )
 
 
-@pytest.mark.parametrize(
-    ("content", "text"),
-    [
-        (None, "no such mesh file"),
-        ("", "the mesh file is empty; get it again"),
-        (TETRAHEDRON[:34], None),
-        (TETRAHEDRON.replace("f 2 3 4", "f 2 3 9"), None),
-    ],
-    ids=["missing", "empty", "cut short", "damaged"],
-)
-def test_model_that_cannot_be_used(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str | None, text: str | None
-) -> None:
+def test_model_that_cannot_be_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     model = tmp_path / "model.obj"
-    if content is not None:
-        model.write_text(content)
-    path = write_observation(tmp_path / "chair.json", model=tmp_path / "model.obj")
-    line = refusal_line(capsys, "fit", str(path))
-    assert line.startswith(str(model))
-    if text is not None:
-        assert line == f"{model}: {text}"
+    path = write_observation(tmp_path / "chair.json", model=model)
+    assert refusal_line(capsys, "fit", path) == f"{model}: no such mesh file"
 
 
-@pytest.mark.parametrize("size", [200_000, 10**9, 10**30])
 def test_photo_sizes_that_cannot_be_drawn(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], size: int
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = write_observation(tmp_path / "chair.json")
+    size, path = 10**30, write_observation(tmp_path / "chair.json")
     edit(path, lambda data: data["camera"].update(width=size))
     assert refusal_line(capsys, "fit", str(path)) == (
         f"camera: {size} x 480 px is too large to be drawn; the limits are 16384 px a side and "
@@ -350,15 +316,6 @@ def test_paths_with_a_nul(
     assert refusal_line(capsys, *(word.format(file=path) for word in arguments)) == text
 
 
-@pytest.mark.parametrize("field", ["image", "model"])
-def test_paths_with_a_nul_in_the_file(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], field: str
-) -> None:
-    path = write_observation(tmp_path / "chair.json")
-    edit(path, lambda data: data.update({field: "a\0b.png"}))
-    assert refusal_line(capsys, "fit", path) == f"{path}: {field}: 'a\\x00b.png' is not a path"
-
-
 def test_output_folder_that_cannot_be_made(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -380,13 +337,6 @@ def test_wrong_command_lines_exit_with_2(
         main(arguments)
     assert caught.value.code == 2
     assert "Traceback" not in capsys.readouterr().err
-
-
-def test_help_exits_with_0(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(["fit", "--help"])
-    assert caught.value.code == 0
-    assert "--method" in capsys.readouterr().out
 
 
 # --- as a process ----------------------------------------------------------------------------

@@ -354,16 +354,6 @@ def test_evidence_that_cannot_be_used_is_refused(
     assert line.startswith(text.format(folder=masked))
 
 
-def test_malformed_mask_is_refused(masked: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = json.loads((masked / "found.json").read_text())
-    found[0]["segmentation"] = {"size": [480, 640], "counts": [1, 2]}
-    (masked / "found.json").write_text(json.dumps(found))
-    line = refusal_line(capsys, *observing(masked, "--camera", str(masked / "camera.json")))
-    assert line.startswith(
-        f"{masked / 'found.json'}: [0]: segmentation.counts: the runs have 3 pixels, "
-    )
-
-
 def test_observations_of_another_time_in_the_folder_are_named(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

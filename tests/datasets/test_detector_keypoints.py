@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import re
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
-from cadalign import Box, Camera, RansacOptions, Result, fit
-from cadalign.cli import main
-from cadalign.datasets import ModelKeypoint, ModelKeypoints
+from cadalign import Box, Camera, RansacOptions, fit
 from cadalign.io.images import read_photo
 
 THRESHOLD_PX = 8.0
@@ -77,61 +72,6 @@ def test_trusted_keypoints_on_one_side_do_not_mislead(car: Path) -> None:
         scores = np.linspace(1.0, 0.5, 36)
         result = fit(points_3d, points_2d, camera, sigma=None, ransac=ransac, scores=scores)
         assert result.inliers.sum() >= 25
-
-
-@pytest.mark.slow
-def test_detection_goes_all_the_way_from_file_to_picture(
-    car: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    points_3d, points_2d, camera = keypoints_in(car)
-    names = [f"car {n}" for n in range(36)]
-    detection = {
-        "images": [{"id": 0, "file_name": "image.png", "width": 1242, "height": 375}],
-        "categories": [{"id": 1, "name": "car", "keypoints": names}],
-        "annotations": [
-            {
-                "image_id": 0,
-                "category_id": 1,
-                "keypoints": np.column_stack([points_2d, np.full(36, 2)]).ravel().tolist(),
-            }
-        ],
-    }
-    (tmp_path / "found.json").write_text(json.dumps(detection))
-    (tmp_path / "camera.json").write_text(json.dumps(camera.to_dict()))
-    rows = zip(names, points_3d.tolist(), strict=True)
-    ModelKeypoints(tuple(ModelKeypoint(name, tuple(xyz)) for name, xyz in rows)).save(
-        tmp_path / "car.keypoints.json"
-    )
-    files = [str(tmp_path / name) for name in ("found.json", "car.keypoints.json")]
-    given = ["--image", str(car / "image.png"), "--camera", str(tmp_path / "camera.json")]
-    assert main(["observe", *files, *given]) == 0
-    options = ["--robust", "--similar", "--max-reproj-error", str(THRESHOLD_PX)]
-    assert main(["fit", str(tmp_path / "found.observation.json"), *options]) == 0
-    printed = capsys.readouterr().out
-    kept = re.search(r"ransac-optimal: (\d+) of 36 keypoints, rms [34]\.", printed)
-    assert kept is not None
-    assert int(kept[1]) >= 25
-    assert re.search(r"  stretch      \(1, 0\.[89]", printed)
-    out = tmp_path / "found.observation_fit"
-    written = Result.from_json((out / "fit.json").read_text())
-    direct = fit(
-        points_3d,
-        points_2d,
-        camera,
-        sigma=None,
-        stretch_sigma=0.2,  # the command's, for a similar model
-        ransac=RansacOptions(max_reproj_error=THRESHOLD_PX),
-    )
-    np.testing.assert_allclose(written.alignment.scale, direct.alignment.scale, rtol=1e-6)
-    overlay = cv2.imread(str(out / "overlay.png"))
-    photo = cv2.imread(str(car / "image.png"))
-    assert overlay.shape == photo.shape
-    x, y, width, height = np.loadtxt(car / "bbox.txt").astype(int)
-    drawn = np.abs(overlay.astype(int) - photo).max(axis=2) > 40
-    inside = drawn[y - 10 : y + height + 10, x - 10 : x + width + 10].sum()
-    assert inside > 2000
-    legend = drawn[:110, :110].sum()
-    assert drawn.sum() - inside - legend < 100
 
 
 def test_focal_length_of_a_shape_that_is_only_similar_is_not_claimed(car: Path) -> None:

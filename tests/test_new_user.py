@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import re
-import shutil
 from pathlib import Path
 
 import pytest
@@ -16,7 +14,6 @@ import cadalign
 pytestmark = pytest.mark.long
 
 DOCS = ROOT / "docs"
-TUTORIALS = sorted((DOCS / "tutorials").glob("*.py"))
 PAGES = [
     page
     for page in [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
@@ -32,14 +29,6 @@ for page in sys.argv[1:]:
     for block in re.findall(r"```python\n(.*?)```", Path(page).read_text("utf-8"), re.DOTALL):
         exec(compile(block, page, "exec"), names)
     print("ran", page)
-"""
-# Few of its millions of objects are garbage, which is searched for seldom: 7 % of the time.
-SPHINX = """
-import gc, sys
-from sphinx.cmd.build import main
-
-gc.set_threshold(100_000, 50, 100)
-sys.exit(main(sys.argv[1:]))
 """
 IPYTHON = """
 from IPython.core.completer import provisionalcompleter
@@ -118,30 +107,6 @@ def test_snippets_of_readme_and_site_run(user: Environment) -> None:
     assert [line for line in ran.splitlines() if line.startswith("ran ")] == [
         f"ran {page}" for page in PAGES
     ]
-
-
-@pytest.mark.long
-def test_site_builds_with_its_tutorials_and_its_schemas_accept_the_examples(
-    user: Environment, tmp_path: Path
-) -> None:
-    """The tutorials run for it, and a warning or an error of one of them fails."""
-    pytest.importorskip("sphinx_gallery", reason='needs pip install -e ".[docs]"')
-    jsonschema = pytest.importorskip("jsonschema")
-    # A copy, since tutorials leave what they made beside their sources.
-    source, site = tmp_path / "docs", tmp_path / "site"
-    shutil.copytree(DOCS, source, ignore=shutil.ignore_patterns("_build", "auto_tutorials"))
-    # Members of classes in the contents at the side take a quarter of the time.
-    options = ["-W", "--keep-going", "-q", "-b", "html", "-D", "toc_object_entries=0"]
-    user.run("python", ["-c", SPHINX, *options, str(source), str(site)], timeout=900)
-    for tutorial in TUTORIALS:
-        assert (site / "auto_tutorials" / f"{tutorial.stem}.html").is_file()
-    for name in ("observation", "model_keypoints"):
-        schema = json.loads((site / "schemas" / f"{name}.schema.json").read_text(encoding="utf-8"))
-        page = (DOCS / "formats" / f"{name}.md").read_text(encoding="utf-8")
-        example = page.partition("```json\n")[2].partition("```")[0]
-        jsonschema.validate(json.loads(example), schema)
-    fetched = r'(?:src|href)="(?:https?:)?//[^"]+\.(?:js|css|woff2?)"'
-    assert not re.search(fetched, (site / "index.html").read_text(encoding="utf-8"))
 
 
 @pytest.mark.long

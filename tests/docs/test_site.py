@@ -1,9 +1,10 @@
-"""The documentation site: its commands, links and examples; it is built in `test_new_user`."""
+"""The documentation site: its commands, links and examples; `make docs` builds it."""
 
 from __future__ import annotations
 
 import json
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from cadalign.datasets import ModelKeypoints
 from cadalign.io.observation import Observation
 
 DOCS = Path(__file__).parents[2] / "docs"
+sys.path.insert(0, str(DOCS))
 PAGES = sorted(DOCS.rglob("*.md"))
 MADE = ("_build", "auto_tutorials")
 
@@ -75,6 +77,12 @@ def test_examples_of_formats_are_read(tmp_path: Path) -> None:
     model["keypoints"] = model["keypoints"][:1]  # the other one needs the mesh
     path.write_text(json.dumps(model), encoding="utf-8")
     assert ModelKeypoints.load(path).names == ("seat, front left",)
+
+
+@pytest.mark.parametrize("name", ["observation", "model_keypoints"])
+def test_examples_of_formats_are_those_of_their_schemas(name: str) -> None:
+    jsonschema, directives = (pytest.importorskip(each) for each in ("jsonschema", "directives"))
+    jsonschema.validate(example(name), json.loads(directives.schema(name)))
 
 
 def test_scores_of_a_detector_become_standard_deviations() -> None:

@@ -34,16 +34,14 @@ class Yardstick:
     seconds: float
 
 
-def ratio(
-    ours: Measure, theirs: Measure, *, below: float, rounds: int = 3, patience: float = _PATIENCE
-) -> float:
+def ratio(ours: Measure, theirs: Measure, *, below: float, rounds: int = 3) -> float:
     """The duration of ours over that of theirs, both measured in turns.
 
     The median of a few rounds each; while that is not below its limit, they are measured anew, for
-    ``patience`` [s], and the fastest of all rounds decide as well: other programs only ever add to
-    what work takes.
+    a while, and the fastest of all rounds decide as well: other programs only ever add to what work
+    takes.
     """
-    end = time.monotonic() + patience
+    end = time.monotonic() + _PATIENCE
     own, other = _measured_in_turns(ours, theirs, rounds)
     found = statistics.median(own) / statistics.median(other)
     while found >= below and time.monotonic() < end:
@@ -127,13 +125,8 @@ USUAL = Yardstick(timed(_usual_work), 0.05)
 
 
 def reference_seconds(
-    measure: Measure,
-    *,
-    below: float,
-    by: Yardstick = USUAL,
-    rounds: int = 3,
-    patience: float = _PATIENCE,
+    measure: Measure, *, below: float, by: Yardstick = USUAL, rounds: int = 3
 ) -> float:
     """The duration [s] on the machine that limits are stated for, judging by the yardstick here."""
     limit = below / by.seconds
-    return by.seconds * ratio(measure, by.measure, below=limit, rounds=rounds, patience=patience)
+    return by.seconds * ratio(measure, by.measure, below=limit, rounds=rounds)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import signal
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +13,6 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from support.forked import Program
 
 import cadalign
 from cadalign import Alignment, CadalignError, Camera, FocalPrior, Observation, Result, Results
@@ -25,7 +22,6 @@ from cadalign.batch.outputs import COLUMNS
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.run import Progress
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.io.images import write_image
 from cadalign.io.observation import DetectorOptions, ObservationChanges
@@ -124,42 +120,6 @@ def test_workers_and_processes_leave_the_bytes_as_they_are(tmp_path: Path) -> No
         cadalign.fit_many(source, out=tmp_path / name, workers=workers, method="aepnp")
     for table in ("results.parquet", "records.parquet", "results.csv"):
         assert (tmp_path / "none" / table).read_bytes() == (tmp_path / "one" / table).read_bytes()
-
-
-_KILLED = """
-import sys, cadalign
-cadalign.fit_many(sys.argv[1], out=sys.argv[2], workers=0)
-"""
-
-
-@pytest.fixture(scope="module")
-def calm(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a run of 200 observations that nothing disturbs, beside their file."""
-    folder = tmp_path_factory.mktemp("calm")
-    cadalign.fit_many(lines(folder / "o.jsonl", 200), out=folder / "run", workers=0)
-    return folder / "run"
-
-
-@pytest.mark.long
-def test_killed_twice_it_gives_the_same_bytes(tmp_path: Path, calm: Path) -> None:
-    source = calm.parent / "o.jsonl"
-    hit = RunFolder(tmp_path / "hit")
-    done = 0
-    for _ in range(2):
-        process = Program(_KILLED, source, hit.path)
-        wanted, end = done + 4, time.monotonic() + 120
-        while len(list(hit.parts.glob("???????.parquet"))) < wanted and time.monotonic() < end:
-            assert process.poll() is None, "it ended before it was killed"
-            time.sleep(0.01)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        done = len(list(hit.parts.glob("???????.parquet")))
-    assert not hit.is_finished
-    seen: list[Progress] = []
-    cadalign.fit_many(source, out=hit.path, workers=0, on_progress=seen.append)
-    assert seen[0].done >= 2 * 4
-    for name in ("results.parquet", "records.parquet", "results.csv", "run.json"):
-        assert (hit.path / name).read_bytes() == (calm / name).read_bytes()
 
 
 def test_workers_may_have_been_started_elsewhere(

@@ -353,7 +353,7 @@ class TestCommand:
 @pytest.mark.long
 def test_of_real_bottles_the_shape_model_is_best(real_data: Path, tmp_path: Path) -> None:
     folder = RunFolder(tmp_path / "run")
-    options = UnseenOptions(real_data / "keypointnet", categories=("bottle",), max_models=16)
+    options = UnseenOptions(real_data / "keypointnet", categories=("bottle",), max_models=8)
     run(options, folder, workers=0, dask=None)
     rotation, iou = (
         # One of the bottles has no volume.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from support.layers import layers as listed
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "cadalign"
+parsed = cache(ast.parse)
 
 
 def layers() -> list[str]:
@@ -31,7 +33,7 @@ def layer_of(path: Path) -> str:
 
 def imports_in(source: str) -> Iterator[str]:
     """The layers that code imports: lazily, for type checking or by a module's name as text too."""
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(parsed(source)):
         if isinstance(node, ast.ImportFrom) and node.module == "cadalign":
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -112,7 +114,7 @@ def name_of(path: Path) -> str:
 def imported_by(source: str, names: set[str]) -> set[str]:
     """The package's modules that code imports, also in functions and for type checking."""
     found: set[str] = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Import):
             found.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:

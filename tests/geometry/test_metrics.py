@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection
@@ -315,6 +315,7 @@ def scaled_box(box: Box, factor: float) -> Box:
 
 
 @pytest.mark.long
+@settings(max_examples=30)
 @given(seed=SEEDS)
 def test_box_iou_up_to_scale_is_the_largest_over_all_factors(seed: int) -> None:
     est, gt = boxes_before_the_camera(seed)

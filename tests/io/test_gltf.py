@@ -259,9 +259,10 @@ def test_deep_scenes_take_linear_time(tmp_path: Path) -> None:
     chain: list[dict[str, Any]] = [
         {"children": [k + 1], "translation": [0, 0, 1e-3]} for k in range(count - 1)
     ]
-    path = write_gltf(tmp_path / "a.gltf", nodes=[*chain, {"mesh": 0}])
-    assert load_mesh(path).bounds[0, 2] == pytest.approx((count - 1) * 1e-3)
-    assert reference_seconds(timed(lambda: load_mesh(path)), below=5, rounds=1) < 5
+    path, found = write_gltf(tmp_path / "a.gltf", nodes=[*chain, {"mesh": 0}]), []
+    loading = timed(lambda: found.append(load_mesh(path)))
+    assert reference_seconds(loading, below=5, rounds=1) < 5
+    assert found[0].bounds[0, 2] == pytest.approx((count - 1) * 1e-3)
 
 
 @pytest.mark.timing
@@ -269,7 +270,8 @@ def test_many_materials_take_linear_time(tmp_path: Path) -> None:
     count = 50_000
     (tmp_path / "a.mtl").write_text("".join(f"newmtl m{k}\nKd 1 0 0\n" for k in range(count)))
     faces = "".join(f"usemtl m{k}\nf 1 2 3\n" for k in range(count))
-    path = tmp_path / "a.obj"
+    path, found = tmp_path / "a.obj", []
     path.write_text(f"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\n{faces}")
-    assert len(load_mesh(path).materials) == count
-    assert reference_seconds(timed(lambda: load_mesh(path)), below=4, rounds=1) < 4
+    loading = timed(lambda: found.append(load_mesh(path)))
+    assert reference_seconds(loading, below=4, rounds=1) < 4
+    assert len(found[0].materials) == count

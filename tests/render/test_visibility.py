@@ -179,9 +179,8 @@ def test_agrees_with_depth_images_of_real_models():
         shape = trimesh.load(path, force="mesh", process=False)
         scene = Scene(Mesh(np.array(shape.vertices), np.array(shape.faces)))
         points = annotated[path.parent.parent.name]
-        for _ in range(3):
-            view = sample_view(scene, points, camera, rng=rng, min_visible=6)
-            agree.append(
-                _agrees_with_depth_image(scene, points, camera, view.cam_from_model, view.visible)
-            )
+        view = sample_view(scene, points, camera, rng=rng, min_visible=6)
+        agree.append(
+            _agrees_with_depth_image(scene, points, camera, view.cam_from_model, view.visible)
+        )
     assert np.concatenate(agree).mean() > 0.99

@@ -151,23 +151,6 @@ def test_similar_model_is_that_of_the_file(
     assert capsys.readouterr().out == f"{expected}\n"
 
 
-def test_robust_search_works_with_shapes(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
-) -> None:
-    path = write(tmp_path, 8)
-    data = json.loads(path.read_text())
-    data["keypoints"][2]["uv"] = [20.0, 400.0]
-    path.write_text(json.dumps(data))
-    numbered.save(tmp_path / "box.shape")
-    command = ["fit", path, "--shape", tmp_path / "box.shape", "--robust", "--max-reproj-error=3"]
-    assert main([str(each) for each in command]) == 0
-    seen = Observation.load(path)
-    ransac = RansacOptions(max_reproj_error=3.0)
-    expected = align(numbered, View(CAMERA, seen.points_2d), ransac=ransac)
-    assert capsys.readouterr().out == f"{expected}\n"
-    assert expected.inliers.tolist() == [k != 2 for k in range(8)]
-
-
 def without_focal(path: Path) -> Path:
     return edit(path, camera={"width": 640, "height": 480})
 
@@ -237,7 +220,9 @@ def test_options_of_the_robust_search_and_confidences_count_with_a_shape(
     assert main(["fit", str(path), *flags]) == 0
     ransac = RansacOptions(max_iterations=20, min_iterations=5, refine=False)
     view = View(CAMERA, Observation.load(path).points_2d, scores=scores)
-    assert capsys.readouterr().out == f"{align(numbered, view, ransac=ransac)}\n"
+    expected = align(numbered, view, ransac=ransac)
+    assert capsys.readouterr().out == f"{expected}\n"
+    assert expected.inliers.tolist() == [k != 2 for k in range(8)]
 
 
 @pytest.mark.long
@@ -314,10 +299,7 @@ def test_similar_model_needs_xyz(tmp_path: Path, capsys: pytest.CaptureFixture[s
     ("flags", "text"),
     [
         ("--shape-sigma=0", "--shape-sigma: 0.0 is not positive"),
-        ("--shape-sigma=-1", "--shape-sigma: -1.0 is not positive"),
         ("--shape-sigma=nan", "--shape-sigma: nan is not positive"),
-        ("--shape-sigma=inf", "--shape-sigma: inf is not positive"),
-        ("--shape-sigma=1e-200", "--shape-sigma: 1e-200 is not between 1e-100 and 1e+100"),
         ("--shape-sigma=1e300", "--shape-sigma: 1e+300 is not between 1e-100 and 1e+100"),
         ("--shape none.shape", "none.shape: no such file"),
         (

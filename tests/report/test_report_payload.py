@@ -19,7 +19,7 @@ import pytest
 from PIL import Image
 from support.pages import embedded_payload
 
-from cadalign import Alignment, Box, Camera, Library, fit
+from cadalign import Alignment, Box, Camera, fit
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.api import run as do_run
@@ -31,13 +31,11 @@ from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.instances.views import KeypointTasks, keypointnet_benchmark
 from cadalign.evaluation.methods import fit_options
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import read_table
 from cadalign.geometry.metrics import alignment_box_iou, rotation_error
 from cadalign.report import write_report
 from cadalign.report.instances import INLINE_LIMIT, compact
 from cadalign.report.page import line_dict
-from cadalign.retrieval import LibraryModel
 
 METHODS = ("optimal", "aepnp", "aepnp-paper", "limit")
 HOSTILE = "<img src=x onerror=alert(1)>&amp;\u2028</script><!--"
@@ -596,41 +594,6 @@ def test_retrieval_has_rates_against_keypoints(tmp_path: Path) -> None:
     rates = [row["cells"]["rank_1"] for row in found["headline"]["rows"][:2]]
     assert first["traces"][0]["y"] == rates
     assert min(rates) >= 75
-
-
-@pytest.mark.long
-def test_an_unfinished_retrieval_shows_the_rates_that_there_are(tmp_path: Path) -> None:
-    file = tmp_path / "library"
-    models = [
-        LibraryModel("box", f"{k:02d}", xyz, np.arange(9), np.array([[-0.3] * 3, [0.3] * 3]))
-        for k, xyz in enumerate(np.random.default_rng(0).uniform(-0.3, 0.3, (20, 9, 3)))
-    ]
-    Library.from_models(models).save(file)
-    options = RetrievalRunOptions(file, keypoints=(8,), noises_px=(1.0,), methods=("epnp",))
-
-    def stop(progress: Progress) -> None:
-        if progress.done:
-            raise KeyboardInterrupt
-
-    folder = RunFolder(tmp_path / "run")
-    with pytest.raises(KeyboardInterrupt):
-        do_run(options, folder, workers=0, dask=None, on_progress=stop)
-    found = report(tmp_path, folder.path)
-    (run,) = found["runs"]
-    assert (run["state"], run["done"], run["total"]) == ("unfinished", 16, 20)
-    rows = [row["cells"] for row in found["headline"]["rows"]]
-    assert [row["instances"] for row in rows] == [16, 16]
-    results = read_table(folder.part(folder.results, 0)).to_pylist()
-    ranks = [row["rank"] for row in results if row["protocol"] == "leave-in"]
-    assert rows[0]["rank_1"] == pytest.approx(100 * np.mean([rank == 1 for rank in ranks]))
-    assert rows[0]["milliseconds"] > 0
-    assert found["plots"][0]["traces"][0]["y"] == [rows[0]["rank_1"]]
-    do_run(options, folder, workers=0, dask=None)
-    folder.timings.unlink()  # what was not kept is not shown
-    found = report(tmp_path, folder.path)
-    assert found["runs"][0]["state"] == "finished"
-    rows = [row["cells"] for row in found["headline"]["rows"]]
-    assert [(row["instances"], row.get("milliseconds")) for row in rows] == [(20, None)] * 2
 
 
 # --- refusals --------------------------------------------------------------------------------

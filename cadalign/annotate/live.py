@@ -275,7 +275,7 @@ def notes_of(live: LiveAlignment, shape: ObjectShape) -> tuple[str, ...]:
             f"{others} other alignment{'s explain' if others > 1 else ' explains'} these pairs "
             f"{how}: one more pair tells them apart"
         )
-    return (*notes, *(warning.replace("+-", "± ") for warning in result.warnings))
+    return (*notes, *(each.text.replace("+-", "± ") for each in result.warnings))
 
 
 def _extent(live: LiveAlignment, axis: str, shape: ObjectShape, *, in_lengths: bool) -> Fact:

@@ -24,6 +24,7 @@ from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Stated
+from cadalign.estimation.warning import EstimateWarning
 from cadalign.evaluation.options import ExperimentOptions, absolute_paths, plain_value
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import (
@@ -141,7 +142,8 @@ class FitRunOptions(ManyOptions):
 
     def estimate_of(self, seen: Observation, where: str) -> Estimated:
         result, _ = self.estimate.fit(seen, where)
-        doubts = [doubt for view in seen.views if (doubt := _photo_doubt(view))]
+        texts = [(number, _photo_doubt(view)) for number, view in enumerate(seen.views)]
+        doubts = [EstimateWarning("camera", text, number) for number, text in texts if text]
         if doubts:
             statistics = Stated.of(result.statistics, warnings=(*doubts, *result.warnings))
             result = replace(result, statistics=statistics)
@@ -240,7 +242,8 @@ class ManyEstimates:
         row = naming_row(task.row, task.name, seen) | result_row(result) | found.cells
         troubles = self._draw(task, row, seen, result)
         row["warning_count"] += len(troubles)
-        row["warnings"] = "; ".join(filter(None, (row["warnings"], *troubles)))
+        for name, more in (("warning_kinds", ["picture"] * len(troubles)), ("warnings", troubles)):
+            row[name] = "; ".join(filter(None, (row[name], *more)))
         timing = {"row": task.row, "seconds": time.perf_counter() - start}
         return Rows([row], [timing], [_record(task.row, seen, found)])
 
@@ -355,7 +358,7 @@ def _parsed(content: bytes, name: str) -> Any:
 
 def _failed(task: ObservationTask, reason: str, seen: Observation | None) -> Rows:
     row = naming_row(task.row, task.name, seen)
-    row |= {"status": FAILED, "reason": reason, "method": "", "warnings": ""}
+    row |= {"status": FAILED, "reason": reason, "method": "", "warning_kinds": "", "warnings": ""}
     return Rows([row], [{"row": task.row}], [_record(task.row, seen, None)])
 
 

@@ -30,8 +30,9 @@ rotation_std_deg, tx_std, ty_std, tz_std, scale_x_std, scale_y_std, scale_z_std,
     is known.
 rms_px, cost
     Root mean square length of the inliers' residuals [px], and the minimised cost.
-alternatives, warning_count, warnings
-    Number of other alignments that explain the keypoints, number of warnings, and their texts.
+alternatives, warning_count, warning_kinds, warnings
+    Number of other alignments that explain the keypoints, number of warnings, the kind of each (see
+    `cadalign.estimation.EstimateWarning`; "picture" for one that is not drawn), and their texts.
 component, coefficients
     Component of a learned shape's mixture that the object belongs to, and the coefficients of its
     modes, each of unit variance; empty without a learned shape.
@@ -92,7 +93,8 @@ COLUMNS: Columns = (
     *((f"t{axis}_std", float) for axis in _AXES),
     *((f"scale_{axis}_std", float) for axis in _AXES),
     *(("focal_length_std", float), ("rms_px", float), ("cost", float)),
-    *(("alternatives", int), ("warning_count", int), ("warnings", str), ("component", int)),
+    *(("alternatives", int), ("warning_count", int), ("warning_kinds", str), ("warnings", str)),
+    ("component", int),
     *_LISTS,
 )
 TIMING_COLUMNS: Columns = (("row", int), ("seconds", float))
@@ -130,7 +132,8 @@ def result_row(result: Result) -> Row:
         "cost": result.cost,
         "alternatives": len(result.alternatives),
         "warning_count": len(warnings),
-        "warnings": "; ".join(warnings),
+        "warning_kinds": "; ".join(each.kind for each in warnings),
+        "warnings": "; ".join(each.text for each in warnings),
         "residuals": result.residuals.ravel().tolist(),
         "is_inlier": result.inliers.tolist(),
     }

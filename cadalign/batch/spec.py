@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -105,7 +106,8 @@ def _exhibit(stored: Row, reason: str) -> str:
         points = [places[row_of[label]] for label in view["ids"] or ()] or places
         pixels, bounds = view["points_2d"], found["bounds"] or _extent(places)
         estimate |= _pose(found["alignment"])
-        estimate |= {name: found[name] for name in ("sigma", "std", "warnings")}
+        estimate |= {name: found[name] for name in ("sigma", "std")}
+        estimate["warnings"] = [each["text"] for each in found["warnings"]]
         estimate["rms_px"] = round(found["rms"], 4)
         estimate["alternatives"] = [
             {**_pose(other["alignment"]), "likelihood": other["relative_likelihood"]}
@@ -187,7 +189,12 @@ def _plots(runs: Sequence[Run]) -> list[Plot]:
 def _describe(run: Run) -> str:
     inputs = [Path(each).name for each in run.config.get("inputs", ())]
     listed = ", ".join(inputs[:3]) + (f" and {len(inputs) - 3} more" if len(inputs) > 3 else "")
-    return f"on {run.total:,} observations of {listed}"
+    cells = [each for each in run.column("warning_kinds").tolist() if each]
+    kinds = Counter(kind for each in cells for kind in each.split("; "))
+    counted = ", ".join(f"{count:,} {kind}" for kind, count in kinds.most_common())
+    return f"on {run.total:,} observations of {listed}" + (
+        f"; warnings: {counted}" if kinds else ""
+    )
 
 
 SPEC = Spec(

@@ -26,10 +26,12 @@ if TYPE_CHECKING:
         Uncertainty,
     )
     from cadalign.estimation.view import View
+    from cadalign.estimation.warning import EstimateWarning
     from cadalign.io.evidence import Size
 
 __all__ = [
     "Alternative",
+    "EstimateWarning",
     "EvidenceSummary",
     "FitOptions",
     "FitStats",

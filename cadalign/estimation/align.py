@@ -51,7 +51,7 @@ from cadalign.estimation.single import (
     is_plain,
     is_single,
 )
-from cadalign.estimation.view import View
+from cadalign.estimation.view import View, numbered
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import needs_facing
 from cadalign.io.evidence import Size
@@ -130,7 +130,7 @@ def align(
     ((8, 3), 0.19)
     """
     start = time.perf_counter()
-    given = _checked_views(views)
+    given = numbered(_checked_views(views))
     if size is not None:
         require_kind(size, Size, "size")
     inits = _checked_inits(init, given)

@@ -34,6 +34,7 @@ from cadalign.estimation.options import (
 )
 from cadalign.estimation.problems import Problems, are_in_one_plane, rays_of, whitening_of
 from cadalign.estimation.solve import solve_one
+from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, faced, turned_poses
 from cadalign.solvers.alignment import Objective
@@ -113,7 +114,7 @@ class RobustSearch:
             disagreeing=disagreeing(np.linalg.norm(best.residuals, axis=1), best.inliers),
         )
 
-    def doubt(self, residuals: FloatArray, inliers: BoolArray) -> str | None:
+    def doubt(self, residuals: FloatArray, inliers: BoolArray) -> EstimateWarning | None:
         """Warn where chance supports as many, and a moderate stretch alone speaks for them.
 
         ``residuals`` (n, 2) [px] and ``inliers`` (n,) are those of the estimate.
@@ -122,9 +123,10 @@ class RobustSearch:
         expected = log_expected_by_chance(support, self._sample_size, SOLUTIONS_OF_FOUR)
         if expected <= np.log(_CHANCE):
             return None
-        return (
+        return EstimateWarning(
+            "chance",
             f"{int(inliers.sum())} of {len(inliers)} keypoints agree, hardly more than chance "
-            "gives: check the others, or give more"
+            "gives: check the others, or give more",
         )
 
     @property
@@ -155,7 +157,7 @@ class RobustSearch:
 
 
 @np.errstate(all="ignore")  # what is not finite explains nothing
-def mistake_in(search: RobustSearch, found: Explained) -> str | None:
+def mistake_in(search: RobustSearch, found: Explained) -> EstimateWarning | None:
     """Name the mistake without which the keypoints agree better; see `find_mistake`.
 
     ``found`` is what the estimate explains.

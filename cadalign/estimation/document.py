@@ -17,6 +17,7 @@ from cadalign.estimation.options import FitOptions, pixel_information
 from cadalign.estimation.result_data import ResultData
 from cadalign.estimation.result_parts import Alternative, FitStats, Stated, ViewResult
 from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals, Misfit
+from cadalign.estimation.warning import EstimateWarning, Kind
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
@@ -32,7 +33,7 @@ from cadalign.io.documents import (
 
 VERSION = 1
 Matrix = list[list[Finite]]
-Kind = TypeVar("Kind", bound=ResultData)
+ResultKind = TypeVar("ResultKind", bound=ResultData)
 Read = TypeVar("Read")
 Made = TypeVar("Made")
 _BEHIND = (math.inf, math.inf)
@@ -111,6 +112,15 @@ class _Summary(ForeignDocument):
     share: NotNegative | None = None  # of a photo
 
 
+class _Warning(ForeignDocument):
+    """The fields of `EstimateWarning`."""
+
+    kind: Kind
+    text: str
+    view: int | None
+    keypoints: tuple[int, ...]
+
+
 class _Outlier(ForeignDocument):
     row: int
     distance_px: NotNegative
@@ -154,7 +164,7 @@ class _Result(ForeignDocument):
     stretched_axes: str
     focal: Literal["known", "estimate"]
     stats: FitStats
-    warnings: list[str]
+    warnings: list[_Warning]
     bounds: Matrix | None = None
     stretch: Point3 | None = None
     points_covariance: list[Matrix] | None = None
@@ -193,7 +203,7 @@ def write_result(result: ResultData) -> dict[str, Any]:
         "rms": result.rms,
         "stretch": result.stretch.tolist(),
         "std": None if std is None else {**vars(std)},
-        "warnings": list(result.warnings),
+        "warnings": [each.to_dict() for each in result.warnings],
         "ids": list(result.ids),
         "points_3d": result.points_3d.tolist(),
         "bounds": _plain(result.own_bounds),
@@ -273,7 +283,7 @@ def _plain_prior(prior: PriorOption) -> Any:
     return asdict(prior) if isinstance(prior, FocalPrior) else prior
 
 
-def read_result(data: Mapping[str, Any], kind: type[Kind]) -> Kind:
+def read_result(data: Mapping[str, Any], kind: type[ResultKind]) -> ResultKind:
     """Read the parsed form of a result; see `cadalign.Result.from_dict`.
 
     Raises InputError if a field is missing or invalid.
@@ -286,7 +296,7 @@ def read_result(data: Mapping[str, Any], kind: type[Kind]) -> Kind:
         raise InputError(error.what, where=place, fix=error.fix) from None
 
 
-def _result(read: _Result, kind: type[Kind]) -> Kind:
+def _result(read: _Result, kind: type[ResultKind]) -> ResultKind:
     unknowns = 10 if read.focal == "estimate" else 9
     views = _each("views", read.views, lambda view: _view(view, unknowns))
     in_camera = read.points_cam_covariance
@@ -295,7 +305,7 @@ def _result(read: _Result, kind: type[Kind]) -> Kind:
         fisher_covariance=_array(read.fisher_covariance, "fisher_covariance", unknowns, unknowns),
         points_covariance=_array(read.points_covariance, "points_covariance", None, 3, 3),
         points_cam_covariance=_array(in_camera, "points_cam_covariance", None, 3, 3),
-        warnings=tuple(read.warnings),
+        warnings=tuple(EstimateWarning(**msgspec.structs.asdict(each)) for each in read.warnings),
         misfit=_misfit(read.misfit),
         evidence=tuple(map(_read_evidence, read.evidence)),
         degrees_of_freedom=read.degrees_of_freedom,

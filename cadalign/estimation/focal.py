@@ -14,6 +14,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, as_positive
 from cadalign.errors import InputError, brief
+from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
 
 logger = logging.getLogger("cadalign")
@@ -227,20 +228,22 @@ def focal_grid(camera: Camera, prior: PriorOption) -> FloatArray:
     return np.sort(np.append(grid[near], prior.focal))
 
 
-def focal_doubt(camera: Camera, prior: PriorOption) -> str | None:
+def focal_doubt(camera: Camera, prior: PriorOption) -> EstimateWarning | None:
     """Warning about a camera whose estimated focal length is doubtful, or None."""
     prior = prior_of_camera(prior, camera)
     if prior is not None:
         off = math.log(camera.fx / prior.focal)
         if abs(off) > _CONTRADICTING_SIGMAS * prior.relative_sigma:
-            return (
+            return EstimateWarning(
+                "focal",
                 f"the keypoints contradict the focal length's prior: {camera.fx:.4g} px "
-                f"instead of {prior}"
+                f"instead of {prior}",
             )
     if np.isclose(camera.fx, focal_bounds(camera), rtol=1e-6).any():
-        return (
+        return EstimateWarning(
+            "focal",
             f"the focal length is the end of the searched range ({camera.fx:.4g} px): "
-            "the keypoints fit best at one that no camera has"
+            "the keypoints fit best at one that no camera has",
         )
     return None
 

@@ -49,6 +49,7 @@ from cadalign.estimation.uncertainty.summary import (
     weaknesses,
 )
 from cadalign.estimation.view import View
+from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import nearest_rotation, vector_from_rotation
@@ -91,7 +92,7 @@ def result_of(
     *,
     inliers: Sequence[BoolArray],
     is_curved: bool,
-    warnings: tuple[str, ...],
+    warnings: Warnings,
     evidence: tuple[EvidenceSummary, ...],
     **of_result: Any,
 ) -> Result:
@@ -128,13 +129,14 @@ def result_of(
         points_cam_covariance=of_seen[:-2],
         warnings=(
             *(
-                text
-                for number, view in enumerate(views)
-                for text in outside_image(
+                warning
+                for view in views
+                for warning in outside_image(
                     view.pixels,
                     view.camera,
                     agree=not warnings,
-                    where=f"views[{number}]: " if len(views) > 1 else "",
+                    view=view.number,
+                    where=f"views[{view.number}]: " if len(views) > 1 else "",
                 )
             ),
             *weaknesses(pose, uncertainty_of(covariances[0]), best.lengths),
@@ -192,7 +194,7 @@ def result_of_minima(
     minima: Sequence[Minimum],
     stats: FitStats,
     *,
-    mistake: str | None = None,
+    mistake: EstimateWarning | None = None,
 ) -> Result:
     """The result of minima, of which the likely ones count, with a widened prior of the shape.
 
@@ -232,7 +234,8 @@ def result_of_minima(
         turned = nearest_rotation(rotation.T @ pose.rotation)
         in_rig = Alignment(turned, rotation.T @ (pose.translation - camera[9:]), best.scale)
     tails = ShapeTails(inflation, prior.degrees_of_freedom)
-    warnings = warnings_of(minimum.evidence, minimum.state, minimum.cost, tails)
+    numbers = [view.number for view in views]
+    warnings = warnings_of(minimum.evidence, minimum.state, minimum.cost, tails, numbers)
     if problem.lacks_sigma:
         pixels = [view.pixels for view in views if view.sigma is None]
         warnings = (*unexplained(problem.noise, pixels), *warnings)
@@ -244,7 +247,10 @@ def result_of_minima(
         inliers=_inliers(prior, views, minimum),
         is_curved=symmetry is None and not is_exact(minimum.evidence),
         warnings=warnings if mistake is None else (mistake,),
-        evidence=summaries_of(minimum.evidence, minimum.state, best.cameras),
+        evidence=tuple(
+            each if each.view is None else replace(each, view=numbers[each.view])
+            for each in summaries_of(minimum.evidence, minimum.state, best.cameras)
+        ),
         cost=minimum.cost,
         stats=stats,
         component=minimum.component,

@@ -31,6 +31,7 @@ from cadalign.estimation.search import (
     thresholds,
 )
 from cadalign.estimation.uncertainty.evidence import redundancy_of
+from cadalign.estimation.warning import EstimateWarning
 from cadalign.shapes.model import ShapeModel
 
 _FEW_REJECTED = 0.9  # share of the keypoints that agree, above which no mistake is searched for
@@ -40,7 +41,9 @@ _MOST_CORRECTED = 1.6  # the same, without the mistake
 _LEAST_RATIO = 1.7  # of both
 
 
-def joint_mistake(problem: JointProblem, best: Minimum, ransac: RansacOptions | None) -> str | None:
+def joint_mistake(
+    problem: JointProblem, best: Minimum, ransac: RansacOptions | None
+) -> EstimateWarning | None:
     """Name the mistake without which the keypoints agree better.
 
     With ``ransac`` where many are rejected or an uncertain shape follows them poorly, otherwise
@@ -64,7 +67,7 @@ def joint_mistake(problem: JointProblem, best: Minimum, ransac: RansacOptions | 
     return find_mistake(found, len(best.inliers), explain, _beside_keypoints(problem))
 
 
-def _mistake_in_all(problem: JointProblem, best: Minimum) -> str | None:
+def _mistake_in_all(problem: JointProblem, best: Minimum) -> EstimateWarning | None:
     """Name the mistake without which all evidence agrees."""
     given, count = _misfit(best), sum(len(view.keypoint_ids) for view in problem.views)
     if (
@@ -91,9 +94,10 @@ def _mistake_in_all(problem: JointProblem, best: Minimum) -> str | None:
     found = find_in_all(best.score, count, explain, more)
     if found is None:
         return None
-    return (
+    return EstimateWarning(
+        "mistake",
         f"{found[0]}: corrected, all evidence agrees; as given, the residuals are {given:.2g} "
-        "times what their standard deviations allow"
+        "times what their standard deviations allow",
     )
 
 
@@ -120,8 +124,8 @@ def no_pose_error(
     views, fix = problem.views, mistake_beside(problem, ransac)
     seen = sum(len(view.keypoint_ids) > 0 for view in views)
     shown = [
-        f"views[{number}].{'image' if view.mask is None else 'mask'}"
-        for number, view in enumerate(views)
+        f"views[{view.number}].{'image' if view.mask is None else 'mask'}"
+        for view in views
         if view.mask is not None or view.image is not None
     ]
     if shown:

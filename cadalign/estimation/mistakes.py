@@ -10,6 +10,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import NoConsensusError
+from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PIXEL_CENTRE, rescaled_pixels
 from cadalign.solvers.minimal import MAX_SOLUTIONS
@@ -157,7 +158,7 @@ def find_mistake(
     given: int,
     explain: Callable[[Mistake], Explained | None],
     more: Sequence[Mistake] = (),
-) -> str | None:
+) -> EstimateWarning | None:
     """Name the mistake without which more keypoints of a robust search would agree.
 
     ``found`` is what the estimate explains of the ``given`` number of keypoints; ``explain`` says
@@ -179,9 +180,10 @@ def find_mistake(
         return None
     tried += try_mistakes(explain, given, _MISTAKES[first:])
     best = min((each for _, each in tried if is_better(each)), key=lambda each: each.score)
-    return (
+    return EstimateWarning(
+        "mistake",
         f"{name_likely(tried, best)}: corrected, {best.inliers} of {given} keypoints agree; as "
-        f"given, {rejected} ({100 * rejected / given:.0f} %) are rejected"
+        f"given, {rejected} ({100 * rejected / given:.0f} %) are rejected",
     )
 
 
@@ -190,7 +192,7 @@ def find_likelier(
     count: int,
     explain: Callable[[Mistake], Explained | None],
     more: Sequence[Mistake] = (),
-) -> str | None:
+) -> EstimateWarning | None:
     """Name the mistake without which the keypoints of an uncertain shape are likelier.
 
     Such a shape follows the keypoints of most mistakes, so that none is rejected: the likelihoods
@@ -208,7 +210,8 @@ def find_likelier(
     tried += try_mistakes(explain, count, _MISTAKES[2:])
     best = min(likelier(tried), key=lambda each: each.score)
     odds = math.exp(min((score - best.score) / 2, _LARGEST_LOG))
-    return f"{name_likely(tried, best)}: corrected, the keypoints are {odds:.2g} times as likely"
+    text = f"{name_likely(tried, best)}: corrected, the keypoints are {odds:.2g} times as likely"
+    return EstimateWarning("mistake", text)
 
 
 def _listed(clauses: Sequence[str]) -> str:
@@ -217,33 +220,37 @@ def _listed(clauses: Sequence[str]) -> str:
 
 
 def outside_image(
-    points_2d: FloatArray, camera: Camera, *, agree: bool, where: str = ""
-) -> tuple[str, ...]:
+    points_2d: FloatArray, camera: Camera, *, agree: bool, view: int = 0, where: str = ""
+) -> Warnings:
     """Warn about keypoints (n, 2) and a principal point that are none of the image's.
+
+    ``view`` is the number of the view, ``where`` what the texts begin with.
 
     All keypoints lie beyond one side, or, where they do not ``agree``, most outside: of an object
     that is hidden or cropped, some may, and they may surround the image.
     """
-    doubts = _doubts_of_camera(camera, where)
-    count = int((~camera.contains(points_2d)).sum())
+    wrong = _wrong_principal_point(camera)
+    doubts = () if wrong is None else (EstimateWarning("camera", where + wrong, view),)
+    outside = np.flatnonzero(~camera.contains(points_2d)).tolist()
+    count = len(outside)
     if 2 * count <= len(points_2d):
         return doubts
     last = np.array([camera.width, camera.height]) - PIXEL_CENTRE
     beyond = (points_2d < -PIXEL_CENTRE).all(axis=0) | (points_2d > last).all(axis=0)
     if agree and not beyond.any():
         return doubts
-    return (
-        *doubts,
+    text = (
         f"{where}{count} of {len(points_2d)} keypoints lie outside of the image of {camera.width} "
         f"x {camera.height} px: are they of another resolution than the camera, or of another "
-        "photo?",
+        "photo?"
     )
+    return (*doubts, EstimateWarning("outside-image", text, view, tuple(outside)))
 
 
-def _doubts_of_camera(camera: Camera, where: str) -> tuple[str, ...]:
-    """Warn about a principal point that is the middle of another image, or outside of its own."""
+def _wrong_principal_point(camera: Camera) -> str | None:
+    """Says that a principal point is the middle of another image, or outside of its own."""
     if camera.is_centred:
-        return ()
+        return None
     size, own = f"{camera.width} x {camera.height} px", f"({camera.cx:.4g}, {camera.cy:.4g})"
     middle = 2 * (camera.cx + PIXEL_CENTRE), 2 * (camera.cy + PIXEL_CENTRE)
     for factor in OTHER_SIZES:
@@ -251,16 +258,16 @@ def _doubts_of_camera(camera: Camera, where: str) -> tuple[str, ...]:
         apart = (abs(a - b) / b for a, b in zip(middle, other, strict=True))
         if max(apart) < _SAME_MIDDLE:
             return (
-                f"{where}the camera's principal point {own} is the middle of an image of "
+                f"the camera's principal point {own} is the middle of an image of "
                 f"{other[0]:.0f} x {other[1]:.0f} px, its own has {size}: if the photo was resized "
                 f"(not cut out), give Camera.resized({camera.width}, {camera.height}) of the "
-                "camera of that size",
+                "camera of that size"
             )
     if camera.contains(np.array([[camera.cx, camera.cy]])).all():
-        return ()
+        return None
     return (
-        f"{where}the camera's principal point {own} lies outside of its image of {size}, which is "
-        "right only for a photo cut out of a larger one: compare the camera with the photo's size",
+        f"the camera's principal point {own} lies outside of its image of {size}, which is right "
+        "only for a photo cut out of a larger one: compare the camera with the photo's size"
     )
 
 

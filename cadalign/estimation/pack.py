@@ -61,11 +61,12 @@ def evidence_of(
     if lenses is None:
         lenses = Lenses.of(views, "known", None)
     rows = []
-    for number, view in enumerate(views):
-        rows.append(prior.rows_of(view.keypoint_ids, f"views[{number}].ids"))
+    for view in views:
+        rows.append(prior.rows_of(view.keypoint_ids, f"views[{view.number}].ids"))
         if not tells_something(view):
             fix = "give keypoints, a mask or a direction, or leave the view away"
-            raise InputError("tells nothing about the object", where=f"views[{number}]", fix=fix)
+            where = f"views[{view.number}]"
+            raise InputError("tells nothing about the object", where=where, fix=fix)
     offsets = known_distances(prior, views, size)
     directions = known_directions(prior, views)
     if any(camera.turn for camera in lenses.cameras):
@@ -159,7 +160,7 @@ def _rig(views: Sequence[View]) -> Rig:
     if any(posed) != all(posed):
         raise InputError(
             "only some views have a known pose",
-            where=f"views[{posed.index(False)}].cam_from_rig",
+            where=f"views[{views[posed.index(False)].number}].cam_from_rig",
             fix="give it for all views, or for none",
         )
     is_rig = all(posed)
@@ -261,8 +262,9 @@ def known_directions(prior: ShapePrior, views: Sequence[View]) -> Directions:
     whitening = [
         _across(up, views[number].up_sigma_deg) for number, up in zip(told, ups, strict=True)
     ]
+    axes = [_upward("up", prior, views[number]) for number in told]
     return Directions(
-        np.array([_upward("up", prior, number) for number in told], dtype=float).reshape(-1, 3),
+        np.array(axes, dtype=float).reshape(-1, 3),
         np.array(ups, dtype=float).reshape(-1, 3),
         np.array(told, dtype=np.int64),
         np.array(whitening).reshape(-1, 3, 3),
@@ -306,7 +308,7 @@ def known_distances(prior: ShapePrior, views: Sequence[View], size: Size | None)
     for number, view in enumerate(views):
         if view.camera_height is None:
             continue
-        up = _upward("camera_height", prior, number)
+        up = _upward("camera_height", prior, view)
         lowest = corners + (0 if up.sum() > 0 else 1)  # the corner that lies in the lowest face
         ends.append((lowest, _CAMERA))
         images.append(number)
@@ -323,9 +325,9 @@ def known_distances(prior: ShapePrior, views: Sequence[View], size: Size | None)
     )
 
 
-def _upward(field: str, prior: ShapePrior, view: int) -> FloatArray:
+def _upward(field: str, prior: ShapePrior, view: View) -> FloatArray:
     """The model's up axis (3,); without one an InputError names the ``field`` that asks for it."""
     if prior.up is None:
         fix = f"learn it with an up axis, or leave `{field}` away"
-        raise InputError("the model has no up axis", where=f"views[{view}].{field}", fix=fix)
+        raise InputError("the model has no up axis", where=f"views[{view.number}].{field}", fix=fix)
     return prior.up

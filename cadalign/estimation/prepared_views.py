@@ -8,14 +8,13 @@ alone determines the pose begins there.
 from __future__ import annotations
 
 import contextlib
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import CadalignError, DegenerateError
+from cadalign.errors import DegenerateError
 from cadalign.estimation.estimates import mean_state
 from cadalign.estimation.model import is_exact_model
 from cadalign.estimation.options import pixel_information
@@ -24,6 +23,7 @@ from cadalign.estimation.prior import ShapePrior, with_known_shape
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Stated, Statistics, ViewResult
 from cadalign.estimation.view import View
+from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.alignment import Alignment, are_on_a_line
 from cadalign.geometry.camera import (
     Camera,
@@ -63,7 +63,7 @@ def views_without_pose(
         for number, view in enumerate(views)
         if inits[number] is None
         and tells_something(view)
-        and _lie_on_a_line(mean[prior.rows_of(view.keypoint_ids, f"views[{number}].ids")])
+        and _lie_on_a_line(mean[prior.rows_of(view.keypoint_ids, f"views[{view.number}].ids")])
     ]
 
 
@@ -103,7 +103,7 @@ def align_without(
             fix="give at least 3 keypoints, not on one line, or another view first",
         )
     used = [number for number in range(len(views)) if number not in left_out]
-    result = _align_used([views[n] for n in used], [inits[n] for n in used], used, align_some)
+    result = align_some([views[n] for n in used], [inits[n] for n in used])
     of_views = dict(zip(used, result.views, strict=True))
     masks = dict(zip(used, result.mask_residuals, strict=bool(result.mask_residuals)))
     estimated = dict(zip((views[n].camera for n in used), result.cameras, strict=True))
@@ -111,7 +111,7 @@ def align_without(
         view = views[number]
         camera = _camera_of(view, estimated)
         pose = _explaining(prior, view, camera, result)
-        rows = prior.rows_of(view.keypoint_ids, f"views[{number}].ids")
+        rows = prior.rows_of(view.keypoint_ids, f"views[{view.number}].ids")
         observed = view.pixels
         residuals = camera.project(pose.apply(result.points_3d[rows])) - observed
         kept, unknown = np.zeros(len(rows), dtype=bool), Stated(None)
@@ -119,19 +119,8 @@ def align_without(
             camera, pose, view.keypoint_ids, observed, residuals, kept, unknown
         )
     numbers = range(len(views))
-    warnings = [
-        f"views[{number}] is left out: its {len(views[number].keypoint_ids)} keypoints do not "
-        "determine its pose"
-        for number in left_out
-    ]
-    statistics = Stated.of(
-        result.statistics,
-        evidence=tuple(
-            replace(each, view=None if each.view is None else used[each.view])
-            for each in result.evidence
-        ),
-        warnings=(*(_renumbered(text, used) for text in result.warnings), *warnings),
-    )
+    warnings = (*result.warnings, *(_left_out_warning(views[number]) for number in left_out))
+    statistics = Stated.of(result.statistics, warnings=warnings)
     return replace(
         result,
         views=tuple(of_views[number] for number in numbers),
@@ -140,22 +129,10 @@ def align_without(
     )
 
 
-def _align_used(
-    views: Sequence[View],
-    inits: Sequence[Alignment | None],
-    used: Sequence[int],
-    align_some: Align,
-) -> Result:
-    """Align some views, of which errors speak by the numbers ``used`` among all."""
-    try:
-        return align_some(views, inits)
-    except CadalignError as error:
-        where = error.where and _renumbered(error.where, used)
-        raise type(error)(_renumbered(error.what, used), where=where, fix=error.fix) from None
-
-
-def _renumbered(text: str, used: Sequence[int]) -> str:
-    return re.sub(r"views\[(\d+)\]", lambda found: f"views[{used[int(found[1])]}]", text)
+def _left_out_warning(view: View) -> EstimateWarning:
+    count = len(view.keypoint_ids)
+    text = f"views[{view.number}] is left out: its {count} keypoints do not determine its pose"
+    return EstimateWarning("left-out", text, view.number)
 
 
 def _lie_on_a_line(points: FloatArray) -> bool:
@@ -215,7 +192,7 @@ def starts_by_one_view(
     others = [number for number in masks if number != first]
     if not others:
         return []
-    alone = _align_used([replace(views[first], cam_from_rig=None)], [None], [first], align_some)
+    alone = align_some([replace(views[first], cam_from_rig=None)], [None])
     camera, known = np.asarray(views[first].cam_from_rig), {views[first].camera: alone.camera}
     middles = []
     for number in others:

@@ -32,6 +32,7 @@ from cadalign.geometry.symmetry import Symmetry
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
     from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals, Misfit
+    from cadalign.estimation.warning import EstimateWarning
     from cadalign.geometry.mesh import Mesh
     from cadalign.shapes.model import ShapeModel
     from cadalign.shapes.parts import NearestShape
@@ -232,8 +233,11 @@ class ResultData:
         return self.statistics.misfit
 
     @property
-    def warnings(self) -> tuple[str, ...]:
-        """Warnings about what `std` does not say: contradictions, other poses, nothing to test."""
+    def warnings(self) -> tuple[EstimateWarning, ...]:
+        """Warnings about what `std` does not say: contradictions, other poses, nothing to test.
+
+        Each has a ``kind``, a ``text``, and the ``view`` and ``keypoints`` that it is about.
+        """
         return self.statistics.warnings
 
     @property

@@ -26,6 +26,7 @@ from cadalign.estimation.uncertainty.summary import (
     uncertainty_of,
     weaknesses_of_keypoints,
 )
+from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment, Box, extent
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import by_rotation
@@ -106,7 +107,7 @@ class Stated:
     fisher_covariance: FloatArray | None = None
     points_covariance: FloatArray | None = None
     points_cam_covariance: FloatArray | None = None
-    warnings: tuple[str, ...] = ()
+    warnings: Warnings = ()
     misfit: Misfit | None = None
     evidence: tuple[EvidenceSummary, ...] = ()
     degrees_of_freedom: float | None = None
@@ -154,7 +155,7 @@ class KeypointStatistics(FittedKeypoints):
         return find_misfit(self)
 
     @cached_property
-    def warnings(self) -> tuple[str, ...]:
+    def warnings(self) -> Warnings:
         """Warnings about mistakes, a misfit, and what the keypoints do not determine."""
         mistake = self._mistake()
         if mistake is not None:  # nothing else can be said of the alignment
@@ -166,7 +167,7 @@ class KeypointStatistics(FittedKeypoints):
         from cadalign.estimation.uncertainty.misfit import unexplained, unverified_stretch
 
         if self.misfit is not None:
-            doubts = [str(self.misfit)]
+            doubts = [self.misfit.warning]
         else:
             unverified = unverified_stretch(self)
             doubts = [] if unverified is None else [unverified]
@@ -185,7 +186,7 @@ class KeypointStatistics(FittedKeypoints):
             stretch_sigma=options.stretch_sigma,
             doubt=focal_doubt(self.camera, options.focal_prior) if is_estimated else None,
         )
-        others: tuple[str, ...] = ()
+        others: Warnings = ()
         # Likelihoods tell nothing where keypoints do not fit, or others than these were rejected.
         if self.misfit is None and self.search is None:
             poses = [(each.alignment, each.relative_likelihood) for each in self.alternatives]
@@ -198,7 +199,7 @@ class KeypointStatistics(FittedKeypoints):
         in_camera = self.alignment.apply(self.points_3d[ahead])
         return self.camera.project_where_ahead(in_camera) - self.residuals[ahead]
 
-    def _placed(self, observed: FloatArray) -> tuple[str, ...]:
+    def _placed(self, observed: FloatArray) -> Warnings:
         """Warnings about keypoints (n, 2) [px] and a principal point outside of the image."""
         if self.camera.is_centred and self.camera.contains(observed).all():
             return ()
@@ -206,7 +207,7 @@ class KeypointStatistics(FittedKeypoints):
 
         return outside_image(observed, self.camera, agree=self.misfit is None)
 
-    def _mistake(self) -> str | None:
+    def _mistake(self) -> EstimateWarning | None:
         if self.search is None:
             if self.fisher_covariance is None:
                 return None

@@ -99,8 +99,8 @@ def _found(search: RobustSearch) -> Consensus:
     try:
         search.check(best)
     except NoConsensusError as error:
-        found = search.explained(best.alignment, best.residuals)
-        error.fix = mistake_in(search, found) or error.fix
+        mistake = mistake_in(search, search.explained(best.alignment, best.residuals))
+        error.fix = error.fix if mistake is None else mistake.text
         raise
     return best
 

@@ -29,6 +29,7 @@ from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.uncertainty.evidence import summary_of_keypoints
 from cadalign.estimation.uncertainty.shape_posterior import SeenShape, ShapeTails, keypoint_misfits
 from cadalign.estimation.view import View
+from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import inflation_with
@@ -119,7 +120,7 @@ def align_single(
     """
     start = time.perf_counter()
     prior = prior_of(model)
-    rows = prior.rows_of(view.keypoint_ids, "views[0].ids")
+    rows = prior.rows_of(view.keypoint_ids, f"views[{view.number}].ids")
     weights, means, covariances = model.gaussians
     mixture = Mixture(means, covariances, -2 * np.log(weights))
     seen = seen_keypoints(view, view.pixels, rows, options)
@@ -155,7 +156,7 @@ def align_single(
     in_camera = estimates[0].poses[0].apply(points)
     errors = in_camera[:, :2] / in_camera[:, 2:] - seen.rays
     component, cost = int(minima.label[0]), float(minima.costs[0])
-    warnings: tuple[str, ...] = ()
+    warnings: Warnings = ()
     if seen.loss == LINEAR:
         beside = (3 * np.array(rows)[:, None] + np.arange(3)).ravel()
         warnings = keypoint_misfits(
@@ -200,7 +201,7 @@ def _mistake_in(
     rows: list[int],
     options: FitOptions,
     score: float,
-) -> str | None:
+) -> EstimateWarning | None:
     """Name the mistake without which the keypoints fit the shape, below that score."""
     given = view.pixels
 
@@ -218,7 +219,10 @@ def _mistake_in(
         return Explained(float(minima.scores[0]), len(rows), up)
 
     found = find_in_all(score, len(rows), explain, larger_sizes(given, view.camera))
-    return None if found is None else f"{found[0]}: corrected, the keypoints fit the learned shapes"
+    if found is None:
+        return None
+    text = f"{found[0]}: corrected, the keypoints fit the learned shapes"
+    return EstimateWarning("mistake", text)
 
 
 def _given(init: Alignment | None) -> FloatArray:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
@@ -93,6 +94,8 @@ class View(BeyondKeypoints):
     image : (h, w, 3) uint8, or path, optional
         The photo in RGB, as evidence: the model's outline is sought in it, from the estimate by
         everything else; the model needs a mesh. It does not count beside a mask of the same view.
+    number : int
+        Its place among the views, which errors, warnings and evidence name; `align` counts them.
 
     Raises
     ------
@@ -115,6 +118,7 @@ class View(BeyondKeypoints):
     sigma: Sigma | None = 1.0
     scores: npt.ArrayLike | None = None
     image: npt.ArrayLike | str | os.PathLike[str] | None = field(default=None, kw_only=True)
+    number: int = field(default=0, kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
         for name, value in _DEFAULTS.items():
@@ -196,6 +200,19 @@ class View(BeyondKeypoints):
     def mask_image(self) -> FloatArray | BoolArray | None:
         """The mask (h, w), bool or probabilities."""
         return cast("FloatArray | BoolArray | None", self.mask)
+
+
+def numbered(views: Iterable[View]) -> list[View]:
+    """The views, each with its place among them."""
+    return [_with_number(view, place) for place, view in enumerate(views)]
+
+
+def _with_number(view: View, number: int) -> View:
+    if view.number == number:
+        return view
+    same = copy(view)  # what was checked need not be checked again
+    object.__setattr__(same, "number", number)
+    return same
 
 
 def without_keypoints(view: View) -> View:

@@ -112,7 +112,7 @@ def _neighbours(cases: list[_Case], seed: int, neighbours: int) -> Row:
             continue
         alone = case.errors(align(case.model, case.view(None)).alignment)
         result = align(case.model, case.view(mask))
-        named.append(any("views[0].mask" in text for text in result.warnings))
+        named.append(any(each.kind == "mask" for each in result.warnings))
         ratios.append(case.errors(result.alignment)[0] / alone[0])
     return {
         "named": float(np.mean(named)),

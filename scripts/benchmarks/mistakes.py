@@ -11,6 +11,7 @@ from benchmarks.section import BenchmarkData, Row, Tables, percent, seen_in
 from cadalign import CadalignError, Model, RansacOptions, Result, View, align, fit
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
+from cadalign.estimation.warning import UNDETERMINED_KINDS
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.geometry.pixels import PIXEL_CENTRE
 from cadalign.geometry.rotations import angle_between
@@ -147,12 +148,11 @@ def _said(seen: SeenModel, shape_sigma: float) -> tuple[bool, bool, bool, bool]:
         found = _estimate(seen, shape_sigma)
     except CadalignError as error:
         return False, any(each in str(error) for each in _CLAUSES), True, False
-    texts = [text for text in found.warnings if "known only" not in text]
+    kinds = {warning.kind for warning in found.warnings} - UNDETERMINED_KINDS
     turn = angle_between(found.alignment.rotation, seen.rotation)
-    named = any(each in text for text in texts for each in _CLAUSES)
     square, count = (found.residuals**2).sum() / _NOISE_PX**2, found.residuals.size
     fits = found.inliers.all() and square < chi2.isf(0.01, max(count - UNKNOWNS, 1))
-    return not texts and turn > _WRONG_DEG, named, False, bool(fits)
+    return not kinds and turn > _WRONG_DEG, "mistake" in kinds, False, bool(fits)
 
 
 def _estimate(seen: SeenModel, shape_sigma: float) -> Result:

@@ -105,7 +105,7 @@ def _compared(clicks: PhotoClicks) -> Row:
     for error, *values in zip(("R", "t", "stretch"), before, after, strict=True):
         row |= dict(zip((f"{error} clicks", f"{error} photo"), values, strict=True))
     row["better"] = after[0] < before[0]
-    row["warned"] = any("image" in text for text in joint.warnings)
+    row["warned"] = any(each.kind == "photo" for each in joint.warnings)
     row["silently worse"] = not row["warned"] and after[0] > before[0] + _WORSE_DEG
     row["covered R"], row["covered t"] = clicks.covered_by(joint)
     return row | {"seconds": second - first}

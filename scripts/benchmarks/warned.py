@@ -15,6 +15,7 @@ from benchmarks.section import BenchmarkData, Row, Tables, percent
 from cadalign import Alignment, Model, Result, ShapeModel, View
 from cadalign.arrays import FloatArray, instance_rng
 from cadalign.datasets import KeypointNet
+from cadalign.estimation.warning import UNDETERMINED_KINDS
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.unseen import UnseenObject
 from cadalign.evaluation.metrics.cramer_rao import probability_level
@@ -28,10 +29,10 @@ _FARTHER = np.array([0.0, 0.0, 0.2])  # until a drawn object is in the image
 _MOVED_PX = 40.0
 _MIRRORED = 0.05  # distance of a keypoint from the other one's mirror image [diagonals]
 _KINDS = {
-    "another pose": ("another pose", "other poses"),
-    "not determined": ("known only to", "is held at 1"),
-    "nothing to test": ("fit exactly",),
-    "misfit": ("residuals are", "does not fit", "predict it", "contradict", "corrected,"),
+    "another pose": {"alternative"},
+    "not determined": UNDETERMINED_KINDS,
+    "nothing to test": {"untested"},
+    "misfit": {"misfit", "outlier", "stretch", "camera", "contradiction", "mistake"},
 }
 
 
@@ -219,13 +220,14 @@ def _outcome(case: _Case, noise_px: float) -> Row:
     result = section.attempt(cadalign.align, case.model, view)
     if result is None:
         return {"refused": True}
-    texts = result.warnings
+    texts = [warning.text for warning in result.warnings]
     row: Row = {"refused": False, "texts": texts, "warned": bool(texts)}
-    kinds = {
-        kind: any(part in text for text in texts for part in parts)
-        for kind, parts in _KINDS.items()
-    }
-    return row | kinds | _errors(result, case.gt)
+    found = {warning.kind for warning in result.warnings}
+    return (
+        row
+        | {name: bool(found & kinds) for name, kinds in _KINDS.items()}
+        | _errors(result, case.gt)
+    )
 
 
 def _errors(result: Result, gt: Alignment) -> Row:

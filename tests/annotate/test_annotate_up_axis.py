@@ -75,7 +75,7 @@ def test_gravity_is_that_of_the_up_axis(case: Case, capsys: pytest.CaptureFixtur
     add_verticals(session, z_up)
     live, _ = session.live(session.photos[0])
     assert live.result is not None
-    assert not any("gravity" in warning for warning in live.result.warnings)
+    assert not any("gravity" in warning for warning in map(str, live.result.warnings))
     wanted = case.instance.cam_from_model.rotation @ FROM_Y_UP["z"].T
     error = np.trace(wanted.T @ live.result.alignment.rotation)
     assert np.degrees(np.arccos(np.clip((error - 1) / 2, -1, 1))) < 3

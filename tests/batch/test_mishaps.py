@@ -93,6 +93,7 @@ def test_a_photo_that_cannot_be_read_is_a_warning_of_its_row(tmp_path: Path) -> 
     source = lines(tmp_path / "o.jsonl", 2, image="broken.png")
     assert main(["fit", str(source), "--out", str(tmp_path / "run")]) == 0
     for row in rows_of(tmp_path / "run"):
+        assert (row["warning_count"], row["warning_kinds"]) == (1, "picture")
         assert "the photo is not shown: " in row["warnings"]
         assert "broken.png" in row["warnings"]
 
@@ -274,4 +275,4 @@ def test_photo_of_another_size_than_its_camera_is_warned_of(tmp_path: Path) -> N
     seen = Observation(problem.points_3d, problem.points_2d, problem.camera, image=photo)
     options = FitRunOptions(inputs=(tmp_path,))
     (warning,) = options.estimate_of(seen, "seen.json").result.warnings
-    assert warning.startswith("photo.png is 1280 x 960 px, the camera 640 x 480: give camera")
+    assert warning.text.startswith("photo.png is 1280 x 960 px, the camera 640 x 480: give camera")

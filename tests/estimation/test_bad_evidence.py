@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -152,11 +152,11 @@ def test_evidence_that_cannot_be_is_refused(call: Callable[[], object], message:
 class TestDepthsInMillimetres:
     """Of a model in metres."""
 
-    def warnings(self, *others: View, depth: np.ndarray, size: Size | None = None) -> Sequence[str]:
+    def warnings(self, *others: View, depth: np.ndarray, size: Size | None = None) -> list[str]:
         rng = np.random.default_rng(0)
         motion = {"cam_from_rig": np.eye(4)} if others else {}
         view = seen(POINTS, truth_of(), np.eye(4), rng, depth=1000 * depth, **motion)
-        return align(PLAIN, [view, *others], size=size).warnings
+        return [each.text for each in align(PLAIN, [view, *others], size=size).warnings]
 
     @pytest.mark.parametrize("kind", ["at keypoints", "image"])
     def test_alone(self, kind: str) -> None:

@@ -20,6 +20,7 @@ from support.scenes import (
 )
 
 from cadalign import Model, Size, View, align
+from cadalign.estimation import EstimateWarning
 
 pytestmark = pytest.mark.long
 
@@ -82,7 +83,7 @@ def _unit(rng: np.random.Generator) -> np.ndarray:
 
 def warnings_of(
     build: Callable[[np.ndarray, np.random.Generator], Case], seeds: range
-) -> list[tuple[str, ...]]:
+) -> list[tuple[EstimateWarning, ...]]:
     points = keypoints(9)
     found = []
     for seed in seeds:
@@ -104,14 +105,14 @@ def test_the_wrong_piece_is_named(
     build: Callable[[np.ndarray, np.random.Generator], Case], name: str
 ) -> None:
     found = warnings_of(build, range(SEEDS))
-    named = [any(text.startswith(f"{name} contradicts") for text in each) for each in found]
+    named = [any(some.text.startswith(f"{name} contradicts") for some in each) for each in found]
     # If one of 5 were missed, all 12 would be named no more often than 19 of 20.
     assert all(named)
 
 
 def test_consistent_evidence_is_not_accused() -> None:
     found = warnings_of(consistent, range(50))
-    assert sum(any("contradict" in text for text in each) for each in found) <= 1
+    assert sum(any(some.kind == "contradiction" for some in each) for each in found) <= 1
 
 
 def test_hidden_keypoints_in_a_depth_image_are_not_a_contradiction() -> None:
@@ -126,5 +127,5 @@ def test_hidden_keypoints_in_a_depth_image_are_not_a_contradiction() -> None:
             image[y - 9 : y + 10, x - 9 : x + 10] = 4.0
         view = seen(points, truth, np.eye(4), rng, depth=image, depth_sigma=0.005)
         warnings = align(Model(points_3d=points), view, size=Size(width=width)).warnings
-        accused += any("contradict" in text or "residuals" in text for text in warnings)
+        accused += any(each.kind in {"contradiction", "misfit"} for each in warnings)
     assert accused <= 1

@@ -20,11 +20,12 @@ from cadalign.estimation.result_parts import (
     Stated,
     ViewResult,
 )
+from cadalign.estimation.warning import EstimateWarning
 from cadalign.evaluation.simulation import SIMULATION_CAMERA
 
 COVARIANCE = np.diag([1e-4, 1e-4, 1e-4, 0.0004, 0.0009, 0.01, 0, 0.0001, 0.0225])
 WARNING = "s_z is known only to +-15 %: there are few keypoints for their noise"
-STATED = Stated(COVARIANCE, COVARIANCE, warnings=(WARNING,))
+STATED = Stated(COVARIANCE, COVARIANCE, warnings=(EstimateWarning("scale", WARNING),))
 POINTS = np.array([[0.0, 0, 1], [1, 0, -1], [0, 1, 1], [1, 1, 1], [1, 0, 1], [0, 0, -1]])
 POSE = Alignment(
     Rotation.from_rotvec([0, np.pi / 3, 0]).as_matrix(), [0.5, -0.25, 6], [1, 0.75, 1.25]
@@ -157,6 +158,5 @@ def test_warnings_look_at_the_inliers_alone() -> None:
         points, np.zeros((7, 2)), inliers, POSE, SIMULATION_CAMERA, options, 1.0, COVARIANCE
     )
     vars(statistics)["covariance"] = 100 * COVARIANCE
-    assert statistics.warnings == (
-        "s_z is known only to +-150 %: the keypoints lie nearly in the plane z = 0.25",
-    )
+    text = "s_z is known only to +-150 %: the keypoints lie nearly in the plane z = 0.25"
+    assert statistics.warnings == (EstimateWarning("scale", text),)

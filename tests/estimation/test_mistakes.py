@@ -16,6 +16,7 @@ from support.scenes import seen as seen_in_scene
 
 from cadalign import Camera, Model, RansacOptions, Result, View, align, fit
 from cadalign.errors import CadalignError, NoConsensusError
+from cadalign.estimation import EstimateWarning
 from cadalign.estimation.mistakes import (
     Explained,
     Mistake,
@@ -79,7 +80,7 @@ class Seen:
             found = self.fit()
         except CadalignError as error:
             return str(error)
-        return "; ".join(text for text in found.warnings if "known only" not in text)
+        return "; ".join(text for text in map(str, found.warnings) if "known only" not in text)
 
 
 def photo(points: np.ndarray, rng: np.random.Generator, camera: Camera) -> np.ndarray:
@@ -139,8 +140,8 @@ def test_the_warning_tells_what_was_rejected_and_what_would_agree() -> None:
     problem = seen(0, count=12).mistaken("mirrored")
     found = problem.fit()
     rejected = 12 - int(found.inliers.sum())
-    assert found.warnings[0].startswith("the model is mirrored or the photo is flipped")
-    assert found.warnings[0].endswith(
+    assert found.warnings[0].text.startswith("the model is mirrored or the photo is flipped")
+    assert found.warnings[0].text.endswith(
         "corrected, 12 of 12 keypoints agree; "
         f"as given, {rejected} ({100 * rejected / 12:.0f} %) are rejected"
     )
@@ -225,7 +226,7 @@ def test_several_views_share_the_check(mistake: str) -> None:
         except NoConsensusError:
             refused += 1
             continue
-        named += NAMES[mistake] in found.warnings[0]
+        named += NAMES[mistake] in found.warnings[0].text
     assert named > 0
     assert named + refused == 10
 
@@ -238,7 +239,7 @@ def test_views_of_a_learned_or_similar_shape_share_it() -> None:
     for problem, wanted in ((right.mistaken("swapped"), True), (spoiled(right, 0), False)):
         view = View(CENTRED, problem.points_2d)
         found = align(Model(points_3d=model, shape_sigma=0.005), view, ransac=options)
-        assert (NAMES["swapped"] in " ".join(found.warnings)) == wanted
+        assert (NAMES["swapped"] in " ".join(map(str, found.warnings))) == wanted
 
 
 @pytest.mark.parametrize("mistake", ["mirrored", "swapped"])
@@ -251,7 +252,7 @@ def test_likelihoods_tell_mistakes_that_a_similar_model_follows(mistake: str) ->
         for problem in (similar, similar.mistaken(mistake)):
             model = Model(points_3d=problem.points_3d, shape_sigma=0.02)
             found = align(model, View(CENTRED, problem.points_2d), ransac=RansacOptions())
-            texts = [text for text in found.warnings if NAMES[mistake] in text]
+            texts = [text for text in map(str, found.warnings) if NAMES[mistake] in text]
             if problem is similar:
                 alarms += bool(texts)
             elif found.inliers.mean() > 0.9:
@@ -294,7 +295,7 @@ def test_an_endless_extent_of_keypoints_is_cut_to_the_image() -> None:
 def test_what_explains_no_more_keypoints_is_no_mistake() -> None:
     asked: list[Mistake] = []
 
-    def explain(score: float, inliers: int) -> str | None:
+    def explain(score: float, inliers: int) -> EstimateWarning | None:
         asked.clear()
 
         def answer(mistake: Mistake) -> Explained:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from support.problems import problem_of
 
-from cadalign import Alignment, Camera, Model, ShapeModel, View, align, fit
+from cadalign import Alignment, Camera, Model, Result, ShapeModel, View, align, fit
 from cadalign.datasets import KeypointNet
 from cadalign.estimation.uncertainty.summary import (
     another_pose,
@@ -21,6 +21,7 @@ from cadalign.estimation.uncertainty.summary import (
     weaknesses,
     weaknesses_of_keypoints,
 )
+from cadalign.estimation.warning import Warnings
 from cadalign.geometry.rotations import angle_between, rotation_from_vector
 from cadalign.shapes.examples import Example
 
@@ -30,7 +31,7 @@ MOST_RIGHT = 0.10
 Measured = Callable[..., list[dict[str, Any]]]
 
 
-def with_other(angle_deg: float, share: float, own_deg: float = 2.0) -> tuple[str, ...]:
+def with_other(angle_deg: float, share: float, own_deg: float = 2.0) -> Warnings:
     """Warnings of two poses, one with that share of the probability, and of their moments."""
     turn = np.radians([angle_deg, 0.0, 0.0])
     other = Alignment(rotation_from_vector(turn), POSE.translation, np.ones(3))
@@ -46,9 +47,23 @@ def deviations(logs: np.ndarray) -> np.ndarray:
     return covariance
 
 
+def test_a_warning_prints_as_its_text_and_is_stored_with_its_kind() -> None:
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (12, 3))
+    pixels = CAMERA.project(POSE.apply(points))
+    pixels[3] += 40
+    result = fit(points, pixels, CAMERA, sigma=1.0)
+    (found,) = result.warnings
+    assert (found.kind, found.view, found.keypoints) == ("outlier", 0, (3,))
+    assert str(result).endswith(f"  warning      {found}")
+    assert repr(result.warnings) == repr((found.text,))
+    written = {"kind": "outlier", "text": found.text, "view": 0, "keypoints": [3]}
+    assert result.to_dict()["warnings"] == [written]
+    assert Result.from_json(result.to_json()).warnings == (found,)
+
+
 def test_another_pose_is_named_where_the_deviations_conceal_it() -> None:
-    (text,) = with_other(170, 0.1)
-    assert text.startswith("another pose, 170 deg away, has a probability of 10 %")
+    (found,) = with_other(170, 0.1)
+    assert found.text.startswith("another pose, 170 deg away, has a probability of 10 %")
     assert not with_other(170, 0.03)  # less than what the 95 % interval leaves
     assert not with_other(90, 0.4)  # the deviations reach that far
     assert not with_other(6, 0.1)
@@ -63,16 +78,16 @@ def test_poses_that_are_concealed_together_are_one_warning() -> None:
         Alignment(rotation_from_vector(np.radians(turn)), POSE.translation, np.ones(3))
         for turn in turns
     ]
-    (text,) = another_pose(POSE, [(poses[0], 0.04), (poses[1], 0.04)], covariance)
-    assert text.startswith("other poses, the likeliest 1")
-    assert "7 %" in text
+    (found,) = another_pose(POSE, [(poses[0], 0.04), (poses[1], 0.04)], covariance)
+    assert found.text.startswith("other poses, the likeliest 1")
+    assert "7 %" in found.text
 
 
 def test_the_thickness_of_a_flat_object_is_not_warned_of() -> None:
     std = uncertainty_of(deviations(np.diag([0.01, 0.01, 2.0**2])))
     assert weaknesses(POSE, std, np.array([0.4, 0.9, 0.02])) == ()
-    (text,) = weaknesses(POSE, std, np.array([0.4, 0.9, 0.8]))
-    assert text == "the length along z is known only to +-200 %"
+    (found,) = weaknesses(POSE, std, np.array([0.4, 0.9, 0.8]))
+    assert found.text == "the length along z is known only to +-200 %"
 
 
 def test_a_size_that_one_image_leaves_open_is_not_warned_of() -> None:
@@ -83,8 +98,8 @@ def test_a_size_that_one_image_leaves_open_is_not_warned_of() -> None:
     together = deviations(np.outer(common, common))
     assert weaknesses_of_keypoints(points, POSE, together, **given) == ()
     apart = deviations(np.diag(common**2))
-    texts = weaknesses_of_keypoints(points, POSE, apart, **given)
-    assert [text[:3] for text in texts] == ["s_y", "s_z"]
+    found = weaknesses_of_keypoints(points, POSE, apart, **given)
+    assert [each.text[:3] for each in found] == ["s_y", "s_z"]
 
 
 def test_keypoints_beyond_their_sigma_are_warned_of_beside_other_evidence() -> None:
@@ -94,8 +109,8 @@ def test_keypoints_beyond_their_sigma_are_warned_of_beside_other_evidence() -> N
         up = problem.alignment.rotation[:, 1]
         view = View(problem.camera, problem.points_2d, sigma=sigma, up=up, up_sigma_deg=1.0)
         told = align(Model(points_3d=problem.points_3d), view).warnings
-        warned = [text for text in told if re.search(r"residuals are \S+ times as large", text)]
-        assert len(warned) == (noise > sigma)
+        found = [each for each in told if re.search(r"residuals are \S+ times", each.text)]
+        assert [each.kind for each in found] == ["misfit"] * (noise > sigma)
 
 
 def test_fit_names_another_pose_that_its_deviations_do_not_reach() -> None:
@@ -109,7 +124,7 @@ def test_fit_names_another_pose_that_its_deviations_do_not_reach() -> None:
         ]
         assert result.std is not None
         if any(angle > max(30, 5 * result.std.rotation_deg) for angle in angles):
-            assert any("pose" in text for text in result.warnings)
+            assert any(each.kind == "alternative" for each in result.warnings)
             named += 1
     assert named > 3
 

@@ -8,6 +8,7 @@ from support.scenes import CAMERA, around, in_camera, keypoints, seen, truth_of
 
 from cadalign import Alignment, Model, Result, ShapeModel, View, align
 from cadalign.errors import DegenerateError, InputError
+from cadalign.estimation import EstimateWarning
 from cadalign.metrics import rotation_error
 
 POINTS = keypoints()
@@ -43,7 +44,7 @@ def test_a_view_that_determines_no_pose_is_left_out_and_named(count: int) -> Non
     weak = view_at(-25, list(range(count)), up=TRUTH.rotation[:, 1])
     result = align(MODEL, [views[0], weak, views[1]])
     plural = f"views[1] is left out: its {count} keypoints do not determine its pose"
-    assert result.warnings == (*expected.warnings, plural)
+    assert result.warnings == (*expected.warnings, EstimateWarning("left-out", plural, view=1))
     assert result.alignment == expected.alignment
     assert result.poses[2] == expected.poses[1]
     assert not result.views[1].inliers.any()
@@ -61,7 +62,8 @@ def test_keypoints_on_a_line_determine_no_pose() -> None:
     rows = list(range(10))
     views = [view_at(a, rows, points) for a in (0, 30)]
     result = align(model, [*views, view_at(-25, [0, 1, 2, 3], points)])
-    assert any(text.startswith("views[2] is left out: its 4 keypoints") for text in result.warnings)
+    (told,) = (each for each in result.warnings if each.kind == "left-out")
+    assert told.text.startswith("views[2] is left out: its 4 keypoints")
     assert result.alignment == align(model, views).alignment
 
 
@@ -73,7 +75,7 @@ def test_a_learned_shape_leaves_a_view_out_as_well() -> None:
     views = [View(CAMERA, each[rows], ids=rows) for each in pixels]
     weak = View(CAMERA, pixels[0][:2], ids=[0, 1])
     result = align(shape, [*views, weak])
-    assert any(text.startswith("views[2] is left out") for text in result.warnings)
+    assert any(each.kind == "left-out" for each in result.warnings)
 
 
 def test_the_first_view_must_determine_its_pose() -> None:

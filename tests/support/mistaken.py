@@ -104,6 +104,6 @@ def seen(root: Path, category: str, seed: int, **options: object) -> Sighting:
 def said(estimate: Callable[[], Result]) -> str:
     """All that an estimate says: its warnings, or its refusal."""
     try:
-        return " | ".join(estimate().warnings)
+        return " | ".join(map(str, estimate().warnings))
     except CadalignError as error:
         return str(error)

@@ -28,6 +28,7 @@ from cadalign.estimation.result_parts import Stated
 from cadalign.estimation.search import Minimum
 from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals
 from cadalign.estimation.view import View
+from cadalign.estimation.warning import EstimateWarning
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.covariance import information_of, scaled_information
 from cadalign.solvers.joint.evidence import Evidence, State
@@ -62,7 +63,7 @@ class Refined(NamedTuple):
 
     minima: list[Minimum]
     summaries: list[EvidenceSummary]
-    warnings: list[str]
+    warnings: list[EstimateWarning]
     residuals: tuple[MaskResiduals | None, ...] = ()
     """The contours of every view's mask."""
 
@@ -123,14 +124,15 @@ def fit_masks(
     is no estimate without the masks and no rim near them.
     """
     used = [
-        contour_view(number, view, f"views[{number}].mask", minima[0].lenses.cameras[number])
+        contour_view(number, view, _mask_of(view), minima[0].lenses.cameras[number])
         for number, view in enumerate(views)
         if view.mask_image is not None
     ]
-    where = f"views[{used[0].image}].mask"
+    where = _mask_of(views[used[0].image])
     choice = surfaces_of(model, minima[0].points[: len(prior.ids)], where)
     search = _Search.of(minima, len(prior.ids), choice)
-    left_out, warnings = [], []
+    left_out: list[ViewContour] = []
+    warnings: list[EstimateWarning] = []
     best: list[_Candidate] = []
     while used:
         best, used = search.best(used, views)
@@ -138,7 +140,8 @@ def fit_masks(
         if wrong is None:
             break
         contour, reason = wrong
-        where = f"views[{contour.image}].mask"
+        view = views[contour.image]
+        where = _mask_of(view)
         if len(used) == 1 and search.is_open:
             if not best:
                 raise DegenerateError(
@@ -146,23 +149,23 @@ def fit_masks(
                     where=where,
                     fix="give an init that shows the model near the mask, or keypoints",
                 )
-            warnings.append(f"{where}: {reason}")
+            warnings.append(EstimateWarning("mask", f"{where}: {reason}", view.number))
             break
-        off = _off_mask(views[contour.image])
-        warnings.append(f"{where} contradicts the rest and is left out: {reason}{off}")
+        text = f"{where} contradicts the rest and is left out: {reason}{_off_mask(view)}"
+        warnings.append(EstimateWarning("mask", text, view.number))
         left_out.append(contour)
         used = [each for each in used if each is not contour]
     if used and search.by_outline:
-        warnings.extend(_uncovered(best[0]))
+        warnings.extend(_uncovered(best[0], views))
     fits = best[0].settled.fits if used else ()
     residuals: list[MaskResiduals | None] = [None] * len(views)
     for contour, fit in [*zip(used, fits, strict=True), *((each, None) for each in left_out)]:
         residuals[contour.image] = _residuals(contour, fit)
     summaries = [
         EvidenceSummary(
-            "mask", number, int(each.inliers.sum()), each.rms / each.sigma, each.rms, "px"
+            "mask", view.number, int(each.inliers.sum()), each.rms / each.sigma, each.rms, "px"
         )
-        for number, each in enumerate(residuals)
+        for view, each in zip(views, residuals, strict=True)
         if each is not None
     ]
     found = [each.minimum for each in best] if used else list(minima)
@@ -318,7 +321,7 @@ def _distances(settled: Settled) -> FloatArray:
     return np.asarray(np.minimum(np.concatenate(every), _LARGEST))
 
 
-def _uncovered(best: _Candidate) -> list[str]:
+def _uncovered(best: _Candidate, views: Sequence[View]) -> list[EstimateWarning]:
     """Report masks of which no occluder, but a wrong pose or model leaves a part uncovered.
 
     The contour alone does not tell where the parts of an object are few pixels wide.
@@ -334,11 +337,13 @@ def _uncovered(best: _Candidate) -> list[str]:
         dilated = SPACING * len(contour.contour.points) * max(fit.offset, 0.0) / len(rows)
         share = 1 - float(covered.mean()) - dilated
         if share > _UNCOVERED:
-            found.append(
-                f"views[{contour.image}].mask: the silhouette of the best pose found leaves "
+            view = views[contour.image]
+            text = (
+                f"{_mask_of(view)}: the silhouette of the best pose found leaves "
                 f"{100 * share:.0f} % of it uncovered: the pose may be wrong, or the model "
                 "another; a larger image of the object, or keypoints, tell more"
             )
+            found.append(EstimateWarning("mask", text, view.number))
     return found
 
 
@@ -424,4 +429,8 @@ def _hull_contour(contour: ViewContour, view: View) -> ViewContour | None:
     filled = np.zeros(inside.shape, dtype=np.uint8)
     cv2.fillConvexPoly(filled, cv2.convexHull(np.concatenate(kept)), 1)
     hull = replace(view, mask=filled > 0)
-    return contour_view(contour.image, hull, f"views[{contour.image}].mask", contour.camera)
+    return contour_view(contour.image, hull, _mask_of(view), contour.camera)
+
+
+def _mask_of(view: View) -> str:
+    return f"views[{view.number}].mask"

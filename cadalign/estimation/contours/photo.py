@@ -40,6 +40,7 @@ from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.search import Minimum
 from cadalign.estimation.uncertainty.summary import EvidenceSummary
 from cadalign.estimation.view import View
+from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.io.images import ByteImage
 from cadalign.shapes.model import ShapeModel
@@ -159,9 +160,9 @@ def fit_photos(
         if view.image is not None and view.mask is None
     ]
     keypoints = len(prior.ids)
-    where = f"views[{photos[0].image}].image"
+    where = f"views[{views[photos[0].image].number}].image"
     surface = surfaces_of(model, minima[0].points[:keypoints], where).surfaces[0]
-    warnings: list[str] = []
+    warnings: list[EstimateWarning] = []
     found: dict[int, OutlineSupport] = {}
     left_out: dict[int, OutlineSupport] = {}
     refined = list(minima)
@@ -171,30 +172,38 @@ def fit_photos(
         if not wrong:
             supports = best[0].supports
             found = {photo.image: each for photo, each in zip(photos, supports, strict=True)}
-            warnings.extend(_weak(found))
+            warnings.extend(_weak(found, views))
             refined = [each.minimum for each in best]
             break
         for photo, reason in wrong:
-            warnings.append(f"views[{photo.image}].image is left out: {reason}")
+            number = views[photo.image].number
+            text = f"views[{number}].image is left out: {reason}"
+            warnings.append(EstimateWarning("photo", text, number))
             left_out[photo.image] = _NO_SUPPORT
             photos.remove(photo)
     summaries = [
-        EvidenceSummary("photo", view, own.lines, own.rms_sigmas, own.rms, "px", own.share)
-        for view, own in {**found, **left_out}.items()
+        EvidenceSummary(
+            "photo", views[image].number, own.lines, own.rms_sigmas, own.rms, "px", own.share
+        )
+        for image, own in {**found, **left_out}.items()
     ]
     return Refined(refined, summaries, warnings)
 
 
-def _weak(found: dict[int, OutlineSupport]) -> list[str]:
+def _weak(found: dict[int, OutlineSupport], views: Sequence[View]) -> list[EstimateWarning]:
     """Warnings about photos that show only a part of the outline, or another thing's."""
     warnings = []
-    for view, each in found.items():
-        where = f"views[{view}].image"
+    for image, each in found.items():
+        number = views[image].number
+        where = f"views[{number}].image"
         if each.share < _GOOD_SUPPORT:
-            warnings.append(f"{where} shows only {100 * each.share:.0f} % of the model's outline")
+            text = f"{where} shows only {100 * each.share:.0f} % of the model's outline"
         elif each.rms_sigmas > _MOST_RMS:
             off = f"{each.rms_sigmas:.1f} standard deviations off the model's outline"
-            warnings.append(f"{where}: edges lie {off}: some may be another object's")
+            text = f"{where}: edges lie {off}: some may be another object's"
+        else:
+            continue
+        warnings.append(EstimateWarning("photo", text, number))
     return warnings
 
 

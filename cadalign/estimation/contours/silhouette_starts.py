@@ -34,6 +34,7 @@ from cadalign.estimation.model import Model
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.search import JointProblem, Minimum, find_minima
 from cadalign.estimation.view import View
+from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.alignment import model_rays
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
@@ -59,7 +60,6 @@ _ROUGHLY = np.radians(10.0)  # standard deviation of a start's directions
 _ROUGH_STRETCH = 0.3  # of the logarithms of its lengths
 _MOST_SIGMAS = 3.0
 _LARGEST_FOCAL_SIGMA = 0.25  # relative: poses are sought at the focal length of the prior
-_WHERE = "views[0].mask"
 
 
 class _Search(NamedTuple):
@@ -146,11 +146,11 @@ class _Start(NamedTuple):
 
 def minima_of_mask(
     problem: JointProblem, model: Model
-) -> tuple[list[Minimum], int, int, str | None]:
+) -> tuple[list[Minimum], int, int, EstimateWarning | None]:
     """Minima of the evidence beside the mask of the only view, at alignments that resemble it.
 
     The model is exact and has a mesh. The best is the first; then numbers of iterations and of
-    starts, and a mistake to warn of.
+    starts, and a warning where the outlines differ.
 
     Raises InputError if the mask has no contour, or no prior says roughly what the focal length is;
     DegenerateError if no start leads to the mask.
@@ -160,31 +160,33 @@ def minima_of_mask(
     if problem.lenses.count and (known is None or known.relative_sigma > _LARGEST_FOCAL_SIGMA):
         raise InputError(
             "a mask alone does not tell the focal length",
-            where="views[0].camera",
+            where=f"views[{view.number}].camera",
             fix="give a calibrated camera, a focal_prior whose relative_sigma is at most "
             f"{_LARGEST_FOCAL_SIGMA}, or keypoints",
         )
-    contour, pixel = _rough_contour(view, camera)
+    where = f"views[{view.number}].mask"
+    contour, pixel = _rough_contour(view, where, camera)
     ends, steps, starts = _searched(problem, model, contour)
     if not ends:
         raise DegenerateError(
             "no pose gives the model an outline like the mask's",
-            where=_WHERE,
+            where=where,
             fix="check that the mask is nonzero on the object, not around it, and that the model "
             "is the object's; or give an init or keypoints",
         )
     misfit, size = pixel * ends[0].misfit, pixel * contour.contour.size
-    mistake = None
+    warning = None
     if misfit > max(_FAR_PX, _FAR * size):
-        mistake = (
-            f"{_WHERE}: the outline of the best pose found is {misfit:.1f} px from the mask's on "
+        text = (
+            f"{where}: the outline of the best pose found is {misfit:.1f} px from the mask's on "
             "average: the object may be partly hidden, the model another, or the pose wrong"
         )
+        warning = EstimateWarning("mask", text, view.number)
     likely = [each for each in ends if each.cost <= ends[0].cost + _CLOSE]
     poses = [poses_of(each.minimum.evidence, each.minimum.state)[0] for each in likely]
     chosen = distinct(zip(poses, likely, strict=True), _MOST_ENDS, model.symmetry)
     minima = [each.minimum._replace(outline_score=each.over(chosen[0])) for each in chosen]
-    return minima, steps, starts, mistake
+    return minima, steps, starts, warning
 
 
 def _searched(
@@ -220,12 +222,12 @@ def _met_by(contour: ViewContour) -> float:
     return float(np.log(sigma) + (1 + np.log(2 * np.pi)) / 2)
 
 
-def _rough_contour(view: View, camera: Camera) -> tuple[ViewContour, float]:
+def _rough_contour(view: View, where: str, camera: Camera) -> tuple[ViewContour, float]:
     """The contour of a view's mask, or of a copy of `_ROUGH_SIZE` where it is larger.
 
     Then how many of the mask's pixels one of the copy is.
     """
-    contour = contour_view(0, view, _WHERE, camera)
+    contour = contour_view(0, view, where, camera)
     pixel = contour.contour.size / _ROUGH_SIZE
     if pixel < _LEAST_PIXEL:
         return contour, 1.0
@@ -234,7 +236,7 @@ def _rough_contour(view: View, camera: Camera) -> tuple[ViewContour, float]:
     small = np.clip(cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA), 0.0, 1.0)
     sigma = view.mask_sigma and view.mask_sigma / pixel
     smaller = View(view.camera.resized(width, height), mask=small, mask_sigma=sigma)
-    return contour_view(0, smaller, _WHERE, camera.resized(width, height)), pixel
+    return contour_view(0, smaller, where, camera.resized(width, height)), pixel
 
 
 def _resembling(problem: JointProblem, model: Model, search: _Search) -> list[Resembling]:

@@ -30,6 +30,7 @@ from cadalign.estimation.uncertainty.evidence import (
 from cadalign.estimation.uncertainty.residuals import chi_square_quantile, chi_square_tail
 from cadalign.estimation.uncertainty.shape_posterior import ShapeTails, misfits
 from cadalign.estimation.uncertainty.summary import name_of
+from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.solvers.joint.covariance import information_of, scaled_information
 from cadalign.solvers.joint.evidence import Evidence, Rig, State, kept_rows, packed
 from cadalign.solvers.joint.search import reduced, refine_joint, search_joint
@@ -62,22 +63,26 @@ class _Trial(NamedTuple):
 
 
 def warnings_of(
-    evidence: Evidence, state: State, cost: float, tails: ShapeTails
-) -> tuple[str, ...]:
+    evidence: Evidence, state: State, cost: float, tails: ShapeTails, numbers: Sequence[int]
+) -> Warnings:
     """Warnings about evidence that contradicts the rest, and residuals beyond their sigma.
 
-    ``state`` is the estimate, ``cost`` its cost; ``tails`` are those of the shape's prior.
+    ``state`` is the estimate, ``cost`` its cost; ``tails`` are those of the shape's prior,
+    ``numbers`` those of the views.
     """
     contradicting = _contradictions(evidence, state, cost)
-    warnings = [*_wrong_units(evidence, state, contradicting), *contradicting]
+    blamed = [trial.piece for trial in contradicting]
+    warnings = list(_wrong_units(evidence, state, blamed, numbers))
+    if contradicting:
+        warnings.append(_contradiction_warning(evidence, contradicting, numbers))
     is_robust = evidence.sightings.loss.any() or len(evidence.image_depths.point)
     if not contradicting and not is_robust:
         warnings += misfits(cost, redundancy_of(evidence), tails)
     return tuple(warnings)
 
 
-def _contradictions(evidence: Evidence, state: State, cost: float) -> tuple[str, ...]:
-    """A warning that names the pieces which contradict the rest."""
+def _contradictions(evidence: Evidence, state: State, cost: float) -> Sequence[_Trial]:
+    """Trials of the pieces of which one contradicts the rest, the likeliest first."""
     every = pieces_of(evidence)
     pieces = [each for each in every if not _determines_its_pose(evidence, each)]
     if len(every) < 2 or not pieces:
@@ -102,13 +107,25 @@ def _contradictions(evidence: Evidence, state: State, cost: float) -> tuple[str,
         return ()
     noise = min(trial.misfit for trial in suspects)
     suspects.sort(key=lambda trial: _PER_EQUATION * trial.equations - trial.saved / noise)
-    best = suspects[0]
-    alike = _as_likely(best, suspects, noise)
-    *names, last = [name_of(*trial.piece) for trial in alike]
+    return _as_likely(suspects[0], suspects, noise)
+
+
+def _contradiction_warning(
+    evidence: Evidence, trials: Sequence[_Trial], numbers: Sequence[int]
+) -> EstimateWarning:
+    best = trials[0]
+    *names, last = [_name_of(trial.piece, numbers) for trial in trials]
     sigmas = np.sqrt(best.saved / best.misfit / best.equations)
-    hint = next(filter(None, (_hint(evidence, trial) for trial in alike)), "")
+    hint = next(filter(None, (_hint(evidence, trial, numbers) for trial in trials)), "")
     named = f"{', '.join(names)} or {last}" if names else last
-    return (f"{named} contradicts the other evidence, by {sigmas:.2g} sigma{hint}",)
+    text = f"{named} contradicts the other evidence, by {sigmas:.2g} sigma{hint}"
+    views = {trial.piece.view for trial in trials}
+    view = None if len(views) > 1 or best.piece.view is None else numbers[best.piece.view]
+    return EstimateWarning("contradiction", text, view)
+
+
+def _name_of(piece: Piece, numbers: Sequence[int]) -> str:
+    return name_of(piece.kind, None if piece.view is None else numbers[piece.view])
 
 
 def _determines_its_pose(evidence: Evidence, piece: Piece) -> bool:
@@ -203,11 +220,12 @@ def _determined(evidence: Evidence, state: State) -> tuple[int, int]:
 # Hints -------------------------------------------------------------------------------------------
 
 
-def _hint(evidence: Evidence, trial: _Trial) -> str:
+def _hint(evidence: Evidence, trial: _Trial, numbers: Sequence[int]) -> str:
     """A hint at another unit of measurements, or at another axis or sign; else nothing."""
     factor = _measured_factor(evidence, trial.state, trial.piece)
     if factor is not None and not _is_plausible(factor):
-        return f": {name_of(*trial.piece)} is {factor:.3g} times what is expected, {_UNIT}"
+        name = _name_of(trial.piece, numbers)
+        return f": {name} is {factor:.3g} times what is expected, {_UNIT}"
     if trial.piece.kind != "gravity":
         return ""
     directions, rig = evidence.directions, evidence.rig
@@ -225,9 +243,12 @@ def _hint(evidence: Evidence, trial: _Trial) -> str:
     return f": the model's {name} axis points {way} there, is it the up axis (up_axis={name!r})?"
 
 
-def _wrong_units(evidence: Evidence, state: State, contradicting: Sequence[str]) -> Iterator[str]:
+def _wrong_units(
+    evidence: Evidence, state: State, blamed: Sequence[Piece], numbers: Sequence[int]
+) -> Iterator[EstimateWarning]:
     """Warnings about measurements in another unit than the model and the rest of the evidence.
 
+    Pieces that are ``blamed`` for a contradiction are left out.
     The estimate may follow them, which then makes the object too large, or leave them out.
     """
     size = float(np.exp(state.log_scales.mean()))
@@ -235,15 +256,18 @@ def _wrong_units(evidence: Evidence, state: State, contradicting: Sequence[str])
     measured = [(piece, factor) for piece, factor in factors if factor is not None]
     is_rig = (np.bincount(evidence.rig.pose) > 1).any()
     is_alone = len({piece.kind for piece, _ in measured}) == 1 and not is_rig
-    is_told = not _is_plausible(size) and (contradicting or is_alone)
+    is_told = not _is_plausible(size) and (blamed or is_alone)
     for piece, factor in measured:
-        name = name_of(*piece)
-        if any(name in text for text in contradicting):
+        if piece in blamed:
             continue
         if not _is_plausible(factor):
-            yield f"{name}: the measurement is {factor:.2g} times what is expected, {_UNIT}"
+            text = f"the measurement is {factor:.2g} times what is expected, {_UNIT}"
         elif is_told:
-            yield f"{name}: the object is {size:.2g} times as large as the model, is it {_UNIT}"
+            text = f"the object is {size:.2g} times as large as the model, is it {_UNIT}"
+        else:
+            continue
+        view = None if piece.view is None else numbers[piece.view]
+        yield EstimateWarning("unit", f"{_name_of(piece, numbers)}: {text}", view)
 
 
 def _is_plausible(factor: float) -> bool:

@@ -22,6 +22,7 @@ from cadalign.estimation.uncertainty.residuals import (
     f_quantile_of_two,
 )
 from cadalign.estimation.uncertainty.summary import Misfit, percent, uncertainty_of
+from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.projection import predicted_covariances, projection_jacobian
@@ -246,7 +247,7 @@ def find_misfit(result: FittedKeypoints) -> Misfit | None:
     return None if passes else Misfit(*sums, outliers=outliers)
 
 
-def unverified_stretch(result: FittedKeypoints) -> str | None:
+def unverified_stretch(result: FittedKeypoints) -> EstimateWarning | None:
     """Warn about scales held at 1 where the keypoints would not contradict another value.
 
     None where nothing is held, sigma is estimated, or the free scales are not determined at all,
@@ -266,8 +267,9 @@ def unverified_stretch(result: FittedKeypoints) -> str | None:
     if not doubtful:
         return None
     known = " and ".join(f"s_{axis} to +-{percent(scale[axis])}" for axis in doubtful)
-    return (
-        f"the scale is held at 1, which is not tested: free, the keypoints determine {known} only"
+    return EstimateWarning(
+        "scale",
+        f"the scale is held at 1, which is not tested: free, the keypoints determine {known} only",
     )
 
 
@@ -335,7 +337,7 @@ def _outliers(tested: _Tested) -> dict[int, float]:
     return {int(tested.rows[row]): length for row, length in found.items()}
 
 
-def unexplained(sigma: float, points_2d: Sequence[FloatArray]) -> tuple[str, ...]:
+def unexplained(sigma: float, points_2d: Sequence[FloatArray]) -> Warnings:
     """Warn of an estimated sigma [px] that is nearly the spread of the keypoints of views (n, 2).
 
     In 98 % of pairs of a category's models it is a smaller share, of keypoints in random order in
@@ -346,10 +348,11 @@ def unexplained(sigma: float, points_2d: Sequence[FloatArray]) -> tuple[str, ...
     if sigma <= _LARGEST_SHARE * spread:
         return ()
     share = f"{sigma:.3g} px, {100 * sigma / spread:.0f} % of the keypoints' standard deviation"
-    return (f"sigma is {share}: the model explains next to nothing of them, check which is which",)
+    text = f"sigma is {share}: the model explains next to nothing of them, check which is which"
+    return (EstimateWarning("noise", text),)
 
 
-def mistake_in_fit(result: FittedKeypoints, misfit: Misfit | None) -> str | None:
+def mistake_in_fit(result: FittedKeypoints, misfit: Misfit | None) -> EstimateWarning | None:
     """Name the mistake in the keypoints of a fit without which they would fit.
 
     ``misfit`` may have a camera that they fit as they are. Returns a warning; None where keypoints
@@ -405,4 +408,5 @@ def mistake_in_fit(result: FittedKeypoints, misfit: Misfit | None) -> str | None
     if sigma is not None:
         what, unit, given = "sigma is", " px", given * sigma
     after = corrected[mistake] * (sigma or 1.0)
-    return f"{clauses}: corrected, {what} {after:.2g}{unit}; as given, {given:.2g}{unit}"
+    text = f"{clauses}: corrected, {what} {after:.2g}{unit}; as given, {given:.2g}{unit}"
+    return EstimateWarning("mistake", text)

@@ -24,6 +24,7 @@ from cadalign.estimation.options import LOSSES
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.problems import rays_of, whitening_of
 from cadalign.estimation.uncertainty.residuals import loss_slopes, whitening_matrices
+from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import faced, turned_alignment
 from cadalign.geometry.pixels import perspective
@@ -190,7 +191,7 @@ def _whitened_errors(
 
 def keypoint_misfits(
     seen: SeenShape, cost: float, names: Sequence[object], *, tails: ShapeTails, focal: float
-) -> tuple[str, ...]:
+) -> Warnings:
     """Warn about a keypoint that contradicts the others, or about all that do not fit together.
 
     ``cost`` is that of the estimate; ``focal`` [px] turns distances into pixels.
@@ -218,14 +219,15 @@ def keypoint_misfits(
     if is_wrong and fits_without:
         away = np.linalg.solve(whitening_matrices(seen.whitening)[worst], misses[worst])
         pixels = focal * float(np.linalg.norm(away))
-        return (
+        text = (
             f"keypoint {quote(names[worst])} is {pixels:.2g} px from where the others and the "
-            "learned shapes predict it: a wrong keypoint, or a part that the shapes do not have",
+            "learned shapes predict it: a wrong keypoint, or a part that the shapes do not have"
         )
+        return (EstimateWarning("outlier", text, 0, (worst,)),)
     return misfits(total, redundancy, inflated)
 
 
-def misfits(cost: float, redundancy: int, tails: ShapeTails) -> tuple[str, ...]:
+def misfits(cost: float, redundancy: int, tails: ShapeTails) -> Warnings:
     """Report residuals that are too large for their standard deviations.
 
     At the optimum the cost, priors included, is distributed as chi-square: every unknown with a
@@ -238,10 +240,11 @@ def misfits(cost: float, redundancy: int, tails: ShapeTails) -> tuple[str, ...]:
     if 1 - probability_within(squares, redundancy, tails.degrees_of_freedom) >= _FALSE_ALARMS:
         return ()
     ratio = np.sqrt(squares / redundancy)
-    return (
+    text = (
         f"the residuals are {ratio:.2g} times as large as sigma and the spread of shapes allow: "
-        "a keypoint, a sigma or the model is wrong",
+        "a keypoint, a sigma or the model is wrong"
     )
+    return (EstimateWarning("misfit", text),)
 
 
 def _predicted(seen: SeenShape, inflation: float) -> tuple[FloatArray, FloatArray]:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
+from cadalign.estimation.warning import EstimateWarning, Kind, Warnings
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import vector_from_rotation
@@ -72,8 +73,8 @@ def weaknesses_of_keypoints(
     *,
     redundancy: int,
     stretch_sigma: float | None,
-    doubt: str | None,
-) -> tuple[str, ...]:
+    doubt: EstimateWarning | None,
+) -> Warnings:
     """Warn about stretch and motion that the keypoints do not determine, with the reason.
 
     Not about two scales that are open together, whose ratio is not: one image leaves size and
@@ -84,13 +85,14 @@ def weaknesses_of_keypoints(
     """
     warnings, std = [], uncertainty_of(covariance)
     if redundancy <= 0:
-        warnings.append(
+        text = (
             f"{len(points_3d)} keypoints fit exactly whatever they are: "
             "the residuals say nothing about the quality of the fit"
         )
+        warnings.append(EstimateWarning("untested", text))
     if std.focal > UNDETERMINED:
         why = _why_focal_is_weak(alignment.apply(points_3d))
-        warnings.append(_known_only("the focal length", percent(std.focal), why))
+        warnings.append(_known_only("focal", "the focal length", percent(std.focal), why))
     if doubt is not None:
         warnings.append(doubt)
     most = UNDETERMINED
@@ -100,15 +102,17 @@ def weaknesses_of_keypoints(
     if len(is_open) == 1 or _ratio_deviation(covariance, is_open) > most:
         for axis in is_open:
             why = _why_scale_is_weak(points_3d, alignment, axis)
-            warnings.append(_known_only(f"s_{'xyz'[axis]}", percent(std.scale[axis]), why))
+            to = percent(std.scale[axis])
+            warnings.append(_known_only("scale", f"s_{'xyz'[axis]}", to, why))
     if std.rotation_deg > UNDETERMINED_ROTATION_DEG:
-        warnings.append(_known_only("the rotation", f"{std.rotation_deg:.2g} deg"))
+        warnings.append(_known_only("rotation", "the rotation", f"{std.rotation_deg:.2g} deg"))
     distance, spread = _distance(alignment, std)
     if spread > UNDETERMINED * distance and not is_open and std.focal <= UNDETERMINED:
         direction = "xyz"[int(np.argmax(std.translation))]
         share = f" ({percent(spread / distance)} of the distance)" if distance > 0 else ""
         size = f"{max(std.translation):.2g} model units{share}"
-        warnings.append(_known_only(f"the translation along the camera's {direction}", size))
+        what = f"the translation along the camera's {direction}"
+        warnings.append(_known_only("translation", what, size))
     return tuple(warnings)
 
 
@@ -121,7 +125,7 @@ def _ratio_deviation(covariance: FloatArray, axes: Sequence[int]) -> float:
     return math.sqrt(max(float(logs @ covariance @ logs), 0.0))
 
 
-def weaknesses(alignment: Alignment, std: Uncertainty, lengths: FloatArray) -> tuple[str, ...]:
+def weaknesses(alignment: Alignment, std: Uncertainty, lengths: FloatArray) -> Warnings:
     """Warn about lengths, distance and focal length that are not determined.
 
     ``lengths`` (3,) are those of the object: what is open of one counts relative to all, for that
@@ -130,17 +134,18 @@ def weaknesses(alignment: Alignment, std: Uncertainty, lengths: FloatArray) -> t
     warnings, size = [], float(np.linalg.norm(lengths))
     for axis, relative, length in zip("xyz", std.scale, lengths.tolist(), strict=True):
         if relative * length > UNDETERMINED * size:
-            warnings.append(_known_only(f"the length along {axis}", percent(relative)))
+            warnings.append(_known_only("scale", f"the length along {axis}", percent(relative)))
     distance, spread = _distance(alignment, std)
     if spread > UNDETERMINED * distance > 0 and not warnings:
-        warnings.append(_known_only("the distance", percent(spread / distance)))
+        warnings.append(_known_only("translation", "the distance", percent(spread / distance)))
     if std.focal > UNDETERMINED:
-        warnings.append(_known_only("the focal length", percent(std.focal)))
+        warnings.append(_known_only("focal", "the focal length", percent(std.focal)))
     return tuple(warnings)
 
 
-def _known_only(what: str, to: str, why: str = "") -> str:
-    return f"{what} is known only to +-{to}" + (f": {why}" if why else "")
+def _known_only(kind: Kind, what: str, to: str, why: str = "") -> EstimateWarning:
+    reason = f": {why}" if why else ""
+    return EstimateWarning(kind, f"{what} is known only to +-{to}{reason}")
 
 
 def _distance(alignment: Alignment, std: Uncertainty) -> tuple[float, float]:
@@ -184,7 +189,7 @@ def another_pose(
     degrees_of_freedom: float | None = None,
     *,
     near: float = 0.0,
-) -> tuple[str, ...]:
+) -> Warnings:
     """Warn about other poses, with likelihoods relative to the best, that the deviations conceal.
 
     Those outside of the stated 95 % interval of the turn to them, where they have more than the 5 %
@@ -208,7 +213,8 @@ def another_pose(
     which = f"another pose, {angle:.0f} deg away, has"
     if len(concealed) > 1:
         which = f"other poses, the likeliest {angle:.0f} deg away, have"
-    return (f"{which} a probability of {percent(share)}: see `alternatives`",)
+    text = f"{which} a probability of {percent(share)}: see `alternatives`"
+    return (EstimateWarning("alternative", text),)
 
 
 @dataclass(frozen=True)
@@ -282,6 +288,17 @@ class Misfit:
             "outliers": [{"row": row, "distance_px": px} for row, px in self.outliers.items()],
             "camera": self.camera and self.camera.to_dict(),
         }
+
+    @property
+    def warning(self) -> EstimateWarning:
+        """The warning that says it."""
+        if self.free_scale is not None:
+            return EstimateWarning("stretch", str(self))
+        if self.camera is not None:
+            return EstimateWarning("camera", str(self), 0)
+        if self.outliers:
+            return EstimateWarning("outlier", str(self), 0, tuple(sorted(self.outliers)))
+        return EstimateWarning("misfit", str(self))
 
     def __str__(self) -> str:
         if self.free_scale is not None:

@@ -17,6 +17,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.result import Result
 from cadalign.estimation.uncertainty.summary import Uncertainty
+from cadalign.estimation.warning import Warnings
 from cadalign.evaluation.runs.work import Columns, Outcome, Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -48,7 +49,7 @@ class AlignedShape:
     rms: float = np.nan  # of the residuals [px]
     sigma: float = np.nan  # standard deviation of the keypoints [px]
     std: Uncertainty | None = None  # None for a method that states none
-    warnings: tuple[str, ...] = ()
+    warnings: Warnings = ()
     alternatives: tuple[AlignedShape, ...] = ()
     relative_likelihood: float = 1.0  # of an alternative
 
@@ -182,7 +183,7 @@ def _described(outcome: Outcome, estimate: Estimate) -> dict[str, Any]:
         "rms_px": None if rms is None or not np.isfinite(rms) else round(rms, _PIXEL_DIGITS),
         "sigma": None if fit is None else fit.sigma,
         "std": None if fit is None or fit.std is None else vars(fit.std),
-        "warnings": () if fit is None else fit.warnings,
+        "warnings": [] if fit is None else [each.text for each in fit.warnings],
         "alternatives": [
             {**_pose(other.alignment), **_warp(other), "likelihood": other.relative_likelihood}
             for other in (() if fit is None else fit.alternatives)

@@ -81,7 +81,7 @@ def test_silhouette_that_leaves_a_part_of_a_small_mask_uncovered_is_warned_of() 
         truth = Alignment(turn, [2.3 * near, 0.0, 3.8 * near], np.ones(3))
         mask = cast_geometry(Scene(plane), camera, truth).mask
         found = align(Model(mesh=plane), View(camera, mask=mask))
-        told = [text for text in found.warnings if "uncovered" in text]
+        told = [text for text in map(str, found.warnings) if "uncovered" in text]
         return rotation_error(est=found.alignment, gt=truth), told
 
     error, told = found_at(1.0)  # 72 px
@@ -129,7 +129,7 @@ class TestSeveralViews:
     def test_a_mask_beside_another_view_counts(self, keypoints: bool) -> None:
         model, views, truths = self.seen(0, keypoints=keypoints)
         found = align(model, views)
-        assert not any("left out" in text for text in found.warnings)
+        assert not any("left out" in text for text in map(str, found.warnings))
         assert rotation_error(est=found.poses[0], gt=truths[0]) < 2.0
         assert rotation_error(est=found.poses[1], gt=truths[1]) < 0.5
         assert found.alignment.scale == pytest.approx(self.SCALE, rel=0.02)
@@ -155,7 +155,7 @@ class TestSeveralViews:
     def test_a_similar_model_begins_at_keypoints(self) -> None:
         model, views, _ = self.seen(0, keypoints=True)
         found = align(replace(model, shape_sigma=0.01), views)
-        assert any(text.startswith("views[1] is left out") for text in found.warnings)
+        assert any(text.startswith("views[1] is left out") for text in map(str, found.warnings))
 
     def test_the_view_that_is_refused_has_its_own_number(self) -> None:
         model, views, truths = self.seen(0, keypoints=True)
@@ -171,7 +171,7 @@ class TestOwnModel:
         found = align(Model(mesh=body()), View(CAMERA, mask=mask_of(body(), truth)))
         assert rotation_error(est=found.alignment, gt=truth) < 1.0
         assert found.alignment.scale == pytest.approx(truth.scale, rel=0.02)
-        assert not any("partly hidden" in text for text in found.warnings)
+        assert not any("partly hidden" in text for text in map(str, found.warnings))
         assert found.std is not None
         assert found.std.scale[0] == 0.0  # it is the known length
         assert "stretch      (1, " in str(found)

@@ -92,7 +92,7 @@ class TestExactMasks:
                         ),
                     ]
                 )
-                assert not any("mask" in text for text in result.warnings)
+                assert not any(each.kind == "mask" for each in result.warnings)
         errors = np.array(found)
         alone, joint, _, stretch, iou = np.median(errors, axis=0)
         assert joint < 0.3 * alone
@@ -190,7 +190,7 @@ class TestOtherObjects:
         neighbour = np.roll(case.mask, 150, axis=1)
         alone = align(case.model, case.view())
         result = align(case.model, case.view(mask=neighbour))
-        assert any("views[0].mask" in text for text in result.warnings)
+        assert any(each.kind == "mask" for each in result.warnings)
         (residuals,) = result.mask_residuals
         assert residuals is not None
         assert not residuals.is_used
@@ -213,7 +213,7 @@ class TestOtherObjects:
             step = (len(columns) if number % 2 else -len(columns)) * 3 // 4
             neighbour = np.roll(cases[(7 * number + 1) % len(cases)].mask, step, axis=1)
             warnings = align(case.model, case.view(mask=neighbour)).warnings
-            named.append(any(text.startswith("views[0].mask contradicts") for text in warnings))
+            named.append(any("mask contradicts" in each.text for each in warnings))
         # If one of 5 were missed, all 12 would be named no more often than 19 of 20.
         assert all(named)
 
@@ -235,7 +235,7 @@ class TestStarts:
         errors = [rotation_error(est=pose, gt=case.truth) for pose in poses]
         assert min(errors) < 3.0
         assert stretch_error(case, poses[int(np.argmin(errors))]) < 0.05
-        assert any("partly hidden" in text for text in result.warnings)
+        assert any("partly hidden" in text for text in map(str, result.warnings))
 
     def test_a_mask_and_three_keypoints_with_a_start(self, sample_root: Path) -> None:
         case = chair(sample_root)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -11,8 +12,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats
 from cadalign.errors import CadalignError, DegenerateError, InputError
-from cadalign.estimation.focal import check_estimable, log_focal_range
-from cadalign.estimation.focal_search import focal_views
+from cadalign.estimation.focal import check_estimable, focal_grid, prior_of_camera
 from cadalign.estimation.mistakes import (
     SOLUTIONS_OF_FOUR,
     Explained,
@@ -32,19 +32,26 @@ from cadalign.estimation.options import (
     RansacOptions,
     pixel_information,
 )
-from cadalign.estimation.problems import Problems, are_in_one_plane, rays_of, whitening_of
-from cadalign.estimation.solve import solve_one
+from cadalign.estimation.problems import (
+    Problems,
+    Solutions,
+    are_in_one_plane,
+    rays_of,
+    whitening_of,
+)
+from cadalign.estimation.solve import camera_of, solve_one
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, faced, turned_poses
 from cadalign.solvers.alignment import Objective
 from cadalign.solvers.constants import LINEAR, POSE_SIZE, SAMPLE_SIZES
-from cadalign.solvers.evidence import KeypointEvidence, LogFocalPrior, Views
+from cadalign.solvers.evidence import KeypointEvidence
 from cadalign.solvers.ransac import Settings, ransac_kernel
 
 _MOST_EXHAUSTIVE = 1000  # subsets that are all tried rather than drawn from
 _CHANCE = 0.2  # bound on the expected number of models; 1 in 50 such problems has one
 _SIGMAS = 3.0  # that the threshold of inliers is taken to be where the noise is not known
+_INLIER_ROUNDS = 5
 _STRETCH_SIGMA = 1.0  # of log scales, by which alignments are compared: outliers invite extremes
 
 
@@ -186,6 +193,8 @@ def find_consensus(search: RobustSearch) -> Consensus:
     Raises InputError if the keypoints are fewer than the minimal solver needs, or options don't go
     together; DegenerateError if all keypoints lie in one plane.
     """
+    if search.options.focal == "estimate":
+        return _consensus_over_focals(search)
     problems, options, ransac = search.problems, search.options, search.ransac
     camera, points = problems.cameras[0], problems.points_3d[:, options.axis_order]
     count, minimal = len(points), MINIMAL_SOLVERS[ransac.minimal]
@@ -198,24 +207,15 @@ def find_consensus(search: RobustSearch) -> Consensus:
     order = np.random.default_rng(ransac.seed).permutation(count)
     ranked = np.arange(count) if by_score is None else np.argsort(order)[by_score]
     facing = faced(camera, problems.points_2d)
-    if options.focal == "estimate":
-        check_estimable([facing])
-        views = focal_views(problems.points_2d[order], facing, options.focal_prior, None)
-    else:
-        facing.require_focal()
-        rays = rays_of(problems.points_2d[order], facing, clips=True)
-        weights = whitening_of(1.0, rays, facing)
-        views = Views(np.array([facing.fx]), rays[None], weights[None])
+    facing.require_focal()
+    rays = rays_of(problems.points_2d[order], facing, clips=True)
     first = np.ascontiguousarray(points[order])
-    keypoints = KeypointEvidence(first, views.rays[0], views.whitening[0], LINEAR, 1.0)
+    keypoints = KeypointEvidence(first, rays, whitening_of(1.0, rays, facing), LINEAR, 1.0)
     exhaustive = math.comb(count, size) <= _MOST_EXHAUSTIVE
     pose = np.zeros(POSE_SIZE)
     inliers = np.zeros(count, dtype=bool)
-    score, log_focal, iterations, hypotheses = ransac_kernel(
+    score, iterations, hypotheses = ransac_kernel(
         Objective(options.free, keypoints, options.scale_prior),
-        views,
-        np.log(views.focals),
-        LogFocalPrior(*log_focal_range(camera, options.focal_prior)),
         ranked,
         Settings(
             threshold=search.threshold,
@@ -228,7 +228,6 @@ def find_consensus(search: RobustSearch) -> Consensus:
             exhaustive=exhaustive,
             guided=by_score is not None,
             optimize=ransac.refine,
-            estimate_focal=options.focal == "estimate",
         ),
         pose,
         inliers,
@@ -239,14 +238,77 @@ def find_consensus(search: RobustSearch) -> Consensus:
             where="points_3d",
             fix="leave ransac away: use loss='cauchy', with stretch= or stretch_sigma=",
         )
-    if options.focal == "estimate":
-        camera = camera.with_focal(math.exp(log_focal))
     pose = turned_poses(options.in_model_axes(pose), facing.lens_from_camera)
     alignment = Alignment.from_packed(pose)
     kept = np.empty(count, dtype=bool)
     kept[order] = inliers
     residuals, effort = search.residuals_of(alignment, camera), (int(iterations), int(hypotheses))
     return Consensus(alignment, camera, kept, residuals, *effort, float(score))
+
+
+def _consensus_over_focals(search: RobustSearch) -> Consensus:
+    """The best consensus at a grid of focal lengths, then with that of the inliers' optimum."""
+    camera, given = search.problems.cameras[0], search.options.focal_prior
+    check_estimable([camera])
+    grid, prior = focal_grid(camera, given), prior_of_camera(given, camera)
+    middle = grid[len(grid) // 2] if prior is None else prior.focal
+    best: Consensus | None = None
+    hypotheses = 0
+    failure: InputError | None = None
+    own = replace(search, options=replace(search.options, focal="known", focal_prior=None))
+    for focal in grid[np.argsort(np.abs(np.log(grid / middle)), kind="stable")].tolist():
+        problems = replace(search.problems, cameras=(camera.with_focal(focal),))
+        try:
+            found = find_consensus(replace(own, problems=problems))
+        except InputError as error:  # the lens model cannot be undone there
+            failure = error
+            continue
+        hypotheses += found.hypotheses
+        if best is None or found.score < best.score:
+            best = found
+            # As many samples find any larger support at another focal length.
+            most = min(own.ransac.max_iterations, max(found.iterations, 1))
+            own = replace(own, ransac=replace(own.ransac, max_iterations=most))
+    if best is None:
+        assert failure is not None
+        raise failure
+    if search.ransac.refine:
+        with suppress(CadalignError):  # too few keypoints agree
+            best = refined(search, best).consensus
+            squares = (best.residuals**2).sum(axis=1)
+            best = best._replace(score=float(np.minimum(squares, search.threshold**2).sum()))
+    return best._replace(hypotheses=hypotheses)
+
+
+class Refined(NamedTuple):
+    """A consensus whose alignment is the optimum of its inliers, and this optimum."""
+
+    consensus: Consensus
+    problems: Problems
+    solutions: Solutions
+    options: FitOptions
+
+
+def refined(search: RobustSearch, best: Consensus) -> Refined:
+    """Find the optimum of the inliers, until these don't change.
+
+    Raises CadalignError if they do not determine the alignment.
+    """
+    given, inliers, sigma = search.problems, best.inliers, search.options.sigma
+    for last in range(_INLIER_ROUNDS + 1):
+        some, options = given.chosen(inliers), search.options
+        if sigma is not None and np.ndim(sigma) > 0:
+            options = replace(options, sigma=np.asarray(sigma, dtype=np.float64)[inliers])
+        solutions = solve_one(some, options)
+        alignment = Alignment.from_packed(solutions.poses[0, 0])
+        camera = camera_of(some, solutions, 0)
+        residuals = search.residuals_of(alignment, camera)
+        kept = np.linalg.norm(residuals, axis=1) < search.threshold
+        if (kept == inliers).all() or kept.sum() < inliers.sum() or last == _INLIER_ROUNDS:
+            break
+        inliers = kept
+    found = best._replace(alignment=alignment, camera=camera, inliers=inliers, residuals=residuals)
+    return Refined(found, some, solutions, options)
 
 
 def _order_of_scores(scores: npt.ArrayLike | None, count: int) -> npt.NDArray[np.intp] | None:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, copied
 from cadalign.errors import CadalignError, InputError, require_kind
 from cadalign.estimation.assemble import canonical_result, result_of_solution
-from cadalign.estimation.focal import USUAL, PriorOption
+from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.estimation.problems import Problems, each_of, in_threads, pack_many, pack_one
 from cadalign.estimation.result import Result
@@ -226,7 +226,7 @@ def fit_batch(
         scores = each_of(scores, "scores", len(problems), "sets")
     if len({(each.width, each.height) for each in problems.cameras}) == 1:
         options = options.for_camera(problems.cameras[0])
-    is_solved_at_once = ransac is None and options.focal_prior != USUAL
+    is_solved_at_once = ransac is None and options.focal == "known"
     is_solved_at_once &= not options.estimates_in_rounds
 
     @np.errstate(all="ignore")  # holds for one thread only

@@ -21,7 +21,6 @@ from cadalign.estimation.solve import solve
 from cadalign.estimation.uncertainty.derivatives import UNKNOWNS, Optima, lens_slopes
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import rotations_from_vectors
-from cadalign.solvers.constants import OK
 
 _LARGEST_POLISH = 0.02  # turn [rad] or change of a logarithm beyond which a step is no polish
 _AT_BOUND = 1e-9
@@ -252,16 +251,22 @@ def _searched(
     present, cameras = batch.present, batch.cameras
     offsets = np.concatenate([[0], np.cumsum(present.sum(axis=1))]).astype(np.int64)
     problems = Problems(points[present], batch.pixels[present], offsets, cameras)
-    sigmas, each = batch.sigmas[present], None
-    if len(cameras) > 1 or options.focal == "estimate":
-        each = [sigmas[problems.rows(b)] for b in range(len(points))]
+    sigmas = batch.sigmas[present]
+    rows = [problems.rows(b) for b in range(len(points))]
+    if options.focal == "estimate":
+        found = [
+            solve(problems.part(b, b + 1), replace(options, sigma=sigmas[own]))
+            for b, own in enumerate(rows)
+        ]
+    elif len(cameras) > 1:
+        found = [solve(problems, options, [sigmas[own] for own in rows])]
     else:  # those of all problems, one after the other
-        options = replace(options, sigma=sigmas)
-    found = solve(problems, options, each)
-    valid = (found.statuses == OK) & np.isfinite(found.poses[:, 0]).all(axis=1)
-    valid[list(found.errors)] = False
-    poses = np.where(valid[:, None], found.poses[:, 0], _NO_POSE)
+        found = [solve(problems, replace(options, sigma=sigmas))]
+    valid = np.concatenate([each.solved for each in found])
+    poses = np.concatenate([each.poses[:, 0] for each in found])
+    poses = np.where(valid[:, None], poses, _NO_POSE)
     focals = np.array([camera.fx for camera in cameras]) * np.ones(len(points))
-    if found.focals is not None:
-        focals = np.where(valid, found.focals[:, 0], focals)
+    if options.focal == "estimate":
+        estimated = [np.nan if each.focals is None else each.focals[0, 0] for each in found]
+        focals = np.where(valid, estimated, focals)
     return poses, focals, valid

@@ -22,7 +22,7 @@ from cadalign.estimation.options import SIGMA_HELP, FitOptions, Sigma, pixel_inf
 from cadalign.geometry.alignment import are_on_a_line
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import check_pixels
-from cadalign.solvers.constants import NOT_FOUND, OUT_OF_RANGE, TOO_FEW
+from cadalign.solvers.constants import NOT_FOUND, OK, OUT_OF_RANGE, TOO_FEW, UNOBSERVABLE
 from cadalign.solvers.linear import aepnp_error, describe_plane, out_of_range_error
 from cadalign.solvers.projection import all_finite, pinhole_rays
 
@@ -72,14 +72,6 @@ class Problems:
         """Number of different pairs of points of each problem, (B,) int."""
         pairs = np.concatenate([self.points_3d, self.points_2d], axis=1)
         return np.array([distinct_rows(pairs[self.rows(b)]) for b in range(len(self))])
-
-    def with_focals(self, focals: FloatArray) -> Problems:
-        """The same problems seen with the focal lengths (B,); NaN leaves a camera as it is."""
-        cameras = tuple(
-            self.camera(b) if math.isnan(focal) else self.camera(b).with_focal(focal)
-            for b, focal in enumerate(focals.tolist())
-        )
-        return replace(self, cameras=cameras)
 
     def part(self, first: int, last: int) -> Problems:
         """Problems ``first`` to ``last``, that one left out."""
@@ -283,7 +275,8 @@ class Solutions(NamedTuple):
     ``poses`` (B, k, 15) are packed, ``costs`` (B, k) their whitened squared errors, infinite where
     there is none; ``covariances`` (B, 8, 8) or (B, 9, 9) and ``residuals`` (n, 2) [px] are those of
     the best. ``info`` (B, 4) counts minima, iterations and hypotheses, and names an undetermined
-    unknown or -1. ``focals`` (B, k) and ``sigmas`` (B,) [px] are there where they were estimated.
+    unknown or -1. ``sigmas`` (B,) [px] and, of the only problem, ``focals`` (1, k) [px] are there
+    where they were estimated.
     """
 
     poses: FloatArray
@@ -295,6 +288,13 @@ class Solutions(NamedTuple):
     sigmas: FloatArray | None = None
     residuals: FloatArray = _NO_RESIDUALS
     errors: Mapping[int, CadalignError] = _NO_ERRORS
+
+    @property
+    def solved(self) -> BoolArray:
+        """True for the problems (B,) that have a solution."""
+        solved = (self.statuses == OK) & np.isfinite(self.poses[:, 0]).all(axis=1)
+        solved[list(self.errors)] = False
+        return np.asarray(solved)
 
 
 def full_covariances(of_solver: FloatArray, known_axis: str) -> FloatArray:
@@ -314,6 +314,25 @@ def full_covariance(of_solver: FloatArray, known_axis: str) -> FloatArray:
     full = np.zeros((size, size))
     full.put(_places(size, known_axis), of_solver)
     return full
+
+
+def with_log_focal(
+    covariance: FloatArray, rows: FloatArray, of_scales: FloatArray, of_focal: float
+) -> FloatArray:
+    """Covariance (9, 9) of the solvers' unknowns and a log focal length from that without (8, 8).
+
+    ``rows`` (n, 2, 9) are whitened derivatives of the residuals, ``of_scales`` (2,) and
+    ``of_focal`` the information of priors. A focal length that the others leave open has as large a
+    variance as rounding errors let it be known.
+    """
+    others, own = rows.reshape(-1, 9)[:, :8], rows.reshape(-1, 9)[:, 8]
+    gain = covariance @ (own @ others)
+    alone = own - others @ gain
+    information = float(alone @ alone + of_scales @ gain[6:] ** 2) + of_focal
+    gain = np.append(-gain, 1.0)
+    whole = np.zeros((9, 9))
+    whole[:8, :8] = covariance
+    return whole + np.outer(gain, gain) / max(information, UNOBSERVABLE * float(own @ own))
 
 
 @lru_cache(maxsize=6)

@@ -302,8 +302,6 @@ def results_of_solutions(
     failed = np.zeros(len(problems), dtype=bool)
     failed[list(solutions.errors)] = True
     focals = np.broadcast_to(problems.calibrations[:, 0], len(problems))
-    if solutions.focals is not None:
-        focals = solutions.focals[:, 0]
     poses, residuals = solutions.poses[:, 0].copy(), solutions.residuals
     covariance = None
     if solutions.covariances is not None:

@@ -15,7 +15,13 @@ import numpy.typing as npt
 
 from cadalign.errors import CadalignError, DegenerateError, InputError, NoConsensusError
 from cadalign.estimation.assemble import result_of_keypoints, result_of_solution
-from cadalign.estimation.consensus import Consensus, RobustSearch, find_consensus, mistake_in
+from cadalign.estimation.consensus import (
+    Consensus,
+    RobustSearch,
+    find_consensus,
+    mistake_in,
+    refined,
+)
 from cadalign.estimation.mistakes import (
     LEAST_ERROR,
     SOLUTIONS_OF_FOUR,
@@ -31,7 +37,6 @@ from cadalign.estimation.result_parts import FitStats, KeypointStatistics
 from cadalign.estimation.solve import solve_one
 from cadalign.estimation.uncertainty.residuals import f_quantile
 
-_INLIER_ROUNDS = 5
 _REACH = 3.0  # estimated sigmas within which keypoints agree
 _FIRST, _FACTOR = 4.0, 2.0  # thresholds [px]
 _WIDEST = 0.25  # threshold, over the keypoints' extent
@@ -64,12 +69,13 @@ def fit_robustly(
     )
     trusted = None if scores is None else np.array(scores)
     search = RobustSearch(given, options, ransac, trusted)
-    best, refined = _found(search), None
+    best, result = _found(search), None
     # As many samples would find the support that a corrected mistake gives, which is more.
     ransac = replace(ransac, max_iterations=best.iterations)
     points = given.points_3d
     if ransac.refine:
-        best, refined = _refined(search, best, start)
+        best, some, solutions, own = refined(search, best)
+        result = result_of_solution(some, solutions, own, time.perf_counter() - start)
     fitted = {
         "points_3d": points,
         "residuals": best.residuals,
@@ -77,18 +83,18 @@ def fit_robustly(
         "alignment": best.alignment,
         "camera": best.camera,
         "options": options,
-        "sigma": refined and refined.sigma,
-        "fisher_covariance": None if refined is None else refined.fisher_covariance,
+        "sigma": result and result.sigma,
+        "fisher_covariance": None if result is None else result.fisher_covariance,
         "search": replace(search, ransac=ransac),
     }
     ratio, seconds = float(best.inliers.mean()), time.perf_counter() - start
-    others = () if refined is None else refined.alternatives
+    others = () if result is None else result.alternatives
     return result_of_keypoints(
         problems.points_2d,
         fitted,
-        method=f"ransac-{ransac.minimal if refined is None else refined.method}",
+        method=f"ransac-{ransac.minimal if result is None else result.method}",
         stats=FitStats(best.iterations, best.hypotheses, seconds, ratio, best.score),
-        cost=None if refined is None else refined.cost,
+        cost=None if result is None else result.cost,
         alternatives=tuple(replace(each, points_3d=points) for each in others),
     )
 
@@ -103,26 +109,6 @@ def _found(search: RobustSearch) -> Consensus:
         error.fix = error.fix if mistake is None else mistake.text
         raise
     return best
-
-
-def _refined(search: RobustSearch, best: Consensus, start: float) -> tuple[Consensus, Result]:
-    """The optimum for the inliers, until these don't change, and its result."""
-    given, inliers, sigma = search.problems, best.inliers, search.options.sigma
-    for last in range(_INLIER_ROUNDS + 1):
-        some, options = given.chosen(inliers), search.options
-        if sigma is not None and np.ndim(sigma) > 0:
-            options = replace(options, sigma=np.asarray(sigma, dtype=np.float64)[inliers])
-        seconds = time.perf_counter() - start
-        result = result_of_solution(some, solve_one(some, options), options, seconds)
-        residuals = search.residuals_of(result.alignment, result.camera)
-        kept = np.linalg.norm(residuals, axis=1) < search.threshold
-        if (kept == inliers).all() or kept.sum() < inliers.sum() or last == _INLIER_ROUNDS:
-            break
-        inliers = kept
-    found = best._replace(
-        alignment=result.alignment, camera=result.camera, inliers=inliers, residuals=residuals
-    )
-    return found, result
 
 
 def fit_similar_robustly(

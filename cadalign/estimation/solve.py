@@ -55,7 +55,8 @@ def solve(
 ) -> Solutions:
     """Solve every problem with the method of the options.
 
-    ``sigmas``, one for each problem, takes the place of the options' sigma.
+    ``sigmas``, one for each problem, takes the place of the options' sigma. A problem whose focal
+    length is estimated is the only one.
     """
     if options.method == "aepnp" and sigmas is None:
         short = _solve_one_linearly(problems, options)
@@ -81,8 +82,7 @@ def solve(
         found = _one_minimum(*aepnp_batch(points, rays, problems.offsets), errors)
     else:
         found = _solve_baseline(problems, options, points)
-    seen = problems if found.focals is None else problems.with_focals(found.focals[:, 0])
-    residuals, statuses = _residuals(seen, points, found)
+    residuals, statuses = _residuals(problems, points, found)
     found = found._replace(residuals=residuals, statuses=statuses)
     if np.count_nonzero(statuses):
         errors = {
@@ -190,7 +190,7 @@ def _solve_optimal(
         # Only here: its kernels take time to import, and most cameras are calibrated.
         from cadalign.estimation.focal_search import search_focal
 
-        search = partial(search_focal, problems, options, points, sigmas)
+        search = partial(search_focal, problems, options, points)
     else:
         rays, errors = _rays(problems)
         whitening = _whitening(problems, options, rays, sigmas)
@@ -294,8 +294,7 @@ def _estimate_sigmas(
 
     Keypoints that are given repeatedly count once for the redundancy.
     """
-    seen = problems if found.focals is None else problems.with_focals(found.focals[:, 0])
-    residuals, _ = _residuals(seen, points, found)
+    residuals, _ = _residuals(problems, points, found)
     sigmas = np.ones(len(problems))
     for b in range(len(problems)):
         rows = problems.rows(b)
@@ -329,6 +328,8 @@ def _residuals(
     problems: Problems, points: FloatArray, found: Solutions
 ) -> tuple[FloatArray, IntArray]:
     """Projected minus observed keypoints (n, 2) [px], and the statuses (B,) that follow."""
+    if found.focals is not None and found.info[0, 0]:
+        problems = replace(problems, cameras=(camera_of(problems, found, 0),))
     given = points, problems.points_2d, problems.offsets
     residuals, statuses = reproject_batch(
         *given, found.poses, problems.calibrations, found.statuses

@@ -6,7 +6,7 @@ and add its terms in `add_evidence` and `evaluate_cost`; everything else sums th
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -63,14 +63,6 @@ def room_for(unknowns: int) -> Equations:
     )
 
 
-@kernel
-def room_for_two(unknowns: int) -> tuple[Equations, Equations]:
-    """Room for equations that take turns, with the same scratch space."""
-    first = room_for(unknowns)
-    second = np.empty((unknowns, unknowns)), np.empty(unknowns)
-    return first, Equations(second[0], second[1], first.rows, first.factor)
-
-
 def keypoint_objective(points: FloatArray, rays: FloatArray, whitening: FloatArray) -> Objective:
     """The plain objective: keypoints with squared errors, all unknowns free, no prior."""
     points = np.require(points, np.float64, ["C", "W"])
@@ -81,30 +73,24 @@ def keypoint_objective(points: FloatArray, rays: FloatArray, whitening: FloatArr
 @room_of.of(Objective)
 @kernel
 def _room_of(objective: Objective) -> tuple[Equations, Equations]:
-    return room_for_two(UNKNOWNS)
+    first = room_for(UNKNOWNS)
+    second = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
+    return first, Equations(second[0], second[1], first.rows, first.factor)
 
 
 @evaluate.of(Objective)
 @borrowing
 def evaluate_alignment(objective: Objective, pose: FloatArray, equations: Equations) -> float:
     """Build the Gauss-Newton system at a pose (15,); unit rows for unknowns that are not free."""
-    return write_equations(objective, None, pose, equations)
-
-
-@inlined
-def write_equations(
-    objective: Objective, slopes: FloatArray | None, pose: FloatArray, equations: Equations
-) -> float:
-    """Build the Gauss-Newton system; returns the cost. The ``slopes`` are as in `add_keypoints`."""
     hessian, gradient = equations.hessian, equations.gradient
     hessian[:] = 0.0
     gradient[:] = 0.0
-    cost = add_keypoints(objective.keypoints, slopes, pose, equations.rows, hessian, gradient)
+    cost = add_keypoints(objective.keypoints, pose, equations.rows, hessian, gradient)
     if not cost < np.inf:
         return np.inf
     cost += add_scale_prior(objective.scale_prior, pose, hessian, gradient)
     mirror_upper(hessian)
-    hold_fixed(objective.free, gradient.shape[0], hessian, gradient)
+    hold_fixed(objective.free, hessian, gradient)
     return cost
 
 
@@ -155,15 +141,13 @@ def _move(
 
 @score_of.of(Objective)
 @inlined
-def rank_by_cost(system: Any, state: FloatArray, cost: float) -> float:
-    """The cost itself; see `cadalign.solvers.search.score_of`."""
+def _score_of(objective: Objective, pose: FloatArray, cost: float) -> float:
     return cost
 
 
 @are_same.of(Objective)
 @kernel
-def are_same_poses(objective: Objective, first: FloatArray, second: FloatArray) -> bool:
-    """True if rotations and scales of two poses coincide."""
+def _are_same(objective: Objective, first: FloatArray, second: FloatArray) -> bool:
     square = 0.0
     for i in range(9):
         square += (first[i] - second[i]) ** 2
@@ -199,9 +183,9 @@ def covariance_of(objective: Objective, pose: FloatArray, covariance: FloatArray
     center, unit = center_and_unit(objective.keypoints.points)
     local = with_points(objective, (objective.keypoints.points - center) / unit)
     equations = room_for(UNKNOWNS)
-    evaluate_alignment(local, centered(pose, center, unit), equations)
-    undetermined = invert(equations.hessian, objective.free, 0.0, covariance)
-    uncenter_covariance(pose, center, unit, covariance)
+    evaluate_alignment(local, _centered(pose, center, unit), equations)
+    undetermined = _invert(equations.hessian, objective.free, covariance)
+    _uncenter_covariance(pose, center, unit, covariance)
     return undetermined
 
 
@@ -221,7 +205,7 @@ def center_and_unit(points: FloatArray) -> tuple[FloatArray, float]:
 
 
 @kernel
-def centered(pose: FloatArray, center: FloatArray, unit: float) -> FloatArray:
+def _centered(pose: FloatArray, center: FloatArray, unit: float) -> FloatArray:
     """The pose of points (x - center) / unit, in these units."""
     centered = pose.copy()
     uncenter(centered, -center, 1.0)
@@ -231,13 +215,11 @@ def centered(pose: FloatArray, center: FloatArray, unit: float) -> FloatArray:
 
 
 @kernel
-def invert(information: FloatArray, free: FloatArray, least: float, covariance: FloatArray) -> int:
-    """Write the inverse of an information matrix (U, U), whose factor takes its place.
+def _invert(information: FloatArray, free: FloatArray, covariance: FloatArray) -> int:
+    """Write the inverse of an information matrix (8, 8), whose factor takes its place.
 
-    An unknown beyond the first 8 has at least the information ``least`` left by the others.
     Returns -1, or the number of an undetermined unknown.
     """
-    size = information.shape[0]
     diagonal = np.diag(information).copy()
     covariance[:] = 0.0
     if not cholesky(information, UNKNOWNS, UNOBSERVABLE):
@@ -248,27 +230,19 @@ def invert(information: FloatArray, free: FloatArray, least: float, covariance: 
             if not total > UNOBSERVABLE * diagonal[k]:
                 return k
         return UNKNOWNS - 1
-    for k in range(UNKNOWNS, size):
-        total = diagonal[k]
-        for m in range(UNKNOWNS):
-            for j in range(m):
-                information[k, m] -= information[m, j] * information[k, j]
-            information[k, m] /= information[m, m]
-            total -= information[k, m] ** 2
-        information[k, k] = np.sqrt(max(total, least))
-    column = np.empty(size)
-    for k in range(size):
-        if k < UNKNOWNS and free[k] == 0.0:
+    column = np.empty(UNKNOWNS)
+    for k in range(UNKNOWNS):
+        if free[k] == 0.0:
             continue
         column[:] = 0.0
         column[k] = 1.0
-        solve_cholesky(information, size, column)
+        solve_cholesky(information, UNKNOWNS, column)
         copy_into(covariance[:, k], column)
     return -1
 
 
 @kernel
-def uncenter_covariance(
+def _uncenter_covariance(
     pose: FloatArray, center: FloatArray, unit: float, covariance: FloatArray
 ) -> None:
     """Carry the covariance from points (x - center) / unit to points x, at the pose of x.
@@ -276,7 +250,7 @@ def uncenter_covariance(
     With t = unit t' - R S center, an infinitesimal change of the unknowns changes t by
     unit dt' + [R S center]x d(rotation) - sum_k R_k s_k center_k d(log s_k).
     """
-    size = covariance.shape[0]
+    size = UNKNOWNS
     jacobian = np.eye(size)
     shift = np.zeros(3)
     for c in range(3):

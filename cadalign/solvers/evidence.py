@@ -35,27 +35,9 @@ class KeypointEvidence(NamedTuple):
     loss_scale: float
 
 
-class LogFocalPrior(NamedTuple):
-    """Bounds, mean and inverse variance (0 for no prior) of the log of a relative focal length."""
-
-    low: float
-    high: float
-    center: float
-    weight: float
-
-
-class Views(NamedTuple):
-    """Rays (k, n, 2) and whitening (k, 1 or n, 3) of keypoints at k rising focal lengths [px]."""
-
-    focals: FloatArray
-    rays: FloatArray
-    whitening: FloatArray
-
-
 @inlined
 def add_keypoints(
     keypoints: KeypointEvidence,
-    slopes: FloatArray | None,
     pose: FloatArray,
     rows: FloatArray,
     hessian: FloatArray,
@@ -63,8 +45,7 @@ def add_keypoints(
 ) -> float:
     """Add the keypoints' part; returns its cost, infinite if a point lies behind the camera.
 
-    With ``slopes`` (n or 0, 2) of the rays by the log focal length, that is the last unknown.
-    ``rows`` (unknowns + 1, 2 * BLOCK) is scratch space.
+    ``rows`` (UNKNOWNS + 1, 2 * BLOCK) is scratch space.
     """
     cost = 0.0
     for start in range(0, keypoints.points.shape[0], BLOCK):
@@ -72,8 +53,6 @@ def add_keypoints(
         cost += _write_rows(keypoints, pose, start, size, rows)
         if not cost < np.inf:
             return np.inf
-        if slopes is not None:
-            _write_focal_row(keypoints, slopes, pose, start, size, rows)
         add_products(rows, 2 * size, hessian, gradient)
     return cost
 
@@ -92,7 +71,6 @@ def _write_rows(
     loss, loss_scale = keypoints.loss, keypoints.loss_scale
     each = whitening.shape[0] > 1
     weights = (whitening[0, 0], whitening[0, 1], whitening[0, 2])
-    last = rows.shape[0] - 1
     cost = 0.0
     nearest = np.inf
     for b in range(size):
@@ -105,37 +83,9 @@ def _write_rows(
         seen = weigh_error(weights, u - rays[i, 0], v - rays[i, 1], loss, loss_scale)
         cost += seen.cost
         write_derivatives(scalars, point, seen.whitening, rows, b, size + b)
-        rows[last, b] = seen.u
-        rows[last, size + b] = seen.v
+        rows[UNKNOWNS, b] = seen.u
+        rows[UNKNOWNS, size + b] = seen.v
     return cost if nearest > 0 else np.inf
-
-
-@borrowing
-def _write_focal_row(
-    keypoints: KeypointEvidence,
-    slopes: FloatArray,
-    pose: FloatArray,
-    start: int,
-    size: int,
-    rows: FloatArray,
-) -> None:
-    """Write the derivatives of a block of points by the log focal length.
-
-    A longer focal length moves a point's image as a smaller depth does; the distance follows it.
-    """
-    points, whitening = keypoints.points, keypoints.whitening
-    scalars = scalars_of(pose)
-    for b in range(size):
-        i = start + b
-        _, _, depth = project_point(scalars, (points[i, 0], points[i, 1], points[i, 2]))
-        nearer = pose[11] - depth
-        by_u, by_v = rows[5, b] * nearer, rows[5, size + b] * nearer
-        if slopes.shape[0] > 0:
-            weights = whitening[i if whitening.shape[0] > 1 else 0]
-            root = rows[3, b] * depth / weights[0]  # of the loss's weight
-            by_u -= root * (weights[0] * slopes[i, 0] + weights[1] * slopes[i, 1])
-            by_v -= root * weights[2] * slopes[i, 1]
-        rows[UNKNOWNS, b], rows[UNKNOWNS, size + b] = by_u, by_v
 
 
 class Weighed(NamedTuple):
@@ -267,17 +217,3 @@ def score_of_distance(distance: float) -> float:
     distances, and for the large scales that go with these.
     """
     return float(6.0 * np.log(distance))
-
-
-@kernel
-def focal_prior_cost(prior: LogFocalPrior, log_ratio: float) -> float:
-    """The cost of the prior on the log focal length."""
-    return prior.weight * (log_ratio - prior.center) ** 2
-
-
-@kernel
-def relative_to(prior: LogFocalPrior, log_ratio: float) -> LogFocalPrior:
-    """The prior relative to exp(log_ratio) times its reference."""
-    return LogFocalPrior(
-        prior.low - log_ratio, prior.high - log_ratio, prior.center - log_ratio, prior.weight
-    )

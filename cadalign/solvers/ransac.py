@@ -1,10 +1,9 @@
-"""Robust search: LO-RANSAC over the minimal solver, for known and unknown focal length.
+"""Robust search: LO-RANSAC over the minimal solver.
 
 Truncated squared errors (MSAC) rank the hypotheses; a sequential probability ratio test rejects
 bad ones after a few points (Matas, Chum, "Randomized RANSAC with sequential probability ratio
 test", 2005); a new best one is optimised locally (Chum, Matas, Kittler, "Locally optimized RANSAC",
-2003). Where the focal length is unknown, every sample is solved at each focal length of a grid, and
-the local optimisation refines it, so the grid need not be fine.
+2003).
 """
 
 from __future__ import annotations
@@ -18,15 +17,7 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.compile import kernel
 from cadalign.solvers.alignment import Objective, with_keypoints
 from cadalign.solvers.constants import AP4P, OK, POSE_SIZE, UNKNOWNS, ScalePrior
-from cadalign.solvers.evidence import (
-    KeypointEvidence,
-    LogFocalPrior,
-    Views,
-    relative_to,
-    squared_error,
-    take_keypoints,
-)
-from cadalign.solvers.focal import FocalObjective, at_focal, refine_focal
+from cadalign.solvers.evidence import KeypointEvidence, squared_error, take_keypoints
 from cadalign.solvers.linalg import copy_into
 from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import (
@@ -47,7 +38,9 @@ _LEAST_SUPPORT = 0.03  # share of the points that a hypothesis is expected to fi
 _REJECTION = 200.0  # likelihood ratio at which a hypothesis is rejected
 _LOCAL_POINTS = 120
 _LOCAL_ITERATIONS = 6
-_LOCAL_FOCAL_ITERATIONS = 40
+_LOCAL_ROUNDS = 3
+_WIDE = 2.0  # thresholds within which the first round takes points
+_LEAST_POINTS = 5
 _FINAL_ROUNDS = 20
 _FINAL_ITERATIONS = 50
 _RIGID_ITERATIONS = 4
@@ -58,8 +51,8 @@ class Settings(NamedTuple):
     """Options of the search; see `cadalign.RansacOptions`.
 
     ``size`` is the minimal solver's number of points, ``threshold`` in pixels. An exhaustive search
-    tries every subset once, in order; a guided one draws from the first points first. At a known
-    focal length, ``optimize`` also refines the last hypothesis on all its inliers.
+    tries every subset once, in order; a guided one draws from the first points first. ``optimize``
+    refines new best hypotheses, and the last one on all its inliers.
     """
 
     threshold: float
@@ -72,29 +65,25 @@ class Settings(NamedTuple):
     exhaustive: bool
     guided: bool
     optimize: bool
-    estimate_focal: bool
 
 
 @kernel
 def ransac_kernel(
     objective: Objective,
-    views: Views,
-    log_focals: FloatArray,
-    focal_prior: LogFocalPrior,
     ranked: IntArray,
     settings: Settings,
     pose: FloatArray,
     inliers: BoolArray,
-) -> tuple[float, float, int, int]:
-    """Find the pose, and the focal length where it is unknown, with the lowest truncated score.
+) -> tuple[float, int, int]:
+    """Find the pose with the lowest truncated score.
 
-    The objective has the points in random order, in which scores look at them; its rays and weights
-    are those of the views, which have one log focal length of any value where it is known.
-    ``ranked`` (n,) holds the points' numbers, by falling confidence where the search is guided.
-    Returns the score, a sum of squared errors, each at most the threshold's square [px^2], the log
-    focal length, and the numbers of iterations and hypotheses.
+    The objective has the points in random order, in which scores look at them. ``ranked`` (n,)
+    holds their numbers, by falling confidence where the search is guided. Returns the score, a sum
+    of squared errors, each at most the threshold's square [px^2], and the numbers of iterations and
+    hypotheses.
     """
-    n = objective.keypoints.points.shape[0]
+    keypoints = objective.keypoints
+    n = keypoints.points.shape[0]
     size = settings.size
     guided = settings.guided
     limit = settings.threshold * settings.threshold
@@ -110,8 +99,6 @@ def ransac_kernel(
     random_support = _RANDOM_SUPPORT
     best = np.inf
     best_support = 0
-    best_focal = log_focals[0]
-    view = best_view = _view(objective, views, 0)
     iterations = 0
     hypotheses = 0
     needed = float(settings.max_iterations)
@@ -130,55 +117,34 @@ def ransac_kernel(
         iterations += 1
         for k in range(size):
             sample[k] = ranked[chosen[k]]
-        for f in range(log_focals.shape[0]):
-            if log_focals.shape[0] > 1:
-                view = _view(objective, views, f)
-            found = _solve_sample(view.keypoints, settings.minimal, sample, memory, candidates)
-            hypotheses += found
-            for k in range(found):
-                score, support, seen = score_pose(
-                    view.keypoints,
-                    candidates[k],
-                    limit,
-                    best,
-                    best_support / n,
-                    random_support,
-                )
-                if seen < n and seen > 0:  # rejected: learn how much support a wrong one finds
-                    random_support = 0.98 * random_support + 0.02 * max(support / seen, 0.002)
-                if not score < best:
-                    continue
-                best, best_support, best_view = score, support, view
-                best_focal = log_focals[f]
-                copy_into(pose, candidates[k])
-                if settings.optimize:
-                    copy_into(trial, candidates[k])
-                    there, moved = _optimize_locally(
-                        view, settings, relative_to(focal_prior, best_focal), trial
-                    )
-                    score, support, _ = score_pose(there.keypoints, trial, limit, np.inf, 0.0, 1.0)
-                    if score < best:
-                        best, best_support, best_view = score, support, there
-                        best_focal += moved
-                        copy_into(pose, trial)
-                if best_support > 0:
-                    needed = _needed_samples(best_support / n, settings)
-    if best < np.inf and settings.optimize and not settings.estimate_focal:
-        best = _finish(best_view, settings.threshold, best, pose)
+        found = _solve_sample(keypoints, settings.minimal, sample, memory, candidates)
+        hypotheses += found
+        for k in range(found):
+            share = best_support / n
+            score, support, seen = score_pose(
+                keypoints, candidates[k], limit, best, share, random_support
+            )
+            if seen < n and seen > 0:  # rejected: learn how much support a wrong one finds
+                random_support = 0.98 * random_support + 0.02 * max(support / seen, 0.002)
+            if not score < best:
+                continue
+            best, best_support = score, support
+            copy_into(pose, candidates[k])
+            if settings.optimize:
+                copy_into(trial, candidates[k])
+                _optimize_locally(objective, settings.threshold, trial)
+                score, support, _ = score_pose(keypoints, trial, limit, np.inf, 0.0, 1.0)
+                if score < best:
+                    best, best_support = score, support
+                    copy_into(pose, trial)
+            if best_support > 0:
+                needed = _needed_samples(best_support / n, settings)
+    if best < np.inf and settings.optimize:
+        best = _finish(objective, settings.threshold, best, pose)
     scalars = scalars_of(pose)
     for i in range(n):
-        inliers[i] = squared_error(best_view.keypoints, scalars, i) < limit
-    return best, best_focal, iterations, hypotheses
-
-
-@kernel
-def _view(objective: Objective, views: Views, f: int) -> Objective:
-    """The objective with the rays and weights of one focal length."""
-    old = objective.keypoints
-    keypoints = KeypointEvidence(
-        old.points, views.rays[f], views.whitening[f], old.loss, old.loss_scale
-    )
-    return with_keypoints(objective, keypoints)
+        inliers[i] = squared_error(keypoints, scalars, i) < limit
+    return best, iterations, hypotheses
 
 
 @kernel
@@ -247,35 +213,14 @@ def score_pose(
 
 
 @kernel
-def _optimize_locally(
-    view: Objective,
-    settings: Settings,
-    focal_prior: LogFocalPrior,
-    pose: FloatArray,
-) -> tuple[Objective, float]:
-    """Refine a pose on its inliers, first the wider ones, and the focal length where it is unknown.
-
-    Returns the view at the refined focal length, and the logarithm of that over the view's.
-    """
-    # The first round takes points within ``wide`` thresholds.
-    rounds, wide, least_points = (4, 3.0, 6) if settings.estimate_focal else (3, 2.0, 5)
-    without_lens = np.empty((0, 2))
-    here = view
-    log_ratio = 0.0
-    for r in range(rounds):
-        factor = wide + (1.0 - wide) * r / (rounds - 1)
-        some = _inliers_of(here, factor * settings.threshold, pose, _LOCAL_POINTS)
-        if some.keypoints.points.shape[0] < least_points:
+def _optimize_locally(objective: Objective, threshold: float, pose: FloatArray) -> None:
+    """Refine a pose on its inliers, first the wider ones."""
+    for r in range(_LOCAL_ROUNDS):
+        factor = _WIDE + (1.0 - _WIDE) * r / (_LOCAL_ROUNDS - 1)
+        some = _inliers_of(objective, factor * threshold, pose, _LOCAL_POINTS)
+        if some.keypoints.points.shape[0] < _LEAST_POINTS:
             break
-        if settings.estimate_focal:
-            prior = relative_to(focal_prior, log_ratio)
-            system = FocalObjective(some, without_lens, prior)
-            _, moved, _ = refine_focal(system, _LOCAL_FOCAL_ITERATIONS, pose)
-            log_ratio += moved
-            here = at_focal(view, without_lens, log_ratio)
-        else:
-            refine(some, _LOCAL_ITERATIONS, pose)
-    return here, log_ratio
+        refine(some, _LOCAL_ITERATIONS, pose)
 
 
 @kernel

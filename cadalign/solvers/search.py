@@ -6,7 +6,6 @@ the functions here is a family of kernels with a member for each system, in that
 
 =========================  =====================================================================
 `alignment.Objective`       pose and stretch from the keypoints of one view
-`focal.FocalObjective`      the same, and the focal length
 `marginal.equations.Posed`  a pose, the shape integrated out
 `joint.system.Joint`        poses, scales, focal lengths and shape from all evidence
 =========================  =====================================================================

@@ -73,12 +73,12 @@ def leaves_bounds(value: float, low: float, high: float, gradient: float) -> boo
 
 
 @inlined
-def hold_fixed(free: FloatArray, unknowns: int, hessian: FloatArray, gradient: FloatArray) -> None:
+def hold_fixed(free: FloatArray, hessian: FloatArray, gradient: FloatArray) -> None:
     """Replace the equations of unknowns that are not ``free`` (8,) by unit rows."""
     for k in range(UNKNOWNS):
         if free[k] == 0.0:
             gradient[k] = 0.0
-            for m in range(unknowns):
+            for m in range(UNKNOWNS):
                 hessian[k, m] = hessian[m, k] = 0.0
             hessian[k, k] = 1.0
 

@@ -33,7 +33,6 @@ from cadalign.estimation import focal_search
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, sample_limit
 from cadalign.evaluation.simulation import SIMULATION_CAMERA, Problem, simulate_problem
 from cadalign.geometry.metrics import rotation_error
-from cadalign.solvers.focal import linear_focal
 
 UNKNOWN = Camera.without_focal(640, 480)
 LONG = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
@@ -212,20 +211,6 @@ def test_known_axis_and_stretch_are_honoured(axis: str, stretch: str | None) -> 
     assert known.fisher_covariance is not None
     where_known = result.fisher_covariance.diagonal()[:9] == 0
     assert (where_known == (known.fisher_covariance.diagonal() == 0)).all()
-
-
-def test_linear_guess_is_exact_without_noise() -> None:
-    for seed in range(20):
-        problem = problem_of(seed, points=12, noise_px=0.0)
-        rays = UNKNOWN.with_focal(400.0).normalize(problem.points_2d)
-        assert 400.0 * linear_focal(problem.points_3d, rays) == pytest.approx(150.0, rel=1e-6)
-
-
-def test_linear_guess_is_nan_where_there_is_none() -> None:
-    points = np.random.default_rng(0).uniform(-1, 1, (10, 3))
-    flat = points * [1, 1, 0]
-    assert np.isnan(linear_focal(points[:5], points[:5, :2].copy()))
-    assert np.isnan(linear_focal(flat, points[:, :2].copy()))
 
 
 # --- what it says of itself -------------------------------------------------------------------
@@ -675,7 +660,7 @@ def test_lens_that_cannot_be_undone_at_one_optimum_stops_no_batch(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The lens model may fail at the focal length found, where it did not at those tried."""
-    covariance = focal_search.focal_covariance
+    covariance = focal_search.covariance_of
     seen = []
 
     def fails_once(*arguments: Any) -> Any:
@@ -684,7 +669,7 @@ def test_lens_that_cannot_be_undone_at_one_optimum_stops_no_batch(
             raise InputError("the lens distortion cannot be undone", where="points_2d")
         return covariance(*arguments)
 
-    monkeypatch.setattr(focal_search, "focal_covariance", fails_once)
+    monkeypatch.setattr(focal_search, "covariance_of", fails_once)
     problem = problem_of(3, points=8, noise_px=0.0)
     given = [problem.points_3d] * 2, [problem.points_2d] * 2
     batch = fit_batch(*given, problem.camera, focal="estimate", focal_prior=None)

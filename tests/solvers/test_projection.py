@@ -12,15 +12,13 @@ from cadalign import Alignment, Camera
 from cadalign.geometry.pixels import perspective
 from cadalign.solvers.alignment import Objective, evaluate_alignment, evaluate_cost, room_for
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR, UNKNOWNS
-from cadalign.solvers.evidence import KeypointEvidence, LogFocalPrior, ScalePrior
-from cadalign.solvers.focal import FocalObjective
+from cadalign.solvers.evidence import KeypointEvidence, ScalePrior
 from cadalign.solvers.projection import (
     project_point,
     projection_jacobian,
     ray_derivatives,
     scalars_of,
 )
-from cadalign.solvers.search import cost_at, evaluate, move, room_of
 from cadalign.solvers.unknowns import move_pose
 
 PLAIN = Camera(640, 480, 600, 620, 315, 245)
@@ -138,34 +136,3 @@ def test_gradient_of_all_evidence_is_that_of_the_cost(
         ahead, behind = (evaluate_cost(objective, moved(pose, k, s)) for s in (STEP, -STEP))
         slope = free[k] * (ahead - behind) / (4 * STEP)  # the gradient is half that of the cost
         assert gradient[k] == pytest.approx(slope, rel=1e-5, abs=1e-4 * np.sqrt(cost))
-
-
-@given(
-    seed=seeds,
-    lens=st.booleans(),
-    weight=st.sampled_from([0.0, 10.0]),
-    width=st.sampled_from([0.0, 0.2]),
-)
-@settings(max_examples=30)
-def test_gradient_with_the_focal_length_is_that_of_the_cost(
-    seed: int, lens: bool, weight: float, width: float
-) -> None:
-    alignment, points = pose_and_points(seed, 40)
-    rng = np.random.default_rng(seed)
-    rays = perspective(alignment.apply(points)) + rng.normal(scale=0.02, size=(len(points), 2))
-    keypoints = KeypointEvidence(points, rays, np.array([[100.0, 3.0, 90.0]]), CAUCHY, 2.0)
-    slopes = rng.normal(scale=0.02, size=(len(points) if lens else 0, 2))
-    prior = LogFocalPrior(-2.0, 2.0, 0.1, weight)
-    system = FocalObjective(
-        Objective(np.ones(8), keypoints, ScalePrior(weight, width)), slopes, prior
-    )
-    state = np.append(alignment.packed, rng.normal(scale=0.2))
-    room, _ = room_of(system)
-    cost = evaluate(system, state, room)
-    assert cost == pytest.approx(cost_at(system, state), rel=1e-12)
-    for k in range(UNKNOWNS + 1):
-        ends = [np.empty_like(state) for _ in range(2)]
-        for end, size in zip(ends, (STEP, -STEP), strict=True):
-            move(system, state, room, 0.0, size * np.eye(UNKNOWNS + 1)[k], end)
-        slope = (cost_at(system, ends[0]) - cost_at(system, ends[1])) / (4 * STEP)
-        assert room.gradient[k] == pytest.approx(slope, rel=1e-5, abs=1e-4 * np.sqrt(cost))

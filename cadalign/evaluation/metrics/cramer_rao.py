@@ -6,8 +6,8 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
-from cadalign.estimation.options import Sigma
-from cadalign.estimation.problems import focal_slopes, full_covariance, whitening_of
+from cadalign.estimation.options import Sigma, pixel_information
+from cadalign.estimation.problems import full_covariance, whitening_of, with_log_focal
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import (
     Camera,
@@ -21,8 +21,6 @@ from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.shapes.parts import probability_within
 from cadalign.solvers.alignment import covariance_of, keypoint_objective
 from cadalign.solvers.constants import UNKNOWNS
-from cadalign.solvers.evidence import LogFocalPrior
-from cadalign.solvers.focal import FocalObjective, focal_covariance
 from cadalign.solvers.projection import projection_jacobian
 
 _LEAST_INFORMATION = 1e-12
@@ -30,7 +28,7 @@ _LARGEST_LOG = 50.0
 # Smallest share of a covariance's largest eigenvalue that counts as variance.
 _NO_VARIANCE = 1e-12
 _FOCAL = 9  # row of the focal length
-_OF_STRETCHED = [0, 1, 2, 3, 4, 5, 7, 8]  # unknowns where x has the scale 1
+_OF_STRETCHED = [0, 1, 2, 3, 4, 5, 7, 8, _FOCAL]  # unknowns where x has the scale 1
 
 
 def cramer_rao_bound(
@@ -51,17 +49,13 @@ def cramer_rao_bound(
         return turned_covariance(bound, turn)
     rays = perspective(in_camera)
     objective = keypoint_objective(points_3d, rays, whitening_of(sigma, rays, camera))
-    unknowns = UNKNOWNS + (focal == "estimate")
-    covariance = np.zeros((unknowns, unknowns))
-    if focal == "known":
-        undetermined = covariance_of(objective, gt.packed, covariance)
-    else:
-        slopes = focal_slopes(camera.project(in_camera), camera, rays)
-        prior = LogFocalPrior(-np.inf, np.inf, 0.0, 0.0)
-        system = FocalObjective(objective, slopes, prior)
-        undetermined = focal_covariance(system, gt.packed, covariance)
-    if undetermined >= 0:
+    covariance = np.zeros((UNKNOWNS, UNKNOWNS))
+    if covariance_of(objective, gt.packed, covariance) >= 0:
         raise DegenerateError("the points do not determine the alignment", where="points_3d")
+    if focal == "estimate":
+        whitening = np.linalg.cholesky(pixel_information(sigma, len(points_3d))).swapaxes(1, 2)
+        rows = whitening @ projection_jacobian(points_3d, camera, gt)[:, :, _OF_STRETCHED]
+        covariance = with_log_focal(covariance, rows, np.zeros(2), 0.0)
     return full_covariance(covariance, "x")
 
 
@@ -96,7 +90,7 @@ def limit_estimate(
     the compared methods, so that no chance enters the comparison. The truth has the scale 1 along
     x, the camera no lens distortion.
     """
-    jacobian = projection_jacobian(points_3d, camera, gt)[:, :, _OF_STRETCHED]
+    jacobian = projection_jacobian(points_3d, camera, gt)[:, :, _OF_STRETCHED[:-1]]
     jacobian = jacobian.reshape(-1, UNKNOWNS)
     noise = (points_2d - camera.project(gt.apply(points_3d))).ravel()
     norms = np.linalg.norm(jacobian, axis=0)

@@ -53,7 +53,7 @@ def search_joint(
         minima.counts[1] = likely.counts[1]
         descend(system, likely, _MAX_ITERATIONS, _LESS_LIKELY, 0, 0.0, minima)
     else:
-        effort = Effort(count, _PROBE_ITERATIONS, _MAX_ITERATIONS, _UNLIKELY)
+        effort = Effort(count, _PROBE_ITERATIONS, _MAX_ITERATIONS, _excess(system, starts))
         search(system, starts, effort, 0, 0.0, minima)
     found = int(minima.counts[0])
     states = [
@@ -62,6 +62,16 @@ def search_joint(
     ]
     costs, scores = minima.costs[:found], minima.scores[:found]
     return JointMinima(states, costs, scores), int(minima.counts[1])
+
+
+def _excess(system: Joint, starts: FloatArray) -> float:
+    """Excess cost at which starts (S, D), the best first, are given up.
+
+    It grows with the residuals, since a wrong sigma should not make every other minimum unlikely.
+    """
+    cost = joint_cost(system, starts[0]) if len(starts) else np.inf
+    variance = cost / max(2 * len(system.evidence.sightings.point), 1)
+    return _UNLIKELY * max(1.0, float(variance)) if np.isfinite(variance) else _UNLIKELY
 
 
 def _has_latent(evidence: Evidence) -> bool:

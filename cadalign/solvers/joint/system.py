@@ -169,6 +169,8 @@ def _move(
     for f in range(focals):
         value = state.log_focals[f] + _bounded(step[first + f])
         moved.log_focals[f] = min(max(value, evidence.focals.low[f]), evidence.focals.high[f])
+    if evidence.rig.pose.shape[0] == poses:
+        _follow_focals(evidence, state, step[first:], moved)
     first += focals
     for a in range(3):
         moved.log_scales[a] = state.log_scales[a] + _bounded(step[first + a])
@@ -179,6 +181,21 @@ def _move(
             moved.displacements[i, a] = state.displacements[i, a]
     if poses == 1:
         follow(evidence, equations, step, moved)
+
+
+@inlined
+def _follow_focals(evidence: Evidence, state: State, log_steps: FloatArray, moved: State) -> None:
+    """Let the distance of every view follow its focal length.
+
+    A longer lens and a larger distance give nearly the same image: along the curve on which both
+    grow by one factor the cost hardly changes, and steps can be long.
+    """
+    for v in range(evidence.rig.pose.shape[0]):
+        p, f = evidence.rig.pose[v], evidence.focals.group[v]
+        if f >= 0:
+            factor = np.exp(moved.log_focals[f] - state.log_focals[f])
+            along = moved.poses[p, 11] - state.poses[p, 11] * log_steps[f]
+            moved.poses[p, 11] = along * factor
 
 
 @inlined

@@ -24,7 +24,7 @@ from cadalign.estimation.observed import model_of, views_of
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.result import Result
 from cadalign.estimation.uncertainty.misfit import PlacedRows, Rows, find_outliers
-from cadalign.estimation.view import View, without_keypoints
+from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
@@ -181,7 +181,7 @@ class LiveProblem:
         view, model = self.view, self.exact
         assert model is not None
         if view.camera not in self.by_mask:
-            alone = replace(without_keypoints(view), image=None)
+            alone = replace(view, points_2d=(), ids=None, sigma=1.0, scores=None, image=None)
             self.by_mask[view.camera] = align(model, alone, size=self.size)
         result, points = self.by_mask[view.camera], _points_of(model, view.keypoint_ids)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -24,36 +23,17 @@ from cadalign.estimation.joint import result_of_minima
 from cadalign.estimation.joint_mistakes import joint_mistake, mistake_beside, no_pose_error
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
-from cadalign.estimation.prepared_views import (
-    align_facing,
-    align_without,
-    starts_by_one_view,
-    views_without_pose,
-    with_poses_by_masks,
-)
-from cadalign.estimation.prior import Lenses, prior_of
+from cadalign.estimation.outline_starts import starts_by_outlines
+from cadalign.estimation.prior import Lenses
+from cadalign.estimation.problem import Problem, compile_problem
 from cadalign.estimation.problems import each_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.results import Results
-from cadalign.estimation.search import (
-    JointProblem,
-    Minimum,
-    find_minima,
-    minima_at_start,
-    widened_by_noise,
-)
-from cadalign.estimation.single import (
-    align_plain,
-    align_single,
-    begins_at_outline,
-    is_mask_alone,
-    is_plain,
-    is_single,
-)
+from cadalign.estimation.search import find_minima, widened_by_noise
+from cadalign.estimation.single import align_plain, align_single, is_plain, is_single
 from cadalign.estimation.view import View, numbered
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import needs_facing
 from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
 
@@ -140,78 +120,39 @@ def align(
     if size is None and init is None and is_plain(model, given):
         exact = cast(Model, model)
         return align_plain(exact, given[0], options=options, ransac=ransac)
-    align_some = partial(_align_all, model, size, options, ransac, start)
-    if needs_facing([view.camera for view in given]):
-        return align_facing(given, inits, align_some, may_surround=ransac is not None)
-    return align_some(given, inits)
+    problem = compile_problem(model, given, size, inits, options, ransac)
+    return align_single(problem, start) if is_single(problem) else _align_joint(problem, start)
 
 
-def _align_all(
-    model: Model | ShapeModel,
-    size: Size | None,
-    options: FitOptions,
-    ransac: RansacOptions | None,
-    start: float,
-    views: Sequence[View],
-    inits: Sequence[Alignment | None],
-) -> Result:
-    """All stages of an estimate of what was checked, which was begun at ``start`` [s]."""
-    lenses = Lenses.of(views, options.focal, options.focal_prior)
-    if size is None and ransac is None and not lenses.count and is_single(model, views):
-        return align_single(cast(ShapeModel, model), views[0], options=options, init=inits[0])
-    prior = prior_of(model)
-    align_some = partial(_align_all, model, size, options, ransac, start)
-    inits = with_poses_by_masks(model, views, inits, align_some)
-    left_out = views_without_pose(prior, views, inits)
-    if left_out:
-        return align_without(left_out, prior, views, inits, align_some)
-    problem = JointProblem(prior, views, size, options, lenses)
-    starts = [] if any(inits) else starts_by_one_view(views, size, align_some)
-    if not starts and is_mask_alone(model, views, inits):
+def _align_joint(problem: Problem, start: float) -> Result:
+    """All stages of an estimate that was begun at ``start`` [s]."""
+    problem, starts = starts_by_outlines(problem)
+    if len(problem.views) == 1 and not any(problem.inits) and problem.is_mask_alone:
         from cadalign.estimation.contours.silhouette_starts import minima_of_mask  # with OpenCV
 
-        minima, iterations, hypotheses, mistake = minima_of_mask(problem, cast(Model, model))
-    elif begins_at_outline(model, views, inits):
-        minima, iterations, hypotheses = minima_at_start(problem, inits)
-        mistake = None
+        minima, iterations, hypotheses, mistake = minima_of_mask(problem)
     else:
         try:
-            problem, minima, iterations, hypotheses = _found(problem, starts or [inits], ransac)
+            problem, minima, iterations, hypotheses = find_minima(problem, starts)
         except NoConsensusError as error:
-            error.fix = mistake_beside(problem, ransac) or error.fix
+            error.fix = mistake_beside(problem) or error.fix
             raise
-        mistake = joint_mistake(problem, minima[0], ransac) if minima else None
+        mistake = joint_mistake(problem, minima[0]) if minima else None
     if not minima:
-        raise no_pose_error(problem, model, ransac)
-    has_mesh = isinstance(model, Model) and model.mesh is not None
+        raise no_pose_error(problem)
+    has_mesh = isinstance(problem.model, Model) and problem.model.mesh is not None
     if has_mesh and any(len(each.evidence.image_depths.point) for each in minima):
         from cadalign.estimation.contours.silhouette_starts import (
             without_covered,  # with OpenCV and embree
         )
 
-        minima = without_covered(cast(Model, model), problem, minima)
-    minima, refined = refine_with_images(model, prior, views, minima)
+        minima = without_covered(problem, minima)
+    minima, refined = refine_with_images(problem.model, problem.prior, problem.views, minima)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
-    likely = widened_by_noise(problem, minima)
-    result = result_of_minima(model, problem, likely, stats, mistake=mistake)
+    result = result_of_minima(problem, widened_by_noise(problem, minima), stats, mistake=mistake)
     for each in refined:
         result = each.noted_in(result)
     return result
-
-
-def _found(
-    problem: JointProblem,
-    starts: Sequence[Sequence[Alignment | None]],
-    ransac: RansacOptions | None,
-) -> tuple[JointProblem, list[Minimum], int, int]:
-    """As `find_minima`, from each of some starts."""
-    minima: list[Minimum] = []
-    iterations = hypotheses = 0
-    for inits in starts:
-        problem, found, *effort = find_minima(problem, inits, ransac)
-        minima += found
-        iterations, hypotheses = iterations + effort[0], hypotheses + effort[1]
-    return problem, sorted(minima, key=lambda each: each.score), iterations, hypotheses
 
 
 def align_batch(

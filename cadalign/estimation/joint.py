@@ -17,6 +17,7 @@ from cadalign.arrays import BoolArray, FloatArray, is_number
 from cadalign.errors import DegenerateError
 from cadalign.estimation.estimates import (
     curvature_of_rotations,
+    mean_state,
     pose_and_border,
     pose_and_lengths,
     poses_of,
@@ -25,11 +26,12 @@ from cadalign.estimation.estimates import (
 )
 from cadalign.estimation.focal import prior_of_camera
 from cadalign.estimation.mistakes import outside_image
-from cadalign.estimation.model import Model
-from cadalign.estimation.prior import ShapePrior, is_exact, widened
+from cadalign.estimation.pack import evidence_of
+from cadalign.estimation.prior import camera_like, is_exact, widened, with_known_shape
+from cadalign.estimation.problem import Problem
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Alternative, FitStats, Stated, ViewResult
-from cadalign.estimation.search import JointProblem, Minimum
+from cadalign.estimation.search import Minimum
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.symmetry import (
     SAME_SQUARES,
@@ -51,24 +53,26 @@ from cadalign.estimation.uncertainty.summary import (
 from cadalign.estimation.view import View
 from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
+from cadalign.geometry.camera import Camera, turned_alignment, turned_covariance
 from cadalign.geometry.rotations import nearest_rotation, vector_from_rotation
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import group_of
-from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import inflation_with
 from cadalign.solvers.joint.covariance import joint_covariance
 from cadalign.solvers.joint.evidence import points_of
+from cadalign.solvers.joint.search import refine_joint
 from cadalign.solvers.linalg import cholesky, solve_cholesky
 
 _Held = tuple[bool, bool, bool]
+_ITERATIONS = 50
 _ALONG_AXES = 1e-6  # of a rotation's entries, that are 0 or 1 where it takes axes to axes
 
 
 class Estimate(NamedTuple):
     """An estimate: points, the box's corners last, ``lengths`` of the box, covariances.
 
-    Poses and covariances (9, 9) are those in every view; ``likelihood`` is relative to the best.
+    Poses, covariances (9, 9) and cameras are those of every view that takes part, in the frames of
+    the cameras that were given; ``likelihood`` is relative to the best.
     The optimum is the one of the least cost, which a shape without latent unknowns has.
     """
 
@@ -85,9 +89,7 @@ class Estimate(NamedTuple):
 
 
 def result_of(
-    model: Model | ShapeModel,
-    prior: ShapePrior,
-    views: Sequence[View],
+    problem: Problem,
     estimates: Sequence[Estimate],
     *,
     inliers: Sequence[BoolArray],
@@ -105,8 +107,9 @@ def result_of(
     ``warnings`` are those beside the ones about uncertainties and alternatives, and ``of_result``
     further fields of `cadalign.Result`.
     """
+    prior, views, numbers = problem.prior, problem.given, problem.numbers
     best = estimates[0]
-    moments = [_moments(estimates, view) for view in range(len(views))]
+    moments = [_moments(estimates, place) for place in range(len(numbers))]
     covariances = [covariance for covariance, _ in moments]
     if is_curved:
         for covariance in covariances:
@@ -130,7 +133,7 @@ def result_of(
         warnings=(
             *(
                 warning
-                for view in views
+                for view in problem.views
                 for warning in outside_image(
                     view.pixels,
                     view.camera,
@@ -152,6 +155,16 @@ def result_of(
                     if not far
                 ),
             ),
+            *(
+                EstimateWarning(
+                    "left-out",
+                    f"views[{number}] is left out: its {len(view.keypoint_ids)} keypoints do not "
+                    "determine its pose",
+                    number,
+                )
+                for number, view in enumerate(views)
+                if number not in numbers
+            ),
         ),
         evidence=evidence,
         degrees_of_freedom=prior.degrees_of_freedom,
@@ -159,17 +172,16 @@ def result_of(
     of_views = []
     for number, view in enumerate(views):
         rows, observed = prior.rows_of(view.keypoint_ids, "ids"), view.pixels
-        camera, alignment = best.cameras[number], best.poses[number]
+        if number in numbers:
+            place = numbers.index(number)
+            camera, alignment, kept = best.cameras[place], best.poses[place], inliers[place]
+            own = Stated(covariances[place]) if number else statistics
+        else:
+            camera, alignment = _pose_beside(problem, number, best)
+            kept, own = np.zeros(len(rows), dtype=bool), Stated(None)
+        residuals = camera.project(alignment.apply(points[rows])) - observed
         of_views.append(
-            ViewResult(
-                camera,
-                alignment,
-                view.keypoint_ids,
-                observed,
-                camera.project(alignment.apply(points[rows])) - observed,
-                inliers[number],
-                Stated(covariances[number]) if number else statistics,
-            )
+            ViewResult(camera, alignment, view.keypoint_ids, observed, residuals, kept, own)
         )
     has_length = prior.lengths > 0
     return Result(
@@ -179,7 +191,7 @@ def result_of(
         method="align",
         statistics=statistics,
         alternatives=alternatives,
-        model=model,
+        model=problem.model,
         own_bounds=best.points[-2:],
         own_stretch=np.where(
             has_length, best.lengths / np.where(has_length, prior.lengths, 1), 1.0
@@ -188,9 +200,34 @@ def result_of(
     )
 
 
+def _pose_beside(problem: Problem, number: int, best: Estimate) -> tuple[Camera, Alignment]:
+    """Camera and pose of a view that takes no part: near the first view's, where its keypoints fit.
+
+    The pose is one of those that explain its keypoints.
+    """
+    view, facing = problem.given[number], problem.views[number].camera
+    cameras = [problem.given[k].camera for k in problem.numbers]
+    camera = camera_like(view.camera, dict(zip(cameras, best.cameras, strict=True)))
+    if not len(view.keypoint_ids) and view.up is None:
+        return camera, best.poses[0]
+    alone = View(
+        facing if camera.is_wide else camera,
+        view.points_2d,
+        ids=view.ids,
+        sigma=view.sigma,
+        up=view.up,
+        up_sigma_deg=view.up_sigma_deg,
+    )
+    turns = [problem.turns[number]]
+    evidence = with_known_shape(evidence_of(problem.prior, [alone], turns=turns), best.points)
+    state = mean_state(evidence, best.poses[0].packed[None, :12], np.log(best.scale))
+    _, state, _, _ = refine_joint(evidence, _ITERATIONS, state)
+    pose = state.poses[0]
+    return camera, Alignment(pose[:9].reshape(3, 3), pose[9:], best.scale)
+
+
 def result_of_minima(
-    model: Model | ShapeModel,
-    problem: JointProblem,
+    problem: Problem,
     minima: Sequence[Minimum],
     stats: FitStats,
     *,
@@ -202,7 +239,7 @@ def result_of_minima(
 
     Raises DegenerateError if the evidence determines none of them.
     """
-    prior, views = problem.prior, problem.views
+    prior, views, model = problem.prior, problem.views, problem.model
     minima = [each for each in minima if np.isfinite(each.score)]
     if not minima:
         raise _undetermined_error()
@@ -218,7 +255,7 @@ def result_of_minima(
         if likelihood >= LEAST_LIKELIHOOD or each is optimum:
             evidence, state = widened(each.evidence, each.state, inflation)
             wide = each._replace(evidence=evidence, state=state)
-            estimate = _estimate(wide, likelihood, prior)._replace(is_optimum=each is optimum)
+            estimate = _estimate(wide, likelihood, problem)._replace(is_optimum=each is optimum)
             if all(np.isfinite(own).all() for own in estimate.covariances):
                 likely = [*likely, estimate]
             elif not likely:
@@ -229,27 +266,26 @@ def result_of_minima(
     likely = _one_of_equals(likely, symmetry, held)
     best, in_rig = likely[0], None
     if views[0].cam_from_rig is not None:
-        camera, pose = minimum.evidence.rig.cam_from_rig[0], best.poses[0]
-        rotation = camera[:9].reshape(3, 3)
+        camera, pose = np.asarray(problem.given[0].cam_from_rig), best.poses[0]
+        rotation = camera[:3, :3]
         turned = nearest_rotation(rotation.T @ pose.rotation)
-        in_rig = Alignment(turned, rotation.T @ (pose.translation - camera[9:]), best.scale)
+        in_rig = Alignment(turned, rotation.T @ (pose.translation - camera[:3, 3]), best.scale)
     tails = ShapeTails(inflation, prior.degrees_of_freedom)
     numbers = [view.number for view in views]
+    seen_by = minimum.lenses.cameras_at(minimum.state.log_focals)
     warnings = warnings_of(minimum.evidence, minimum.state, minimum.cost, tails, numbers)
     if problem.lacks_sigma:
         pixels = [view.pixels for view in views if view.sigma is None]
         warnings = (*unexplained(problem.noise, pixels), *warnings)
     return result_of(
-        model,
-        prior,
-        views,
+        problem,
         likely,
-        inliers=_inliers(prior, views, minimum),
+        inliers=_inliers(problem, minimum),
         is_curved=symmetry is None and not is_exact(minimum.evidence),
         warnings=warnings if mistake is None else (mistake,),
         evidence=tuple(
             each if each.view is None else replace(each, view=numbers[each.view])
-            for each in summaries_of(minimum.evidence, minimum.state, best.cameras)
+            for each in summaries_of(minimum.evidence, minimum.state, seen_by)
         ),
         cost=minimum.cost,
         stats=stats,
@@ -277,8 +313,9 @@ def _undetermined_error() -> DegenerateError:
     return DegenerateError(what, where="views", fix="give more keypoints, or a size")
 
 
-def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> Estimate:
-    keypoints, evidence, state = len(prior.ids), minimum.evidence, minimum.state
+def _estimate(minimum: Minimum, likelihood: float, problem: Problem) -> Estimate:
+    prior, evidence, state = problem.prior, minimum.evidence, minimum.state
+    keypoints = len(prior.ids)
     evidence, state = with_box(evidence, state, prior)
     scale = np.exp(state.log_scales)
     rows = np.r_[:keypoints, -2:0]  # without what stands between keypoints and box
@@ -286,26 +323,50 @@ def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> Estimat
     if len(evidence.shape.modes):  # a box whose corners were estimated holds what is seen
         sighted = np.unique(evidence.sightings.point)
         widen_box(stretched, sighted[sighted < keypoints])
-    found = joint_covariance(evidence, state)
-    return Estimate(
+    found, poses = joint_covariance(evidence, state), poses_of(evidence, state)
+    cameras = minimum.lenses.cameras_at(state.log_focals)
+    estimate = Estimate(
         stretched / scale,
         scale,
-        tuple(poses_of(evidence, state)),
+        tuple(poses[number] for number in problem.numbers),
         stretched[-1] - stretched[-2],
         tuple(
-            pose_and_lengths(evidence, state, pose_and_border(found, int(pose)), view)
-            for view, pose in enumerate(evidence.rig.pose)
+            pose_and_lengths(
+                evidence, state, pose_and_border(found, int(evidence.rig.pose[number])), number
+            )
+            for number in problem.numbers
         ),
         found.points[rows],
         found.seen[rows],
         likelihood,
-        tuple(minimum.lenses.cameras_at(state.log_focals)),
+        tuple(cameras[number] for number in problem.numbers),
+    )
+    return as_given(estimate, problem)
+
+
+def as_given(estimate: Estimate, problem: Problem) -> Estimate:
+    """An estimate in the frames of turned lenses as that in the frames that were given."""
+    numbers = problem.numbers
+    turns = [problem.turns[number] for number in numbers]
+    first = turns[0]
+    if all(problem.views[n].camera == problem.given[n].camera for n in numbers):
+        return estimate
+    wide = [problem.given[number].camera for number in numbers]
+    return estimate._replace(
+        poses=tuple(map(turned_alignment, estimate.poses, turns)),
+        covariances=tuple(map(turned_covariance, estimate.covariances, turns)),
+        of_seen=first @ estimate.of_seen @ first.T,
+        cameras=tuple(
+            given if given.is_wide else own
+            for given, own in zip(wide, estimate.cameras, strict=True)
+        ),
     )
 
 
-def _inliers(prior: ShapePrior, views: Sequence[View], minimum: Minimum) -> list[BoolArray]:
-    """The inliers of every view, in its own order of keypoints."""
-    names = np.concatenate([prior.rows_of(view.keypoint_ids, "ids") for view in views])
+def _inliers(problem: Problem, minimum: Minimum) -> list[BoolArray]:
+    """The inliers of every view that takes part, in its own order of keypoints."""
+    views = [problem.views[number] for number in problem.numbers]
+    names = np.concatenate([problem.prior.rows_of(view.keypoint_ids, "ids") for view in views])
     kept = np.empty(len(names), dtype=bool)
     kept[np.argsort(names, kind="stable")] = minimum.inliers
     ends = np.cumsum([len(view.keypoint_ids) for view in views])

@@ -20,11 +20,10 @@ from cadalign.estimation.mistakes import (
     find_mistake,
     other_sizes,
 )
-from cadalign.estimation.model import Model
 from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.prior import is_exact
+from cadalign.estimation.problem import Problem
 from cadalign.estimation.search import (
-    JointProblem,
     Minimum,
     minima_at_noise,
     outlier_areas,
@@ -32,7 +31,6 @@ from cadalign.estimation.search import (
 )
 from cadalign.estimation.uncertainty.evidence import redundancy_of
 from cadalign.estimation.warning import EstimateWarning
-from cadalign.shapes.model import ShapeModel
 
 _FEW_REJECTED = 0.9  # share of the keypoints that agree, above which no mistake is searched for
 _LEAST_UNCERTAIN_MISFIT = 1.0  # of an uncertain shape, below which none is searched for
@@ -41,14 +39,13 @@ _MOST_CORRECTED = 1.6  # the same, without the mistake
 _LEAST_RATIO = 1.7  # of both
 
 
-def joint_mistake(
-    problem: JointProblem, best: Minimum, ransac: RansacOptions | None
-) -> EstimateWarning | None:
+def joint_mistake(problem: Problem, best: Minimum) -> EstimateWarning | None:
     """Name the mistake without which the keypoints agree better.
 
-    With ``ransac`` where many are rejected or an uncertain shape follows them poorly, otherwise
-    where the evidence does not agree at all.
+    With RANSAC where many are rejected or an uncertain shape follows them poorly, otherwise where
+    the evidence does not agree at all.
     """
+    ransac = problem.ransac
     if ransac is None:
         return _mistake_in_all(problem, best)
     if not len(best.inliers):  # masks or photos alone
@@ -58,7 +55,7 @@ def joint_mistake(
         return None
 
     def explain(mistake: Mistake) -> Explained | None:
-        minimum = _without(problem, mistake, ransac)
+        minimum = _without(problem, mistake)
         return None if minimum is None else _explained(problem, minimum, ransac)
 
     found = _explained(problem, best, ransac)
@@ -67,7 +64,7 @@ def joint_mistake(
     return find_mistake(found, len(best.inliers), explain, _beside_keypoints(problem))
 
 
-def _mistake_in_all(problem: JointProblem, best: Minimum) -> EstimateWarning | None:
+def _mistake_in_all(problem: Problem, best: Minimum) -> EstimateWarning | None:
     """Name the mistake without which all evidence agrees."""
     given, count = _misfit(best), sum(len(view.keypoint_ids) for view in problem.views)
     if (
@@ -79,7 +76,7 @@ def _mistake_in_all(problem: JointProblem, best: Minimum) -> EstimateWarning | N
         return None
 
     def explain(mistake: Mistake) -> Explained | None:
-        minimum = _without(problem, mistake, None)
+        minimum = _without(problem, mistake)
         if minimum is None or _misfit(minimum) > min(_MOST_CORRECTED, given / _LEAST_RATIO):
             return None
         return Explained(minimum.score, count, _up(minimum))
@@ -101,27 +98,25 @@ def _mistake_in_all(problem: JointProblem, best: Minimum) -> EstimateWarning | N
     )
 
 
-def _beside_keypoints(problem: JointProblem) -> list[Mistake]:
+def _beside_keypoints(problem: Problem) -> list[Mistake]:
     """Mistakes in other evidence than keypoints."""
     is_rig = len(problem.views) > 1 and problem.views[0].cam_from_rig is not None
     has_up = any(view.up is not None for view in problem.views)
     return [INVERTED] * is_rig + [DOWNWARD] * has_up
 
 
-def mistake_beside(problem: JointProblem, ransac: RansacOptions | None) -> str | None:
+def mistake_beside(problem: Problem) -> str | None:
     """Name the mistake in other evidence than keypoints without which there is an estimate."""
     tried = _beside_keypoints(problem)
-    return next((each.clause for each in tried if _without(problem, each, ransac)), None)
+    return next((each.clause for each in tried if _without(problem, each)), None)
 
 
-def no_pose_error(
-    problem: JointProblem, model: Model | ShapeModel, ransac: RansacOptions | None
-) -> CadalignError:
+def no_pose_error(problem: Problem) -> CadalignError:
     """The error where no start leads to a pose: what the evidence lacks, and what to give.
 
     Raises InputError if a mask or photo is given for a model without meshes.
     """
-    views, fix = problem.views, mistake_beside(problem, ransac)
+    views, fix = problem.views, mistake_beside(problem)
     seen = sum(len(view.keypoint_ids) > 0 for view in views)
     shown = [
         f"views[{view.number}].{'image' if view.mask is None else 'mask'}"
@@ -132,7 +127,7 @@ def no_pose_error(
         from cadalign.estimation.contours.surface import surfaces_of  # imports this package
 
         keypoints = problem.prior.components[0].mean[: len(problem.prior.ids)]
-        surfaces_of(model, keypoints, shown[0])
+        surfaces_of(problem.model, keypoints, shown[0])
     if shown and fix is None:
         is_rig = len(views) > 1 and views[0].cam_from_rig is not None
         if not seen and len(views) == 1 and views[0].mask is not None:
@@ -172,9 +167,7 @@ def _misfit(minimum: Minimum) -> float:
     return math.sqrt(minimum.cost / redundancy) if redundancy > 0 else 0.0
 
 
-def _without(
-    problem: JointProblem, mistake: Mistake, ransac: RansacOptions | None
-) -> Minimum | None:
+def _without(problem: Problem, mistake: Mistake) -> Minimum | None:
     """The likeliest minimum after a mistake is undone, if there is one."""
 
     def undone(points: FloatArray) -> FloatArray:
@@ -200,7 +193,7 @@ def _without(
     prior = replace(problem.prior, components=components)
     unknown = [None] * len(views)  # starts are of the data as given
     try:
-        minima, _, _ = minima_at_noise(problem._replace(prior=prior, views=views), unknown, ransac)
+        minima, _, _ = minima_at_noise(problem._replace(prior=prior, views=tuple(views)), unknown)
     except CadalignError:
         return None
     return minima[0] if minima else None
@@ -214,7 +207,7 @@ def _up(minimum: Minimum) -> float:
     return -float(in_camera[1, 1])
 
 
-def _explained(problem: JointProblem, minimum: Minimum, ransac: RansacOptions) -> Explained:
+def _explained(problem: Problem, minimum: Minimum, ransac: RansacOptions) -> Explained:
     """Likelihood of all keypoints at a minimum: outliers of any threshold lie anywhere."""
     rejected, error = ~minimum.inliers, problem.threshold(ransac)
     evidence = problem.evidence(minimum.evidence.shape, minimum.lenses)

@@ -210,7 +210,7 @@ def whitened_residuals(evidence: Evidence, state: State) -> FloatArray:
     """Whitened residuals (N, 2) in the image; infinite behind a camera."""
     sightings = evidence.sightings
     points = points_of(evidence.shape, state)[sightings.point]
-    seen = seen_in_cameras(evidence, state, points, sightings.image)
+    seen = seen_in_cameras(evidence, state.poses, points, sightings.image)
     log_ratio = log_focals_of(evidence, state)[sightings.image][:, None]
     error = np.exp(log_ratio) * seen[:, :2] / seen[:, 2:] - sightings.rays
     error -= log_ratio * sightings.slopes
@@ -223,7 +223,7 @@ def _projected(evidence: Evidence, state: State) -> FloatArray:
     """Whitened standard deviations (N,) that the points' displacements project to."""
     sightings, shape = evidence.sightings, evidence.shape
     points = points_of(shape, state)[sightings.point]
-    depths = seen_in_cameras(evidence, state, points, sightings.image)[:, 2]
+    depths = seen_in_cameras(evidence, state.poses, points, sightings.image)[:, 2]
     root = np.sqrt(sightings.whitening[:, 0] * sightings.whitening[:, 2])
     scale = np.exp(state.log_scales.mean())
     return np.asarray(root * scale * shape.spread[sightings.point] / np.maximum(depths, _NEAREST))

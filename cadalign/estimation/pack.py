@@ -48,12 +48,14 @@ def evidence_of(
     *,
     options: FitOptions = _PLAIN,
     lenses: Lenses | None = None,
+    turns: Sequence[FloatArray] | None = None,
     noise: float = 1.0,
 ) -> Evidence:
     """Evidence of the views, of the size and of the first component of the prior.
 
-    Of the ``options`` the loss counts. By default the views' focal lengths are known. Keypoints
-    without a sigma have the standard deviation ``noise`` [px].
+    Of the ``options`` the loss counts. By default the views' focal lengths are known. Lenses were
+    turned by ``turns``, (3, 3) each. Keypoints without a sigma have the standard deviation
+    ``noise`` [px].
 
     Raises InputError if a view names a keypoint that the model lacks, lacks evidence, or has some
     of an up axis that the model lacks, or if only some views have a known pose.
@@ -63,24 +65,20 @@ def evidence_of(
     rows = []
     for view in views:
         rows.append(prior.rows_of(view.keypoint_ids, f"views[{view.number}].ids"))
-        if not tells_something(view):
-            fix = "give keypoints, a mask or a direction, or leave the view away"
-            where = f"views[{view.number}]"
-            raise InputError("tells nothing about the object", where=where, fix=fix)
     offsets = known_distances(prior, views, size)
     directions = known_directions(prior, views)
     if any(camera.turn for camera in lenses.cameras):
         # What is known in the lenses' frames, in those of cameras that are turned.
-        turns = np.array([lenses.cameras[image].lens_from_camera for image in directions.image])
-        turns = turns.reshape(-1, 3, 3)
+        of_lenses = np.array([camera.lens_from_camera for camera in lenses.cameras])
+        turned = of_lenses[directions.image]
         directions = directions._replace(
-            camera=np.einsum("dij,di->dj", turns, directions.camera),
-            whitening=directions.whitening @ turns,
+            camera=np.einsum("dij,di->dj", turned, directions.camera),
+            whitening=directions.whitening @ turned,
         )
     return Evidence(
         prior.components[0],
         _sightings(rows, views, lenses.cameras, noise, options),
-        _rig(views),
+        _rig(views, turns),
         lenses.focals(),
         directions,
         offsets,
@@ -106,13 +104,6 @@ def _is_metric(offsets: Offsets, views: Sequence[View]) -> bool:
     if len(offsets.value) or any(np.isfinite(depth).any() for depth in depths):
         return True
     return len(views) > 1 and views[0].cam_from_rig is not None
-
-
-def tells_something(view: View) -> bool:
-    """True if a view has any evidence about the object."""
-    has_image = view.mask is not None or view.image is not None
-    is_told = view.up is not None or view.camera_height is not None
-    return bool(len(view.keypoint_ids)) or has_image or is_told
 
 
 def _sightings(
@@ -155,7 +146,11 @@ def _depths(view: View, count: int) -> FloatArray:
     return found
 
 
-def _rig(views: Sequence[View]) -> Rig:
+def _rig(views: Sequence[View], turns: Sequence[FloatArray] | None) -> Rig:
+    """Motions of the cameras, with the turns of lenses, and the pose that each belongs to.
+
+    The pose of a view without evidence is -1.
+    """
     posed = [view.cam_from_rig is not None for view in views]
     if any(posed) != all(posed):
         raise InputError(
@@ -164,10 +159,16 @@ def _rig(views: Sequence[View]) -> Rig:
             fix="give it for all views, or for none",
         )
     is_rig = all(posed)
-    motions = [view.cam_from_rig if is_rig else np.eye(4) for view in views]
-    rows = [np.append(pose[:3, :3], pose[:3, 3]) for pose in cast("list[FloatArray]", motions)]
-    poses = [0] * len(views) if is_rig else range(len(views))
-    return Rig(np.array(rows), np.array(poses, dtype=np.int64))
+    rows = []
+    for number, view in enumerate(views):
+        motion = np.asarray(view.cam_from_rig if is_rig else np.eye(4))[:3]
+        if turns is not None:
+            motion = turns[number].T @ motion
+        rows.append(np.append(motion[:, :3], motion[:, 3]))
+    if is_rig:
+        return Rig(np.array(rows), np.zeros(len(views), dtype=np.int64))
+    takes_part = np.array([view.has_evidence for view in views])
+    return Rig(np.array(rows), np.where(takes_part, takes_part.cumsum() - 1, -1))
 
 
 def _image_depths(shape: Shape, rows: Sequence[list[int]], views: Sequence[View]) -> ImageDepths:

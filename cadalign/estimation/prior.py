@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import cast
@@ -187,20 +187,24 @@ class Lenses:
 
     @classmethod
     def of(cls, views: Sequence[View], focal: str, prior: PriorOption) -> Lenses:
-        """The cameras of views, their focal lengths known or to be estimated."""
+        """The cameras of views, their focal lengths known or to be estimated.
+
+        Views without evidence have no focal length of their own.
+        """
         cameras = tuple(view.camera for view in views)
         if focal == "known":
             for camera in cameras:
                 camera.require_focal()
             return cls(cameras, (-1,) * len(cameras))
         check_estimable(cameras)
-        distinct = list(dict.fromkeys(cameras))
+        distinct = list(dict.fromkeys(view.camera for view in views if view.has_evidence))
         reference = []
         for camera in cameras:
             grid, own = focal_grid(camera, prior), prior_of_camera(prior, camera)
             known = own.focal if own is not None else float(grid[len(grid) // 2])
             reference.append(camera.with_focal(known))
-        return cls(tuple(reference), tuple(distinct.index(camera) for camera in cameras), prior)
+        groups = [distinct.index(each) if each in distinct else -1 for each in cameras]
+        return cls(tuple(reference), tuple(groups), prior)
 
     @property
     def count(self) -> int:
@@ -228,3 +232,12 @@ class Lenses:
         """Focal lengths to start from: (F,) logarithms relative to the references, each."""
         grids = [np.log(focal_grid(camera, self.prior) / camera.fx) for camera in self._firsts]
         return list(np.array(grids).T) if grids else [np.zeros(0)]
+
+
+def camera_like(camera: Camera, estimated: Mapping[Camera, Camera]) -> Camera:
+    """A camera with the focal length of an equal one, or that of the first for its size."""
+    if camera in estimated or camera.focal_known:
+        return estimated.get(camera, camera)
+    first = next(iter(estimated.values()))
+    side = max(camera.width, camera.height) / max(first.width, first.height)
+    return camera.with_focal(first.fx * side)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -20,20 +20,15 @@ from cadalign.estimation.joint_robust import (
     without_hidden,
 )
 from cadalign.estimation.mistakes import Support, area_of, check_support
-from cadalign.estimation.options import FitOptions, RansacOptions
-from cadalign.estimation.pack import evidence_of
-from cadalign.estimation.prior import Lenses, ShapePrior
+from cadalign.estimation.prior import Lenses
+from cadalign.estimation.problem import Inits, Problem
 from cadalign.estimation.problems import no_redundancy_error
 from cadalign.estimation.starts import Start, Starts, starts_of
+from cadalign.estimation.uncertainty.evidence import count_equations
 from cadalign.estimation.uncertainty.posterior import widening_of
-from cadalign.estimation.view import View, without_keypoints
-from cadalign.geometry.alignment import Alignment
-from cadalign.io.evidence import Size
+from cadalign.estimation.view import View
 from cadalign.solvers.joint.evidence import Evidence, Shape, State, points_of
 from cadalign.solvers.joint.search import refine_joint, score_state, search_joint
-
-if TYPE_CHECKING:
-    pass
 
 _MOST_PER_FOCAL = 8  # starts of one pose, at each focal length of the grid
 _MOST_PER_FOCAL_OF_SEVERAL = 3
@@ -49,44 +44,6 @@ _NOISE_TOLERANCE = 0.2  # change of the log noise that asks for another search
 _NOISE_PRECISION = 0.01  # of the log noise
 _NOISE_ITERATIONS = 30
 _GOLDEN = (math.sqrt(5) - 1) / 2
-
-Inits = Sequence[Alignment | None]
-"""Given starts: one for each view of unknown motion, or one in the frame that the views share."""
-
-
-class JointProblem(NamedTuple):
-    """Views of an object with a prior shape, in the terms of the user."""
-
-    prior: ShapePrior
-    views: Sequence[View]
-    size: Size | None
-    options: FitOptions
-    lenses: Lenses
-    noise: float = 1.0  # [px], where it is not given
-
-    @property
-    def lacks_sigma(self) -> bool:
-        """True if the keypoints' noise is to be estimated."""
-        return any(view.sigma is None and len(view.keypoint_ids) for view in self.views)
-
-    def threshold(self, ransac: RansacOptions) -> float:
-        """Largest reprojection error of an inlier [px], by the noise alone."""
-        seen = [view for view in self.views if len(view.keypoint_ids)]
-        sigmas = [self.noise if view.sigma is None else view.sigma for view in seen]
-        limits = [ransac.threshold(sigma) for sigma in sigmas] or [ransac.threshold(None)]
-        return float(np.sqrt(np.mean(np.square(limits))))
-
-    def evidence(self, shape: Shape, lenses: Lenses) -> Evidence:
-        """The evidence about one component of the shape, with rays of ``lenses``."""
-        everything = evidence_of(
-            self.prior,
-            self.views,
-            self.size,
-            options=self.options,
-            lenses=lenses,
-            noise=self.noise,
-        )
-        return everything._replace(shape=shape)
 
 
 class Minimum(NamedTuple):
@@ -117,38 +74,20 @@ class Minimum(NamedTuple):
         return points_of(self.evidence.shape, self.state) / np.exp(self.state.log_scales)
 
 
-def minima_at_noise(
-    problem: JointProblem, init: Inits, ransac: RansacOptions | None
-) -> tuple[list[Minimum], int, int]:
+def minima_at_noise(problem: Problem, init: Inits) -> tuple[list[Minimum], int, int]:
     """Minima, the likeliest first, and the numbers of iterations and of starts, at one noise."""
     minima: list[Minimum] = []
     iterations = hypotheses = 0
     for number, shape in enumerate(problem.prior.components):
         evidence = problem.evidence(shape, problem.lenses)
-        starts = _starts(problem, shape, init, ransac)
+        starts = _starts(problem, shape, init)
         hypotheses += len(starts.poses)
         if not len(starts.poses):
             continue
-        every = np.ones(len(evidence.sightings.point), dtype=bool)
-        if _is_bare(evidence):
-            states = [
-                mean_state(evidence, poses, log_scales)._replace(log_focals=log_focals)
-                for poses, log_focals, log_scales in zip(*starts, strict=True)
-            ]
-            found = [JointConsensus(every, evidence, each, 0.0, math.inf) for each in states]
-            used = 0
-        elif ransac is None:
-            minima_of, used = search_joint(evidence, *starts)
-            found = [
-                JointConsensus(every, evidence, state, float(cost), float(score))
-                for state, cost, score in zip(*minima_of, strict=True)
-            ]
+        if any(init) and _is_left_to_outlines(problem, evidence):
+            found, used = _states_of(evidence, starts), 0
         else:
-            threshold = thresholds(evidence, problem.lenses, problem.threshold(ransac))
-            projects = ransac.max_reproj_error is None
-            found, used = robust_minima(
-                evidence, starts, threshold, settles=ransac.refine, projects=projects
-            )
+            found, used = _searched(problem, evidence, starts)
         iterations += used
         prior_score = -2 * float(np.log(problem.prior.weights[number]))
         minima.extend(
@@ -156,9 +95,9 @@ def minima_at_noise(
             for minimum in found
             for each in without_hidden(minimum)
         )
-    if ransac is not None and minima:
+    if problem.ransac is not None and minima:
         best = min(minima, key=lambda each: each.score)
-        _check_support(problem, best, problem.threshold(ransac))
+        _check_support(problem, best, problem.threshold(problem.ransac))
     lenses = zip(problem.lenses.cameras, problem.lenses.groups, strict=True)
     if any(camera.distortion and group >= 0 for camera, group in lenses):
         minima = [_relinearised(problem, each) for each in minima]
@@ -166,33 +105,49 @@ def minima_at_noise(
     return minima, iterations, hypotheses
 
 
-def _is_bare(evidence: Evidence) -> bool:
-    """True where priors alone would move a given start whose size is to be found by outlines."""
-    told = evidence.sightings.point, evidence.directions.image, evidence.offsets.image
-    return bool(evidence.scales.free.all()) and not any(map(len, told))
+def _is_left_to_outlines(problem: Problem, evidence: Evidence) -> bool:
+    """True where masks or photos determine what the other evidence leaves open.
 
-
-def minima_at_start(problem: JointProblem, init: Inits) -> tuple[list[Minimum], int, int]:
-    """As `minima_at_noise`, but at a given start, which too few keypoints would lead astray.
-
-    They are in the minima's evidence, for the outline to be found together with them.
+    That evidence would lead a given start astray.
     """
-    bare = problem._replace(views=[without_keypoints(view) for view in problem.views])
-    minima, *effort = minima_at_noise(bare, init, None)
-    found = []
-    for each in minima:
-        evidence = problem.evidence(each.evidence.shape, each.lenses)
-        every = np.ones(len(evidence.sightings.point), dtype=bool)
-        score = score_state(evidence, each.state) + each.prior_score
-        found.append(each._replace(inliers=every, evidence=evidence, score=score))
-    return found, effort[0], effort[1]
+    unknowns = 6 * problem.pose_count + int(evidence.scales.free.sum())
+    equations = count_equations(evidence) - len(evidence.shape.modes)
+    return problem.uses_outlines and equations < unknowns
 
 
-def _starts(
-    problem: JointProblem, shape: Shape, init: Inits, ransac: RansacOptions | None
-) -> Starts:
+def _states_of(evidence: Evidence, starts: Starts) -> list[JointConsensus]:
+    """Starts as they are, with the score of the evidence there."""
+    every = np.ones(len(evidence.sightings.point), dtype=bool)
+    states = [
+        mean_state(evidence, poses, log_scales)._replace(log_focals=log_focals)
+        for poses, log_focals, log_scales in zip(*starts, strict=True)
+    ]
+    return [
+        JointConsensus(every, evidence, each, 0.0, score_state(evidence, each)) for each in states
+    ]
+
+
+def _searched(
+    problem: Problem, evidence: Evidence, starts: Starts
+) -> tuple[list[JointConsensus], int]:
+    """Minima from starts, and the number of iterations."""
+    ransac = problem.ransac
+    if ransac is not None:
+        threshold = thresholds(evidence, problem.lenses, problem.threshold(ransac))
+        projects = ransac.max_reproj_error is None
+        return robust_minima(evidence, starts, threshold, settles=ransac.refine, projects=projects)
+    every = np.ones(len(evidence.sightings.point), dtype=bool)
+    minima, used = search_joint(evidence, *starts)
+    found = [
+        JointConsensus(every, evidence, state, float(cost), float(score))
+        for state, cost, score in zip(*minima, strict=True)
+    ]
+    return found, used
+
+
+def _starts(problem: Problem, shape: Shape, init: Inits) -> Starts:
     """Starts at every focal length of the grid, or at those that are known."""
-    lenses = problem.lenses
+    lenses, ransac = problem.lenses, problem.ransac
     found = []
     for log_focals in lenses.grid():
         known = Lenses(tuple(lenses.cameras_at(log_focals)), (-1,) * len(lenses.cameras))
@@ -212,7 +167,7 @@ def _starts(
     return Starts(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 
-def _relinearised(problem: JointProblem, minimum: Minimum) -> Minimum:
+def _relinearised(problem: Problem, minimum: Minimum) -> Minimum:
     """The minimum with lenses linearised about its own focal lengths."""
     prior_score = minimum.prior_score
     for _ in range(_LENS_ROUNDS):
@@ -231,7 +186,7 @@ def _relinearised(problem: JointProblem, minimum: Minimum) -> Minimum:
     return minimum._replace(score=score_state(minimum.evidence, minimum.state) + prior_score)
 
 
-def _check_support(problem: JointProblem, best: Minimum, max_reproj_error: float) -> None:
+def _check_support(problem: Problem, best: Minimum, max_reproj_error: float) -> None:
     """Refuse a minimum that chance gives as well; few keypoints leave that to other evidence."""
     views, rig, sightings = problem.views, best.evidence.rig, best.evidence.sightings
     limits = thresholds(best.evidence, best.lenses, 1.0)
@@ -283,7 +238,9 @@ def _start(init: Inits, evidence: Evidence) -> Start | None:
         if each is None:
             continue
         size = np.array(each.scale)[held].mean() if held.any() else 1.0
-        poses[number] = np.concatenate([each.rotation.ravel(), each.translation / size])
+        poses[evidence.rig.pose[number]] = np.concatenate(
+            [each.rotation.ravel(), each.translation / size]
+        )
     scale = np.array(given[0].scale)
     if held.any():
         scale = np.where(held, 1.0, scale / scale[held].mean())
@@ -291,43 +248,41 @@ def _start(init: Inits, evidence: Evidence) -> Start | None:
 
 
 def find_minima(
-    problem: JointProblem, inits: Inits, ransac: RansacOptions | None
-) -> tuple[JointProblem, list[Minimum], int, int]:
+    problem: Problem, starts: Sequence[Inits]
+) -> tuple[Problem, list[Minimum], int, int]:
     """Minima, with the likeliest standard deviation of the keypoints where these have none.
 
     The shape is integrated out, and so is the pose by Laplace's approximation, so that the estimate
-    is free of the bias that fitted unknowns cause. Returns the problem with that noise, minima, the
-    likeliest first, and numbers of iterations and of starts.
+    is free of the bias that fitted unknowns cause. Returns the problem with that noise, minima from
+    each of the given ``starts``, the likeliest first, and numbers of iterations and of starts.
 
     Raises DegenerateError if noise is to be estimated, and the keypoints fit exactly whatever they
     are; NoConsensusError if the likeliest has no more support by keypoints than chance gives, with
-    ``ransac``.
+    ``problem.ransac``.
     """
-    if not problem.lacks_sigma:
-        return problem, *minima_at_noise(problem, inits, ransac)
-    counts = [len(view.keypoint_ids) for view in problem.views if view.sigma is None]
-    poses = 1 if problem.views[0].cam_from_rig is not None else len(problem.views)
-    if 2 * sum(counts) <= 6 * poses:
-        raise no_redundancy_error(sum(counts))
-    effort = np.zeros(2, dtype=int)
+    if problem.lacks_sigma:
+        counts = [len(view.keypoint_ids) for view in problem.views if view.sigma is None]
+        if 2 * sum(counts) <= 6 * problem.pose_count:
+            raise no_redundancy_error(sum(counts))
     minima: list[Minimum] = []
-    for _ in range(_NOISE_ROUNDS):
-        minima, *spent = minima_at_noise(problem, inits, ransac)
+    effort = np.zeros(2, dtype=int)
+    for init in starts:
+        rounds = _NOISE_ROUNDS if problem.lacks_sigma else 0
+        found, *spent = minima_at_noise(problem, init)
         effort += spent
-        if not minima:
-            break
-        noise = _likeliest(problem, minima[0])
-        change = abs(math.log(noise / problem.noise))
-        problem = problem._replace(noise=noise)
-        if change < _NOISE_TOLERANCE:
-            break
-    if minima:
-        minima, *spent = minima_at_noise(problem, inits, ransac)
-        effort += spent
+        while rounds and found:
+            noise = _likeliest(problem, found[0])
+            change = abs(math.log(noise / problem.noise))
+            problem = problem._replace(noise=noise)
+            rounds = 0 if change < _NOISE_TOLERANCE else rounds - 1
+            found, *spent = minima_at_noise(problem, init)
+            effort += spent
+        minima += found
+    minima.sort(key=lambda each: each.score)
     return problem, minima, int(effort[0]), int(effort[1])
 
 
-def widened_by_noise(problem: JointProblem, minima: Sequence[Minimum]) -> Sequence[Minimum]:
+def widened_by_noise(problem: Problem, minima: Sequence[Minimum]) -> Sequence[Minimum]:
     """The minima with less information, where the noise itself is uncertain."""
     if not problem.lacks_sigma:
         return minima
@@ -338,7 +293,7 @@ def widened_by_noise(problem: JointProblem, minima: Sequence[Minimum]) -> Sequen
     return [_scaled(each, _without_sigma(problem.views, each), factor) for each in minima]
 
 
-def _likeliest(problem: JointProblem, minimum: Minimum) -> float:
+def _likeliest(problem: Problem, minimum: Minimum) -> float:
     """The noise [px] with the best score of one minimum."""
     unknown = _without_sigma(problem.views, minimum)
     count = int(unknown.sum())

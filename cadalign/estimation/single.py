@@ -17,12 +17,13 @@ from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.assemble import canonical_result
 from cadalign.estimation.estimates import with_boxes
 from cadalign.estimation.fit import fit
-from cadalign.estimation.joint import Estimate, common_sigma, result_of
+from cadalign.estimation.joint import Estimate, as_given, common_sigma, result_of
 from cadalign.estimation.mistakes import Explained, Mistake, find_in_all, larger_sizes
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.pack import seen_keypoints
 from cadalign.estimation.prior import prior_of
+from cadalign.estimation.problem import Problem
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
@@ -31,6 +32,7 @@ from cadalign.estimation.uncertainty.shape_posterior import SeenShape, ShapeTail
 from cadalign.estimation.view import View
 from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import turned_alignment
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import inflation_with
 from cadalign.solvers.constants import LEAST_POINTS, LINEAR
@@ -45,38 +47,17 @@ _DECISIVE = 10.0  # of -2 log likelihood, times the variance of shapes that were
 
 def is_plain(model: object, views: Sequence[View]) -> bool:
     """True where nothing but the keypoints of one view and an exact model is given."""
-    return is_exact_model(model) and _has_keypoints_alone(views)
+    return is_exact_model(model) and len(views) == 1 and not views[0].sources
 
 
-def is_single(model: object, views: Sequence[View]) -> bool:
+def is_single(problem: Problem) -> bool:
     """True where nothing but the keypoints of one view and a learned shape is given."""
-    if not isinstance(model, ShapeModel) or not _has_keypoints_alone(views):
+    if problem.numbers != [0] or not isinstance(problem.model, ShapeModel):
         return False
-    return views[0].sigma is not None and len(views[0].keypoint_ids) >= LEAST_POINTS
-
-
-def is_mask_alone(model: object, views: Sequence[View], inits: Sequence[Alignment | None]) -> bool:
-    """True where the mask of one view is all evidence of the pose of an exact model with a mesh."""
-    if not isinstance(model, Model) or model.mesh is None or not is_exact_model(model):
+    view = problem.views[0]
+    if view.sources or view.sigma is None or len(view.keypoint_ids) < LEAST_POINTS:
         return False
-    return len(views) == 1 and inits[0] is None and views[0].has_mask_alone
-
-
-def begins_at_outline(
-    model: object, views: Sequence[View], inits: Sequence[Alignment | None]
-) -> bool:
-    """True where a start is given for a mask or photo, and too few keypoints to refine it by.
-
-    The own model is refined by them, as its pose stays near where they leave it open.
-    """
-    if len(views) > 1 or inits[0] is None or is_exact_model(model):
-        return False
-    few = 0 < len(views[0].keypoint_ids) < LEAST_POINTS
-    return few and (views[0].mask is not None or views[0].image is not None)
-
-
-def _has_keypoints_alone(views: Sequence[View]) -> bool:
-    return len(views) == 1 and not views[0].sources
+    return problem.size is None and problem.ransac is None and not problem.lenses.count
 
 
 def align_plain(
@@ -110,16 +91,16 @@ def align_plain(
     return found if model.symmetry is None else canonical_result(found, model.symmetry)
 
 
-def align_single(
-    model: ShapeModel, view: View, *, options: FitOptions, init: Alignment | None
-) -> Result:
-    """The result of `cadalign.align` where `is_single` holds.
+def align_single(problem: Problem, start: float) -> Result:
+    """The result of `cadalign.align` where `is_single` holds, which was begun at ``start`` [s].
 
     Raises InputError if the view names a keypoint that the model lacks; DegenerateError if no pose
     has all keypoints in front of the camera.
     """
-    start = time.perf_counter()
-    prior = prior_of(model)
+    model, view, options = cast(ShapeModel, problem.model), problem.views[0], problem.options
+    prior, init = problem.prior, problem.inits[0]
+    if init is not None:
+        init = turned_alignment(init, problem.turns[0].T)
     rows = prior.rows_of(view.keypoint_ids, f"views[{view.number}].ids")
     weights, means, covariances = model.gaussians
     mixture = Mixture(means, covariances, -2 * np.log(weights))
@@ -178,10 +159,8 @@ def align_single(
             mistake = _mistake_in(mixture, view, rows, options, score)
             warnings = warnings if mistake is None else (mistake,)
     return result_of(
-        model,
-        prior,
-        [view],
-        estimates,
+        problem,
+        [as_given(each, problem) for each in estimates],
         inliers=[np.ones(len(rows), dtype=bool)],
         is_curved=bool(covariances.any()),
         warnings=warnings,
@@ -189,7 +168,7 @@ def align_single(
         cost=cost,
         stats=stats,
         component=component,
-        sigma=common_sigma([view]),
+        sigma=common_sigma(problem.views),
         known_axis=None,
         stretched_axes="",
     )

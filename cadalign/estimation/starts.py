@@ -23,7 +23,7 @@ from cadalign.estimation.prior import has_scale_prior
 from cadalign.estimation.uncertainty.evidence import count_equations
 from cadalign.geometry.rotations import spread_rotations
 from cadalign.solvers.constants import LEAST_POINTS
-from cadalign.solvers.joint.evidence import Evidence, distances_of
+from cadalign.solvers.joint.evidence import Evidence, distances_of, seen_in_cameras
 from cadalign.solvers.joint.search import MOST_PER_VIEW, view_starts
 from cadalign.solvers.marginal.problem import GaussianTarget
 from cadalign.solvers.marginal.search import after_motion, half_turns
@@ -104,7 +104,7 @@ def _proposed(evidence: Evidence, init: Start | None) -> list[_Start]:
         per_pose[rig.pose[view]][:0] = _carried_starts(evidence, view, per_pose)
     if not all(per_pose):
         return []
-    if is_metric and (np.bincount(rig.pose) > 1).any():
+    if is_metric and rig.is_shared.any():
         return _with_rig(evidence, per_pose)
     likeliest = [found[0] for found in per_pose]
     others = [
@@ -120,7 +120,7 @@ def _proposed(evidence: Evidence, init: Start | None) -> list[_Start]:
 
 def _with_rig(evidence: Evidence, per_pose: list[list[_Start]]) -> list[_Start]:
     """Starts whose scales are those of the rig with the most views; the other poses follow."""
-    main = int(np.argmax(np.bincount(evidence.rig.pose)))
+    main = int(np.argmax(np.bincount(evidence.rig.pose[evidence.rig.pose >= 0])))
     starts = []
     seen = told_by(evidence, evidence.rig.pose == main)
     for k, (own, logs) in enumerate(_metric_starts(seen, per_pose[main])):
@@ -151,9 +151,7 @@ def _size_factor(evidence: Evidence, poses: FloatArray, scale: FloatArray) -> fl
     sampled, offsets = evidence.image_depths, evidence.offsets
 
     def seen(point: IntArray, image: IntArray) -> FloatArray:
-        turns = poses[evidence.rig.pose[image]]
-        turned = np.einsum("nij,nj->ni", turns[:, :9].reshape(-1, 3, 3), mean[point] * scale)
-        return np.asarray(turned + turns[:, 9:])
+        return seen_in_cameras(evidence, poses, mean[point] * scale, image)
 
     has_depth = sightings.depths[:, 1] > 0
     depths = seen(sightings.point[has_depth], sightings.image[has_depth])[:, 2]
@@ -179,8 +177,9 @@ def _weakly_determined(evidence: Evidence) -> list[int]:
     if unknowns == 6:
         return []
     counts = _keypoint_counts(evidence)
-    shared = np.bincount(evidence.rig.pose)[evidence.rig.pose] > 1
-    return np.flatnonzero((2 * counts <= unknowns) & ~shared & (len(counts) > 1)).tolist()
+    rig = evidence.rig
+    is_weak = (2 * counts <= unknowns) & ~rig.is_shared & (rig.pose >= 0) & (rig.pose.max() > 0)
+    return np.flatnonzero(is_weak).tolist()
 
 
 def _carried_starts(

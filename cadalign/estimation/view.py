@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Hashable, Iterable, Sequence
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
@@ -197,6 +197,11 @@ class View(BeyondKeypoints):
         return self.mask is not None and not len(self.keypoint_ids)
 
     @property
+    def has_evidence(self) -> bool:
+        """True if the view says anything about the object."""
+        return bool(len(self.keypoint_ids)) or bool({*self.sources} - {"cam_from_rig", "depth"})
+
+    @property
     def mask_image(self) -> FloatArray | BoolArray | None:
         """The mask (h, w), bool or probabilities."""
         return cast("FloatArray | BoolArray | None", self.mask)
@@ -215,9 +220,9 @@ def _with_number(view: View, number: int) -> View:
     return same
 
 
-def without_keypoints(view: View) -> View:
-    """A view with the evidence that stands beside its keypoints and their depths."""
-    return replace(view, points_2d=(), ids=None, sigma=1.0, scores=None, depth=None)
+def without_evidence(view: View) -> View:
+    """The camera of a view, and nothing of what it shows."""
+    return View(view.camera, cam_from_rig=view.cam_from_rig, number=view.number)
 
 
 def _depths(given: Any, camera: Camera, count: int, scale: float | None) -> FloatArray:

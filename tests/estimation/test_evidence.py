@@ -25,10 +25,9 @@ from support.scenes import (
 from cadalign import Alignment, Model, ShapeModel, Size, View, align
 from cadalign.errors import InputError
 from cadalign.estimation.estimates import with_box
-from cadalign.estimation.options import FitOptions
-from cadalign.estimation.prior import Lenses, prior_of
+from cadalign.estimation.pack import evidence_of
+from cadalign.estimation.prior import prior_of
 from cadalign.estimation.result import Result
-from cadalign.estimation.search import JointProblem
 from cadalign.estimation.uncertainty.evidence import redundancy_of
 from cadalign.geometry.conventions import up_from_vertical_edges
 from cadalign.shapes.parts import BoxMargins
@@ -306,8 +305,7 @@ def test_bad_input_is_named(call: Any, message: str) -> None:
 def test_points_that_are_no_keypoints_end_no_box() -> None:
     prior = prior_of(similar())
     views = [seen(keypoints(12), truth_of((1, 1, 1)), np.eye(4))]
-    problem = JointProblem(prior, views, None, FitOptions(), Lenses.of(views, "known", None))
-    evidence = problem.evidence(prior.components[0], problem.lenses)
+    evidence = evidence_of(prior, views)
     modes, mean = evidence.shape.modes, evidence.shape.mean
     pose = truth_of((1, 1, 1)).packed[None, :12]
     state = State(pose, np.zeros(0), np.zeros(3), np.zeros(len(modes)), np.zeros_like(mean))
@@ -325,6 +323,5 @@ def test_equations_beyond_the_unknowns_are_counted() -> None:
     views = [seen(points, truth, np.eye(4)), seen(points, truth, np.eye(4))]
     prior = prior_of(Model(points_3d=points))
     for few, poses in ((views[:1], 1), (views, 2)):
-        problem = JointProblem(prior, few, None, FitOptions(), Lenses.of(few, "known", None))
-        evidence = problem.evidence(prior.components[0], problem.lenses)
+        evidence = evidence_of(prior, few)
         assert redundancy_of(evidence) == 24 * poses - 6 * poses - 2

@@ -32,11 +32,12 @@ from cadalign.estimation.focal import prior_of_camera
 from cadalign.estimation.joint_robust import LEAST_SEEN, cost_of_hidden, hidden_limits
 from cadalign.estimation.model import Model
 from cadalign.estimation.pack import evidence_of
-from cadalign.estimation.search import JointProblem, Minimum, find_minima
+from cadalign.estimation.problem import Problem
+from cadalign.estimation.search import Minimum, find_minima
 from cadalign.estimation.view import View
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.alignment import model_rays
-from cadalign.geometry.camera import Camera
+from cadalign.geometry.camera import Camera, turned_alignment
 from cadalign.geometry.mesh import Mesh
 from cadalign.solvers.joint.evidence import (
     Evidence,
@@ -145,7 +146,7 @@ class _Start(NamedTuple):
 
 
 def minima_of_mask(
-    problem: JointProblem, model: Model
+    problem: Problem,
 ) -> tuple[list[Minimum], int, int, EstimateWarning | None]:
     """Minima of the evidence beside the mask of the only view, at alignments that resemble it.
 
@@ -155,7 +156,7 @@ def minima_of_mask(
     Raises InputError if the mask has no contour, or no prior says roughly what the focal length is;
     DegenerateError if no start leads to the mask.
     """
-    (view,), camera = problem.views, problem.lenses.cameras[0]
+    (view,), camera, model = problem.views, problem.lenses.cameras[0], cast(Model, problem.model)
     known = prior_of_camera(problem.lenses.prior, camera)
     if problem.lenses.count and (known is None or known.relative_sigma > _LARGEST_FOCAL_SIGMA):
         raise InputError(
@@ -189,9 +190,7 @@ def minima_of_mask(
     return minima, steps, starts, warning
 
 
-def _searched(
-    problem: JointProblem, model: Model, contour: ViewContour
-) -> tuple[list[_End], int, int]:
+def _searched(problem: Problem, model: Model, contour: ViewContour) -> tuple[list[_End], int, int]:
     """Minima near a contour, the likeliest first; numbers of iterations and of starts.
 
     A search follows those before it where none of these meets the contour.
@@ -239,7 +238,7 @@ def _rough_contour(view: View, where: str, camera: Camera) -> tuple[ViewContour,
     return contour_view(0, smaller, where, camera.resized(width, height)), pixel
 
 
-def _resembling(problem: JointProblem, model: Model, search: _Search) -> list[Resembling]:
+def _resembling(problem: Problem, model: Model, search: _Search) -> list[Resembling]:
     """Alignments whose silhouettes resemble the mask, the best first."""
     (view,) = problem.views
     mesh = cast(Mesh, model.mesh)
@@ -255,7 +254,7 @@ def _resembling(problem: JointProblem, model: Model, search: _Search) -> list[Re
     )
 
 
-def _possible(problem: JointProblem, mesh: Mesh) -> Possible | None:
+def _possible(problem: Problem, mesh: Mesh) -> Possible | None:
     """Tell which poses known directions, such as gravity's, and known lengths leave."""
     directions = evidence_of(problem.prior, problem.views, lenses=problem.lenses).directions
     lengths = np.full(3, np.nan) if problem.size is None else problem.size.lengths
@@ -277,10 +276,11 @@ def _possible(problem: JointProblem, mesh: Mesh) -> Possible | None:
 
 
 def _begun(
-    problem: JointProblem, start: Resembling, surface: RigidSurface, contour: ViewContour
+    problem: Problem, start: Resembling, surface: RigidSurface, contour: ViewContour
 ) -> tuple[_Start | None, int]:
     """A start before its first step towards the mask's outline; and iterations that led there."""
-    _, minima, iterations, _ = find_minima(problem, [start.alignment], None)
+    alignment = turned_alignment(start.alignment, problem.turns[0])
+    _, minima, iterations, _ = find_minima(problem._replace(ransac=None), [[alignment]])
     if not minima:
         return None, iterations
     best = minima[0]
@@ -298,7 +298,7 @@ _MOST_COVERED = 12
 _COVERED = 0.5  # [sigma], of a keypoint behind the surface
 
 
-def without_covered(model: Model, problem: JointProblem, minima: list[Minimum]) -> list[Minimum]:
+def without_covered(problem: Problem, minima: list[Minimum]) -> list[Minimum]:
     """Minima by the depths of keypoints that the model's own surface does not hide, the best first.
 
     A depth image shows that surface in their place. Where next to none is in view, as of keypoints
@@ -306,7 +306,7 @@ def without_covered(model: Model, problem: JointProblem, minima: list[Minimum]) 
     """
     first = minima[0]
     keypoints = len(problem.prior.ids)
-    surface = surfaces_of(model, first.points[:keypoints], "views[0].depth").surfaces[0]
+    surface = surfaces_of(problem.model, first.points[:keypoints], "views[0].depth").surfaces[0]
     likely = [each for each in minima if not each.score > first.score + _UNLIKELY]
     found: dict[tuple[bytes, float], Minimum] = {}
     for each in likely[:_MOST_COVERED]:
@@ -349,7 +349,7 @@ def _is_covered(evidence: Evidence, state: State, surface: Surface) -> BoolArray
     """Marks the depths (m,) of keypoints that lie behind the surface."""
     depths, posed = evidence.image_depths, surface.at(evidence.shape, state)
     points = points_of(evidence.shape, state)[depths.point]
-    seen = seen_in_cameras(evidence, state, points, depths.image)
+    seen = seen_in_cameras(evidence, state.poses, points, depths.image)
     covered = np.zeros(len(points), dtype=bool)
     for number, pose in enumerate(poses_of(evidence, state)):
         rows = np.flatnonzero(depths.image == number)

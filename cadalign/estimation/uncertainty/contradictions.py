@@ -254,7 +254,7 @@ def _wrong_units(
     size = float(np.exp(state.log_scales.mean()))
     factors = [(p, _measured_factor(evidence, state, p)) for p in pieces_of(evidence)]
     measured = [(piece, factor) for piece, factor in factors if factor is not None]
-    is_rig = (np.bincount(evidence.rig.pose) > 1).any()
+    is_rig = bool(evidence.rig.is_shared.any())
     is_alone = len({piece.kind for piece, _ in measured}) == 1 and not is_rig
     is_told = not _is_plausible(size) and (blamed or is_alone)
     for piece, factor in measured:

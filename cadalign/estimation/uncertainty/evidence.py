@@ -46,7 +46,7 @@ def pieces_of(evidence: Evidence) -> list[Piece]:
     told["depth"] = np.append(told["depth"], evidence.image_depths.image)
     told["gravity"] = evidence.directions.image
     told["camera height"] = offsets.image[offsets.image >= 0]
-    told["rig"] = np.flatnonzero(np.bincount(rig.pose)[rig.pose] > 1)
+    told["rig"] = np.flatnonzero(rig.is_shared)
     views = {kind: set(rows.tolist()) for kind, rows in told.items()}
     pieces = [
         Piece(kind, view) for view in range(len(rig.pose)) for kind in views if view in views[kind]
@@ -106,7 +106,7 @@ def summaries_of(
 def _sighted(evidence: Evidence, state: State, rows: BoolArray) -> FloatArray:
     """Points (n, 3) of some sightings in their cameras."""
     points = points_of(evidence.shape, state)[evidence.sightings.point[rows]]
-    return seen_in_cameras(evidence, state, points, evidence.sightings.image[rows])
+    return seen_in_cameras(evidence, state.poses, points, evidence.sightings.image[rows])
 
 
 def _of_keypoints(evidence: Evidence, state: State, view: int, camera: Camera) -> EvidenceSummary:
@@ -150,13 +150,13 @@ def image_depths_at(evidence: Evidence, state: State) -> FloatArray:
     """Depths (m,) that a state has in the place of the evidence's image depths."""
     depths = evidence.image_depths
     points = points_of(evidence.shape, state)[depths.point]
-    return seen_in_cameras(evidence, state, points, depths.image)[:, 2]
+    return seen_in_cameras(evidence, state.poses, points, depths.image)[:, 2]
 
 
 def _of_gravity(evidence: Evidence, state: State, view: int) -> EvidenceSummary:
     directions = kept_rows(evidence.directions, evidence.directions.image == view)
-    origin = seen_in_cameras(evidence, state, 0.0 * directions.model, directions.image)
-    seen = seen_in_cameras(evidence, state, directions.model, directions.image)
+    origin = seen_in_cameras(evidence, state.poses, 0.0 * directions.model, directions.image)
+    seen = seen_in_cameras(evidence, state.poses, directions.model, directions.image)
     differences = seen - origin - directions.camera
     whitened = np.einsum("nij,nj->ni", directions.whitening, differences)
     halves = np.minimum(np.linalg.norm(differences, axis=1) / 2, 1.0)

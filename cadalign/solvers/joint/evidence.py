@@ -55,10 +55,19 @@ class Sightings(NamedTuple):
 
 
 class Rig(NamedTuple):
-    """Cameras (V, 12), rotation row by row and translation, and the pose (V,) each belongs to."""
+    """Cameras (V, 12), rotation row by row and translation, and the pose (V,) each belongs to.
+
+    The pose of a view without evidence is -1.
+    """
 
     cam_from_rig: FloatArray
     pose: IntArray
+
+    @property
+    def is_shared(self) -> BoolArray:
+        """True for the views (V,) whose pose is that of other views, too."""
+        counts = np.bincount(self.pose[self.pose >= 0])
+        return np.asarray((self.pose >= 0) & (counts[self.pose] > 1))
 
 
 class Focals(NamedTuple):
@@ -210,11 +219,11 @@ def points_of(shape: Shape, state: State) -> FloatArray:
 
 
 def seen_in_cameras(
-    evidence: Evidence, state: State, points: FloatArray, image: IntArray
+    evidence: Evidence, poses: FloatArray, points: FloatArray, image: IntArray
 ) -> FloatArray:
-    """Points (N, 3) of the model in the cameras (N,) of views."""
+    """Points (N, 3) of the model in the cameras (N,) of views, under poses (P, 12)."""
     rig = evidence.rig
-    for motion in (state.poses[rig.pose[image]], rig.cam_from_rig[image]):
+    for motion in (poses[rig.pose[image]], rig.cam_from_rig[image]):
         turned = np.einsum("nij,nj->ni", motion[:, :9].reshape(-1, 3, 3), points)
         points = turned + motion[:, 9:]
     return points

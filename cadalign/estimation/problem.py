@@ -1,0 +1,268 @@
+"""An estimate's problem: the model, the views that take part, known lengths, and options.
+
+A wide lens is turned to what its view shows, so that this lies in front of the camera. The turn is
+part of the rig: poses are those of the cameras as they were given.
+
+A view of unknown motion whose keypoints determine no pose does not take part: it has no evidence
+and no pose, and keeps its number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.errors import DegenerateError, InputError
+from cadalign.estimation.model import Model, is_exact_model
+from cadalign.estimation.options import FitOptions, RansacOptions, pixel_information
+from cadalign.estimation.pack import evidence_of
+from cadalign.estimation.prior import Lenses, ShapePrior, prior_of
+from cadalign.estimation.view import View, without_evidence
+from cadalign.geometry.alignment import Alignment, are_on_a_line
+from cadalign.geometry.camera import Camera, faced, needs_facing, rays_ahead
+from cadalign.io.evidence import Size
+from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.constants import LEAST_POINTS
+from cadalign.solvers.joint.evidence import Evidence, Shape
+
+Inits = Sequence[Alignment | None]
+"""Given starts: one for each view of unknown motion, or one in the frame that the views share."""
+
+_ON_A_LINE = 1e-3  # second over first extent of keypoints that determine no rotation about it
+_LEAST_AHEAD = 0.05  # cosine off a wide lens's axis below which a depth says nothing of a point
+_MOST_PIXELS = 500  # of a mask, amid which a wide lens is turned
+
+
+class Problem(NamedTuple):
+    """Model, views, known lengths and options of an estimate.
+
+    Parameters
+    ----------
+    model, prior
+        The model as given, and as the kernels take it.
+    given : tuple of View
+        All views, as given.
+    views : tuple of View
+        The same with wide lenses turned; without evidence where one has no pose.
+    size : Size, optional
+    inits : sequence of Alignment or None
+        Given starts, as for `cadalign.align`.
+    options : FitOptions
+        Loss and focal length.
+    ransac : RansacOptions, optional
+    lenses : Lenses
+        Cameras of ``views``, with unknown focal lengths.
+    turns : tuple of (3, 3) float
+        Rotations that turn poses in the frames of ``views`` to those of the given ones.
+    noise : float
+        Standard deviation of keypoints that have none [px].
+    """
+
+    model: Model | ShapeModel
+    prior: ShapePrior
+    given: tuple[View, ...]
+    views: tuple[View, ...]
+    size: Size | None
+    inits: Inits
+    options: FitOptions
+    ransac: RansacOptions | None
+    lenses: Lenses
+    turns: tuple[FloatArray, ...]
+    noise: float = 1.0
+
+    @property
+    def lacks_sigma(self) -> bool:
+        """True if the keypoints' noise is to be estimated."""
+        return any(view.sigma is None and len(view.keypoint_ids) for view in self.views)
+
+    @property
+    def is_rig(self) -> bool:
+        """True if the views share one pose."""
+        return self.views[0].cam_from_rig is not None
+
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of the views that take part."""
+        return [number for number, view in enumerate(self.views) if view.has_evidence]
+
+    @property
+    def uses_outlines(self) -> bool:
+        """True if a view has a mask or a photo."""
+        return any(view.mask is not None or view.image is not None for view in self.views)
+
+    @property
+    def pose_count(self) -> int:
+        """Number of unknown poses."""
+        return 1 if self.is_rig else len(self.numbers)
+
+    @property
+    def has_own_mesh(self) -> bool:
+        """True for an exact model with a mesh, whose silhouettes can be compared with masks."""
+        return is_exact_model(self.model) and getattr(self.model, "mesh", None) is not None
+
+    @property
+    def is_mask_alone(self) -> bool:
+        """True if the first view's mask is all evidence of the pose of an exact model."""
+        return self.has_own_mesh and self.views[0].has_mask_alone
+
+    def threshold(self, ransac: RansacOptions) -> float:
+        """Largest reprojection error of an inlier [px], by the noise alone."""
+        seen = [view for view in self.views if len(view.keypoint_ids)]
+        sigmas = [self.noise if view.sigma is None else view.sigma for view in seen]
+        limits = [ransac.threshold(sigma) for sigma in sigmas] or [ransac.threshold(None)]
+        return float(np.sqrt(np.mean(np.square(limits))))
+
+    def evidence(self, shape: Shape, lenses: Lenses) -> Evidence:
+        """The evidence about one component of the shape, with rays of ``lenses``."""
+        everything = evidence_of(
+            self.prior,
+            self.views,
+            self.size,
+            options=self.options,
+            lenses=lenses,
+            turns=self.turns,
+            noise=self.noise,
+        )
+        return everything._replace(shape=shape)
+
+    def without(self, numbers: Sequence[int]) -> Problem:
+        """The problem without the evidence and the poses of some views.
+
+        Raises DegenerateError if the first is among them: the result is in its camera's frame.
+        """
+        if not numbers:
+            return self
+        if 0 in numbers:
+            raise DegenerateError(
+                "its keypoints do not determine its pose, and the result is in its camera's frame",
+                where="views[0]",
+                fix="give at least 3 keypoints, not on one line, or another view first",
+            )
+        views = list(self.views)
+        for number in numbers:
+            views[number] = without_evidence(views[number])
+        lenses = Lenses.of(views, self.options.focal, self.options.focal_prior)
+        return self._replace(views=tuple(views), lenses=lenses)
+
+    def alone(self, number: int) -> Problem:
+        """The problem of one view alone, without the known motion of its camera."""
+        view = replace(self.views[number], cam_from_rig=None)
+        lenses = Lenses.of([view], self.options.focal, self.options.focal_prior)
+        return self._replace(
+            given=(self.given[number],),
+            views=(view,),
+            size=None,
+            inits=[None],
+            lenses=lenses,
+            turns=(self.turns[number],),
+        )
+
+
+def compile_problem(
+    model: Model | ShapeModel,
+    views: Sequence[View],
+    size: Size | None,
+    inits: Inits,
+    options: FitOptions,
+    ransac: RansacOptions | None,
+) -> Problem:
+    """The problem of checked arguments.
+
+    Raises InputError if a view has no evidence, or names a keypoint that the model lacks, or if
+    keypoints lie all around a wide lens, without ``ransac``; DegenerateError if the first view has
+    no pose.
+    """
+    prior = prior_of(model)
+    for view in views:
+        if not view.has_evidence:
+            fix, where = (
+                "give keypoints, a mask or a direction, or leave the view away",
+                f"views[{view.number}]",
+            )
+            raise InputError("tells nothing about the object", where=where, fix=fix)
+    facing = [_facing_view(view) for view in views]
+    if ransac is None:
+        for view in facing:
+            if view.camera.is_wide:
+                rays_ahead(view.pixels, view.camera)
+    lenses = Lenses.of(facing, options.focal, options.focal_prior)
+    turns = tuple(
+        np.eye(3) if own is view else own.camera.lens_from_camera
+        for own, view in zip(facing, views, strict=True)
+    )
+    problem = Problem(
+        model, prior, tuple(views), tuple(facing), size, inits, options, ransac, lenses, turns
+    )
+    return problem.without(_views_without_pose(problem))
+
+
+def _views_without_pose(problem: Problem) -> list[int]:
+    """Numbers of the views of unknown motion whose keypoints determine no pose.
+
+    Those are fewer than three keypoints, or keypoints on one line. Masks alone determine the pose
+    of an exact model. A single view, and views with a given start, are never among them.
+    """
+    views, prior = problem.views, problem.prior
+    if len(views) < 2 or any(view.cam_from_rig is not None for view in views):
+        return []
+    mean = prior.components[0].mean
+    return [
+        number
+        for number, view in enumerate(views)
+        if problem.inits[number] is None
+        and not (problem.has_own_mesh and view.has_mask_alone)
+        and _lie_on_a_line(mean[prior.rows_of(view.keypoint_ids, f"views[{number}].ids")])
+    ]
+
+
+def _lie_on_a_line(points: FloatArray) -> bool:
+    """True for points (n, 3) that determine no rotation: fewer than three, or on one line."""
+    return len(points) < LEAST_POINTS or are_on_a_line(points, _ON_A_LINE)
+
+
+def _facing_view(view: View) -> View:
+    """The view of a wide lens that is turned to what it shows; ``up`` stays in the lens's frame.
+
+    Depths, along the lens's axis as they are given, become those along the turned axis.
+    """
+    if not needs_facing([view.camera]):
+        return view
+    turned = replace(view, camera=faced(view.camera, _pixels_of_object(view)))
+    return turned if view.depth is None else _with_facing_depths(turned, view.camera)
+
+
+def _pixels_of_object(view: View) -> FloatArray:
+    """Pixels (n, 2) where a view shows the object: its keypoints or, without any, its mask."""
+    if not view.has_mask_alone:
+        return view.pixels
+    inside = np.argwhere(np.asarray(view.mask) > 0.5)[:, ::-1]
+    return inside[:: max(len(inside) // _MOST_PIXELS, 1)].astype(float)
+
+
+def _with_facing_depths(turned: View, lens: Camera) -> View:
+    """A turned view whose depths, along the axis of its lens, become those along its own.
+
+    NaN for those of points beside the lens, of which that axis says nothing. A keypoint's noise
+    turns its ray, which adds to the standard deviation of its depth.
+    """
+    depth = np.array(turned.depth, dtype=np.float64)
+    known = np.isfinite(depth)
+    is_image = depth.ndim == 2
+    pixels = np.argwhere(known)[:, ::-1].astype(float) if is_image else turned.pixels[known]
+    rays, valid = lens.rays_where_valid(pixels)
+    along, ahead = rays[:, 2], rays @ turned.camera.lens_from_camera[:, 2]
+    usable = valid & (along > _LEAST_AHEAD) & (ahead > _LEAST_AHEAD)
+    along, ahead = (np.where(usable, each, 1.0) for each in (along, ahead))
+    depth[known] *= np.where(usable, ahead / along, np.nan)
+    if is_image:
+        return replace(turned, depth=depth)
+    noise = 1.0 if turned.sigma is None else turned.sigma
+    variances = np.linalg.inv(pixel_information(noise, len(depth)))[known]
+    angles = np.sqrt(np.trace(variances, axis1=1, axis2=2) / 2) / lens.fx
+    sigma = np.broadcast_to(np.asarray(turned.depth_sigma, dtype=np.float64), depth.shape).copy()
+    sigma[known] = np.sqrt(sigma[known] ** 2 + angles**2 * (along**-2 - 1 + ahead**-2 - 1))
+    return replace(turned, depth=depth, depth_sigma=sigma)

@@ -13,7 +13,13 @@ from support.layers import layers as listed
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "cadalign"
-parsed = cache(ast.parse)
+
+
+@cache
+def parsed(source: str) -> list[ast.AST]:
+    """Imports and constants in code; the rest of its tree is not kept."""
+    kinds = (ast.Import, ast.ImportFrom, ast.Constant)
+    return [node for node in ast.walk(ast.parse(source)) if isinstance(node, kinds)]
 
 
 def layers() -> list[str]:
@@ -33,7 +39,7 @@ def layer_of(path: Path) -> str:
 
 def imports_in(source: str) -> Iterator[str]:
     """The layers that code imports: lazily, for type checking or by a module's name as text too."""
-    for node in ast.walk(parsed(source)):
+    for node in parsed(source):
         if isinstance(node, ast.ImportFrom) and node.module == "cadalign":
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -114,7 +120,7 @@ def name_of(path: Path) -> str:
 def imported_by(source: str, names: set[str]) -> set[str]:
     """The package's modules that code imports, also in functions and for type checking."""
     found: set[str] = set()
-    for node in ast.walk(parsed(source)):
+    for node in parsed(source):
         if isinstance(node, ast.Import):
             found.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:

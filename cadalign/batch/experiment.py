@@ -23,7 +23,6 @@ from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoin
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import Stated
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.evaluation.options import ExperimentOptions, absolute_paths, plain_value
 from cadalign.evaluation.runs.folder import RunFolder
@@ -145,8 +144,8 @@ class FitRunOptions(ManyOptions):
         texts = [(number, _photo_doubt(view)) for number, view in enumerate(seen.views)]
         doubts = [EstimateWarning("camera", text, number) for number, text in texts if text]
         if doubts:
-            statistics = Stated.of(result.statistics, warnings=(*doubts, *result.warnings))
-            result = replace(result, statistics=statistics)
+            posterior = result.posterior.stating(warnings=(*doubts, *result.warnings))
+            result = replace(result, posterior=posterior)
         return Estimated(seen, result, {}, {})
 
     def contents(self) -> dict[str, Any]:

@@ -11,13 +11,14 @@ from cadalign.names import lazy_names
 if TYPE_CHECKING:
     from cadalign.estimation.align import align_batch
     from cadalign.estimation.fit import fit_batch
+    from cadalign.estimation.fitted import Alternative, FitStats
     from cadalign.estimation.focal import FocalPrior
     from cadalign.estimation.model import Model
     from cadalign.estimation.observed import model_of, views_from, views_of
     from cadalign.estimation.options import FitOptions, RansacOptions
     from cadalign.estimation.outputs import object_of
     from cadalign.estimation.result import Result
-    from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
+    from cadalign.estimation.result_parts import ViewResult
     from cadalign.estimation.results import Results, to_dataframe
     from cadalign.estimation.uncertainty.summary import (
         EvidenceSummary,

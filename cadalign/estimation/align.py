@@ -18,6 +18,7 @@ from cadalign.errors import (
     require_kind,
 )
 from cadalign.estimation.contours import refine_with_images
+from cadalign.estimation.fitted import FitStats
 from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.joint import result_of_minima
 from cadalign.estimation.joint_mistakes import joint_mistake, mistake_beside, no_pose_error
@@ -28,7 +29,6 @@ from cadalign.estimation.prior import Lenses
 from cadalign.estimation.problem import Problem, compile_problem
 from cadalign.estimation.problems import each_of
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.results import Results
 from cadalign.estimation.search import find_minima, widened_by_noise
 from cadalign.estimation.single import align_plain, align_single, is_plain, is_single

@@ -1,83 +1,97 @@
-"""Results of the keypoints of an exact or stretched model in one view."""
+"""From the solution of an exact or stretched model's keypoints in one view to their result."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
+from cadalign.estimation.fitted import Alternative, FitStats, FittedKeypoints, quickly
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.problems import Problems, Solutions
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import (
-    Alternative,
-    FitStats,
-    KeypointStatistics,
-    ViewResult,
-    quickly,
-)
+from cadalign.estimation.result_parts import Posterior, ViewResult
 from cadalign.estimation.solve import LEAST_LIKELIHOOD, camera_of, fitted_fields
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.symmetry import Symmetry
 
+if TYPE_CHECKING:
+    from cadalign.estimation.model import Model
+    from cadalign.estimation.view import View
 
-def result_of_solution(
+
+def keypoints_of_solution(
     problems: Problems, solutions: Solutions, options: FitOptions, seconds: float
-) -> Result:
-    """The result of the only problem, which has a solution."""
+) -> FittedKeypoints:
+    """The fitted keypoints of the only problem, which has a solution."""
     minima, iterations, hypotheses, _ = solutions.info[0].tolist()
     fitted = fitted_fields(problems, solutions, options)
+    fitted["method"] = options.method
+    if fitted["fisher_covariance"] is not None:
+        fitted["cost"] = solutions.costs.item(0)
+    if minima > 1:
+        fitted["alternatives"] = _alternatives(problems, solutions, minima, options)
     effort = {"iterations": iterations, "hypotheses": hypotheses, "seconds": seconds}
-    return result_of_keypoints(
-        problems.points_2d,
-        fitted,
-        method=options.method,
-        stats=quickly(FitStats, effort),
-        cost=None if fitted["fisher_covariance"] is None else solutions.costs.item(0),
-        alternatives=_alternatives(problems, solutions, minima, options) if minima > 1 else (),
-    )
+    fitted["stats"] = quickly(FitStats, effort)
+    return quickly(FittedKeypoints, fitted)
 
 
 def result_of_keypoints(
     points_2d: FloatArray,
-    fitted: dict[str, Any],
+    fitted: FittedKeypoints,
     *,
-    method: str,
-    stats: FitStats,
-    cost: float | None = None,
-    alternatives: tuple[Alternative, ...] = (),
+    symmetry: Symmetry | None = None,
+    model: Model | None = None,
+    view: View | None = None,
 ) -> Result:
-    """The result of keypoints in one view, from the fields of their `FittedKeypoints`."""
-    points, options = fitted["points_3d"], fitted["options"]
-    ids = _rows(len(points))
-    statistics = quickly(KeypointStatistics, {**fitted, "alternatives": alternatives})
+    """The result of keypoints (n, 2) [px] in one view.
+
+    With a symmetry it is the canonical one. With the ``model`` it has all of its keypoints, and
+    ids of those in the ``view``.
+    """
+    points: FloatArray = fitted.points_3d
+    bounds: FloatArray | None = None
+    if model is not None:
+        points, bounds = cast(FloatArray, model.points_3d), cast(FloatArray, model.bounds)
+        others = (
+            replace(each, points_3d=points, own_bounds=bounds) for each in fitted.alternatives
+        )
+        fitted = replace(fitted, alternatives=tuple(others))
+    if symmetry is not None:
+        fitted, points = _canonical(fitted, points, symmetry)
+    rows, options = _rows(len(fitted.points_3d)), fitted.options
+    of_posterior = {"keypoints": fitted, "fisher_covariance": fitted.fisher_covariance}
+    posterior = quickly(Posterior, of_posterior)
     of_view = {
-        "camera": fitted["camera"],
-        "alignment": fitted["alignment"],
-        "ids": ids,
+        "camera": fitted.camera,
+        "alignment": fitted.alignment,
+        "ids": rows if view is None else view.keypoint_ids,
         "points_2d": points_2d.copy(),  # the caller may go on to change theirs
-        "residuals": fitted["residuals"],
-        "inliers": fitted["inliers"],
-        "statistics": statistics,
+        "residuals": fitted.residuals,
+        "inliers": fitted.inliers,
+        "posterior": posterior,
     }
     of_result = {
         "views": (quickly(ViewResult, of_view),),
-        "ids": ids,
+        "ids": rows if model is None else model.ids,
         "points_3d": points,
-        "method": method,
-        "statistics": statistics,
+        "method": fitted.method,
+        "posterior": posterior,
         "known_axis": options.known_axis,
         "stretched_axes": options.stretched_axes,
         "focal": options.focal,
         "focal_prior": options.focal_prior,
-        "sigma": fitted.get("sigma"),
-        "cost": cost,
-        "alternatives": alternatives,
-        "stats": stats,
+        "sigma": fitted.sigma,
+        "cost": fitted.cost,
+        "alternatives": fitted.alternatives,
+        "stats": fitted.stats,
         "options": options,
+        "symmetry": symmetry,
+        "model": model,
+        "own_bounds": bounds,
     }
     return quickly(Result, of_result)
 
@@ -106,40 +120,37 @@ def _alternatives(
     )
 
 
-def canonical_result(result: Result, symmetry: Symmetry) -> Result:
-    """A result of keypoints in one view as its canonical one, with alternatives that are others."""
+def _canonical(
+    fitted: FittedKeypoints, points: FloatArray, symmetry: Symmetry
+) -> tuple[FittedKeypoints, FloatArray]:
+    """Keypoints with the canonical one of all equal alignments, and points (m, 3) as it has them.
+
+    Alternatives are others than that one.
+    """
     from cadalign.estimation.symmetry import carried, held_axes, is_same
     from cadalign.geometry.symmetry_group import group_of  # most models have none
 
     group = group_of(symmetry)
-    held = held_axes(result.stretched_axes)
-    best = group.canonical(result.alignment, held=held)
-    statistics = cast("KeypointStatistics", result.statistics)
-    covariance = statistics.fisher_covariance
+    held = held_axes(fitted.options.stretched_axes)
+    best = group.canonical(fitted.alignment, held=held)
+    covariance = fitted.fisher_covariance
     if covariance is not None:
-        covariance = carried(covariance, result.alignment, best, held)
-    canonical = [(group.canonical(each.alignment, held=held), each) for each in result.alternatives]
+        covariance = carried(covariance, fitted.alignment, best, held)
+    canonical = [(group.canonical(each.alignment, held=held), each) for each in fitted.alternatives]
     alternatives = tuple(
         replace(each, alignment=equal.alignment, points_3d=equal.relabelled(each.points_3d))
         for equal, each in canonical
         if group.is_trivial or not is_same(group, best.alignment, equal.alignment, covariance)
     )
-    statistics = replace(
-        statistics,
+    same = replace(
+        fitted,
         alignment=best.alignment,
-        points_3d=best.relabelled(statistics.points_3d),
+        points_3d=best.relabelled(fitted.points_3d),
         fisher_covariance=covariance,
         symmetry=symmetry,
         alternatives=alternatives,
     )
-    return replace(
-        result,
-        views=(replace(result.views[0], alignment=best.alignment, statistics=statistics),),
-        points_3d=best.relabelled(result.points_3d),
-        statistics=statistics,
-        alternatives=alternatives,
-        symmetry=symmetry,
-    )
+    return same, best.relabelled(points)
 
 
 @lru_cache(maxsize=64)

@@ -162,29 +162,29 @@ class RobustSearch:
         score += (np.log(alignment.scale) ** 2).sum() / _STRETCH_SIGMA**2
         return Explained(float(score), int(kept.sum()), -float(alignment.rotation[1, 1]))
 
+    @np.errstate(all="ignore")  # what is not finite explains nothing
+    def mistake_in(self, alignment: Alignment, residuals: FloatArray) -> EstimateWarning | None:
+        """Name the mistake without which the keypoints agree better; see `find_mistake`.
 
-@np.errstate(all="ignore")  # what is not finite explains nothing
-def mistake_in(search: RobustSearch, found: Explained) -> EstimateWarning | None:
-    """Name the mistake without which the keypoints agree better; see `find_mistake`.
+        ``alignment`` and ``residuals`` (n, 2) [px] are those of the estimate.
+        """
+        found, given = self.explained(alignment, residuals), len(residuals)
 
-    ``found`` is what the estimate explains.
-    """
-    given = len(search.problems.points_2d)
+        def explain(mistake: Mistake) -> Explained | None:
+            own = self.without(mistake)
+            try:
+                if found.inliers == given:  # which samples need not be drawn for
+                    solved = solve_one(own.problems, own.options)
+                    pose = Alignment.from_packed(solved.poses[0, 0])
+                    return own.explained(pose, solved.residuals)
+                best = find_consensus(own)
+                own.check(best)
+                return own.explained(best.alignment, best.residuals)
+            except CadalignError:
+                return None
 
-    def explain(mistake: Mistake) -> Explained | None:
-        own = search.without(mistake)
-        try:
-            if found.inliers == given:  # which samples need not be drawn for
-                solved = solve_one(own.problems, own.options)
-                return own.explained(Alignment.from_packed(solved.poses[0, 0]), solved.residuals)
-            best = find_consensus(own)
-            own.check(best)
-            return own.explained(best.alignment, best.residuals)
-        except CadalignError:
-            return None
-
-    sizes = larger_sizes(search.problems.points_2d, search.problems.cameras[0])
-    return find_mistake(found, given, explain, sizes)
+        sizes = larger_sizes(self.problems.points_2d, self.problems.cameras[0])
+        return find_mistake(found, given, explain, sizes)
 
 
 def find_consensus(search: RobustSearch) -> Consensus:

@@ -12,10 +12,11 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import CadalignError, InputError
+from cadalign.estimation.fitted import Alternative, FitStats
 from cadalign.estimation.focal import FocalPrior, PriorOption
 from cadalign.estimation.options import FitOptions, pixel_information
 from cadalign.estimation.result_data import ResultData
-from cadalign.estimation.result_parts import Alternative, FitStats, Stated, ViewResult
+from cadalign.estimation.result_parts import Posterior, ViewResult
 from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals, Misfit
 from cadalign.estimation.warning import EstimateWarning, Kind
 from cadalign.geometry.alignment import Alignment
@@ -194,7 +195,7 @@ class _Result(ForeignDocument):
 
 def write_result(result: ResultData) -> dict[str, Any]:
     """A result as plain lists and numbers; its model is not part of it."""
-    std, misfit, statistics = result.std, result.misfit, result.statistics
+    std, misfit, posterior = result.std, result.misfit, result.posterior
     return {
         "version": VERSION,
         **{name: getattr(result, name) for name in _PLAIN},
@@ -221,8 +222,8 @@ def write_result(result: ResultData) -> dict[str, Any]:
         ],
         "covariance": _plain(result.covariance),
         "fisher_covariance": _plain(result.fisher_covariance),
-        "points_covariance": _plain(statistics.points_covariance),
-        "points_cam_covariance": _plain(statistics.points_cam_covariance),
+        "points_covariance": _plain(posterior.points_covariance),
+        "points_cam_covariance": _plain(posterior.points_cam_covariance),
         "degrees_of_freedom": result.degrees_of_freedom,
         "focal_prior": _plain_prior(result.focal_prior),
         "alternatives": [
@@ -300,7 +301,7 @@ def _result(read: _Result, kind: type[ResultKind]) -> ResultKind:
     unknowns = 10 if read.focal == "estimate" else 9
     views = _each("views", read.views, lambda view: _view(view, unknowns))
     in_camera = read.points_cam_covariance
-    statistics = Stated(
+    posterior = Posterior.stated(
         views[0].covariance,
         fisher_covariance=_array(read.fisher_covariance, "fisher_covariance", unknowns, unknowns),
         points_covariance=_array(read.points_covariance, "points_covariance", None, 3, 3),
@@ -310,13 +311,13 @@ def _result(read: _Result, kind: type[ResultKind]) -> ResultKind:
         evidence=tuple(map(_read_evidence, read.evidence)),
         degrees_of_freedom=read.degrees_of_freedom,
     )
-    views[0] = replace(views[0], statistics=statistics)
+    views[0] = replace(views[0], posterior=posterior)
     count = len(views[0].residuals)
     return kind(
         views=tuple(views),
         ids=tuple(read.ids),
         points_3d=np.array(read.points_3d).reshape(-1, 3),
-        statistics=statistics,
+        posterior=posterior,
         focal_prior=read.focal_prior,
         **{name: getattr(read, name) for name in _PLAIN},
         alternatives=tuple(_each("alternatives", read.alternatives, _alternative)),
@@ -339,7 +340,7 @@ def _view(read: _View, unknowns: int) -> ViewResult:
         np.array([row or _UNKNOWN for row in read.points_2d]).reshape(-1, 2),
         np.array([row or _BEHIND for row in read.residuals]).reshape(-1, 2),
         np.array(read.inliers, dtype=bool),
-        Stated(_array(read.covariance, "covariance", unknowns, unknowns)),
+        Posterior.stated(_array(read.covariance, "covariance", unknowns, unknowns)),
     )
 
 

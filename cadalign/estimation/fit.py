@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, copied
 from cadalign.errors import CadalignError, InputError, require_kind
-from cadalign.estimation.assemble import canonical_result, result_of_solution
+from cadalign.estimation.assemble import keypoints_of_solution, result_of_keypoints
 from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.estimation.problems import Problems, each_of, in_threads, pack_many, pack_one
@@ -281,15 +281,16 @@ def _fit_one(
     options = options.for_camera(problems.camera(0))
     if ransac is None:
         solutions = solve_one(problems, options)
-        result = result_of_solution(problems, solutions, options, time.perf_counter() - start)
+        seconds = time.perf_counter() - start
+        fitted = keypoints_of_solution(problems, solutions, options, seconds)
     else:
         # Only here: most programs never search for outliers, and its kernels take time to import.
         from cadalign.estimation.robust import fit_robustly, fit_similar_robustly
 
         is_noise_known = options.sigma is not None or ransac.max_reproj_error is not None
         search = fit_robustly if is_noise_known else fit_similar_robustly
-        result = search(problems, options, ransac, scores, start)
-    return result if symmetry is None else canonical_result(result, symmetry)
+        fitted = search(problems, options, ransac, scores, start)
+    return result_of_keypoints(problems.points_2d, fitted, symmetry=symmetry)
 
 
 # Checking options takes as long as solving a small problem linearly, and calls repeat them.

@@ -24,13 +24,14 @@ from cadalign.estimation.estimates import (
     widen_box,
     with_box,
 )
+from cadalign.estimation.fitted import Alternative, FitStats
 from cadalign.estimation.focal import prior_of_camera
 from cadalign.estimation.mistakes import outside_image
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import camera_like, is_exact, widened, with_known_shape
 from cadalign.estimation.problem import Problem
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import Alternative, FitStats, Stated, ViewResult
+from cadalign.estimation.result_parts import Posterior, ViewResult
 from cadalign.estimation.search import Minimum
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.symmetry import (
@@ -125,7 +126,7 @@ def result_of(
     )
     pose, points = best.poses[0], best.points[:-2]
     of_points, of_seen = _moments_of_points(estimates)
-    statistics = Stated(
+    posterior = Posterior.stated(
         covariances[0],
         fisher_covariance=best.covariances[0],
         points_covariance=of_points[:-2],
@@ -175,10 +176,10 @@ def result_of(
         if number in numbers:
             place = numbers.index(number)
             camera, alignment, kept = best.cameras[place], best.poses[place], inliers[place]
-            own = Stated(covariances[place]) if number else statistics
+            own = Posterior.stated(covariances[place]) if number else posterior
         else:
             camera, alignment = _pose_beside(problem, number, best)
-            kept, own = np.zeros(len(rows), dtype=bool), Stated(None)
+            kept, own = np.zeros(len(rows), dtype=bool), Posterior()
         residuals = camera.project(alignment.apply(points[rows])) - observed
         of_views.append(
             ViewResult(camera, alignment, view.keypoint_ids, observed, residuals, kept, own)
@@ -189,7 +190,7 @@ def result_of(
         ids=prior.ids,
         points_3d=points,
         method="align",
-        statistics=statistics,
+        posterior=posterior,
         alternatives=alternatives,
         model=problem.model,
         own_bounds=best.points[-2:],

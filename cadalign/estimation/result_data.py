@@ -13,17 +13,10 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, is_number
 from cadalign.errors import CadalignError, InputError, quote
+from cadalign.estimation.fitted import NO_STATS, Alternative, FitStats
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import FitOptions
-from cadalign.estimation.result_parts import (
-    NO_STATS,
-    Alternative,
-    FitStats,
-    Statistics,
-    ViewResult,
-    points_covariances,
-    rms_of,
-)
+from cadalign.estimation.result_parts import Posterior, ViewResult, points_covariances, rms_of
 from cadalign.estimation.uncertainty.summary import Uncertainty, uncertainty_of
 from cadalign.geometry.alignment import Alignment, Box, extent
 from cadalign.geometry.camera import Camera
@@ -57,8 +50,8 @@ class ResultData:
     method : str
         The method that found it: that of `cadalign.fit`, "align" where all evidence was estimated
         together.
-    statistics : Statistics
-        What is stated of the uncertainty.
+    posterior : Posterior
+        The uncertainty, and warnings about it.
     known_axis : {"x", "y", "z"}, optional
         The model's axis whose scale was taken as 1; None where all of them are estimated, or none.
     stretched_axes : str
@@ -97,7 +90,7 @@ class ResultData:
     ids: tuple[Hashable, ...]
     points_3d: FloatArray
     method: str
-    statistics: Statistics = field(repr=False)
+    posterior: Posterior = field(repr=False)
     known_axis: str | None = "x"
     stretched_axes: str = "yz"
     focal: str = "known"
@@ -181,7 +174,7 @@ class ResultData:
 
         With a symmetry, rotations about its axes count nothing.
         """
-        return self.statistics.covariance
+        return self.posterior.covariance
 
     @property
     def fisher_covariance(self) -> FloatArray | None:
@@ -190,7 +183,7 @@ class ResultData:
         The Cramer-Rao bound there: with few keypoints errors are larger. None for methods that are
         not statistical, and where a file does not hold it.
         """
-        return self.statistics.fisher_covariance
+        return self.posterior.fisher_covariance
 
     @property
     def std(self) -> Uncertainty | None:
@@ -203,7 +196,7 @@ class ResultData:
 
         None if they are Gaussian. `radius` depends on it.
         """
-        return self.statistics.degrees_of_freedom
+        return self.posterior.degrees_of_freedom
 
     @cached_property
     def _of_points(self) -> tuple[FloatArray, FloatArray] | None:
@@ -214,13 +207,13 @@ class ResultData:
     @property
     def points_covariance(self) -> FloatArray | None:
         """Covariance (m, 3, 3) of each keypoint in the model's frame, with its stretch."""
-        stated = self.statistics.points_covariance
+        stated = self.posterior.points_covariance
         return stated if stated is not None or self._of_points is None else self._of_points[0]
 
     @property
     def points_cam_covariance(self) -> FloatArray | None:
         """Covariance (m, 3, 3) of each keypoint in the first camera's frame."""
-        stated = self.statistics.points_cam_covariance
+        stated = self.posterior.points_cam_covariance
         return stated if stated is not None or self._of_points is None else self._of_points[1]
 
     @property
@@ -230,7 +223,7 @@ class ResultData:
         None if they pass (of right data, 99.5 % or more do), for an estimated sigma, and for
         methods that are not statistical. For several pieces of evidence, see ``warnings``.
         """
-        return self.statistics.misfit
+        return self.posterior.misfit
 
     @property
     def warnings(self) -> tuple[EstimateWarning, ...]:
@@ -238,12 +231,12 @@ class ResultData:
 
         Each has a ``kind``, a ``text``, and the ``view`` and ``keypoints`` that it is about.
         """
-        return self.statistics.warnings
+        return self.posterior.warnings
 
     @property
     def evidence(self) -> tuple[EvidenceSummary, ...]:
         """Agreement of every piece of evidence with the estimate."""
-        return self.statistics.evidence
+        return self.posterior.evidence
 
     @property
     def bounds(self) -> FloatArray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import CadalignError, InputError
-from cadalign.estimation.assemble import canonical_result, result_of_solution
+from cadalign.estimation.assemble import keypoints_of_solution, result_of_keypoints
 from cadalign.estimation.options import FitOptions, Sigma
 from cadalign.estimation.problems import Problems, Solutions, full_covariances
 from cadalign.estimation.result import Result
@@ -353,8 +353,9 @@ def _solved(
     own = Solutions(**of_problem, residuals=solutions.residuals[problems.rows(b)].copy())
     if sigmas is not None:
         options = replace(options, sigma=sigmas[b])
-    result = result_of_solution(problems.part(b, b + 1), own, options, seconds)
-    return result if symmetry is None else canonical_result(result, symmetry)
+    some = problems.part(b, b + 1)
+    fitted = keypoints_of_solution(some, own, options, seconds)
+    return result_of_keypoints(some.points_2d, fitted, symmetry=symmetry)
 
 
 def to_dataframe(

@@ -8,20 +8,15 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import replace
-from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 
+from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError, InputError, NoConsensusError
-from cadalign.estimation.assemble import result_of_keypoints, result_of_solution
-from cadalign.estimation.consensus import (
-    Consensus,
-    RobustSearch,
-    find_consensus,
-    mistake_in,
-    refined,
-)
+from cadalign.estimation.assemble import keypoints_of_solution
+from cadalign.estimation.consensus import Consensus, RobustSearch, find_consensus, refined
+from cadalign.estimation.fitted import FitStats, FittedKeypoints
 from cadalign.estimation.mistakes import (
     LEAST_ERROR,
     SOLUTIONS_OF_FOUR,
@@ -32,8 +27,6 @@ from cadalign.estimation.mistakes import (
 )
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.problems import Problems, check_sigmas
-from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import FitStats, KeypointStatistics
 from cadalign.estimation.solve import solve_one
 from cadalign.estimation.uncertainty.residuals import f_quantile
 
@@ -51,7 +44,7 @@ def fit_robustly(
     ransac: RansacOptions,
     scores: npt.ArrayLike | None,
     start: float,
-) -> Result:
+) -> FittedKeypoints:
     """Fit the only problem to the keypoints that support its best alignment.
 
     Raises NoConsensusError if no alignment has more support than chance gives; it carries the best
@@ -69,33 +62,32 @@ def fit_robustly(
     )
     trusted = None if scores is None else np.array(scores)
     search = RobustSearch(given, options, ransac, trusted)
-    best, result = _found(search), None
+    best, optimum = _found(search), None
     # As many samples would find the support that a corrected mistake gives, which is more.
     ransac = replace(ransac, max_iterations=best.iterations)
-    points = given.points_3d
     if ransac.refine:
         best, some, solutions, own = refined(search, best)
-        result = result_of_solution(some, solutions, own, time.perf_counter() - start)
-    fitted = {
-        "points_3d": points,
-        "residuals": best.residuals,
-        "inliers": best.inliers,
-        "alignment": best.alignment,
-        "camera": best.camera,
-        "options": options,
-        "sigma": result and result.sigma,
-        "fisher_covariance": None if result is None else result.fisher_covariance,
-        "search": replace(search, ransac=ransac),
-    }
+        optimum = keypoints_of_solution(some, solutions, own, time.perf_counter() - start)
+    points = given.points_3d
+    found = FittedKeypoints(
+        points, best.residuals, best.inliers, best.alignment, best.camera, options
+    )
+    method = ransac.minimal
+    if optimum is not None:
+        method = optimum.method
+        found = replace(
+            found,
+            sigma=optimum.sigma,
+            fisher_covariance=optimum.fisher_covariance,
+            cost=optimum.cost,
+            alternatives=tuple(replace(each, points_3d=points) for each in optimum.alternatives),
+        )
     ratio, seconds = float(best.inliers.mean()), time.perf_counter() - start
-    others = () if result is None else result.alternatives
-    return result_of_keypoints(
-        problems.points_2d,
-        fitted,
-        method=f"ransac-{ransac.minimal if result is None else result.method}",
+    return replace(
+        found,
+        method=f"ransac-{method}",
         stats=FitStats(best.iterations, best.hypotheses, seconds, ratio, best.score),
-        cost=None if result is None else result.cost,
-        alternatives=tuple(replace(each, points_3d=points) for each in others),
+        search=replace(search, ransac=ransac),
     )
 
 
@@ -105,7 +97,7 @@ def _found(search: RobustSearch) -> Consensus:
     try:
         search.check(best)
     except NoConsensusError as error:
-        mistake = mistake_in(search, search.explained(best.alignment, best.residuals))
+        mistake = search.mistake_in(best.alignment, best.residuals)
         error.fix = error.fix if mistake is None else mistake.text
         raise
     return best
@@ -117,7 +109,7 @@ def fit_similar_robustly(
     ransac: RansacOptions,
     scores: npt.ArrayLike | None,
     start: float,
-) -> Result:
+) -> FittedKeypoints:
     """Fit the only problem, whose keypoints' standard deviation is to be estimated.
 
     For a model that is only similar the noise, and with it the threshold, is unknown. Two estimates
@@ -126,10 +118,18 @@ def fit_similar_robustly(
     not that all of them are off by more than the threshold. The one whose inliers chance explains
     less wins. Raises NoConsensusError if both explain the keypoints no better than chance.
     """
+    pixels = problems.points_2d
+
+    def by_chance(found: FittedKeypoints, threshold: float) -> float:
+        """Log of the number of alignments that chance supports as well."""
+        errors = np.linalg.norm(found.residuals[found.inliers], axis=1)
+        support = Support(errors, len(found.inliers), area_of(pixels, found.camera, threshold))
+        return log_expected_by_chance(support, 4, SOLUTIONS_OF_FOUR)
+
     tolerant = _under_cauchy(problems, options, start)
-    strict: tuple[Result, float] | None = None
+    strict: tuple[FittedKeypoints, float] | None = None
     refusal: CadalignError | None = None
-    extent = float(np.ptp(problems.points_2d, axis=0).max()) if len(problems.points_2d) else 0.0
+    extent = float(np.ptp(pixels, axis=0).max()) if len(pixels) else 0.0
     threshold = _FIRST
     while threshold == _FIRST or threshold <= _WIDEST * extent:
         chosen = replace(ransac, max_reproj_error=threshold)
@@ -138,13 +138,13 @@ def fit_similar_robustly(
         except (NoConsensusError, DegenerateError) as error:
             refusal = refusal or error
         else:
-            if strict is None or _by_chance(found, threshold) < _by_chance(*strict):
+            if strict is None or by_chance(found, threshold) < by_chance(*strict):
                 strict = found, threshold
         threshold *= _FACTOR
     if tolerant is not None:
         reach = _reach(tolerant)
-        if strict is None or _by_chance(tolerant, reach) - _PREFERENCE <= _by_chance(*strict):
-            if strict is None and not _is_explained(tolerant, options):
+        if strict is None or by_chance(tolerant, reach) - _PREFERENCE <= by_chance(*strict):
+            if strict is None and not _is_explained(tolerant, pixels):
                 raise _refused(tolerant)
             return tolerant
     if strict is None:
@@ -153,60 +153,45 @@ def fit_similar_robustly(
     return strict[0]
 
 
-def _under_cauchy(problems: Problems, options: FitOptions, start: float) -> Result | None:
+def _under_cauchy(problems: Problems, options: FitOptions, start: float) -> FittedKeypoints | None:
     """The alignment under Cauchy's loss, its inliers marked; None where there is none."""
     own = replace(options, loss="cauchy" if options.loss == "linear" else options.loss)
     try:
-        result = result_of_solution(problems, solve_one(problems, own), own, 0.0)
+        found = keypoints_of_solution(problems, solve_one(problems, own), own, 0.0)
     except CadalignError:
         return None
-    near = np.linalg.norm(result.residuals, axis=1) <= _reach(result)
+    near = np.linalg.norm(found.residuals, axis=1) <= _reach(found)
     if near.sum() < min(_LEAST_KEYPOINTS, len(near)):
         return None
-    statistics = replace(cast(KeypointStatistics, result.statistics), inliers=near)
     seconds = time.perf_counter() - start
-    return replace(
-        result,
-        views=(replace(result.views[0], inliers=near, statistics=statistics),),
-        statistics=statistics,
-        method="robust-optimal",
-        stats=replace(result.stats, seconds=seconds, inlier_ratio=float(near.mean())),
-    )
+    stats = replace(found.stats, seconds=seconds, inlier_ratio=float(near.mean()))
+    return replace(found, inliers=near, method="robust-optimal", stats=stats)
 
 
-def _by_chance(result: Result, threshold: float) -> float:
-    """Log of the number of alignments that chance supports as well; see `support`."""
-    errors = np.linalg.norm(result.residuals[result.inliers], axis=1)
-    view = result.views[0]
-    area = area_of(view.points_2d, view.camera, threshold)
-    return log_expected_by_chance(Support(errors, len(result.inliers), area), 4, SOLUTIONS_OF_FOUR)
-
-
-def _is_explained(result: Result, options: FitOptions) -> bool:
+def _is_explained(found: FittedKeypoints, points_2d: FloatArray) -> bool:
     """True if the alignment explains more of the keypoints' places than chance would.
 
     An F test of the residuals against those of the keypoints' mean.
     """
-    kept = result.inliers
-    residuals, pixels = result.residuals[kept], result.views[0].points_2d[kept]
+    residuals, pixels = found.residuals[found.inliers], points_2d[found.inliers]
     left = float((residuals**2).sum())
     total = float(((pixels - pixels.mean(axis=0)) ** 2).sum())
-    unknowns = options.unknowns - 2
-    redundancy = 2 * len(pixels) - options.unknowns
+    unknowns = found.options.unknowns - 2
+    redundancy = 2 * len(pixels) - found.options.unknowns
     if redundancy < 1:
         return True
     ratio = (total - left) / unknowns / max(left / redundancy, 1e-300)
     return ratio > f_quantile(unknowns, redundancy, _SMALL_CHANCE)
 
 
-def _reach(result: Result) -> float:
+def _reach(found: FittedKeypoints) -> float:
     """Largest residual of a keypoint that agrees [px]."""
-    return max(_REACH * (result.sigma or 0.0), LEAST_ERROR)
+    return max(_REACH * (found.sigma or 0.0), LEAST_ERROR)
 
 
-def _refused(result: Result) -> NoConsensusError:
+def _refused(found: FittedKeypoints) -> NoConsensusError:
     """The error of keypoints that no alignment explains, with those that disagree most."""
-    errors = np.linalg.norm(result.residuals, axis=1)
+    errors = np.linalg.norm(found.residuals, axis=1)
     typical = errors <= np.median(errors)
     return NoConsensusError(
         f"no alignment is supported: the best leaves residuals of {np.median(errors):.3g} px, as "
@@ -214,5 +199,5 @@ def _refused(result: Result) -> NoConsensusError:
         where="points_2d",
         fix="check which keypoint is which, the model and the camera; give sigma or "
         "max_reproj_error where you know them, or a learned shape",
-        inliers=int(result.inliers.sum()),
+        inliers=int(found.inliers.sum()),
     )

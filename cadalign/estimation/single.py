@@ -7,16 +7,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import cast
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError, InputError
-from cadalign.estimation.assemble import canonical_result
+from cadalign.estimation.assemble import result_of_keypoints
 from cadalign.estimation.estimates import with_boxes
 from cadalign.estimation.fit import fit
+from cadalign.estimation.fitted import FitStats, FittedKeypoints
 from cadalign.estimation.joint import Estimate, as_given, common_sigma, result_of
 from cadalign.estimation.mistakes import Explained, Mistake, find_in_all, larger_sizes
 from cadalign.estimation.model import Model, is_exact_model
@@ -25,7 +25,6 @@ from cadalign.estimation.pack import seen_keypoints
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.problem import Problem
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.uncertainty.evidence import summary_of_keypoints
 from cadalign.estimation.uncertainty.shape_posterior import SeenShape, ShapeTails, keypoint_misfits
@@ -65,7 +64,7 @@ def align_plain(
 ) -> Result:
     """The result of `fit`, with all keypoints of the model."""
     prior = prior_of(model)
-    points, bounds = cast(FloatArray, model.points_3d), cast(FloatArray, model.bounds)
+    points = cast(FloatArray, model.points_3d)
     rows = prior.rows_of(view.keypoint_ids, "views[0].ids")
     shape = ("stretch", "stretch_sigma", "known_axis")
     chosen = vars(options) | {name: getattr(model, name) for name in shape}
@@ -77,18 +76,8 @@ def align_plain(
         ransac=ransac,
         scores=view.scores if ransac is not None else None,
     )
-    found = replace(
-        found,
-        views=(replace(found.views[0], ids=view.keypoint_ids),),
-        ids=prior.ids,
-        points_3d=points,
-        alternatives=tuple(
-            replace(each, points_3d=points, own_bounds=bounds) for each in found.alternatives
-        ),
-        model=model,
-        own_bounds=bounds,
-    )
-    return found if model.symmetry is None else canonical_result(found, model.symmetry)
+    fitted = cast(FittedKeypoints, found.posterior.keypoints)
+    return result_of_keypoints(view.pixels, fitted, symmetry=model.symmetry, model=model, view=view)
 
 
 def align_single(problem: Problem, start: float) -> Result:

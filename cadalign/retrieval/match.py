@@ -13,7 +13,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import Stated, ViewResult
+from cadalign.estimation.result_parts import Posterior, ViewResult
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.io.meshes.files import load_mesh
@@ -112,7 +112,7 @@ class Match:
         """
         if self.camera is None:
             raise InputError("the match has no camera", where="camera", fix="retrieve it again")
-        ids, none = tuple(self.ids.tolist()), Stated(None)
+        ids, none = tuple(self.ids.tolist()), Posterior()
         inliers = np.ones(self.shared, dtype=bool)
         seen = (self.camera, self.alignment, ids, self.points_2d, self.residuals, inliers, none)
         return Result(

@@ -12,20 +12,19 @@ from support.problems import fit_problem, problem_of
 
 from cadalign import Alignment, FocalPrior, Result
 from cadalign.errors import InputError
+from cadalign.estimation.fitted import Alternative, FitStats, FittedKeypoints
 from cadalign.estimation.options import FitOptions
-from cadalign.estimation.result_parts import (
-    Alternative,
-    FitStats,
-    KeypointStatistics,
-    Stated,
-    ViewResult,
-)
+from cadalign.estimation.result_parts import Posterior, ViewResult
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.evaluation.simulation import SIMULATION_CAMERA
 
 COVARIANCE = np.diag([1e-4, 1e-4, 1e-4, 0.0004, 0.0009, 0.01, 0, 0.0001, 0.0225])
 WARNING = "s_z is known only to +-15 %: there are few keypoints for their noise"
-STATED = Stated(COVARIANCE, COVARIANCE, warnings=(EstimateWarning("scale", WARNING),))
+STATED = Posterior.stated(
+    COVARIANCE,
+    fisher_covariance=COVARIANCE,
+    warnings=(EstimateWarning("scale", WARNING),),
+)
 POINTS = np.array([[0.0, 0, 1], [1, 0, -1], [0, 1, 1], [1, 1, 1], [1, 0, 1], [0, 0, -1]])
 POSE = Alignment(
     Rotation.from_rotvec([0, np.pi / 3, 0]).as_matrix(), [0.5, -0.25, 6], [1, 0.75, 1.25]
@@ -35,7 +34,7 @@ POSE = Alignment(
 def made(
     residuals: list[list[float]],
     inliers: list[bool],
-    stated: Stated = STATED,
+    stated: Posterior = STATED,
     **changes: Any,
 ) -> Result:
     """A result of the six points."""
@@ -49,7 +48,7 @@ def made(
         "alternatives": (other,),
         "stats": FitStats(12, 34, 0.5),
     }
-    return Result((view,), ids, POINTS, statistics=stated, **{**fields, **changes})
+    return Result((view,), ids, POINTS, posterior=stated, **{**fields, **changes})
 
 
 NEAR = [[0.0, 0.0]] * 5
@@ -69,7 +68,7 @@ def test_text_of_a_result() -> None:
 
 def test_text_of_a_result_without_statistics() -> None:
     plain = made(
-        [[3.0, 4.0], *NEAR], [True] * 6, Stated(None), method="aepnp", sigma=None, alternatives=()
+        [[3.0, 4.0], *NEAR], [True] * 6, Posterior(), method="aepnp", sigma=None, alternatives=()
     )
     assert str(plain) == (
         "aepnp: 6 keypoints, rms 2.04 px\n"
@@ -154,9 +153,9 @@ def test_warnings_look_at_the_inliers_alone() -> None:
     in_plane = POINTS * [1, 1, 0] + [0, 0, 0.25]
     points, inliers = np.vstack([in_plane, [[0.5, 0.5, 3.0]]]), np.array([True] * 6 + [False])
     options = FitOptions()
-    statistics = KeypointStatistics(
+    fitted = FittedKeypoints(
         points, np.zeros((7, 2)), inliers, POSE, SIMULATION_CAMERA, options, 1.0, COVARIANCE
     )
-    vars(statistics)["covariance"] = 100 * COVARIANCE
+    posterior = Posterior(fitted).stating(covariance=100 * COVARIANCE)
     text = "s_z is known only to +-150 %: the keypoints lie nearly in the plane z = 0.25"
-    assert statistics.warnings == (EstimateWarning("scale", text),)
+    assert posterior.warnings == (EstimateWarning("scale", text),)

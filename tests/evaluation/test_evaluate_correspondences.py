@@ -19,7 +19,7 @@ from cadalign.errors import DataError, InputError
 from cadalign.estimation.fit import fit
 from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import Stated, ViewResult
+from cadalign.estimation.result_parts import Posterior, ViewResult
 from cadalign.evaluation import plots
 from cadalign.evaluation.api import run as do_run
 from cadalign.evaluation.experiments.correspondences import SPEC, CorrespondenceOptions, summarize
@@ -257,9 +257,9 @@ class TestRows:
 
         def made(alignment, inliers):
             view = ViewResult(
-                CAMERA, alignment, (0, 1, 2, 3), *np.zeros((2, 4, 2)), inliers, Stated(None)
+                CAMERA, alignment, (0, 1, 2, 3), *np.zeros((2, 4, 2)), inliers, Posterior()
             )
-            return Result((view,), view.ids, points, "", view.statistics)
+            return Result((view,), view.ids, points, "", view.posterior)
 
         pose = Alignment(turn, [0, 0.5, 10], [1, 1.005, 1.99])
         est = made(pose, np.array([True, False, True, True]))

@@ -24,7 +24,6 @@ from cadalign.estimation.contours.view_contour import ViewContour, contour_view,
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import Stated
 from cadalign.estimation.search import Minimum
 from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals
 from cadalign.estimation.view import View
@@ -69,13 +68,12 @@ class Refined(NamedTuple):
 
     def noted_in(self, result: Result) -> Result:
         """The result with what is known of the masks or photos."""
-        statistics = Stated.of(
-            result.statistics,
+        posterior = result.posterior.stating(
             evidence=(*result.evidence, *self.summaries),
             warnings=(*result.warnings, *self.warnings),
         )
         residuals = self.residuals or result.mask_residuals
-        return replace(result, mask_residuals=residuals, statistics=statistics)
+        return replace(result, mask_residuals=residuals, posterior=posterior)
 
 
 class _Candidate(NamedTuple):

@@ -12,10 +12,11 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import CadalignError, InputError
+from cadalign.estimation.fitted import FittedKeypoints
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.problems import pack_one
 from cadalign.estimation.solve import fitted_fields, solve_one
-from cadalign.estimation.uncertainty.posterior import FittedKeypoints, Likelihood
+from cadalign.estimation.uncertainty.posterior import Likelihood
 from cadalign.estimation.uncertainty.residuals import (
     chi_square_tail,
     f_quantile,
@@ -229,7 +230,7 @@ def find_misfit(result: FittedKeypoints) -> Misfit | None:
     the sum without it, which has one degree of freedom for each scale, and so is the camera's focal
     length.
     """
-    if result.options.sigma is None:
+    if result.options.sigma is None or result.fisher_covariance is None:
         return None
     try:
         tested = _Tested.of(result)

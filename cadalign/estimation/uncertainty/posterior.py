@@ -14,12 +14,12 @@ import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
+from cadalign.estimation.fitted import FittedKeypoints
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import LOSSES, FitOptions, pixel_information
 from cadalign.estimation.problems import distinct_rows, whitening_by
@@ -31,9 +31,8 @@ from cadalign.estimation.uncertainty.residuals import (
     whitening_matrices,
 )
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera, needs_facing
+from cadalign.geometry.camera import needs_facing
 from cadalign.geometry.rotations import by_rotation
-from cadalign.geometry.symmetry import Symmetry
 from cadalign.solvers.draws import Centred, LogPriors, WhitenedPixels, weigh_draws
 
 MOST_POINTS = 100
@@ -50,29 +49,6 @@ _NOISE_OF_DRAWS = 1.25  # ratio of variances that the draws cannot tell from 1
 _SEED = 0
 # Of an estimated sigma: that from an order statistic varies more than that from a sum of squares.
 _EFFICIENCY = {"linear": 1.0, "huber": 0.7, "cauchy": 0.7}
-
-
-@dataclass(frozen=True, eq=False)
-class FittedKeypoints:
-    """Keypoints of an exact or stretched model in one view, with the alignment that fits them.
-
-    Fields without a comment are those of `cadalign.Result`.
-    """
-
-    points_3d: FloatArray  # (n, 3) on the model, of the keypoints that the view shows
-    residuals: FloatArray
-    inliers: BoolArray
-    alignment: Alignment
-    camera: Camera
-    options: FitOptions
-    sigma: float | None = None
-    fisher_covariance: FloatArray | None = None
-    symmetry: Symmetry | None = None
-
-    @property
-    def chosen_sigma(self) -> Any:
-        """The keypoints' standard deviation or covariances [px]: given, or estimated."""
-        return self.sigma if self.options.sigma is None else self.options.sigma
 
 
 @dataclass(frozen=True, eq=False)

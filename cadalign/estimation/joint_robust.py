@@ -235,7 +235,7 @@ def under_cauchy(evidence: Evidence) -> Evidence:
     return evidence._replace(sightings=old._replace(loss=np.full(len(old.loss), CAUCHY)))
 
 
-def with_sightings(evidence: Evidence, kept: BoolArray) -> Evidence:
+def with_sightings(evidence: Evidence, kept: BoolArray | IntArray) -> Evidence:
     """The evidence of some sightings."""
     return evidence._replace(sightings=kept_rows(evidence.sightings, kept))
 

@@ -174,7 +174,7 @@ class FitOptions(AlignmentOptions):
         return (
             self.method == "optimal"
             and self.sigma is None
-            and (self.loss != "linear" or self.prior_weight > 0 or self.focal_prior is not None)
+            and (self.loss != "linear" or self.prior_weight > 0 or self.focal == "estimate")
         )
 
     @property

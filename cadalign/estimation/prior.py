@@ -212,6 +212,17 @@ class Lenses:
         return max(self.groups, default=-1) + 1
 
     @property
+    def are_distorted(self) -> bool:
+        """True if a camera of unknown focal length has lens distortion."""
+        own = zip(self.cameras, self.groups, strict=True)
+        return any(bool(camera.distortion) and group >= 0 for camera, group in own)
+
+    @property
+    def focal_lengths(self) -> FloatArray:
+        """The references (F,) of unknown focal lengths [px]."""
+        return np.array([camera.fx for camera in self._firsts])
+
+    @property
     def _firsts(self) -> list[Camera]:
         return [self.cameras[self.groups.index(group)] for group in range(self.count)]
 

@@ -9,7 +9,8 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.errors import InputError
 from cadalign.estimation.estimates import mean_state
 from cadalign.estimation.joint_robust import (
     JointConsensus,
@@ -20,7 +21,7 @@ from cadalign.estimation.joint_robust import (
     without_hidden,
 )
 from cadalign.estimation.mistakes import Support, area_of, check_support
-from cadalign.estimation.prior import Lenses
+from cadalign.estimation.prior import Lenses, is_exact
 from cadalign.estimation.problem import Inits, Problem
 from cadalign.estimation.problems import no_redundancy_error
 from cadalign.estimation.starts import Start, Starts, starts_of
@@ -28,10 +29,13 @@ from cadalign.estimation.uncertainty.evidence import count_equations
 from cadalign.estimation.uncertainty.posterior import widening_of
 from cadalign.estimation.view import View
 from cadalign.solvers.joint.evidence import Evidence, Shape, State, points_of
-from cadalign.solvers.joint.search import refine_joint, score_state, search_joint
+from cadalign.solvers.joint.search import costs_at, refine_joint, score_state, search_joint
 
 _MOST_PER_FOCAL = 8  # starts of one pose, at each focal length of the grid
 _MOST_PER_FOCAL_OF_SEVERAL = 3
+_COARSE_SIGHTINGS = 256  # of a view of an exact model, which separate the starts
+_SAME_BRANCH = 0.6  # chord between rotations of one minimum at neighbouring focal lengths
+_SAME = 1e-3  # difference of rotations and log focal lengths of one minimum
 _ITERATIONS = 100  # about a lens that is linearised anew
 _LENS_ROUNDS = 12  # of linearising lenses with distortion about the focal lengths
 _SETTLED = 1e-8  # change of a log focal length
@@ -69,6 +73,11 @@ class Minimum(NamedTuple):
         return own if np.isfinite(own) else 0.0
 
     @property
+    def focal_lengths(self) -> FloatArray:
+        """The estimated focal lengths (F,) [px]."""
+        return self.lenses.focal_lengths * np.exp(self.state.log_focals)
+
+    @property
     def points(self) -> FloatArray:
         """The shape's points (m, 3) before the stretch."""
         return points_of(self.evidence.shape, self.state) / np.exp(self.state.log_scales)
@@ -79,11 +88,11 @@ def minima_at_noise(problem: Problem, init: Inits) -> tuple[list[Minimum], int, 
     minima: list[Minimum] = []
     iterations = hypotheses = 0
     for number, shape in enumerate(problem.prior.components):
-        evidence = problem.evidence(shape, problem.lenses)
-        starts = _starts(problem, shape, init)
+        lenses, starts = _starts(problem, shape, init)
         hypotheses += len(starts.poses)
         if not len(starts.poses):
             continue
+        evidence = problem.evidence(shape, lenses)
         if any(init) and _is_left_to_outlines(problem, evidence):
             found, used = _states_of(evidence, starts), 0
         else:
@@ -91,16 +100,15 @@ def minima_at_noise(problem: Problem, init: Inits) -> tuple[list[Minimum], int, 
         iterations += used
         prior_score = -2 * float(np.log(problem.prior.weights[number]))
         minima.extend(
-            Minimum(number, *each._replace(score=each.score + prior_score), problem.lenses)
+            Minimum(number, *each._replace(score=each.score + prior_score), lenses)
             for minimum in found
             for each in without_hidden(minimum)
         )
     if problem.ransac is not None and minima:
         best = min(minima, key=lambda each: each.score)
         _check_support(problem, best, problem.threshold(problem.ransac))
-    lenses = zip(problem.lenses.cameras, problem.lenses.groups, strict=True)
-    if any(camera.distortion and group >= 0 for camera, group in lenses):
-        minima = [_relinearised(problem, each) for each in minima]
+    if problem.lenses.are_distorted:
+        minima = _distinct([_relinearised(problem, each) for each in minima])
     minima.sort(key=lambda minimum: minimum.score)
     return minima, iterations, hypotheses
 
@@ -145,26 +153,97 @@ def _searched(
     return found, used
 
 
-def _starts(problem: Problem, shape: Shape, init: Inits) -> Starts:
-    """Starts at every focal length of the grid, or at those that are known."""
+def _starts(problem: Problem, shape: Shape, init: Inits) -> tuple[Lenses, Starts]:
+    """Starts at every focal length of the grid, and the lenses that these are relative to.
+
+    Where focal lengths are unknown, the lenses are those of the start of the lowest cost: lenses
+    with distortion are linear near it. Focal lengths at which a lens cannot be undone have none.
+    """
     lenses, ransac = problem.lenses, problem.ransac
-    found = []
+    found: list[tuple[Lenses, Starts, FloatArray]] = []
+    failure: InputError | None = None
+    plain = None if lenses.are_distorted else _thinned(problem.evidence(shape, lenses))
     for log_focals in lenses.grid():
-        known = Lenses(tuple(lenses.cameras_at(log_focals)), (-1,) * len(lenses.cameras))
-        evidence = problem.evidence(shape, known)
+        there = replace(lenses, cameras=tuple(lenses.cameras_at(log_focals)))
+        try:
+            if plain is None:
+                evidence = _thinned(problem.evidence(shape, there))
+            else:
+                evidence = _zoomed(plain, log_focals, there)
+        except InputError as error:
+            failure = error
+            continue
         first = _start(init, evidence)
         if ransac is None:
             starts = starts_of(evidence, first)
         else:
             trusted = [cast("FloatArray | None", view.scores) for view in problem.views]
             starts = robust_starts(evidence, ransac, trusted, first)
-        if lenses.count:
-            one = starts.poses.shape[1] == 1
-            most = _MOST_PER_FOCAL if one else _MOST_PER_FOCAL_OF_SEVERAL
-            poses, log_scales = starts.poses[:most], starts.log_scales[:most]
-            starts = Starts(poses, np.tile(log_focals, (len(poses), 1)), log_scales)
-        found.append(starts)
-    return Starts(*(np.concatenate(column) for column in zip(*found, strict=True)))
+        if not lenses.count:
+            return lenses, starts
+        one = starts.poses.shape[1] == 1
+        most = _MOST_PER_FOCAL if one else _MOST_PER_FOCAL_OF_SEVERAL
+        starts = Starts(*(column[:most] for column in starts))
+        found.append((there, starts, costs_at(evidence, *starts)))
+    if failure is not None and not found:
+        raise failure
+    number = np.repeat(np.arange(len(found)), [len(costs) for _, _, costs in found])
+    costs = np.concatenate([own for _, _, own in found])
+    order = np.argsort(costs, kind="stable")
+    reference = found[number[order[0]]][0] if len(costs) else lenses
+    ratios = np.array([each.focal_lengths for each, _, _ in found]) / reference.focal_lengths
+    poses, log_scales = (
+        np.concatenate([getattr(starts, name) for _, starts, _ in found])
+        for name in ("poses", "log_scales")
+    )
+    if ransac is None and is_exact(evidence):
+        order = order[_unimproved(poses, costs, number)[order]]
+    return reference, Starts(poses[order], np.log(ratios)[number[order]], log_scales[order])
+
+
+def _thinned(evidence: Evidence) -> Evidence:
+    """Evidence about an unknown focal length, with as many sightings as tell starts apart."""
+    count, most = len(evidence.sightings.point), _COARSE_SIGHTINGS * len(evidence.rig.pose)
+    if count <= most or not len(evidence.focals.low) or not is_exact(evidence):
+        return evidence
+    return with_sightings(evidence, np.arange(most) * count // most)
+
+
+def _zoomed(evidence: Evidence, log_focals: FloatArray, lenses: Lenses) -> Evidence:
+    """The evidence with rays of ``lenses`` without distortion, ``log_focals`` (F,) longer."""
+    sightings = evidence.sightings
+    logs = np.append(log_focals, 0.0)[evidence.focals.group[sightings.image], None]
+    seen = sightings._replace(
+        rays=sightings.rays * np.exp(-logs), whitening=sightings.whitening * np.exp(logs)
+    )
+    return evidence._replace(sightings=seen, focals=lenses.focals())
+
+
+def _unimproved(poses: FloatArray, costs: FloatArray, number: IntArray) -> BoolArray:
+    """True for the starts (S,) that none at a neighbouring focal length improves on.
+
+    Starts whose rotations are nearly the same lie on the way to the same minimum; ``number`` (S,)
+    is that of their focal length in the grid.
+    """
+    turns = poses[:, None, :, :9] - poses[None, :, :, :9]
+    is_one = (np.linalg.norm(turns, axis=-1) < _SAME_BRANCH).all(axis=-1)
+    is_next = np.abs(number[:, None] - number) == 1
+    return np.asarray(~(is_one & is_next & (costs < costs[:, None])).any(axis=1))
+
+
+def _distinct(minima: Sequence[Minimum]) -> list[Minimum]:
+    """The minima without those that lie at the same place as a likelier one."""
+    kept: list[Minimum] = []
+    for each in sorted(minima, key=lambda minimum: minimum.score):
+        if not any(_are_same(each, other) for other in kept):
+            kept.append(each)
+    return kept
+
+
+def _are_same(first: Minimum, second: Minimum) -> bool:
+    turned = np.abs(first.state.poses[:, :9] - second.state.poses[:, :9]).max()
+    zoomed = np.abs(np.log(first.focal_lengths / second.focal_lengths)).max(initial=0.0)
+    return first.component == second.component and max(turned, zoomed) < _SAME
 
 
 def _relinearised(problem: Problem, minimum: Minimum) -> Minimum:

@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.compile import fast_sums
+from cadalign.compile import fast_sums, kernel
 from cadalign.solvers.constants import LEAST_POINTS, LINEAR, UNKNOWNS, ScalePrior
 from cadalign.solvers.evidence import KeypointEvidence
 from cadalign.solvers.joint.evidence import Evidence, Shape, State, packed, unpacked
 from cadalign.solvers.joint.system import Joint, joint_cost, joint_score
 from cadalign.solvers.optimal import optimal_batch
-from cadalign.solvers.search import Effort, descend, refine, room_for_minima, search
+from cadalign.solvers.search import Effort, cost_at, descend, refine, room_for_minima, search
 from cadalign.solvers.starts import widen_by_shape
 
 _PROBE_ITERATIONS = 8
@@ -42,9 +42,7 @@ def search_joint(
     """
     reduction = reduce_modes(evidence)
     fewer, count = reduction.evidence, len(poses)
-    system = Joint(fewer, False)
-    unmoved = np.zeros((count, len(fewer.shape.modes) + fewer.shape.mean.size))
-    starts = np.concatenate([poses.reshape(count, -1), log_focals, log_scales, unmoved], axis=1)
+    system, starts = Joint(fewer, False), _mean_rows(fewer, poses, log_focals, log_scales)
     minima = room_for_minima(max(count, 1), starts.shape[1])
     if _has_latent(fewer):
         effort = Effort(count, _FEW_ITERATIONS, 0, _UNLIKELY)
@@ -62,6 +60,32 @@ def search_joint(
     ]
     costs, scores = minima.costs[:found], minima.scores[:found]
     return JointMinima(states, costs, scores), int(minima.counts[1])
+
+
+def _mean_rows(
+    evidence: Evidence, poses: FloatArray, log_focals: FloatArray, log_scales: FloatArray
+) -> FloatArray:
+    """States (S, D) of the mean shape."""
+    count = len(poses)
+    unmoved = np.zeros((count, len(evidence.shape.modes) + evidence.shape.mean.size))
+    rows = poses.reshape(count, 12 * poses.shape[1])
+    return np.concatenate([rows, log_focals, log_scales, unmoved], axis=1)
+
+
+def costs_at(
+    evidence: Evidence, poses: FloatArray, log_focals: FloatArray, log_scales: FloatArray
+) -> FloatArray:
+    """Costs (S,) of the mean shape at starts as those of `search_joint`."""
+    rows = _mean_rows(evidence, poses, log_focals, log_scales)
+    return _costs_of(Joint(evidence, False), rows)
+
+
+@kernel
+def _costs_of(system: Joint, rows: FloatArray) -> FloatArray:
+    costs = np.empty(rows.shape[0])
+    for s in range(rows.shape[0]):
+        costs[s] = cost_at(system, rows[s])
+    return costs
 
 
 def _excess(system: Joint, starts: FloatArray) -> float:
@@ -145,7 +169,8 @@ def view_starts(evidence: Evidence, view: int) -> tuple[FloatArray, FloatArray]:
         LEAST_POINTS,
     )
     own = costs[0, : min(info[0, 0], MOST_PER_VIEW)]
-    poses = found[0, : int((own < costs[0, 0] + _UNLIKELY_POSE).sum())]
+    variance = max(1.0, costs[0, 0] / (2 * len(given.points)))
+    poses = found[0, : int((own < costs[0, 0] + _UNLIKELY_POSE * variance).sum())]
     place = np.argsort(order)
     rotations = poses[:, :9].reshape(-1, 3, 3)[:, :, place].reshape(-1, 9)
     return np.concatenate([rotations, poses[:, 9:12]], axis=1), np.log(poses[:, 12 + place])

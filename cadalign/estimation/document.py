@@ -18,7 +18,7 @@ from cadalign.estimation.options import FitOptions, pixel_information
 from cadalign.estimation.result_data import ResultData
 from cadalign.estimation.result_parts import Posterior, ViewResult
 from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals, Misfit
-from cadalign.estimation.warning import EstimateWarning, Kind
+from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
@@ -34,7 +34,7 @@ from cadalign.io.documents import (
 
 VERSION = 1
 Matrix = list[list[Finite]]
-ResultKind = TypeVar("ResultKind", bound=ResultData)
+Kind = TypeVar("Kind", bound=ResultData)
 Read = TypeVar("Read")
 Made = TypeVar("Made")
 _BEHIND = (math.inf, math.inf)
@@ -113,15 +113,6 @@ class _Summary(ForeignDocument):
     share: NotNegative | None = None  # of a photo
 
 
-class _Warning(ForeignDocument):
-    """The fields of `EstimateWarning`."""
-
-    kind: Kind
-    text: str
-    view: int | None
-    keypoints: tuple[int, ...]
-
-
 class _Outlier(ForeignDocument):
     row: int
     distance_px: NotNegative
@@ -165,7 +156,7 @@ class _Result(ForeignDocument):
     stretched_axes: str
     focal: Literal["known", "estimate"]
     stats: FitStats
-    warnings: list[_Warning]
+    warnings: tuple[EstimateWarning, ...]
     bounds: Matrix | None = None
     stretch: Point3 | None = None
     points_covariance: list[Matrix] | None = None
@@ -204,7 +195,7 @@ def write_result(result: ResultData) -> dict[str, Any]:
         "rms": result.rms,
         "stretch": result.stretch.tolist(),
         "std": None if std is None else {**vars(std)},
-        "warnings": [each.to_dict() for each in result.warnings],
+        "warnings": [{**vars(each), "keypoints": [*each.keypoints]} for each in result.warnings],
         "ids": list(result.ids),
         "points_3d": result.points_3d.tolist(),
         "bounds": _plain(result.own_bounds),
@@ -284,7 +275,7 @@ def _plain_prior(prior: PriorOption) -> Any:
     return asdict(prior) if isinstance(prior, FocalPrior) else prior
 
 
-def read_result(data: Mapping[str, Any], kind: type[ResultKind]) -> ResultKind:
+def read_result(data: Mapping[str, Any], kind: type[Kind]) -> Kind:
     """Read the parsed form of a result; see `cadalign.Result.from_dict`.
 
     Raises InputError if a field is missing or invalid.
@@ -297,7 +288,7 @@ def read_result(data: Mapping[str, Any], kind: type[ResultKind]) -> ResultKind:
         raise InputError(error.what, where=place, fix=error.fix) from None
 
 
-def _result(read: _Result, kind: type[ResultKind]) -> ResultKind:
+def _result(read: _Result, kind: type[Kind]) -> Kind:
     unknowns = 10 if read.focal == "estimate" else 9
     views = _each("views", read.views, lambda view: _view(view, unknowns))
     in_camera = read.points_cam_covariance
@@ -306,7 +297,7 @@ def _result(read: _Result, kind: type[ResultKind]) -> ResultKind:
         fisher_covariance=_array(read.fisher_covariance, "fisher_covariance", unknowns, unknowns),
         points_covariance=_array(read.points_covariance, "points_covariance", None, 3, 3),
         points_cam_covariance=_array(in_camera, "points_cam_covariance", None, 3, 3),
-        warnings=tuple(EstimateWarning(**msgspec.structs.asdict(each)) for each in read.warnings),
+        warnings=read.warnings,
         misfit=_misfit(read.misfit),
         evidence=tuple(map(_read_evidence, read.evidence)),
         degrees_of_freedom=read.degrees_of_freedom,

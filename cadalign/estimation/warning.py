@@ -6,7 +6,7 @@ This module alone lists the kinds. Whoever chooses, counts or stores warnings do
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 Kind = Literal[
     "mistake",
@@ -82,10 +82,6 @@ class EstimateWarning:
 
     def __repr__(self) -> str:
         return repr(self.text)
-
-    def to_dict(self) -> dict[str, Any]:
-        """The fields as plain numbers, words and lists, for JSON."""
-        return {**vars(self), "keypoints": list(self.keypoints)}
 
 
 Warnings = tuple[EstimateWarning, ...]

@@ -12,27 +12,29 @@ import numpy as np
 from cadalign.arrays import worker_count
 from cadalign.errors import (
     CadalignError,
+    DegenerateError,
     InputError,
     NoConsensusError,
     quote,
     require_kind,
 )
 from cadalign.estimation.contours import refine_with_images
+from cadalign.estimation.diagnose import diagnose, diagnose_refusal
 from cadalign.estimation.fitted import FitStats
 from cadalign.estimation.focal import PriorOption
-from cadalign.estimation.joint import result_of_minima
-from cadalign.estimation.joint_mistakes import joint_mistake, mistake_beside, no_pose_error
+from cadalign.estimation.joint import result_of_minima, with_mistake
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.outline_starts import starts_by_outlines
 from cadalign.estimation.prior import Lenses
-from cadalign.estimation.problem import Problem, compile_problem
+from cadalign.estimation.problem import Problem, compile_problem, no_pose_error
 from cadalign.estimation.problems import each_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.results import Results
 from cadalign.estimation.search import find_minima, widened_by_noise
 from cadalign.estimation.single import align_plain, align_single, is_plain, is_single
 from cadalign.estimation.view import View, numbered
+from cadalign.estimation.warning import Warnings
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
@@ -121,23 +123,39 @@ def align(
         exact = cast(Model, model)
         return align_plain(exact, given[0], options=options, ransac=ransac)
     problem = compile_problem(model, given, size, inits, options, ransac)
-    return align_single(problem, start) if is_single(problem) else _align_joint(problem, start)
+
+    def again(model: Model | ShapeModel, views: Sequence[View]) -> Result:
+        some = [None] * len(views)
+        return _estimate(compile_problem(model, views, size, some, options, ransac), start)
+
+    taking_part = [given[number] for number in problem.numbers]
+    try:
+        result = _estimate(problem, start)
+    except (NoConsensusError, DegenerateError) as error:
+        named = diagnose_refusal(
+            model, taking_part, again, ransac, with_keypoints=isinstance(error, NoConsensusError)
+        )
+        error.fix = named or error.fix
+        raise
+    if loss == FitOptions.loss:
+        mistake = diagnose(model, taking_part, again, result=result, ransac=ransac)
+        if mistake is not None:
+            return with_mistake(result, mistake)
+    return result
 
 
-def _align_joint(problem: Problem, start: float) -> Result:
+def _estimate(problem: Problem, start: float) -> Result:
     """All stages of an estimate that was begun at ``start`` [s]."""
+    if is_single(problem):
+        return align_single(problem, start)
     problem, starts = starts_by_outlines(problem)
+    notes: Warnings = ()
     if len(problem.views) == 1 and not any(problem.inits) and problem.is_mask_alone:
         from cadalign.estimation.contours.silhouette_starts import minima_of_mask  # with OpenCV
 
-        minima, iterations, hypotheses, mistake = minima_of_mask(problem)
+        minima, iterations, hypotheses, notes = minima_of_mask(problem)
     else:
-        try:
-            problem, minima, iterations, hypotheses = find_minima(problem, starts)
-        except NoConsensusError as error:
-            error.fix = mistake_beside(problem) or error.fix
-            raise
-        mistake = joint_mistake(problem, minima[0]) if minima else None
+        problem, minima, iterations, hypotheses = find_minima(problem, starts)
     if not minima:
         raise no_pose_error(problem)
     has_mesh = isinstance(problem.model, Model) and problem.model.mesh is not None
@@ -149,7 +167,7 @@ def _align_joint(problem: Problem, start: float) -> Result:
         minima = without_covered(problem, minima)
     minima, refined = refine_with_images(problem.model, problem.prior, problem.views, minima)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
-    result = result_of_minima(problem, widened_by_noise(problem, minima), stats, mistake=mistake)
+    result = result_of_minima(problem, widened_by_noise(problem, minima), stats, notes=notes)
     for each in refined:
         result = each.noted_in(result)
     return result

@@ -13,24 +13,10 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray, as_floats
 from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.estimation.focal import check_estimable, focal_grid, prior_of_camera
-from cadalign.estimation.mistakes import (
-    SOLUTIONS_OF_FOUR,
-    Explained,
-    Mistake,
-    Support,
-    area_of,
-    check_support,
-    disagreeing,
-    find_mistake,
-    larger_sizes,
-    log_expected_by_chance,
-    share_as_moderate,
-)
 from cadalign.estimation.options import (
     MINIMAL_SOLVERS,
     FitOptions,
     RansacOptions,
-    pixel_information,
 )
 from cadalign.estimation.problems import (
     Problems,
@@ -40,6 +26,15 @@ from cadalign.estimation.problems import (
     whitening_of,
 )
 from cadalign.estimation.solve import camera_of, solve_one
+from cadalign.estimation.support import (
+    SOLUTIONS_OF_FOUR,
+    Support,
+    area_of,
+    check_support,
+    disagreeing,
+    log_expected_by_chance,
+    share_as_moderate,
+)
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, faced, turned_poses
@@ -88,13 +83,6 @@ class RobustSearch:
     def threshold(self) -> float:
         """Largest reprojection error of an inlier [px]."""
         return self.ransac.threshold(self.options.sigma)
-
-    def without(self, mistake: Mistake) -> RobustSearch:
-        """The search with a mistake undone."""
-        given = self.problems
-        points_3d = mistake.undo_3d(given.points_3d)
-        points_2d = mistake.undo_2d(given.points_2d, given.cameras[0])
-        return replace(self, problems=replace(given, points_3d=points_3d, points_2d=points_2d))
 
     def residuals_of(self, alignment: Alignment, camera: Camera) -> FloatArray:
         """Projected minus observed keypoints (n, 2) [px]; infinite behind the camera."""
@@ -145,46 +133,6 @@ class RobustSearch:
     def _support(self, residuals: FloatArray, inliers: BoolArray) -> Support:
         errors = np.linalg.norm(residuals[inliers], axis=1)
         return Support(errors, len(inliers), self.area)
-
-    @np.errstate(all="ignore")  # residuals that overflow are outliers'
-    def explained(self, alignment: Alignment, residuals: FloatArray) -> Explained:
-        """Likelihood of all keypoints with residuals (n, 2) [px]: an outlier lies anywhere."""
-        sigma, limit = self.options.sigma, self.threshold
-        if sigma is None:
-            sigma = limit / _SIGMAS
-        information = pixel_information(sigma, len(residuals))
-        kept = np.linalg.norm(residuals, axis=1) < limit
-        finite = np.where(kept[:, None], residuals, 0.0)
-        squares = np.einsum("ni,nij,nj->n", finite, information, finite)
-        normal = squares + math.log(4 * math.pi**2) - np.log(np.linalg.det(information))
-        uniform = 2 * math.log(self.area)
-        score = np.where(kept, np.minimum(normal, uniform), uniform).sum()
-        score += (np.log(alignment.scale) ** 2).sum() / _STRETCH_SIGMA**2
-        return Explained(float(score), int(kept.sum()), -float(alignment.rotation[1, 1]))
-
-    @np.errstate(all="ignore")  # what is not finite explains nothing
-    def mistake_in(self, alignment: Alignment, residuals: FloatArray) -> EstimateWarning | None:
-        """Name the mistake without which the keypoints agree better; see `find_mistake`.
-
-        ``alignment`` and ``residuals`` (n, 2) [px] are those of the estimate.
-        """
-        found, given = self.explained(alignment, residuals), len(residuals)
-
-        def explain(mistake: Mistake) -> Explained | None:
-            own = self.without(mistake)
-            try:
-                if found.inliers == given:  # which samples need not be drawn for
-                    solved = solve_one(own.problems, own.options)
-                    pose = Alignment.from_packed(solved.poses[0, 0])
-                    return own.explained(pose, solved.residuals)
-                best = find_consensus(own)
-                own.check(best)
-                return own.explained(best.alignment, best.residuals)
-            except CadalignError:
-                return None
-
-        sizes = larger_sizes(self.problems.points_2d, self.problems.cameras[0])
-        return find_mistake(found, given, explain, sizes)
 
 
 def find_consensus(search: RobustSearch) -> Consensus:

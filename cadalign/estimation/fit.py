@@ -12,8 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, copied
-from cadalign.errors import CadalignError, InputError, require_kind
+from cadalign.errors import CadalignError, InputError, NoConsensusError, require_kind
 from cadalign.estimation.assemble import keypoints_of_solution, result_of_keypoints
+from cadalign.estimation.fitted import FittedKeypoints
 from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.estimation.problems import Problems, each_of, in_threads, pack_many, pack_one
@@ -278,19 +279,38 @@ def _fit_one(
     start: float,
 ) -> Result:
     """Fit the only problem, which was begun at ``start`` [s]."""
+    try:
+        fitted = fit_once(problems, options, ransac, scores, start)
+    except NoConsensusError as error:
+        from cadalign.estimation.diagnose import diagnose_refusal, estimates_by_fit
+
+        data, again = estimates_by_fit(
+            problems.points_3d, problems.points_2d, problems.camera(0), options, ransac
+        )
+        error.fix = diagnose_refusal(*data, again, ransac) or error.fix
+        raise
+    return result_of_keypoints(problems.points_2d, fitted, symmetry=symmetry)
+
+
+def fit_once(
+    problems: Problems,
+    options: FitOptions,
+    ransac: RansacOptions | None,
+    scores: npt.ArrayLike | None,
+    start: float,
+) -> FittedKeypoints:
+    """Fit the only problem, without a diagnosis of keypoints that no alignment explains."""
     options = options.for_camera(problems.camera(0))
     if ransac is None:
         solutions = solve_one(problems, options)
         seconds = time.perf_counter() - start
-        fitted = keypoints_of_solution(problems, solutions, options, seconds)
-    else:
-        # Only here: most programs never search for outliers, and its kernels take time to import.
-        from cadalign.estimation.robust import fit_robustly, fit_similar_robustly
+        return keypoints_of_solution(problems, solutions, options, seconds)
+    # Only here: most programs never search for outliers, and its kernels take time to import.
+    from cadalign.estimation.robust import fit_robustly, fit_similar_robustly
 
-        is_noise_known = options.sigma is not None or ransac.max_reproj_error is not None
-        search = fit_robustly if is_noise_known else fit_similar_robustly
-        fitted = search(problems, options, ransac, scores, start)
-    return result_of_keypoints(problems.points_2d, fitted, symmetry=symmetry)
+    is_noise_known = options.sigma is not None or ransac.max_reproj_error is not None
+    search = fit_robustly if is_noise_known else fit_similar_robustly
+    return search(problems, options, ransac, scores, start)
 
 
 # Checking options takes as long as solving a small problem linearly, and calls repeat them.

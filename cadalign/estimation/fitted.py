@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.estimation.options import FitOptions
+from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.alignment import Alignment, Box, extent
 from cadalign.geometry.camera import Camera
@@ -80,8 +80,9 @@ NO_STATS = FitStats(0, 0, 0.0)
 class KeypointSearch(Protocol):
     """How inliers were searched for, which tells what is doubtful of those that were found."""
 
-    def mistake_in(self, alignment: Alignment, residuals: FloatArray) -> EstimateWarning | None:
-        """Name the mistake without which more keypoints agree."""
+    @property
+    def ransac(self) -> RansacOptions:
+        """Its options."""
 
     def doubt(self, residuals: FloatArray, inliers: BoolArray) -> EstimateWarning | None:
         """Warn where chance supports as many."""

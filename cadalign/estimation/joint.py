@@ -26,7 +26,7 @@ from cadalign.estimation.estimates import (
 )
 from cadalign.estimation.fitted import Alternative, FitStats
 from cadalign.estimation.focal import prior_of_camera
-from cadalign.estimation.mistakes import outside_image
+from cadalign.estimation.image_checks import outside_image
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import camera_like, is_exact, widened, with_known_shape
 from cadalign.estimation.problem import Problem
@@ -66,6 +66,7 @@ from cadalign.solvers.linalg import cholesky, solve_cholesky
 
 _Held = tuple[bool, bool, bool]
 _ITERATIONS = 50
+_EXPLAINED_KINDS = ("contradiction", "misfit", "outlier", "unit", "noise")
 _ALONG_AXES = 1e-6  # of a rotation's entries, that are 0 or 1 where it takes axes to axes
 
 
@@ -232,11 +233,11 @@ def result_of_minima(
     minima: Sequence[Minimum],
     stats: FitStats,
     *,
-    mistake: EstimateWarning | None = None,
+    notes: Warnings = (),
 ) -> Result:
     """The result of minima, of which the likely ones count, with a widened prior of the shape.
 
-    ``mistake`` is a warning about one in the data.
+    ``notes`` are further warnings.
 
     Raises DegenerateError if the evidence determines none of them.
     """
@@ -283,7 +284,7 @@ def result_of_minima(
         likely,
         inliers=_inliers(problem, minimum),
         is_curved=symmetry is None and not is_exact(minimum.evidence),
-        warnings=warnings if mistake is None else (mistake,),
+        warnings=(*warnings, *notes),
         evidence=tuple(
             each if each.view is None else replace(each, view=numbers[each.view])
             for each in summaries_of(minimum.evidence, minimum.state, seen_by)
@@ -299,6 +300,12 @@ def result_of_minima(
         focal="estimate" if minimum.lenses.count else "known",
         focal_prior=prior_of_camera(minimum.lenses.prior, views[0].camera),
     )
+
+
+def with_mistake(result: Result, mistake: EstimateWarning) -> Result:
+    """The result with a mistake in the data in the place of the warnings that it explains."""
+    others = [each for each in result.warnings if each.kind not in _EXPLAINED_KINDS]
+    return replace(result, posterior=result.posterior.stating(warnings=(mistake, *others)))
 
 
 def common_sigma(views: Sequence[View]) -> float | None:

@@ -200,6 +200,56 @@ def compile_problem(
     return problem.without(_views_without_pose(problem))
 
 
+def no_pose_error(problem: Problem) -> DegenerateError:
+    """The error where no start leads to a pose: what the evidence lacks, and what to give.
+
+    Raises InputError if a mask or photo is given for a model without meshes.
+    """
+    views = problem.views
+    seen = sum(len(view.keypoint_ids) > 0 for view in views)
+    shown = [
+        f"views[{view.number}].{'image' if view.mask is None else 'mask'}"
+        for view in views
+        if view.mask is not None or view.image is not None
+    ]
+    if shown:
+        from cadalign.estimation.contours.surface import surfaces_of  # imports this package
+
+        keypoints = problem.prior.components[0].mean[: len(problem.prior.ids)]
+        surfaces_of(problem.model, keypoints, shown[0])
+    if shown:
+        is_rig = len(views) > 1 and views[0].cam_from_rig is not None
+        if not seen and len(views) == 1 and views[0].mask is not None:
+            return DegenerateError(
+                "a mask without keypoints does not tell the pose of an object that is only similar",
+                where=shown[0],
+                fix="give at least 3 keypoints, `init`, or the object's own model",
+            )
+        if not seen and len(views) == 1:
+            return DegenerateError(
+                "a photo without keypoints does not tell where its outline is to be sought",
+                where=shown[0],
+                fix="give `init`, at least 3 keypoints, or a mask",
+            )
+        if not seen:
+            return DegenerateError(
+                "photos of several views tell no pose without keypoints",
+                where="views",
+                fix="give at least 3 keypoints in one view, masks of two, or `init`",
+            )
+        if is_rig and seen == 1 and problem.size is None:
+            return DegenerateError(
+                "keypoints of one view alone leave open the size that the known motion gives",
+                where="views",
+                fix="give a keypoint or a mask in another view, `size`, or `init`",
+            )
+    return DegenerateError(
+        "no pose has the keypoints in front of the camera",
+        where="views",
+        fix="give at least 3 keypoints in one view, or `init`, and check which is which",
+    )
+
+
 def _views_without_pose(problem: Problem) -> list[int]:
     """Numbers of the views of unknown motion whose keypoints determine no pose.
 

@@ -15,9 +15,12 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError, InputError, NoConsensusError
 from cadalign.estimation.assemble import keypoints_of_solution
-from cadalign.estimation.consensus import Consensus, RobustSearch, find_consensus, refined
+from cadalign.estimation.consensus import RobustSearch, find_consensus, refined
 from cadalign.estimation.fitted import FitStats, FittedKeypoints
-from cadalign.estimation.mistakes import (
+from cadalign.estimation.options import FitOptions, RansacOptions
+from cadalign.estimation.problems import Problems, check_sigmas
+from cadalign.estimation.solve import solve_one
+from cadalign.estimation.support import (
     LEAST_ERROR,
     SOLUTIONS_OF_FOUR,
     Support,
@@ -25,9 +28,6 @@ from cadalign.estimation.mistakes import (
     disagreeing,
     log_expected_by_chance,
 )
-from cadalign.estimation.options import FitOptions, RansacOptions
-from cadalign.estimation.problems import Problems, check_sigmas
-from cadalign.estimation.solve import solve_one
 from cadalign.estimation.uncertainty.residuals import f_quantile
 
 _REACH = 3.0  # estimated sigmas within which keypoints agree
@@ -62,7 +62,8 @@ def fit_robustly(
     )
     trusted = None if scores is None else np.array(scores)
     search = RobustSearch(given, options, ransac, trusted)
-    best, optimum = _found(search), None
+    best, optimum = find_consensus(search), None
+    search.check(best)
     # As many samples would find the support that a corrected mistake gives, which is more.
     ransac = replace(ransac, max_iterations=best.iterations)
     if ransac.refine:
@@ -89,18 +90,6 @@ def fit_robustly(
         stats=FitStats(best.iterations, best.hypotheses, seconds, ratio, best.score),
         search=replace(search, ransac=ransac),
     )
-
-
-def _found(search: RobustSearch) -> Consensus:
-    """The consensus; where there is none, the error names the mistake that is to blame."""
-    best = find_consensus(search)
-    try:
-        search.check(best)
-    except NoConsensusError as error:
-        mistake = search.mistake_in(best.alignment, best.residuals)
-        error.fix = error.fix if mistake is None else mistake.text
-        raise
-    return best
 
 
 def fit_similar_robustly(

@@ -20,11 +20,11 @@ from cadalign.estimation.joint_robust import (
     with_sightings,
     without_hidden,
 )
-from cadalign.estimation.mistakes import Support, area_of, check_support
 from cadalign.estimation.prior import Lenses, is_exact
 from cadalign.estimation.problem import Inits, Problem
 from cadalign.estimation.problems import no_redundancy_error
 from cadalign.estimation.starts import Start, Starts, starts_of
+from cadalign.estimation.support import Support, area_of, check_support
 from cadalign.estimation.uncertainty.evidence import count_equations
 from cadalign.estimation.uncertainty.posterior import widening_of
 from cadalign.estimation.view import View

@@ -12,13 +12,12 @@ from typing import cast
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import DegenerateError, InputError
+from cadalign.errors import DegenerateError
 from cadalign.estimation.assemble import result_of_keypoints
 from cadalign.estimation.estimates import with_boxes
 from cadalign.estimation.fit import fit
 from cadalign.estimation.fitted import FitStats, FittedKeypoints
 from cadalign.estimation.joint import Estimate, as_given, common_sigma, result_of
-from cadalign.estimation.mistakes import Explained, Mistake, find_in_all, larger_sizes
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.pack import seen_keypoints
@@ -29,19 +28,15 @@ from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.uncertainty.evidence import summary_of_keypoints
 from cadalign.estimation.uncertainty.shape_posterior import SeenShape, ShapeTails, keypoint_misfits
 from cadalign.estimation.view import View
-from cadalign.estimation.warning import EstimateWarning, Warnings
+from cadalign.estimation.warning import Warnings
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import turned_alignment
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import inflation_with
 from cadalign.solvers.constants import LEAST_POINTS, LINEAR
-from cadalign.solvers.marginal.equations import POSE
 from cadalign.solvers.marginal.posterior import posteriors_of
 from cadalign.solvers.marginal.problem import Mixture
 from cadalign.solvers.marginal.search import search_view
-
-_SUSPICIOUS = 2.0  # reduced chi-square at which a mistake in the keypoints is looked for
-_DECISIVE = 10.0  # of -2 log likelihood, times the variance of shapes that were held out
 
 
 def is_plain(model: object, views: Sequence[View]) -> bool:
@@ -143,10 +138,6 @@ def align_single(problem: Problem, start: float) -> Result:
             tails=ShapeTails(inflation, model.degrees_of_freedom),
             focal=view.camera.fx,
         )
-        if warnings or cost > _SUSPICIOUS * (2 * len(rows) - POSE):
-            score = float(minima.scores[0]) - _DECISIVE * inflation**2
-            mistake = _mistake_in(mixture, view, rows, options, score)
-            warnings = warnings if mistake is None else (mistake,)
     return result_of(
         problem,
         [as_given(each, problem) for each in estimates],
@@ -161,36 +152,6 @@ def align_single(problem: Problem, start: float) -> Result:
         known_axis=None,
         stretched_axes="",
     )
-
-
-def _mistake_in(
-    mixture: Mixture,
-    view: View,
-    rows: list[int],
-    options: FitOptions,
-    score: float,
-) -> EstimateWarning | None:
-    """Name the mistake without which the keypoints fit the shape, below that score."""
-    given = view.pixels
-
-    def explain(mistake: Mistake) -> Explained | None:
-        if mistake.mirrored:  # not a learned shape: its models share one frame
-            return None
-        try:
-            seen = seen_keypoints(view, mistake.undo_2d(given, view.camera), rows, options)
-        except InputError:  # which a wide lens that faces the given ones does not see
-            return None
-        minima, _ = search_view(mixture, seen, _given(None))
-        if not minima.counts[0] or minima.costs[0] > _SUSPICIOUS * (2 * len(rows) - POSE):
-            return None
-        up = -float(minima.states[0, 4])
-        return Explained(float(minima.scores[0]), len(rows), up)
-
-    found = find_in_all(score, len(rows), explain, larger_sizes(given, view.camera))
-    if found is None:
-        return None
-    text = f"{found[0]}: corrected, the keypoints fit the learned shapes"
-    return EstimateWarning("mistake", text)
 
 
 def _given(init: Alignment | None) -> FloatArray:

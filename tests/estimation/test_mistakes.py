@@ -16,14 +16,10 @@ from support.scenes import seen as seen_in_scene
 
 from cadalign import Camera, Model, RansacOptions, Result, View, align, fit
 from cadalign.errors import CadalignError, NoConsensusError
-from cadalign.estimation import EstimateWarning
-from cadalign.estimation.mistakes import (
-    Explained,
-    Mistake,
+from cadalign.estimation.support import (
     Support,
     area_of,
     check_support,
-    find_mistake,
     log_expected_by_chance,
     share_as_moderate,
 )
@@ -257,7 +253,7 @@ def test_likelihoods_tell_mistakes_that_a_similar_model_follows(mistake: str) ->
                 alarms += bool(texts)
             elif found.inliers.mean() > 0.9:
                 followed += 1
-                named += any("times as likely" in text for text in texts)
+                named += bool(texts)
     assert alarms == 0
     assert named >= 0.3 * followed > 0
 
@@ -290,30 +286,3 @@ def test_an_up_that_points_down_is_told_to_be_the_opposite(view: dict[str, Any])
 def test_an_endless_extent_of_keypoints_is_cut_to_the_image() -> None:
     points = np.array([[0.0, 0.0], [1e308, 275.0], [-1e308, 100.0]])
     assert area_of(points, CENTRED, 2.0) == 640 * 480
-
-
-def test_what_explains_no_more_keypoints_is_no_mistake() -> None:
-    asked: list[Mistake] = []
-
-    def explain(score: float, inliers: int) -> EstimateWarning | None:
-        asked.clear()
-
-        def answer(mistake: Mistake) -> Explained:
-            asked.append(mistake)
-            return Explained(score, inliers, 1.0)
-
-        return find_mistake(Explained(100.0, 9, 1.0), 12, answer)
-
-    assert explain(50.0, 9) is None
-    assert explain(101.0, 10) is None
-    assert len(asked) == 2
-    assert explain(50.0, 10) is not None
-    assert find_mistake(Explained(100.0, 9, 1.0), 12, lambda mistake: None) is None
-
-
-def test_a_mistake_made_twice_is_undone() -> None:
-    pixels = np.random.default_rng(0).uniform(0, 400, (5, 2))
-    mistake = Mistake("", mirrored=True, flipped=(True, True))
-    np.testing.assert_allclose(mistake.undo_3d(mistake.undo_3d(CHAIR)), CHAIR)
-    twice = mistake.undo_2d(mistake.undo_2d(pixels, CENTRED), CENTRED)
-    np.testing.assert_allclose(twice, pixels)

@@ -35,7 +35,7 @@ from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.problem import Problem
 from cadalign.estimation.search import Minimum, find_minima
 from cadalign.estimation.view import View
-from cadalign.estimation.warning import EstimateWarning
+from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import model_rays
 from cadalign.geometry.camera import Camera, turned_alignment
 from cadalign.geometry.mesh import Mesh
@@ -147,7 +147,7 @@ class _Start(NamedTuple):
 
 def minima_of_mask(
     problem: Problem,
-) -> tuple[list[Minimum], int, int, EstimateWarning | None]:
+) -> tuple[list[Minimum], int, int, Warnings]:
     """Minima of the evidence beside the mask of the only view, at alignments that resemble it.
 
     The model is exact and has a mesh. The best is the first; then numbers of iterations and of
@@ -176,18 +176,18 @@ def minima_of_mask(
             "is the object's; or give an init or keypoints",
         )
     misfit, size = pixel * ends[0].misfit, pixel * contour.contour.size
-    warning = None
+    warnings: Warnings = ()
     if misfit > max(_FAR_PX, _FAR * size):
         text = (
             f"{where}: the outline of the best pose found is {misfit:.1f} px from the mask's on "
             "average: the object may be partly hidden, the model another, or the pose wrong"
         )
-        warning = EstimateWarning("mask", text, view.number)
+        warnings = (EstimateWarning("mask", text, view.number),)
     likely = [each for each in ends if each.cost <= ends[0].cost + _CLOSE]
     poses = [poses_of(each.minimum.evidence, each.minimum.state)[0] for each in likely]
     chosen = distinct(zip(poses, likely, strict=True), _MOST_ENDS, model.symmetry)
     minima = [each.minimum._replace(outline_score=each.over(chosen[0])) for each in chosen]
-    return minima, steps, starts, warning
+    return minima, steps, starts, warnings
 
 
 def _searched(problem: Problem, model: Model, contour: ViewContour) -> tuple[list[_End], int, int]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.estimation.fitted import FittedKeypoints
 from cadalign.estimation.focal import focal_doubt
 from cadalign.estimation.options import pixel_information
-from cadalign.estimation.uncertainty.misfit import mistake_in_fit, unexplained, unverified_stretch
+from cadalign.estimation.uncertainty.misfit import has_large_sigma, unexplained, unverified_stretch
 from cadalign.estimation.uncertainty.posterior import posterior_covariance
 from cadalign.estimation.uncertainty.summary import (
     EvidenceSummary,
@@ -42,12 +44,12 @@ def keypoint_warnings(
     fitted: FittedKeypoints, misfit: Misfit | None, covariance: FloatArray | None
 ) -> Warnings:
     """Warnings about mistakes, a misfit, and what the keypoints do not determine."""
-    mistake = _mistake(fitted, misfit)
-    if mistake is not None:  # nothing else can be said of the alignment
-        return (mistake,)
     ahead = np.isfinite(fitted.residuals).all(axis=1)
     in_camera = fitted.alignment.apply(fitted.points_3d[ahead])
     observed = fitted.camera.project_where_ahead(in_camera) - fitted.residuals[ahead]
+    mistake = _mistake(fitted, misfit, observed)
+    if mistake is not None:  # nothing else can be said of the alignment
+        return (mistake,)
     placed = _placed(fitted.camera, observed, misfit)
     if covariance is None:
         return placed
@@ -69,18 +71,38 @@ def keypoint_warnings(
     return (*placed, *_doubts(fitted, misfit, observed), *weak, *others)
 
 
-def _mistake(fitted: FittedKeypoints, misfit: Misfit | None) -> EstimateWarning | None:
-    if fitted.search is not None:
-        return fitted.search.mistake_in(fitted.alignment, fitted.residuals)
-    if fitted.fisher_covariance is None or (misfit is None and fitted.options.sigma is not None):
+def _mistake(
+    fitted: FittedKeypoints, misfit: Misfit | None, observed: FloatArray
+) -> EstimateWarning | None:
+    """A mistake in the keypoints, where they fail their test; ``observed`` are those ahead."""
+    ransac = None if fitted.search is None else fitted.search.ransac
+    if ransac is None and fitted.fisher_covariance is None:
         return None
-    return mistake_in_fit(fitted, misfit)
+    if fitted.inliers.all():
+        if misfit is None and not has_large_sigma(fitted):
+            return None
+        ransac = None  # samples need not be drawn
+    from cadalign.estimation.diagnose import diagnose, estimates_by_fit  # rarely asked
+
+    ahead, options = np.isfinite(fitted.residuals).all(axis=1), fitted.options
+    if options.sigma is not None and np.ndim(options.sigma) > 0:
+        options = replace(options, sigma=np.asarray(options.sigma)[ahead])
+    points = fitted.points_3d[ahead]
+    (model, views), again = estimates_by_fit(points, observed, fitted.camera, options, ransac)
+    return diagnose(
+        model,
+        views,
+        again,
+        ransac=ransac,
+        has_reason=misfit is not None and bool(misfit.outliers or misfit.free_scale),
+        rival=None if misfit is None else misfit.camera,
+    )
 
 
 def _placed(camera: Camera, observed: FloatArray, misfit: Misfit | None) -> Warnings:
     if camera.is_centred and camera.contains(observed).all():
         return ()
-    from cadalign.estimation.mistakes import outside_image  # rarely asked
+    from cadalign.estimation.image_checks import outside_image  # rarely asked
 
     return outside_image(observed, camera, agree=misfit is None)
 

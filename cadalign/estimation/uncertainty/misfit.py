@@ -19,7 +19,6 @@ from cadalign.estimation.solve import fitted_fields, solve_one
 from cadalign.estimation.uncertainty.posterior import Likelihood
 from cadalign.estimation.uncertainty.residuals import (
     chi_square_tail,
-    f_quantile,
     f_quantile_of_two,
 )
 from cadalign.estimation.uncertainty.summary import Misfit, percent, uncertainty_of
@@ -29,7 +28,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.solvers.projection import predicted_covariances, projection_jacobian
 
 if TYPE_CHECKING:
-    from cadalign.estimation.mistakes import Explained, Mistake
+    pass
 
 Rows = npt.NDArray[np.intp]
 _FALSE_OUTLIERS = 0.01
@@ -302,7 +301,7 @@ def _contradicting_camera(tested: _Tested) -> Camera | None:
         return None
     if tested.passes and tested.decrease_by_focal() < _WORTH_A_SEARCH:
         return None
-    from cadalign.estimation.mistakes import OTHER_SIZES  # rarely asked
+    from cadalign.estimation.image_checks import OTHER_SIZES  # rarely asked
 
     found = [tested.again(focal="estimate")]
     for factor in OTHER_SIZES:
@@ -353,61 +352,10 @@ def unexplained(sigma: float, points_2d: Sequence[FloatArray]) -> Warnings:
     return (EstimateWarning("noise", text),)
 
 
-def mistake_in_fit(result: FittedKeypoints, misfit: Misfit | None) -> EstimateWarning | None:
-    """Name the mistake in the keypoints of a fit without which they would fit.
-
-    ``misfit`` may have a camera that they fit as they are. Returns a warning; None where keypoints
-    fit, and where no mistake explains the misfit better than that camera. Another image size, which
-    leaves nearly as much open as a stretch, counts only where neither a stretch nor a few wrong
-    keypoints explain it.
-    """
-    from cadalign.estimation.mistakes import Explained, find_in_all, other_sizes
-
-    camera = None if misfit is None else misfit.camera
-    has_reason = misfit is not None and bool(misfit.outliers or misfit.free_scale)
-    try:
-        tested = _Tested.of(result)
-    except InputError:  # a depth that rounds to zero has no projection
-        return None
-    redundancy, keypoints = tested.redundancy, len(tested.rows)
-    if redundancy < 1:
-        return None
-    sigma, most = result.sigma if result.options.sigma is None else None, math.inf
-    if sigma is None:
-        if chi_square_tail(tested.chi_square, redundancy) >= _MISTAKE_CHANCE:
-            return None
-    else:
-        if sigma < _LARGE * np.ptp(tested.points_2d, axis=0).max():
-            return None
-        most = tested.chi_square / f_quantile(redundancy, redundancy, _CHANCE_OF_RATIO)
-
-    def score(fitted: _Tested) -> float:
-        """Twice the negative log likelihood, at the likeliest sigma where it is not known."""
-        if sigma is None:
-            return fitted.chi_square
-        return 2 * keypoints * math.log(max(fitted.chi_square, _LEAST_SQUARES))
-
-    def explain(mistake: Mistake) -> Explained | None:
-        points_3d: FloatArray = mistake.undo_3d(tested.points_3d)
-        points_2d = mistake.undo_2d(tested.points_2d, tested.camera)
-        found = replace(tested, points_3d=points_3d, points_2d=points_2d).again()
-        if found is None or not found.passes or found.chi_square * mistake.factor**2 > most:
-            return None
-        corrected[mistake] = math.sqrt(found.chi_square / redundancy)
-        return Explained(score(found), keypoints, -float(found.alignment.rotation[1, 1]))
-
-    corrected: dict[Mistake, float] = {}
-    sizes: Sequence[Mistake] = () if has_reason else other_sizes(tested.points_2d, tested.camera)
-    named = find_in_all(score(tested), keypoints, explain, sizes)
-    if named is None:
-        return None
-    clauses, mistake, best = named
-    if camera is not None and score(_Tested.of(tested.fit(camera=camera))) < best:
-        return None
-    given = math.sqrt(tested.chi_square / redundancy)
-    what, unit = ("the residuals are", " times what sigma explains")
-    if sigma is not None:
-        what, unit, given = "sigma is", " px", given * sigma
-    after = corrected[mistake] * (sigma or 1.0)
-    text = f"{clauses}: corrected, {what} {after:.2g}{unit}; as given, {given:.2g}{unit}"
-    return EstimateWarning("mistake", text)
+def has_large_sigma(result: FittedKeypoints) -> bool:
+    """True for an estimated sigma that is large beside the extent of the keypoints."""
+    if result.options.sigma is not None or result.sigma is None:
+        return False
+    observed = result.camera.project_where_ahead(result.alignment.apply(result.points_3d))
+    extent = np.ptp((observed - result.residuals)[result.inliers], axis=0).max()
+    return bool(result.sigma > _LARGE * extent)

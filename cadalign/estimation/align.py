@@ -126,7 +126,8 @@ def align(
 
     def again(model: Model | ShapeModel, views: Sequence[View]) -> Result:
         some = [None] * len(views)
-        return _estimate(compile_problem(model, views, size, some, options, ransac), start)
+        problem = compile_problem(model, views, size, some, options, ransac)
+        return _estimate(problem, start, has_warnings=False)
 
     taking_part = [given[number] for number in problem.numbers]
     try:
@@ -144,7 +145,7 @@ def align(
     return result
 
 
-def _estimate(problem: Problem, start: float) -> Result:
+def _estimate(problem: Problem, start: float, *, has_warnings: bool = True) -> Result:
     """All stages of an estimate that was begun at ``start`` [s]."""
     if is_single(problem):
         return align_single(problem, start)
@@ -167,7 +168,8 @@ def _estimate(problem: Problem, start: float) -> Result:
         minima = without_covered(problem, minima)
     minima, refined = refine_with_images(problem.model, problem.prior, problem.views, minima)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
-    result = result_of_minima(problem, widened_by_noise(problem, minima), stats, notes=notes)
+    likely = widened_by_noise(problem, minima)
+    result = result_of_minima(problem, likely, stats, notes=notes, has_warnings=has_warnings)
     for each in refined:
         result = each.noted_in(result)
     return result

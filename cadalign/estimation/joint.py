@@ -234,10 +234,11 @@ def result_of_minima(
     stats: FitStats,
     *,
     notes: Warnings = (),
+    has_warnings: bool = True,
 ) -> Result:
     """The result of minima, of which the likely ones count, with a widened prior of the shape.
 
-    ``notes`` are further warnings.
+    ``notes`` are further warnings; those about contradictions take time.
 
     Raises DegenerateError if the evidence determines none of them.
     """
@@ -275,7 +276,9 @@ def result_of_minima(
     tails = ShapeTails(inflation, prior.degrees_of_freedom)
     numbers = [view.number for view in views]
     seen_by = minimum.lenses.cameras_at(minimum.state.log_focals)
-    warnings = warnings_of(minimum.evidence, minimum.state, minimum.cost, tails, numbers)
+    warnings: Warnings = ()
+    if has_warnings:
+        warnings = warnings_of(minimum.evidence, minimum.state, minimum.cost, tails, numbers)
     if problem.lacks_sigma:
         pixels = [view.pixels for view in views if view.sigma is None]
         warnings = (*unexplained(problem.noise, pixels), *warnings)

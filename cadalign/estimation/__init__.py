@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from cadalign.estimation.uncertainty.summary import (
         EvidenceSummary,
         MaskResiduals,
-        Misfit,
         Uncertainty,
     )
     from cadalign.estimation.view import View
@@ -38,7 +37,6 @@ __all__ = [
     "FitStats",
     "FocalPrior",
     "MaskResiduals",
-    "Misfit",
     "Model",
     "RansacOptions",
     "Result",

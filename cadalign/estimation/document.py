@@ -17,7 +17,7 @@ from cadalign.estimation.focal import FocalPrior, PriorOption
 from cadalign.estimation.options import FitOptions, pixel_information
 from cadalign.estimation.result_data import ResultData
 from cadalign.estimation.result_parts import Posterior, ViewResult
-from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals, Misfit
+from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -113,19 +113,6 @@ class _Summary(ForeignDocument):
     share: NotNegative | None = None  # of a photo
 
 
-class _Outlier(ForeignDocument):
-    row: int
-    distance_px: NotNegative
-
-
-class _Misfit(ForeignDocument):
-    chi_square: float
-    redundancy: int
-    free_scale: Point3 | None
-    outliers: list[_Outlier]
-    camera: dict[str, Any] | None = None
-
-
 class _Mask(ForeignDocument):
     """The fields of `MaskResiduals`; null for a number that is not known."""
 
@@ -167,7 +154,6 @@ class _Result(ForeignDocument):
     cost: float | None = None
     alternatives: tuple[_Alternative, ...] = ()
     evidence: tuple[_Summary, ...] = ()
-    misfit: _Misfit | None = None
     options: _Options | None = None
     focal_prior: FocalPrior | None = None
     symmetry: Any = None  # in the form of `Symmetry.from_dict`
@@ -186,7 +172,7 @@ class _Result(ForeignDocument):
 
 def write_result(result: ResultData) -> dict[str, Any]:
     """A result as plain lists and numbers; its model is not part of it."""
-    std, misfit, posterior = result.std, result.misfit, result.posterior
+    std, posterior = result.std, result.posterior
     return {
         "version": VERSION,
         **{name: getattr(result, name) for name in _PLAIN},
@@ -228,7 +214,6 @@ def write_result(result: ResultData) -> dict[str, Any]:
             for other in result.alternatives
         ],
         "evidence": [_written_evidence(each) for each in result.evidence],
-        "misfit": misfit and misfit.to_dict(),
         "options": result.options and _plain_options(result.options),
         "symmetry": result.symmetry and result.symmetry.to_dict(),
         "equal_under_symmetry": result.equal_under_symmetry,
@@ -298,7 +283,6 @@ def _result(read: _Result, kind: type[Kind]) -> Kind:
         points_covariance=_array(read.points_covariance, "points_covariance", None, 3, 3),
         points_cam_covariance=_array(in_camera, "points_cam_covariance", None, 3, 3),
         warnings=read.warnings,
-        misfit=_misfit(read.misfit),
         evidence=tuple(map(_read_evidence, read.evidence)),
         degrees_of_freedom=read.degrees_of_freedom,
     )
@@ -333,14 +317,6 @@ def _view(read: _View, unknowns: int) -> ViewResult:
         np.array(read.inliers, dtype=bool),
         Posterior.stated(_array(read.covariance, "covariance", unknowns, unknowns)),
     )
-
-
-def _misfit(read: _Misfit | None) -> Misfit | None:
-    if read is None:
-        return None
-    outliers = {each.row: each.distance_px for each in read.outliers}
-    camera = None if read.camera is None else Camera.from_dict(read.camera)
-    return Misfit(read.chi_square, read.redundancy, read.free_scale, outliers, camera)
 
 
 def _mask(read: _Mask | None) -> MaskResiduals | None:

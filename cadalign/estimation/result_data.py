@@ -24,7 +24,7 @@ from cadalign.geometry.symmetry import Symmetry
 
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
-    from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals, Misfit
+    from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals
     from cadalign.estimation.warning import EstimateWarning
     from cadalign.geometry.mesh import Mesh
     from cadalign.shapes.model import ShapeModel
@@ -215,15 +215,6 @@ class ResultData:
         """Covariance (m, 3, 3) of each keypoint in the first camera's frame."""
         stated = self.posterior.points_cam_covariance
         return stated if stated is not None or self._of_points is None else self._of_points[1]
-
-    @property
-    def misfit(self) -> Misfit | None:
-        """Result of a chi-square test of residuals that the given sigma does not explain.
-
-        None if they pass (of right data, 99.5 % or more do), for an estimated sigma, and for
-        methods that are not statistical. For several pieces of evidence, see ``warnings``.
-        """
-        return self.posterior.misfit
 
     @property
     def warnings(self) -> tuple[EstimateWarning, ...]:

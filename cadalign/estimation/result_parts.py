@@ -17,7 +17,6 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.fitted import FittedKeypoints, quickly
 from cadalign.estimation.uncertainty.summary import (
     EvidenceSummary,
-    Misfit,
     Uncertainty,
     uncertainty_of,
 )
@@ -60,22 +59,13 @@ class Posterior:
         return keypoint_covariance(self.keypoints)
 
     @cached_property
-    def misfit(self) -> Misfit | None:
-        """See `cadalign.Result.misfit`."""
-        if self.keypoints is None:
-            return None
-        from cadalign.estimation.uncertainty.misfit import find_misfit
-
-        return find_misfit(self.keypoints)
-
-    @cached_property
     def warnings(self) -> Warnings:
         """See `cadalign.Result.warnings`."""
         if self.keypoints is None:
             return ()
         from cadalign.estimation.uncertainty.keypoints import keypoint_warnings
 
-        return keypoint_warnings(self.keypoints, self.misfit, self.covariance)
+        return keypoint_warnings(self.keypoints, self.covariance)
 
     @cached_property
     def evidence(self) -> tuple[EvidenceSummary, ...]:

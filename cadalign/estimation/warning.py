@@ -88,3 +88,6 @@ Warnings = tuple[EstimateWarning, ...]
 
 UNDETERMINED_KINDS: frozenset[Kind] = frozenset({"scale", "translation", "rotation", "focal"})
 """Kinds about what is hardly determined."""
+
+MISFIT_KINDS: frozenset[Kind] = frozenset({"misfit", "outlier", "stretch", "camera", "mistake"})
+"""Kinds about keypoints that do not fit."""

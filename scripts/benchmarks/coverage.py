@@ -15,6 +15,7 @@ from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, T, Tables
 from cadalign import Alignment, Camera, Model, RansacOptions, Result, View
 from cadalign.arrays import FloatArray
+from cadalign.estimation.warning import MISFIT_KINDS
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.metrics.cramer_rao import probability_level
 from cadalign.evaluation.simulation import Problem, simulate_problem
@@ -127,7 +128,7 @@ def _warnings(seed: int, problems: int, noise_px: float) -> Iterator[Row]:
             result for problem, result in fits if _is_large(result.alignment, problem.alignment)
         ]
         silent = sum(not result.warnings and not result.alternatives for result in large)
-        misfits = sum(result.misfit is not None for _, result in fits)
+        misfits = sum(any(w.kind in MISFIT_KINDS for w in result.warnings) for _, result in fits)
         yield {
             "data": name,
             "fits": len(fits),

@@ -10,11 +10,16 @@ from cadalign.arrays import FloatArray
 from cadalign.estimation.fitted import FittedKeypoints
 from cadalign.estimation.focal import focal_doubt
 from cadalign.estimation.options import pixel_information
-from cadalign.estimation.uncertainty.misfit import has_large_sigma, unexplained, unverified_stretch
+from cadalign.estimation.uncertainty.misfit import (
+    Misfit,
+    find_misfit,
+    has_large_sigma,
+    unexplained,
+    unverified_stretch,
+)
 from cadalign.estimation.uncertainty.posterior import posterior_covariance
 from cadalign.estimation.uncertainty.summary import (
     EvidenceSummary,
-    Misfit,
     another_pose,
     weaknesses_of_keypoints,
 )
@@ -40,10 +45,9 @@ def keypoint_covariance(fitted: FittedKeypoints) -> FloatArray | None:
     return without_free_turns(covariance, best)
 
 
-def keypoint_warnings(
-    fitted: FittedKeypoints, misfit: Misfit | None, covariance: FloatArray | None
-) -> Warnings:
+def keypoint_warnings(fitted: FittedKeypoints, covariance: FloatArray | None) -> Warnings:
     """Warnings about mistakes, a misfit, and what the keypoints do not determine."""
+    misfit = find_misfit(fitted)
     ahead = np.isfinite(fitted.residuals).all(axis=1)
     in_camera = fitted.alignment.apply(fitted.points_3d[ahead])
     observed = fitted.camera.project_where_ahead(in_camera) - fitted.residuals[ahead]
@@ -94,7 +98,7 @@ def _mistake(
         views,
         again,
         ransac=ransac,
-        has_reason=misfit is not None and bool(misfit.outliers or misfit.free_scale),
+        has_reason=misfit is not None and misfit.has_reason,
         rival=None if misfit is None else misfit.camera,
     )
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,14 +21,11 @@ from cadalign.estimation.uncertainty.residuals import (
     chi_square_tail,
     f_quantile_of_two,
 )
-from cadalign.estimation.uncertainty.summary import Misfit, percent, uncertainty_of
+from cadalign.estimation.uncertainty.summary import percent, uncertainty_of
 from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.projection import predicted_covariances, projection_jacobian
-
-if TYPE_CHECKING:
-    pass
 
 Rows = npt.NDArray[np.intp]
 _FALSE_OUTLIERS = 0.01
@@ -39,14 +36,12 @@ _SCALES = 2  # unknown ones, of an alignment without constraints
 _WORTH_A_SEARCH = 4.0  # linearised decrease of the sum
 _TESTED_TO = 0.1  # relative standard deviation to which a held scale must be tested
 _MOST_ROUNDS = 100  # of a forward search, each of which fits all inliers
+_MOST_NAMED = 5  # outliers, in a sentence
 _MOST_OUTLIERS = 1 / 3  # of the keypoints; more are no outliers
 # Hands click to about 2 px, and shapes differ by as much: weight of that, as of so many equations.
 _CLICK, _CLICK_EQUATIONS = 2.0, 4
-_MISTAKE_CHANCE = 1e-4  # that noise alone leaves residuals in which mistakes are looked for
-_CHANCE_OF_RATIO = 1e-3  # that residuals of an unknown noise differ by as much
 _LARGE = 0.02  # estimated sigma, over the keypoints' extent, that asks for a mistake
 _LARGEST_SHARE = 0.45  # of the keypoints' spread, of an estimated sigma
-_LEAST_SQUARES = 1e-9  # of exact keypoints
 
 PlacedRows = tuple[Alignment, Camera, FloatArray | None]
 FitRows = Callable[[Rows, bool], PlacedRows]
@@ -220,6 +215,18 @@ class _Tested:
             return None
 
 
+class Misfit(NamedTuple):
+    """A warning about residuals that the noise does not explain; a camera that would, if any."""
+
+    warning: EstimateWarning
+    camera: Camera | None = None
+
+    @property
+    def has_reason(self) -> bool:
+        """True where a few keypoints or the stretch are to blame."""
+        return self.warning.kind in ("outlier", "stretch")
+
+
 def find_misfit(result: FittedKeypoints) -> Misfit | None:
     """Test the residuals of the inliers by chi-square; None if they pass, or sigma is estimated.
 
@@ -235,16 +242,46 @@ def find_misfit(result: FittedKeypoints) -> Misfit | None:
         tested = _Tested.of(result)
     except (InputError, np.linalg.LinAlgError):  # a depth, or a weight, that rounds to zero
         return None
-    sums = tested.chi_square, tested.redundancy
-    free_scale = _contradicting_scale(tested)
-    if free_scale is not None:
-        return Misfit(*sums, free_scale)
+    scale = _contradicting_scale(tested)
+    if scale is not None:
+        listed = ", ".join(f"{value:.3g}" for value in scale)
+        text = (
+            "the keypoints contradict the constraint on the stretch: without it they fit better, "
+            f"with the scale ({listed})"
+        )
+        return Misfit(EstimateWarning("stretch", text))
     passes = tested.passes
     outliers = {} if passes else _outliers(tested)
     camera = _contradicting_camera(tested) if len(outliers) != 1 else None
     if camera is not None:
-        return Misfit(*sums, camera=camera)
-    return None if passes else Misfit(*sums, outliers=outliers)
+        text = (
+            "the keypoints contradict the camera: they fit one better that has a focal length of "
+            f"{camera.fx:.4g} px and images of {camera.width} x {camera.height} px"
+        )
+        return Misfit(EstimateWarning("camera", text, 0), camera)
+    return None if passes else Misfit(_large_residuals(tested, outliers))
+
+
+def _large_residuals(tested: _Tested, outliers: Mapping[int, float]) -> EstimateWarning:
+    """The warning about residuals; ``outliers`` are rows with their distances [px]."""
+    ratio = math.sqrt(tested.chi_square / tested.redundancy)
+    text = f"the residuals are {ratio:.2g} times as large as sigma explains: "
+    if not outliers:
+        text += (
+            "the keypoints do not fit the model together (wrong pairs, model, stretch or camera), "
+            "or sigma is too small; sigma=None suits a model that is only similar"
+        )
+        return EstimateWarning("misfit", text)
+    worst = sorted(outliers, key=lambda row: -outliers[row])[:_MOST_NAMED]
+    named = ", ".join(f"{row} ({outliers[row]:.3g} px)" for row in worst)
+    if len(worst) < len(outliers):
+        named += f" and {len(outliers) - len(worst)} more"
+    one = len(outliers) == 1
+    text += (
+        f"keypoint{'' if one else 's'} {named} {'does' if one else 'do'} not fit the others "
+        "(counted from 0, with the distance from where those put it)"
+    )
+    return EstimateWarning("outlier", text, 0, tuple(sorted(outliers)))
 
 
 def unverified_stretch(result: FittedKeypoints) -> EstimateWarning | None:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.warning import EstimateWarning, Kind, Warnings
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.shapes.parts import probability_within
 
@@ -28,7 +26,6 @@ _ANOTHER_DEG = 10.0
 _LEAST_TURN = 1e-12  # [rad], and of a relative variance
 _ROUNDING = 1e-12  # relative standard deviation below which a length is known
 _REGION = 0.95  # probability of the stated region, which alternatives outside of it contradict
-_MOST_NAMED = 5  # outliers, in a sentence
 _FIELDS = {
     "keypoints": "points_2d",
     "photo": "image",
@@ -262,73 +259,6 @@ def name_of(kind: str, view: int | None) -> str:
     ('size', 'views[0].depth')
     """
     return kind if view is None else f"views[{view}].{_FIELDS.get(kind, kind)}"
-
-
-@dataclass(frozen=True)
-class Misfit:
-    """Residuals that are larger than the standard deviations of the keypoints explain."""
-
-    chi_square: float
-    """Sum of the losses on the whitened residuals: of their squares, with the linear loss."""
-    redundancy: int
-    """What is expected of it: the equations minus the unknowns."""
-    free_scale: tuple[float, float, float] | None = None
-    """The scales without the constraints on them (stretch=, stretch_sigma), where it is these that
-    contradict the keypoints."""
-    outliers: Mapping[int, float] = field(default_factory=dict)
-    """The keypoints without which the others fit, and their distances from where the others put
-    them [px]; empty where no few keypoints are to blame."""
-    camera: Camera | None = None
-    """The camera that the keypoints fit, where they contradict the given one."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain numbers and lists, for JSON."""
-        return vars(self) | {
-            "free_scale": self.free_scale and list(self.free_scale),
-            "outliers": [{"row": row, "distance_px": px} for row, px in self.outliers.items()],
-            "camera": self.camera and self.camera.to_dict(),
-        }
-
-    @property
-    def warning(self) -> EstimateWarning:
-        """The warning that says it."""
-        if self.free_scale is not None:
-            return EstimateWarning("stretch", str(self))
-        if self.camera is not None:
-            return EstimateWarning("camera", str(self), 0)
-        if self.outliers:
-            return EstimateWarning("outlier", str(self), 0, tuple(sorted(self.outliers)))
-        return EstimateWarning("misfit", str(self))
-
-    def __str__(self) -> str:
-        if self.free_scale is not None:
-            scale = ", ".join(f"{value:.3g}" for value in self.free_scale)
-            return (
-                f"the keypoints contradict the constraint on the stretch: without it they fit "
-                f"better, with the scale ({scale})"
-            )
-        if self.camera is not None:
-            camera = self.camera
-            return (
-                "the keypoints contradict the camera: they fit one better that has a focal length "
-                f"of {camera.fx:.4g} px and images of {camera.width} x {camera.height} px"
-            )
-        ratio = math.sqrt(self.chi_square / self.redundancy)
-        text = f"the residuals are {ratio:.2g} times as large as sigma explains: "
-        if not self.outliers:
-            return text + (
-                "the keypoints do not fit the model together (wrong pairs, model, stretch or "
-                "camera), or sigma is too small; sigma=None suits a model that is only similar"
-            )
-        worst = sorted(self.outliers, key=lambda row: -self.outliers[row])[:_MOST_NAMED]
-        named = ", ".join(f"{row} ({self.outliers[row]:.3g} px)" for row in worst)
-        if len(worst) < len(self.outliers):
-            named += f" and {len(self.outliers) - len(worst)} more"
-        one = len(self.outliers) == 1
-        return text + (
-            f"keypoint{'' if one else 's'} {named} {'does' if one else 'do'} not fit the others "
-            "(counted from 0, with the distance from where those put it)"
-        )
 
 
 @dataclass(frozen=True, eq=False)

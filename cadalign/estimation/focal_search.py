@@ -22,6 +22,7 @@ from cadalign.estimation.uncertainty.posterior import Likelihood
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.projection import projection_jacobian
 from cadalign.solvers.alignment import Objective, covariance_of
 from cadalign.solvers.constants import (
     DEGENERATE,
@@ -34,7 +35,6 @@ from cadalign.solvers.constants import (
 )
 from cadalign.solvers.evidence import KeypointEvidence
 from cadalign.solvers.optimal import MAX_MINIMA
-from cadalign.solvers.projection import projection_jacobian
 from cadalign.solvers.unknowns import orthonormalize, uncenter
 
 _UNKNOWNS_OF_MODEL = [0, 1, 2, 3, 4, 5, 7, 8, 9]  # of a result where the scale of x is known

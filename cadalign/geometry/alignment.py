@@ -181,6 +181,27 @@ def are_on_a_line(points: FloatArray, flat: float) -> bool:
     return bool(extents[1] <= flat * extents[0])
 
 
+def describe_plane(points_3d: FloatArray) -> str | None:
+    """Describe how the points fail to span a volume; None if they span one."""
+    mean = points_3d.mean(axis=0)
+    rows = np.vstack([points_3d - mean, np.zeros((3, 3))])  # at least three
+    if not np.isfinite(rows).all():
+        return None
+    _, spread, axes = np.linalg.svd(rows, full_matrices=False)
+    if spread[0] <= 1e-14 * np.abs(points_3d).max(initial=0.0):
+        return "all points are the same"
+    if spread[1] < 1e-6 * spread[0]:
+        return "the points lie on one line"
+    if spread[2] > 1e-6 * spread[0]:
+        return None
+    normal = axes[2] * np.sign(axes[2][np.argmax(np.abs(axes[2]))])
+    axis = int(np.argmax(np.abs(normal)))
+    if normal[axis] > 1 - 1e-6:
+        return f"the points lie in the plane {'xyz'[axis]} = {mean[axis]:.4g}"
+    words = ", ".join(f"{value:.3g}" for value in normal)
+    return f"the points lie in one plane, with the normal ({words})"
+
+
 def bounds_corners(low: FloatArray, high: FloatArray) -> FloatArray:
     """The 8 corners (8, 3) between lowest and highest coordinates, in the order of a `Box`."""
     return np.where(_CORNER_SIGNS > 0, high, low)

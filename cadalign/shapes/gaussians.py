@@ -16,7 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.solvers.linalg import factorize, invert_factor, product, solve_factor_rows
+from cadalign.compile import fast_sums
+from cadalign.solvers.linalg import factorize, solve_factor_rows
 
 _UNSEEN = 1e-6  # weight of the previous mean: a component without vectors stays where it is
 
@@ -163,7 +164,7 @@ def _conditionals(vectors: Vectors, model: Gaussians) -> list[Conditional]:
         root, offsets, gaps = _root(covariance), vectors.offsets(mean), []
         if vectors.gaps:
             precision = _inverse(root)
-            pulled = product(offsets, precision)
+            pulled = multiplied(offsets, precision)
             for rows, missing in vectors.gaps:
                 of_gap = _root(precision[missing[:, None], missing])
                 gaps.append((of_gap, _solve(of_gap, pulled[rows, missing].T)))
@@ -176,7 +177,7 @@ def _log_densities(vectors: Vectors, model: Gaussians, given: Sequence[Condition
     found = np.empty((len(vectors.values), len(model.weights)))
     constants = vectors.has.sum(axis=1) / 2 * math.log(2 * math.pi)
     for number, (root, offsets, gaps) in enumerate(given):
-        whitened = product(invert_factor(root), np.ascontiguousarray(offsets.T))
+        whitened = multiplied(_inverse_factor(root), np.ascontiguousarray(offsets.T))
         squares = np.einsum("nr,nr->r", whitened, whitened)
         volumes = constants + np.log(root.diagonal()).sum()
         # The density of all entries, integrated over those that are missing.
@@ -215,7 +216,7 @@ def _maximise(
         mean = share @ completed + _UNSEEN * model.means[number]
         mean /= share.sum() + _UNSEEN
         offsets = completed - mean
-        scatter = product(offsets.T, share[:, None] * offsets) + spread
+        scatter = multiplied(offsets.T, share[:, None] * offsets) + spread
         scatter += (strength + _UNSEEN) * towards
         covariance = scatter / (share.sum() + strength + _UNSEEN)
         covariance[np.diag_indices_from(covariance)] += floor**2
@@ -244,5 +245,33 @@ def _solve(root: FloatArray, right: FloatArray) -> FloatArray:
 
 def _inverse(root: FloatArray) -> FloatArray:
     """The inverse of the matrix that has the root."""
-    half = invert_factor(root)
-    return product(half.T, half)
+    half = _inverse_factor(root)
+    return multiplied(half.T, half)
+
+
+@fast_sums
+def _inverse_factor(factor: FloatArray) -> FloatArray:
+    """The inverse of the lower triangle that `factorize` left."""
+    size = factor.shape[0]
+    inverse = np.zeros((size, size))
+    for i in range(size):
+        scale = 1.0 / factor[i, i]
+        for k in range(i):
+            product = factor[i, k] * scale
+            for m in range(k + 1):
+                inverse[i, m] -= product * inverse[k, m]
+        inverse[i, i] = scale
+    return inverse
+
+
+@fast_sums
+def multiplied(first: FloatArray, second: FloatArray) -> FloatArray:
+    """The matrix product (n, k) of (n, m) and (m, k), in one thread."""
+    found = np.zeros((first.shape[0], second.shape[1]))
+    for i in range(first.shape[0]):
+        own = found[i]
+        for j in range(second.shape[0]):
+            share, other = first[i, j], second[j]
+            for c in range(own.shape[0]):
+                own[c] += share * other[c]
+    return found

@@ -73,6 +73,9 @@ def aepnp(
 
 def aepnp_error(points_3d: FloatArray) -> DegenerateError:
     """The error for points that `aepnp_kernel` calls degenerate."""
+    # Only here: kernels are compiled anew where a module that theirs imports has changed.
+    from cadalign.geometry.alignment import describe_plane
+
     if len(points_3d) < MIN_POINTS:
         return DegenerateError(
             f"{len(points_3d)} points are too few for a linear solver",
@@ -93,27 +96,6 @@ def out_of_range_error() -> DegenerateError:
         where="points_3d",
         fix="give the model and the image in other units, and check for outlying values",
     )
-
-
-def describe_plane(points_3d: FloatArray) -> str | None:
-    """Describe how the points fail to span a volume; None if they span one."""
-    mean = points_3d.mean(axis=0)
-    rows = np.vstack([points_3d - mean, np.zeros((3, 3))])  # at least three
-    if not np.isfinite(rows).all():
-        return None
-    _, spread, axes = np.linalg.svd(rows, full_matrices=False)
-    if spread[0] <= 1e-14 * np.abs(points_3d).max(initial=0.0):
-        return "all points are the same"
-    if spread[1] < 1e-6 * spread[0]:
-        return "the points lie on one line"
-    if spread[2] > 1e-6 * spread[0]:
-        return None
-    normal = axes[2] * np.sign(axes[2][np.argmax(np.abs(axes[2]))])
-    axis = int(np.argmax(np.abs(normal)))
-    if normal[axis] > 1 - 1e-6:
-        return f"the points lie in the plane {'xyz'[axis]} = {mean[axis]:.4g}"
-    words = ", ".join(f"{value:.3g}" for value in normal)
-    return f"the points lie in one plane, with the normal ({words})"
 
 
 @fast_sums

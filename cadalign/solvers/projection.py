@@ -8,22 +8,14 @@ row and the translation, and a slope the derivative of a residual by the point i
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import inlined, kernel
-from cadalign.errors import InputError
 from cadalign.solvers.constants import NOT_FOUND, OK, OUT_OF_RANGE, UNKNOWNS
 from cadalign.solvers.linalg import Triple, cross, dot
 from cadalign.solvers.unknowns import is_pose
 
-if TYPE_CHECKING:  # kernels are compiled anew where a module that theirs imports has changed
-    from cadalign.geometry.alignment import Alignment
-    from cadalign.geometry.camera import Camera
-
-_OF_A_RESULT = 10  # unknowns of a result's covariance, focal length included
 Scalars = tuple[float, ...]
 Motion = tuple[float, ...] | FloatArray
 
@@ -200,52 +192,3 @@ def reproject_batch(
             elif not (squares < np.inf and is_pose(poses[b, 0])):
                 checked[b] = OUT_OF_RANGE
     return residuals, checked
-
-
-@kernel
-def all_finite(points_3d: FloatArray, points_2d: FloatArray) -> bool:
-    """True if no coordinate is NaN or infinite: a sum of zeros is zero only then."""
-    total = 0.0
-    for i in range(points_3d.shape[0]):
-        total += 0.0 * (points_3d[i, 0] + points_3d[i, 1] + points_3d[i, 2])
-    for i in range(points_2d.shape[0]):
-        total += 0.0 * (points_2d[i, 0] + points_2d[i, 1])
-    return total == 0.0
-
-
-@kernel
-def pinhole_rays(points_2d: FloatArray, fx: float, fy: float, cx: float, cy: float) -> FloatArray:
-    """Normalised image coordinates (n, 2) of pixels (n, 2), for a lens without distortion."""
-    rays = np.empty((points_2d.shape[0], 2))
-    for i in range(points_2d.shape[0]):
-        rays[i, 0] = (points_2d[i, 0] - cx) / fx
-        rays[i, 1] = (points_2d[i, 1] - cy) / fy
-    return rays
-
-
-def projection_jacobian(points_3d: FloatArray, camera: Camera, alignment: Alignment) -> FloatArray:
-    """Derivatives (n, 2, 10) of projected points, in the order of `cadalign.Result.covariance`.
-
-    In pixels per rad, model unit, and unit of a logarithm. Refuses points behind the camera.
-    """
-    in_camera = alignment.apply(points_3d)
-    if not camera.sees(in_camera).all():
-        raise InputError("a point lies behind the camera", where="points_3d")
-    stretched = points_3d * alignment.scale
-    turned = stretched @ alignment.rotation.T
-    jacobian = np.empty((len(points_3d), 2, _OF_A_RESULT))
-    by_point = camera.projection_slopes(in_camera)
-    jacobian[:, :, :3] = np.cross(turned[:, None], by_point)
-    jacobian[:, :, 3:6] = by_point
-    jacobian[:, :, 6:9] = by_point @ (alignment.rotation * stretched[:, None])
-    jacobian[:, :, 9] = camera.pixels_of_rays(in_camera) - (camera.cx, camera.cy)
-    return jacobian
-
-
-def predicted_covariances(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Covariances (n, 2, 2) [px^2] of predicted projections, without a measurement's own noise.
-
-    By the `projection_jacobian` and the covariance of the unknowns (m, m), the first of its 10.
-    """
-    jacobian = jacobian[:, :, : len(covariance)]
-    return np.asarray(jacobian @ covariance @ jacobian.transpose(0, 2, 1))

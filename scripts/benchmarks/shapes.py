@@ -18,10 +18,10 @@ from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.unseen import UnseenObject
 from cadalign.evaluation.simulation import Problem
+from cadalign.geometry.projection import projection_jacobian
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import rotation_error
 from cadalign.render import look_at
-from cadalign.solvers.projection import projection_jacobian
 
 _SECOND_VIEW = rotation_from_vector(np.array([0.0, np.radians(25.0), 0.0]))
 _NEAR = cadalign.Camera(width=640, height=480, fx=520.0, fy=520.0, cx=319.5, cy=239.5)

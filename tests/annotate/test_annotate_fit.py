@@ -24,11 +24,11 @@ from cadalign.datasets import ModelKeypoint
 from cadalign.errors import DegenerateError, InputError
 from cadalign.evaluation.simulation import Problem
 from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.projection import projection_jacobian
 from cadalign.io.evidence import ImageEvidence
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 from cadalign.render import visible_keypoints
-from cadalign.solvers.projection import projection_jacobian
 
 KNOWN = FocalChoice(known=True)
 STRETCHED = ObjectShape()

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from cadalign.geometry.alignment import describe_plane
 from cadalign.solvers.alignment import center_and_unit
-from cadalign.solvers.linear import describe_plane
 
 
 def test_the_unit_of_points_is_their_root_mean_square_distance_from_the_mean() -> None:

@@ -10,15 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from cadalign import Alignment, Camera
 from cadalign.geometry.pixels import perspective
+from cadalign.geometry.projection import projection_jacobian
 from cadalign.solvers.alignment import Objective, evaluate_alignment, evaluate_cost, room_for
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR, UNKNOWNS
 from cadalign.solvers.evidence import KeypointEvidence, ScalePrior
-from cadalign.solvers.projection import (
-    project_point,
-    projection_jacobian,
-    ray_derivatives,
-    scalars_of,
-)
+from cadalign.solvers.projection import project_point, ray_derivatives, scalars_of
 from cadalign.solvers.unknowns import move_pose
 
 PLAIN = Camera(640, 480, 600, 620, 315, 245)

@@ -17,11 +17,11 @@ from cadalign.geometry.camera import (
     turned_covariance,
 )
 from cadalign.geometry.pixels import perspective
+from cadalign.geometry.projection import projection_jacobian
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.shapes.parts import probability_within
 from cadalign.solvers.alignment import covariance_of, keypoint_objective
 from cadalign.solvers.constants import UNKNOWNS
-from cadalign.solvers.projection import projection_jacobian
 
 _LEAST_INFORMATION = 1e-12
 _LARGEST_LOG = 50.0

@@ -56,6 +56,17 @@ def triple(row: FloatArray) -> Triple:
     return row[0], row[1], row[2]
 
 
+@inlined
+def second_moments(points: FloatArray) -> tuple[float, float, float, float, float, float]:
+    """Sums of xx, xy, xz, yy, yz and zz over points (n, 3)."""
+    xx = xy = xz = yy = yz = zz = 0.0
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        xx, xy, xz = xx + x * x, xy + x * y, xz + x * z
+        yy, yz, zz = yy + y * y, yz + y * z, zz + z * z
+    return xx, xy, xz, yy, yz, zz
+
+
 @fast_sums
 def add_products(rows: FloatArray, columns: int, hessian: FloatArray, gradient: FloatArray) -> None:
     """Add J' J to the upper triangle of ``hessian`` (U, U), and J' r to ``gradient`` (U,).
@@ -181,34 +192,6 @@ def solve_factor_rows(factor: FloatArray, right: FloatArray) -> None:
                 share, other = factor[i, k], block[k]
                 for c in range(own.shape[0]):
                     other[c] -= share * own[c]
-
-
-@fast_sums
-def invert_factor(factor: FloatArray) -> FloatArray:
-    """The inverse of the lower triangle that `factorize` left."""
-    size = factor.shape[0]
-    inverse = np.zeros((size, size))
-    for i in range(size):
-        scale = 1.0 / factor[i, i]
-        for k in range(i):
-            product = factor[i, k] * scale
-            for m in range(k + 1):
-                inverse[i, m] -= product * inverse[k, m]
-        inverse[i, i] = scale
-    return inverse
-
-
-@fast_sums
-def product(first: FloatArray, second: FloatArray) -> FloatArray:
-    """The matrix product (n, k) of (n, m) and (m, k), in one thread."""
-    found = np.zeros((first.shape[0], second.shape[1]))
-    for i in range(first.shape[0]):
-        own = found[i]
-        for j in range(second.shape[0]):
-            share, other = first[i, j], second[j]
-            for c in range(own.shape[0]):
-                own[c] += share * other[c]
-    return found
 
 
 @inlined

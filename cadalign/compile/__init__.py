@@ -79,8 +79,8 @@ class KernelFamily:
     compiled for a type is found by the sources of its module.
     """
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self.__name__, self.__doc__ = function.__name__, function.__doc__
+    def __init__(self, name: str) -> None:
+        self.__name__ = name
         self._members: dict[type, Any] = {}
 
     def of(self, kind: type) -> Callable[[F], F]:

@@ -14,7 +14,6 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.covariance import JointCovariance
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
-from cadalign.solvers.marginal.equations import force_of
 from cadalign.solvers.marginal.problem import Mixture, Seen, shape_at
 from cadalign.solvers.search import Minima
 
@@ -168,7 +167,7 @@ def with_boxes(
     component, axes = minima.label[:count], np.arange(3)
     means, covariances = mixture.means[component], mixture.covariances[component]
     for k in range(count):
-        points = shape_at(mixture, component[k], seen, force_of(minima.states[k]))
+        points = shape_at(mixture, component[k], seen, minima.states[k])
         bounds, rows = _placed_box(points, len(model.ids), seen.points, model)
         means[k, -2:] = means[k, rows, axes] + (bounds - points[rows, axes])
         own = (3 * rows + axes).ravel()

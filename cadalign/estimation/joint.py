@@ -62,7 +62,6 @@ from cadalign.shapes.parts import inflation_with
 from cadalign.solvers.joint.covariance import joint_covariance
 from cadalign.solvers.joint.evidence import points_of
 from cadalign.solvers.joint.search import refine_joint
-from cadalign.solvers.linalg import cholesky, solve_cholesky
 
 _Held = tuple[bool, bool, bool]
 _ITERATIONS = 50
@@ -223,7 +222,7 @@ def _pose_beside(problem: Problem, number: int, best: Estimate) -> tuple[Camera,
     turns = [problem.turns[number]]
     evidence = with_known_shape(evidence_of(problem.prior, [alone], turns=turns), best.points)
     state = mean_state(evidence, best.poses[0].packed[None, :12], np.log(best.scale))
-    _, state, _, _ = refine_joint(evidence, _ITERATIONS, state)
+    _, _, state = refine_joint(evidence, _ITERATIONS, state)
     pose = state.poses[0]
     return camera, Alignment(pose[:9].reshape(3, 3), pose[9:], best.scale)
 
@@ -392,14 +391,15 @@ def _moments(estimates: Sequence[Estimate], view: int) -> tuple[FloatArray, Floa
     """
     best, *others = estimates
     total, distances = best.likelihood * best.covariances[view], np.zeros(len(estimates))
-    factor = best.covariances[view][:3, :3].copy()
-    is_determined = cholesky(factor, 3, 0.0)
+    try:
+        root = np.linalg.inv(np.linalg.cholesky(best.covariances[view][:3, :3]))
+    except np.linalg.LinAlgError:
+        root = np.full((3, 3), np.nan)
     for k, each in enumerate(others, start=1):
         step = _step(best, each, view)
         total += each.likelihood * (each.covariances[view] + step[:, None] * step)
-        solved = step[:3].copy()
-        solve_cholesky(factor, 3, solved)
-        distances[k] = step[:3] @ solved if is_determined else np.inf
+        distance = np.square(root @ step[:3]).sum()
+        distances[k] = distance if np.isfinite(distance) else np.inf
     return total / sum(each.likelihood for each in estimates), distances
 
 

@@ -160,10 +160,10 @@ def without_hidden(found: JointConsensus) -> list[JointConsensus]:
                 break
             shown = again
             evidence = found.evidence._replace(image_depths=kept_rows(depths, shown))
-            cost, state, _, _ = refine_joint(evidence, _ITERATIONS, state)
+            cost, score, state = refine_joint(evidence, _ITERATIONS, state)
             if not cost < np.inf:
                 break
-            score = beside + score_state(evidence, state) + cost_of_hidden(limits, shown)
+            score += beside + cost_of_hidden(limits, shown)
             settled = JointConsensus(found.inliers, evidence, state, cost, score)
         if settled is not None and np.isfinite(settled.score):
             estimates.setdefault(shown.tobytes(), settled)

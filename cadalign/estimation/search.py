@@ -258,7 +258,7 @@ def _relinearised(problem: Problem, minimum: Minimum) -> Minimum:
         there = problem.evidence(minimum.evidence.shape, lenses)
         evidence = with_sightings(there, minimum.inliers)
         state = minimum.state._replace(log_focals=np.zeros_like(log_focals))
-        cost, state, _, _ = refine_joint(evidence, _ITERATIONS, state)
+        cost, _, state = refine_joint(evidence, _ITERATIONS, state)
         if not cost < np.inf:
             break
         minimum = minimum._replace(evidence=evidence, state=state, cost=cost, lenses=lenses)
@@ -379,11 +379,9 @@ def _likeliest(problem: Problem, minimum: Minimum) -> float:
 
     def score(noise: float) -> float:
         scaled = _scaled(minimum, unknown, problem.noise / noise)
-        cost, state, _, _ = refine_joint(scaled.evidence, _NOISE_ITERATIONS, scaled.state)
-        if not cost < np.inf:
-            return math.inf
+        _, least, _ = refine_joint(scaled.evidence, _NOISE_ITERATIONS, scaled.state)
         prior = (math.log(noise / _USUAL) / _USUAL_LOG_SIGMA) ** 2
-        return score_state(scaled.evidence, state) + 4 * count * math.log(noise) + prior
+        return least + 4 * count * math.log(noise) + prior
 
     scores = [score(noise) for noise in _NOISES.tolist()]
     best = int(np.argmin(scores))

@@ -27,6 +27,7 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.uncertainty.evidence import summary_of_keypoints
 from cadalign.estimation.uncertainty.shape_posterior import SeenShape, ShapeTails, keypoint_misfits
+from cadalign.estimation.uncertainty.single_posterior import single_posterior
 from cadalign.estimation.view import View
 from cadalign.estimation.warning import Warnings
 from cadalign.geometry.alignment import Alignment
@@ -34,7 +35,6 @@ from cadalign.geometry.camera import turned_alignment
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import inflation_with
 from cadalign.solvers.constants import LEAST_POINTS, LINEAR
-from cadalign.solvers.marginal.posterior import posteriors_of
 from cadalign.solvers.marginal.problem import Mixture
 from cadalign.solvers.marginal.search import search_view
 
@@ -102,21 +102,23 @@ def align_single(problem: Problem, start: float) -> Result:
     likelihoods = likelihoods[likelihoods >= LEAST_LIKELIHOOD]
     inflation = inflation_with(len(rows), model.inflation, model.few_keypoints)
     placed, chosen = with_boxes(mixture, seen, minima, len(likelihoods), model)
-    likely = posteriors_of(placed, seen, chosen, len(likelihoods), inflation)
-    estimates = [
-        Estimate(
-            likely.points[k],
-            np.ones(3),
-            (Alignment(pose[:9].reshape(3, 3), pose[9:], np.ones(3), is_valid=True),),
-            likely.lengths[k],
-            (likely.covariances[k],),
-            likely.of_points[k],
-            likely.of_seen[k],
-            likelihood,
-            (view.camera,),
+    labels = chosen.label.tolist()
+    estimates = []
+    for k, likelihood in enumerate(likelihoods.tolist()):
+        each = single_posterior(placed, labels[k], seen, chosen.states[k], inflation)
+        estimates.append(
+            Estimate(
+                each.points,
+                np.ones(3),
+                (each.pose,),
+                each.lengths,
+                (each.covariance,),
+                each.of_points,
+                each.of_seen,
+                likelihood,
+                (view.camera,),
+            )
         )
-        for k, (likelihood, pose) in enumerate(zip(likelihoods.tolist(), likely.poses, strict=True))
-    ]
     points = estimates[0].points[rows]
     in_camera = estimates[0].poses[0].apply(points)
     errors = in_camera[:, :2] / in_camera[:, 2:] - seen.rays

@@ -20,6 +20,7 @@ from cadalign.estimation.problems import (
     check_sigmas,
     full_covariance,
     no_redundancy_error,
+    pinhole_rays,
     rays_of,
     solver_error,
     whitening_of,
@@ -28,8 +29,8 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, needs_facing
 from cadalign.solvers.constants import OK, OUT_OF_RANGE, POSE_SIZE
 from cadalign.solvers.linear import aepnp_batch
-from cadalign.solvers.optimal import optimal_batch
-from cadalign.solvers.projection import pinhole_rays, reproject_batch
+from cadalign.solvers.optimal import optimal_batch, rigid_flag
+from cadalign.solvers.projection import reproject_batch
 
 _SIGMA_ROUNDS = 20
 _BOUNDED_ROUNDS = 4  # where only the bound of the scales depends on sigma
@@ -134,9 +135,8 @@ def _solve_one_linearly(problems: Problems, options: FitOptions) -> Solutions | 
     if not plain or camera.distortion or not _is_plain(options.sigma, None):
         return None
     points, pixels, offsets = problems.points_3d, problems.points_2d, problems.offsets
-    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
-    poses, solved = aepnp_batch(points, pinhole_rays(pixels, fx, fy, cx, cy), offsets)
-    calibration = np.array([[fx, fy, cx, cy]])
+    poses, solved = aepnp_batch(points, pinhole_rays(pixels, camera), offsets)
+    calibration = np.array([[camera.fx, camera.fy, camera.cx, camera.cy]])
     residuals, statuses = reproject_batch(points, pixels, offsets, poses, calibration, solved)
     if statuses[0] != OK:
         return None
@@ -228,8 +228,9 @@ def _search(
     given = points, rays, whitening, problems.offsets
     weight, width = options.scale_prior if is_bounded else (options.prior_weight, 0.0)
     scales = options.loss_scale * noises, weight * noises**2, width
-    loss = LOSSES[options.loss]
-    minima = optimal_batch(*given, loss, *scales, options.free, options.min_points)
+    loss, free = LOSSES[options.loss], options.free
+    rigid = rigid_flag(loss, free)
+    minima = optimal_batch(*given, loss, *scales, free, options.min_points, rigid)
     return Solutions(*minima, errors=errors)
 
 

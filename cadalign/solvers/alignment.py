@@ -18,8 +18,8 @@ from cadalign.solvers.evidence import (
     KeypointEvidence,
     add_keypoints,
     add_scale_prior,
+    beyond,
     keypoint_cost,
-    scale_prior_cost,
 )
 from cadalign.solvers.linalg import (
     LEAST_INFORMATION,
@@ -30,7 +30,7 @@ from cadalign.solvers.linalg import (
     solve_cholesky,
 )
 from cadalign.solvers.search import are_same, cost_at, evaluate, move, room_of, score_of, solve
-from cadalign.solvers.unknowns import hold_fixed, move_pose, uncenter
+from cadalign.solvers.unknowns import move_pose, uncenter
 
 _SAME_CHORD = 1e-3
 
@@ -73,9 +73,7 @@ def keypoint_objective(points: FloatArray, rays: FloatArray, whitening: FloatArr
 @room_of.of(Objective)
 @kernel
 def _room_of(objective: Objective) -> tuple[Equations, Equations]:
-    first = room_for(UNKNOWNS)
-    second = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
-    return first, Equations(second[0], second[1], first.rows, first.factor)
+    return room_for(UNKNOWNS), room_for(UNKNOWNS)
 
 
 @evaluate.of(Objective)
@@ -90,7 +88,12 @@ def evaluate_alignment(objective: Objective, pose: FloatArray, equations: Equati
         return np.inf
     cost += add_scale_prior(objective.scale_prior, pose, hessian, gradient)
     mirror_upper(hessian)
-    hold_fixed(objective.free, hessian, gradient)
+    for k in range(UNKNOWNS):
+        if objective.free[k] == 0.0:
+            gradient[k] = 0.0
+            for m in range(UNKNOWNS):
+                hessian[k, m] = hessian[m, k] = 0.0
+            hessian[k, k] = 1.0
     return cost
 
 
@@ -98,8 +101,9 @@ def evaluate_alignment(objective: Objective, pose: FloatArray, equations: Equati
 @borrowing
 def evaluate_cost(objective: Objective, pose: FloatArray) -> float:
     """The cost of a pose, without derivatives."""
-    cost = keypoint_cost(objective.keypoints, pose)
-    return cost + scale_prior_cost(objective.scale_prior, pose)
+    prior = objective.scale_prior
+    y, z = beyond(np.log(pose[13]), prior.width), beyond(np.log(pose[14]), prior.width)
+    return keypoint_cost(objective.keypoints, pose) + float(prior.weight * (y * y + z * z))
 
 
 @solve.of(Objective)

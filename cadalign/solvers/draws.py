@@ -29,7 +29,7 @@ class Centred(NamedTuple):
 
 
 class WhitenedPixels(NamedTuple):
-    """WhitenedPixels pixels of rays, linear about those of the alignment: ``fixed + slopes ray``.
+    """Whitened pixels of rays, linear about those of the alignment: ``fixed + slopes ray``.
 
     They are over the principal point, as are the keypoints ``seen``, and grow with the focal
     length.

@@ -194,13 +194,6 @@ def add_scale_prior(
 
 
 @kernel
-def scale_prior_cost(prior: ScalePrior, pose: FloatArray) -> float:
-    """The cost of the prior on the log scales."""
-    y, z = beyond(np.log(pose[13]), prior.width), beyond(np.log(pose[14]), prior.width)
-    return float(prior.weight * (y * y + z * z))
-
-
-@kernel
 def whole_information(prior: ScalePrior) -> float:
     """Inverse variance of the whole prior, flat part and flanks."""
     flank, width = 1.0 / np.sqrt(prior.weight), prior.width

@@ -46,6 +46,11 @@ _LEAST_RELIEF = 3.0  # of points whose subsets tell their depths
 _UNLIKELY = 40.0  # excess cost, over a unit variance, at which a coarse minimum is given up
 
 
+def rigid_flag(loss: int, free: FloatArray) -> bool | None:
+    """True for squared errors of a model without stretch, of which the code is compiled apart."""
+    return True if loss == LINEAR and free[6] == free[7] == 0.0 else None
+
+
 @kernel
 def optimal_batch(
     points: FloatArray,
@@ -58,11 +63,13 @@ def optimal_batch(
     prior_width: float,
     free: FloatArray,
     min_points: int,
+    rigid: bool | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray, IntArray]:
     """Find the optimum of every problem; a single fit is a batch of one.
 
     Problem b has the rows ``offsets[b]`` to ``offsets[b + 1]``. ``loss_scale`` and ``prior_weight``
-    (B,), the weight of a `ScalePrior` of ``prior_width``, are in units of the whitening's sigma.
+    (B,), the weight of a `ScalePrior` of ``prior_width``, are in units of the whitening's sigma;
+    ``rigid`` is the `rigid_flag`.
     Returns the minima's poses (B, MAX_MINIMA, 15) and costs (B, MAX_MINIMA), the covariance of the
     best (B, 8, 8), statuses (B,), and (B, 4) the number of minima, iterations, hypotheses, and the
     number of an undetermined unknown or -1.
@@ -86,8 +93,8 @@ def optimal_batch(
             loss_scale[b],
         )
         objective = Objective(free, keypoints, ScalePrior(prior_weight[b], prior_width))
-        info[b, 0], info[b, 1], info[b, 2], info[b, 3] = optimal_kernel(
-            objective, poses[b], costs[b], covariances[b]
+        info[b, 0], info[b, 1], info[b, 2], info[b, 3] = _solve_one(
+            objective, rigid, poses[b], costs[b], covariances[b]
         )
         if info[b, 3] >= 0:
             statuses[b] = DEGENERATE
@@ -99,8 +106,12 @@ def optimal_batch(
 
 
 @kernel
-def optimal_kernel(
-    objective: Objective, poses: FloatArray, costs: FloatArray, covariance: FloatArray
+def _solve_one(
+    objective: Objective,
+    rigid: bool | None,
+    poses: FloatArray,
+    costs: FloatArray,
+    covariance: FloatArray,
 ) -> tuple[int, int, int, int]:
     """Write the minima of one problem, the best first, and its covariance; returns the `info`."""
     points = objective.keypoints.points
@@ -110,7 +121,7 @@ def optimal_kernel(
     local = with_points(objective, (points - center) / unit)
     counts = np.zeros(2, dtype=np.int64)
     found = Minima(poses, costs, costs.copy(), np.zeros(MAX_MINIMA, dtype=np.int64), counts)
-    hypotheses = _search(local, found)
+    hypotheses = _search(local, rigid, found)
     minima, iterations = int(counts[0]), int(counts[1])
     if minima == 0:
         return 0, iterations, hypotheses, -1
@@ -121,7 +132,7 @@ def optimal_kernel(
 
 
 @kernel
-def _search(objective: Objective, minima: Minima) -> int:
+def _search(objective: Objective, rigid: bool | None, minima: Minima) -> int:
     """Find the minima; returns the number of starts.
 
     Where there are many points the search runs on some of them, and what it finds is refined on
@@ -132,10 +143,10 @@ def _search(objective: Objective, minima: Minima) -> int:
     is_solved = aepnp_kernel(keypoints.points, keypoints.rays, linear) == OK
     n = keypoints.points.shape[0]
     if n <= _COARSE_POINTS:
-        return _search_from_all_starts(objective, linear, is_solved, minima)
+        return _search_from_all_starts(objective, rigid, linear, is_solved, minima)
     chosen = np.arange(_COARSE_POINTS) * n // _COARSE_POINTS  # evenly spread over their order
     coarse = with_keypoints(objective, take_keypoints(keypoints, chosen))
-    hypotheses = _search_from_all_starts(coarse, linear, is_solved, minima)
+    hypotheses = _search_from_all_starts(coarse, rigid, linear, is_solved, minima)
     found = minima.counts[0]
     starts = np.empty((found + 1, POSE_SIZE))
     count = 0
@@ -157,15 +168,19 @@ def _search(objective: Objective, minima: Minima) -> int:
 
 @kernel
 def _search_from_all_starts(
-    objective: Objective, linear: FloatArray, is_solved: bool, minima: Minima
+    objective: Objective,
+    rigid: bool | None,
+    linear: FloatArray,
+    is_solved: bool,
+    minima: Minima,
 ) -> int:
     """Refine the most promising of all starts; returns their number.
 
     ``linear`` is the linear solver's pose, where it has one.
     """
-    points, rays, free = objective.keypoints.points, objective.keypoints.rays, objective.free
-    if free[6] == 0.0 and free[7] == 0.0 and objective.keypoints.loss == LINEAR:
+    if rigid is not None:
         return _search_rigid(objective, minima)
+    points, rays, free = objective.keypoints.points, objective.keypoints.rays, objective.free
     subset_count, refined = _effort(points.shape[0], objective.keypoints.loss)
     starts = np.empty((subset_count * MAX_SOLUTIONS + 1 + _GRID_ROTATIONS, POSE_SIZE))
     count = 0

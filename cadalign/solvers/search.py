@@ -27,74 +27,32 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import KernelFamily, borrowing, kernel
 from cadalign.solvers.linalg import copy_into
 
+room_of = KernelFamily("room_of")
+"""``(system)``: room for the equations that steps are from and for those of a trial, in turns.
 
-@KernelFamily
-def room_of(system: Any) -> Any:
-    """Room for the equations that steps are from and for those of a trial, which take turns.
+Their ``gradient`` has one entry for each unknown.
+"""
+evaluate = KernelFamily("evaluate")
+"""``(system, state, equations)``: write the normal equations at a state; returns the cost."""
+cost_at = KernelFamily("cost_at")
+"""``(system, state)``: the cost at a state, without derivatives."""
+solve = KernelFamily("solve")
+"""``(system, equations, damping, step)``: write the damped Gauss-Newton step.
 
-    Their ``gradient`` has one entry for each unknown. They may share scratch space.
-    """
-    raise NotImplementedError
+Returns the decrease of the cost that the equations predict for it, NaN where they have no solution.
+"""
+move = KernelFamily("move")
+"""``(system, state, equations, damping, step, moved)``: write the state that a step leads to.
 
+What the equations eliminate follows it.
+"""
+score_of = KernelFamily("score_of")
+"""``(system, state, cost)``: -2 log of the evidence by Laplace's approximation, but for a constant.
 
-@KernelFamily
-def evaluate(system: Any, state: FloatArray, equations: Any) -> float:
-    """Write the normal equations at a proposed state; returns the cost."""
-    raise NotImplementedError
-
-
-@KernelFamily
-def cost_at(system: Any, state: FloatArray) -> float:
-    """The cost at a state, without derivatives."""
-    raise NotImplementedError
-
-
-@KernelFamily
-def solve(system: Any, equations: Any, damping: float, step: FloatArray) -> float:
-    """Write the damped Gauss-Newton step.
-
-    Returns the decrease of the cost that the equations predict for it, NaN where they have no
-    solution.
-    """
-    raise NotImplementedError
-
-
-@KernelFamily
-def move(
-    system: Any,
-    state: FloatArray,
-    equations: Any,
-    damping: float,
-    step: FloatArray,
-    moved: FloatArray,
-) -> None:
-    """Write the state that a step leads to; what the equations eliminate follows it."""
-    raise NotImplementedError
-
-
-@KernelFamily
-def score_of(system: Any, state: FloatArray, cost: float) -> float:
-    """-2 log of the evidence by Laplace's approximation, up to a constant.
-
-    Infinite where the unknowns are not determined; ``cost`` where the system ranks by cost.
-    """
-    raise NotImplementedError
-
-
-@KernelFamily
-def are_same(system: Any, first: FloatArray, second: FloatArray) -> bool:
-    """True if two states lie at the same minimum."""
-    raise NotImplementedError
-
-
-@KernelFamily
-def integrating(system: Any, integrates: bool) -> Any:
-    """The system with the shape integrated out of its objective, or with that of the cost alone.
-
-    Systems that have no shape have no member.
-    """
-    raise NotImplementedError
-
+Infinite where the unknowns are not determined; ``cost`` where the system ranks by cost.
+"""
+are_same = KernelFamily("are_same")
+"""``(system, first, second)``: True if two states lie at the same minimum."""
 
 _RELATIVE_DECREASE = 1e-12
 _ABSOLUTE_DECREASE = 1e-16
@@ -253,7 +211,8 @@ def search(
 
 @kernel
 def descend(
-    system: Any,
+    plain: Any,
+    whole: Any,
     likely: Minima,
     max_iterations: int,
     unlikely: float,
@@ -261,22 +220,27 @@ def descend(
     penalty: float,
     minima: Minima,
 ) -> None:
-    """Add the minima with the shape integrated out that states of a low cost lead to.
+    """Add the minima of the ``whole`` objective that ``likely`` states of a ``plain`` one lead to.
 
-    The most promising of the ``likely`` states of this label is refined first, none whose score
-    exceeds the best one by ``unlikely``. Minima of the cost are no starts: some lie so near the
-    camera that the descent ends in another minimum. The ``costs`` are without what is integrated.
+    The whole one has the shape integrated out. The most promising state of this label is refined
+    first, none whose score exceeds the best one by ``unlikely``. Minima of the plain one are no
+    starts: some lie so near the camera that the descent ends in another minimum. The ``costs`` are
+    plain ones.
     """
-    whole = integrating(system, True)
     count = likely.counts[0]
     scores = np.full(count, np.inf)
     for k in range(count):
         if likely.label[k] == label:
             scores[k] = score_of(whole, likely.states[k], likely.costs[k]) + penalty
-    for k in np.argsort(scores):
-        if not scores[k] < minima.scores[0] + unlikely:
+    for _ in range(count):
+        best = 0
+        for k in range(1, count):
+            if scores[k] < scores[best]:
+                best = k
+        if not scores[best] < minima.scores[0] + unlikely:
             break
-        state = likely.states[k]
+        scores[best] = np.inf
+        state = likely.states[best]
         if _find(whole, state, np.inf, label, minima) >= 0:
             continue
         cost, used, _ = refine(whole, max_iterations, state)
@@ -284,7 +248,7 @@ def descend(
         add_minimum(whole, state, cost, label, penalty, minima)
     for k in range(minima.counts[0]):
         if minima.label[k] == label:
-            minima.costs[k] = cost_at(integrating(system, False), minima.states[k])
+            minima.costs[k] = cost_at(plain, minima.states[k])
 
 
 @kernel

@@ -12,6 +12,7 @@ from cadalign.solvers.linalg import (
     dot,
     minus,
     rotation_from_quaternion,
+    second_moments,
     solve_cholesky,
     triple,
 )
@@ -102,16 +103,7 @@ def relief(points: FloatArray, rays: FloatArray, whitening: FloatArray) -> float
     The root mean square distance from the plane that fits best, about: for small ones, the least
     eigenvalue of a covariance is its determinant over the sum of its principal minors.
     """
-    n = points.shape[0]
-    a = b = c = p = q = r = 0.0
-    for i in range(n):  # centred, as the search has them
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        a += x * x
-        b += y * y
-        c += z * z
-        p += x * y
-        q += x * z
-        r += y * z
+    a, p, q, b, r, c = second_moments(points)  # centred, as the search has them
     minors = a * b - p * p + a * c - q * q + b * c - r * r
     determinant = a * (b * c - r * r) - p * (p * c - q * r) + q * (p * r - b * q)
     information = 0.0
@@ -176,20 +168,18 @@ def rotation_starts(points: FloatArray, rays: FloatArray, poses: FloatArray) -> 
     return found
 
 
-@kernel
 def widen_by_shape(
     points: FloatArray, rays: FloatArray, variances: FloatArray, whitening: FloatArray
-) -> None:
-    """Widen keypoints by the shape's uncertainty, ``variances`` (n,) of each coordinate.
+) -> FloatArray:
+    """Whitening (n, 3) of keypoints, widened by the shape's ``variances`` (n,) of each coordinate.
 
-    It is that seen from the distance at which the mean ``points`` have the size of their image.
+    These are seen from the distance at which the mean ``points`` have the size of their image.
     """
-    extent, size = _square_spread(points), _square_spread(rays)
+    extent, size = points.var(axis=0).sum(), rays.var(axis=0).sum()
     depth = max(np.sqrt(extent * 2.0 / 3.0 / max(size, 1e-30)), _LEAST_DEPTH)
-    for i in range(whitening.shape[0]):
-        # The variances add up for a whitening (a, b, c) whose b is small beside a and c.
-        information = (whitening[i, 0] ** 2 + whitening[i, 2] ** 2) / 2.0
-        whitening[i] /= np.sqrt(1.0 + variances[i] / depth**2 * information)
+    # The variances add up for a whitening (a, b, c) whose b is small beside a and c.
+    information = np.square(whitening[:, ::2]).sum(axis=1) / 2.0
+    return np.asarray(whitening / np.sqrt(1.0 + variances / depth**2 * information)[:, None])
 
 
 @kernel

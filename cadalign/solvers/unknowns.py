@@ -2,7 +2,7 @@
 
 A pose is packed into 15 numbers: rotation row by row (9), translation (3), scale (3). Its unknowns
 are, in this order, a rotation vector that is applied in the camera frame (3), the translation (3),
-log s_y and log s_z. The logarithm of the focal length is a ninth, see `cadalign.solvers.focal`.
+log s_y and log s_z.
 """
 
 from __future__ import annotations
@@ -11,12 +11,10 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import inlined, kernel
-from cadalign.solvers.constants import UNKNOWNS
 from cadalign.solvers.linalg import polish_rotation
 
 _LARGEST_LOG_STEP = 2.0
 _ROTATION_ERROR = 1e-10
-_AT_BOUND = 1e-9
 
 
 @kernel
@@ -62,25 +60,6 @@ def move_pose(pose: FloatArray, step: FloatArray, moved: FloatArray) -> None:
     for k in range(2):
         log_step = min(max(step[6 + k], -_LARGEST_LOG_STEP), _LARGEST_LOG_STEP)
         moved[13 + k] = pose[13 + k] * np.exp(log_step)
-
-
-@inlined
-def leaves_bounds(value: float, low: float, high: float, gradient: float) -> bool:
-    """True if an unknown stands at a bound that the descent leads beyond."""
-    return (value <= low + _AT_BOUND and gradient > 0.0) or (
-        value >= high - _AT_BOUND and gradient < 0.0
-    )
-
-
-@inlined
-def hold_fixed(free: FloatArray, hessian: FloatArray, gradient: FloatArray) -> None:
-    """Replace the equations of unknowns that are not ``free`` (8,) by unit rows."""
-    for k in range(UNKNOWNS):
-        if free[k] == 0.0:
-            gradient[k] = 0.0
-            for m in range(UNKNOWNS):
-                hessian[k, m] = hessian[m, k] = 0.0
-            hessian[k, k] = 1.0
 
 
 @kernel

@@ -26,8 +26,8 @@ from cadalign.solvers.joint.evidence import (
     points_of,
     unpacked,
 )
-from cadalign.solvers.joint.search import reduce_modes, reduced_state, refine_joint, whole_state
-from cadalign.solvers.joint.system import Joint, joint_cost
+from cadalign.solvers.joint.search import equations_at, reduce_modes, refine_joint
+from cadalign.solvers.joint.system import joint_system
 from cadalign.solvers.search import evaluate, move, refine
 
 POINTS, MODES, VIEWS = 7, 3, 2
@@ -95,23 +95,23 @@ def evidence_of(
 
 
 def gradient_of(evidence: Evidence, state: State, *, integrates: bool = False) -> np.ndarray:
-    system = Joint(evidence, integrates)
-    room = joint_room(system.evidence)
+    system = joint_system(evidence, integrates=integrates)
+    room = joint_room(system.evidence, system.layout)
     assert evaluate(system, packed(state), room) < np.inf
     return room.gradient
 
 
 def cost_of(evidence: Evidence, state: State, *, integrates: bool = False) -> float:
-    return joint_cost(Joint(evidence, integrates), packed(state))
+    return equations_at(evidence, packed(state), integrates=integrates)[0]
 
 
 def moved(evidence: Evidence, state: State, step: np.ndarray) -> State:
-    system = Joint(evidence, False)
-    row, room = packed(state), joint_room(system.evidence)
+    system = joint_system(evidence, integrates=False)
+    row, room = packed(state), joint_room(system.evidence, system.layout)
     evaluate(system, row, room)
     there = row.copy()
     move(system, row, room, 0.0, step, there)
-    return unpacked(evidence, there)
+    return unpacked(evidence.shape, len(evidence.focals.low), there)
 
 
 def state_of(seed: int, poses: int, focals: int = 0) -> State:
@@ -210,12 +210,12 @@ def test_the_gradient_of_the_integrated_objective_is_that_of_the_cost(
 
 def shifts_of(evidence: Evidence, state: State) -> np.ndarray:
     """The change of the gradient by the prior means that the log determinant moves."""
-    system = Joint(evidence, True)
-    room = joint_room(system.evidence)
+    system = joint_system(evidence, integrates=True)
+    room = joint_room(system.evidence, system.layout)
     evaluate(system, packed(state), room)
     shifted = room.rows[-4].copy()
-    plain = joint_room(evidence)
-    evaluate(Joint(evidence, False), packed(state), plain)
+    plain = joint_room(evidence, system.layout)
+    evaluate(joint_system(evidence, integrates=False), packed(state), plain)
     return np.asarray(room.rows[:-4] @ (shifted - plain.rows[-4]))
 
 
@@ -224,10 +224,10 @@ def test_the_minimum_has_no_slope_in_displacements_either(poses: tuple[int, int]
     evidence = evidence_of(3, spread=0.05, poses=poses, loss=LINEAR)
     evidence = seen_from(evidence, state_of(3, max(poses) + 1))
     reduction = reduce_modes(evidence)
-    row = packed(reduced_state(reduction, evidence.shape, state_of(3, max(poses) + 1)))
-    cost, _, converged = refine(Joint(reduction.evidence, False), 300, row)
+    row = packed(reduction.reduced(state_of(3, max(poses) + 1)))
+    cost, _, converged = refine(joint_system(reduction.evidence, integrates=False), 300, row)
     assert converged
-    state = whole_state(reduction, evidence.shape, unpacked(reduction.evidence, row))
+    state = reduction.state_of(row)
     assert cost < np.inf
     for i in range(POINTS):
         for a in range(3):
@@ -272,8 +272,8 @@ def test_eliminated_displacements_equal_modes_of_the_same_deviation() -> None:
     state = state_of(5, 1)
     state.displacements[:] = 0
     more = np.concatenate([state.coefficients, np.zeros(3 * POINTS)])
-    first, one, _, _ = refine_joint(evidence, 300, state)
-    second, other, _, _ = refine_joint(as_modes, 300, state._replace(coefficients=more))
+    first, _, one = refine_joint(evidence, 300, state)
+    second, _, other = refine_joint(as_modes, 300, state._replace(coefficients=more))
     assert np.isclose(first, second, rtol=1e-8)
     assert np.allclose(one.poses, other.poses, atol=1e-5)
     found = points_of(evidence.shape, one), points_of(as_modes.shape, other)

@@ -24,7 +24,7 @@ from cadalign.solvers.joint.evidence import (
     points_of,
 )
 from cadalign.solvers.joint.search import reduce_modes, search_joint, used_points
-from cadalign.solvers.joint.system import Joint
+from cadalign.solvers.joint.system import joint_system
 from cadalign.solvers.search import evaluate
 
 POINTS, SEEN, MODES, RANK = 9, 6, 24, 15
@@ -94,7 +94,7 @@ def mean_depth(evidence: Evidence, state: State) -> float:
 
 
 def test_the_basis_spans_what_moves_the_seen_points(evidence: Evidence, rank: int) -> None:
-    reduced, basis, _ = reduce_modes(evidence)
+    reduced, basis, *_ = reduce_modes(evidence)
     assert basis.shape == (MODES, min(rank, 3 * SEEN))
     assert np.allclose(basis.T @ basis, np.eye(basis.shape[1]), atol=1e-12)
     seen = evidence.shape.modes[:, :SEEN].reshape(MODES, -1)
@@ -105,8 +105,8 @@ def test_the_basis_spans_what_moves_the_seen_points(evidence: Evidence, rank: in
 def test_a_minimum_is_one_of_all_modes(evidence: Evidence, rank: int) -> None:
     state, score = best_of(evidence, rank)
     cost, information = information_of(evidence, state)
-    system = Joint(evidence, True)
-    room = joint_room(system.evidence)
+    system = joint_system(evidence, integrates=True)
+    room = joint_room(system.evidence, system.layout)
     evaluate(system, packed(state), room)
     slope = np.linalg.solve(information, room.gradient)
     assert room.gradient @ slope < 1e-9 * max(cost, 1.0)

@@ -9,18 +9,22 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cadalign.arrays import FloatArray
+from cadalign.estimation.uncertainty.single_posterior import single_posterior
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR
 from cadalign.solvers.marginal.equations import (
     POSE,
     Posed,
     evaluate_posed,
-    force_of,
     posed_cost,
     posed_room,
-    state_at,
 )
-from cadalign.solvers.marginal.posterior import posterior_of
-from cadalign.solvers.marginal.problem import Mixture, Seen, shape_at, target_of
+from cadalign.solvers.marginal.problem import (
+    Mixture,
+    Seen,
+    mixture_at,
+    shape_at,
+    target_of,
+)
 from cadalign.solvers.marginal.search import search_view
 from cadalign.solvers.search import move, refine, solve
 from cadalign.solvers.unknowns import move_rigid
@@ -44,6 +48,11 @@ def problem_of(seed: int, loss: int = LINEAR) -> tuple[Mixture, Seen, FloatArray
     whitening = np.tile([1e3, 0.0, 1e3], (7, 1))
     penalties = -2 * np.log([0.7, 0.3])
     return Mixture(means, covariances, penalties), Seen(seen, rays, whitening, loss, 2.0), pose
+
+
+def state_at(pose: FloatArray, keypoints: int) -> FloatArray:
+    """The state of the mean at a pose (12,)."""
+    return np.append(pose, np.zeros(6 * keypoints))
 
 
 def stacked_cost(system: Posed, state: FloatArray) -> float:
@@ -77,7 +86,7 @@ def moved(state: FloatArray, step: FloatArray, offset: FloatArray) -> FloatArray
 @given(st.integers(0, 1000), st.booleans())
 def test_a_minimum_is_one_of_pose_and_shape_together(seed: int, integrates: bool) -> None:
     mixture, seen, pose = problem_of(seed)
-    system = Posed(target_of(mixture, 0, seen), seen, integrates)
+    system = Posed(target_of(mixture_at(mixture, seen), 0), seen, integrates)
     state = state_at(pose, 7)
     cost, _, converged = refine(system, 100, state)
     assert converged
@@ -93,7 +102,7 @@ def test_a_minimum_is_one_of_pose_and_shape_together(seed: int, integrates: bool
 def test_the_derivatives_of_the_determinant_are_finite_differences(loss: int) -> None:
     mixture, seen, pose = problem_of(2, loss)
     seen.rays[0] += 0.02  # an outlier
-    system = Posed(target_of(mixture, 0, seen), seen, True)
+    system = Posed(target_of(mixture_at(mixture, seen), 0), seen, True)
     state = state_at(pose, 7)
     force = np.random.default_rng(2).normal(0, 0.5, 21)
     state[POSE:] = np.concatenate([system.target.covariance @ force, force])
@@ -114,7 +123,7 @@ def test_the_derivatives_of_the_determinant_are_finite_differences(loss: int) ->
 @pytest.mark.parametrize("integrates", [False, True])
 def test_the_predicted_decrease_is_that_of_a_small_step(integrates: bool) -> None:
     mixture, seen, pose = problem_of(4)
-    system = Posed(target_of(mixture, 0, seen), seen, integrates)
+    system = Posed(target_of(mixture_at(mixture, seen), 0), seen, integrates)
     state = state_at(pose, 7)
     refine(system, 100, state)
     near = moved(state, 1e-4 * np.ones(6), np.zeros(21))
@@ -150,9 +159,11 @@ def test_a_given_start_is_searched_from() -> None:
 def test_the_posterior_is_the_inverse_information_of_pose_and_shape() -> None:
     mixture, seen, pose = problem_of(1)
     state = state_at(pose, 7)
-    refine(Posed(target_of(mixture, 0, seen), seen, False), 100, state)
-    points, covariance, of_points, of_seen = posterior_of(mixture, 0, seen, state, 1.0)
-    assert points == pytest.approx(shape_at(mixture, 0, seen, force_of(state)))
+    refine(Posed(target_of(mixture_at(mixture, seen), 0), seen, False), 100, state)
+    found = single_posterior(mixture, 0, seen, state, 1.0)
+    _, _, _, covariance, of_points, of_seen = found
+    points = shape_at(mixture, 0, seen, state)
+    assert found.points[:KEYPOINTS] == pytest.approx(points[:KEYPOINTS])
     size = mixture.means[0].size
     rotation = state[:9].reshape(3, 3)
     rows = np.zeros((14, 6 + size))
@@ -187,7 +198,7 @@ def test_the_posterior_is_the_inverse_information_of_pose_and_shape() -> None:
 def test_points_behind_the_camera_have_no_cost() -> None:
     mixture, seen, pose = problem_of(0)
     behind = state_at(np.concatenate([pose[:9], -pose[9:]]), 7)
-    system = Posed(target_of(mixture, 0, seen), seen, True)
+    system = Posed(target_of(mixture_at(mixture, seen), 0), seen, True)
     assert evaluate_posed(system, behind, posed_room(system)) == np.inf
     assert posed_cost(system, behind) == np.inf
     assert refine(system, 10, behind)[0] == np.inf

@@ -100,7 +100,7 @@ def test_no_minimum_is_missed_that_a_fine_grid_of_rotations_finds(
         noise = rng.normal(0, 4e-3, (count, 2))
         in_camera = points @ random_rotation(rng).T + translation
         rays, whitening = in_camera[:, :2] / in_camera[:, 2:] + noise, np.array([[250.0, 0, 250.0]])
-        given = np.ones(1), np.zeros(1), 0.0, RIGID, 3
+        given = np.ones(1), np.zeros(1), 0.0, RIGID, 3, True
         found = optimal_batch(points, rays, whitening, np.array([0, count]), LINEAR, *given)[1][0]
         grid, minima = np.empty((400, 15)), room_for_minima(12, 15)
         keypoints = KeypointEvidence(points, rays, whitening, LINEAR, 1.0)

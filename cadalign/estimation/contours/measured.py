@@ -166,7 +166,7 @@ class Joined(NamedTuple):
 
     def refined(self, iterations: int) -> tuple[float, Joined] | None:
         """The cost, and the place of the least cost, where every point of the surface stays."""
-        cost, state, _, _ = refine_joint(self.evidence, iterations, self.state)
+        cost, _, state = refine_joint(self.evidence, iterations, self.state)
         if not cost < np.inf:
             return None
         last = len(state.coefficients) - self.place.own.size

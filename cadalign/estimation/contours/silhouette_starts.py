@@ -47,7 +47,7 @@ from cadalign.solvers.joint.evidence import (
     points_of,
     seen_in_cameras,
 )
-from cadalign.solvers.joint.search import refine_joint, score_state
+from cadalign.solvers.joint.search import refine_joint
 
 _MEETS = 0.003  # standard deviation of a contour that meets the rim, relative to its size
 _MEETS_PX = 0.5
@@ -336,12 +336,11 @@ def _uncovered(minimum: Minimum, whole: ImageDepths, surface: Surface) -> Minimu
             break
         shown = again
         some = evidence._replace(image_depths=kept_rows(whole, shown))
-        cost, moved, _, _ = refine_joint(some, _ITERATIONS, state)
-        score = beside + score_state(some, moved)
+        cost, score, moved = refine_joint(some, _ITERATIONS, state)
         if not np.isfinite(score):
             break
         state = moved
-        minimum = minimum._replace(evidence=some, state=state, cost=cost, score=score)
+        minimum = minimum._replace(evidence=some, state=state, cost=cost, score=beside + score)
     return minimum
 
 

@@ -32,9 +32,8 @@ from cadalign.estimation.uncertainty.shape_posterior import ShapeTails, misfits
 from cadalign.estimation.uncertainty.summary import name_of
 from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.solvers.joint.covariance import information_of, scaled_information
-from cadalign.solvers.joint.evidence import Evidence, Rig, State, kept_rows, packed
-from cadalign.solvers.joint.search import reduced, refine_joint, search_joint
-from cadalign.solvers.joint.system import Joint, joint_cost
+from cadalign.solvers.joint.evidence import Evidence, Rig, State, kept_rows
+from cadalign.solvers.joint.search import cost_of, reduced, refine_joint, search_joint
 
 _FALSE_ALARMS = 0.005  # of all tests of an estimate together
 _REFITTING = 12  # iterations that show if a piece contradicts the others
@@ -90,10 +89,10 @@ def _contradictions(evidence: Evidence, state: State, cost: float) -> Sequence[_
     evidence, state = reduced(evidence, state)
     if len(evidence.image_depths.point):
         evidence = _without_hidden(evidence, state)
-        cost, state, _, _ = refine_joint(evidence, 10 * _REFITTING, state)
+        cost, _, state = refine_joint(evidence, 10 * _REFITTING, state)
     if len(pieces) > _MOST_TESTED:  # those of the largest own cost
         trials = [_without(evidence, state, piece) for piece in pieces]
-        rests = [joint_cost(Joint(rest, False), packed(start)) for rest, start in trials]
+        rests = [cost_of(rest, start) for rest, start in trials]
         pieces = [
             pieces[k] for k in sorted(np.argsort(rests, kind="stable")[:_MOST_TESTED].tolist())
         ]
@@ -143,7 +142,7 @@ def _is_suspicious(
 ) -> bool:
     """True if leaving out a piece, by a short refinement, saves more than is likely."""
     rest, start = _without(evidence, state, piece)
-    lower, refitted, _, _ = refine_joint(rest, _REFITTING, start)
+    lower, _, refitted = refine_joint(rest, _REFITTING, start)
     if not cost - lower >= chi_square_quantile(1, level):  # of one equation; of more, more
         return False
     trial = _trial(piece, _determined(evidence, state), rest, refitted, cost, lower)
@@ -182,7 +181,7 @@ def _searched(
 ) -> _Trial | None:
     """The trial of a piece by a search, since the estimate may lie far from that without it."""
     rest, start = _without(evidence, state, piece)
-    lower, refitted, _, _ = refine_joint(rest, 10 * _REFITTING, start)
+    lower, _, refitted = refine_joint(rest, 10 * _REFITTING, start)
     starts = starts_of(rest)
     minima = search_joint(rest, *starts)[0] if len(starts.poses) else None
     if minima is not None and minima.states:

@@ -151,7 +151,7 @@ def _linearised(
     weights = np.broadcast_to(whitening_of(view.sigma, rays, camera), (len(rays), 3))[kept]
     pose = turned_alignment(result.alignment, camera.lens_from_camera.T)
     points = result.points_3d[names]
-    residuals, derivatives = _whitened_errors(points, pose, rays[kept], weights)
+    residuals, derivatives = whitened_errors(points, pose, rays[kept], weights)
     roots = np.sqrt(loss_slopes((residuals**2).sum(axis=1), loss, loss_scale)[0])
     by_pose = roots[:, None, None] * derivatives
     by_point = by_pose[:, :, 3:]  # a translation moves every point alike
@@ -179,7 +179,7 @@ def _conditioned(prior: Gaussians, rows: FloatArray, right: FloatArray) -> Shape
     return ShapePosterior(Gaussians(weights, np.array(means), np.array(covariances)), total)
 
 
-def _whitened_errors(
+def whitened_errors(
     points: FloatArray, pose: Alignment, rays: FloatArray, whitening: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Whitened errors (n, 2) of points in a view, and their derivatives (n, 2, 6) by the pose."""
@@ -250,7 +250,7 @@ def misfits(cost: float, redundancy: int, tails: ShapeTails) -> Warnings:
 def _predicted(seen: SeenShape, inflation: float) -> tuple[FloatArray, FloatArray]:
     """Whitened errors (2 n,) of the mean shape, and their inverse covariance beside any pose."""
     count = len(seen.rays)
-    errors, by_pose = _whitened_errors(seen.points, seen.pose, seen.rays, seen.whitening)
+    errors, by_pose = whitened_errors(seen.points, seen.pose, seen.rays, seen.whitening)
     by_point = by_pose[:, :, 3:] @ seen.pose.rotation
     errors = errors - (by_point @ (seen.points - seen.mean)[:, :, None])[:, :, 0]
     by_shape = np.zeros((count, 2, count, 3))

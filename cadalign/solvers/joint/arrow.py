@@ -14,9 +14,7 @@ from cadalign.arrays import FloatArray
 from cadalign.compile import fast_sums, inlined, kernel
 from cadalign.solvers.linalg import (
     add_products,
-    copy_into,
     factorize,
-    invert_factor,
     mirror_upper,
     solve_factor,
 )
@@ -62,14 +60,6 @@ def clear(arrow: Arrow) -> None:
     arrow.gradient[:] = 0.0
 
 
-@kernel
-def copy_matrix(source: Arrow, target: Arrow) -> None:
-    """Copy all entries but the right side."""
-    copy_into(target.blocks.ravel(), source.blocks.ravel())
-    copy_into(target.coupling.ravel(), source.coupling.ravel())
-    copy_into(target.border.ravel(), source.border.ravel())
-
-
 def dense_matrix(arrow: Arrow) -> FloatArray:
     """All entries (U, U), the border last."""
     poses, size, border = arrow.coupling.shape
@@ -82,26 +72,6 @@ def dense_matrix(arrow: Arrow) -> FloatArray:
         whole[last:, own] = arrow.coupling[p].T
     whole[last:, last:] = arrow.border
     return whole
-
-
-@kernel
-def add_row(arrow: Arrow, pose: int, row: FloatArray, value: float) -> None:
-    """Add an equation ``row . step = -value`` about one pose and the border, (6 + b,)."""
-    first, own = border_start(arrow), arrow.blocks.shape[1] * pose
-    for k in range(row.shape[0]):
-        slope = row[k]
-        if slope == 0.0:
-            continue
-        if k < 6:
-            arrow.gradient[own + k] += slope * value
-            for m in range(6):
-                arrow.blocks[pose, k, m] += slope * row[m]
-            for m in range(arrow.border.shape[0]):
-                arrow.coupling[pose, k, m] += slope * row[6 + m]
-        else:
-            arrow.gradient[first + k - 6] += slope * value
-            for m in range(arrow.border.shape[0]):
-                arrow.border[k - 6, m] += slope * row[6 + m]
 
 
 @inlined
@@ -238,17 +208,22 @@ def log_determinant(factor: Arrow) -> float:
     return total
 
 
-@kernel
-def invert_arrow(factor: Arrow) -> Arrow:
-    """Blocks of the inverse matrix in the same pattern, from its factor; an empty gradient."""
-    poses, border = factor.blocks.shape[0], factor.border.shape[0]
-    inverse = empty_arrow(poses, border)
-    triangle = invert_factor(factor.border)
-    inverse.border[:] = triangle.T @ triangle
-    for p in range(poses):
-        lower = invert_factor(factor.blocks[p].copy())
-        gain = lower.T @ factor.coupling[p].copy()  # - d(pose) / d(border)
-        across = gain @ inverse.border
-        inverse.coupling[p] = -across
-        inverse.blocks[p] = lower.T @ lower + across @ gain.T
-    return inverse
+def invert_arrow(arrow: Arrow) -> Arrow | None:
+    """Blocks of the inverse matrix in the same pattern; None if it is not determined.
+
+    That is decided as by `decide_on_undetermined`.
+    """
+    share = _LEAST_SHARE if len(arrow.blocks) > 1 else -_LEAST_SHARE
+    try:
+        lower = np.linalg.inv(np.linalg.cholesky(arrow.blocks * (1.0 + share * np.eye(6))))
+        across = lower @ arrow.coupling
+        rest = arrow.border * (1.0 + share * np.eye(len(arrow.border)))
+        rest -= np.tensordot(across, across, ((0, 1), (0, 1)))
+        triangle = np.linalg.inv(np.linalg.cholesky(rest))
+    except np.linalg.LinAlgError:
+        return None
+    border = triangle.T @ triangle
+    gain = lower.swapaxes(1, 2) @ across  # - d(pose) / d(border)
+    coupling = -gain @ border
+    blocks = lower.swapaxes(1, 2) @ lower - coupling @ gain.swapaxes(1, 2)
+    return Arrow(blocks, coupling, border, np.zeros_like(arrow.gradient))

@@ -27,35 +27,45 @@ from cadalign.solvers.joint.evidence import (
     State,
     exp_of,
     stretched_point,
+    undisplaced,
     unstretched,
 )
 from cadalign.solvers.joint.rows import (
     count_block_equations,
-    count_equations,
-    first_scale,
     write_block_row,
 )
 from cadalign.solvers.linalg import cholesky, cross, dot, factorize, solve_factor_rows
 from cadalign.solvers.projection import slope_of_row, turn, turn_back
 
 
+class Layout(NamedTuple):
+    """Places of the equations of N sightings in the rows of derivatives.
+
+    The sightings of pose p are ``order[first[p]:first[p + 1]]``, point after point, with ``widths``
+    (N,) columns each: a contour point has one, a keypoint two or three. For one pose, the equations
+    of point i are the ``columns[i]`` (2,) of the rows, first and behind the last; none of several
+    poses.
+    """
+
+    order: IntArray
+    first: IntArray
+    widths: IntArray
+    columns: IntArray
+
+
 class JointEquations(NamedTuple):
     """Normal equations, and scratch space.
 
-    ``gradient`` is that of the ``arrow``; ``factor`` is for the damped one. The sightings of pose p
-    are ``order[first[p]:first[p + 1]]``, point after point. ``rows`` and ``seen`` are those of
-    `write_rows`. For one pose, the equations of point i are the ``columns[i]`` (2,) of the rows,
-    first and behind the last, none of several poses. ``log_determinant`` (1,) is that of the
-    covariances by which eliminated displacements widened the equations; ``slopes`` (m, 3) are half
-    the derivatives of the whole log determinant by the points before the stretch.
+    ``gradient`` is that of the ``arrow``; ``factor`` is for the damped one. ``rows`` and ``seen``
+    are those of `write_rows`. ``log_determinant`` (1,) is that of the covariances by which
+    eliminated displacements widened the equations; ``slopes`` (m, 3) are half the derivatives of
+    the whole log determinant by the points before the stretch.
     """
 
     arrow: Arrow
     gradient: FloatArray
     factor: Arrow
-    order: IntArray
-    first: IntArray
-    columns: IntArray
+    layout: Layout
     rows: FloatArray
     seen: FloatArray
     products: FloatArray
@@ -63,36 +73,41 @@ class JointEquations(NamedTuple):
     slopes: FloatArray
 
 
+def layout_of(evidence: Evidence) -> Layout:
+    """The places of all equations of sightings."""
+    sightings, points = evidence.sightings, len(evidence.shape.mean)
+    pose = evidence.rig.pose[sightings.image]
+    poses = int(evidence.rig.pose.max()) + 1
+    widths = 1 + (sightings.whitening[:, 2] > 0) + (sightings.depths[:, 1] > 0)
+    counts = np.bincount(sightings.point, widths, points) * (poses == 1)
+    ends = np.cumsum(counts.astype(np.int64))
+    return Layout(
+        np.argsort(pose * points + sightings.point, kind="stable"),
+        np.append(0, np.cumsum(np.bincount(pose, minlength=poses))),
+        widths,
+        np.column_stack([np.append(0, ends[:-1]), ends]),
+    )
+
+
 @kernel
-def joint_room(evidence: Evidence) -> JointEquations:
+def joint_room(evidence: Evidence, layout: Layout) -> JointEquations:
     """Room for the normal equations."""
-    sightings, rig = evidence.sightings, evidence.rig
-    poses, points = rig.pose.max() + 1, evidence.shape.mean.shape[0]
+    poses, points = layout.first.shape[0] - 1, evidence.shape.mean.shape[0]
     border = evidence.focals.low.shape[0] + 3 + evidence.shape.modes.shape[0]
-    order = np.argsort(rig.pose[sightings.image] * points + sightings.point, kind="mergesort")
-    first = np.zeros(poses + 1, dtype=np.int64)
-    counts = np.zeros(poses, dtype=np.int64)
-    columns = np.zeros((points, 2), dtype=np.int64)
-    for n in order:
-        i, p = sightings.point[n], rig.pose[sightings.image[n]]
-        if poses == 1 and columns[i, 1] == 0:
-            columns[i, 0] = counts[0]
-        first[p + 1] += 1
-        counts[p] += count_equations(sightings, n)
-        if poses == 1:
-            columns[i, 1] = counts[0]
+    most = total = 0
     for p in range(poses):
-        first[p + 1] += first[p]
+        columns = 0
+        for n in layout.order[layout.first[p] : layout.first[p + 1]]:
+            columns += layout.widths[n]
+        most, total = max(most, columns), total + columns
     arrow = empty_arrow(poses, border)
     return JointEquations(
         arrow,
         arrow.gradient,
         empty_arrow(poses, border),
-        order,
-        first,
-        columns,
-        np.zeros((6 + border + 4, counts.max())),
-        np.zeros((8, counts.sum())),
+        layout,
+        np.zeros((6 + border + 4, most)),
+        np.zeros((8, total)),
         np.zeros((7 + border, 7 + border)),
         np.zeros(1),
         np.zeros((points, 3)),
@@ -100,9 +115,9 @@ def joint_room(evidence: Evidence) -> JointEquations:
 
 
 @kernel
-def eliminate(evidence: Evidence, state: State, equations: JointEquations) -> float:
+def eliminate(spread: FloatArray, displacements: FloatArray, equations: JointEquations) -> float:
     """Whiten the equations of points with displacements; returns the cost of their prior."""
-    spread, rows, columns = evidence.shape.spread, equations.rows, equations.columns
+    rows, columns = equations.rows, equations.layout.columns
     last = rows.shape[0] - 4
     cost = 0.0
     for i in range(spread.shape[0]):
@@ -110,7 +125,7 @@ def eliminate(evidence: Evidence, state: State, equations: JointEquations) -> fl
         if start == end or not spread[i] > 0:
             continue
         for a in range(3):
-            displacement = state.displacements[i, a]
+            displacement = displacements[i, a]
             cost += (displacement / spread[i]) ** 2
             for c in range(start, end):
                 rows[last, c] -= rows[last + 1 + a, c] * displacement
@@ -146,9 +161,9 @@ def _whiten(rows: FloatArray, start: int, end: int, spread: float, factor: Float
 
 
 @borrowing
-def shift_means(evidence: Evidence, equations: JointEquations) -> None:
+def shift_means(spread: FloatArray, equations: JointEquations) -> None:
     """Move the displacements' prior means as the slopes of the log determinant do."""
-    spread, rows, columns = evidence.shape.spread, equations.rows, equations.columns
+    rows, columns = equations.rows, equations.layout.columns
     unknowns = rows.shape[0] - 4
     beyond_pose = equations.gradient.shape[0] - unknowns
     for i in range(spread.shape[0]):
@@ -164,23 +179,25 @@ def shift_means(evidence: Evidence, equations: JointEquations) -> None:
 
 
 @borrowing
-def follow(evidence: Evidence, equations: JointEquations, step: FloatArray, moved: State) -> None:
+def follow(
+    spread: FloatArray, equations: JointEquations, step: FloatArray, displacements: FloatArray
+) -> None:
     """Write the displacements that are best after a step."""
-    spread, rows, columns = evidence.shape.spread, equations.rows, equations.columns
+    rows, columns = equations.rows, equations.layout.columns
     unknowns = step.shape[0]
     for i in range(spread.shape[0]):
         start, end = columns[i, 0], columns[i, 1]
         if start == end or not spread[i] > 0:
             continue
         for a in range(3):
-            moved.displacements[i, a] = -(spread[i] ** 2) * equations.slopes[i, a]
+            displacements[i, a] = -(spread[i] ** 2) * equations.slopes[i, a]
         for c in range(start, end):
             residual = rows[unknowns, c]
             for k in range(unknowns):
                 residual += rows[k, c] * step[k]
             residual *= -(spread[i] ** 2)
             for a in range(3):
-                moved.displacements[i, a] += residual * rows[unknowns + 1 + a, c]
+                displacements[i, a] += residual * rows[unknowns + 1 + a, c]
 
 
 @kernel
@@ -190,14 +207,15 @@ def add_log_determinant(evidence: Evidence, state: State, equations: JointEquati
     Half the derivatives by the points before the stretch are left in the equations' ``slopes``.
     """
     modes, total = evidence.shape.modes.shape[0], equations.seen.shape[1]
-    first = first_scale(evidence) + 3
+    first = evidence.focals.low.shape[0] + 3
     factor = equations.arrow.border[first:, first:].copy()
     if not factorize(factor):
         return np.inf
     volume = 0.0
     for k in range(modes):
         volume += 2.0 * np.log(factor[k, k])
-    left = _left_of_displacements(evidence, equations)
+    spread, columns = evidence.shape.spread, equations.layout.columns
+    left = _left_of_displacements(spread, equations.rows, columns)
     by_model, response = np.empty((3, total)), np.empty((modes, total))
     _write_rows(evidence, state, equations, left, by_model, response)
     solve_factor_rows(factor, response)
@@ -214,23 +232,20 @@ def _add_block_slopes(evidence: Evidence, state: State, arrow: Arrow, factor: Fl
     A residual is linear in the coefficients, so that the derivative of its row by these, along
     their response to it, is the change of the row as they move by the response.
     """
-    first, total = 6 + first_scale(evidence) + 3, count_block_equations(evidence)
+    first, total = 6 + evidence.focals.low.shape[0] + 3, count_block_equations(evidence)
     row, moved_row = np.empty(6 + arrow.border.shape[0]), np.empty(6 + arrow.border.shape[0])
+    still, moved = undisplaced(state), undisplaced(state)
     response = np.empty((factor.shape[0], total))
     for q in range(total):
-        equation = write_block_row(evidence, state, q, row)
+        equation = write_block_row(evidence, still, q, row)
         for k in range(factor.shape[0]):
             response[k, q] = equation.root * row[first + k]
     solve_factor_rows(factor, response)
-    still = state.coefficients
-    moved = State(
-        state.poses, state.log_focals, state.log_scales, still.copy(), state.displacements
-    )
     for q in range(total):
-        equation = write_block_row(evidence, state, q, row)
+        equation = write_block_row(evidence, still, q, row)
         along = 0.0
         for k in range(factor.shape[0]):
-            moved.coefficients[k] = still[k] + response[k, q]
+            moved.coefficients[k] = still.coefficients[k] + response[k, q]
             along += equation.root * row[first + k] * response[k, q]
         write_block_row(evidence, moved, q, moved_row)
         # A weight of a loss falls where the residual grows.
@@ -241,9 +256,8 @@ def _add_block_slopes(evidence: Evidence, state: State, arrow: Arrow, factor: Fl
 
 
 @kernel
-def _left_of_displacements(evidence: Evidence, equations: JointEquations) -> FloatArray:
+def _left_of_displacements(spread: FloatArray, rows: FloatArray, columns: IntArray) -> FloatArray:
     """Share (m, 3, 3) of each point's displacement that its whitened equations leave open."""
-    spread, rows, columns = evidence.shape.spread, equations.rows, equations.columns
     left = np.zeros((spread.shape[0], 3, 3))
     last = rows.shape[0] - 3
     for i in range(spread.shape[0]):
@@ -273,10 +287,10 @@ def _write_rows(
     sightings, modes, seen = evidence.sightings, evidence.shape.modes, equations.seen
     scale = exp_of(state.log_scales)
     column = 0
-    for n in equations.order:
+    for n in equations.layout.order:
         i = sightings.point[n]
         motion = state.poses[evidence.rig.pose[sightings.image[n]]]
-        for _ in range(count_equations(sightings, n)):
+        for _ in range(equations.layout.widths[n]):
             turned = turn_back(motion, (seen[0, column], seen[1, column], seen[2, column]))
             row = turned[0] * scale[0], turned[1] * scale[1], turned[2] * scale[2]
             kept = dot(left[i, 0], row), dot(left[i, 1], row), dot(left[i, 2], row)
@@ -301,16 +315,16 @@ def _add_slopes(
     shape, sightings, rig = evidence.shape, evidence.sightings, evidence.rig
     seen, slopes, gradient = equations.seen, equations.slopes, equations.gradient
     size, start = equations.arrow.blocks.shape[1], border_start(equations.arrow)
-    first = start + first_scale(evidence)
+    first = start + evidence.focals.low.shape[0]
     scale = exp_of(state.log_scales)
     slopes[:] = 0.0
     column = 0
-    for n in equations.order:
+    for n in equations.layout.order:
         i, v = sightings.point[n], sightings.image[n]
         p = rig.pose[v]
         motion, group = state.poses[p], evidence.focals.group[v]
         turned = turn(motion, stretched_point(shape, state, scale, i))
-        count = count_equations(sightings, n)
+        count = equations.layout.widths[n]
         _write_responses(shape, i, left[i], by_model, response, column, count, moved)
         of_depth = count - int(sightings.depths[n, 1] > 0.0)
         in_image = 0.0

@@ -165,10 +165,9 @@ class State(NamedTuple):
 
 
 @kernel
-def unpacked(evidence: Evidence, row: FloatArray) -> State:
+def unpacked(shape: Shape, focals: int, row: FloatArray) -> State:
     """The parts of a state that is a row of numbers; they share its memory."""
-    modes, points = evidence.shape.modes.shape[0], evidence.shape.mean.shape[0]
-    focals = evidence.focals.low.shape[0]
+    modes, points = shape.modes.shape[0], shape.mean.shape[0]
     a = row.shape[0] - 3 * points
     b = a - modes
     c = b - 3
@@ -176,6 +175,13 @@ def unpacked(evidence: Evidence, row: FloatArray) -> State:
     return State(
         row[:d].reshape((d // 12, 12)), row[d:c], row[c:b], row[b:a], row[a:].reshape((points, 3))
     )
+
+
+@kernel
+def undisplaced(state: State) -> State:
+    """A state with own coefficients and no displacements."""
+    still = np.zeros_like(state.displacements)
+    return State(state.poses, state.log_focals, state.log_scales, state.coefficients.copy(), still)
 
 
 def kept_rows(table: Table, kept: BoolArray | IntArray) -> Table:
@@ -209,13 +215,10 @@ def distances_of(evidence: Evidence, poses: FloatArray, points: FloatArray) -> F
     return np.asarray(((places[:, 1] - places[:, 0]) * offsets.direction).sum(axis=1))
 
 
-@kernel
 def points_of(shape: Shape, state: State) -> FloatArray:
     """The points (m, 3) in the model's frame."""
-    points, scale = np.empty_like(shape.mean), exp_of(state.log_scales)
-    for i in range(points.shape[0]):
-        points[i, 0], points[i, 1], points[i, 2] = stretched_point(shape, state, scale, i)
-    return points
+    varied = np.tensordot(state.coefficients, shape.modes, 1)
+    return np.asarray(np.exp(state.log_scales) * (shape.mean + state.displacements + varied))
 
 
 def seen_in_cameras(

@@ -15,23 +15,23 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, inlined, kernel
 from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.evidence import beyond, fall_of_weight, loss_and_root, weigh_error
-from cadalign.solvers.joint.arrow import Arrow, add_row, border_start
+from cadalign.solvers.joint.arrow import Arrow, add_rows, border_start
 from cadalign.solvers.joint.evidence import (
     DEPTH_LOSS_SCALE,
+    Directions,
     Evidence,
-    Sightings,
+    Focals,
+    Rig,
+    ScalePriors,
+    Shape,
     State,
     exp_of,
     stretched_point,
+    undisplaced,
+    unstretched,
 )
 from cadalign.solvers.linalg import cross, dot, triple
 from cadalign.solvers.projection import ray_slopes, see, shift, turn, turn_back, write_motion
-
-
-@borrowing
-def count_equations(sightings: Sightings, n: int) -> int:
-    """Number of equations that sighting n gives: a contour point one, a keypoint two or three."""
-    return 1 + int(sightings.whitening[n, 2] > 0.0) + int(sightings.depths[n, 1] > 0.0)
 
 
 @borrowing
@@ -47,7 +47,7 @@ def write_rows(
 
     The ``chosen`` sightings are of one pose. Rows of ``rows`` (6 + b + 4, C) are the unknowns of
     that pose and of the border, the residual, and the displacement of the point; columns are those
-    of `count_equations`, sighting after sighting. ``seen`` (8, N) receives, from column
+    of the sightings, one after the other. ``seen`` (8, N) receives, from column
     ``first_seen`` on, the vector by which the residual changes with the point in the rig's frame,
     the camera's z there over the depth (none for equations in depth), the residual times
     `fall_of_weight`, and the derivative by the log focal length.
@@ -118,40 +118,36 @@ def write_rows(
 
 
 @kernel
-def add_blocks(evidence: Evidence, state: State, arrow: Arrow) -> float:
-    """Add all evidence but sightings; returns its cost."""
-    cost = _add_priors(evidence, state, arrow)
-    row = np.empty(6 + arrow.border.shape[0])
+def add_blocks(evidence: Evidence, state: State, arrow: Arrow, products: FloatArray) -> float:
+    """Add all evidence but sightings; returns its cost. ``products`` are as of `add_rows`."""
+    cost = _add_priors(evidence.focals, evidence.scales, state, arrow)
+    column = np.empty(products.shape[0])
+    row, rows, still = column[:-1], column.reshape((-1, 1)), undisplaced(state)
     for q in range(count_block_equations(evidence)):
-        equation = write_block_row(evidence, state, q, row)
+        equation = write_block_row(evidence, still, q, row)
         cost += equation.cost
         row *= equation.root
-        add_row(arrow, equation.pose, row, equation.root * equation.residual)
+        column[-1] = equation.root * equation.residual
+        add_rows(arrow, equation.pose, rows, 1, products)
     return cost
 
 
-@inlined
-def first_scale(evidence: Evidence) -> int:
-    """Place of the log scales in the border."""
-    return int(evidence.focals.low.shape[0])
-
-
 @kernel
-def bounded_scales(evidence: Evidence) -> FloatArray:
-    """Rows (3, 3) by which log scales give what their bound is on."""
-    free = evidence.scales.free
-    rows = np.diag(free)
-    if free.all():
-        rows -= 1.0 / 3.0
+def bounded_scales(free: FloatArray) -> FloatArray:
+    """Rows (3, 3) by which log scales, those ``free`` (3,) 1, give what their bound is on."""
+    rows = np.zeros((3, 3))
+    mean = np.floor((free[0] + free[1] + free[2]) / 3.0) / 3.0
+    for a in range(3):
+        for b in range(3):
+            rows[a, b] = (free[a] if a == b else 0.0) - mean
     return rows
 
 
 @kernel
-def _add_priors(evidence: Evidence, state: State, arrow: Arrow) -> float:
+def _add_priors(focals: Focals, scales: ScalePriors, state: State, arrow: Arrow) -> float:
     """Add the priors on focal lengths, log scales and coefficients."""
     border, gradient = arrow.border, arrow.gradient[border_start(arrow) :]
-    focals = evidence.focals
-    first = first_scale(evidence)
+    first = focals.low.shape[0]
     cost = 0.0
     for f in range(first):
         value = state.log_focals[f] - focals.center[f]
@@ -160,11 +156,11 @@ def _add_priors(evidence: Evidence, state: State, arrow: Arrow) -> float:
         border[f, f] += focals.weight[f]
     for a in range(3):
         for b in range(3):
-            weight = evidence.scales.precision[a, b]
+            weight = scales.precision[a, b]
             cost += weight * state.log_scales[a] * state.log_scales[b]
             gradient[first + a] += weight * state.log_scales[b]
             border[first + a, first + b] += weight
-    bound, rows = evidence.scales.bound, bounded_scales(evidence)
+    bound, rows = scales.bound, bounded_scales(scales.free)
     for a in range(3):
         bounded = 0.0
         for b in range(3):
@@ -208,7 +204,7 @@ def count_block_equations(evidence: Evidence) -> int:
 def write_block_row(evidence: Evidence, state: State, q: int, row: FloatArray) -> BlockEquation:
     """Write derivatives (6 + b,) of the residual of direction, offset or depth number ``q``.
 
-    Directions come first, with three equations each.
+    Directions come first, with three equations each. The state has no displacements.
     """
     row[:] = 0.0
     offset = q - 3 * evidence.directions.image.shape[0]
@@ -222,21 +218,21 @@ def write_block_row(evidence: Evidence, state: State, q: int, row: FloatArray) -
     if offset >= 0:
         pose, residual = _write_offset(evidence, state, offset, row)
     else:
-        pose, residual = _write_direction(evidence, state, q // 3, q % 3, row)
+        rig, poses = evidence.rig, state.poses
+        pose, residual = _write_direction(evidence.directions, rig, poses, q // 3, q % 3, row)
     return BlockEquation(pose, residual, residual * residual, 1.0, 0.0)
 
 
 @inlined
 def _write_direction(
-    evidence: Evidence, state: State, d: int, w: int, row: FloatArray
+    directions: Directions, rig: Rig, poses: FloatArray, d: int, w: int, row: FloatArray
 ) -> tuple[int, float]:
     """Write equation w of a direction known in a camera, such as gravity; pose and residual.
 
     The residual is the whitened difference of two unit vectors: its length is 2 sin(angle / 2).
     """
-    directions, rig = evidence.directions, evidence.rig
     v = directions.image[d]
-    camera, pose = rig.cam_from_rig[v], state.poses[rig.pose[v]]
+    camera, pose = rig.cam_from_rig[v], poses[rig.pose[v]]
     rotated = turn(pose, triple(directions.model[d]))
     (x, y, z), known = turn(camera, rotated), directions.camera[d]
     whitening = triple(directions.whitening[d, w])
@@ -271,9 +267,9 @@ def _write_offset(evidence: Evidence, state: State, j: int, row: FloatArray) -> 
         for a in range(3):
             along = sign * offsets.direction[j, a]
             if along != 0.0:
-                stretched = np.exp(state.log_scales[a]) * _undisplaced(evidence, state, i, a)
+                stretched = np.exp(state.log_scales[a]) * unstretched(evidence.shape, state, i, a)
                 value += along * stretched
-                _add_shape(evidence, state, i, a, weight * along, row)
+                _add_shape(evidence.shape, state, i, a, weight * along, row)
     return p, value * weight
 
 
@@ -284,37 +280,22 @@ def _write_depth(evidence: Evidence, state: State, j: int, row: FloatArray) -> t
     scale = exp_of(state.log_scales)
     v, i, weight = depths.image[j], depths.point[j], depths.weight[j]
     camera, pose = rig.cam_from_rig[v], state.poses[rig.pose[v]]
-    point = (
-        scale[0] * _undisplaced(evidence, state, i, 0),
-        scale[1] * _undisplaced(evidence, state, i, 1),
-        scale[2] * _undisplaced(evidence, state, i, 2),
-    )
-    rotated = turn(pose, point)
+    rotated = turn(pose, stretched_point(evidence.shape, state, scale, i))
     _, _, depth = shift(camera, turn(camera, shift(pose, rotated)))
     by_rig = turn_back(camera, (0.0, 0.0, weight))
     by_turn, by_model = cross(rotated, by_rig), turn_back(pose, by_rig)
     for k in range(3):
         row[k], row[3 + k] = by_turn[k], by_rig[k]
-        _add_shape(evidence, state, i, k, by_model[k], row)
+        _add_shape(evidence.shape, state, i, k, by_model[k], row)
     return rig.pose[v], (depth - depths.value[j]) * weight
 
 
 @inlined
-def _undisplaced(evidence: Evidence, state: State, i: int, a: int) -> float:
-    """Coordinate a of point i, neither stretched nor displaced."""
-    value = evidence.shape.mean[i, a]
-    for k in range(evidence.shape.modes.shape[0]):
-        value += state.coefficients[k] * evidence.shape.modes[k, i, a]
-    return float(value)
-
-
-@inlined
-def _add_shape(
-    evidence: Evidence, state: State, i: int, a: int, slope: float, row: FloatArray
-) -> None:
+def _add_shape(shape: Shape, state: State, i: int, a: int, slope: float, row: FloatArray) -> None:
     """Add the derivatives by scale and modes of ``slope`` times coordinate a of point i."""
-    first = 6 + first_scale(evidence)
+    modes = shape.modes.shape[0]
+    first = row.shape[0] - modes - 3
     scale = slope * np.exp(state.log_scales[a])
-    row[first + a] += scale * _undisplaced(evidence, state, i, a)
-    for k in range(evidence.shape.modes.shape[0]):
-        row[first + 3 + k] += scale * evidence.shape.modes[k, i, a]
+    row[first + a] += scale * unstretched(shape, state, i, a)
+    for k in range(modes):
+        row[first + 3 + k] += scale * shape.modes[k, i, a]

@@ -7,21 +7,20 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.compile import fast_sums, kernel
 from cadalign.solvers.constants import LEAST_POINTS, LINEAR, UNKNOWNS, ScalePrior
 from cadalign.solvers.evidence import KeypointEvidence
-from cadalign.solvers.joint.evidence import Evidence, Shape, State, packed, unpacked
-from cadalign.solvers.joint.system import Joint, joint_cost, joint_score
-from cadalign.solvers.optimal import optimal_batch
-from cadalign.solvers.search import Effort, cost_at, descend, refine, room_for_minima, search
+from cadalign.solvers.joint.equations import JointEquations
+from cadalign.solvers.joint.evidence import Evidence, Shape, State, packed
+from cadalign.solvers.joint.system import joint_system, run_joint
+from cadalign.solvers.optimal import optimal_batch, rigid_flag
+from cadalign.solvers.search import Effort
 from cadalign.solvers.starts import widen_by_shape
 
 _PROBE_ITERATIONS = 8
 _MAX_ITERATIONS = 200
-_FEW_ITERATIONS = 3  # of a start, before the shape is integrated out
-_LESS_LIKELY = 20.0  # excess score of a start that is refined no further
 _UNLIKELY = 40.0  # excess cost, after the probe, at which a start is given up
 MOST_PER_VIEW = 8
+_EVALUATION = Effort(0, 0, 0, np.inf)
 _UNLIKELY_POSE = 60.0  # excess cost of a pose of the mean shape that is still a start
 
 
@@ -40,26 +39,17 @@ def search_joint(
 
     Returns them and the number of iterations.
     """
-    reduction = reduce_modes(evidence)
-    fewer, count = reduction.evidence, len(poses)
-    system, starts = Joint(fewer, False), _mean_rows(fewer, poses, log_focals, log_scales)
-    minima = room_for_minima(max(count, 1), starts.shape[1])
-    if _has_latent(fewer):
-        effort = Effort(count, _FEW_ITERATIONS, 0, _UNLIKELY)
-        likely = room_for_minima(max(count, 1), starts.shape[1])
-        search(system, starts, effort, 0, 0.0, likely)
-        minima.counts[1] = likely.counts[1]
-        descend(system, likely, _MAX_ITERATIONS, _LESS_LIKELY, 0, 0.0, minima)
-    else:
-        effort = Effort(count, _PROBE_ITERATIONS, _MAX_ITERATIONS, _excess(system, starts))
-        search(system, starts, effort, 0, 0.0, minima)
-    found = int(minima.counts[0])
-    states = [
-        whole_state(reduction, evidence.shape, unpacked(fewer, row))
-        for row in minima.states[:found]
-    ]
-    costs, scores = minima.costs[:found], minima.scores[:found]
-    return JointMinima(states, costs, scores), int(minima.counts[1])
+    reduction, count = reduce_modes(evidence), len(poses)
+    fewer = reduction.evidence
+    if not count:
+        return JointMinima([], np.empty(0), np.empty(0)), 0
+    starts, integrates = _mean_rows(fewer, poses, log_focals, log_scales), _has_latent(fewer)
+    unlikely = _UNLIKELY if integrates else _excess(fewer, starts[0])
+    effort = Effort(count, _PROBE_ITERATIONS, _MAX_ITERATIONS, unlikely)
+    minima, _ = run_joint(joint_system(fewer, integrates=integrates), starts, effort)
+    found, iterations = minima.counts.tolist()
+    states = [reduction.state_of(row) for row in minima.states[:found]]
+    return JointMinima(states, minima.costs[:found], minima.scores[:found]), iterations
 
 
 def _mean_rows(
@@ -77,25 +67,17 @@ def costs_at(
 ) -> FloatArray:
     """Costs (S,) of the mean shape at starts as those of `search_joint`."""
     rows = _mean_rows(evidence, poses, log_focals, log_scales)
-    return _costs_of(Joint(evidence, False), rows)
+    minima, _ = run_joint(joint_system(evidence, integrates=False), rows, _EVALUATION)
+    return minima.costs
 
 
-@kernel
-def _costs_of(system: Joint, rows: FloatArray) -> FloatArray:
-    costs = np.empty(rows.shape[0])
-    for s in range(rows.shape[0]):
-        costs[s] = cost_at(system, rows[s])
-    return costs
-
-
-def _excess(system: Joint, starts: FloatArray) -> float:
-    """Excess cost at which starts (S, D), the best first, are given up.
+def _excess(evidence: Evidence, start: FloatArray) -> float:
+    """Excess cost at which starts are given up, from that of the best (D,).
 
     It grows with the residuals, since a wrong sigma should not make every other minimum unlikely.
     """
-    cost = joint_cost(system, starts[0]) if len(starts) else np.inf
-    variance = cost / max(2 * len(system.evidence.sightings.point), 1)
-    return _UNLIKELY * max(1.0, float(variance)) if np.isfinite(variance) else _UNLIKELY
+    variance = equations_at(evidence, start)[0] / max(2 * len(evidence.sightings.point), 1)
+    return _UNLIKELY * max(1.0, variance) if variance < np.inf else _UNLIKELY
 
 
 def _has_latent(evidence: Evidence) -> bool:
@@ -106,30 +88,46 @@ def _has_latent(evidence: Evidence) -> bool:
 
 def refine_joint(
     evidence: Evidence, max_iterations: int, state: State
-) -> tuple[float, State, int, bool]:
-    """Improve a state; returns the cost, the state, the iterations, and if they converged.
+) -> tuple[float, float, State]:
+    """Improve a state; returns the cost, the score as of `score_state`, and the state.
 
-    The cost is infinite if a point lies behind a camera at the start.
+    Cost and score are infinite if a point lies behind a camera at the start.
     """
     reduction, row = reduced_row(evidence, state)
-    system = Joint(reduction.evidence, _has_latent(reduction.evidence))
-    cost, iterations, converged = refine(system, max_iterations, row)
-    if system.integrates and cost < np.inf:
-        cost = joint_cost(Joint(reduction.evidence, False), row)
-    found = whole_state(reduction, evidence.shape, unpacked(reduction.evidence, row))
-    return cost, found, iterations, converged
+    fewer, effort = reduction.evidence, Effort(1, max_iterations, 0, np.inf)
+    system = joint_system(fewer, integrates=_has_latent(fewer))
+    minima, _ = run_joint(system, row[None], effort)
+    if not minima.counts[0]:
+        return np.inf, np.inf, state
+    return float(minima.costs[0]), float(minima.scores[0]), reduction.state_of(minima.states[0])
 
 
 def objective_of(evidence: Evidence, state: State) -> float:
     """Objective of `refine_joint`: the cost, with the log determinant of what is integrated out."""
     reduction, row = reduced_row(evidence, state)
-    return float(joint_cost(Joint(reduction.evidence, _has_latent(reduction.evidence)), row))
+    return equations_at(reduction.evidence, row, integrates=_has_latent(reduction.evidence))[0]
+
+
+def cost_of(evidence: Evidence, state: State) -> float:
+    """The cost at a state, without what is integrated out."""
+    return equations_at(evidence, packed(state))[0]
 
 
 def score_state(evidence: Evidence, state: State) -> float:
     """-2 log of the evidence by Laplace's approximation; infinite where it is not determined."""
     reduction, row = reduced_row(evidence, state)
-    return float(joint_score(reduction.evidence, row))
+    system = joint_system(reduction.evidence, integrates=False)
+    minima, _ = run_joint(system, row[None], Effort(1, 0, 0, np.inf))
+    return float(minima.scores[0])
+
+
+def equations_at(
+    evidence: Evidence, row: FloatArray, *, integrates: bool = False
+) -> tuple[float, JointEquations]:
+    """The objective at a state that is a row of numbers, and the normal equations there."""
+    system = joint_system(evidence, integrates=integrates)
+    minima, equations = run_joint(system, row[None], _EVALUATION)
+    return float(minima.costs[0]), equations
 
 
 def keypoints_of(evidence: Evidence, view: int) -> KeypointEvidence:
@@ -141,7 +139,7 @@ def keypoints_of(evidence: Evidence, view: int) -> KeypointEvidence:
     if not len(rows):
         return KeypointEvidence(points, rays, whitening, LINEAR, 1.0)
     variances = shape.spread[point] ** 2 + (shape.modes[:, point] ** 2).sum(axis=(0, 2)) / 3
-    widen_by_shape(points, rays, variances, whitening)
+    whitening = widen_by_shape(points, rays, variances, whitening)
     loss, loss_scale = int(sightings.loss[rows[0]]), float(sightings.loss_scale[rows[0]])
     return KeypointEvidence(points, rays, whitening, loss, loss_scale)
 
@@ -156,6 +154,7 @@ def view_starts(evidence: Evidence, view: int) -> tuple[FloatArray, FloatArray]:
     order = (np.argmin(scales.free) + np.arange(3)) % 3
     weight = scales.precision[order[1], order[1]]
     prior = ScalePrior(weight, 0.0) if weight > 0 else scales.bound
+    free = np.append(np.ones(UNKNOWNS - 2), scales.free[order[1:]])
     found, costs, _, _, info = optimal_batch(
         np.ascontiguousarray(given.points[:, order]),
         given.rays,
@@ -165,8 +164,9 @@ def view_starts(evidence: Evidence, view: int) -> tuple[FloatArray, FloatArray]:
         np.array([given.loss_scale]),
         np.array([prior.weight]),
         float(prior.width),
-        np.append(np.ones(UNKNOWNS - 2), scales.free[order[1:]]),
+        free,
         LEAST_POINTS,
+        rigid_flag(given.loss, free),
     )
     own = costs[0, : min(info[0, 0], MOST_PER_VIEW)]
     variance = max(1.0, costs[0, 0] / (2 * len(given.points)))
@@ -176,8 +176,7 @@ def view_starts(evidence: Evidence, view: int) -> tuple[FloatArray, FloatArray]:
     return np.concatenate([rotations, poses[:, 9:12]], axis=1), np.log(poses[:, 12 + place])
 
 
-_LEAST_SQUARE = 1e-14  # of a direction's rest, over the largest
-_LOST = 0.01  # of a direction's square: less asks for a second pass
+_LEAST_SHARE = 1e-7  # of a direction, over the longest
 
 
 class Reduction(NamedTuple):
@@ -188,12 +187,33 @@ class Reduction(NamedTuple):
     such point: the rest keeps its standard normal prior, and the reduced coefficients have one,
     too. Estimates, costs and determinants are those of all modes. With several poses, the
     displacements of sighted points are modes as well, before the basis is chosen: rows K + 3 j + a
-    belong to that along axis a of point ``displaced[j]`` (u,).
+    belong to that along axis a of point ``displaced[j]`` (u,). The ``whole`` shape is that of all.
     """
 
     evidence: Evidence
     basis: FloatArray
     displaced: IntArray
+    whole: Shape
+
+    def reduced(self, state: State) -> State:
+        """A state in reduced coefficients."""
+        moved = state.displacements[self.displaced] / self.whole.spread[self.displaced, None]
+        displacements = state.displacements.copy()
+        displacements[self.displaced] = 0.0
+        given = np.concatenate([state.coefficients, moved.ravel()])
+        return state._replace(coefficients=given @ self.basis, displacements=displacements)
+
+    def state_of(self, row: FloatArray) -> State:
+        """The state in all coefficients and displacements, of one in reduced ones as a row."""
+        focals, reduced = len(self.evidence.focals.low), self.basis.shape[1]
+        modes, points = len(self.whole.modes), len(self.whole.mean)
+        sizes = focals, 3, reduced, 3 * points
+        ends = np.cumsum([len(row) - sum(sizes), *sizes[:-1]])
+        poses, log_focals, log_scales, fewer, moved = np.split(row, ends)
+        given, displacements = self.basis @ fewer, moved.reshape(-1, 3).copy()
+        own = given[modes:].reshape(-1, 3)
+        displacements[self.displaced] = own * self.whole.spread[self.displaced, None]
+        return State(poses.reshape(-1, 12), log_focals, log_scales, given[:modes], displacements)
 
 
 def reduce_modes(evidence: Evidence) -> Reduction:
@@ -207,16 +227,16 @@ def reduce_modes(evidence: Evidence) -> Reduction:
     used = used_points(evidence)
     is_small = size <= 3 * used.sum()
     if is_small and not len(displaced):
-        return Reduction(evidence, np.eye(modes), displaced)
+        return Reduction(evidence, np.eye(modes), displaced, shape)
     whole, spread = displaced_modes(shape, displaced), shape.spread.copy()
     spread[displaced] = 0.0
     basis = np.eye(size)
     if not is_small:
-        directions = np.ascontiguousarray(whole[:, used].reshape(size, -1).T)
-        basis = directions[: _orthonormalize(directions)]
+        _, lengths, basis = np.linalg.svd(whole[:, used].reshape(size, -1).T, full_matrices=False)
+        basis = basis[lengths > _LEAST_SHARE * lengths.max(initial=0.0)]
         whole = (basis @ whole.reshape(size, -1)).reshape(-1, *shape.mean.shape)
     reduced = evidence._replace(shape=Shape(shape.mean, whole, spread))
-    return Reduction(reduced, np.ascontiguousarray(basis.T), displaced)
+    return Reduction(reduced, np.ascontiguousarray(basis.T), displaced, shape)
 
 
 def displaced_modes(shape: Shape, displaced: IntArray) -> FloatArray:
@@ -227,38 +247,16 @@ def displaced_modes(shape: Shape, displaced: IntArray) -> FloatArray:
     return np.concatenate([shape.modes, own])
 
 
-def reduced_state(reduction: Reduction, whole: Shape, state: State) -> State:
-    """A state in reduced coefficients; ``whole`` is the shape that was reduced."""
-    displaced = reduction.displaced
-    moved = state.displacements[displaced] / whole.spread[displaced, None]
-    displacements = state.displacements.copy()
-    displacements[displaced] = 0.0
-    given = np.concatenate([state.coefficients, moved.ravel()])
-    return state._replace(
-        coefficients=given @ reduction.basis,
-        displacements=displacements,
-    )
-
-
 def reduced(evidence: Evidence, state: State) -> tuple[Evidence, State]:
     """The evidence in reduced modes, and a state of it."""
     reduction = reduce_modes(evidence)
-    return reduction.evidence, reduced_state(reduction, evidence.shape, state)
+    return reduction.evidence, reduction.reduced(state)
 
 
 def reduced_row(evidence: Evidence, state: State) -> tuple[Reduction, FloatArray]:
     """The reduction of evidence, and a state in it as a row of numbers."""
     reduction = reduce_modes(evidence)
-    return reduction, packed(reduced_state(reduction, evidence.shape, state))
-
-
-def whole_state(reduction: Reduction, whole: Shape, state: State) -> State:
-    """The state in the coefficients and displacements of the shape that was reduced."""
-    modes, displaced = len(whole.modes), reduction.displaced
-    given = reduction.basis @ state.coefficients
-    displacements = state.displacements.copy()
-    displacements[displaced] = given[modes:].reshape(-1, 3) * whole.spread[displaced, None]
-    return state._replace(coefficients=given[:modes], displacements=displacements)
+    return reduction, packed(reduction.reduced(state))
 
 
 def used_points(evidence: Evidence) -> BoolArray:
@@ -273,59 +271,3 @@ def sighted_points(evidence: Evidence) -> BoolArray:
     sighted = np.zeros(len(evidence.shape.mean), dtype=bool)
     sighted[evidence.sightings.point] = True
     return sighted
-
-
-@fast_sums
-def _squared(row: FloatArray) -> float:
-    total = 0.0
-    for k in range(row.shape[0]):
-        total += row[k] * row[k]
-    return total
-
-
-@fast_sums
-def _subtract(unit: FloatArray, row: FloatArray) -> float:
-    """Take the part along a unit vector off a row; returns its length."""
-    product = 0.0
-    for k in range(row.shape[0]):
-        product += unit[k] * row[k]
-    for k in range(row.shape[0]):
-        row[k] -= product * unit[k]
-    return product
-
-
-@fast_sums
-def _orthonormalize(rows: FloatArray) -> int:
-    """Turn the first rows of a matrix into an orthonormal basis of them all; returns its rank.
-
-    Gram and Schmidt's method, the longest rest first, with a second pass for rows that lost most of
-    their length.
-    """
-    count, size = rows.shape
-    squares = np.empty(count)
-    for i in range(count):
-        squares[i] = _squared(rows[i])
-    wholes = squares.copy()
-    least = _LEAST_SQUARE * squares.max() if count else 0.0
-    for rank in range(count):
-        best = rank
-        for i in range(rank + 1, count):
-            if squares[i] > squares[best]:
-                best = i
-        if not squares[best] > least:
-            return rank
-        for k in range(size):
-            rows[rank, k], rows[best, k] = rows[best, k], rows[rank, k]
-        whole = wholes[best]
-        squares[best], wholes[best] = squares[rank], wholes[rank]
-        square = _squared(rows[rank])
-        if square < _LOST * whole:
-            for i in range(rank):
-                _subtract(rows[i], rows[rank])
-            square = _squared(rows[rank])
-        factor = 1.0 / np.sqrt(square)
-        for k in range(size):
-            rows[rank, k] *= factor
-        for i in range(rank + 1, count):
-            squares[i] -= _subtract(rows[rank], rows[i]) ** 2
-    return int(count)

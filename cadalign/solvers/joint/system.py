@@ -16,11 +16,9 @@ from cadalign.arrays import FloatArray
 from cadalign.compile import inlined, kernel
 from cadalign.solvers.evidence import score_of_distance, whole_information
 from cadalign.solvers.joint.arrow import (
-    Arrow,
     add_rows,
     border_start,
     clear,
-    copy_matrix,
     decide_on_undetermined,
     factorize_arrow,
     hold,
@@ -29,63 +27,84 @@ from cadalign.solvers.joint.arrow import (
 )
 from cadalign.solvers.joint.equations import (
     JointEquations,
+    Layout,
     add_log_determinant,
     eliminate,
     follow,
     joint_room,
+    layout_of,
     shift_means,
 )
-from cadalign.solvers.joint.evidence import Evidence, State, exp_of, stretched_point, unpacked
+from cadalign.solvers.joint.evidence import (
+    Evidence,
+    ScalePriors,
+    State,
+    exp_of,
+    stretched_point,
+    unpacked,
+)
 from cadalign.solvers.joint.rows import (
     add_blocks,
     bounded_scales,
-    count_equations,
-    first_scale,
     write_rows,
 )
-from cadalign.solvers.linalg import damp, expected_decrease
+from cadalign.solvers.linalg import copy_into, damp, expected_decrease
 from cadalign.solvers.projection import shift, turn
 from cadalign.solvers.search import (
+    Effort,
+    Minima,
     are_same,
     cost_at,
+    descend,
     evaluate,
-    integrating,
     move,
+    room_for_minima,
     room_of,
     score_of,
+    search,
     solve,
 )
-from cadalign.solvers.unknowns import leaves_bounds, move_rigid, orthonormalize
+from cadalign.solvers.unknowns import move_rigid, orthonormalize
 
 _LARGEST_LOG_STEP = 1.0
 _SAME_CHORD = 1e-3
+_AT_BOUND = 1e-9  # of a log focal length
+_FEW_ITERATIONS = 3  # of a start, before the shape is integrated out
+_LESS_LIKELY = 20.0  # excess score of a start that is refined no further
 
 
 class Joint(NamedTuple):
     """All evidence; with ``integrates`` the shape is integrated out of the objective."""
 
     evidence: Evidence
+    layout: Layout
     integrates: bool
 
 
-@integrating.of(Joint)
+def joint_system(evidence: Evidence, *, integrates: bool) -> Joint:
+    """The system of all evidence."""
+    return Joint(evidence, layout_of(evidence), integrates)
+
+
 @kernel
-def _integrating(system: Joint, integrates: bool) -> Joint:
-    return Joint(system.evidence, integrates)
+def plain_system(system: Joint) -> Joint:
+    """The same with the shape estimated, not integrated out."""
+    return Joint(system.evidence, system.layout, False)
 
 
 @room_of.of(Joint)
 @kernel
 def _room_of(system: Joint) -> tuple[JointEquations, JointEquations]:
-    return joint_room(system.evidence), joint_room(system.evidence)
+    return joint_room(system.evidence, system.layout), joint_room(system.evidence, system.layout)
 
 
 @evaluate.of(Joint)
 @kernel
 def evaluate_joint(system: Joint, row: FloatArray, equations: JointEquations) -> float:
     """Write the normal equations at a state; see `cadalign.solvers.search.evaluate`."""
-    evidence, arrow = system.evidence, equations.arrow
-    state = unpacked(evidence, row)
+    evidence, arrow, layout = system.evidence, equations.arrow, system.layout
+    first = evidence.focals.low.shape[0]
+    state = unpacked(evidence.shape, first, row)
     poses = state.poses.shape[0]
     clear(arrow)
     equations.log_determinant[0] = 0.0
@@ -93,33 +112,35 @@ def evaluate_joint(system: Joint, row: FloatArray, equations: JointEquations) ->
     cost = 0.0
     seen = 0
     for p in range(poses):
-        chosen = equations.order[equations.first[p] : equations.first[p + 1]]
+        chosen = layout.order[layout.first[p] : layout.first[p + 1]]
         part = write_rows(evidence, state, chosen, equations.rows, equations.seen, seen)
         if not part < np.inf:
             return np.inf
         cost += part
         columns = 0
         for n in chosen:
-            columns += count_equations(evidence.sightings, n)
+            columns += layout.widths[n]
         seen += columns
         if poses == 1:
-            cost += eliminate(evidence, state, equations)
+            cost += eliminate(evidence.shape.spread, state.displacements, equations)
         add_rows(arrow, p, equations.rows, columns, equations.products)
-    cost += add_blocks(evidence, state, arrow)
+    cost += add_blocks(evidence, state, arrow, equations.products)
     if system.integrates:
         volume = add_log_determinant(evidence, state, equations)
         if not volume < np.inf:
             return np.inf
         cost += volume + equations.log_determinant[0]
         if poses == 1:
-            shift_means(evidence, equations)
+            shift_means(evidence.shape.spread, equations)
     for a in range(3):
         if evidence.scales.free[a] == 0.0:
-            hold(arrow, first_scale(evidence) + a)
+            hold(arrow, first + a)
     focals = evidence.focals
     for f in range(focals.low.shape[0]):
         slope = arrow.gradient[border_start(arrow) + f]
-        if leaves_bounds(state.log_focals[f], focals.low[f], focals.high[f], slope):
+        is_low = state.log_focals[f] <= focals.low[f] + _AT_BOUND
+        is_high = state.log_focals[f] >= focals.high[f] - _AT_BOUND
+        if (is_low and slope > 0.0) or (is_high and slope < 0.0):
             hold(arrow, f)
     return cost
 
@@ -127,20 +148,17 @@ def evaluate_joint(system: Joint, row: FloatArray, equations: JointEquations) ->
 @cost_at.of(Joint)
 @kernel
 def _cost_at(system: Joint, row: FloatArray) -> float:
-    return evaluate_joint(system, row, joint_room(system.evidence))
-
-
-def joint_cost(system: Joint, row: FloatArray) -> float:
-    """The cost at a state; not one kernel, since `evaluate_joint` takes long to compile."""
-    return evaluate_joint(system, row, joint_room(system.evidence))
+    return evaluate_joint(system, row, joint_room(system.evidence, system.layout))
 
 
 @solve.of(Joint)
 @kernel
 def _solve(system: Any, equations: JointEquations, damping: float, step: FloatArray) -> float:
     """Write the damped step; see `cadalign.solvers.search.solve`."""
-    factor = equations.factor
-    copy_matrix(equations.arrow, factor)
+    factor, arrow = equations.factor, equations.arrow
+    copy_into(factor.blocks.ravel(), arrow.blocks.ravel())
+    copy_into(factor.coupling.ravel(), arrow.coupling.ravel())
+    copy_into(factor.border.ravel(), arrow.border.ravel())
     damp(factor.blocks, factor.border, damping)
     if not factorize_arrow(factor):
         return np.nan
@@ -160,8 +178,9 @@ def _move(
 ) -> None:
     """Write the state that a step leads to; see `cadalign.solvers.search.move`."""
     evidence = system.evidence
-    state, moved = unpacked(evidence, row), unpacked(evidence, moved_row)
-    poses, focals = state.poses.shape[0], state.log_focals.shape[0]
+    shape, focals = evidence.shape, evidence.focals.low.shape[0]
+    state, moved = unpacked(shape, focals, row), unpacked(shape, focals, moved_row)
+    poses = state.poses.shape[0]
     for p in range(poses):
         move_rigid(state.poses[p], step[6 * p : 6 * p + 6], moved.poses[p])
         orthonormalize(moved.poses[p])
@@ -180,7 +199,7 @@ def _move(
         for a in range(3):
             moved.displacements[i, a] = state.displacements[i, a]
     if poses == 1:
-        follow(evidence, equations, step, moved)
+        follow(evidence.shape.spread, equations, step, moved.displacements)
 
 
 @inlined
@@ -206,43 +225,28 @@ def _bounded(log_step: float) -> float:
 @score_of.of(Joint)
 @kernel
 def _score_of(system: Joint, row: FloatArray, cost: float) -> float:
-    equations = joint_room(system.evidence)
-    cost = evaluate_joint(Joint(system.evidence, False), row, equations)
-    return _score_from(system.evidence, row, cost, equations)
-
-
-def joint_score(evidence: Evidence, row: FloatArray) -> float:
-    """-2 log of the evidence by Laplace's approximation; infinite where it is not determined."""
-    equations = joint_room(evidence)
-    cost = evaluate_joint(Joint(evidence, False), row, equations)
-    return _score_from(evidence, row, cost, equations)
-
-
-@kernel
-def _score_from(
-    evidence: Evidence, row: FloatArray, cost: float, equations: JointEquations
-) -> float:
+    evidence, equations = system.evidence, joint_room(system.evidence, system.layout)
+    cost, arrow = evaluate_joint(plain_system(system), row, equations), equations.arrow
     if not cost < np.inf:
         return np.inf
-    decide_on_undetermined(equations.arrow, equations.arrow.blocks.shape[0] > 1)
-    _bound_volume(evidence, equations.arrow)
-    if not factorize_arrow(equations.arrow):
+    decide_on_undetermined(arrow, arrow.blocks.shape[0] > 1)
+    first = evidence.focals.low.shape[0]
+    _bound_volume(evidence.scales, arrow.border[first:, first:])
+    if not factorize_arrow(arrow):
         return np.inf
-    score = cost + log_determinant(equations.arrow) + equations.log_determinant[0]
-    return float(score + _score_of_distances(evidence, unpacked(evidence, row)))
+    score = cost + log_determinant(arrow) + equations.log_determinant[0]
+    return float(score + _score_of_distances(evidence, unpacked(evidence.shape, first, row)))
 
 
 @kernel
-def _bound_volume(evidence: Evidence, arrow: Arrow) -> None:
+def _bound_volume(scales: ScalePriors, information: FloatArray) -> None:
     """Add the information of a prior that is flat at the estimate: no volume exceeds its own."""
-    bound, first = evidence.scales.bound, first_scale(evidence)
-    if bound.weight > 0.0:
-        rows = bounded_scales(evidence)
+    if scales.bound.weight > 0.0:
+        rows, whole = bounded_scales(scales.free), whole_information(scales.bound)
         for a in range(3):
             for b in range(3):
                 for c in range(3):
-                    share = rows[a, b] * rows[a, c]
-                    arrow.border[first + b, first + c] += share * whole_information(bound)
+                    information[b, c] += rows[a, b] * rows[a, c] * whole
 
 
 @kernel
@@ -268,8 +272,8 @@ def _score_of_distances(evidence: Evidence, state: State) -> float:
 @are_same.of(Joint)
 @kernel
 def _are_same(system: Joint, first_row: FloatArray, second_row: FloatArray) -> bool:
-    evidence = system.evidence
-    first, second = unpacked(evidence, first_row), unpacked(evidence, second_row)
+    shape, focals = system.evidence.shape, system.evidence.focals.low.shape[0]
+    first, second = unpacked(shape, focals, first_row), unpacked(shape, focals, second_row)
     square = 0.0
     for p in range(first.poses.shape[0]):
         for i in range(9):
@@ -279,3 +283,31 @@ def _are_same(system: Joint, first_row: FloatArray, second_row: FloatArray) -> b
     for f in range(first.log_focals.shape[0]):
         square += (first.log_focals[f] - second.log_focals[f]) ** 2
     return square < _SAME_CHORD * _SAME_CHORD
+
+
+@kernel
+def run_joint(system: Joint, starts: FloatArray, effort: Effort) -> tuple[Minima, JointEquations]:
+    """Search from starts (S, D); with ``effort.starts`` 0, write their costs and last equations.
+
+    A single kernel does both, since each would compile the equations anew. With
+    ``effort.iterations`` 0 the objective itself is probed; otherwise, where the shape is integrated
+    out, few steps tell the promising starts first. The ``costs`` of minima never have it integrated
+    out.
+    """
+    plain, integrates, size = plain_system(system), system.integrates, starts.shape[1]
+    equations = joint_room(system.evidence, system.layout)
+    minima = room_for_minima(effort.starts if effort.starts > 0 else starts.shape[0], size)
+    if effort.starts == 0:
+        for s in range(starts.shape[0]):
+            minima.costs[s] = evaluate_joint(system, starts[s], equations)
+    elif integrates and effort.iterations > 0:
+        likely = room_for_minima(effort.starts, size)
+        few = Effort(effort.starts, _FEW_ITERATIONS, 0, effort.unlikely)
+        search(plain, starts, few, 0, 0.0, likely)
+        minima.counts[1] = likely.counts[1]
+        descend(plain, system, likely, effort.iterations, _LESS_LIKELY, 0, 0.0, minima)
+    else:
+        search(system, starts, effort, 0, 0.0, minima)
+        for k in range(minima.counts[0] if integrates else 0):
+            minima.costs[k] = cost_at(plain, minima.states[k])
+    return minima, equations

@@ -66,7 +66,6 @@ from cadalign.solvers.search import (
     are_same,
     cost_at,
     evaluate,
-    integrating,
     move,
     room_of,
     score_of,
@@ -147,26 +146,6 @@ def posed_room(system: Posed) -> PosedEquations:
 @kernel
 def _room_of(system: Posed) -> tuple[PosedEquations, PosedEquations]:
     return posed_room(system), posed_room(system)
-
-
-@integrating.of(Posed)
-@kernel
-def _integrating(system: Posed, integrates: bool) -> Posed:
-    return Posed(system.target, system.seen, integrates)
-
-
-@kernel
-def state_at(pose: FloatArray, keypoints: int) -> FloatArray:
-    """The state of the mean at a pose (12,)."""
-    state = np.zeros(POSE + 6 * keypoints)
-    copy_into(state[:POSE], pose)
-    return state
-
-
-@kernel
-def force_of(state: FloatArray) -> FloatArray:
-    """The w (n, 3) of a state."""
-    return state[(state.shape[0] + POSE) // 2 :].copy().reshape((-1, 3))
 
 
 @evaluate.of(Posed)

@@ -51,38 +51,29 @@ class GaussianTarget(NamedTuple):
     covariance: FloatArray
 
 
+def mixture_at(mixture: Mixture, seen: Seen) -> Mixture:
+    """The Gaussians at the keypoints: means (G, n, 3), covariances (G, 3 n, 3 n)."""
+    rows = coordinates_of(seen)
+    covariances = np.ascontiguousarray(mixture.covariances[:, rows[:, None], rows])
+    return Mixture(mixture.means[:, seen.points], covariances, mixture.penalties)
+
+
 @kernel
-def target_of(mixture: Mixture, component: int, seen: Seen) -> GaussianTarget:
-    """A component at the keypoints."""
-    n = seen.points.shape[0]
-    whole = mixture.covariances[component]
-    mean = np.empty((n, 3))
-    covariance = np.empty((3 * n, 3 * n))
-    for i in range(n):
-        p = seen.points[i]
-        for a in range(3):
-            mean[i, a] = mixture.means[component, p, a]
-            for j in range(n):
-                q = seen.points[j]
-                for b in range(3):
-                    covariance[3 * i + a, 3 * j + b] = whole[3 * p + a, 3 * q + b]
-    return GaussianTarget(mean, covariance)
+def target_of(mixture: Mixture, component: int) -> GaussianTarget:
+    """A component of a mixture at the keypoints."""
+    return GaussianTarget(mixture.means[component], mixture.covariances[component])
 
 
-@fast_sums
-def shape_at(mixture: Mixture, component: int, seen: Seen, force: FloatArray) -> FloatArray:
-    """All points (m, 3) of the shape that a force (n, 3) on the keypoints leads to."""
-    whole = mixture.covariances[component]
-    points: FloatArray = mixture.means[component].copy()
-    for p in range(points.shape[0]):
-        for a in range(3):
-            total = 0.0
-            for i in range(seen.points.shape[0]):
-                first = 3 * seen.points[i]
-                for b in range(3):
-                    total += whole[3 * p + a, first + b] * force[i, b]
-            points[p, a] += total
-    return points
+def coordinates_of(seen: Seen) -> IntArray:
+    """Numbers (3 n,) of the keypoints' coordinates among those of all points."""
+    return np.asarray((3 * seen.points[:, None] + np.arange(3)).ravel())
+
+
+def shape_at(mixture: Mixture, component: int, seen: Seen, state: FloatArray) -> FloatArray:
+    """All points (m, 3) of the shape at a state of `cadalign.solvers.marginal.equations.Posed`."""
+    force = state[len(state) - 3 * len(seen.points) :]
+    moved = mixture.covariances[component][:, coordinates_of(seen)] @ force
+    return np.asarray(mixture.means[component] + moved.reshape(-1, 3))
 
 
 @fast_sums

@@ -13,9 +13,9 @@ from cadalign.compile import kernel
 from cadalign.solvers.alignment import Objective, center_and_unit
 from cadalign.solvers.constants import POSE_SIZE, UNKNOWNS, ScalePrior
 from cadalign.solvers.evidence import KeypointEvidence
-from cadalign.solvers.linalg import eigenvectors_4, factorize, solve_factor
-from cadalign.solvers.marginal.equations import Posed, state_at
-from cadalign.solvers.marginal.problem import GaussianTarget, Mixture, Seen, target_of
+from cadalign.solvers.linalg import copy_into, eigenvectors_4, factorize, solve_factor
+from cadalign.solvers.marginal.equations import POSE, Posed
+from cadalign.solvers.marginal.problem import GaussianTarget, Mixture, Seen, mixture_at, target_of
 from cadalign.solvers.search import Effort, Minima, descend, room_for_minima, search
 from cadalign.solvers.starts import rotation_starts, widen_by_shape
 from cadalign.solvers.unknowns import orthonormalize, uncenter
@@ -35,7 +35,6 @@ _UNLIKELY_SHAPE = 60.0  # squared distance of a start from the mean, in deviatio
 _FLATNESS = 0.01  # displacement that no image shows, relative to the extent
 
 
-@kernel
 def search_view(mixture: Mixture, seen: Seen, given: FloatArray) -> tuple[Minima, int]:
     """Search from all starts, ``given`` poses (k, 12) among them.
 
@@ -43,47 +42,66 @@ def search_view(mixture: Mixture, seen: Seen, given: FloatArray) -> tuple[Minima
     det M, and the number of starts. The components share their starts: what the mean of one
     suggests may be the best of another.
     """
-    components, n = mixture.means.shape[0], seen.points.shape[0]
-    targets = [target_of(mixture, g, seen) for g in range(components)]
-    starts = np.empty((_MOST_STARTS, 12))
+    own = mixture_at(mixture, seen)
+    variances = own.covariances.diagonal(axis1=1, axis2=2).reshape(own.means.shape).mean(axis=2)
+    widened = [
+        widen_by_shape(mean, seen.rays, own_variances, seen.whitening)
+        for mean, own_variances in zip(own.means, variances, strict=True)
+    ]
+    return _search_mixture(own, seen, np.stack(widened), given)
+
+
+@kernel
+def _search_mixture(
+    mixture: Mixture, seen: Seen, widened: FloatArray, given: FloatArray
+) -> tuple[Minima, int]:
+    """As `search_view`, of a mixture at the keypoints, and their whitening (G, n, 3) about it."""
+    components, n = mixture.means.shape[0], mixture.means.shape[1]
+    starts = np.empty((_MOST_STARTS, POSE))
     firsts = np.zeros(components + 1, dtype=np.int64)
     count = min(given.shape[0], _MOST_STARTS)
-    starts[:count] = given[:count]
+    for k in range(count):
+        copy_into(starts[k], given[k])
     for g in range(components):
         firsts[g] = count
-        count = _add_starts(targets[g], seen, starts, count)
+        count = _add_starts(target_of(mixture, g), seen, widened[g], starts, count)
     firsts[components] = count
-    likely = room_for_minima(_MOST, 12 + 6 * n)
+    likely = room_for_minima(_MOST, POSE + 6 * n)
     for g in range(components):
         chosen = _chosen(starts[:count], given.shape[0], firsts[g], firsts[g + 1])
-        states = np.empty((chosen.shape[0], 12 + 6 * n))
+        states = np.zeros((chosen.shape[0], POSE + 6 * n))
         for s in range(chosen.shape[0]):
-            states[s] = state_at(starts[chosen[s]], n)
+            copy_into(states[s, :POSE], starts[chosen[s]])
         effort = Effort(chosen.shape[0], _PROBE_ITERATIONS, 0, _UNLIKELY)
-        search(Posed(targets[g], seen, False), states, effort, g, mixture.penalties[g], likely)
+        plain = Posed(target_of(mixture, g), seen, False)
+        search(plain, states, effort, g, mixture.penalties[g], likely)
     found = likely.counts[0]
-    minima = room_for_minima(max(found, 1), 12 + 6 * n)
+    minima = room_for_minima(max(found, 1), POSE + 6 * n)
     minima.counts[1] = likely.counts[1]
     is_left = np.ones(components, dtype=np.bool_)
     for k in range(found):  # the most promising component first
         g = likely.label[k]
         if is_left[g]:
             is_left[g] = False
-            system, penalty = Posed(targets[g], seen, False), mixture.penalties[g]
-            descend(system, likely, _MAX_ITERATIONS, _LESS_LIKELY, g, penalty, minima)
+            target, penalty = target_of(mixture, g), mixture.penalties[g]
+            plain, whole = Posed(target, seen, False), Posed(target, seen, True)
+            descend(plain, whole, likely, _MAX_ITERATIONS, _LESS_LIKELY, g, penalty, minima)
     return minima, count
 
 
 @kernel
-def _add_starts(target: GaussianTarget, seen: Seen, starts: FloatArray, count: int) -> int:
+def _add_starts(
+    target: GaussianTarget, seen: Seen, whitening: FloatArray, starts: FloatArray, count: int
+) -> int:
     """Append the starts of one component, and those half a turn away; returns the new number."""
-    own = mean_starts(target, seen)
+    own = _mean_starts(target, seen, whitening)
     motions = half_turns(target)
     for m in range(motions.shape[0] + 1):
         for k in range(own.shape[0]):
             if count == starts.shape[0]:
                 return count
-            starts[count] = own[k] if m == 0 else after_motion(own[k], motions[m - 1])
+            moved = own[k] if m == 0 else after_motion(own[k], motions[m - 1])
+            copy_into(starts[count], moved)
             count += 1
     return count
 
@@ -102,17 +120,16 @@ def _chosen(starts: FloatArray, given: int, first: int, end: int) -> IntArray:
             if kind != turn or (turn == 2 and is_among(starts[s], kept[:found], _SAME_START)):
                 continue
             chosen[found] = s
-            kept[found] = starts[s]
+            copy_into(kept[found], starts[s])
             found += 1
     return chosen[:found].copy()
 
 
 @kernel
-def mean_starts(target: GaussianTarget, seen: Seen) -> FloatArray:
+def _mean_starts(target: GaussianTarget, seen: Seen, whitening: FloatArray) -> FloatArray:
     """Poses (S, 12) of the mean, the likeliest first.
 
-    The best of poses at evenly spread rotations are improved by a few steps. The shape's
-    uncertainty widens the keypoints' own.
+    The best of poses at evenly spread rotations are improved by a few steps.
     """
     center, unit = center_and_unit(target.mean)
     if not unit > 0:
@@ -120,7 +137,6 @@ def mean_starts(target: GaussianTarget, seen: Seen) -> FloatArray:
     points = (target.mean - center) / unit
     free = np.ones(UNKNOWNS)
     free[6:] = 0.0
-    whitening = _widened(target, seen)
     keypoints = KeypointEvidence(points, seen.rays, whitening, seen.loss, seen.loss_scale)
     objective = Objective(free, keypoints, ScalePrior(0.0, 0.0))
     grid = np.empty((_ROTATIONS, POSE_SIZE))
@@ -134,7 +150,7 @@ def mean_starts(target: GaussianTarget, seen: Seen) -> FloatArray:
         if not is_among(pose, poses[:found], _SAME_CHORD):
             orthonormalize(pose)
             uncenter(pose, center, unit)
-            poses[found] = pose[:12]
+            copy_into(poses[found], pose[:POSE])
             found += 1
     return poses[:found].copy()
 
@@ -149,18 +165,6 @@ def is_among(pose: FloatArray, poses: FloatArray, chord: float) -> bool:
         if square < chord * chord:
             return True
     return False
-
-
-@kernel
-def _widened(target: GaussianTarget, seen: Seen) -> FloatArray:
-    """Whitening (n, 3) of the keypoints about the mean's projection."""
-    variances = np.zeros(seen.points.shape[0])
-    for i in range(variances.shape[0]):
-        for a in range(3):
-            variances[i] += target.covariance[3 * i + a, 3 * i + a] / 3.0
-    whitening = seen.whitening.copy()
-    widen_by_shape(target.mean, seen.rays, variances, whitening)
-    return whitening
 
 
 @kernel
@@ -201,7 +205,7 @@ def half_turns(target: GaussianTarget) -> FloatArray:
             )
             for a in range(3):
                 moved[3 * i + a] = along * axis[a] - 2.0 * offsets[i, a]
-        solved[:] = moved
+        copy_into(solved, moved)
         solve_factor(factor, solved)
         square = 0.0
         distance = 0.0

@@ -5,36 +5,32 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.estimates import mean_state
 from cadalign.estimation.joint_robust import (
     JointConsensus,
     robust_minima,
-    robust_starts,
     whitened_lengths,
     with_sightings,
     without_hidden,
 )
-from cadalign.estimation.prior import Lenses, is_exact
+from cadalign.estimation.prior import Lenses
 from cadalign.estimation.problem import Inits, Problem
 from cadalign.estimation.problems import no_redundancy_error
-from cadalign.estimation.starts import Start, Starts, starts_of
+from cadalign.estimation.search_starts import starts_of_problem
+from cadalign.estimation.starts import Starts
 from cadalign.estimation.support import Support, area_of, check_support
 from cadalign.estimation.uncertainty.evidence import count_equations
 from cadalign.estimation.uncertainty.posterior import widening_of
 from cadalign.estimation.view import View
-from cadalign.solvers.joint.evidence import Evidence, Shape, State, points_of
-from cadalign.solvers.joint.search import costs_at, refine_joint, score_state, search_joint
+from cadalign.solvers.joint.evidence import Evidence, State, points_of
+from cadalign.solvers.joint.search import refine_joint, score_state, search_joint
 
-_MOST_PER_FOCAL = 8  # starts of one pose, at each focal length of the grid
-_MOST_PER_FOCAL_OF_SEVERAL = 3
-_COARSE_SIGHTINGS = 256  # of a view of an exact model, which separate the starts
-_SAME_BRANCH = 0.6  # chord between rotations of one minimum at neighbouring focal lengths
 _SAME = 1e-3  # difference of rotations and log focal lengths of one minimum
 _ITERATIONS = 100  # about a lens that is linearised anew
 _LENS_ROUNDS = 12  # of linearising lenses with distortion about the focal lengths
@@ -88,7 +84,7 @@ def minima_at_noise(problem: Problem, init: Inits) -> tuple[list[Minimum], int, 
     minima: list[Minimum] = []
     iterations = hypotheses = 0
     for number, shape in enumerate(problem.prior.components):
-        lenses, starts = _starts(problem, shape, init)
+        lenses, starts = starts_of_problem(problem, shape, init)
         hypotheses += len(starts.poses)
         if not len(starts.poses):
             continue
@@ -96,7 +92,7 @@ def minima_at_noise(problem: Problem, init: Inits) -> tuple[list[Minimum], int, 
         if any(init) and _is_left_to_outlines(problem, evidence):
             found, used = _states_of(evidence, starts), 0
         else:
-            found, used = _searched(problem, evidence, starts)
+            found, used = _searched(problem, lenses, evidence, starts)
         iterations += used
         prior_score = -2 * float(np.log(problem.prior.weights[number]))
         minima.extend(
@@ -136,12 +132,12 @@ def _states_of(evidence: Evidence, starts: Starts) -> list[JointConsensus]:
 
 
 def _searched(
-    problem: Problem, evidence: Evidence, starts: Starts
+    problem: Problem, lenses: Lenses, evidence: Evidence, starts: Starts
 ) -> tuple[list[JointConsensus], int]:
     """Minima from starts, and the number of iterations."""
     ransac = problem.ransac
     if ransac is not None:
-        threshold = thresholds(evidence, problem.lenses, problem.threshold(ransac))
+        threshold = thresholds(evidence, lenses, problem.threshold(ransac))
         projects = ransac.max_reproj_error is None
         return robust_minima(evidence, starts, threshold, settles=ransac.refine, projects=projects)
     every = np.ones(len(evidence.sightings.point), dtype=bool)
@@ -151,84 +147,6 @@ def _searched(
         for state, cost, score in zip(*minima, strict=True)
     ]
     return found, used
-
-
-def _starts(problem: Problem, shape: Shape, init: Inits) -> tuple[Lenses, Starts]:
-    """Starts at every focal length of the grid, and the lenses that these are relative to.
-
-    Where focal lengths are unknown, the lenses are those of the start of the lowest cost: lenses
-    with distortion are linear near it. Focal lengths at which a lens cannot be undone have none.
-    """
-    lenses, ransac = problem.lenses, problem.ransac
-    found: list[tuple[Lenses, Starts, FloatArray]] = []
-    failure: InputError | None = None
-    plain = None if lenses.are_distorted else _thinned(problem.evidence(shape, lenses))
-    for log_focals in lenses.grid():
-        there = replace(lenses, cameras=tuple(lenses.cameras_at(log_focals)))
-        try:
-            if plain is None:
-                evidence = _thinned(problem.evidence(shape, there))
-            else:
-                evidence = _zoomed(plain, log_focals, there)
-        except InputError as error:
-            failure = error
-            continue
-        first = _start(init, evidence)
-        if ransac is None:
-            starts = starts_of(evidence, first)
-        else:
-            trusted = [cast("FloatArray | None", view.scores) for view in problem.views]
-            starts = robust_starts(evidence, ransac, trusted, first)
-        if not lenses.count:
-            return lenses, starts
-        one = starts.poses.shape[1] == 1
-        most = _MOST_PER_FOCAL if one else _MOST_PER_FOCAL_OF_SEVERAL
-        starts = Starts(*(column[:most] for column in starts))
-        found.append((there, starts, costs_at(evidence, *starts)))
-    if failure is not None and not found:
-        raise failure
-    number = np.repeat(np.arange(len(found)), [len(costs) for _, _, costs in found])
-    costs = np.concatenate([own for _, _, own in found])
-    order = np.argsort(costs, kind="stable")
-    reference = found[number[order[0]]][0] if len(costs) else lenses
-    ratios = np.array([each.focal_lengths for each, _, _ in found]) / reference.focal_lengths
-    poses, log_scales = (
-        np.concatenate([getattr(starts, name) for _, starts, _ in found])
-        for name in ("poses", "log_scales")
-    )
-    if ransac is None and is_exact(evidence):
-        order = order[_unimproved(poses, costs, number)[order]]
-    return reference, Starts(poses[order], np.log(ratios)[number[order]], log_scales[order])
-
-
-def _thinned(evidence: Evidence) -> Evidence:
-    """Evidence about an unknown focal length, with as many sightings as tell starts apart."""
-    count, most = len(evidence.sightings.point), _COARSE_SIGHTINGS * len(evidence.rig.pose)
-    if count <= most or not len(evidence.focals.low) or not is_exact(evidence):
-        return evidence
-    return with_sightings(evidence, np.arange(most) * count // most)
-
-
-def _zoomed(evidence: Evidence, log_focals: FloatArray, lenses: Lenses) -> Evidence:
-    """The evidence with rays of ``lenses`` without distortion, ``log_focals`` (F,) longer."""
-    sightings = evidence.sightings
-    logs = np.append(log_focals, 0.0)[evidence.focals.group[sightings.image], None]
-    seen = sightings._replace(
-        rays=sightings.rays * np.exp(-logs), whitening=sightings.whitening * np.exp(logs)
-    )
-    return evidence._replace(sightings=seen, focals=lenses.focals())
-
-
-def _unimproved(poses: FloatArray, costs: FloatArray, number: IntArray) -> BoolArray:
-    """True for the starts (S,) that none at a neighbouring focal length improves on.
-
-    Starts whose rotations are nearly the same lie on the way to the same minimum; ``number`` (S,)
-    is that of their focal length in the grid.
-    """
-    turns = poses[:, None, :, :9] - poses[None, :, :, :9]
-    is_one = (np.linalg.norm(turns, axis=-1) < _SAME_BRANCH).all(axis=-1)
-    is_next = np.abs(number[:, None] - number) == 1
-    return np.asarray(~(is_one & is_next & (costs < costs[:, None])).any(axis=1))
 
 
 def _distinct(minima: Sequence[Minimum]) -> list[Minimum]:
@@ -255,7 +173,10 @@ def _relinearised(problem: Problem, minimum: Minimum) -> Minimum:
             break
         cameras = tuple(minimum.lenses.cameras_at(log_focals))
         lenses = replace(minimum.lenses, cameras=cameras)
-        there = problem.evidence(minimum.evidence.shape, lenses)
+        try:
+            there = problem.evidence(minimum.evidence.shape, lenses)
+        except InputError:  # a lens cannot be undone at these
+            break
         evidence = with_sightings(there, minimum.inliers)
         state = minimum.state._replace(log_focals=np.zeros_like(log_focals))
         cost, _, state = refine_joint(evidence, _ITERATIONS, state)
@@ -304,26 +225,6 @@ def thresholds(evidence: Evidence, lenses: Lenses, max_reproj_error: float) -> F
     focal = np.array([np.sqrt(camera.fx * camera.fy) for camera in lenses.cameras])
     root = np.sqrt(sightings.whitening[:, 0] * sightings.whitening[:, 2])
     return max_reproj_error / focal[sightings.image] * root
-
-
-def _start(init: Inits, evidence: Evidence) -> Start | None:
-    """Given alignments as a start; where the size is held, they shrink about their cameras."""
-    given = [each for each in init if each is not None]
-    if not given:
-        return None
-    held = evidence.scales.free == 0
-    poses: list[FloatArray | None] = [None] * (int(evidence.rig.pose.max()) + 1)
-    for number, each in enumerate(init):
-        if each is None:
-            continue
-        size = np.array(each.scale)[held].mean() if held.any() else 1.0
-        poses[evidence.rig.pose[number]] = np.concatenate(
-            [each.rotation.ravel(), each.translation / size]
-        )
-    scale = np.array(given[0].scale)
-    if held.any():
-        scale = np.where(held, 1.0, scale / scale[held].mean())
-    return poses, np.log(scale)
 
 
 def find_minima(

@@ -280,7 +280,7 @@ def _with_bounded_repeated(
     for b in np.flatnonzero(outside).tolist():
         own = points[problems.rows(b)]
         one = _solve_optimal(problems.part(b, b + 1), options, own, None, _BOUNDED_ROUNDS)
-        for name in ("poses", "costs", "covariances", "statuses", "info", "focals", "sigmas"):
+        for name in ("poses", "costs", "covariances", "statuses", "info", "sigmas"):
             if (values := getattr(found, name)) is not None:
                 values[b] = getattr(one, name)[0]
         if one.errors:

@@ -11,7 +11,7 @@ from cadalign.annotate.live import LiveAlignment, short
 from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.models import KeypointRegistry, ObjectShape
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
-from cadalign.geometry.projection import predicted_covariances, projection_jacobian
+from cadalign.geometry.camera import predicted_covariances, projection_jacobian
 from cadalign.render.viewpoints import visible_keypoints
 
 # Depth of visible points beneath the surface, and beneath one that is warped [diagonals].

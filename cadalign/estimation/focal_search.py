@@ -21,8 +21,7 @@ from cadalign.estimation.search import minima_at_noise
 from cadalign.estimation.uncertainty.posterior import Likelihood
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
-from cadalign.geometry.projection import projection_jacobian
+from cadalign.geometry.camera import Camera, projection_jacobian
 from cadalign.solvers.alignment import Objective, covariance_of
 from cadalign.solvers.constants import (
     DEGENERATE,

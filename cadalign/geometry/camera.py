@@ -286,6 +286,7 @@ _REACH = 85.0  # of rays off the facing axis [degrees]
 _OF_OBJECT = 60.0  # half the angle under which an object is seen that stray keypoints go beyond
 _CANDIDATES = 200
 _ROUNDS = 64
+_OF_A_RESULT = 10  # unknowns of a result's covariance, focal length included
 
 
 def require_perspective(camera: Camera, what: str) -> None:
@@ -375,3 +376,31 @@ def turned_covariance(covariance: FloatArray, rotation: FloatArray) -> FloatArra
     turn = np.eye(covariance.shape[-1])
     turn[:3, :3] = turn[3:6, 3:6] = rotation
     return np.asarray(turn @ covariance @ turn.T)
+
+
+def projection_jacobian(points_3d: FloatArray, camera: Camera, alignment: Alignment) -> FloatArray:
+    """Derivatives (n, 2, 10) of projected points, in the order of `cadalign.Result.covariance`.
+
+    In pixels per rad, model unit, and unit of a logarithm. Refuses points behind the camera.
+    """
+    in_camera = alignment.apply(points_3d)
+    if not camera.sees(in_camera).all():
+        raise InputError("a point lies behind the camera", where="points_3d")
+    stretched = points_3d * alignment.scale
+    turned = stretched @ alignment.rotation.T
+    jacobian = np.empty((len(points_3d), 2, _OF_A_RESULT))
+    by_point = camera.projection_slopes(in_camera)
+    jacobian[:, :, :3] = np.cross(turned[:, None], by_point)
+    jacobian[:, :, 3:6] = by_point
+    jacobian[:, :, 6:9] = by_point @ (alignment.rotation * stretched[:, None])
+    jacobian[:, :, 9] = camera.pixels_of_rays(in_camera) - (camera.cx, camera.cy)
+    return jacobian
+
+
+def predicted_covariances(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Covariances (n, 2, 2) [px^2] of predicted projections, without a measurement's own noise.
+
+    By the `projection_jacobian` and the covariance of the unknowns (m, m), the first of its 10.
+    """
+    jacobian = jacobian[:, :, : len(covariance)]
+    return np.asarray(jacobian @ covariance @ jacobian.transpose(0, 2, 1))

@@ -18,7 +18,7 @@ from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.unseen import UnseenObject
 from cadalign.evaluation.simulation import Problem
-from cadalign.geometry.projection import projection_jacobian
+from cadalign.geometry.camera import projection_jacobian
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import rotation_error
 from cadalign.render import look_at

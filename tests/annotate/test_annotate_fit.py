@@ -23,8 +23,8 @@ from cadalign.annotate.suggestion import Suggestion, suggest
 from cadalign.datasets import ModelKeypoint
 from cadalign.errors import DegenerateError, InputError
 from cadalign.evaluation.simulation import Problem
+from cadalign.geometry.camera import projection_jacobian
 from cadalign.geometry.mesh import Mesh
-from cadalign.geometry.projection import projection_jacobian
 from cadalign.io.evidence import ImageEvidence
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation

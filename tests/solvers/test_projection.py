@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cadalign import Alignment, Camera
+from cadalign.geometry.camera import projection_jacobian
 from cadalign.geometry.pixels import perspective
-from cadalign.geometry.projection import projection_jacobian
 from cadalign.solvers.alignment import Objective, evaluate_alignment, evaluate_cost, room_for
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR, UNKNOWNS
 from cadalign.solvers.evidence import KeypointEvidence, ScalePrior

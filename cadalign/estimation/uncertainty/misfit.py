@@ -24,8 +24,7 @@ from cadalign.estimation.uncertainty.residuals import (
 from cadalign.estimation.uncertainty.summary import percent, uncertainty_of
 from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
-from cadalign.geometry.projection import predicted_covariances, projection_jacobian
+from cadalign.geometry.camera import Camera, predicted_covariances, projection_jacobian
 
 Rows = npt.NDArray[np.intp]
 _FALSE_OUTLIERS = 0.01

@@ -13,11 +13,11 @@ from cadalign.geometry.camera import (
     Camera,
     faced,
     needs_facing,
+    projection_jacobian,
     turned_alignment,
     turned_covariance,
 )
 from cadalign.geometry.pixels import perspective
-from cadalign.geometry.projection import projection_jacobian
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.shapes.parts import probability_within
 from cadalign.solvers.alignment import covariance_of, keypoint_objective

@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.options import LOSSES, FitOptions
 from cadalign.estimation.prior import Lenses, ShapePrior, scale_priors
@@ -37,8 +37,6 @@ _GAP = 4.0  # between surfaces in a window [sigma]
 _LEAST_PIXELS = 3  # of a surface in a window
 _LEAST_OF_PLANE = 6  # pixels of one whose slope is told
 _PLAIN = FitOptions()
-TABLES = ("sightings", "directions", "offsets", "image_depths")
-"""Evidence by rows, each with the ``image`` of its view, -1 for what is of none."""
 
 
 def evidence_of(
@@ -84,17 +82,6 @@ def evidence_of(
         offsets,
         _image_depths(prior.components[0], rows, views),
         scale_priors(prior, _is_metric(offsets, views)),
-    )
-
-
-def told_by(evidence: Evidence, views: BoolArray) -> Evidence:
-    """The evidence of some views (V,), and what is of none."""
-    tables = {name: getattr(evidence, name) for name in TABLES}
-    return evidence._replace(
-        **{
-            name: kept_rows(rows, (rows.image < 0) | views[rows.image])
-            for name, rows in tables.items()
-        }
     )
 
 

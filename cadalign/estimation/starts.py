@@ -18,13 +18,12 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.estimation.pack import told_by
 from cadalign.estimation.prior import has_scale_prior
 from cadalign.estimation.uncertainty.evidence import count_equations
 from cadalign.geometry.rotations import spread_rotations
 from cadalign.solvers.constants import LEAST_POINTS
 from cadalign.solvers.joint.evidence import Evidence, distances_of, seen_in_cameras
-from cadalign.solvers.joint.search import MOST_PER_VIEW, view_starts
+from cadalign.solvers.joint.search import view_starts
 from cadalign.solvers.marginal.problem import GaussianTarget
 from cadalign.solvers.marginal.search import after_motion, half_turns
 
@@ -100,12 +99,12 @@ def _proposed(evidence: Evidence, init: Start | None) -> list[_Start]:
             # are noise: the likeliest poses that keypoints alone suggest come after them.
             first = [(pose[None], logs) for pose, logs in per_pose[0][:_MOST_SIZED]]
             return placed + [_sized(evidence, *each) for each in first]
+        if rig.is_shared.any():  # nothing tells the size
+            return []
     for view in _weakly_determined(evidence):
         per_pose[rig.pose[view]][:0] = _carried_starts(evidence, view, per_pose)
     if not all(per_pose):
         return []
-    if is_metric and rig.is_shared.any():
-        return _with_rig(evidence, per_pose)
     likeliest = [found[0] for found in per_pose]
     others = [
         [*likeliest[:p], per_pose[p][rank], *likeliest[p + 1 :]]
@@ -116,24 +115,6 @@ def _proposed(evidence: Evidence, init: Start | None) -> list[_Start]:
     chosen = [likeliest, *others][:_MOST_STARTS]
     starts = [(np.array([pose for pose, _ in each]), each[0][1]) for each in chosen]
     return [_sized(evidence, *each) for each in starts] if is_metric else starts
-
-
-def _with_rig(evidence: Evidence, per_pose: list[list[_Start]]) -> list[_Start]:
-    """Starts whose scales are those of the rig with the most views; the other poses follow."""
-    main = int(np.argmax(np.bincount(evidence.rig.pose[evidence.rig.pose >= 0])))
-    starts = []
-    seen = told_by(evidence, evidence.rig.pose == main)
-    for k, (own, logs) in enumerate(_metric_starts(seen, per_pose[main])):
-        for rank in range(MOST_PER_VIEW if k == 0 else 1):
-            start = []
-            for p, found in enumerate(per_pose):
-                pose, scales = found[min(rank, len(found) - 1)]
-                camera = evidence.rig.cam_from_rig[evidence.rig.pose == p][0]
-                centre = -camera[:9].reshape(3, 3).T @ camera[9:]
-                enlarged = centre + (pose[9:] - centre) * np.exp((logs - scales).mean())
-                start.append(own[0] if p == main else np.concatenate([pose[:9], enlarged]))
-            starts.append((np.array(start), logs))
-    return starts[:_MOST_STARTS]
 
 
 def _sized(evidence: Evidence, poses: FloatArray, log_scales: FloatArray) -> _Start:

@@ -150,26 +150,18 @@ def _estimate(problem: Problem, start: float, *, has_warnings: bool = True) -> R
     if is_single(problem):
         return align_single(problem, start)
     problem, starts = starts_by_outlines(problem)
-    notes: Warnings = ()
     if len(problem.views) == 1 and not any(problem.inits) and problem.is_mask_alone:
         from cadalign.estimation.contours.silhouette_starts import minima_of_mask  # with OpenCV
 
-        minima, iterations, hypotheses, notes = minima_of_mask(problem)
+        minima, iterations, hypotheses = minima_of_mask(problem)
     else:
         problem, minima, iterations, hypotheses = find_minima(problem, starts)
     if not minima:
         raise no_pose_error(problem)
-    has_mesh = isinstance(problem.model, Model) and problem.model.mesh is not None
-    if has_mesh and any(len(each.evidence.image_depths.point) for each in minima):
-        from cadalign.estimation.contours.silhouette_starts import (
-            without_covered,  # with OpenCV and embree
-        )
-
-        minima = without_covered(problem, minima)
     minima, refined = refine_with_images(problem.model, problem.prior, problem.views, minima)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
     likely = widened_by_noise(problem, minima)
-    result = result_of_minima(problem, likely, stats, notes=notes, has_warnings=has_warnings)
+    result = result_of_minima(problem, likely, stats, has_warnings=has_warnings)
     for each in refined:
         result = each.noted_in(result)
     return result

@@ -232,7 +232,6 @@ def result_of_minima(
     minima: Sequence[Minimum],
     stats: FitStats,
     *,
-    notes: Warnings = (),
     has_warnings: bool = True,
 ) -> Result:
     """The result of minima, of which the likely ones count, with a widened prior of the shape.
@@ -286,7 +285,7 @@ def result_of_minima(
         likely,
         inliers=_inliers(problem, minimum),
         is_curved=symmetry is None and not is_exact(minimum.evidence),
-        warnings=(*warnings, *notes),
+        warnings=tuple(warnings),
         evidence=tuple(
             each if each.view is None else replace(each, view=numbers[each.view])
             for each in summaries_of(minimum.evidence, minimum.state, seen_by)

@@ -213,10 +213,10 @@ def no_pose_error(problem: Problem) -> DegenerateError:
         if view.mask is not None or view.image is not None
     ]
     if shown:
-        from cadalign.estimation.contours.surface import surfaces_of  # imports this package
+        from cadalign.estimation.contours.surface import surface_of  # imports this package
 
         keypoints = problem.prior.components[0].mean[: len(problem.prior.ids)]
-        surfaces_of(problem.model, keypoints, shown[0])
+        surface_of(problem.model, keypoints, shown[0])
     if shown:
         is_rig = len(views) > 1 and views[0].cam_from_rig is not None
         if not seen and len(views) == 1 and views[0].mask is not None:

@@ -49,8 +49,7 @@ _GOLDEN = (math.sqrt(5) - 1) / 2
 class Minimum(NamedTuple):
     """An estimate under one component of the prior; ``score`` is -2 log of its probability.
 
-    The state's focal lengths are relative to those of ``lenses``. The score of a mask alone is
-    the ``outline_score``.
+    The state's focal lengths are relative to those of ``lenses``.
     """
 
     component: int
@@ -60,7 +59,6 @@ class Minimum(NamedTuple):
     cost: float
     score: float
     lenses: Lenses
-    outline_score: float | None = None
 
     @property
     def prior_score(self) -> float:

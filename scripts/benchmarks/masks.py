@@ -13,13 +13,13 @@ import numpy as np
 from scipy.stats import chi2
 
 from benchmarks import section
+from benchmarks.contour_bound import contour_bound
 from benchmarks.evidence import DAMAGES, damaged_mask
 from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Alignment, Camera, Model, View, align
 from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel
-from cadalign.estimation.contours.measured import shift_to
-from cadalign.estimation.contours.view_contour import contour_bound
+from cadalign.estimation.contours.place import shift_to
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.simulation import Problem
 from cadalign.geometry.rotations import rotation_from_vector

@@ -12,7 +12,7 @@ from cadalign.estimation.view import View
 from cadalign.shapes.model import ShapeModel
 
 if TYPE_CHECKING:
-    from cadalign.estimation.contours.fit import Refined
+    from cadalign.estimation.contours.engine import Refined
 
 
 def refine_with_images(
@@ -25,16 +25,9 @@ def refine_with_images(
 
     Without any of them they are the same, and neither OpenCV nor embree is loaded.
     """
-    refined: list[Refined] = []
-    found = list(minima)
-    if any(view.mask is not None for view in views):
-        from cadalign.estimation.contours.fit import fit_masks
+    if all(view.mask is None and view.image is None for view in views):
+        return list(minima), []
+    from cadalign.estimation.contours.engine import refine_with_outlines
 
-        refined.append(fit_masks(model, prior, views, found))
-        found = refined[-1].minima
-    if any(view.image is not None and view.mask is None for view in views):
-        from cadalign.estimation.contours.photo import fit_photos
-
-        refined.append(fit_photos(model, prior, views, found))
-        found = refined[-1].minima
-    return found, refined
+    refined = refine_with_outlines(model, prior, views, minima)
+    return refined.minima, [refined]

@@ -38,9 +38,7 @@ _STEP = 0.25
 
 _LONGEST_STEP = 1.5  # [px], between rays on a normal: a thinner part may be missed
 _MOST_STEPS = 24  # to either side
-_PRECISION = 0.01  # [px], of a rim
-ROUGH = 0.05
-"""Precision [px] of a rim whose contour is extracted as well, which replaces its place."""
+_PRECISION = 0.05  # [px], of a rim
 _STEEPEST = 1.2  # tangent of the angle between rim and contour above which these don't match
 # Widths [px] of the band about a rim where pixels may differ from the mask's, by the largest
 # distance [px] of the rim from the contour; smoothing does not reach beyond the last.
@@ -273,11 +271,10 @@ class Sight(NamedTuple):
         return origin, flat @ by_pixel.T + first, np.ones(len(flat), dtype=bool)
 
 
-def find_rims(sight: Sight, contour: Contour, reach: float, precision: float = _PRECISION) -> Rims:
+def find_rims(sight: Sight, contour: Contour, reach: float) -> Rims:
     """Find the rims that are nearest to a contour, at most ``reach`` [px] away.
 
-    A rim is a change from the object to the background in the contour's outward direction, located
-    to the ``precision`` [px].
+    A rim is a change from the object to the background in the contour's outward direction.
     """
     count = len(contour.points)
     intervals = 2 * min(int(np.ceil(reach / _LONGEST_STEP)), _MOST_STEPS)
@@ -286,7 +283,7 @@ def find_rims(sight: Sight, contour: Contour, reach: float, precision: float = _
     rows = np.flatnonzero(found)
     some = contour.taken(rows)
     inner, outer = steps[first[rows]], steps[first[rows] + 1]
-    for _ in range(int(np.ceil(np.log2((steps[1] - steps[0]) / precision)))):
+    for _ in range(int(np.ceil(np.log2((steps[1] - steps[0]) / _PRECISION)))):
         half = (inner + outer) / 2
         inside = sight.covers(some.at(half))
         inner, outer = np.where(inside, half, inner), np.where(inside, outer, half)

@@ -1,10 +1,11 @@
-"""Fit the model's rim to masks' contours, together with all other evidence.
+"""Bring a model's outline to that of masks and photos, together with all other evidence.
 
-Rounds of steps approach the contours and learn from the residuals how accurate these are; then the
-cost at that noise is lowered until no step does. A Gauss-Newton step holds every rim's point on the
-surface: that the rim moves along the surface as the pose changes does not count to first order. It
-counts where little else distinguishes poses, so that a step is taken only as far as the distances
-at its end, measured anew, with all other evidence, cost less.
+Rounds of steps approach the outlines and learn from the residuals how accurate these are. Where
+costs at several places compare, the cost at that noise is then lowered until no step does. A
+Gauss-Newton step holds every rim's point on the surface: that the rim moves along the surface as
+the pose changes does not count to first order. It counts where little else distinguishes poses, so
+that a step is taken only as far as the distances at its end, measured anew, with all other
+evidence, cost less.
 """
 
 from __future__ import annotations
@@ -14,27 +15,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
-from cadalign.estimation.contours.contour import (
-    ROUGH,
-    Rims,
-    Sight,
-    extraction_bias,
-    find_rims,
-    without_steep,
-)
-from cadalign.estimation.contours.measured import Joined, Place, Sought, cost_of, weakest_steps
-from cadalign.estimation.contours.surface import PosedSurface
-from cadalign.estimation.contours.view_contour import (
-    Noise,
-    ViewContour,
-    first_noise,
-    noise_of,
-    noise_of_similar,
-    with_learned_offsets,
-)
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.estimation.contours.noise import LEAST_OFFSET, Noise
+from cadalign.estimation.contours.outline import MeasuredOutline, Track
+from cadalign.estimation.contours.place import OWN_MODES, Place, solved, weakest_steps
+from cadalign.estimation.contours.problem import Augmented, ContourProblem, Look
 from cadalign.solvers.joint.covariance import information_of
-from cadalign.solvers.joint.evidence import State
+from cadalign.solvers.joint.evidence import Evidence, State
 from cadalign.solvers.joint.search import objective_of, score_state
 
 _ITERATIONS = 12
@@ -44,102 +31,116 @@ _SHARES = (0.4, 0.1)  # of a step, until one lowers the cost
 _SHARES_OF_OTHERS = (0.5, 0.25)  # of the way to another estimate
 _LEAST_GAIN = 0.1  # of the cost, -2 log likelihood
 _WEAKEST = 2  # directions that are tried before a descent ends
-_FIRST_REACH = 24.0  # [px], and the same relative to the contour's size
-_RELATIVE_REACH = 0.04
-_WIDE_REACH = 0.15  # where nothing but the masks determines the estimate
-_LEAST_REACH = 4.0
-_REACH = 6.0  # in standard deviations of the residuals
-_OFFSETS = 2.0  # in standard deviations of the offset that all of a contour has in common
 MOST_ROUNDS = 16
-"""Most of the `FirstSteps`."""
+"""Most rounds of an approach."""
 _FEW_ITERATIONS = 4  # of a round, whose rims are not those of its end
-_SETTLED = 0.02  # [px], median change of the offsets from round to round, or in standard deviations
 _MOST_NOISES = 3  # that are learned, each where the cost at the last is least
-
-Masked = Sought[ViewContour]
-"""Evidence with the contours of masks, and the surface whose rims are to meet these."""
+_LEAST_FREEDOM = 0.1  # share of the residuals' degrees of freedom that the unknowns leave
 
 
-class PlacedRims(NamedTuple):
-    """Rims at a place: of every contour, as its view sees them, with the extraction's bias."""
+class OutlineFit(NamedTuple):
+    """An estimate, with the outlines of a look as evidence.
 
-    posed: PosedSurface
-    sights: list[Sight]
-    rims: list[Rims]
-    biases: list[FloatArray]
-
-
-class Stacked(NamedTuple):
-    """A place with its rims as evidence.
-
-    The ``cost`` is that of all evidence at the place, and of the samples without a rim, which is
+    The ``cost`` is that of all evidence, and of masks' samples without a rim, which is
     ``unmatched``.
     """
 
-    joined: Joined
-    look: PlacedRims
-    cost: float
-    unmatched: float
+    look: Look
+    augmented: Augmented
+    tracks: list[Track]
+    cost: float = np.inf
+    unmatched: float = 0.0
 
     @property
     def place(self) -> Place:
-        """The place, without the rims."""
-        return self.joined.place
+        """The place of the estimate."""
+        return self.augmented.place
+
+    @property
+    def score(self) -> float:
+        """-2 log of the probability of all evidence, at the noise of the tracks."""
+        return score_state(self.augmented.evidence, self.augmented.state) + self.unmatched
+
+    @property
+    def measured(self) -> list[MeasuredOutline | None]:
+        """What each source measures at the outline, and its noise."""
+        return [
+            None if outline is None else MeasuredOutline(outline, own, track.noise)
+            for outline, own, track in zip(
+                self.look.outlines, self.place.own, self.tracks, strict=True
+            )
+        ]
 
 
-def rims_at(masked: Masked, place: Place, reach: float, *, is_fine: bool) -> PlacedRims:
-    """Find the rims at a place; ``is_fine`` measures the bias of their extraction, too."""
-    posed, poses = masked.at(place.state)
-    sights, rims, biases = [], [], []
-    for view, own in zip(masked.views, place.own, strict=True):
-        camera = view.registered(masked.camera_at(view.image, view.camera, place.state), own)
-        sight = Sight(posed.caster, camera, poses[view.image])
-        if is_fine:
-            found = find_rims(sight, view.contour, reach, ROUGH)
-            bias = extraction_bias(sight, view.mask, view.contour, found)
-        else:
-            found = find_rims(sight, view.contour, reach)
-            bias = np.zeros(len(found.found))
-        sights.append(sight)
-        rims.append(without_steep(view.contour, found, bias))
-        biases.append(bias)
-    return PlacedRims(posed, sights, rims, biases)
+class Approach(NamedTuple):
+    """A place on the way to the outlines; the step that led there, with the outlines before it."""
 
+    place: Place
+    tracks: list[Track]
+    step: OutlineFit | None = None
 
-def stack(
-    masked: Masked, place: Place, look: PlacedRims, noises: list[Noise], reach: float
-) -> Stacked | None:
-    """The rims of a place as evidence; None where there are none."""
-    rows = [
-        view.evidence_of(rims, noise, look.posed, sight, bias)
-        for view, noise, sight, rims, bias in zip(
-            masked.views, noises, look.sights, look.rims, look.biases, strict=True
-        )
-    ]
-    if not any(len(each.mean) for each in rows):
-        return None
-    joined = masked.joined(place, rows)
-    unmatched = sum(
-        noise.cost(reach) * int((~rims.found).sum())
-        for rims, noise in zip(look.rims, noises, strict=True)
-    )
-    return Stacked(joined, look, objective_of(joined.evidence, joined.state) + unmatched, unmatched)
+    @classmethod
+    def begun(cls, problem: ContourProblem, state: State, *, is_wide: bool = False) -> Approach:
+        """The start, which ``is_wide`` says may be far off."""
+        tracks = [source.first(is_wide=is_wide) for source in problem.sources]
+        return cls(Place.of(state, len(tracks)), tracks)
+
+    def followed(self, problem: ContourProblem, rounds: int = MOST_ROUNDS) -> Approach | None:
+        """So many rounds further, at most; None where no source shows an outline."""
+        here: Approach | None = self
+        for _ in range(rounds):
+            if here is None or all(track.is_settled for track in here.tracks):
+                break
+            here = here._next(problem)
+        return here
+
+    def _next(self, problem: ContourProblem) -> Approach | None:
+        look = problem.look(self.place, self.tracks)
+        tracks = _learned(problem, look, self.tracks)
+        augmented = problem.augmented(look, [track.noise for track in tracks])
+        there = None if augmented is None else augmented.refined(_FEW_ITERATIONS)
+        if there is None:
+            return None
+        tracks, own = with_learned_offsets(there, tracks, there.place.own, problem.learning)
+        moves = problem.moves(look, there)
+        advanced = [
+            source.advanced(track, outline, moved)
+            for source, track, outline, moved in zip(
+                problem.sources, tracks, look.outlines, moves, strict=True
+            )
+        ]
+        step = OutlineFit(look, there, advanced)
+        return Approach(there.place._replace(own=own), advanced, step)
 
 
 class Descent(NamedTuple):
-    """Steps that lower the cost at a known noise; ``others`` are estimates from other starts."""
+    """Steps that lower the cost of masks at a known noise.
 
-    masked: Masked
-    noises: list[Noise]
-    reach: float
+    The ``others`` are estimates from other starts, towards which the cost is tried, too.
+    """
+
+    problem: ContourProblem
+    tracks: list[Track]
     others: Sequence[Place] = ()
 
-    def at(self, place: Place) -> Stacked | None:
-        """The rims of a place as evidence; None where there are none."""
-        look = rims_at(self.masked, place, self.reach, is_fine=self.masked.surface.is_exact)
-        return stack(self.masked, place, look, self.noises, self.reach)
+    def at(self, place: Place) -> OutlineFit | None:
+        """The outlines of a place as evidence; None where there are none."""
+        return self.stacked(self.problem.look(place, self.tracks))
 
-    def run(self, here: Stacked) -> Stacked:
+    def stacked(self, look: Look) -> OutlineFit | None:
+        """The outlines of a look as evidence; None where there are none."""
+        augmented = self.problem.augmented(look, [track.noise for track in self.tracks])
+        if augmented is None:
+            return None
+        unmatched = sum(
+            track.noise.cost(track.reach) * int((~outline.found).sum())
+            for outline, track in zip(look.outlines, self.tracks, strict=True)
+            if outline is not None
+        )
+        cost = objective_of(augmented.evidence, augmented.state) + unmatched
+        return OutlineFit(look, augmented, self.tracks, cost, unmatched)
+
+    def run(self, here: OutlineFit) -> OutlineFit:
         """The place where no step lowers the cost.
 
         Pixels make the cost rough: whole steps go on for a while where they don't lower it, before
@@ -147,8 +148,8 @@ class Descent(NamedTuple):
         """
         best, since = here, 0
         for _ in range(_MOST_STEPS):
-            step = here.joined.refined(_ITERATIONS)
-            there = None if step is None else self.at(step[1].place)
+            step = here.augmented.refined(_ITERATIONS)
+            there = None if step is None else self.at(step.place)
             if there is not None and there.cost < best.cost - _LEAST_GAIN:
                 here = best = there
                 since = 0
@@ -164,22 +165,22 @@ class Descent(NamedTuple):
             since = 0
         return best
 
-    def _shorter(self, here: Stacked) -> Stacked | None:
+    def _shorter(self, here: OutlineFit) -> OutlineFit | None:
         """The first place on the way to the goal of a step that costs less."""
-        step = here.joined.refined(_ITERATIONS)
+        step = here.augmented.refined(_ITERATIONS)
         if step is None:
             return None
         for share in _SHARES:
-            there = self.at(here.place.towards(step[1].place, share))
+            there = self.at(here.place.towards(step.place, share))
             if there is not None and there.cost < here.cost - _LEAST_GAIN:
                 return there
         return None
 
-    def _elsewhere(self, here: Stacked) -> Stacked | None:
+    def _elsewhere(self, here: OutlineFit) -> OutlineFit | None:
         """A place that costs less along the directions of which least is known, or to others."""
-        if not self.masked.surface.is_exact:
+        if not self.problem.surface.is_exact:
             return None
-        _, information = information_of(here.joined.evidence, here.joined.state)
+        _, information = information_of(here.augmented.evidence, here.augmented.state)
         steps = weakest_steps(information, _WEAKEST)
         goals = [here.place.moved(sign * step) for step in steps for sign in (1.0, -1.0)]
         goals.extend(
@@ -190,190 +191,117 @@ class Descent(NamedTuple):
         return best if best.cost < here.cost - _LEAST_GAIN else None
 
 
-class ContourFit(NamedTuple):
-    """A view's contour at an estimate: residuals (S,) [px] with the offset removed, noise."""
+def first_fit(problem: ContourProblem, state: State, *, is_wide: bool = False) -> OutlineFit | None:
+    """The estimate near a start, which ``is_wide`` says may be far off; None without an outline.
 
-    residuals: FloatArray
-    noise: Noise
-    offset: float
-
-
-class Settled(NamedTuple):
-    """An estimate, with its rims as evidence."""
-
-    joined: Joined
-    fits: tuple[ContourFit, ...]
-    cost: float
-    score: float
-
-    @property
-    def noises(self) -> list[Noise]:
-        """The noise of every contour."""
-        return [fit.noise for fit in self.fits]
-
-
-class FirstSteps(NamedTuple):
-    """First steps towards contours, which learn the noise from the residuals.
-
-    The rims at the ``place`` were sought within a ``reach`` [px], at first ``first_reach``. They
-    ``is_settled`` where the last step changed the rims little.
+    Where costs compare it has the least cost nearby, at the noise that is learned on the way.
     """
-
-    place: Place
-    noises: list[Noise]
-    reach: float
-    first_reach: float
-    look: PlacedRims
-    is_settled: bool = False
-
-    @classmethod
-    def begun(cls, masked: Masked, state: State, *, is_wide: bool = False) -> FirstSteps:
-        """The start; ``is_wide`` says that it may be far off."""
-        place = Place.of(state, len(masked.views))
-        reach = _first_reach(masked, _WIDE_REACH if is_wide else _RELATIVE_REACH)
-        is_exact = masked.surface.is_exact
-        noises = [first_noise(view.sigma, reach, is_exact=is_exact) for view in masked.views]
-        return cls(place, noises, reach, reach, rims_at(masked, place, reach, is_fine=False))
-
-    def followed(self, masked: Masked, steps: int = MOST_ROUNDS) -> FirstSteps | None:
-        """So many steps further, at most; None where no rim comes near a contour."""
-        here: FirstSteps | None = self
-        for _ in range(steps):
-            if here is None or here.is_settled:
-                break
-            here = here._next(masked)
-        return here
-
-    def residuals(self) -> FloatArray:
-        """Signed distances (S,) of the contours from the rims [px], as far as `first_reach`.
-
-        They are without the offset that all of a contour has in common.
-        """
-        far = self.first_reach
-        found = [
-            np.where(rims.found, rims.offset + own_offset * noise.offset, far)
-            for rims, own_offset, noise in zip(
-                self.look.rims, self.place.own[:, 0], self.noises, strict=True
-            )
-        ]
-        return np.asarray(np.clip(np.concatenate(found), -far, far))
-
-    def widened(self, masked: Masked) -> FirstSteps:
-        """The same with the rims within the first reach."""
-        look = rims_at(masked, self.place, self.first_reach, is_fine=False)
-        return self._replace(look=look)
-
-    def _next(self, masked: Masked) -> FirstSteps | None:
-        place, noises, reach, first_reach, look, _ = self
-        is_exact = masked.surface.is_exact
-        noises = _learned(masked, place, look, noises, reach, correlated=False)
-        if is_exact:
-            reach = min(reach, _reach_of(noises))
-        here = stack(masked, place, look, noises, reach)
-        step = None if here is None else here.joined.refined(_FEW_ITERATIONS)
-        if step is None:
-            return None
-        _, joined = step
-        place = joined.place
-        if is_exact:
-            noises, own = with_learned_offsets(joined.evidence, joined.state, noises, place.own)
-            place = place._replace(own=own)
-        there = rims_at(masked, place, reach, is_fine=False)
-        widest = max(noise.sigma for noise in noises)
-        is_settled = _change(look.rims, there.rims) < _SETTLED * max(1.0, widest)
-        return FirstSteps(place, noises, reach, first_reach, there, is_settled)
-
-
-def settle(masked: Masked, state: State, *, is_wide: bool = False) -> Settled | None:
-    """Descend from one start; None where no rim comes near a contour.
-
-    ``is_wide`` says that the start may be far off.
-    """
-    start = FirstSteps.begun(masked, state, is_wide=is_wide)
-    found = start.followed(masked)
-    if found is None:
+    here = Approach.begun(problem, state, is_wide=is_wide).followed(problem)
+    if here is None:
         return None
-    place, noises, reach = found.place, found.noises, found.reach
-    is_exact, here = masked.surface.is_exact, None
-    look = rims_at(masked, place, reach, is_fine=True) if is_exact else found.look
-    for _ in range(_MOST_NOISES):
-        learned = _learned(masked, place, look, noises, reach, correlated=True)
-        if here is not None and is_exact:
-            joined = here.joined
-            learned, own = with_learned_offsets(joined.evidence, joined.state, learned, place.own)
-            place = place._replace(own=own)
-        if here is not None and (not is_exact or all(map(Noise.is_like, noises, learned))):
-            break  # a similar surface's noise is learned on the way
-        noises = learned
-        here = stack(masked, place, look, noises, reach)
-        if here is None:
-            return None
-        here = Descent(masked, noises, reach).run(here)
-        place, look = here.place, here.look
-    return None if here is None else _settled(here, noises)
+    return _lowered(problem, here) if problem.is_comparable else here.step
 
 
-def settle_with(
-    masked: Masked, place: Place, noises: list[Noise], others: Sequence[Place] = ()
-) -> Settled | None:
-    """Descend at a known noise, so that the scores of several estimates compare.
+def last_fit(
+    problem: ContourProblem, place: Place, tracks: Sequence[Track], others: Sequence[Place] = ()
+) -> OutlineFit | None:
+    """The estimate near another one at a place, with the noise of ``tracks`` where costs compare.
 
     ``others`` are estimates from other starts, towards which the cost is tried, too.
     """
-    reach = min(_first_reach(masked, _RELATIVE_REACH), _reach_of(noises))
-    descent = Descent(masked, noises, reach, others)
-    here = descent.at(place)
-    return None if here is None else _settled(descent.run(here), noises)
+    tracks = [source.last(track) for source, track in zip(problem.sources, tracks, strict=True)]
+    if problem.is_comparable:
+        descent = Descent(problem, tracks, others)
+        start = descent.at(place)
+        return None if start is None else descent.run(start)
+    here = Approach(place, tracks).followed(problem)
+    return None if here is None or here.step is None else _widened(problem, here.step)
 
 
-def _first_reach(masked: Masked, share: float) -> float:
-    return max(_FIRST_REACH, *(share * view.contour.size for view in masked.views))
-
-
-def _reach_of(noises: list[Noise]) -> float:
-    least = max(_LEAST_REACH, *(_OFFSETS * noise.offset for noise in noises))
-    return max(_REACH * max(noise.sigma for noise in noises), least)
-
-
-def _change(last: list[Rims], rims: list[Rims]) -> float:
-    """Median change of the rims' offsets [px] since the last step."""
-    changes = [np.zeros(0)]
-    for before, after in zip(last, rims, strict=True):
-        both = before.found & after.found
-        changes.append(np.abs(after.offset - before.offset)[both])
-    every = np.concatenate(changes)
-    return float(np.median(every)) if len(every) else np.inf
-
-
-def _learned(
-    masked: Masked,
-    place: Place,
-    look: PlacedRims,
-    noises: list[Noise],
-    reach: float,
-    *,
-    correlated: bool,
-) -> list[Noise]:
-    """The noise that the residuals at a place show."""
-    found = []
-    for view, rims, bias, noise, own in zip(
-        masked.views, look.rims, look.biases, noises, place.own, strict=True
-    ):
-        residuals = np.where(rims.found, rims.offset + own[0] * noise.offset, np.nan)
-        given = view.contour, view.sigma, rims
-        if masked.surface.is_exact:
-            found.append(noise_of(*given, residuals - bias, noise, correlated=correlated))
-        else:
-            found.append(noise_of_similar(*given, residuals, reach))
+def _lowered(problem: ContourProblem, here: Approach) -> OutlineFit | None:
+    """The least cost near the end of an approach, at the noise that its residuals show."""
+    is_exact = problem.surface.is_exact
+    found: OutlineFit | None = None
+    descent = Descent(problem, [track._replace(is_fine=is_exact) for track in here.tracks])
+    look = problem.look(here.place, descent.tracks)
+    for _ in range(_MOST_NOISES):
+        learned = _learned(problem, look, descent.tracks)
+        if found is not None:
+            own, learning = look.place.own, problem.learning
+            learned, own = with_learned_offsets(found.augmented, learned, own, learning)
+            look = look._replace(place=look.place._replace(own=own))
+            before = [track.noise for track in descent.tracks]
+            if not is_exact or all(map(Noise.is_like, before, [each.noise for each in learned])):
+                break  # a similar surface's noise is learned on the way
+        descent = descent._replace(tracks=learned)
+        start = descent.stacked(look)
+        if start is None:
+            return None
+        found = descent.run(start)
+        look = found.look
     return found
 
 
-def _settled(here: Stacked, noises: list[Noise]) -> Settled:
-    joined = here.joined
-    fits = []
-    for own, rims, noise in zip(here.place.own, here.look.rims, noises, strict=True):
-        offset = own[0] * noise.offset
-        residuals = np.where(rims.found, rims.offset + offset, np.nan)
-        fits.append(ContourFit(residuals, noise, offset))
-    score = score_state(joined.evidence, joined.state) + here.unmatched
-    return Settled(joined, tuple(fits), cost_of(joined.evidence, joined.state), score)
+def _learned(problem: ContourProblem, look: Look, tracks: Sequence[Track]) -> list[Track]:
+    """The tracks with the noise that the residuals of a look show."""
+    return [
+        track if outline is None else source.learned(outline, own, track)
+        for source, track, outline, own in zip(
+            problem.sources, tracks, look.outlines, look.place.own, strict=True
+        )
+    ]
+
+
+def with_learned_offsets(
+    there: Augmented, tracks: Sequence[Track], own: FloatArray, learning: IntArray
+) -> tuple[list[Track], FloatArray]:
+    """Tracks with the deviations of the offsets that masks ``learning`` (L,) have by likelihood.
+
+    All contours' ``own`` coefficients (V, 3), last of the evidence's unknowns, come along.
+    """
+    learned, own = list(tracks), own.copy()
+    if not len(learning):
+        return learned, own
+    _, information = information_of(there.evidence, there.state)
+    size = len(information)
+    rows = size - own.size + OWN_MODES * learning
+    variances = solved(information, np.eye(size)[:, rows])[rows].diagonal()
+    for number, variance in zip(learning, variances, strict=True):
+        noise = learned[number].noise
+        without_prior = 1 / max(1 / min(variance, 1.0) - 1, 1e-6)  # in squares of the offset
+        free = own[number, 0] * (1 + without_prior)
+        square = noise.offset**2 * max(free**2 - without_prior, 0.0)
+        offset = max(float(np.sqrt(square)), LEAST_OFFSET)
+        learned[number] = learned[number]._replace(noise=noise._replace(offset=offset))
+        own[number, 0] *= noise.offset / offset
+    return learned, own
+
+
+def _widened(problem: ContourProblem, fit: OutlineFit) -> OutlineFit:
+    """The same, with the noise of photos' lines as large as if unknowns fitted a part of it.
+
+    Their residuals have as many degrees of freedom less as the lines determine unknowns.
+    """
+    augmented, sightings = fit.augmented, fit.augmented.evidence.sightings
+    is_line = np.zeros(len(problem.evidence.sightings.point), dtype=bool)
+    for source, rows in zip(problem.sources, augmented.rows, strict=True):
+        count = 0 if rows is None else len(rows.mean)
+        is_line = np.append(is_line, np.full(count, not source.is_comparable))
+
+    def weighted(factor: float) -> Evidence:
+        whitening = np.where(is_line[:, None], factor, 1.0) * sightings.whitening
+        return augmented.evidence._replace(sightings=sightings._replace(whitening=whitening))
+
+    (_, whole), (_, rest) = (
+        information_of(weighted(lines), augmented.state) for lines in (1.0, 0.0)
+    )
+    fitted = float(np.trace(solved(whole, whole - rest)))
+    independent = sum(
+        float(outline.found.sum()) / track.noise.correlation
+        for source, outline, track in zip(
+            problem.sources, fit.look.outlines, fit.tracks, strict=True
+        )
+        if outline is not None and not source.is_comparable
+    )
+    factor = np.sqrt(max(1 - fitted / max(independent, 1.0), _LEAST_FREEDOM))
+    return fit._replace(augmented=augmented._replace(evidence=weighted(factor)))

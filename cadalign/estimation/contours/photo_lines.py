@@ -16,7 +16,6 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.contours.contour import (
-    ROUGH,
     Contour,
     Sight,
     across_rims,
@@ -24,6 +23,7 @@ from cadalign.estimation.contours.contour import (
     find_rims,
     without_steep,
 )
+from cadalign.estimation.contours.outline import Outline
 from cadalign.estimation.contours.silhouettes import colors_at
 from cadalign.estimation.contours.surface import PosedSurface
 from cadalign.geometry.alignment import Alignment
@@ -166,9 +166,8 @@ _SMALLEST = 64  # [px], of a side of the smallest copy of a photo
 
 
 class PhotoPyramid(NamedTuple):
-    """A photo in view number ``image``, and copies of it, each half as wide as the last."""
+    """A photo, and copies of it, each half as wide as the last."""
 
-    image: int
     camera: Camera
     levels: tuple[ByteImage, ...]
 
@@ -193,7 +192,7 @@ class PhotoPyramid(NamedTuple):
         return min(int(np.log2(max(step, 1.0))), len(self.levels) - 1)
 
 
-def photo_of(image: int, camera: Camera, pixels: ByteImage) -> PhotoPyramid:
+def photo_of(camera: Camera, pixels: ByteImage) -> PhotoPyramid:
     """A photo (h, w, 3) with its smaller copies."""
     levels = [np.array(pixels, order="C")]  # kernels are compiled anew for read-only arrays
     while min(levels[-1].shape[:2]) > _SMALLEST:
@@ -202,7 +201,7 @@ def photo_of(image: int, camera: Camera, pixels: ByteImage) -> PhotoPyramid:
         even = levels[-1][: 2 * size[1], : 2 * size[0]]
         smaller = cv2.resize(even, size, interpolation=cv2.INTER_AREA)
         levels.append(np.asarray(smaller, dtype=np.uint8))
-    return PhotoPyramid(image, camera, tuple(levels))
+    return PhotoPyramid(camera, tuple(levels))
 
 
 class Silhouette(NamedTuple):
@@ -225,11 +224,6 @@ class Silhouette(NamedTuple):
     def size(self) -> float:
         """Square root of the area [px]."""
         return float(np.sqrt(self.inside.sum()) * self.cell)
-
-    @property
-    def length(self) -> float:
-        """Longer side of its box [px]."""
-        return float(np.ptp(self.contour.points, axis=0).max())
 
     def at(self, points: FloatArray) -> BoolArray:
         """Tell if pixels (..., 2) lie inside."""
@@ -259,7 +253,7 @@ def silhouette_of(
     if not len(rough.points):
         return None
     contour = rough._replace(points=corner + cell * rough.points)
-    rims = without_steep(contour, find_rims(sight, contour, _RIM_REACH * cell, ROUGH))
+    rims = without_steep(contour, find_rims(sight, contour, _RIM_REACH * cell))
     on_rim = contour._replace(points=contour.at(rims.offset))
     across = across_rims(on_rim, rims._replace(offset=np.zeros(len(rims.offset))))
     within = (on_rim.points > _BORDER) & (on_rim.points < [camera.width - 3, camera.height - 3])
@@ -303,33 +297,11 @@ def _box_in_image(
     return None if (high - low < 2).any() else (low, high)
 
 
-class Outline(NamedTuple):
-    """Evidence of a photo about a predicted outline.
-
-    ``places`` (S,) [px] are outwards from the silhouette's contour, by ``reach`` at most; their
-    standard deviations ``sigmas`` (S,) are infinite where nothing is told; ``contrast`` is that of
-    `regions_of`.
-    """
-
-    silhouette: Silhouette
-    places: FloatArray
-    sigmas: FloatArray
-    contrast: float
-    reach: float
-
-    def in_sigmas(self, common: FloatArray) -> FloatArray:
-        """Places (S,) beside ``common`` ones, in standard deviations; 0 where none is told."""
-        safe = np.where(self.is_told, self.sigmas, 1.0)
-        return np.where(self.is_told, (self.places - common) / safe, 0.0)
-
-    @property
-    def is_told(self) -> BoolArray:
-        """Lines (S,) that have a place."""
-        return np.isfinite(self.sigmas)
-
-
 def outline_of(photo: PhotoPyramid, silhouette: Silhouette, reach: float) -> Outline | None:
-    """Find the photo's contour on lines that reach so far [px]; None where there are no colours."""
+    """Find the photo's contour on lines that reach so far [px]; None where there are no colours.
+
+    Places are found where the lines tell one; their sigmas are standard deviations [px].
+    """
     step = reach / STEPS
     inside, outside = _colors_beside(photo, silhouette, reach, step)
     if min(len(inside), len(outside)) < _LEAST_PIXELS:
@@ -345,7 +317,23 @@ def outline_of(photo: PhotoPyramid, silhouette: Silhouette, reach: float) -> Out
         logs += edges_of(colors.astype(np.float64), valid, step)
         logs = with_neighbours(logs, contour.neighbours(np.ones(len(logs), dtype=bool)))
     places, variances = crossings_of(logs)
-    return Outline(silhouette, step * places, step * np.sqrt(variances), contrast, reach)
+    found = np.isfinite(variances)
+    sigmas = step * np.sqrt(np.where(found, variances, 1.0))
+    rays, _ = photo.camera.normalize_where_valid(contour.points)
+    focal = np.array([[photo.camera.fx], [photo.camera.fy]])
+    slopes = focal * photo.camera.distortion_jacobian(rays)
+    return Outline(
+        contour,
+        found,
+        step * places,
+        sigmas,
+        silhouette.points,
+        silhouette.face,
+        np.einsum("ni,nij->nj", silhouette.across, slopes),
+        silhouette.size,
+        reach,
+        contrast,
+    )
 
 
 def _colors_beside(

@@ -1,18 +1,11 @@
-"""Surfaces whose rims are sought: the model's own mesh, or training models' warped, at a state.
-
-For a mesh that is only similar to the object, there is its convex hull, too. What lies between
-legs, or a hole, differs from object to object more than the outermost points do, which keypoints
-and the box describe. The silhouette of a convex hull is the convex hull of the silhouette, so that
-masks and meshes compare by their hulls as they do by themselves.
-"""
+"""Surfaces whose rims are sought: the model's own mesh, or training models' warped, at a state."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import cast
 
 import numpy as np
 
@@ -27,7 +20,6 @@ from cadalign.shapes.warp import LinearWarp, linear_warp
 from cadalign.solvers.joint.evidence import Shape, State, points_of
 
 _QHULL = "QJ Pp"  # joggled, for a flat mesh has a hull, too
-_MOST_MESHES = 3  # training models that are tried, the nearest ones
 
 
 class RigidSurface:
@@ -40,7 +32,7 @@ class RigidSurface:
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
-        self.caster = caster_of(mesh)
+        self.caster = RayCaster(mesh)
         self.corners = corners_of(mesh)
 
     def at(self, shape: Shape, state: State) -> PosedSurface:
@@ -60,11 +52,9 @@ class WarpedSurface:
 
     is_exact = False
 
-    def __init__(
-        self, mesh: Mesh, source: FloatArray, rows: IntArray, *, is_hull: bool = False
-    ) -> None:
+    def __init__(self, mesh: Mesh, source: FloatArray, rows: IntArray, *, is_hull: bool) -> None:
         self.mesh = mesh
-        self._rows, self._faces = rows, None if is_hull else mesh.faces
+        self._rows, self._is_hull = rows, is_hull
         used = np.unique(_hull_faces(mesh.vertices)) if is_hull else slice(None)
         self._warp = linear_warp(mesh.vertices[used], mesh.bounds, source)
 
@@ -72,10 +62,8 @@ class WarpedSurface:
         """See `RigidSurface`."""
         points = points_of(shape, state) / np.exp(state.log_scales)
         vertices = self._warp.apply(points[self._rows], np.sort(points[-2:], axis=0))
-        faces = _hull_faces(vertices) if self._faces is None else self._faces
-        return Warped(
-            Mesh(vertices, faces), self._warp, self._rows, shape.modes, state.coefficients
-        )
+        mesh = Mesh(vertices, _hull_faces(vertices) if self._is_hull else self.mesh.faces)
+        return Warped(mesh, self._warp, self._rows, shape.modes, state.coefficients)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +79,7 @@ class Warped:
     @cached_property
     def caster(self) -> RayCaster:
         """The ray hierarchy."""
-        return caster_of(self.mesh)
+        return RayCaster(self.mesh)
 
     @property
     def corners(self) -> FloatArray:
@@ -125,11 +113,6 @@ def corners_of(mesh: Mesh) -> FloatArray:
     return np.asarray(mesh.bounds[choices, np.arange(3)])
 
 
-def caster_of(mesh: Mesh) -> RayCaster:
-    """The ray hierarchy of a mesh."""
-    return RayCaster(mesh)
-
-
 def _barycentric(triangles: FloatArray, points: FloatArray) -> FloatArray:
     """Barycentric coordinates (n, 3) of points (n, 3) on triangles (n, 3, 3)."""
     edges = triangles[:, 1:] - triangles[:, :1]
@@ -150,60 +133,45 @@ def _hull_faces(vertices: FloatArray) -> IntArray:
     return cast(IntArray, ConvexHull(vertices, qhull_options=_QHULL).simplices.astype(np.int64))
 
 
-class SurfaceChoice(NamedTuple):
-    """Surfaces, the likeliest first; ``hulls`` are their convex hulls, none of an exact one."""
+def surface_of(
+    model: Model | ShapeModel, points_3d: FloatArray, where: str, *, is_hull: bool = False
+) -> Surface:
+    """The surface of a shape whose keypoints are about ``points_3d`` (m, 3).
 
-    surfaces: list[Surface]
-    hulls: list[Surface]
-
-
-def surfaces_of(model: Model | ShapeModel, points_3d: FloatArray, where: str) -> SurfaceChoice:
-    """Surfaces for a shape whose keypoints are about ``points_3d`` (m, 3), the nearest first.
-
-    Raises InputError where there is no mesh, which the mask or photo ``where`` needs; DataError if
-    one cannot be read.
+    A learned shape has the mesh of the nearest training model that has one. One that is only
+    similar to the object's may be replaced by its convex hull. Raises InputError where
+    there is no mesh, which the mask or photo ``where`` needs; DataError if it cannot be read.
     """
     wanting = "a photo" if where.endswith("image") else "a mask"
-    if isinstance(model, Model):
-        if model.mesh is None:
-            fix = "give it: Model(..., mesh=cadalign.load_mesh(path))"
-            raise InputError(f"the model has no mesh, which {wanting} needs", where=where, fix=fix)
-        if model.shape_sigma is None:
-            return SurfaceChoice([rigid_surface(model.mesh)], [])
-        points = cast(FloatArray, model.points_3d)
-        return _warped([(model.mesh, points, np.arange(len(points)))])
-    return _warped(_nearest_with_mesh(model, points_3d, where, wanting))
-
-
-def _warped(given: Sequence[tuple[Mesh, FloatArray, IntArray]]) -> SurfaceChoice:
-    return SurfaceChoice(
-        [WarpedSurface(*each) for each in given],
-        [WarpedSurface(*each, is_hull=True) for each in given],
-    )
+    if isinstance(model, ShapeModel):
+        return WarpedSurface(*_nearest_with_mesh(model, points_3d, where, wanting), is_hull=is_hull)
+    if model.mesh is None:
+        fix = "give it: Model(..., mesh=cadalign.load_mesh(path))"
+        raise InputError(f"the model has no mesh, which {wanting} needs", where=where, fix=fix)
+    if model.shape_sigma is None:
+        return rigid_surface(model.mesh)
+    points = cast(FloatArray, model.points_3d)
+    return WarpedSurface(model.mesh, points, np.arange(len(points)), is_hull=is_hull)
 
 
 def _nearest_with_mesh(
     model: ShapeModel, points_3d: FloatArray, where: str, wanting: str
-) -> list[tuple[Mesh, FloatArray, IntArray]]:
-    """Meshes of training models whose keypoints are nearest; these, and their numbers."""
+) -> tuple[Mesh, FloatArray, IntArray]:
+    """Mesh, keypoints and their numbers of the training model whose keypoints are nearest."""
     training = model.training
     rows = [] if training is None else training.rows_with_mesh
     if training is None or not rows:
         fix = "learn it from a data set with meshes, such as KeypointNet beside ShapeNet's models"
         what = f"no training model has a mesh, which {wanting} needs"
         raise InputError(what, where=where, fix=fix)
-    gaps = training.points_3d[rows].astype(np.float64) - points_3d
-    squares = (gaps**2).sum(axis=2)
+    squares = ((training.points_3d[rows].astype(np.float64) - points_3d) ** 2).sum(axis=2)
     known = np.isfinite(squares)
     sums = np.where(known, squares, 0.0).sum(axis=1)
     distances = np.where(known.any(axis=1), sums / np.maximum(known.sum(axis=1), 1), np.inf)
-    order = np.argsort(distances, kind="stable")[:_MOST_MESHES]
-    found = []
-    for row in (rows[k] for k in order):
-        source = training.points_3d[row].astype(np.float64)
-        known = np.flatnonzero(np.isfinite(source).all(axis=1))
-        found.append((_mesh_at(cast(Path, training.mesh_paths[row])), source[known], known))
-    return found
+    row = rows[int(distances.argmin())]
+    source = training.points_3d[row].astype(np.float64)
+    known = np.flatnonzero(np.isfinite(source).all(axis=1))
+    return _mesh_at(cast(Path, training.mesh_paths[row])), source[known], known
 
 
 @lru_cache(maxsize=16)

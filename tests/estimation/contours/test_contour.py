@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import pytest
@@ -20,13 +20,11 @@ from cadalign.estimation.contours.contour import (
     find_rims,
     mask_contour,
 )
+from cadalign.estimation.contours.descent import with_learned_offsets
+from cadalign.estimation.contours.noise import Noise, correlation_length, cost_of_contour
+from cadalign.estimation.contours.outline import Track
+from cadalign.estimation.contours.problem import Augmented
 from cadalign.estimation.contours.silhouettes import colors_at, sampled
-from cadalign.estimation.contours.view_contour import (
-    Noise,
-    correlation_length,
-    cost_of_contour,
-    with_learned_offsets,
-)
 
 WIDTH, HEIGHT = 160, 120
 
@@ -142,12 +140,15 @@ def test_an_offset_has_the_deviation_that_its_own_place_shows(
 ) -> None:
     """A contour lies ``place`` before a prior of 1 px, with a variance of .36 px^2."""
     information = np.diag([1 / 0.36 + 1, 1.0, 1.0])
-    module = "cadalign.estimation.contours.view_contour.information_of"
+    module = "cadalign.estimation.contours.descent.information_of"
     monkeypatch.setattr(module, lambda *_: (None, information))
     own = np.array([[place / (1 + 0.36), 0.2, 0.3]])
-    (learned,), moved = with_learned_offsets(None, None, [Noise(1.0, 1.0, 1.0)], own)  # type: ignore[arg-type]
-    assert learned.offset == pytest.approx(max(np.sqrt(max(place**2 - 0.36, 0.0)), 0.1))
-    assert moved[0, 0] * learned.offset == pytest.approx(own[0, 0])
+    nothing = Augmented(*[cast(Any, None)] * 5)
+    tracks = [Track(Noise(1.0, 1.0, 1.0), 4.0)]
+    (learned,), moved = with_learned_offsets(nothing, tracks, own, np.arange(1))
+    offset = learned.noise.offset
+    assert offset == pytest.approx(max(np.sqrt(max(place**2 - 0.36, 0.0)), 0.1))
+    assert moved[0, 0] * offset == pytest.approx(own[0, 0])
     assert moved[0, 1:] == pytest.approx(own[0, 1:])
 
 

@@ -12,10 +12,11 @@ from support.scenes import CAMERA, truth_of
 from cadalign import Alignment, Camera, Mesh, Model, Result, View, align
 from cadalign.datasets import KeypointNet
 from cadalign.estimation.contours.contour import Contour, Rims, across_rims
-from cadalign.estimation.contours.descent import Descent, Masked, settle
-from cadalign.estimation.contours.measured import Place, shift_to, shifted
+from cadalign.estimation.contours.descent import Descent, first_fit
+from cadalign.estimation.contours.mask import MaskSource
+from cadalign.estimation.contours.place import Place, shift_to, shifted
+from cadalign.estimation.contours.problem import ContourProblem
 from cadalign.estimation.contours.surface import RigidSurface
-from cadalign.estimation.contours.view_contour import contour_view
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import prior_of
 from cadalign.geometry.rotations import vector_from_rotation
@@ -134,18 +135,18 @@ def test_no_step_from_the_end_of_a_descent_lowers_the_cost() -> None:
     still = np.zeros_like(evidence.shape.mean)
     start = State(pose, np.zeros(0), np.log(truth.scale), np.zeros(0), still)
     start.poses[0, 9:] *= 1.03
-    masked = Masked(evidence, 8, [contour_view(0, view, "mask", view.camera)], RigidSurface(BOX))
-    found = settle(masked, start)
+    problem = ContourProblem(evidence, 8, [MaskSource.of(0, view, view.camera)], RigidSurface(BOX))
+    found = first_fit(problem, start)
     assert found is not None
-    descent = Descent(masked, found.noises, 4.0)
-    end = descent.at(found.joined.place)
+    descent, place = Descent(problem, found.tracks), found.place
+    end = descent.at(place)
     assert end is not None
     again = descent.run(end)
     assert again is end
     for _ in range(20):
         step = np.zeros(6 + 3 + 3)
         step[:9] = rng.normal(0, 1e-3, 9) * [1, 1, 1, 1, 1, 1, 0, 1, 1]
-        there = descent.at(found.joined.place.moved(step))
+        there = descent.at(place.moved(step))
         assert there is not None
         assert there.cost > end.cost
 

@@ -9,7 +9,6 @@ from support.scenes import CAMERA, truth_of
 from cadalign import Alignment, Mesh
 from cadalign.estimation.contours import contour as contours
 from cadalign.estimation.contours.contour import (
-    ROUGH,
     Sight,
     contour_of,
     extraction_bias,
@@ -17,7 +16,7 @@ from cadalign.estimation.contours.contour import (
     mask_image,
     without_steep,
 )
-from cadalign.estimation.contours.surface import caster_of
+from cadalign.geometry.raycaster import RayCaster
 from cadalign.render import Scene, cast_geometry
 
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
@@ -28,7 +27,7 @@ TRUTH = truth_of((0.6, 0.4, 0.8))
 
 def offsets_and_bias(mask: np.ndarray, pose: Alignment) -> tuple[np.ndarray, np.ndarray]:
     """How far the rims of a pose lie outside of a mask's contour, and the bias of these."""
-    contour, sight = contour_of(mask), Sight(caster_of(BOX), CAMERA, pose)
+    contour, sight = contour_of(mask), Sight(RayCaster(BOX), CAMERA, pose)
     rims = find_rims(sight, contour, 8.0)
     bias = extraction_bias(sight, mask_image(mask, contour), contour, rims)
     assert rims.found.mean() > 0.9
@@ -66,16 +65,17 @@ def test_pixels_that_cannot_differ_from_the_mask_are_not_cast(
 
     monkeypatch.setattr(Sight, "covers", counted)
 
-    def distances(precision: float) -> np.ndarray:
+    def distances() -> np.ndarray:
         cast.clear()
-        sight = Sight(caster_of(BOX), CAMERA, turned)
-        rims = find_rims(sight, contour, 4.0, precision)
+        sight = Sight(RayCaster(BOX), CAMERA, turned)
+        rims = find_rims(sight, contour, 4.0)
         bias = extraction_bias(sight, mask_image(mask, contour), contour, rims)
         return np.where(rims.found, rims.offset - bias, np.nan)
 
-    found, rays = distances(ROUGH), sum(cast)
+    found, rays = distances(), sum(cast)
     monkeypatch.setattr(contours, "_BANDS", ((np.inf, 9),))
-    every = distances(0.01)
+    monkeypatch.setattr(contours, "_PRECISION", 0.01)
+    every = distances()
     assert rays < 0.6 * sum(cast)
     assert (np.abs(found - every) < 1e-3).mean() > 0.99
 

@@ -1,0 +1,353 @@
+"""Refine the minima of the other evidence with masks and photos.
+
+Likely minima, and states beside the best one where it is poorly known, are brought to the outlines.
+Masks and photos that contradict the rest are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple, cast
+
+import numpy as np
+
+from cadalign.errors import DegenerateError
+from cadalign.estimation.contours.descent import OutlineFit, first_fit, last_fit
+from cadalign.estimation.contours.mask import MaskSource, convex_hull
+from cadalign.estimation.contours.outline import (
+    OutlineSource,
+    OutlineSupport,
+)
+from cadalign.estimation.contours.photo import PhotoSource
+from cadalign.estimation.contours.photo_lines import photo_of
+from cadalign.estimation.contours.place import Place, weakest_steps
+from cadalign.estimation.contours.problem import ContourProblem, cost_of, with_displacement_modes
+from cadalign.estimation.contours.surface import Surface, surface_of
+from cadalign.estimation.model import Model, is_exact_model
+from cadalign.estimation.prior import ShapePrior
+from cadalign.estimation.result import Result
+from cadalign.estimation.search import Minimum
+from cadalign.estimation.uncertainty.residuals import chi_square_quantile
+from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals
+from cadalign.estimation.view import View
+from cadalign.estimation.warning import EstimateWarning
+from cadalign.geometry.rotations import angle_between
+from cadalign.io.images import ByteImage
+from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.joint.covariance import information_of, scaled_information
+from cadalign.solvers.joint.evidence import State
+from cadalign.solvers.joint.search import reduced, score_state
+
+_MOST_STARTS = 4
+_MOST_OPEN_STARTS = 8  # where nothing but masks determines the estimate
+_MOST_FINISHED = 2  # where costs do not compare
+_UNLIKELY = 60.0  # excess score of a minimum that is still a start
+_LEAST_INFORMATION = 1e-9  # about the worst known direction of the unknowns, relative
+_INDEPENDENT = 10.0  # samples that count as one where estimates near the starts are compared
+# Of further starts: standard deviations along the direction of which an estimate knows least, and
+# that of a logarithm of a scale there, below which the estimate is near enough, or near enough if
+# its outline agrees; standard deviations along directions of the pose, and their turns.
+_SIDEWAYS = (-2.0, -1.0, 1.0, 2.0)
+_LEAST_STRETCH, _OPEN_STRETCH = 0.05, 0.25
+_WEAKEST, _SIDEWAYS_OF_POSE = 2, (-1.5, 1.5)
+_LEAST_TURN, _MOST_TURN = np.radians(2.0), np.radians(40.0)
+_SAME_TURN_DEG, _SAME_STRETCH = 1.0, 0.2  # logarithms of scales
+_LEAST_SUPPORT = 0.5  # share of a source's samples that must agree with the outline
+_LEAST_PROBABILITY = 1e-5  # of such a rise of the other residuals by chance
+
+
+class Refined(NamedTuple):
+    """Minima with masks and photos, and what is to be noted of these in the result."""
+
+    minima: list[Minimum]
+    summaries: list[EvidenceSummary]
+    warnings: list[EstimateWarning]
+    residuals: tuple[MaskResiduals | None, ...] = ()
+    """The contours of every view's mask."""
+
+    def noted_in(self, result: Result) -> Result:
+        """The result with what is known of the masks and photos."""
+        posterior = result.posterior.stating(
+            evidence=(*result.evidence, *self.summaries),
+            warnings=(*result.warnings, *self.warnings),
+        )
+        return replace(result, mask_residuals=self.residuals, posterior=posterior)
+
+
+class Candidate(NamedTuple):
+    """A start, what is to be refined from there, and where that led."""
+
+    start: Minimum
+    problem: ContourProblem
+    fit: OutlineFit
+
+    @property
+    def supports(self) -> list[OutlineSupport]:
+        """The agreement of each source with the outline."""
+        return [
+            OutlineSupport() if each is None else source.support(each)
+            for source, each in zip(self.problem.sources, self.fit.measured, strict=True)
+        ]
+
+    @property
+    def agrees(self) -> bool:
+        """True if all of the outlines agree, and other starts would not do better."""
+        sources = self.problem.sources
+        shares = zip(sources, self.supports, strict=True)
+        return self.problem.is_comparable and all(
+            each.share >= source.good_share for source, each in shares
+        )
+
+    def rank(self, correlation: float | None = None) -> float:
+        """-2 log of its probability by the other evidence and by the outlines.
+
+        Neighbours of a mask's samples that count as one are as many as the ``correlation``, if it
+        is given.
+        """
+        rest = cost_of(self.problem.evidence, self.fit.place.state) + self.start.prior_score
+        for source, each in zip(self.problem.sources, self.fit.measured, strict=True):
+            rest += 0.0 if each is None else source.rank(each, correlation)
+        return rest
+
+    def minimum(self, *, by_rank: bool) -> Minimum:
+        """The minimum, its score with the `rank` or with the cost of the outlines."""
+        evidence, state, *_ = self.fit.augmented
+        cost, score = cost_of(evidence, state), self.fit.score + self.start.prior_score
+        if by_rank and np.isfinite(score):
+            score = score_state(evidence, state) - cost + self.rank()
+        return self.start._replace(evidence=evidence, state=state, cost=cost, score=score)
+
+
+def refine_with_outlines(
+    model: Model | ShapeModel,
+    prior: ShapePrior,
+    views: Sequence[View],
+    minima: Sequence[Minimum],
+) -> Refined:
+    """Refine the likely minima of the other evidence, the likeliest first, with masks and photos.
+
+    A photo counts where its view has no mask, which is the better outline. Raises InputError if a
+    mask has no contour, or the model no mesh; DegenerateError if there is no estimate without the
+    outlines, and none near it with them.
+    """
+    search = OutlineSearch.of(model, prior, minima, views)
+    sources = left = search.sources
+    warnings: list[EstimateWarning] = []
+    best: list[Candidate] = []
+    wrong: tuple[OutlineSource, str] | None = None
+    while left:
+        best = search.best(left)
+        wrong = _contradicting(best, left)
+        if wrong is None:
+            break
+        source, reason = wrong
+        if search.is_open and len(left) == 1:
+            if not best or not best[0].supports[0].share:
+                raise DegenerateError(
+                    reason, where=source.where, fix="give an init nearer to it, or keypoints"
+                )
+            warnings.append(source.warning(f"{source.where}: {reason}"))
+            break
+        text = f"{source.where} contradicts the rest and is left out: {reason}"
+        warnings.append(source.warning(text))
+        left = [each for each in left if each is not source]
+    ends = dict(zip(left, best[0].fit.measured, strict=True)) if left else {}
+    supports = dict(zip(left, best[0].supports, strict=True)) if left else {}
+    by_rank = search.by_rank(left)
+    if by_rank and not wrong:
+        doubts = {source: source.doubt(each) for source, each in supports.items()}
+        warnings += [source.warning(text) for source, text in doubts.items() if text]
+    masks = {each.image: each for each in sources if isinstance(each, MaskSource)}
+    residuals = [
+        masks[number].residuals(ends.get(masks[number])) if number in masks else None
+        for number in range(len(views) if masks else 0)
+    ]
+    summaries = [source.summary(supports.get(source, OutlineSupport())) for source in sources]
+    found = [each.minimum(by_rank=by_rank) for each in best] if left else list(minima)
+    return Refined(found, summaries, warnings, tuple(residuals))
+
+
+class OutlineSearch(NamedTuple):
+    """Minima without outlines, and the sources and the surface that are brought together there.
+
+    The search ``is_open`` where nothing but the outlines determines the estimate.
+    """
+
+    minima: list[Minimum]
+    sources: list[OutlineSource]
+    surface: Surface
+    keypoints: int
+    is_open: bool
+
+    @classmethod
+    def of(
+        cls,
+        model: Model | ShapeModel,
+        prior: ShapePrior,
+        minima: Sequence[Minimum],
+        views: Sequence[View],
+    ) -> OutlineSearch:
+        """The search from the likely ones of minima."""
+        first, keypoints = minima[0], len(prior.ids)
+        is_exact = is_exact_model(model)
+        hulls = [] if is_exact else _hulls_of(views)
+        sources = sources_of(hulls or views, first, is_exact=is_exact)
+        points, where = first.points[:keypoints], min(source.where for source in sources)
+        surface = surface_of(model, points, where, is_hull=bool(hulls))
+        is_open = not _is_determined(first)
+        likely = [each for each in minima if is_open or each.score < first.score + _UNLIKELY]
+        most = _MOST_OPEN_STARTS if is_open else _MOST_STARTS
+        return cls(likely[:most], sources, surface, keypoints, is_open)
+
+    def by_rank(self, sources: Sequence[OutlineSource]) -> bool:
+        """True if ranks score the estimates: costs do not compare, or nothing is beside them."""
+        return self.is_open or not all(source.is_comparable for source in sources)
+
+    def best(self, sources: Sequence[OutlineSource]) -> list[Candidate]:
+        """Distinct candidates, the likeliest first."""
+        near = self._near(sources, [(each, each.state) for each in self.minima])
+        by_rank = self.by_rank(sources)
+        if not self.is_open and (self.surface.is_exact or by_rank):
+            least = _OPEN_STRETCH if near and near[0].agrees else _LEAST_STRETCH
+            others = _displaced(self.minima[0], None if by_rank else least)
+            near += self._near(sources, others)
+        found = _finished(_distinct(near, _INDEPENDENT))
+        return sorted(found, key=lambda each: each.minimum(by_rank=by_rank).score)
+
+    def _near(
+        self, sources: Sequence[OutlineSource], starts: Sequence[tuple[Minimum, State]]
+    ) -> list[Candidate]:
+        """The estimates near starts, the likeliest first."""
+        found = []
+        for start, state in starts:
+            evidence, moved = with_displacement_modes(start.evidence, state)
+            problem = ContourProblem(evidence, self.keypoints, sources, self.surface)
+            fit = first_fit(problem, moved, is_wide=self.is_open)
+            if fit is not None:
+                found.append(Candidate(start, problem, fit))
+        return sorted(found, key=lambda each: each.rank(_INDEPENDENT))
+
+
+def _hulls_of(views: Sequence[View]) -> list[View]:
+    """Views with the convex hulls of their masks; none where a mask leaves the image, or lacks.
+
+    What lies between legs, or a hole, differs from object to object more than the outermost points
+    do, which keypoints and the box describe. The silhouette of a convex hull is the convex hull of
+    the silhouette.
+    """
+    found = []
+    for view in views:
+        hull = None if view.mask_image is None else convex_hull(view.mask_image)
+        if hull is None and (view.mask is not None or view.image is not None):
+            return []
+        found.append(view if hull is None else replace(view, mask=hull))
+    return found
+
+
+def sources_of(views: Sequence[View], minimum: Minimum, *, is_exact: bool) -> list[OutlineSource]:
+    """The masks of views, and the photos of those that have none."""
+    found: list[OutlineSource] = []
+    for image, (view, camera) in enumerate(zip(views, minimum.lenses.cameras, strict=True)):
+        if view.mask_image is not None:
+            found.append(MaskSource.of(image, view, camera, is_exact=is_exact))
+        elif view.image is not None:
+            photo = photo_of(camera, cast(ByteImage, view.image))
+            found.append(PhotoSource(image, view.number, camera, is_exact, photo))
+    return found
+
+
+def _is_determined(minimum: Minimum) -> bool:
+    """True if the evidence without outlines determines all unknowns."""
+    _, information = information_of(*reduced(minimum.evidence, minimum.state))
+    if not np.isfinite(information.diagonal()).all() or not (information.diagonal() > 0).all():
+        return False
+    return bool(np.linalg.eigvalsh(scaled_information(information)[0])[0] > _LEAST_INFORMATION)
+
+
+def _displaced(start: Minimum, least_stretch: float | None) -> list[tuple[Minimum, State]]:
+    """States beside an estimate without outlines, along the directions of which it knows least.
+
+    This is the one of all unknowns, if the standard deviation of a stretch is larger than the least
+    one there; None asks for directions of the pose.
+    """
+    _, information = information_of(*reduced(start.evidence, start.state))
+    count = 6 * len(start.state.poses) + len(start.state.log_focals) + 3
+    if least_stretch is not None:
+        (step,) = weakest_steps(information, 1)
+        is_open = np.abs(step[count - 3 : count]).max() > least_stretch
+        steps = [sign * step[:count] for sign in _SIDEWAYS if is_open]
+    else:
+        steps = [
+            sign * np.append(step, np.zeros(count - 6))
+            for step in weakest_steps(information[:6, :6], _WEAKEST)
+            for sign in _SIDEWAYS_OF_POSE
+        ]
+        steps = [each for each in steps if _LEAST_TURN < np.linalg.norm(each[:3]) < _MOST_TURN]
+    place = Place.of(start.state)
+    return [(start, place.moved(step).state) for step in steps]
+
+
+def _finished(candidates: list[Candidate]) -> list[Candidate]:
+    """The candidates brought to their ends, at the noise of the likeliest one where costs compare.
+
+    A single one at its own noise is at its end.
+    """
+    if not candidates:
+        return []
+    is_comparable = candidates[0].problem.is_comparable
+    if is_comparable and len(candidates) == 1:
+        return candidates
+    tracks, found = candidates[0].fit.tracks, []
+    for each in candidates if is_comparable else candidates[:_MOST_FINISHED]:
+        others = [other.fit.place for other in candidates if other is not each]
+        fit = last_fit(each.problem, each.fit.place, tracks, others)
+        if fit is not None:
+            found.append(each._replace(fit=fit))
+    return found if is_comparable else _distinct(found)
+
+
+def _distinct(candidates: list[Candidate], correlation: float | None = None) -> list[Candidate]:
+    """Candidates without those that equal a likelier one, the likeliest first."""
+    kept: list[Candidate] = []
+    for each in sorted(candidates, key=lambda candidate: candidate.rank(correlation)):
+        if not any(_are_same(each.fit.place.state, other.fit.place.state) for other in kept):
+            kept.append(each)
+    return kept
+
+
+def _are_same(one: State, other: State) -> bool:
+    """True if first poses and stretches are nearly the same."""
+    turn, other_turn = (each.poses[0, :9].reshape(3, 3) for each in (one, other))
+    stretch = np.abs(one.log_scales - other.log_scales).max()
+    return bool(angle_between(turn, other_turn) < _SAME_TURN_DEG and stretch < _SAME_STRETCH)
+
+
+def _contradicting(
+    best: list[Candidate], sources: Sequence[OutlineSource]
+) -> tuple[OutlineSource, str] | None:
+    """The source that contradicts the rest the most, and how; None where all agree."""
+    supports = best[0].supports if best else [OutlineSupport()]
+    worst = min(range(len(supports)), key=lambda number: supports[number].share)
+    if supports[worst].share < _LEAST_SUPPORT:
+        return sources[worst], sources[worst].refusal(supports[worst])
+    reason = _tension(best[0])
+    return None if reason is None else (sources[worst], reason)
+
+
+def _tension(candidate: Candidate) -> str | None:
+    """Report other residuals that rise from a start's more than chance and noise explain."""
+    start, evidence = candidate.start, candidate.problem.evidence
+    equations = 2 * int((evidence.sightings.whitening[:, 2] > 0).sum())
+    if not equations:
+        return None
+    alone = cost_of(*with_displacement_modes(start.evidence, start.state))
+    joint = cost_of(evidence, candidate.fit.place.state)
+    free = 6 * len(start.state.poses) + int(evidence.scales.free.sum())
+    redundancy = equations - free
+    scale = max(1.0, alone / redundancy) if redundancy > 0 else 1.0
+    unknowns = min(free + len(evidence.shape.modes), equations)
+    if joint - alone <= scale * chi_square_quantile(unknowns, _LEAST_PROBABILITY):
+        return None
+    times = np.sqrt(joint / max(alone, float(max(redundancy, 1))))
+    return f"with it the other residuals are {times:.2g} times as large"

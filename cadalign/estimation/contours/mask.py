@@ -1,0 +1,260 @@
+"""A view's mask as a source of the outline: its contour, the rims on its normals, its noise.
+
+A contour lies beside the rim by an offset that all of it has in common, of a mask that is dilated
+say, and by its registration: programs place pixels' centres half a pixel apart, and annotators
+click no better. Both are unknown, and integrated out with the rest of the shape.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import cast
+
+import cv2
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.estimation.contours.contour import (
+    Contour,
+    MaskImage,
+    Sight,
+    across_rims,
+    extraction_bias,
+    find_rims,
+    mask_contour,
+    mask_image,
+    without_steep,
+)
+from cadalign.estimation.contours.noise import (
+    LEAST_LOSS_SCALE,
+    LEAST_OFFSET,
+    LOSS_SCALE,
+    Noise,
+    correlation_length,
+    cost_of_contour,
+    influence_length,
+    robust_deviation,
+    trimmed_deviation,
+)
+from cadalign.estimation.contours.outline import (
+    MeasuredOutline,
+    Outline,
+    OutlineSource,
+    OutlineSupport,
+    Track,
+)
+from cadalign.estimation.contours.surface import PosedSurface
+from cadalign.estimation.uncertainty.summary import MaskResiduals
+from cadalign.estimation.view import View
+from cadalign.geometry.camera import Camera
+
+LARGEST = 24.0
+"""Distance of a sample without a rim [px], where estimates are compared."""
+_LEAST_SIGMA = 0.1  # [px]
+_FIRST_OFFSET = 1.0  # [px], standard deviation of the offset that all of a contour has in common
+_UNEVEN = 0.05  # share of the offset by which it differs from edge to edge
+_EDGE = 30.0  # samples of an edge
+_OF_PIXELS = 3.0  # samples that count as one where pixels alone displace them
+_FIRST_CORRELATION = 10.0  # samples, of a surface that is only similar
+_INLIER = 3.5  # in standard deviations
+_FIRST_REACH = 24.0  # [px], and the same relative to the contour's size
+_RELATIVE_REACH = 0.04
+_WIDE_REACH = 0.15  # where nothing but the masks determines the estimate
+_LEAST_REACH = 4.0
+_REACH = 6.0  # in standard deviations of the residuals
+_OFFSETS = 2.0  # in standard deviations of the offset that all of a contour has in common
+_SETTLED = 0.02  # [px], step of an outline that ends the rounds, or in standard deviations
+_LEAST_TOLERANCE = 3.0  # [px], of a sample that agrees, and the same relative to the mask's size
+_RELATIVE_TOLERANCE = 0.02
+_WARPED_TOLERANCE = 0.06  # where the model is only similar to the object
+_OPEN_BORDER = 3  # [px], within which a mask may go on outside of the image
+_LEAST_PIECE = 0.003  # of a piece of the mask, relative to the largest
+_LEAST_KEYPOINTS = 4  # that tell whether a mask is inverted
+
+
+@dataclass(frozen=True, eq=False)
+class MaskSource(OutlineSource):
+    """The contour of a mask.
+
+    ``slopes`` (S, 2, 2) are the derivatives of its samples' places [px] by their rays; ``sigma`` is
+    the given standard deviation [px], None to estimate it. The contour is that of ``mask``.
+    A ``hint`` tells what may be wrong.
+    """
+
+    kind = "mask"
+    field = "mask"
+    is_comparable = True
+    good_share = 0.94
+
+    contour: Contour
+    slopes: FloatArray
+    sigma: float | None
+    mask: MaskImage
+    hint: str = ""
+
+    @classmethod
+    def of(cls, image: int, view: View, camera: Camera, *, is_exact: bool = True) -> MaskSource:
+        """The contour of a view's mask, without samples outside of its lens.
+
+        Raises InputError if the mask has no contour.
+        """
+        mask = cast("FloatArray | BoolArray", view.mask_image)
+        contour = mask_contour(mask, f"views[{view.number}].mask")
+        rays, valid = camera.normalize_where_valid(contour.points)
+        slopes = np.array([[camera.fx], [camera.fy]]) * camera.distortion_jacobian(rays[valid])
+        contour = contour.taken(valid)
+        given = contour, slopes, view.mask_sigma, mask_image(mask, contour)
+        return cls(image, view.number, camera, is_exact, *given, _off_mask(view.pixels, mask))
+
+    def shown_by(self, line: FloatArray) -> MaskSource:
+        """The part that no line (3,) hides, beyond which rays have ``line @ ray > 0``."""
+        if not line.any():
+            return self
+        rays, _ = self.camera.normalize_where_valid(self.contour.points)
+        shown = rays @ line[:2] + line[2] <= 0
+        return replace(self, contour=self.contour.taken(shown), slopes=self.slopes[shown])
+
+    def first(self, *, is_wide: bool = False) -> Track:
+        """See `OutlineSource`."""
+        share = _WIDE_REACH if is_wide else _RELATIVE_REACH
+        reach = max(_FIRST_REACH, share * self.contour.size)
+        if self.is_exact:
+            return Track(Noise(self.sigma or reach / 3, 1.0, _FIRST_OFFSET), reach)
+        return Track(Noise(reach / 3, _FIRST_CORRELATION, LEAST_OFFSET), reach)
+
+    def last(self, track: Track) -> Track:
+        """See `OutlineSource`."""
+        return self._narrowed(self.first()._replace(noise=track.noise, is_fine=self.is_exact))
+
+    def outline(self, sight: Sight, surface: PosedSurface, track: Track) -> Outline:
+        """See `OutlineSource`; a fine outline is free of the bias of the contour's extraction."""
+        rims = find_rims(sight, self.contour, track.reach)
+        bias = np.zeros(len(rims.found))
+        if track.is_fine:
+            bias = extraction_bias(sight, self.mask, self.contour, rims)
+        rims = without_steep(self.contour, rims, bias)
+        across = np.einsum("ni,nij->nj", across_rims(self.contour, rims), self.slopes)
+        return Outline(
+            self.contour,
+            rims.found,
+            bias - rims.offset,
+            np.ones(len(bias)),
+            rims.points,
+            rims.face,
+            across,
+            self.contour.size,
+            track.reach,
+        )
+
+    def learned(self, outline: Outline, own: FloatArray, track: Track) -> Track:
+        """See `OutlineSource`.
+
+        The correlation is that of the samples' influence on the estimate, which runs of outliers
+        have, too; what the residuals don't reach of the given ``sigma`` is correlated as pixels
+        are. Beside the rim a contour lies unevenly, by a share of the offset that all of an edge
+        has in common. Where the surface is only similar, samples without a rim count as the
+        farthest: there it lacks a part or has one more.
+        """
+        noise, residuals = track.noise, outline.residuals(own, track.noise)
+        some = np.nan_to_num(residuals)
+        if not self.is_exact:
+            everywhere = np.nan_to_num(residuals, nan=track.reach)
+            sigma = max(robust_deviation(everywhere), self.sigma or _LEAST_SIGMA)
+            length = correlation_length(self.contour, some, outline.found)
+            return track._replace(noise=Noise(sigma, length, LEAST_OFFSET))
+        found = trimmed_deviation(residuals[outline.found], LEAST_LOSS_SCALE)
+        measured = max(found, _LEAST_SIGMA)
+        sigma, length = self.sigma or measured, 1.0
+        if track.is_fine:
+            scale = max(LOSS_SCALE * measured, LEAST_LOSS_SCALE)
+            share = min((found / sigma) ** 2, 1.0)
+            along = influence_length(self.contour, some, outline.found, scale)
+            length = share * max(along, _OF_PIXELS) + (1 - share) * _OF_PIXELS
+            length += _EDGE * (_UNEVEN * noise.offset / sigma) ** 2
+        learned = track._replace(noise=Noise(sigma, length, noise.offset))
+        return learned if track.is_fine else self._narrowed(learned)
+
+    def _narrowed(self, track: Track) -> Track:
+        """The track with a reach as small as its noise allows."""
+        least = max(_LEAST_REACH, _OFFSETS * track.noise.offset)
+        return track._replace(reach=min(track.reach, max(_REACH * track.noise.sigma, least)))
+
+    def advanced(self, track: Track, outline: Outline | None, moved: float) -> Track:
+        """See `OutlineSource`."""
+        return track._replace(is_settled=moved < _SETTLED * max(1.0, track.noise.sigma))
+
+    def rank(self, found: MeasuredOutline, correlation: float | None) -> float:
+        """See `OutlineSource`; an occluder may have made a part of the contour."""
+        alike = found.noise.correlation if correlation is None else correlation
+        return 2 * len(self.contour.points) / alike * outline_cost(found)
+
+    def support(self, found: MeasuredOutline) -> OutlineSupport:
+        """See `OutlineSource`."""
+        relative = _RELATIVE_TOLERANCE if self.is_exact else _WARPED_TOLERANCE
+        tolerance = max(_LEAST_TOLERANCE, relative * self.contour.size)
+        within = np.abs(np.nan_to_num(found.residuals, nan=np.inf)) < tolerance
+        seen = self.residuals(found)
+        figures = int(seen.inliers.sum()), seen.rms, seen.rms / seen.sigma
+        return OutlineSupport(float(within.mean()), *figures)
+
+    def refusal(self, support: OutlineSupport) -> str:
+        """See `OutlineSource`."""
+        if not support.share:
+            return f"no part of the model's outline comes near its contour{self.hint}"
+        share = f"{100 * support.share:.0f} % of its contour"
+        return f"only {share} can be the model's outline{self.hint}"
+
+    def doubt(self, support: OutlineSupport) -> str | None:
+        """See `OutlineSource`."""
+        if support.share >= self.good_share:
+            return None
+        return (
+            f"{self.where}: only {100 * support.share:.0f} % of its contour meets the outline of "
+            "the best pose found: the object may be partly hidden, the model another, or the pose "
+            "wrong"
+        )
+
+    def residuals(self, found: MeasuredOutline | None) -> MaskResiduals:
+        """The contour beside the rim; without an outline that of a mask that was left out."""
+        points, normals, _ = self.contour
+        if found is None:
+            lacking = np.full(len(points), np.nan)
+            unused = np.zeros(len(points), dtype=bool)
+            nothing = float("nan"), 1.0, 0.0
+            return MaskResiduals(points, normals, lacking, unused, *nothing, is_used=False)
+        residuals, noise = -found.residuals, found.noise
+        near = np.abs(np.nan_to_num(residuals, nan=np.inf)) < _INLIER * noise.sigma
+        figures = noise.sigma, noise.correlation, float(found.own[0]) * noise.offset
+        return MaskResiduals(points, normals, residuals, near, *figures)
+
+
+def convex_hull(mask: FloatArray | BoolArray) -> BoolArray | None:
+    """The convex hull of a mask (h, w) without small pieces; None where it leaves the image."""
+    inside = mask >= 0.5
+    if inside.sum() > inside[_OPEN_BORDER:-_OPEN_BORDER, _OPEN_BORDER:-_OPEN_BORDER].sum():
+        return None
+    pieces, _ = cv2.findContours(
+        inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE
+    )
+    largest = max(map(cv2.contourArea, pieces), default=0.0)
+    kept = [piece for piece in pieces if cv2.contourArea(piece) >= _LEAST_PIECE * largest]
+    filled = np.zeros(inside.shape, dtype=np.uint8)
+    if kept:
+        cv2.fillConvexPoly(filled, cv2.convexHull(np.concatenate(kept)), 1)
+    return filled > 0
+
+
+def outline_cost(found: MeasuredOutline) -> float:
+    """The mean of -log density of a contour's samples [1/px]; see `cost_of_contour`."""
+    distances = np.nan_to_num(np.abs(found.residuals), nan=LARGEST)
+    return cost_of_contour(np.minimum(distances, LARGEST), LARGEST)
+
+
+def _off_mask(pixels: FloatArray, mask: FloatArray | BoolArray) -> str:
+    """Report that most keypoints lie off a mask, as they do where it is inverted."""
+    places = np.round(pixels).astype(int)
+    u, v = places[((places >= 0) & (places < mask.shape[::-1])).all(axis=1)].T
+    count, off = len(u), int((mask[v, u] < 0.5).sum())
+    if count < _LEAST_KEYPOINTS or 2 * off <= count:
+        return ""
+    return f"; {off} of {count} keypoints lie off it: it may be inverted, or another object's"

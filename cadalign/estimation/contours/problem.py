@@ -1,0 +1,257 @@
+"""Evidence with the rows of outlines.
+
+What is measured at points of a surface is evidence as any other: these points stand between the
+keypoints and the box's corners.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.estimation.contours.contour import Sight
+from cadalign.estimation.contours.noise import Noise
+from cadalign.estimation.contours.outline import (
+    REGISTRATION,
+    Outline,
+    OutlineSource,
+    Track,
+)
+from cadalign.estimation.contours.place import OWN_MODES, Place
+from cadalign.estimation.contours.surface import PosedSurface, Surface
+from cadalign.estimation.estimates import poses_of
+from cadalign.geometry.camera import Camera
+from cadalign.solvers.constants import CAUCHY
+from cadalign.solvers.joint.covariance import information_of
+from cadalign.solvers.joint.evidence import (
+    Evidence,
+    Shape,
+    Sightings,
+    State,
+    log_focals_of,
+    stacked,
+)
+from cadalign.solvers.joint.search import displaced_modes, reduced, refine_joint
+
+
+class OutlineRows(NamedTuple):
+    """Points of a surface in one view, with their modes, and what was measured at each.
+
+    ``mean`` (n, 3) and ``modes`` (K, n, 3) are as in `Shape`. ``sightings`` has a row for each
+    point. ``own`` (3, n, 3) are the contour's own modes, which move these points alone.
+    """
+
+    mean: FloatArray
+    modes: FloatArray
+    sightings: Sightings
+    own: FloatArray
+
+
+class Look(NamedTuple):
+    """The outlines of a surface at a place: its sights in the views, and what these measure."""
+
+    place: Place
+    posed: PosedSurface
+    sights: list[Sight]
+    outlines: list[Outline | None]
+
+
+class Augmented(NamedTuple):
+    """Evidence with rows of outlines.
+
+    The ``state`` of this evidence is that of the ``place``, with so many points more as ``rows``
+    have.
+    """
+
+    evidence: Evidence
+    state: State
+    place: Place
+    rows: list[OutlineRows | None]
+    points: slice
+
+    def refined(self, iterations: int) -> Augmented | None:
+        """The place of the least cost, where every point of the surface stays."""
+        cost, _, state = refine_joint(self.evidence, iterations, self.state)
+        if not cost < np.inf:
+            return None
+        last = len(state.coefficients) - self.place.own.size
+        bare = state._replace(
+            coefficients=state.coefficients[:last],
+            displacements=np.delete(state.displacements, self.points, axis=0),
+        )
+        place = Place(bare, state.coefficients[last:].reshape(self.place.own.shape))
+        return self._replace(state=state, place=place)
+
+
+class ContourProblem(NamedTuple):
+    """Evidence, of so many keypoints, and the surface whose outline ``sources`` measure."""
+
+    evidence: Evidence
+    keypoints: int
+    sources: Sequence[OutlineSource]
+    surface: Surface
+
+    @property
+    def is_comparable(self) -> bool:
+        """True if costs at several places compare."""
+        return all(source.is_comparable for source in self.sources)
+
+    @property
+    def learning(self) -> IntArray:
+        """Numbers of the sources that learn their offset."""
+        return np.flatnonzero([source.learns_offset for source in self.sources])
+
+    def camera_at(self, source: OutlineSource, state: State) -> Camera:
+        """The camera of a source with the focal length of a state."""
+        image, camera = source.image, source.camera
+        if self.evidence.focals.group[image] < 0:
+            return camera
+        ratio = float(np.exp(log_focals_of(self.evidence, state)[image]))
+        return camera.with_focal(camera.fx * ratio)
+
+    def look(self, place: Place, tracks: Sequence[Track]) -> Look:
+        """Measure the outlines at a place."""
+        posed = self.surface.at(self.evidence.shape, place.state)
+        poses, sights, outlines = poses_of(self.evidence, place.state), [], []
+        for source, track, own in zip(self.sources, tracks, place.own, strict=True):
+            camera = self.camera_at(source, place.state)
+            right, down = (REGISTRATION * own[1:]).tolist()
+            camera = replace(camera, cx=camera.cx + right, cy=camera.cy + down)
+            sights.append(Sight(posed.caster, camera, poses[source.image]))
+            outlines.append(source.outline(sights[-1], posed, track))
+        return Look(place, posed, sights, outlines)
+
+    def augmented(self, look: Look, noises: Sequence[Noise]) -> Augmented | None:
+        """The evidence with what was measured; None where there is nothing."""
+        rows = [
+            outline and rows_of(source, outline, noise, look.posed, sight)
+            for source, outline, noise, sight in zip(
+                self.sources, look.outlines, noises, look.sights, strict=True
+            )
+        ]
+        total = sum(len(each.mean) for each in rows if each is not None)
+        if not total:
+            return None
+        state, first = look.place.state, self.keypoints
+        full = state._replace(
+            coefficients=np.concatenate([state.coefficients, look.place.own.ravel()]),
+            displacements=np.insert(state.displacements, [first] * total, 0.0, axis=0),
+        )
+        evidence = _with_rows(self.evidence, first, rows, total)
+        return Augmented(evidence, full, look.place, rows, slice(first, first + total))
+
+    def moves(self, look: Look, there: Augmented) -> list[float]:
+        """Root mean squares [px] by which a step moved the outlines of a look along its normals."""
+        poses, found = poses_of(self.evidence, there.place.state), []
+        for source, outline, rows in zip(self.sources, look.outlines, there.rows, strict=True):
+            if outline is None or rows is None or not len(rows.mean):
+                found.append(0.0)
+                continue
+            coefficients = there.state.coefficients[: len(rows.modes)]  # none if it is rigid
+            points = rows.mean + np.tensordot(coefficients, rows.modes, axes=1)
+            before, after = (
+                self.camera_at(source, state).project(pose.apply(at))
+                for state, pose, at in (
+                    (look.place.state, look.sights[len(found)].pose, outline.points[outline.found]),
+                    (there.place.state, poses[source.image], points),
+                )
+            )
+            along = ((after - before) * outline.contour.normals[outline.found]).sum(axis=1)
+            found.append(float(np.sqrt((along**2).mean())))
+        return found
+
+
+def rows_of(
+    source: OutlineSource, outline: Outline, noise: Noise, surface: PosedSurface, sight: Sight
+) -> OutlineRows:
+    """The samples of an outline that were found, in the form of the evidence.
+
+    At the state of the ``sight`` the residuals are the distances that were found, whatever the
+    normals are. The contour's own modes move its points outwards, to the right and down.
+    """
+    kept = np.flatnonzero(outline.found)
+    points, across, count = outline.points[kept], outline.across[kept], len(kept)
+    given, camera = source.camera, sight.camera
+    focal, root = np.array([given.fx, given.fy]), np.sqrt(noise.correlation)
+    step = across / (across**2).sum(axis=1, keepdims=True)
+    seen, ratio = sight.pose.apply(points), camera.fx / given.fx
+    rays = ratio * seen[:, :2] / seen[:, 2:]
+    rays += np.subtract((camera.cx, camera.cy), (given.cx, given.cy)) / focal
+    rays += outline.places[kept, None] * step
+    moved = np.zeros((OWN_MODES, count, 3))
+    moved[0, :, :2] = noise.offset * step
+    for axis in range(2):
+        moved[1 + axis, :, axis] = REGISTRATION / focal[axis]
+    moved *= seen[:, 2:] / ratio
+    weights = 1 / (noise.sigma * outline.sigmas[kept] * root)
+    return OutlineRows(
+        *surface.rows(points, outline.face[kept]),
+        Sightings(
+            np.arange(count),
+            np.full(count, source.image),
+            rays,
+            np.column_stack([across * weights[:, None], np.zeros(count)]),
+            np.zeros((count, 2)),
+            np.full(count, CAUCHY),
+            np.full(count, noise.loss_scale / root),
+            np.zeros((count, 2)),
+        ),
+        moved @ sight.pose.rotation / sight.pose.scale,
+    )
+
+
+def _with_rows(
+    evidence: Evidence, keypoints: int, measured: Sequence[OutlineRows | None], total: int
+) -> Evidence:
+    """The evidence with what was measured at ``total`` points, and the contours' own modes."""
+    shape, last, room = evidence.shape, len(evidence.shape.modes), [keypoints] * total
+    mean = np.insert(shape.mean, room, 0.0, axis=0)
+    modes = np.zeros((last + OWN_MODES * len(measured), *mean.shape))
+    modes[:last] = np.insert(shape.modes, room, 0.0, axis=1)
+
+    def moved(points: IntArray) -> IntArray:
+        return np.where(points >= keypoints, points + total, points)
+
+    depths = evidence.image_depths
+    sightings = [evidence.sightings._replace(point=moved(evidence.sightings.point))]
+    first = keypoints
+    for number, rows in enumerate(measured):
+        if rows is None:
+            continue
+        there, place = slice(first, first + len(rows.mean)), last + OWN_MODES * number
+        mean[there] = rows.mean
+        modes[: len(rows.modes), there] = rows.modes  # none for a rigid surface
+        modes[place : place + OWN_MODES, there] = rows.own
+        sightings.append(rows.sightings._replace(point=np.arange(there.start, there.stop)))
+        first = there.stop
+    return evidence._replace(
+        shape=Shape(mean, modes, np.insert(shape.spread, room, 0.0)),
+        offsets=evidence.offsets._replace(ends=moved(evidence.offsets.ends)),
+        image_depths=depths._replace(point=moved(depths.point)),
+        sightings=stacked(sightings),
+    )
+
+
+def with_displacement_modes(evidence: Evidence, state: State) -> tuple[Evidence, State]:
+    """The same with the points' own displacements as modes, which a warped surface follows."""
+    shape, rows = evidence.shape, np.flatnonzero(evidence.shape.spread > 0)
+    if not len(rows):
+        return evidence, state
+    modes = displaced_modes(shape, rows)
+    moved = state.displacements[rows] / shape.spread[rows, None]
+    return (
+        evidence._replace(shape=Shape(shape.mean, modes, np.zeros_like(shape.spread))),
+        state._replace(
+            coefficients=np.concatenate([state.coefficients, moved.ravel()]),
+            displacements=np.zeros_like(state.displacements),
+        ),
+    )
+
+
+def cost_of(evidence: Evidence, state: State) -> float:
+    """Cost of all evidence."""
+    return information_of(*reduced(evidence, state))[0]

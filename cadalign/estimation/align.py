@@ -34,7 +34,6 @@ from cadalign.estimation.results import Results
 from cadalign.estimation.search import find_minima, widened_by_noise
 from cadalign.estimation.single import align_plain, align_single, is_plain, is_single
 from cadalign.estimation.view import View, numbered
-from cadalign.estimation.warning import Warnings
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel

@@ -236,7 +236,7 @@ def result_of_minima(
 ) -> Result:
     """The result of minima, of which the likely ones count, with a widened prior of the shape.
 
-    ``notes`` are further warnings; those about contradictions take time.
+    Warnings about contradictions take time.
 
     Raises DegenerateError if the evidence determines none of them.
     """

@@ -7,7 +7,7 @@ the stretch follows by two linear equations in the inverse squares of its scales
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import cache
 from typing import NamedTuple, TypeVar
 
@@ -40,7 +40,6 @@ _LINE_MARGIN = 4.0  # [cells], on the object's side of a line, whose directions 
 _LEAST_OF_BEST = 0.97  # overlap of another turn, relative to the best one of the same direction
 _MOST_AFFINE = 200  # cameras of which the silhouettes are rendered
 _MOST_AFFINE_CUT = 600  # where the mask may lack a part, which leaves more possible
-_WIDER = 3  # times as many cameras, where other evidence leaves few of them
 _ITERATIONS = 8
 _PRIOR = 0.05  # weight of the logarithms of scales
 _MOST_LOG = 1.3
@@ -48,8 +47,6 @@ _DISTINCT_DEG = 10.0
 _DISTINCT_STRETCH = 0.2
 
 T = TypeVar("T")
-Possible = Callable[[FloatArray, FloatArray], BoolArray]
-"""Tells which rotations (n, 3, 3) in the camera and scales (n, 3) other evidence leaves."""
 
 
 class Resembling(NamedTuple):
@@ -73,24 +70,16 @@ def resembling_poses(
     count: int,
     is_cut: bool = False,
     symmetry: Symmetry | None = None,
-    possible: Possible | None = None,
 ) -> list[Resembling]:
     """Distinct alignments whose silhouettes resemble a mask (h, w), the best first.
 
     ``free`` (3,) marks the scales that are unknown; ``is_cut`` says that the mask may lack all that
-    lies beyond a line. Of alignments that are equal under the ``symmetry`` one is kept. Those that
-    are not ``possible`` are left out.
+    lies beyond a line. Of alignments that are equal under the ``symmetry`` one is kept.
     """
     view = FacedMask.of(mask, camera)
     atlas = atlas_of(mesh, eye_of(mesh, view.outline), is_cut=is_cut)
-    most = _MOST_AFFINE_CUT if is_cut else _MOST_AFFINE
-    cameras = _affine_cameras(atlas, view.outline, most if possible is None else _WIDER * most)
-    rotations, places, scales = _poses_of(*cameras, atlas, free)
-    is_left = np.ones(len(scales), dtype=bool)
-    if possible is not None:
-        is_left = possible(view.camera_from_facing @ rotations, scales)
-    left = (each[is_left][:most] for each in (rotations, places, scales))
-    poses = [Alignment(*each) for each in zip(*left, strict=True)]
+    cameras = _affine_cameras(atlas, view.outline, _MOST_AFFINE_CUT if is_cut else _MOST_AFFINE)
+    poses = [Alignment(*each) for each in zip(*_poses_of(*cameras, atlas, free), strict=True)]
     found = [_resemblance(atlas, view, pose, is_cut=is_cut) for pose in poses]
     found.sort(key=lambda each: -each.overlap)
     kept = distinct(((each.alignment, each) for each in found), count, symmetry)

@@ -7,14 +7,13 @@ from typing import NamedTuple, cast
 import cv2
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.contours.descent import MOST_ROUNDS, Approach
 from cadalign.estimation.contours.mask import LARGEST, MaskSource, outline_cost
 from cadalign.estimation.contours.outline import MeasuredOutline, Outline, Track
 from cadalign.estimation.contours.problem import ContourProblem
 from cadalign.estimation.contours.resembling import (
-    Possible,
     Resembling,
     distinct,
     resembling_poses,
@@ -23,7 +22,6 @@ from cadalign.estimation.contours.surface import RigidSurface, rigid_surface
 from cadalign.estimation.estimates import poses_of
 from cadalign.estimation.focal import prior_of_camera
 from cadalign.estimation.model import Model
-from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.problem import Problem
 from cadalign.estimation.search import Minimum, find_minima
 from cadalign.estimation.view import View
@@ -36,9 +34,6 @@ _MOST_ENDS = 5
 _CLOSE = 1.1  # cost above the least, of a contour's sample, at which an end still counts
 _ROUGH_SIZE = 160.0  # [px], of the mask's copy in which starts are followed
 _LEAST_PIXEL = 1.3  # of a smaller copy, in those of the mask
-_ROUGHLY = np.radians(10.0)  # standard deviation of a start's directions
-_ROUGH_STRETCH = 0.3  # of the logarithms of its lengths
-_MOST_SIGMAS = 3.0
 _LARGEST_FOCAL_SIGMA = 0.25  # relative: poses are sought at the focal length of the prior
 
 
@@ -183,29 +178,7 @@ def _resembling(problem: Problem, model: Model, search: _Search) -> list[Resembl
         count=search.starts,
         is_cut=search.is_cut,
         symmetry=model.symmetry,
-        possible=_possible(problem, mesh),
     )
-
-
-def _possible(problem: Problem, mesh: Mesh) -> Possible | None:
-    """Tell which poses known directions, such as gravity's, and known lengths leave."""
-    directions = evidence_of(problem.prior, problem.views, lenses=problem.lenses).directions
-    lengths = np.full(3, np.nan) if problem.size is None else problem.size.lengths
-    known = np.log(lengths / np.ptp(mesh.bounds, axis=0))
-    if not len(directions.model) and np.isfinite(known).sum() < 2:
-        return None
-    roots, axes = np.linalg.eigh(directions.whitening.swapaxes(1, 2) @ directions.whitening)
-    weights = roots / (1 + _ROUGHLY**2 * roots)  # of directions that are as rough as a start
-
-    def possible(rotations: FloatArray, scales: FloatArray) -> BoolArray:
-        seen = np.einsum("nij,dj->ndi", rotations, directions.model) - directions.camera
-        along = np.einsum("ndi,dij->ndj", seen, axes)
-        agree = (weights * along**2).sum(axis=2) < _MOST_SIGMAS**2
-        gaps = (known - np.log(scales))[:, np.isfinite(known)]
-        spread = np.ptp(gaps, axis=1) if gaps.size else np.zeros(len(scales))
-        return np.asarray(agree.all(axis=1) & (spread < _MOST_SIGMAS * _ROUGH_STRETCH))
-
-    return possible
 
 
 def _begun(

@@ -96,6 +96,8 @@ def test_a_photo_that_cannot_be_read_is_a_warning_of_its_row(tmp_path: Path) -> 
         assert (row["warning_count"], row["warning_kinds"]) == (1, "picture")
         assert "the photo is not shown: " in row["warnings"]
         assert "broken.png" in row["warnings"]
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert "; warnings: 2 picture" in page
 
 
 def test_a_mask_that_cannot_be_read_fails_its_row_alone(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.fitted import Alternative, FitStats, FittedKeypoints, quickly
+from cadalign.estimation.fitted import Alternative, Diagnosis, FitStats, FittedKeypoints, quickly
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.problems import Problems, Solutions
 from cadalign.estimation.result import Result
@@ -43,6 +43,7 @@ def result_of_keypoints(
     points_2d: FloatArray,
     fitted: FittedKeypoints,
     *,
+    diagnosis: Diagnosis | None = None,
     symmetry: Symmetry | None = None,
     model: Model | None = None,
     view: View | None = None,
@@ -63,7 +64,11 @@ def result_of_keypoints(
     if symmetry is not None:
         fitted, points = _canonical(fitted, points, symmetry)
     rows, options = _rows(len(fitted.points_3d)), fitted.options
-    of_posterior = {"keypoints": fitted, "fisher_covariance": fitted.fisher_covariance}
+    of_posterior = {
+        "keypoints": fitted,
+        "diagnosis": diagnosis,
+        "fisher_covariance": fitted.fisher_covariance,
+    }
     posterior = quickly(Posterior, of_posterior)
     of_view = {
         "camera": fitted.camera,

@@ -16,6 +16,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError
 from cadalign.estimation.assemble import result_of_keypoints
+from cadalign.estimation.fitted import FittedKeypoints
 from cadalign.estimation.image_checks import OTHER_SIZES
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma, pixel_information
@@ -247,6 +248,23 @@ def diagnose(
     best = min(explaining, key=lambda each: each.score)
     named = _named(found, best)
     return EstimateWarning("mistake", f"{named}: corrected, {_compared(best, given)}")
+
+
+def diagnose_fit(
+    fitted: FittedKeypoints, *, has_reason: bool, rival: Camera | None
+) -> EstimateWarning | None:
+    """As `diagnose`, of keypoints in one view."""
+    ahead, options = np.isfinite(fitted.residuals).all(axis=1), fitted.options
+    if options.sigma is not None and np.ndim(options.sigma) > 0:
+        options = replace(options, sigma=np.asarray(options.sigma)[ahead])
+    ransac = None  # samples need not be drawn where all agree
+    if fitted.search is not None and not fitted.inliers.all():
+        ransac = fitted.search.ransac
+    points = fitted.points_3d[ahead]
+    in_camera = fitted.alignment.apply(points)
+    observed = fitted.camera.project_where_ahead(in_camera) - fitted.residuals[ahead]
+    (model, views), again = estimates_by_fit(points, observed, fitted.camera, options, ransac)
+    return diagnose(model, views, again, ransac=ransac, has_reason=has_reason, rival=rival)
 
 
 def diagnose_refusal(

@@ -20,6 +20,7 @@ from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.estimation.problems import Problems, each_of, in_threads, pack_many, pack_one
 from cadalign.estimation.result import Result
 from cadalign.estimation.solve import solve, solve_one
+from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 
@@ -239,7 +240,13 @@ def fit_batch(
             solutions = solutions._replace(errors=dict(solutions.errors))  # which can be pickled
             seconds = (time.perf_counter() - start) / max(len(some), 1)
             return results_of_solutions(
-                some, solutions, options, sigmas=own, symmetry=symmetry, seconds=seconds
+                some,
+                solutions,
+                options,
+                sigmas=own,
+                symmetry=symmetry,
+                diagnosis=_diagnosis,
+                seconds=seconds,
             )
         fits: list[Result | CadalignError] = []
         for b in range(first, last):
@@ -289,7 +296,16 @@ def _fit_one(
         )
         error.fix = diagnose_refusal(*data, again, ransac) or error.fix
         raise
-    return result_of_keypoints(problems.points_2d, fitted, symmetry=symmetry)
+    return result_of_keypoints(problems.points_2d, fitted, diagnosis=_diagnosis, symmetry=symmetry)
+
+
+def _diagnosis(
+    fitted: FittedKeypoints, *, has_reason: bool, rival: Camera | None
+) -> EstimateWarning | None:
+    """See `diagnose`, which makes fits anew."""
+    from cadalign.estimation.diagnose import diagnose_fit  # rarely asked
+
+    return diagnose_fit(fitted, has_reason=has_reason, rival=rival)
 
 
 def fit_once(

@@ -88,6 +88,15 @@ class KeypointSearch(Protocol):
         """Warn where chance supports as many."""
 
 
+class Diagnosis(Protocol):
+    """A function that names a usual mistake in keypoints that fail their test."""
+
+    def __call__(
+        self, fitted: FittedKeypoints, *, has_reason: bool, rival: Camera | None
+    ) -> EstimateWarning | None:
+        """See `cadalign.estimation.diagnose.diagnose`."""
+
+
 @dataclass(frozen=True, eq=False)
 class FittedKeypoints:
     """Keypoints of an exact or stretched model in one view, with the alignment that fits them.

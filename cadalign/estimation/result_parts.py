@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.estimation.fitted import FittedKeypoints, quickly
+from cadalign.estimation.fitted import Diagnosis, FittedKeypoints, quickly
 from cadalign.estimation.uncertainty.summary import (
     EvidenceSummary,
     Uncertainty,
@@ -35,6 +35,7 @@ class Posterior:
     """
 
     keypoints: FittedKeypoints | None = None
+    diagnosis: Diagnosis | None = None
     fisher_covariance: FloatArray | None = None
     points_covariance: FloatArray | None = None
     points_cam_covariance: FloatArray | None = None
@@ -65,7 +66,7 @@ class Posterior:
             return ()
         from cadalign.estimation.uncertainty.keypoints import keypoint_warnings
 
-        return keypoint_warnings(self.keypoints, self.covariance)
+        return keypoint_warnings(self.keypoints, self.covariance, self.diagnosis)
 
     @cached_property
     def evidence(self) -> tuple[EvidenceSummary, ...]:

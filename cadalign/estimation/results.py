@@ -13,6 +13,7 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.assemble import keypoints_of_solution, result_of_keypoints
+from cadalign.estimation.fitted import Diagnosis
 from cadalign.estimation.options import FitOptions, Sigma
 from cadalign.estimation.problems import Problems, Solutions, full_covariances
 from cadalign.estimation.result import Result
@@ -292,6 +293,7 @@ def results_of_solutions(
     *,
     sigmas: Sequence[Sigma] | None,
     symmetry: Symmetry | None,
+    diagnosis: Diagnosis,
     seconds: float,
 ) -> Results:
     """Arrange the solutions of a batch; single results are made one at a time.
@@ -331,7 +333,7 @@ def results_of_solutions(
         inliers=inliers,
         offsets=problems.offsets,
         errors=dict(solutions.errors),
-        single=partial(_solved, problems, solutions, options, sigmas, symmetry, seconds),
+        single=partial(_solved, problems, solutions, options, sigmas, symmetry, diagnosis, seconds),
     )
 
 
@@ -341,6 +343,7 @@ def _solved(
     options: FitOptions,
     sigmas: Sequence[Sigma] | None,
     symmetry: Symmetry | None,
+    diagnosis: Diagnosis,
     seconds: float,
     b: int,
 ) -> Result:
@@ -355,7 +358,7 @@ def _solved(
         options = replace(options, sigma=sigmas[b])
     some = problems.part(b, b + 1)
     fitted = keypoints_of_solution(some, own, options, seconds)
-    return result_of_keypoints(some.points_2d, fitted, symmetry=symmetry)
+    return result_of_keypoints(some.points_2d, fitted, diagnosis=diagnosis, symmetry=symmetry)
 
 
 def to_dataframe(

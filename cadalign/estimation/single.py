@@ -71,8 +71,14 @@ def align_plain(
         ransac=ransac,
         scores=view.scores if ransac is not None else None,
     )
-    fitted = cast(FittedKeypoints, found.posterior.keypoints)
-    return result_of_keypoints(view.pixels, fitted, symmetry=model.symmetry, model=model, view=view)
+    return result_of_keypoints(
+        view.pixels,
+        cast(FittedKeypoints, found.posterior.keypoints),
+        diagnosis=found.posterior.diagnosis,
+        symmetry=model.symmetry,
+        model=model,
+        view=view,
+    )
 
 
 def align_single(problem: Problem, start: float) -> Result:

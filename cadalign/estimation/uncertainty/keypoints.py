@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.fitted import FittedKeypoints
+from cadalign.estimation.fitted import Diagnosis, FittedKeypoints
 from cadalign.estimation.focal import focal_doubt
 from cadalign.estimation.options import pixel_information
 from cadalign.estimation.uncertainty.misfit import (
@@ -45,15 +43,23 @@ def keypoint_covariance(fitted: FittedKeypoints) -> FloatArray | None:
     return without_free_turns(covariance, best)
 
 
-def keypoint_warnings(fitted: FittedKeypoints, covariance: FloatArray | None) -> Warnings:
-    """Warnings about mistakes, a misfit, and what the keypoints do not determine."""
+def keypoint_warnings(
+    fitted: FittedKeypoints, covariance: FloatArray | None, diagnosis: Diagnosis | None
+) -> Warnings:
+    """Warnings about mistakes, a misfit, and what the keypoints do not determine.
+
+    The ``diagnosis`` names a mistake in keypoints that fail their test.
+    """
     misfit = find_misfit(fitted)
     ahead = np.isfinite(fitted.residuals).all(axis=1)
     in_camera = fitted.alignment.apply(fitted.points_3d[ahead])
     observed = fitted.camera.project_where_ahead(in_camera) - fitted.residuals[ahead]
-    mistake = _mistake(fitted, misfit, observed)
-    if mistake is not None:  # nothing else can be said of the alignment
-        return (mistake,)
+    if diagnosis is not None and _is_doubtful(fitted, misfit):
+        rival = None if misfit is None else misfit.camera
+        has_reason = misfit is not None and misfit.has_reason
+        mistake = diagnosis(fitted, has_reason=has_reason, rival=rival)
+        if mistake is not None:  # nothing else can be said of the alignment
+            return (mistake,)
     placed = _placed(fitted.camera, observed, misfit)
     if covariance is None:
         return placed
@@ -75,32 +81,11 @@ def keypoint_warnings(fitted: FittedKeypoints, covariance: FloatArray | None) ->
     return (*placed, *_doubts(fitted, misfit, observed), *weak, *others)
 
 
-def _mistake(
-    fitted: FittedKeypoints, misfit: Misfit | None, observed: FloatArray
-) -> EstimateWarning | None:
-    """A mistake in the keypoints, where they fail their test; ``observed`` are those ahead."""
-    ransac = None if fitted.search is None else fitted.search.ransac
-    if ransac is None and fitted.fisher_covariance is None:
-        return None
-    if fitted.inliers.all():
-        if misfit is None and not has_large_sigma(fitted):
-            return None
-        ransac = None  # samples need not be drawn
-    from cadalign.estimation.diagnose import diagnose, estimates_by_fit  # rarely asked
-
-    ahead, options = np.isfinite(fitted.residuals).all(axis=1), fitted.options
-    if options.sigma is not None and np.ndim(options.sigma) > 0:
-        options = replace(options, sigma=np.asarray(options.sigma)[ahead])
-    points = fitted.points_3d[ahead]
-    (model, views), again = estimates_by_fit(points, observed, fitted.camera, options, ransac)
-    return diagnose(
-        model,
-        views,
-        again,
-        ransac=ransac,
-        has_reason=misfit is not None and misfit.has_reason,
-        rival=None if misfit is None else misfit.camera,
-    )
+def _is_doubtful(fitted: FittedKeypoints, misfit: Misfit | None) -> bool:
+    """True if keypoints are rejected, or fail their test."""
+    if fitted.search is None and fitted.fisher_covariance is None:
+        return False
+    return not fitted.inliers.all() or misfit is not None or has_large_sigma(fitted)
 
 
 def _placed(camera: Camera, observed: FloatArray, misfit: Misfit | None) -> Warnings:

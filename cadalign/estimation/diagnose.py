@@ -351,7 +351,8 @@ def _is_doubtful(
         return True
     if given.sigma is None:
         return not given.has_chance(_DOUBTFUL, inflation)
-    extent = max(float(np.ptp(view.pixels, axis=0).max(initial=0.0)) for view in views)
+    seen = [view.pixels for view in views if len(view.pixels)]
+    extent = max((float(np.ptp(pixels, axis=0).max()) for pixels in seen), default=0.0)
     return given.redundancy > 0 and given.sigma > _LARGE_SIGMA * extent
 
 

@@ -295,7 +295,9 @@ def test_end_of_the_searched_range_is_said_so() -> None:
         for shift in np.random.default_rng(1).normal(size=(8, 12, 2))
     ]
     ends = [result for result in seen if result.camera.fx == pytest.approx(50 * 640)]
-    assert ends
+    # Where noise looks like a mistake in the data, that alone is told.
+    ends = [each for each in ends if not any(told.kind == "mistake" for told in each.warnings)]
+    assert len(ends) > 4
     for result in ends:
         assert any(
             text == "the focal length is the end of the searched range (3.2e+04 px): "

@@ -17,7 +17,8 @@ from cadalign.estimation.assemble import result_of_keypoints
 from cadalign.estimation.estimates import with_boxes
 from cadalign.estimation.fit import fit
 from cadalign.estimation.fitted import FitStats, FittedKeypoints
-from cadalign.estimation.joint import Estimate, as_given, common_sigma, result_of
+from cadalign.estimation.joint import common_sigma, result_of
+from cadalign.estimation.mixture import Estimate, as_given
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.pack import seen_keypoints

@@ -12,7 +12,7 @@ from cadalign.estimation.view import View
 from cadalign.shapes.model import ShapeModel
 
 if TYPE_CHECKING:
-    from cadalign.estimation.contours.engine import Refined
+    from cadalign.estimation.contours.engine import RefinedMinima
 
 
 def refine_with_images(
@@ -20,7 +20,7 @@ def refine_with_images(
     prior: ShapePrior,
     views: Sequence[View],
     minima: Sequence[Minimum],
-) -> tuple[list[Minimum], list[Refined]]:
+) -> tuple[list[Minimum], list[RefinedMinima]]:
     """Minima with the views' masks and photos, and what a result is to note of these.
 
     Without any of them they are the same, and neither OpenCV nor embree is loaded.

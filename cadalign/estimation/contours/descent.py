@@ -215,7 +215,7 @@ def last_fit(
         start = descent.at(place)
         return None if start is None else descent.run(start)
     here = Approach(place, tracks).followed(problem)
-    return None if here is None or here.step is None else _widened(problem, here.step)
+    return None if here is None or here.step is None else _with_wider_noise(problem, here.step)
 
 
 def _lowered(problem: ContourProblem, here: Approach) -> OutlineFit | None:
@@ -277,7 +277,7 @@ def with_learned_offsets(
     return learned, own
 
 
-def _widened(problem: ContourProblem, fit: OutlineFit) -> OutlineFit:
+def _with_wider_noise(problem: ContourProblem, fit: OutlineFit) -> OutlineFit:
     """The same, with the noise of photos' lines as large as if unknowns fitted a part of it.
 
     Their residuals have as many degrees of freedom less as the lines determine unknowns.

@@ -22,7 +22,7 @@ from cadalign.estimation.contours.outline import (
 from cadalign.estimation.contours.photo import PhotoSource
 from cadalign.estimation.contours.photo_lines import photo_of
 from cadalign.estimation.contours.place import Place, weakest_steps
-from cadalign.estimation.contours.problem import ContourProblem, cost_of, with_displacement_modes
+from cadalign.estimation.contours.problem import ContourProblem, with_displacement_modes
 from cadalign.estimation.contours.surface import Surface, surface_of
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.prior import ShapePrior
@@ -37,7 +37,7 @@ from cadalign.io.images import ByteImage
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.covariance import information_of, scaled_information
 from cadalign.solvers.joint.evidence import State
-from cadalign.solvers.joint.search import reduced, score_state
+from cadalign.solvers.joint.search import cost_of, reduced, score_state
 
 _MOST_STARTS = 4
 _MOST_OPEN_STARTS = 8  # where nothing but masks determines the estimate
@@ -57,7 +57,7 @@ _LEAST_SUPPORT = 0.5  # share of a source's samples that must agree with the out
 _LEAST_PROBABILITY = 1e-5  # of such a rise of the other residuals by chance
 
 
-class Refined(NamedTuple):
+class RefinedMinima(NamedTuple):
     """Minima with masks and photos, and what is to be noted of these in the result."""
 
     minima: list[Minimum]
@@ -124,7 +124,7 @@ def refine_with_outlines(
     prior: ShapePrior,
     views: Sequence[View],
     minima: Sequence[Minimum],
-) -> Refined:
+) -> RefinedMinima:
     """Refine the likely minima of the other evidence, the likeliest first, with masks and photos.
 
     A photo counts where its view has no mask, which is the better outline. Raises InputError if a
@@ -165,7 +165,7 @@ def refine_with_outlines(
     ]
     summaries = [source.summary(supports.get(source, OutlineSupport())) for source in sources]
     found = [each.minimum(by_rank=by_rank) for each in best] if left else list(minima)
-    return Refined(found, summaries, warnings, tuple(residuals))
+    return RefinedMinima(found, summaries, warnings, tuple(residuals))
 
 
 class OutlineSearch(NamedTuple):
@@ -212,7 +212,7 @@ class OutlineSearch(NamedTuple):
             least = _OPEN_STRETCH if near and near[0].agrees else _LEAST_STRETCH
             others = _displaced(self.minima[0], None if by_rank else least)
             near += self._near(sources, others)
-        found = _finished(_distinct(near, _INDEPENDENT))
+        found = _finished(_distinct_candidates(near, _INDEPENDENT))
         return sorted(found, key=lambda each: each.minimum(by_rank=by_rank).score)
 
     def _near(
@@ -304,19 +304,21 @@ def _finished(candidates: list[Candidate]) -> list[Candidate]:
         fit = last_fit(each.problem, each.fit.place, tracks, others)
         if fit is not None:
             found.append(each._replace(fit=fit))
-    return found if is_comparable else _distinct(found)
+    return found if is_comparable else _distinct_candidates(found)
 
 
-def _distinct(candidates: list[Candidate], correlation: float | None = None) -> list[Candidate]:
+def _distinct_candidates(
+    candidates: list[Candidate], correlation: float | None = None
+) -> list[Candidate]:
     """Candidates without those that equal a likelier one, the likeliest first."""
     kept: list[Candidate] = []
     for each in sorted(candidates, key=lambda candidate: candidate.rank(correlation)):
-        if not any(_are_same(each.fit.place.state, other.fit.place.state) for other in kept):
+        if not any(_are_alike(each.fit.place.state, other.fit.place.state) for other in kept):
             kept.append(each)
     return kept
 
 
-def _are_same(one: State, other: State) -> bool:
+def _are_alike(one: State, other: State) -> bool:
     """True if first poses and stretches are nearly the same."""
     turn, other_turn = (each.poses[0, :9].reshape(3, 3) for each in (one, other))
     stretch = np.abs(one.log_scales - other.log_scales).max()

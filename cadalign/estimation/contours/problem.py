@@ -26,7 +26,6 @@ from cadalign.estimation.contours.surface import PosedSurface, Surface
 from cadalign.estimation.estimates import poses_of
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.constants import CAUCHY
-from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import (
     Evidence,
     Shape,
@@ -35,7 +34,7 @@ from cadalign.solvers.joint.evidence import (
     log_focals_of,
     stacked,
 )
-from cadalign.solvers.joint.search import displaced_modes, reduced, refine_joint
+from cadalign.solvers.joint.search import displaced_modes, refine_joint
 
 
 class OutlineRows(NamedTuple):
@@ -250,8 +249,3 @@ def with_displacement_modes(evidence: Evidence, state: State) -> tuple[Evidence,
             displacements=np.zeros_like(state.displacements),
         ),
     )
-
-
-def cost_of(evidence: Evidence, state: State) -> float:
-    """Cost of all evidence."""
-    return information_of(*reduced(evidence, state))[0]

@@ -104,7 +104,7 @@ def minima_of_mask(problem: Problem) -> tuple[list[Minimum], int, int]:
             fix="give a calibrated camera, a focal_prior whose relative_sigma is at most "
             f"{_LARGEST_FOCAL_SIGMA}, or keypoints",
         )
-    ends, steps, starts = _searched(problem, model, _rough_contour(view, camera))
+    ends, steps, starts = _ends_near(problem, model, _rough_contour(view, camera))
     if not ends:
         raise DegenerateError(
             "no pose gives the model an outline like the mask's",
@@ -118,7 +118,7 @@ def minima_of_mask(problem: Problem) -> tuple[list[Minimum], int, int]:
     return chosen, steps, starts
 
 
-def _searched(
+def _ends_near(
     problem: Problem, model: Model, contour: MaskSource
 ) -> tuple[list[tuple[float, Minimum]], int, int]:
     """Costs and minima near a contour, the likeliest first; numbers of iterations and of starts.

@@ -168,6 +168,13 @@ def test_faces_are_numbers_of_vertices(root, number):
         cad_model(root, "chair", 1).load_mesh()
 
 
+def test_angles_beyond_all_measure_are_no_failure(root):
+    path = root / "Annotations" / "chair_pascal" / "2008_000001.mat"
+    write_record(path, annotated(viewpoint={**VIEW, "azimuth": 1e300}))
+    (chair,) = Pascal3D(root)[0].objects
+    assert np.isfinite(chair.truth.rotation).all()
+
+
 def test_damaged_files_are_told(root):
     assert_damage_is_told(root)
 

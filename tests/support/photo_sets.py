@@ -117,7 +117,7 @@ def write_pascal3d(root: Path) -> Path:
     cad = {"vertices": CORNERS[:, [0, 2, 1]], "faces": FACES + 1.0}
     cad |= {"pnames": np.array(NAMES, dtype=object), **fields}
     (root / "CAD").mkdir(parents=True)
-    savemat(root / "CAD" / "chair.mat", {"chair": np.array([cad], dtype=object)})
+    _write_mat(root / "CAD" / "chair.mat", {"chair": np.array([cad], dtype=object)})
     write_photo(root / "Images" / "chair_pascal" / "1.jpg", 320, 240)
     view = {"azimuth": 40.0, "elevation": 15.0, "distance": 15.0, "focal": 1.0, "px": 160.5,
             "py": 120.5, "theta": 5.0, "viewport": 3000.0}  # fmt: skip
@@ -156,14 +156,19 @@ def write_detections(root: Path, *, photos: int) -> Path:
     lists = {"imgname": np.array(names, dtype=object), "cad_index": np.ones(photos)}
     lists["class"] = np.array(["chair"] * photos, dtype=object)
     (root / "annot").mkdir()
-    savemat(root / "annot" / "valid.mat", {"annot": lists})
+    _write_mat(root / "annot" / "valid.mat", {"annot": lists})
     return root
 
 
 def _write_record(path: Path, found: dict[str, Any]) -> None:
     objects = np.array([found], dtype=object)
     record = {"filename": "1.jpg", "imgsize": [320.0, 240.0, 3.0], "objects": objects}
-    savemat(path, {"record": record})
+    _write_mat(path, {"record": record})
+
+
+def _write_mat(path: Path, variables: dict[str, Any]) -> None:
+    # As MATLAB does; damage to others can crash SciPy.
+    savemat(path, variables, do_compression=True)
 
 
 WRITERS = {

@@ -26,7 +26,7 @@ from cadalign.estimation.problems import (
     whitening_of,
 )
 from cadalign.estimation.solve import camera_of, solve_one
-from cadalign.estimation.support import (
+from cadalign.estimation.uncertainty.residuals import (
     SOLUTIONS_OF_FOUR,
     Support,
     area_of,

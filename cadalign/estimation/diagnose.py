@@ -17,12 +17,11 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError
 from cadalign.estimation.assemble import result_of_keypoints
 from cadalign.estimation.fitted import FittedKeypoints
-from cadalign.estimation.image_checks import OTHER_SIZES
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma, pixel_information
 from cadalign.estimation.problems import pack_one
-from cadalign.estimation.support import area_of
-from cadalign.estimation.uncertainty.residuals import chi_square_tail, f_quantile
+from cadalign.estimation.uncertainty.residuals import area_of, chi_square_tail, f_quantile
+from cadalign.estimation.uncertainty.summary import OTHER_SIZES
 from cadalign.estimation.view import View, numbered
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera

@@ -15,8 +15,13 @@ import numpy as np
 from cadalign.arrays import BoolArray, is_number
 from cadalign.errors import DegenerateError
 from cadalign.estimation.estimates import (
+    Estimate,
+    as_given,
     curvature_of_rotations,
     mean_state,
+    moments_of_points,
+    moments_of_poses,
+    one_of_equals,
     pose_and_border,
     pose_and_lengths,
     poses_of,
@@ -25,14 +30,6 @@ from cadalign.estimation.estimates import (
 )
 from cadalign.estimation.fitted import Alternative, FitStats
 from cadalign.estimation.focal import prior_of_camera
-from cadalign.estimation.image_checks import outside_image
-from cadalign.estimation.mixture import (
-    Estimate,
-    as_given,
-    moments_of_points,
-    moments_of_poses,
-    one_of_equals,
-)
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import camera_like, is_exact, widened, with_known_shape
 from cadalign.estimation.problem import Problem
@@ -51,6 +48,7 @@ from cadalign.estimation.uncertainty.shape_posterior import ShapeTails
 from cadalign.estimation.uncertainty.summary import (
     EvidenceSummary,
     another_pose,
+    outside_image,
     uncertainty_of,
     weaknesses,
 )

@@ -20,15 +20,15 @@ from cadalign.estimation.fitted import FitStats, FittedKeypoints
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.problems import Problems, check_sigmas
 from cadalign.estimation.solve import solve_one
-from cadalign.estimation.support import (
+from cadalign.estimation.uncertainty.residuals import (
     LEAST_ERROR,
     SOLUTIONS_OF_FOUR,
     Support,
     area_of,
     disagreeing,
+    f_quantile,
     log_expected_by_chance,
 )
-from cadalign.estimation.uncertainty.residuals import f_quantile
 
 _REACH = 3.0  # estimated sigmas within which keypoints agree
 _FIRST, _FACTOR = 4.0, 2.0  # thresholds [px]

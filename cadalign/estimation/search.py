@@ -24,9 +24,9 @@ from cadalign.estimation.problem import Inits, Problem
 from cadalign.estimation.problems import no_redundancy_error
 from cadalign.estimation.search_starts import starts_of_problem
 from cadalign.estimation.starts import Starts
-from cadalign.estimation.support import Support, area_of, check_support
 from cadalign.estimation.uncertainty.evidence import count_equations
 from cadalign.estimation.uncertainty.posterior import widening_of
+from cadalign.estimation.uncertainty.residuals import Support, area_of, check_support
 from cadalign.estimation.view import View
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
 from cadalign.solvers.joint.search import refine_joint, score_state, search_joint

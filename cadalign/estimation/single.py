@@ -14,11 +14,10 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
 from cadalign.estimation.assemble import result_of_keypoints
-from cadalign.estimation.estimates import with_boxes
+from cadalign.estimation.estimates import Estimate, as_given, with_boxes
 from cadalign.estimation.fit import fit
 from cadalign.estimation.fitted import FitStats, FittedKeypoints
 from cadalign.estimation.joint import common_sigma, result_of
-from cadalign.estimation.mixture import Estimate, as_given
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.pack import seen_keypoints
@@ -27,8 +26,12 @@ from cadalign.estimation.problem import Problem
 from cadalign.estimation.result import Result
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.uncertainty.evidence import summary_of_keypoints
-from cadalign.estimation.uncertainty.shape_posterior import SeenShape, ShapeTails, keypoint_misfits
-from cadalign.estimation.uncertainty.single_posterior import single_posterior
+from cadalign.estimation.uncertainty.shape_posterior import (
+    SeenShape,
+    ShapeTails,
+    keypoint_misfits,
+    single_posterior,
+)
 from cadalign.estimation.view import View
 from cadalign.estimation.warning import Warnings
 from cadalign.geometry.alignment import Alignment

@@ -16,7 +16,7 @@ from support.scenes import seen as seen_in_scene
 
 from cadalign import Camera, Model, RansacOptions, Result, View, align, fit
 from cadalign.errors import CadalignError, NoConsensusError
-from cadalign.estimation.support import (
+from cadalign.estimation.uncertainty.residuals import (
     Support,
     area_of,
     check_support,

@@ -91,7 +91,7 @@ def _is_doubtful(fitted: FittedKeypoints, misfit: Misfit | None) -> bool:
 def _placed(camera: Camera, observed: FloatArray, misfit: Misfit | None) -> Warnings:
     if camera.is_centred and camera.contains(observed).all():
         return ()
-    from cadalign.estimation.image_checks import outside_image  # rarely asked
+    from cadalign.estimation.uncertainty.summary import outside_image  # rarely asked
 
     return outside_image(observed, camera, agree=misfit is None)
 

@@ -337,7 +337,7 @@ def _contradicting_camera(tested: _Tested) -> Camera | None:
         return None
     if tested.passes and tested.decrease_by_focal() < _WORTH_A_SEARCH:
         return None
-    from cadalign.estimation.image_checks import OTHER_SIZES  # rarely asked
+    from cadalign.estimation.uncertainty.summary import OTHER_SIZES  # rarely asked
 
     found = [tested.again(focal="estimate")]
     for factor in OTHER_SIZES:

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from benchmarks.contour_bound import contour_bound
 from benchmarks.evidence import damaged_mask
+from benchmarks.masks import contour_bound
 
 from cadalign import Alignment, Camera, Model, Result, View, align
 from cadalign.datasets import KeypointNet

@@ -157,13 +157,10 @@ def _estimate(problem: Problem, start: float, *, has_warnings: bool = True) -> R
         problem, minima, iterations, hypotheses = find_minima(problem, starts)
     if not minima:
         raise no_pose_error(problem)
-    minima, refined = refine_with_images(problem.model, problem.prior, problem.views, minima)
+    minima, notes = refine_with_images(problem.model, problem.prior, problem.views, minima)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
     likely = widened_by_noise(problem, minima)
-    result = result_of_minima(problem, likely, stats, has_warnings=has_warnings)
-    for each in refined:
-        result = each.noted_in(result)
-    return result
+    return result_of_minima(problem, likely, stats, notes=notes, has_warnings=has_warnings)
 
 
 def align_batch(

@@ -34,7 +34,7 @@ from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import camera_like, is_exact, widened, with_known_shape
 from cadalign.estimation.problem import Problem
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import Posterior, ViewResult
+from cadalign.estimation.result_parts import NO_NOTES, OutlineNotes, Posterior, ViewResult
 from cadalign.estimation.search import Minimum
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.symmetry import (
@@ -74,6 +74,7 @@ def result_of(
     is_curved: bool,
     warnings: Warnings,
     evidence: tuple[EvidenceSummary, ...],
+    notes: OutlineNotes = NO_NOTES,
     **of_result: Any,
 ) -> Result:
     """The result of likely estimates, the best first.
@@ -143,8 +144,9 @@ def result_of(
                 for number, view in enumerate(views)
                 if number not in numbers
             ),
+            *notes.warnings,
         ),
-        evidence=evidence,
+        evidence=(*evidence, *notes.evidence),
         degrees_of_freedom=prior.degrees_of_freedom,
     )
     of_views = []
@@ -174,6 +176,7 @@ def result_of(
         own_stretch=np.where(
             has_length, best.lengths / np.where(has_length, prior.lengths, 1), 1.0
         ),
+        mask_residuals=notes.mask_residuals,
         **of_result,
     )
 
@@ -209,6 +212,7 @@ def result_of_minima(
     minima: Sequence[Minimum],
     stats: FitStats,
     *,
+    notes: OutlineNotes = NO_NOTES,
     has_warnings: bool = True,
 ) -> Result:
     """The result of minima, of which the likely ones count, with a widened prior of the shape.
@@ -263,6 +267,7 @@ def result_of_minima(
         inliers=_inliers(problem, minimum),
         is_curved=symmetry is None and not is_exact(minimum.evidence),
         warnings=tuple(warnings),
+        notes=notes,
         evidence=tuple(
             each if each.view is None else replace(each, view=numbers[each.view])
             for each in summaries_of(minimum.evidence, minimum.state, seen_by)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.fitted import Diagnosis, FittedKeypoints, quickly
 from cadalign.estimation.uncertainty.summary import (
     EvidenceSummary,
+    MaskResiduals,
     Uncertainty,
     uncertainty_of,
 )
@@ -76,6 +77,18 @@ class Posterior:
         from cadalign.estimation.uncertainty.keypoints import keypoint_evidence
 
         return keypoint_evidence(self.keypoints)
+
+
+class OutlineNotes(NamedTuple):
+    """What masks and photos add to a result."""
+
+    evidence: tuple[EvidenceSummary, ...] = ()
+    warnings: Warnings = ()
+    mask_residuals: tuple[MaskResiduals | None, ...] = ()
+    """The contours of every view's mask."""
+
+
+NO_NOTES = OutlineNotes()
 
 
 def points_covariances(

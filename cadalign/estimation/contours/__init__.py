@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
+from cadalign.estimation.result_parts import NO_NOTES, OutlineNotes
 from cadalign.estimation.search import Minimum
 from cadalign.estimation.view import View
 from cadalign.shapes.model import ShapeModel
-
-if TYPE_CHECKING:
-    from cadalign.estimation.contours.engine import RefinedMinima
 
 
 def refine_with_images(
@@ -20,14 +17,13 @@ def refine_with_images(
     prior: ShapePrior,
     views: Sequence[View],
     minima: Sequence[Minimum],
-) -> tuple[list[Minimum], list[RefinedMinima]]:
+) -> tuple[list[Minimum], OutlineNotes]:
     """Minima with the views' masks and photos, and what a result is to note of these.
 
     Without any of them they are the same, and neither OpenCV nor embree is loaded.
     """
     if all(view.mask is None and view.image is None for view in views):
-        return list(minima), []
+        return list(minima), NO_NOTES
     from cadalign.estimation.contours.engine import refine_with_outlines
 
-    refined = refine_with_outlines(model, prior, views, minima)
-    return refined.minima, [refined]
+    return refine_with_outlines(model, prior, views, minima)

@@ -26,10 +26,9 @@ from cadalign.estimation.contours.problem import ContourProblem, with_displaceme
 from cadalign.estimation.contours.surface import Surface, surface_of
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.prior import ShapePrior
-from cadalign.estimation.result import Result
+from cadalign.estimation.result_parts import OutlineNotes
 from cadalign.estimation.search import Minimum
 from cadalign.estimation.uncertainty.residuals import chi_square_quantile
-from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals
 from cadalign.estimation.view import View
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.rotations import angle_between
@@ -55,24 +54,6 @@ _LEAST_TURN, _MOST_TURN = np.radians(2.0), np.radians(40.0)
 _SAME_TURN_DEG, _SAME_STRETCH = 1.0, 0.2  # logarithms of scales
 _LEAST_SUPPORT = 0.5  # share of a source's samples that must agree with the outline
 _LEAST_PROBABILITY = 1e-5  # of such a rise of the other residuals by chance
-
-
-class RefinedMinima(NamedTuple):
-    """Minima with masks and photos, and what is to be noted of these in the result."""
-
-    minima: list[Minimum]
-    summaries: list[EvidenceSummary]
-    warnings: list[EstimateWarning]
-    residuals: tuple[MaskResiduals | None, ...] = ()
-    """The contours of every view's mask."""
-
-    def noted_in(self, result: Result) -> Result:
-        """The result with what is known of the masks and photos."""
-        posterior = result.posterior.stating(
-            evidence=(*result.evidence, *self.summaries),
-            warnings=(*result.warnings, *self.warnings),
-        )
-        return replace(result, mask_residuals=self.residuals, posterior=posterior)
 
 
 class Candidate(NamedTuple):
@@ -124,7 +105,7 @@ def refine_with_outlines(
     prior: ShapePrior,
     views: Sequence[View],
     minima: Sequence[Minimum],
-) -> RefinedMinima:
+) -> tuple[list[Minimum], OutlineNotes]:
     """Refine the likely minima of the other evidence, the likeliest first, with masks and photos.
 
     A photo counts where its view has no mask, which is the better outline. Raises InputError if a
@@ -165,7 +146,7 @@ def refine_with_outlines(
     ]
     summaries = [source.summary(supports.get(source, OutlineSupport())) for source in sources]
     found = [each.minimum(by_rank=by_rank) for each in best] if left else list(minima)
-    return RefinedMinima(found, summaries, warnings, tuple(residuals))
+    return found, OutlineNotes(tuple(summaries), tuple(warnings), tuple(residuals))
 
 
 class OutlineSearch(NamedTuple):

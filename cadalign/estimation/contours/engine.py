@@ -72,6 +72,11 @@ class Candidate(NamedTuple):
         ]
 
     @property
+    def is_supported(self) -> bool:
+        """True if every source shows enough of the outline."""
+        return all(each.share >= _LEAST_SUPPORT for each in self.supports)
+
+    @property
     def agrees(self) -> bool:
         """True if all of the outlines agree, and other starts would not do better."""
         sources = self.problem.sources
@@ -204,9 +209,12 @@ class OutlineSearch(NamedTuple):
         for start, state in starts:
             evidence, moved = with_displacement_modes(start.evidence, state)
             problem = ContourProblem(evidence, self.keypoints, sources, self.surface)
-            fit = first_fit(problem, moved, is_wide=self.is_open)
-            if fit is not None:
-                found.append(Candidate(start, problem, fit))
+            for is_wide in (False, True) if self.is_open else (False,):
+                fit = first_fit(problem, moved, is_wide=is_wide)
+                if fit is not None:
+                    found.append(Candidate(start, problem, fit))
+                    if not is_wide and found[-1].is_supported:
+                        break
         return sorted(found, key=lambda each: each.rank(_INDEPENDENT))
 
 

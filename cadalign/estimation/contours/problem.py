@@ -144,7 +144,10 @@ class ContourProblem(NamedTuple):
         return Augmented(evidence, full, look.place, rows, slice(first, first + total))
 
     def moves(self, look: Look, there: Augmented) -> list[float]:
-        """Root mean squares [px] by which a step moved the outlines of a look along its normals."""
+        """Root mean squares [px] by which a step moved the outlines of a look along its normals.
+
+        They are infinite where a step leads behind the camera.
+        """
         poses, found = poses_of(self.evidence, there.place.state), []
         for source, outline, rows in zip(self.sources, look.outlines, there.rows, strict=True):
             if outline is None or rows is None or not len(rows.mean):
@@ -152,14 +155,14 @@ class ContourProblem(NamedTuple):
                 continue
             coefficients = there.state.coefficients[: len(rows.modes)]  # none if it is rigid
             points = rows.mean + np.tensordot(coefficients, rows.modes, axes=1)
-            before, after = (
-                self.camera_at(source, state).project(pose.apply(at))
-                for state, pose, at in (
-                    (look.place.state, look.sights[len(found)].pose, outline.points[outline.found]),
-                    (there.place.state, poses[source.image], points),
-                )
-            )
-            along = ((after - before) * outline.contour.normals[outline.found]).sum(axis=1)
+            before = look.sights[len(found)].pose.apply(outline.points[outline.found])
+            after = poses[source.image].apply(points)
+            if (np.minimum(before[:, 2], after[:, 2]) <= 0).any():
+                found.append(np.inf)
+                continue
+            moved = self.camera_at(source, there.place.state).project(after)
+            moved -= self.camera_at(source, look.place.state).project(before)
+            along = (moved * outline.contour.normals[outline.found]).sum(axis=1)
             found.append(float(np.sqrt((along**2).mean())))
         return found
 

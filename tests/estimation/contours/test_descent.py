@@ -151,6 +151,24 @@ def test_no_step_from_the_end_of_a_descent_lowers_the_cost() -> None:
         assert there.cost > end.cost
 
 
+def test_a_step_behind_the_camera_moves_the_outline_without_limit() -> None:
+    truth = truth_of((0.6, 0.4, 0.8))
+    mask = cast_geometry(Scene(BOX), CAMERA, truth).mask
+    view = View(CAMERA, CAMERA.project(truth.apply(CORNERS)), mask=mask)
+    evidence = evidence_of(prior_of(Model(points_3d=CORNERS, mesh=BOX)), [view])
+    source = MaskSource.of(0, view, CAMERA)
+    problem, track = ContourProblem(evidence, 8, [source], RigidSurface(BOX)), source.first()
+    pose = np.append(truth.rotation.ravel(), truth.translation)[None]
+    still = np.zeros_like(evidence.shape.mean)
+    state = State(pose, np.zeros(0), np.log(truth.scale), np.zeros(0), still)
+    look = problem.look(Place.of(state, 1), [track])
+    here = problem.augmented(look, [track.noise])
+    assert here is not None
+    assert problem.moves(look, here) == pytest.approx([0.0], abs=1e-9)
+    behind = state._replace(poses=pose * np.append(np.ones(11), -1.0))
+    assert problem.moves(look, here._replace(place=Place.of(behind, 1))) == [np.inf]
+
+
 def test_places_move_and_go_towards_others() -> None:
     rng = np.random.default_rng(1)
     pose = np.append(np.eye(3).ravel(), [0, 0, 4.0])[None]

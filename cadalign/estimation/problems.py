@@ -24,6 +24,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import check_pixels
 from cadalign.solvers.constants import NOT_FOUND, OK, OUT_OF_RANGE, TOO_FEW, UNOBSERVABLE
 from cadalign.solvers.linear import aepnp_error, out_of_range_error
+from cadalign.solvers.projection import all_finite, pinhole_rays
 
 T = TypeVar("T")
 
@@ -117,7 +118,7 @@ def pack_many(
     if _is_stack(points_3d, 3) and _is_stack(points_2d, 2):
         model = np.array(points_3d, dtype=np.float64, order="C").reshape(-1, 3)
         image = np.array(points_2d, dtype=np.float64, order="C").reshape(-1, 2)
-        if len(model) == len(image) and _are_finite(model, image):
+        if len(model) == len(image) and all_finite(model, image):
             offsets = np.arange(count + 1) * (len(model) // count)
             problems = Problems(model, image, offsets, cameras)
     if problems is None:
@@ -191,7 +192,7 @@ def _check_pair(
 ) -> tuple[FloatArray, FloatArray]:
     """Writable arrays (n, 3) and (n, 2) of finite numbers; the given ones where they are that."""
     model, image = cast(FloatArray, points_3d), cast(FloatArray, points_2d)
-    if not (_is_plain(model, 3) and _is_plain(image, 2) and _are_finite(model, image)):
+    if not (_is_plain(model, 3) and _is_plain(image, 2) and all_finite(model, image)):
         model = np.require(as_points(points_3d, name=name_3d, dimension=3), requirements="W")
         image = np.require(as_points(points_2d, name=name_2d, dimension=2), requirements="W")
     if len(model) != len(image):
@@ -203,15 +204,6 @@ def _check_pair(
     return model, image
 
 
-def _are_finite(points_3d: FloatArray, points_2d: FloatArray) -> bool:
-    return bool(np.isfinite(points_3d).all() and np.isfinite(points_2d).all())
-
-
-def pinhole_rays(points_2d: FloatArray, camera: Camera) -> FloatArray:
-    """Normalised image coordinates (n, 2) of pixels (n, 2), for a lens without distortion."""
-    return np.asarray((points_2d - (camera.cx, camera.cy)) / (camera.fx, camera.fy))
-
-
 def rays_of(points_2d: FloatArray, camera: Camera, *, clips: bool = False) -> FloatArray:
     """Normalised image coordinates (n, 2) of checked pixels (n, 2); see `rays_ahead`."""
     if camera.is_wide:
@@ -220,7 +212,7 @@ def rays_of(points_2d: FloatArray, camera: Camera, *, clips: bool = False) -> Fl
         return rays_ahead(points_2d, camera, clips=clips)
     if camera.distortion:
         return camera.normalize(points_2d)
-    return pinhole_rays(points_2d, camera)
+    return pinhole_rays(points_2d, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
 def focal_slopes(points_2d: FloatArray, camera: Camera, rays: FloatArray) -> FloatArray:

@@ -20,7 +20,6 @@ from cadalign.estimation.problems import (
     check_sigmas,
     full_covariance,
     no_redundancy_error,
-    pinhole_rays,
     rays_of,
     solver_error,
     whitening_of,
@@ -30,7 +29,7 @@ from cadalign.geometry.camera import Camera, needs_facing
 from cadalign.solvers.constants import OK, OUT_OF_RANGE, POSE_SIZE
 from cadalign.solvers.linear import aepnp_batch
 from cadalign.solvers.optimal import optimal_batch, rigid_flag
-from cadalign.solvers.projection import reproject_batch
+from cadalign.solvers.projection import pinhole_rays, reproject_batch
 
 _SIGMA_ROUNDS = 20
 _BOUNDED_ROUNDS = 4  # where only the bound of the scales depends on sigma
@@ -135,8 +134,9 @@ def _solve_one_linearly(problems: Problems, options: FitOptions) -> Solutions | 
     if not plain or camera.distortion or not _is_plain(options.sigma, None):
         return None
     points, pixels, offsets = problems.points_3d, problems.points_2d, problems.offsets
-    poses, solved = aepnp_batch(points, pinhole_rays(pixels, camera), offsets)
-    calibration = np.array([[camera.fx, camera.fy, camera.cx, camera.cy]])
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    poses, solved = aepnp_batch(points, pinhole_rays(pixels, fx, fy, cx, cy), offsets)
+    calibration = np.array([[fx, fy, cx, cy]])
     residuals, statuses = reproject_batch(points, pixels, offsets, poses, calibration, solved)
     if statuses[0] != OK:
         return None

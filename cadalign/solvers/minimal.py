@@ -19,7 +19,6 @@ from cadalign.solvers.linalg import (
     minus,
     polish_rotation,
     scaled,
-    second_moments,
     unit,
 )
 from cadalign.solvers.polynomial import ROOTS_ROWS, real_roots
@@ -81,12 +80,23 @@ def ap4p(
     """
     points = np.ascontiguousarray(points_3d, dtype=np.float64)
     directions = np.ascontiguousarray(rays, dtype=np.float64)
+    if directions.shape[1] == 2:
+        directions = np.column_stack([directions, np.ones(4)])
     solutions = np.empty((MAX_SOLUTIONS, POSE_SIZE))
-    count = solve_subset(points, directions, np.arange(4), np.empty((_ROWS, 16)), solutions)
+    count = ap4p_kernel(points, directions, solutions)
     found = solutions[:count]
     found = found[np.isfinite(found).all(axis=1)]
     found = found[np.argsort((np.log(found[:, 12:]) ** 2).sum(axis=1), kind="stable")]
     return found[:, :9].reshape(-1, 3, 3), found[:, 9:12].copy(), found[:, 12:].copy()
+
+
+@kernel
+def ap4p_kernel(points: FloatArray, rays: FloatArray, solutions: FloatArray) -> int:
+    """Compiled `ap4p`: packs its solutions into (8, 15) ``solutions``, returns their number."""
+    memory = minimal_memory()
+    for i in range(4):
+        _write_point(points, i, (rays[i, 0], rays[i, 1], rays[i, 2]), memory, i)
+    return _solve_sample(memory, solutions)
 
 
 @kernel
@@ -103,17 +113,25 @@ def solve_subset(
     memory: FloatArray,
     solutions: FloatArray,
 ) -> int:
-    """Solve from the points with the 4 numbers ``chosen``, seen at ``rays`` (n, 2) or (n, 3).
-
-    Packs the solutions into (8, 15) ``solutions``, and returns their number; see `ap4p`.
-    """
+    """Solve from the points with the 4 numbers ``chosen``; see `ap4p_kernel`."""
     for i in range(4):
         c = chosen[i]
-        depth = rays[c, 2] if rays.shape[1] == 3 else 1.0
-        direction = unit((rays[c, 0], rays[c, 1], depth))
-        for k in range(3):
-            memory[_SAMPLE + i, k] = points[c, k]
-            memory[_RAYS + i, k] = direction[k]
+        _write_point(points, c, (rays[c, 0], rays[c, 1], 1.0), memory, i)
+    return _solve_sample(memory, solutions)
+
+
+@inlined
+def _write_point(points: FloatArray, i: int, ray: Triple, memory: FloatArray, row: int) -> None:
+    """Write a point and its unit ray into the sample."""
+    direction = unit(ray)
+    for c in range(3):
+        memory[_SAMPLE + row, c] = points[i, c]
+        memory[_RAYS + row, c] = direction[c]
+
+
+@inlined
+def _solve_sample(memory: FloatArray, solutions: FloatArray) -> int:
+    """Solve for the sample in the memory."""
     if not _column_weights(memory):
         return 0
     _split_columns(memory)
@@ -358,7 +376,11 @@ def reflect(points: FloatArray, pose: FloatArray, other: FloatArray) -> None:
     ``points`` (n, 3) are centred. The image from afar stays if depths are reversed, which mirrors
     the model; its mirror image in the plane that the points are nearest to is most like it.
     """
-    xx, xy, xz, yy, yz, zz = second_moments(points)
+    xx = xy = xz = yy = yz = zz = 0.0
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        xx, xy, xz = xx + x * x, xy + x * y, xz + x * z
+        yy, yz, zz = yy + y * y, yz + y * z, zz + z * z
     # The adjugate's largest eigenvector is the moments' least one.
     first = (yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy)
     second = (first[1], xx * zz - xz * xz, xy * xz - xx * yz)

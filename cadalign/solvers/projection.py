@@ -192,3 +192,24 @@ def reproject_batch(
             elif not (squares < np.inf and is_pose(poses[b, 0])):
                 checked[b] = OUT_OF_RANGE
     return residuals, checked
+
+
+@kernel
+def all_finite(points_3d: FloatArray, points_2d: FloatArray) -> bool:
+    """True if no coordinate is NaN or infinite: a sum of zeros is zero only then."""
+    total = 0.0
+    for i in range(points_3d.shape[0]):
+        total += 0.0 * (points_3d[i, 0] + points_3d[i, 1] + points_3d[i, 2])
+    for i in range(points_2d.shape[0]):
+        total += 0.0 * (points_2d[i, 0] + points_2d[i, 1])
+    return total == 0.0
+
+
+@kernel
+def pinhole_rays(points_2d: FloatArray, fx: float, fy: float, cx: float, cy: float) -> FloatArray:
+    """Normalised image coordinates (n, 2) of pixels (n, 2), for a lens without distortion."""
+    rays = np.empty((points_2d.shape[0], 2))
+    for i in range(points_2d.shape[0]):
+        rays[i, 0] = (points_2d[i, 0] - cx) / fx
+        rays[i, 1] = (points_2d[i, 1] - cy) / fy
+    return rays

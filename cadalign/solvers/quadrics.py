@@ -11,7 +11,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import inlined, kernel
-from cadalign.solvers.linalg import Triple, cross, dot
+from cadalign.solvers.linalg import Triple, cross, dot, minus, plus
 from cadalign.solvers.polynomial import ROOTS_ROWS, real_roots
 
 _DEGREE = 8
@@ -22,7 +22,10 @@ _ALMOST_EXACT = 1e-11  # after which one step of Newton's method reaches roundin
 _FAR_BEHIND = -0.05  # depth, over half the sum of all, that polishing cannot make positive
 _SAME = 1e-6  # relative difference of depths below which two solutions are one
 
+Pair = tuple[float, float]
 Quadruple = tuple[float, float, float, float]
+Quintuple = tuple[float, float, float, float, float]
+Sextuple = tuple[float, float, float, float, float, float]
 
 
 # Rows of the memory, which is a single array for the reason given in `real_roots`.
@@ -30,11 +33,8 @@ QUADRICS = 0
 """First of 3 rows of coefficients of e_i e_l for i <= l: 00, 01, 02, 03, 11, 12, 13, 22, 23, 33."""
 POINTS = 3
 """First of the rows of the intersections."""
-_A = POINTS + 2 * _DEGREE  # see `_eliminate`
-_B = _A + 3
-_C = _B + 3
-_D = _C + 3
-_SYSTEM = _D + 6
+_TABLE = POINTS + 2 * _DEGREE  # see `_solve_for_monomials`
+_SYSTEM = _TABLE + 3  # see `_eliminate`
 _POLYNOMIAL = _SYSTEM + 9
 INTERSECTION_ROWS = _POLYNOMIAL + ROOTS_ROWS
 """Rows of 16 numbers that `intersect_quadrics` uses."""
@@ -112,7 +112,7 @@ def _column(memory: FloatArray, k: int) -> Triple:
 
 @inlined
 def _solve_for_monomials(memory: FloatArray, x: int, y: int, z: int) -> None:
-    """Solve for y^2, yz and z^2: coefficients of 1, x, x^2, of y, xy, and of z, xz, in own rows."""
+    """Solve for y^2, yz and z^2 (rows from `_TABLE`): coefficients of 1, x, x^2, y, xy, z, xz."""
     products = (0, x, _entry(x, x), y, _entry(x, y), z, _entry(x, z))
     a = _column(memory, _entry(y, y))
     b = _column(memory, _entry(y, z))
@@ -121,11 +121,9 @@ def _solve_for_monomials(memory: FloatArray, x: int, y: int, z: int) -> None:
     scale = -1.0 / dot(a, bc)
     for k in range(7):
         column = _column(memory, products[k])
-        part = 0 if k < 3 else (k - 1) // 2
-        power = k if k < 3 else (k - 1) % 2
-        memory[_A + part, power] = scale * dot(bc, column)
-        memory[_B + part, power] = scale * dot(ca, column)
-        memory[_C + part, power] = scale * dot(ab, column)
+        memory[_TABLE, k] = scale * dot(bc, column)
+        memory[_TABLE + 1, k] = scale * dot(ca, column)
+        memory[_TABLE + 2, k] = scale * dot(ab, column)
 
 
 @inlined
@@ -137,71 +135,65 @@ def _eliminate(memory: FloatArray) -> None:
     to 3 r + 2 from `_SYSTEM` receive the coefficients of y, z and 1 in identity r. All that
     is done in coefficients, not in values, since roots may be a hundred times smaller than 1.
     """
-    m = memory
-    a0, a1, a2, b0, b1, b2, c0, c1, c2 = _A, _A + 1, _A + 2, _B, _B + 1, _B + 2, _C, _C + 1, _C + 2
-    d, e, f, g, h, yy = _D, _D + 1, _D + 2, _D + 3, _D + 4, _D + 5
-    y1, z1, w1, y2 = _SYSTEM, _SYSTEM + 1, _SYSTEM + 2, _SYSTEM + 3
-    z2, w2, y3, z3, w3 = y2 + 1, y2 + 2, y2 + 3, y2 + 4, y2 + 5
-    for row in range(_D, _POLYNOMIAL + 1):
-        for k in range(_DEGREE + 1):
-            m[row, k] = 0.0
-    for k in range(2):
-        m[d, k], m[e, k] = m[a1, k] - m[b2, k], m[c2, k] - m[b1, k]
-    for k in range(3):
-        m[y1, k], m[z1, k], m[y2, k] = -m[b0, k], m[a0, k], m[c0, k]
-        m[f, k], m[g, k], m[h, k] = m[b0, k], -m[a0, k], -m[c0, k]
-    _add_product(m, y1, 1.0, a2, 2, c1, 2)
-    _add_product(m, y1, -1.0, b1, 2, b2, 2)
-    _add_product(m, z1, 1.0, d, 2, b2, 2)
-    _add_product(m, z1, 1.0, a2, 2, e, 2)
-    _add_product(m, w1, 1.0, d, 2, b0, 3)
-    _add_product(m, w1, 1.0, a2, 2, c0, 3)
-    _add_product(m, w1, -1.0, b1, 2, a0, 3)
-    _add_product(m, y2, 1.0, c1, 2, d, 2)
-    _add_product(m, y2, 1.0, e, 2, b1, 2)
-    _add_product(m, w2, 1.0, c1, 2, a0, 3)
-    _add_product(m, w2, 1.0, e, 2, b0, 3)
-    _add_product(m, w2, -1.0, b2, 2, c0, 3)
-    _add_product(m, yy, 1.0, b1, 2, b1, 2)
-    _add_product(m, yy, -1.0, a1, 2, c1, 2)
-    _add_product(m, g, 1.0, b2, 2, b2, 2)
-    _add_product(m, g, -1.0, a2, 2, c2, 2)
-    _add_product(m, f, 2.0, b1, 2, b2, 2)
-    _add_product(m, f, -1.0, a1, 2, c2, 2)
-    _add_product(m, f, -1.0, a2, 2, c1, 2)
-    for k in range(3):
-        m[z2, k] = m[y1, k]
-        m[h, k] += m[yy, k]
-    for target, first, last in ((y3, b1, a1), (z3, b2, a2)):
-        _add_product(m, target, 1.0, first, 2, b0, 3)
-        _add_product(m, target, 1.0, first, 2, f, 3)
-        _add_product(m, target, 1.0, last + c1 - a1, 2, g, 3)
-        _add_product(m, target, 1.0, last, 2, h, 3)
-    _add_product(m, w3, 1.0, b0, 3, f, 3)
-    _add_product(m, w3, 1.0, c0, 3, g, 3)
-    _add_product(m, w3, 1.0, yy, 3, a0, 3)
-    for k in range(6):  # the minors
-        m[d, k] = m[e, k] = m[f, k] = 0.0
-    _add_product(m, d, 1.0, z1, 3, w2, 4)
-    _add_product(m, d, -1.0, y1, 3, w1, 4)
-    _add_product(m, e, 1.0, y2, 3, w1, 4)
-    _add_product(m, e, -1.0, y1, 3, w2, 4)
-    _add_product(m, f, 1.0, y1, 3, y1, 3)
-    _add_product(m, f, -1.0, y2, 3, z1, 3)
-    _add_product(m, _POLYNOMIAL, 1.0, d, 6, y3, 4)
-    _add_product(m, _POLYNOMIAL, 1.0, e, 6, z3, 4)
-    _add_product(m, _POLYNOMIAL, 1.0, f, 5, w3, 5)
+    a0, b0, c0 = _parabola(memory, 0), _parabola(memory, 1), _parabola(memory, 2)
+    a1, b1, c1 = _line(memory, 0, 3), _line(memory, 1, 3), _line(memory, 2, 3)
+    a2, b2, c2 = _line(memory, 0, 5), _line(memory, 1, 5), _line(memory, 2, 5)
+    d, e = _minus_2(a1, b2), _minus_2(c2, b1)
+    y1 = minus(minus(_times_22(a2, c1), _times_22(b1, b2)), b0)  # equal to z2
+    z1 = plus(plus(_times_22(d, b2), _times_22(a2, e)), a0)
+    w1 = _minus_4(_plus_4(_times_23(d, b0), _times_23(a2, c0)), _times_23(b1, a0))
+    y2 = plus(plus(_times_22(c1, d), _times_22(e, b1)), c0)
+    w2 = _minus_4(_plus_4(_times_23(c1, a0), _times_23(e, b0)), _times_23(b2, c0))
+    yy = minus(_times_22(b1, b1), _times_22(a1, c1))
+    zz = minus(_times_22(b2, b2), _times_22(a2, c2))
+    b12 = _times_22(b1, b2)
+    yz = minus(minus(plus(b12, b12), _times_22(a1, c2)), _times_22(a2, c1))
+    f, g, h = plus(b0, yz), minus(zz, a0), minus(yy, c0)
+    y3 = _plus_4(
+        _plus_4(_times_23(b1, plus(b0, f)), _times_23(c1, g)),
+        _times_23(a1, h),
+    )
+    z3 = _plus_4(
+        _plus_4(_times_23(b2, plus(b0, f)), _times_23(c2, g)),
+        _times_23(a2, h),
+    )
+    w3 = _plus_5(_plus_5(_times_33(b0, f), _times_33(c0, g)), _times_33(yy, a0))
+    _write(memory, 0, (y1[0], y1[1], y1[2], 0.0, 0.0))
+    _write(memory, 1, (z1[0], z1[1], z1[2], 0.0, 0.0))
+    _write(memory, 2, (w1[0], w1[1], w1[2], w1[3], 0.0))
+    _write(memory, 3, (y2[0], y2[1], y2[2], 0.0, 0.0))
+    _write(memory, 4, (y1[0], y1[1], y1[2], 0.0, 0.0))
+    _write(memory, 5, (w2[0], w2[1], w2[2], w2[3], 0.0))
+    _write(memory, 6, (y3[0], y3[1], y3[2], y3[3], 0.0))
+    _write(memory, 7, (z3[0], z3[1], z3[2], z3[3], 0.0))
+    _write(memory, 8, w3)
+    y = _minus_6(_times_34(z1, w2), _times_34(y1, w1))
+    z = _minus_6(_times_34(y2, w1), _times_34(y1, w2))
+    w = _minus_5(_times_33(y1, y1), _times_33(y2, z1))
+    for k in range(_DEGREE + 1):
+        memory[_POLYNOMIAL, k] = 0.0
+    for i in range(6):
+        for k in range(4):
+            memory[_POLYNOMIAL, i + k] += y[i] * y3[k] + z[i] * z3[k]
+    for i in range(5):
+        for k in range(5):
+            memory[_POLYNOMIAL, i + k] += w[i] * w3[k]
 
 
 @inlined
-def _add_product(
-    memory: FloatArray, target: int, factor: float, row: int, terms: int, other: int, others: int
-) -> None:
-    """Add a multiple of the product of two polynomials, of so many terms, to a row."""
-    for i in range(terms):
-        share = factor * memory[row, i]
-        for k in range(others):
-            memory[target, i + k] += share * memory[other, k]
+def _line(memory: FloatArray, row: int, first: int) -> Pair:
+    return memory[_TABLE + row, first], memory[_TABLE + row, first + 1]
+
+
+@inlined
+def _parabola(memory: FloatArray, row: int) -> Triple:
+    return memory[_TABLE + row, 0], memory[_TABLE + row, 1], memory[_TABLE + row, 2]
+
+
+@inlined
+def _write(memory: FloatArray, row: int, values: Quintuple) -> None:
+    for k in range(5):
+        memory[_SYSTEM + row, k] = values[k]
 
 
 @kernel
@@ -280,3 +272,78 @@ def _polish(memory: FloatArray, row: int) -> bool:
             break
     memory[row, 1], memory[row, 2], memory[row, 3] = b, c, d
     return error < _EXACT
+
+
+# Sums and products of polynomials, named by their numbers of coefficients, constants first.
+
+
+@inlined
+def _plus_4(p: Quadruple, q: Quadruple) -> Quadruple:
+    return p[0] + q[0], p[1] + q[1], p[2] + q[2], p[3] + q[3]
+
+
+@inlined
+def _plus_5(p: Quintuple, q: Quintuple) -> Quintuple:
+    return p[0] + q[0], p[1] + q[1], p[2] + q[2], p[3] + q[3], p[4] + q[4]
+
+
+@inlined
+def _minus_2(p: Pair, q: Pair) -> Pair:
+    return p[0] - q[0], p[1] - q[1]
+
+
+@inlined
+def _minus_4(p: Quadruple, q: Quadruple) -> Quadruple:
+    return p[0] - q[0], p[1] - q[1], p[2] - q[2], p[3] - q[3]
+
+
+@inlined
+def _minus_5(p: Quintuple, q: Quintuple) -> Quintuple:
+    return p[0] - q[0], p[1] - q[1], p[2] - q[2], p[3] - q[3], p[4] - q[4]
+
+
+@inlined
+def _minus_6(p: Sextuple, q: Sextuple) -> Sextuple:
+    return p[0] - q[0], p[1] - q[1], p[2] - q[2], p[3] - q[3], p[4] - q[4], p[5] - q[5]
+
+
+@inlined
+def _times_22(p: Pair, q: Pair) -> Triple:
+    return (
+        p[0] * q[0],
+        p[0] * q[1] + p[1] * q[0],
+        p[1] * q[1],
+    )
+
+
+@inlined
+def _times_23(p: Pair, q: Triple) -> Quadruple:
+    return (
+        p[0] * q[0],
+        p[0] * q[1] + p[1] * q[0],
+        p[0] * q[2] + p[1] * q[1],
+        p[1] * q[2],
+    )
+
+
+@inlined
+def _times_33(p: Triple, q: Triple) -> Quintuple:
+    return (
+        p[0] * q[0],
+        p[0] * q[1] + p[1] * q[0],
+        p[0] * q[2] + p[1] * q[1] + p[2] * q[0],
+        p[1] * q[2] + p[2] * q[1],
+        p[2] * q[2],
+    )
+
+
+@inlined
+def _times_34(p: Triple, q: Quadruple) -> Sextuple:
+    return (
+        p[0] * q[0],
+        p[0] * q[1] + p[1] * q[0],
+        p[0] * q[2] + p[1] * q[1] + p[2] * q[0],
+        p[0] * q[3] + p[1] * q[2] + p[2] * q[1],
+        p[1] * q[3] + p[2] * q[2],
+        p[2] * q[3],
+    )

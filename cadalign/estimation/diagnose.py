@@ -186,6 +186,7 @@ class Agreement(NamedTuple):
         return self.has_chance(_FITTING, inflation) or self.ratio < most
 
 
+@np.errstate(all="ignore")
 def diagnose(
     model: AnyModel,
     views: Sequence[View],
@@ -266,6 +267,7 @@ def diagnose_fit(
     return diagnose(model, views, again, ransac=ransac, has_reason=has_reason, rival=rival)
 
 
+@np.errstate(all="ignore")
 def diagnose_refusal(
     model: AnyModel,
     views: Sequence[View],
@@ -395,6 +397,7 @@ def _other_sizes(points_2d: FloatArray, camera: Camera, *, may_be_smaller: bool)
     ]
 
 
+@np.errstate(all="ignore")  # what is not finite is refused
 def _agreement_without(
     mistake: Mistake,
     model: AnyModel,

@@ -21,8 +21,7 @@ from cadalign.datasets import AnnotatedModel
 from cadalign.errors import InputError
 from cadalign.estimation.contours.mask import MaskSource
 from cadalign.estimation.contours.outline import Track
-from cadalign.estimation.contours.place import Place, shift_to
-from cadalign.estimation.contours.problem import ContourProblem
+from cadalign.estimation.contours.problem import ContourProblem, Place, shift_to
 from cadalign.estimation.contours.surface import surface_of
 from cadalign.estimation.estimates import mean_state, pose_and_border, pose_and_lengths
 from cadalign.estimation.pack import evidence_of

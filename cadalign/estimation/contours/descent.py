@@ -16,10 +16,16 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.estimation.contours.noise import LEAST_OFFSET, Noise
-from cadalign.estimation.contours.outline import MeasuredOutline, Track
-from cadalign.estimation.contours.place import OWN_MODES, Place, solved, weakest_steps
-from cadalign.estimation.contours.problem import Augmented, ContourProblem, Look
+from cadalign.estimation.contours.outline import LEAST_OFFSET, MeasuredOutline, Noise, Track
+from cadalign.estimation.contours.problem import (
+    OWN_MODES,
+    Augmented,
+    ContourProblem,
+    Look,
+    Place,
+    solved,
+    weakest_steps,
+)
 from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import Evidence, State
 from cadalign.solvers.joint.search import objective_of, score_state

@@ -21,8 +21,12 @@ from cadalign.estimation.contours.outline import (
 )
 from cadalign.estimation.contours.photo import PhotoSource
 from cadalign.estimation.contours.photo_lines import photo_of
-from cadalign.estimation.contours.place import Place, weakest_steps
-from cadalign.estimation.contours.problem import ContourProblem, with_displacement_modes
+from cadalign.estimation.contours.problem import (
+    ContourProblem,
+    Place,
+    weakest_steps,
+    with_displacement_modes,
+)
 from cadalign.estimation.contours.surface import Surface, surface_of
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.prior import ShapePrior

@@ -25,23 +25,21 @@ from cadalign.estimation.contours.contour import (
     mask_image,
     without_steep,
 )
-from cadalign.estimation.contours.noise import (
+from cadalign.estimation.contours.outline import (
     LEAST_LOSS_SCALE,
     LEAST_OFFSET,
     LOSS_SCALE,
+    MeasuredOutline,
     Noise,
+    Outline,
+    OutlineSource,
+    OutlineSupport,
+    Track,
     correlation_length,
     cost_of_contour,
     influence_length,
     robust_deviation,
     trimmed_deviation,
-)
-from cadalign.estimation.contours.outline import (
-    MeasuredOutline,
-    Outline,
-    OutlineSource,
-    OutlineSupport,
-    Track,
 )
 from cadalign.estimation.contours.surface import PosedSurface
 from cadalign.estimation.uncertainty.summary import MaskResiduals

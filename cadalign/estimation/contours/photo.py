@@ -14,18 +14,16 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.estimation.contours.contour import Sight
-from cadalign.estimation.contours.noise import (
-    LOSS_SCALE,
-    Noise,
-    influence_length,
-    trimmed_deviation,
-)
 from cadalign.estimation.contours.outline import (
+    LOSS_SCALE,
     MeasuredOutline,
+    Noise,
     Outline,
     OutlineSource,
     OutlineSupport,
     Track,
+    influence_length,
+    trimmed_deviation,
 )
 from cadalign.estimation.contours.photo_lines import PhotoPyramid, outline_of, silhouette_of
 from cadalign.estimation.contours.surface import PosedSurface

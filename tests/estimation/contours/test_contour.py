@@ -21,8 +21,7 @@ from cadalign.estimation.contours.contour import (
     mask_contour,
 )
 from cadalign.estimation.contours.descent import with_learned_offsets
-from cadalign.estimation.contours.noise import Noise, correlation_length, cost_of_contour
-from cadalign.estimation.contours.outline import Track
+from cadalign.estimation.contours.outline import Noise, Track, correlation_length, cost_of_contour
 from cadalign.estimation.contours.problem import Augmented
 from cadalign.estimation.contours.silhouettes import colors_at, sampled
 

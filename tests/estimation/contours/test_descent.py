@@ -14,8 +14,7 @@ from cadalign.datasets import KeypointNet
 from cadalign.estimation.contours.contour import Contour, Rims, across_rims
 from cadalign.estimation.contours.descent import Descent, first_fit
 from cadalign.estimation.contours.mask import MaskSource
-from cadalign.estimation.contours.place import Place, shift_to, shifted
-from cadalign.estimation.contours.problem import ContourProblem
+from cadalign.estimation.contours.problem import ContourProblem, Place, shift_to, shifted
 from cadalign.estimation.contours.surface import RigidSurface
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import prior_of

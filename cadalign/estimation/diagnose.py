@@ -17,7 +17,7 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError
 from cadalign.estimation.assemble import result_of_keypoints
 from cadalign.estimation.fitted import FittedKeypoints
-from cadalign.estimation.model import Model
+from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma, pixel_information
 from cadalign.estimation.problems import pack_one
 from cadalign.estimation.uncertainty.residuals import area_of, chi_square_tail, f_quantile
@@ -216,19 +216,16 @@ def diagnose(
     rival : Camera, optional
         A camera that the keypoints fit as they are: a mistake must explain more.
     """
-    inflation = model.inflation if isinstance(model, ShapeModel) else 1.0
-    if result is not None:
-        own = Agreement.of(result, model, views, ransac)
-        kind = {"is_exact": result.options is not None, "is_robust": ransac is not None}
-        if not _is_doubtful(own, views, inflation, **kind):
-            return None
-    shown = _without_outlines(views)
+    inflation, shown = getattr(model, "inflation", 1.0), _without_outlines(views)
     if not any(len(view.keypoint_ids) for view in shown):
         return None
-    given = own if result is not None and len(shown) == len(views) else None
+    kind = {"is_exact": is_exact_model(model), "is_robust": ransac is not None}
+    given = None if result is None else Agreement.of(result, model, views, ransac)
+    if given is not None and not _is_doubtful(given, views, inflation, **kind):
+        return None
     if given is None or any(view.mask is not None or view.image is not None for view in views):
         given = _agreement_without(Mistake(""), model, shown, again, ransac)
-    if given is None:
+    if given is None or not _is_doubtful(given, shown, inflation, **kind):
         return None
     limit = given
     if rival is not None:

@@ -130,16 +130,19 @@ class Agreement(NamedTuple):
             own = result.views[view.number]
             sigma: Sigma = result.sigma or 1.0 if view.sigma is None else view.sigma
             information, kept = pixel_information(sigma, len(own.residuals)), own.inliers
+            threshold = (ransac or RansacOptions()).threshold(view.sigma)
+            if ransac is not None and result.options is not None:
+                kept = kept & (np.linalg.norm(own.residuals, axis=1) < threshold)
             inliers, count = inliers + int(kept.sum()), count + len(kept)
             if len(kept):
                 seen = own.residuals[kept], information[kept]
                 squares += float(np.einsum("ni,nij,nj->", seen[0], seen[1], seen[0]))
                 score += float((math.log(4 * math.pi**2) - np.log(np.linalg.det(seen[1]))).sum())
-                threshold = (ransac or RansacOptions()).threshold(view.sigma)
                 area = area_of(own.points_2d, own.camera, threshold)
                 score += 2 * math.log(area) * int((~kept).sum())
         kinds = {each.kind for each in result.evidence}
-        if result.cost is not None and not kinds & {"mask", "photo"}:
+        is_whole = inliers == int(result.inliers.sum())
+        if result.cost is not None and is_whole and not kinds & {"mask", "photo"}:
             squares = result.cost
         score += squares
         equations = sum(_EQUATIONS.get(each.kind, 0) * each.count for each in result.evidence)
@@ -171,9 +174,11 @@ class Agreement(NamedTuple):
         squares = self.chi_square / inflation**2
         return self.redundancy <= 0 or chi_square_tail(squares, self.redundancy) >= probability
 
-    def explains(self, given: Agreement, inflation: float, *, is_robust: bool) -> bool:
+    def explains(
+        self, given: Agreement, inflation: float, *, is_exact: bool, is_robust: bool
+    ) -> bool:
         """True if data without a mistake fit, and much better than those that were ``given``."""
-        if is_robust and given.inliers < given.keypoints:
+        if is_robust and (is_exact or given.inliers < given.keypoints):
             more = self.inliers > given.inliers or self.inliers == self.keypoints
             return more and self.score < given.score - _MORE_AGREE
         least = _AS_MANY_ARE_FOUND if is_robust else _AS_MANY_AGREE
@@ -233,15 +238,23 @@ def diagnose(
         other = _agreement_without(Mistake(""), model, seen, again, ransac)
         if other is not None:
             limit = given._replace(score=other.score + _AS_MANY_AGREE)
-    found = [
-        (mistake, each)
-        for mistake in _mistakes_in(model, shown, has_reason=has_reason or ransac is not None)
-        if (each := _agreement_without(mistake, model, shown, again, ransac)) is not None
-    ]
-    is_robust = ransac is not None
-    explaining = [each for _, each in found if each.explains(limit, inflation, is_robust=is_robust)]
-    if not explaining:
-        return None
+    mistakes = _mistakes_in(model, shown, has_reason=has_reason or ransac is not None)
+    # About a centred principal point, flips are the same as a mirrored model. Where perspective is
+    # weak, all keypoints agree with a mirrored model if with any.
+    rest = [each for each in mistakes if each in (FLIPPED, UPSIDE_DOWN) and MIRRORED in mistakes]
+    if ransac is not None and given.inliers == given.keypoints and kind["is_exact"]:
+        rest = [each for each in mistakes if each is not MIRRORED]
+    found: list[tuple[Mistake, Agreement]] = []
+    explaining: list[Agreement] = []
+    for some in ([each for each in mistakes if each not in rest], rest):
+        for mistake in some:
+            each = _agreement_without(mistake, model, shown, again, ransac)
+            if each is not None:
+                found.append((mistake, each))
+                if each.explains(limit, inflation, **kind):
+                    explaining.append(each)
+        if not explaining:
+            return None
     best = min(explaining, key=lambda each: each.score)
     named = _named(found, best)
     return EstimateWarning("mistake", f"{named}: corrected, {_compared(best, given)}")
@@ -254,13 +267,12 @@ def diagnose_fit(
     ahead, options = np.isfinite(fitted.residuals).all(axis=1), fitted.options
     if options.sigma is not None and np.ndim(options.sigma) > 0:
         options = replace(options, sigma=np.asarray(options.sigma)[ahead])
-    ransac = None  # samples need not be drawn where all agree
-    if fitted.search is not None and not fitted.inliers.all():
-        ransac = fitted.search.ransac
+    ransac = None if fitted.search is None else fitted.search.ransac
+    own = None if fitted.inliers.all() else ransac  # samples need not be drawn where all agree
     points = fitted.points_3d[ahead]
     in_camera = fitted.alignment.apply(points)
     observed = fitted.camera.project_where_ahead(in_camera) - fitted.residuals[ahead]
-    (model, views), again = estimates_by_fit(points, observed, fitted.camera, options, ransac)
+    (model, views), again = estimates_by_fit(points, observed, fitted.camera, options, own)
     return diagnose(model, views, again, ransac=ransac, has_reason=has_reason, rival=rival)
 
 
@@ -340,12 +352,13 @@ def _is_doubtful(
 ) -> bool:
     """True if the residuals fail their test.
 
-    An uncertain shape follows keypoints that a robust search would reject of an exact one.
+    An uncertain shape follows keypoints that a robust search would reject of an exact one, which
+    may agree with its mirror image.
     """
     rejected = given.keypoints - given.inliers
     if rejected > (0 if is_exact else _FEW_REJECTED * given.keypoints):
         return True
-    if is_robust and not is_exact and given.ratio >= 1:
+    if is_robust and (is_exact or given.ratio >= 1):
         return True
     if given.sigma is None:
         return not given.has_chance(_DOUBTFUL, inflation)

@@ -82,10 +82,11 @@ def keypoint_warnings(
 
 
 def _is_doubtful(fitted: FittedKeypoints, misfit: Misfit | None) -> bool:
-    """True if keypoints are rejected, or fail their test."""
-    if fitted.search is None and fitted.fisher_covariance is None:
-        return False
-    return not fitted.inliers.all() or misfit is not None or has_large_sigma(fitted)
+    """True if keypoints fail their test, or those that agree were searched for."""
+    if fitted.search is not None:
+        return True
+    is_doubtful = misfit is not None or has_large_sigma(fitted)
+    return fitted.fisher_covariance is not None and is_doubtful
 
 
 def _placed(camera: Camera, observed: FloatArray, misfit: Misfit | None) -> Warnings:

@@ -25,7 +25,6 @@ from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.joint import result_of_minima, with_mistake
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
-from cadalign.estimation.outline_starts import starts_by_outlines
 from cadalign.estimation.prior import Lenses
 from cadalign.estimation.problem import Problem, compile_problem, no_pose_error
 from cadalign.estimation.problems import each_of
@@ -148,13 +147,12 @@ def _estimate(problem: Problem, start: float, *, has_warnings: bool = True) -> R
     """All stages of an estimate that was begun at ``start`` [s]."""
     if is_single(problem):
         return align_single(problem, start)
-    problem, starts = starts_by_outlines(problem)
-    if len(problem.views) == 1 and not any(problem.inits) and problem.is_mask_alone:
-        from cadalign.estimation.contours.silhouette_starts import minima_of_mask  # with OpenCV
+    if any(view.mask is not None for view in problem.views):
+        from cadalign.estimation.contours.silhouette_starts import minima_by_masks  # with OpenCV
 
-        minima, iterations, hypotheses = minima_of_mask(problem)
+        problem, minima, iterations, hypotheses = minima_by_masks(problem)
     else:
-        problem, minima, iterations, hypotheses = find_minima(problem, starts)
+        problem, minima, iterations, hypotheses = find_minima(problem, [problem.inits])
     if not minima:
         raise no_pose_error(problem)
     minima, notes = refine_with_images(problem.model, problem.prior, problem.views, minima)

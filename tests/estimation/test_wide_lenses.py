@@ -365,7 +365,8 @@ class TestPictures:
     def test_a_mask_alone(self, angle: float, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(TestPictures, "CAMERA", self.CAMERA.resized(320, 320))
         view, truth = self.seen(angle, "mask", keypoints=False)
-        assert degrees_off(align(self.model(), view), truth) < 1.0
+        found = align(self.model(), view)
+        assert degrees_off(found, truth) < 2.5 * found.std.rotation_deg < 5.0
 
     def test_a_mask_of_the_other_camera_of_a_rig(self) -> None:
         view, truth = self.seen(30, "mask", keypoints=False)

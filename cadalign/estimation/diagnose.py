@@ -431,7 +431,7 @@ def _listed(clauses: Sequence[str]) -> str:
 
 
 def _compared(best: Agreement, given: Agreement) -> str:
-    """What the corrected data reach, and the given ones."""
+    """Words that compare the corrected data with the given ones."""
     rejected = given.keypoints - given.inliers
     if rejected:
         share = f"{rejected} ({100 * rejected / given.keypoints:.0f} %)"

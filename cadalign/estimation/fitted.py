@@ -78,7 +78,7 @@ NO_STATS = FitStats(0, 0, 0.0)
 
 
 class KeypointSearch(Protocol):
-    """How inliers were searched for, which tells what is doubtful of those that were found."""
+    """The search for inliers, by which those that were found may be doubted."""
 
     @property
     def ransac(self) -> RansacOptions:

@@ -80,7 +80,7 @@ class Posterior:
 
 
 class OutlineNotes(NamedTuple):
-    """What masks and photos add to a result."""
+    """Additions of masks and photos to a result."""
 
     evidence: tuple[EvidenceSummary, ...] = ()
     warnings: Warnings = ()

@@ -21,8 +21,8 @@ from cadalign.estimation.contours.problem import (
     OWN_MODES,
     Augmented,
     ContourProblem,
-    Look,
     Place,
+    PosedOutlines,
     solved,
     weakest_steps,
 )
@@ -51,7 +51,7 @@ class OutlineFit(NamedTuple):
     ``unmatched``.
     """
 
-    look: Look
+    look: PosedOutlines
     augmented: Augmented
     tracks: list[Track]
     cost: float = np.inf
@@ -69,7 +69,7 @@ class OutlineFit(NamedTuple):
 
     @property
     def measured(self) -> list[MeasuredOutline | None]:
-        """What each source measures at the outline, and its noise."""
+        """The outline that each source measures, and its noise."""
         return [
             None if outline is None else MeasuredOutline(outline, own, track.noise)
             for outline, own, track in zip(
@@ -133,7 +133,7 @@ class Descent(NamedTuple):
         """The outlines of a place as evidence; None where there are none."""
         return self.stacked(self.problem.look(place, self.tracks))
 
-    def stacked(self, look: Look) -> OutlineFit | None:
+    def stacked(self, look: PosedOutlines) -> OutlineFit | None:
         """The outlines of a look as evidence; None where there are none."""
         augmented = self.problem.augmented(look, [track.noise for track in self.tracks])
         if augmented is None:
@@ -248,7 +248,7 @@ def _lowered(problem: ContourProblem, here: Approach) -> OutlineFit | None:
     return found
 
 
-def _learned(problem: ContourProblem, look: Look, tracks: Sequence[Track]) -> list[Track]:
+def _learned(problem: ContourProblem, look: PosedOutlines, tracks: Sequence[Track]) -> list[Track]:
     """The tracks with the noise that the residuals of a look show."""
     return [
         track if outline is None else source.learned(outline, own, track)

@@ -241,7 +241,7 @@ class OutlineSource(ABC):
 
     @abstractmethod
     def outline(self, sight: Sight, surface: PosedSurface, track: Track) -> Outline | None:
-        """What is measured at the outline of a posed surface; None where nothing is."""
+        """The outline of a posed surface as it is measured; None where nothing is."""
 
     @abstractmethod
     def learned(self, outline: Outline, own: FloatArray, track: Track) -> Track:

@@ -140,7 +140,7 @@ class OutlineRows(NamedTuple):
     own: FloatArray
 
 
-class Look(NamedTuple):
+class PosedOutlines(NamedTuple):
     """The outlines of a surface at a place: its sights in the views, and what these measure."""
 
     place: Place
@@ -202,7 +202,7 @@ class ContourProblem(NamedTuple):
         ratio = float(np.exp(log_focals_of(self.evidence, state)[image]))
         return camera.with_focal(camera.fx * ratio)
 
-    def look(self, place: Place, tracks: Sequence[Track]) -> Look:
+    def look(self, place: Place, tracks: Sequence[Track]) -> PosedOutlines:
         """Measure the outlines at a place."""
         posed = self.surface.at(self.evidence.shape, place.state)
         poses, sights, outlines = poses_of(self.evidence, place.state), [], []
@@ -212,9 +212,9 @@ class ContourProblem(NamedTuple):
             camera = replace(camera, cx=camera.cx + right, cy=camera.cy + down)
             sights.append(Sight(posed.caster, camera, poses[source.image]))
             outlines.append(source.outline(sights[-1], posed, track))
-        return Look(place, posed, sights, outlines)
+        return PosedOutlines(place, posed, sights, outlines)
 
-    def augmented(self, look: Look, noises: Sequence[Noise]) -> Augmented | None:
+    def augmented(self, look: PosedOutlines, noises: Sequence[Noise]) -> Augmented | None:
         """The evidence with what was measured; None where there is nothing."""
         rows = [
             outline and rows_of(source, outline, noise, look.posed, sight)
@@ -233,7 +233,7 @@ class ContourProblem(NamedTuple):
         evidence = _with_rows(self.evidence, first, rows, total)
         return Augmented(evidence, full, look.place, rows, slice(first, first + total))
 
-    def moves(self, look: Look, there: Augmented) -> list[float]:
+    def moves(self, look: PosedOutlines, there: Augmented) -> list[float]:
         """Root mean squares [px] by which a step moved the outlines of a look along its normals.
 
         They are infinite where a step leads behind the camera.

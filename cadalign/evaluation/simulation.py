@@ -16,7 +16,7 @@ SIMULATION_CAMERA = Camera(width=640, height=480, fx=150.0, fy=150.0, cx=319.5, 
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class SimulatedProblem:
     """Keypoints on a model (n, 3) and in an image (n, 2) [px], and the alignment that joins them.
 
     ``outliers`` (n,) are the observations that have nothing to do with their points; None where
@@ -39,7 +39,7 @@ def simulate_problem(
     camera: Camera = SIMULATION_CAMERA,
     depth: tuple[float, float] = (4.0, 8.0),
     stretch: tuple[float, float] = (0.5, 2.0),
-) -> Problem:
+) -> SimulatedProblem:
     """Draw one problem of the paper's simulation.
 
     The object's points are uniform in the cube [-1, 1)^3 and the rotation is uniform. The model is
@@ -64,11 +64,11 @@ def simulate_problem(
     points_2d = points_2d + noise_px * rng.standard_normal(points_2d.shape)
     count = round(outlier_share * points)
     if not count:
-        return Problem(points_3d, points_2d, camera, alignment, None)
+        return SimulatedProblem(points_3d, points_2d, camera, alignment, None)
     outliers = np.zeros(points, dtype=bool)
     outliers[rng.choice(points, size=count, replace=False)] = True
     points_2d[outliers] = rng.uniform(-0.5, [camera.width - 0.5, camera.height - 0.5], (count, 2))
-    return Problem(points_3d, points_2d, camera, alignment, outliers)
+    return SimulatedProblem(points_3d, points_2d, camera, alignment, outliers)
 
 
 def random_rotation(rng: np.random.Generator) -> FloatArray:

@@ -23,7 +23,7 @@ from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, sample_limi
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.simulation import (
     SIMULATION_CAMERA,
-    Problem,
+    SimulatedProblem,
     random_rotation,
     simulate_problem,
 )
@@ -50,7 +50,7 @@ _ROBUST_POINTS = 100
 _FIELDS = (120, 180, 200)  # of view [degrees]
 _WIDE_SIDE = 1000  # of their images [px]
 
-Draw = Callable[[np.random.Generator], Problem]
+Draw = Callable[[np.random.Generator], SimulatedProblem]
 
 
 # Known focal length -------------------------------------------------------------------------------
@@ -164,7 +164,7 @@ def _levels(errors: dict[str, Any]) -> dict[str, FloatArray]:
 
 
 def _ideal_errors(
-    problems: Iterable[Problem], rng: np.random.Generator, *, sigma: float, focal: str
+    problems: Iterable[SimulatedProblem], rng: np.random.Generator, *, sigma: float, focal: str
 ) -> dict[str, FloatArray]:
     """Errors of an ideal estimator on all problems, by name; see `cramer_rao_bound`."""
     draws = []
@@ -176,7 +176,9 @@ def _ideal_errors(
     return {error: np.concatenate([draw[error] for draw in draws]) for error in draws[0]}
 
 
-def _wide_problem(camera: Camera, reach: float, points: int, rng: np.random.Generator) -> Problem:
+def _wide_problem(
+    camera: Camera, reach: float, points: int, rng: np.random.Generator
+) -> SimulatedProblem:
     """A problem as `simulate_problem` draws them, turned to anywhere in a field of view."""
     while True:
         drawn = simulate_problem(rng, points=points, noise_px=0.0, depth=(3.0, 6.0))
@@ -194,7 +196,7 @@ def _keypointnet_sources(root: Path) -> Iterator[tuple[str, float, Draw]]:
             yield f"{category}, 7 keypoints", 1.0, partial(_keypointnet_problem, models)
 
 
-def _keypointnet_problem(models: list[FloatArray], rng: np.random.Generator) -> Problem:
+def _keypointnet_problem(models: list[FloatArray], rng: np.random.Generator) -> SimulatedProblem:
     points = models[rng.integers(len(models))]
     chosen = points[rng.choice(len(points), 7, replace=False)]
     scale = np.array([1.0, *(1 / rng.uniform(*STRETCH_RANGE, 2))])
@@ -209,7 +211,7 @@ def _spans_volume(points: FloatArray) -> bool:
     return bool(sizes[2] > 0.05 * sizes[0])
 
 
-def _is_missed(problem: Problem, noise: float, est: Alignment) -> bool:
+def _is_missed(problem: SimulatedProblem, noise: float, est: Alignment) -> bool:
     """True if a refinement from the truth ends at a better alignment."""
     camera = faced(problem.camera, problem.points_2d)
     truth, found = (
@@ -224,7 +226,7 @@ def _is_missed(problem: Problem, noise: float, est: Alignment) -> bool:
     return bool(cost < evaluate_cost(objective, found) * (1 - 1e-6) - 1e-9)
 
 
-def _speed(problem: Problem, points: int, repetitions: int) -> Iterator[Row]:
+def _speed(problem: SimulatedProblem, points: int, repetitions: int) -> Iterator[Row]:
     x, uv, camera = problem.points_3d, problem.points_2d, problem.camera
     rays, matrix = camera.normalize(uv), camera.matrix
     calls: dict[str, Callable[[], object]] = {

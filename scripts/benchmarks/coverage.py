@@ -18,7 +18,7 @@ from cadalign.arrays import FloatArray
 from cadalign.estimation.warning import MISFIT_KINDS
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.metrics.cramer_rao import probability_level
-from cadalign.evaluation.simulation import Problem, simulate_problem
+from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
 from cadalign.metrics import rotation_error
 
 _LARGE_ROTATION_DEG, _LARGE_SCALE = 15.0, 0.25
@@ -32,7 +32,7 @@ _SHAPE_SIGMAS = (0.01, 0.05, 0.1)
 _SIMILAR_SIZES = (6, 12, 30, 60, 200)
 _REGIONS = ("R", "t", "lengths")
 
-Draw = Callable[[np.random.Generator], Problem]
+Draw = Callable[[np.random.Generator], SimulatedProblem]
 
 
 def coverage(
@@ -141,7 +141,7 @@ def _warnings(seed: int, problems: int, noise_px: float) -> Iterator[Row]:
 
 def _fits(
     seed: int, draw: Draw, *, problems: int, **options: Any
-) -> Iterator[tuple[Problem, Result]]:
+) -> Iterator[tuple[SimulatedProblem, Result]]:
     """Problems with their fits; those that are refused are left out."""
     for number in range(problems):
         problem = draw(np.random.default_rng([seed, number]))
@@ -219,7 +219,7 @@ def _warned_cases(noise_px: float) -> list[tuple[str, Draw, dict[str, Any]]]:
     """Names, problems and options of `fit`; first data with outliers, then inliers alone."""
 
     def draw(points: int, change: Callable[..., None] | None = None) -> Draw:
-        def problem_of(rng: np.random.Generator) -> Problem:
+        def problem_of(rng: np.random.Generator) -> SimulatedProblem:
             problem = simulate_problem(rng, points=points, noise_px=noise_px)
             if change is not None:
                 change(rng, problem.points_2d)

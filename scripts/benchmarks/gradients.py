@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Camera
-from cadalign.evaluation.simulation import Problem, simulate_problem
+from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
 
 _WELL_KNOWN_DEG = 10.0
 
@@ -25,7 +25,9 @@ def _torch() -> Any:
     return torch
 
 
-def _drawn(rng: np.random.Generator, problems: int, points: int) -> tuple[list[Problem], Any, Any]:
+def _drawn(
+    rng: np.random.Generator, problems: int, points: int
+) -> tuple[list[SimulatedProblem], Any, Any]:
     drawn = [simulate_problem(rng, points=points, noise_px=1.0) for _ in range(problems)]
     tensor = _torch().tensor
     parts = (np.array([getattr(p, name) for p in drawn]) for name in ("points_3d", "points_2d"))

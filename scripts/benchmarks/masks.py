@@ -27,7 +27,7 @@ from cadalign.estimation.estimates import mean_state, pose_and_border, pose_and_
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import prior_of
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.simulation import Problem
+from cadalign.evaluation.simulation import SimulatedProblem
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import alignment_box_iou, nearest_truth, rotation_error
 from cadalign.render import Scene, cast_geometry, sample_view
@@ -176,7 +176,7 @@ class _Case:
     annotated: AnnotatedModel
     scene: Scene
     ids: list[int]
-    seen: Problem
+    seen: SimulatedProblem
     mask: np.ndarray
 
     @property

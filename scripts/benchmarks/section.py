@@ -22,7 +22,7 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.evaluation.experiments.unseen import UnseenOptions
 from cadalign.evaluation.instances.unseen import UnseenObject, UnseenTasks, observe_object
-from cadalign.evaluation.simulation import Problem
+from cadalign.evaluation.simulation import SimulatedProblem
 from cadalign.geometry.rotations import vector_from_rotation
 
 COMMAND = (sys.executable, "-c", "import sys; from cadalign.cli import main; sys.exit(main())")
@@ -116,7 +116,7 @@ def attempt(call: Callable[..., T], *given: Any, **options: Any) -> T | None:
         return None
 
 
-def fitted(problem: Problem, **options: Any) -> cadalign.Result | None:
+def fitted(problem: SimulatedProblem, **options: Any) -> cadalign.Result | None:
     """The fit of a simulated problem; None where it is refused."""
     given = problem.points_3d, problem.points_2d, problem.camera
     return attempt(cadalign.fit, *given, **options)
@@ -128,11 +128,11 @@ def seen_in(
     points_3d: FloatArray,
     noise_px: float,
     rng: np.random.Generator,
-) -> Problem:
+) -> SimulatedProblem:
     """The problem of points (n, 3) of a model in an image, with Gaussian noise."""
     pixels = camera.project(pose.apply(points_3d))
     pixels += noise_px * rng.standard_normal(pixels.shape)
-    return Problem(points_3d, pixels, camera, pose, None)
+    return SimulatedProblem(points_3d, pixels, camera, pose, None)
 
 
 def deviation(*, est: cadalign.Alignment, gt: cadalign.Alignment) -> FloatArray:

@@ -17,7 +17,7 @@ from cadalign.datasets import KeypointNet
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.unseen import UnseenObject
-from cadalign.evaluation.simulation import Problem
+from cadalign.evaluation.simulation import SimulatedProblem
 from cadalign.geometry.camera import projection_jacobian
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import rotation_error
@@ -173,13 +173,17 @@ def _unseen(
     }, deviations
 
 
-def _see_near(points_3d: FloatArray, noise_px: float, rng: np.random.Generator) -> Problem:
+def _see_near(points_3d: FloatArray, noise_px: float, rng: np.random.Generator) -> SimulatedProblem:
     gt, _ = sample_hull_view(KeypointHull(points_3d), _NEAR, rng=rng, min_visible=0)
     return section.seen_in(_NEAR, gt, points_3d, noise_px, rng)
 
 
 def _near(
-    shape: cadalign.ShapeModel, ids: Sequence[int], seen: Problem, noise_px: float, focal: str
+    shape: cadalign.ShapeModel,
+    ids: Sequence[int],
+    seen: SimulatedProblem,
+    noise_px: float,
+    focal: str,
 ) -> cadalign.Result | None:
     camera = seen.camera if focal == "known" else _UNKNOWN
     view = cadalign.View(camera, seen.points_2d, ids=ids, sigma=noise_px)
@@ -222,7 +226,7 @@ def _sizes(errors: FloatArray) -> FloatArray:
     return np.stack([np.linalg.norm(part, axis=1) for part in parts], axis=1)
 
 
-def _posterior_bound(seen: Problem, basis: FloatArray, *, noise_px: float) -> FloatArray:
+def _posterior_bound(seen: SimulatedProblem, basis: FloatArray, *, noise_px: float) -> FloatArray:
     """Least covariance (7 + K, 7 + K) of rotation, translation, log focal length and modes.
 
     Inverse of the keypoints' Fisher information at the truth and that of the modes' prior; what
@@ -239,7 +243,7 @@ def _posterior_bound(seen: Problem, basis: FloatArray, *, noise_px: float) -> Fl
 
 
 def _unseen_errors(
-    result: cadalign.Result, ids: Sequence[int], seen: Problem
+    result: cadalign.Result, ids: Sequence[int], seen: SimulatedProblem
 ) -> tuple[float, float]:
     """Rotation error [deg], and intersection over union of the extents up to scale."""
     _, rows, kept = np.intersect1d(result.ids, ids, return_indices=True)
@@ -301,7 +305,7 @@ def _seen(
     shape: cadalign.ShapeModel,
     seed: int,
     noise_px: float,
-) -> Iterator[tuple[Problem, list[int]]]:
+) -> Iterator[tuple[SimulatedProblem, list[int]]]:
     """The objects through lenses of photos, and the ids of their keypoints."""
     width, height = _UNKNOWN.width, _UNKNOWN.height
     for place, one in found:
@@ -318,7 +322,9 @@ def _seen(
         yield section.seen_in(camera, pose, points, noise_px, rng), ids.tolist()
 
 
-def _row(model: Any, seen: Sequence[tuple[Problem, list[int]]], prior: str, noise_px: float) -> Row:
+def _row(
+    model: Any, seen: Sequence[tuple[SimulatedProblem, list[int]]], prior: str, noise_px: float
+) -> Row:
     errors, focals, holds = [], [], []
     for number, (one, ids) in enumerate(seen):
         rng = instance_rng(number, "exif")

@@ -22,7 +22,7 @@ from cadalign.annotate.problem import Known, LiveProblem
 from cadalign.annotate.suggestion import Suggestion, suggest
 from cadalign.datasets import ModelKeypoint
 from cadalign.errors import DegenerateError, InputError
-from cadalign.evaluation.simulation import Problem
+from cadalign.evaluation.simulation import SimulatedProblem
 from cadalign.geometry.camera import projection_jacobian
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.evidence import ImageEvidence
@@ -41,7 +41,7 @@ LENS_CAMERA = Camera(640, 480, 300.0, 310.0, 310.0, 250.0, (-0.2, 0.05, 0.003, -
 
 
 def live_of(
-    problem: Problem,
+    problem: SimulatedProblem,
     *,
     choice: FocalChoice = KNOWN,
     points_2d: np.ndarray | None = None,
@@ -246,7 +246,9 @@ def test_too_few_pairs_accuse_nobody() -> None:
 # --- the next keypoint -----------------------------------------------------------------------
 
 
-def refitted(problem: Problem, result: Any, candidate: np.ndarray, focal: str) -> np.ndarray:
+def refitted(
+    problem: SimulatedProblem, result: Any, candidate: np.ndarray, focal: str
+) -> np.ndarray:
     """The covariance of a fit to which the candidate was added, measured where it is predicted."""
     pixel = result.camera.project(result.alignment.apply(candidate[None]))
     again = fit(

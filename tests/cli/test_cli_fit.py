@@ -19,7 +19,7 @@ from support.refusals import refusal_line
 
 from cadalign import RansacOptions, Result, fit
 from cadalign.cli import main
-from cadalign.evaluation.simulation import Problem, simulate_problem
+from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.layers import REPROJECTED_COLOR
 
@@ -28,7 +28,7 @@ SIGMA = np.linspace(0.2, 5, 10)
 STORED = {"sigma": 3.0, "loss": "cauchy", "stretch": "y", "stretch_sigma": 0.3}
 
 
-def write_observation(path: Path, problem: Problem = PROBLEM, **fields: Any) -> Path:
+def write_observation(path: Path, problem: SimulatedProblem = PROBLEM, **fields: Any) -> Path:
     Observation(problem.points_3d, problem.points_2d, problem.camera, **fields).save(path)
     return path
 
@@ -179,7 +179,7 @@ def test_a_rejected_keypoint_behind_the_camera_is_written_and_drawn(
     behind = np.array([[0.0, 0.0, -100.0]])
     points_3d = np.vstack([behind @ PROBLEM.alignment.linear, PROBLEM.points_3d])
     points_2d = np.vstack([[[100.0, 100.0]], PROBLEM.points_2d])
-    problem = Problem(points_3d, points_2d, PROBLEM.camera, PROBLEM.alignment, None)
+    problem = SimulatedProblem(points_3d, points_2d, PROBLEM.camera, PROBLEM.alignment, None)
     path = write_observation(tmp_path / "chair.json", problem)
     assert main(["fit", str(path), "--robust"]) == 0
     text = (tmp_path / "chair_fit" / "fit.json").read_text()

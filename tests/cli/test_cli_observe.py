@@ -18,7 +18,7 @@ from cadalign import Alignment, Camera, FocalPrior, Result, fit
 from cadalign.cli import main
 from cadalign.cli.observe import _names
 from cadalign.datasets import ModelKeypoint, ModelKeypoints
-from cadalign.evaluation.simulation import Problem, random_rotation
+from cadalign.evaluation.simulation import SimulatedProblem, random_rotation
 from cadalign.io.observation import Observation
 
 TRUE = Camera(640, 480, 620.0, 620.0, 319.5, 239.5)
@@ -27,7 +27,7 @@ POINTS_3D = np.random.default_rng(1).uniform(-1, 1, (24, 3)) / ALIGNMENT.scale
 POINTS_2D = TRUE.project(ALIGNMENT.apply(POINTS_3D)) + np.random.default_rng(2).normal(
     scale=0.3, size=(24, 2)
 )
-PROBLEM = Problem(POINTS_3D, POINTS_2D, TRUE, ALIGNMENT, None)
+PROBLEM = SimulatedProblem(POINTS_3D, POINTS_2D, TRUE, ALIGNMENT, None)
 NAMES = [f"corner {n}" for n in range(24)]
 
 

@@ -19,21 +19,23 @@ from support.covariances import of_unknowns
 from cadalign import Camera, RansacOptions, Result, fit
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.estimation.warning import MISFIT_KINDS
-from cadalign.evaluation.simulation import Problem, simulate_problem
+from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
 from cadalign.io.observation import Observation
 
 ROUNDS = 120
 LENS = Camera(640, 480, 300.0, 310.0, 310.0, 250.0, (-0.1, 0.02, 0.001, -0.001))
 
 
-def fits(points: int, rounds: int = ROUNDS, **options: Any) -> Iterator[tuple[Problem, Result]]:
+def fits(
+    points: int, rounds: int = ROUNDS, **options: Any
+) -> Iterator[tuple[SimulatedProblem, Result]]:
     for seed in range(rounds):
         problem = simulate_problem(np.random.default_rng(seed), points=points, noise_px=1.0)
         with suppress(CadalignError):  # with few keypoints, the noise may leave no solution
             yield problem, fit(problem.points_3d, problem.points_2d, problem.camera, **options)
 
 
-def holds_truth(result: Result, problem: Problem) -> bool:
+def holds_truth(result: Result, problem: SimulatedProblem) -> bool:
     est, gt = result.alignment, problem.alignment
     vector = Rotation.from_matrix(gt.rotation @ est.rotation.T).as_rotvec()
     log_ratio = np.log(gt.scale / est.scale)

@@ -14,7 +14,7 @@ from support.problems import LENS, assert_same, fit_problem, moved, problem_of, 
 from cadalign import Alignment, Camera, fit
 from cadalign.errors import DegenerateError
 from cadalign.estimation.options import BOUNDING_PRIOR
-from cadalign.evaluation.simulation import SIMULATION_CAMERA, Problem
+from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem
 from cadalign.geometry.metrics import rotation_error, scale_error, translation_error
 
 # --- what it finds ----------------------------------------------------------------------------
@@ -264,7 +264,7 @@ def test_four_points_give_every_exact_solution_least_stretch_first(seed: int) ->
     assert all(other.relative_likelihood > 0.99 for other in result.alternatives)
 
 
-def cost_at(problem: Problem, alignment: Alignment) -> float:
+def cost_at(problem: SimulatedProblem, alignment: Alignment) -> float:
     """The objective at a deviation of 1 px, with the bound of the log scales."""
     weight, width = BOUNDING_PRIOR
     excess = np.maximum(np.abs(np.log(alignment.scale)) - width, 0.0)

@@ -11,18 +11,18 @@ import pytest
 
 from cadalign import Camera, RansacOptions, Result, Results, View, fit, fit_batch
 from cadalign.errors import CadalignError, DegenerateError, InputError
-from cadalign.evaluation.simulation import Problem, simulate_problem
+from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
 
 LENS = Camera(640, 480, 500.0, 520.0, 310.0, 250.0, (-0.2, 0.05, 0.002, -0.001))
 
 
-def problems_of(counts: list[int], *, seed: int = 0, **options: Any) -> list[Problem]:
+def problems_of(counts: list[int], *, seed: int = 0, **options: Any) -> list[SimulatedProblem]:
     rng = np.random.default_rng(seed)
     options = {"noise_px": 1.0} | options
     return [simulate_problem(rng, points=count, **options) for count in counts]
 
 
-def run(problems: list[Problem], camera: Any = None, **options: Any) -> Results:
+def run(problems: list[SimulatedProblem], camera: Any = None, **options: Any) -> Results:
     return fit_batch(
         [p.points_3d for p in problems],
         [p.points_2d for p in problems],
@@ -33,7 +33,7 @@ def run(problems: list[Problem], camera: Any = None, **options: Any) -> Results:
 
 def assert_like_single_fits(
     batch: Results,
-    problems: list[Problem],
+    problems: list[SimulatedProblem],
     each: list[dict[str, Any]] | None = None,
     **options: Any,
 ) -> None:
@@ -322,7 +322,9 @@ def test_threads_agree_where_all_of_a_share_fail() -> None:
     good = problems_of([20, 20])
     rng = np.random.default_rng(0)
     bad = [
-        Problem(rng.normal(size=(20, 3)), rng.uniform(0, 400, (20, 2)), p.camera, p.alignment, None)
+        SimulatedProblem(
+            rng.normal(size=(20, 3)), rng.uniform(0, 400, (20, 2)), p.camera, p.alignment, None
+        )
         for p in good
     ]
     batch = run([*good, *bad], focal="estimate", ransac=RansacOptions(max_iterations=20), workers=2)

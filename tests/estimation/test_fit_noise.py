@@ -13,7 +13,7 @@ from support.problems import LENS, assert_same, fit_problem, moved, problem_of, 
 
 from cadalign import Alignment, Camera, Model, RansacOptions, View, align, fit
 from cadalign.errors import CadalignError, DegenerateError
-from cadalign.evaluation.simulation import SIMULATION_CAMERA, Problem, simulate_problem
+from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem, simulate_problem
 from cadalign.geometry.metrics import rotation_error
 
 # --- sigma ------------------------------------------------------------------------------------
@@ -96,7 +96,7 @@ def test_unknown_sigma_is_estimated_from_the_residuals() -> None:
     np.testing.assert_allclose(known.fisher_covariance, result.fisher_covariance, rtol=1e-5)
 
 
-def said_of(problem: Problem, points_2d: np.ndarray) -> list[bool]:
+def said_of(problem: SimulatedProblem, points_2d: np.ndarray) -> list[bool]:
     """Whether a fit and an estimate from two views say that keypoints explain nothing."""
     view = View(problem.camera, points_2d, sigma=None)
     views = [view, replace(view, points_2d=points_2d + 1.0)]
@@ -226,7 +226,7 @@ def test_methods_without_statistics_say_so(method: str) -> None:
     assert result.alternatives == ()
 
 
-def flattened(axis: int, thickness: float) -> Problem:
+def flattened(axis: int, thickness: float) -> SimulatedProblem:
     """A problem with its keypoints near the plane that an axis has 0.25 in, exactly seen."""
     problem = problem_of(3, points=10, noise_px=0.0)
     factor = np.ones(3)
@@ -234,7 +234,7 @@ def flattened(axis: int, thickness: float) -> Problem:
     points_3d = problem.points_3d * factor
     points_3d[:, axis] += 0.25 - points_3d[:, axis].mean()
     points_2d = problem.camera.project(problem.alignment.apply(points_3d))
-    return Problem(points_3d, points_2d, problem.camera, problem.alignment, None)
+    return SimulatedProblem(points_3d, points_2d, problem.camera, problem.alignment, None)
 
 
 @pytest.mark.parametrize("axis", [1, 2])

@@ -12,7 +12,7 @@ from support.problems import problem_of
 
 from cadalign import Alignment, Camera, Result, fit
 from cadalign.errors import DegenerateError
-from cadalign.evaluation.simulation import SIMULATION_CAMERA, Problem, random_rotation
+from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem, random_rotation
 from cadalign.geometry.metrics import rotation_error
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -30,7 +30,7 @@ def assert_aligned(result: Result, expected: Alignment, tolerance: float = 1e-6)
     assert np.abs(est.scale / expected.scale - 1).max() < tolerance
 
 
-def assert_explains(result: Result, problem: Problem, tolerance_px: float = 1e-5) -> None:
+def assert_explains(result: Result, problem: SimulatedProblem, tolerance_px: float = 1e-5) -> None:
     """No residual is larger than that: where several alignments fit, each is as good."""
     assert np.abs(result.residuals).max() < tolerance_px
     assert (result.alignment.apply(problem.points_3d)[:, 2] > 0).all()

@@ -12,7 +12,7 @@ from scipy.special import chdtri
 from cadalign import Alignment, Camera, Model, Result, View, align, align_batch, fit, fit_batch
 from cadalign.estimation.options import USUAL_STRETCH
 from cadalign.estimation.warning import MISFIT_KINDS
-from cadalign.evaluation.simulation import Problem, random_rotation
+from cadalign.evaluation.simulation import SimulatedProblem, random_rotation
 from cadalign.geometry.metrics import rotation_error
 
 CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
@@ -21,7 +21,7 @@ THICKNESS = 0.02
 
 def flat_problem(
     seed: int, *, axis: int, points: int, noise_px: float, thickness: float = THICKNESS
-) -> Problem:
+) -> SimulatedProblem:
     """Points of a slab that is thin along an axis, seen from 2.5 of its stretched diagonals."""
     rng = np.random.default_rng([seed, axis, points])
     points_3d = rng.uniform(-0.5, 0.5, (points, 3))
@@ -32,22 +32,22 @@ def flat_problem(
     place = np.array([*rng.uniform(-0.2, 0.2, 2), 2.5]) * size
     alignment = Alignment(rotation, place - rotation @ (points_3d * scale).mean(axis=0), scale)
     points_2d = CAMERA.project(alignment.apply(points_3d)) + noise_px * rng.normal(size=(points, 2))
-    return Problem(points_3d, points_2d, CAMERA, alignment, None)
+    return SimulatedProblem(points_3d, points_2d, CAMERA, alignment, None)
 
 
 def flat_problems(
     rounds: int, *, points: int, noise_px: float, axes: tuple[int, ...] = (0, 1, 2)
-) -> Iterator[Problem]:
+) -> Iterator[SimulatedProblem]:
     for seed in range(rounds):
         for axis in axes:
             yield flat_problem(seed, axis=axis, points=points, noise_px=noise_px)
 
 
-def fit_problem(problem: Problem, **options: float | None) -> Result:
+def fit_problem(problem: SimulatedProblem, **options: float | None) -> Result:
     return fit(problem.points_3d, problem.points_2d, problem.camera, **options)  # type: ignore[arg-type]
 
 
-def cost_of(alignment: Alignment, problem: Problem, result: Result) -> float:
+def cost_of(alignment: Alignment, problem: SimulatedProblem, result: Result) -> float:
     """The objective of a result at another alignment."""
     assert result.options is not None
     errors = CAMERA.project(alignment.apply(problem.points_3d)) - problem.points_2d

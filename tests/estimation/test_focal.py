@@ -31,28 +31,28 @@ from cadalign.datasets import Colmap
 from cadalign.errors import DegenerateError, InputError, NoConsensusError
 from cadalign.estimation import focal_search
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, sample_limit
-from cadalign.evaluation.simulation import SIMULATION_CAMERA, Problem, simulate_problem
+from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem, simulate_problem
 from cadalign.geometry.metrics import rotation_error
 
 UNKNOWN = Camera.without_focal(640, 480)
 LONG = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 
 
-def fit_unknown(problem: Problem, camera: Camera = UNKNOWN, **options: Any) -> Result:
+def fit_unknown(problem: SimulatedProblem, camera: Camera = UNKNOWN, **options: Any) -> Result:
     """Fit what keypoints alone say of the focal length."""
     chosen = {"focal": "estimate", "focal_prior": None, **options}
     return fit(problem.points_3d, problem.points_2d, camera, **chosen)
 
 
 def whitened(
-    problem: Problem, alignment: Alignment, camera: Camera, step: np.ndarray
+    problem: SimulatedProblem, alignment: Alignment, camera: Camera, step: np.ndarray
 ) -> np.ndarray:
     """Residuals after a step of the 9 unknowns, in the documented order."""
     seen = camera.with_focal(camera.fx * np.exp(step[8]))
     return seen.project(moved(alignment, step).apply(problem.points_3d)) - problem.points_2d
 
 
-def spoiled(problem: Problem, share: float) -> tuple[np.ndarray, np.ndarray]:
+def spoiled(problem: SimulatedProblem, share: float) -> tuple[np.ndarray, np.ndarray]:
     """Image points of which some were moved by 15 px or more, and which these are."""
     rng = np.random.default_rng(0)
     count = len(problem.points_2d)

@@ -11,7 +11,7 @@ from support.problems import with_outliers
 
 from cadalign import Camera, RansacOptions, fit, fit_batch
 from cadalign.errors import DegenerateError, InputError, NoConsensusError
-from cadalign.evaluation.simulation import Problem, simulate_problem
+from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
 from cadalign.geometry.metrics import rotation_error
 
 CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)
@@ -190,7 +190,7 @@ def test_identical_points_are_refused() -> None:
         fit(np.ones((20, 3)), np.full((20, 2), 100.0), CAMERA, ransac=RansacOptions())
 
 
-def good() -> Problem:
+def good() -> SimulatedProblem:
     return simulate_problem(np.random.default_rng(0), points=10, noise_px=1.0, camera=CAMERA)
 
 

@@ -33,7 +33,7 @@ from cadalign.evaluation.instances.correspondences import (
 from cadalign.evaluation.methods import fit_options
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run, read_table
-from cadalign.evaluation.simulation import Problem, simulate_problem
+from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
 from cadalign.evaluation.summary import Quartiles
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -245,7 +245,7 @@ class TestRows:
     def test_errors_are_counted_as_they_are_described(self):
         # All points 10 from the camera; the last of 4 was moved.
         points = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], dtype=float)
-        truth = Problem(
+        truth = SimulatedProblem(
             points,
             np.zeros((4, 2)),
             CAMERA,

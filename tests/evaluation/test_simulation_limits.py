@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from cadalign import Alignment, Camera, fit, fit_batch
 from cadalign.errors import DegenerateError
-from cadalign.evaluation.simulation import Problem, random_rotation, simulate_problem
+from cadalign.evaluation.simulation import SimulatedProblem, random_rotation, simulate_problem
 from cadalign.geometry.metrics import rotation_error, scale_error, translation_error
 
 pytestmark = pytest.mark.slow
@@ -39,7 +39,7 @@ class Row:
     scale: np.ndarray
 
     @classmethod
-    def of(cls, problems: list[Problem]) -> Row:
+    def of(cls, problems: list[SimulatedProblem]) -> Row:
         return cls(
             np.array([p.points_3d for p in problems]),
             np.array([p.points_2d for p in problems]),
@@ -50,7 +50,7 @@ class Row:
         )
 
 
-def simulated_row(points: int, noise_px: float, *, count: int = PROBLEMS) -> list[Problem]:
+def simulated_row(points: int, noise_px: float, *, count: int = PROBLEMS) -> list[SimulatedProblem]:
     rng = np.random.default_rng([0, points, round(1000 * noise_px)])
     return [simulate_problem(rng, points=points, noise_px=noise_px) for _ in range(count)]
 
@@ -111,7 +111,7 @@ def bound_errors(row: Row, noise_px: float) -> dict[str, np.ndarray]:
 
 
 def fit_errors(
-    problems: list[Problem], noise_px: float, method: str = "optimal"
+    problems: list[SimulatedProblem], noise_px: float, method: str = "optimal"
 ) -> dict[str, np.ndarray]:
     """Errors of `fit`; a problem without result counts as the worst possible."""
     batch = fit_batch(
@@ -142,7 +142,7 @@ def ratios(reached: dict[str, np.ndarray], bound: dict[str, np.ndarray], q: floa
     }
 
 
-def assert_at_the_limit(problems: list[Problem], noise_px: float) -> None:
+def assert_at_the_limit(problems: list[SimulatedProblem], noise_px: float) -> None:
     reached = fit_errors(problems, noise_px)
     bound = bound_errors(Row.of(problems), noise_px)
     medians, tails = ratios(reached, bound, 0.5), ratios(reached, bound, 0.9)
@@ -164,7 +164,7 @@ def test_errors_are_at_the_cramer_rao_bound(points: int, noise_px: float) -> Non
     assert_at_the_limit(simulated_row(points, noise_px, count=count), noise_px)
 
 
-def real_problems(real_data: Path, category: str, count: int) -> Iterator[Problem]:
+def real_problems(real_data: Path, category: str, count: int) -> Iterator[SimulatedProblem]:
     """Views of annotated models of a category with 7 keypoints or more that span a volume."""
     from cadalign.datasets import KeypointNet
 
@@ -183,7 +183,7 @@ def real_problems(real_data: Path, category: str, count: int) -> Iterator[Proble
         points_3d = xyz / scale
         points_2d = KEYPOINT_CAMERA.project(gt.apply(points_3d))
         points_2d += rng.standard_normal(points_2d.shape)
-        yield Problem(points_3d, points_2d, KEYPOINT_CAMERA, gt, None)
+        yield SimulatedProblem(points_3d, points_2d, KEYPOINT_CAMERA, gt, None)
 
 
 @pytest.mark.long

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from support.problems import problem_of
 
 from cadalign import Alignment
-from cadalign.evaluation.simulation import Problem
+from cadalign.evaluation.simulation import SimulatedProblem
 from cadalign.geometry.metrics import rotation_error
 from cadalign.solvers.minimal import ap4p
 
@@ -21,7 +21,7 @@ def solutions_of(points_3d: np.ndarray, rays: np.ndarray) -> list[Alignment]:
     return [Alignment(*parts) for parts in zip(*ap4p(points_3d, rays), strict=True)]
 
 
-def solve(problem: Problem) -> list[Alignment]:
+def solve(problem: SimulatedProblem) -> list[Alignment]:
     return solutions_of(problem.points_3d, problem.camera.normalize(problem.points_2d))
 
 

@@ -10,20 +10,22 @@ from scipy.spatial.transform import Rotation
 
 from cadalign import Alignment, Camera, Result, fit
 from cadalign.datasets import Correspondences
-from cadalign.evaluation.simulation import Problem, simulate_problem
+from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
 from cadalign.geometry.metrics import rotation_error
 
 LENS = Camera(640, 480, 500.0, 520.0, 310.0, 250.0, (-0.25, 0.08, 0.004, -0.003))
 
 
-def problem_of(seed: int, *, points: int = 12, noise_px: float = 0.5, **options: Any) -> Problem:
+def problem_of(
+    seed: int, *, points: int = 12, noise_px: float = 0.5, **options: Any
+) -> SimulatedProblem:
     """A synthetic problem, the same for the same seed."""
     return simulate_problem(
         np.random.default_rng(seed), points=points, noise_px=noise_px, **options
     )
 
 
-def fit_problem(problem: Problem, **options: Any) -> Result:
+def fit_problem(problem: SimulatedProblem, **options: Any) -> Result:
     return fit(problem.points_3d, problem.points_2d, problem.camera, **options)
 
 
@@ -36,7 +38,7 @@ def moved(alignment: Alignment, step: np.ndarray) -> Alignment:
     )
 
 
-def residuals_at(problem: Problem, alignment: Alignment) -> np.ndarray:
+def residuals_at(problem: SimulatedProblem, alignment: Alignment) -> np.ndarray:
     return problem.camera.project(alignment.apply(problem.points_3d)) - problem.points_2d
 
 

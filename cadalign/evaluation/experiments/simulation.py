@@ -26,7 +26,7 @@ from cadalign.evaluation.options import FunctionOptions, name_of, plain_value
 from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, Trace
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import OK, Columns, Plan, Row
-from cadalign.evaluation.simulation import Problem, simulate_problem
+from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
 from cadalign.evaluation.summary import ConsoleTable, Quartiles, Summary, group_name
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.documents import convert, in_file
@@ -207,7 +207,7 @@ class SweepProblems(Setting):
     def failed(self, task: SweepTask) -> list[Case]:
         return [Case(self._names(task))]
 
-    def given(self, instance: tuple[Problem, float]) -> MethodInput:
+    def given(self, instance: tuple[SimulatedProblem, float]) -> MethodInput:
         problem, sigma = instance
         inliers = None if problem.outliers is None else ~problem.outliers
         return MethodInput(
@@ -220,14 +220,16 @@ class SweepProblems(Setting):
         )
 
     def answered(
-        self, method: Method, instance: tuple[Problem, float], answer: Alignment | Result
+        self, method: Method, instance: tuple[SimulatedProblem, float], answer: Alignment | Result
     ) -> Alignment:
         return answer if isinstance(answer, Alignment) else answer.alignment
 
-    def row(self, method: Method, instance: tuple[Problem, float], estimate: Alignment) -> Row:
+    def row(
+        self, method: Method, instance: tuple[SimulatedProblem, float], estimate: Alignment
+    ) -> Row:
         return {**alignment_errors(est=estimate, gt=instance[0].alignment)}
 
-    def problem(self, task: SweepTask) -> Problem:
+    def problem(self, task: SweepTask) -> SimulatedProblem:
         """The problem of a task."""
         value, run = task
         rng = instance_rng(self.seed, self.kind.name, repr(float(value)), str(run))

@@ -24,7 +24,7 @@ from cadalign.evaluation.experiments.correspondences import COLUMNS, NAMES, Corr
 from cadalign.evaluation.methods import Method, MethodInput
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.runs.work import Row, fingerprint
-from cadalign.evaluation.simulation import Problem, simulate_problem
+from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 
@@ -107,7 +107,7 @@ _STRETCH = (0.5, 2.0)
 _REDRAWS = 100
 
 
-SpoiledImage = tuple[Problem, RansacOptions]
+SpoiledImage = tuple[SimulatedProblem, RansacOptions]
 """An image with a stretched scene and moved points, and the options of searches for inliers."""
 
 
@@ -158,7 +158,9 @@ def correspondence_benchmark(options: CorrespondenceOptions) -> Benchmark:
     return Benchmark.chosen(SpoiledImages(options), options.methods, metrics=options.metrics)
 
 
-def errors_of(found: Alignment | Result, truth: Problem, *, is_robust: bool = False) -> Row:
+def errors_of(
+    found: Alignment | Result, truth: SimulatedProblem, *, is_robust: bool = False
+) -> Row:
     """Errors of an estimate by column; of its inliers where they were searched for."""
     est = found if isinstance(found, Alignment) else found.alignment
     distance = np.linalg.norm(truth.alignment.apply(truth.points_3d).mean(axis=0))
@@ -181,7 +183,7 @@ def errors_of(found: Alignment | Result, truth: Problem, *, is_robust: bool = Fa
     }
 
 
-def spoil(seen: Correspondences, outliers: float, *, rng: np.random.Generator) -> Problem:
+def spoil(seen: Correspondences, outliers: float, *, rng: np.random.Generator) -> SimulatedProblem:
     """Stretch what an image shows, and move a share of its points to anywhere in the image.
 
     The model is the scene with y and z divided by scales between 0.5 and 2, so that the true
@@ -195,7 +197,7 @@ def spoil(seen: Correspondences, outliers: float, *, rng: np.random.Generator) -
     moved[rng.choice(len(seen), size=count, replace=False)] = True
     points_2d = seen.points_2d.copy()
     points_2d[moved] = _pixels_anywhere(seen.camera, count, rng)
-    return Problem(
+    return SimulatedProblem(
         points_3d=seen.points_3d / scale,
         points_2d=points_2d,
         camera=seen.camera,

@@ -20,6 +20,7 @@ from cadalign.estimation.fitted import FittedKeypoints
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma, pixel_information
 from cadalign.estimation.problems import pack_one
+from cadalign.estimation.uncertainty.misfit import is_large_sigma
 from cadalign.estimation.uncertainty.residuals import area_of, chi_square_tail, f_quantile
 from cadalign.estimation.uncertainty.summary import OTHER_SIZES
 from cadalign.estimation.view import View, numbered
@@ -44,7 +45,6 @@ _AS_MANY_AGREE = 12.0  # the same where as many do
 _AS_MANY_ARE_FOUND = 2 * math.log(100)  # the same after a robust search
 _AS_LIKELY = 6.0  # difference of -2 log likelihoods of mistakes that are both named
 _FEW_REJECTED = 0.1  # share of the keypoints, up to which an uncertain shape is not doubted
-_LARGE_SIGMA = 0.02  # estimated sigma, over the keypoints' extent, that is doubtful
 _CHANCE_OF_RATIO = 1e-3  # that residuals of an unknown noise differ by as much
 _UPRIGHT = 0.5  # cosine between the model's y axis and the photo's upwards, at least
 _MOST_INSIDE = 0.8  # share of the keypoints that lie in their image
@@ -228,7 +228,7 @@ def diagnose(
     given = None if result is None else Agreement.of(result, model, views, ransac)
     if given is not None and not _is_doubtful(given, views, inflation, **kind):
         return None
-    if given is None or any(view.mask is not None or view.image is not None for view in views):
+    if given is None or any(view.has_outline for view in views):
         given = _agreement_without(Mistake(""), model, shown, again, ransac)
     if given is None or not _is_doubtful(given, shown, inflation, **kind):
         return None
@@ -269,9 +269,7 @@ def diagnose_fit(
         options = replace(options, sigma=np.asarray(options.sigma)[ahead])
     ransac = None if fitted.search is None else fitted.search.ransac
     own = None if fitted.inliers.all() else ransac  # samples need not be drawn where all agree
-    points = fitted.points_3d[ahead]
-    in_camera = fitted.alignment.apply(points)
-    observed = fitted.camera.project_where_ahead(in_camera) - fitted.residuals[ahead]
+    points, observed = fitted.points_3d[ahead], fitted.observed[ahead]
     (model, views), again = estimates_by_fit(points, observed, fitted.camera, options, own)
     return diagnose(model, views, again, ransac=ransac, has_reason=has_reason, rival=rival)
 
@@ -362,9 +360,7 @@ def _is_doubtful(
         return True
     if given.sigma is None:
         return not given.has_chance(_DOUBTFUL, inflation)
-    seen = [view.pixels for view in views if len(view.pixels)]
-    extent = max((float(np.ptp(pixels, axis=0).max()) for pixels in seen), default=0.0)
-    return given.redundancy > 0 and given.sigma > _LARGE_SIGMA * extent
+    return given.redundancy > 0 and is_large_sigma(given.sigma, [each.pixels for each in views])
 
 
 def _mistakes_in(model: AnyModel, views: Sequence[View], *, has_reason: bool) -> list[Mistake]:

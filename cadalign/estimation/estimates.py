@@ -23,7 +23,6 @@ from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import group_of
 from cadalign.shapes.model import ShapeModel
-from cadalign.solvers.joint.covariance import JointCovariance
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
 from cadalign.solvers.marginal.problem import Mixture, Seen, shape_at
 from cadalign.solvers.search import Minima
@@ -39,19 +38,13 @@ def mean_state(evidence: Evidence, poses: FloatArray, log_scales: FloatArray) ->
     return State(poses, focals, log_scales, *still)
 
 
-def pose_and_border(found: JointCovariance, pose: int) -> FloatArray:
-    """Covariance (6 + b, 6 + b) of one pose and of the unknowns that all views share."""
-    cross = found.cross[pose]
-    return np.block([[found.poses[pose], cross], [cross.T, found.border]])
-
-
 def pose_and_lengths(
     evidence: Evidence, state: State, unknowns: FloatArray, view: int = 0
 ) -> FloatArray:
     """Covariance (9, 9) of a camera's pose and the log lengths of the box.
 
     With an estimated focal length (10, 10), its logarithm last. ``unknowns`` is the covariance of
-    the view's pose and the border, see `pose_and_border`.
+    the view's pose and the border, see `cadalign.solvers.joint.covariance.pose_and_border`.
     """
     shape, rig = evidence.shape, evidence.rig
     rotation = rig.cam_from_rig[view][:9].reshape(3, 3)

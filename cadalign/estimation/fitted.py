@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
+import numpy as np
+
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.warning import EstimateWarning
@@ -118,6 +120,13 @@ class FittedKeypoints:
     alternatives: tuple[Alternative, ...] = ()
     stats: FitStats = NO_STATS
     search: KeypointSearch | None = None  # for the inliers, where they were searched for
+
+    @property
+    def observed(self) -> FloatArray:
+        """The keypoints (n, 2) [px] as they were given; NaN for those behind the camera."""
+        projected = self.camera.project_where_ahead(self.alignment.apply(self.points_3d))
+        with np.errstate(invalid="ignore"):  # infinite residuals
+            return np.asarray(projected - self.residuals)
 
     @property
     def chosen_sigma(self) -> Any:

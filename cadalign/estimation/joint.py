@@ -22,7 +22,6 @@ from cadalign.estimation.estimates import (
     moments_of_points,
     moments_of_poses,
     one_of_equals,
-    pose_and_border,
     pose_and_lengths,
     poses_of,
     widen_box,
@@ -58,7 +57,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.shapes.parts import inflation_with
-from cadalign.solvers.joint.covariance import joint_covariance
+from cadalign.solvers.joint.covariance import joint_covariance, pose_and_border
 from cadalign.solvers.joint.evidence import points_of
 from cadalign.solvers.joint.search import refine_joint
 

@@ -235,6 +235,13 @@ def under_cauchy(evidence: Evidence) -> Evidence:
     return evidence._replace(sightings=old._replace(loss=np.full(len(old.loss), CAUCHY)))
 
 
+def with_whitening_times(factor: float, chosen: BoolArray, evidence: Evidence) -> Evidence:
+    """The evidence with the whitening of ``chosen`` sightings (N,) times a factor."""
+    old = evidence.sightings
+    whitening = np.where(chosen[:, None], factor, 1.0) * old.whitening
+    return evidence._replace(sightings=old._replace(whitening=whitening))
+
+
 def with_sightings(evidence: Evidence, kept: BoolArray | IntArray) -> Evidence:
     """The evidence of some sightings."""
     return evidence._replace(sightings=kept_rows(evidence.sightings, kept))

@@ -92,7 +92,7 @@ class Problem(NamedTuple):
     @property
     def uses_outlines(self) -> bool:
         """True if a view has a mask or a photo."""
-        return any(view.mask is not None or view.image is not None for view in self.views)
+        return any(view.has_outline for view in self.views)
 
     @property
     def pose_count(self) -> int:
@@ -179,11 +179,11 @@ def compile_problem(
     prior = prior_of(model)
     for view in views:
         if not view.has_evidence:
-            fix, where = (
-                "give keypoints, a mask or a direction, or leave the view away",
-                f"views[{view.number}]",
+            raise InputError(
+                "tells nothing about the object",
+                where=f"views[{view.number}]",
+                fix="give keypoints, a mask or a direction, or leave the view away",
             )
-            raise InputError("tells nothing about the object", where=where, fix=fix)
     facing = [_facing_view(view) for view in views]
     if ransac is None:
         for view in facing:
@@ -210,14 +210,13 @@ def no_pose_error(problem: Problem) -> DegenerateError:
     shown = [
         f"views[{view.number}].{'image' if view.mask is None else 'mask'}"
         for view in views
-        if view.mask is not None or view.image is not None
+        if view.has_outline
     ]
     if shown:
         from cadalign.estimation.contours.surface import surface_of  # imports this package
 
         keypoints = problem.prior.components[0].mean[: len(problem.prior.ids)]
         surface_of(problem.model, keypoints, shown[0])
-    if shown:
         is_rig = len(views) > 1 and views[0].cam_from_rig is not None
         if not seen and len(views) == 1 and views[0].mask is not None:
             return DegenerateError(

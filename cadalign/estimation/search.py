@@ -17,6 +17,7 @@ from cadalign.estimation.joint_robust import (
     robust_minima,
     whitened_lengths,
     with_sightings,
+    with_whitening_times,
     without_hidden,
 )
 from cadalign.estimation.prior import Lenses
@@ -62,7 +63,10 @@ class Minimum(NamedTuple):
 
     @property
     def prior_score(self) -> float:
-        """The part of the score that its component's weight is; 0 where the score is infinite."""
+        """The part of the score beside that of its evidence; 0 where the score is infinite.
+
+        It is that of its component's weight, and of what was left out.
+        """
         own = self.score - score_state(self.evidence, self.state)
         return own if np.isfinite(own) else 0.0
 
@@ -304,7 +308,4 @@ def _without_sigma(views: Sequence[View], minimum: Minimum) -> BoolArray:
 
 def _scaled(minimum: Minimum, chosen: BoolArray, factor: float) -> Minimum:
     """The minimum with the whitening of chosen sightings times a factor."""
-    sightings = minimum.evidence.sightings
-    whitening = np.where(chosen[:, None], factor, 1.0) * sightings.whitening
-    evidence = minimum.evidence._replace(sightings=sightings._replace(whitening=whitening))
-    return minimum._replace(evidence=evidence)
+    return minimum._replace(evidence=with_whitening_times(factor, chosen, minimum.evidence))

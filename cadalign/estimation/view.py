@@ -197,6 +197,11 @@ class View(BeyondKeypoints):
         return self.mask is not None and not len(self.keypoint_ids)
 
     @property
+    def has_outline(self) -> bool:
+        """True if a mask or a photo may show the outline."""
+        return self.mask is not None or self.image is not None
+
+    @property
     def has_evidence(self) -> bool:
         """True if the view says anything about the object."""
         return bool(len(self.keypoint_ids)) or bool({*self.sources} - {"cam_from_rig", "depth"})

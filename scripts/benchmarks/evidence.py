@@ -17,7 +17,7 @@ from cadalign import Alignment, Model, Result, View, align
 from cadalign.arrays import BoolArray, FloatArray, IntArray, instance_rng
 from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.estimation import joint
-from cadalign.estimation.estimates import pose_and_border, pose_and_lengths
+from cadalign.estimation.estimates import pose_and_lengths
 from cadalign.evaluation.instances.instance import (
     KEYPOINT_CAMERA,
     Instance,
@@ -32,7 +32,7 @@ from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.evidence import Size
 from cadalign.render import cast_geometry, visible_keypoints
 from cadalign.solvers.constants import LINEAR
-from cadalign.solvers.joint.covariance import joint_covariance
+from cadalign.solvers.joint.covariance import joint_covariance, pose_and_border
 from cadalign.solvers.joint.evidence import Evidence, State
 
 Weighed = tuple[Evidence, State]

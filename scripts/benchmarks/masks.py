@@ -23,7 +23,7 @@ from cadalign.estimation.contours.mask import MaskSource
 from cadalign.estimation.contours.outline import Track
 from cadalign.estimation.contours.problem import ContourProblem, Place, shift_to
 from cadalign.estimation.contours.surface import surface_of
-from cadalign.estimation.estimates import mean_state, pose_and_border, pose_and_lengths
+from cadalign.estimation.estimates import mean_state, pose_and_lengths
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import prior_of
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
@@ -32,7 +32,7 @@ from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import alignment_box_iou, nearest_truth, rotation_error
 from cadalign.render import Scene, cast_geometry, sample_view
 from cadalign.solvers.constants import LINEAR
-from cadalign.solvers.joint.covariance import joint_covariance
+from cadalign.solvers.joint.covariance import joint_covariance, pose_and_border
 
 _NOISE_PX = 1.0
 _STRETCH = 2.0

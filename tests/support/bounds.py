@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from cadalign import Alignment, Model, Size, View
-from cadalign.estimation.estimates import mean_state, pose_and_border, pose_and_lengths
+from cadalign.estimation.estimates import mean_state, pose_and_lengths
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import prior_of
 from cadalign.geometry.rotations import vector_from_rotation
-from cadalign.solvers.joint.covariance import joint_covariance
+from cadalign.solvers.joint.covariance import joint_covariance, pose_and_border
 
 
 def bound_of(

@@ -22,7 +22,7 @@ def refine_with_images(
 
     Without any of them they are the same, and neither OpenCV nor embree is loaded.
     """
-    if all(view.mask is None and view.image is None for view in views):
+    if not any(view.has_outline for view in views):
         return list(minima), NO_NOTES
     from cadalign.estimation.contours.engine import refine_with_outlines
 

@@ -26,8 +26,9 @@ from cadalign.estimation.contours.problem import (
     solved,
     weakest_steps,
 )
+from cadalign.estimation.joint_robust import with_whitening_times
 from cadalign.solvers.joint.covariance import information_of
-from cadalign.solvers.joint.evidence import Evidence, State
+from cadalign.solvers.joint.evidence import State
 from cadalign.solvers.joint.search import objective_of, score_state
 
 _ITERATIONS = 12
@@ -288,18 +289,15 @@ def _with_wider_noise(problem: ContourProblem, fit: OutlineFit) -> OutlineFit:
 
     Their residuals have as many degrees of freedom less as the lines determine unknowns.
     """
-    augmented, sightings = fit.augmented, fit.augmented.evidence.sightings
+    augmented = fit.augmented
     is_line = np.zeros(len(problem.evidence.sightings.point), dtype=bool)
     for source, rows in zip(problem.sources, augmented.rows, strict=True):
         count = 0 if rows is None else len(rows.mean)
         is_line = np.append(is_line, np.full(count, not source.is_comparable))
 
-    def weighted(factor: float) -> Evidence:
-        whitening = np.where(is_line[:, None], factor, 1.0) * sightings.whitening
-        return augmented.evidence._replace(sightings=sightings._replace(whitening=whitening))
-
     (_, whole), (_, rest) = (
-        information_of(weighted(lines), augmented.state) for lines in (1.0, 0.0)
+        information_of(with_whitening_times(lines, is_line, augmented.evidence), augmented.state)
+        for lines in (1.0, 0.0)
     )
     fitted = float(np.trace(solved(whole, whole - rest)))
     independent = sum(
@@ -310,4 +308,5 @@ def _with_wider_noise(problem: ContourProblem, fit: OutlineFit) -> OutlineFit:
         if outline is not None and not source.is_comparable
     )
     factor = np.sqrt(max(1 - fitted / max(independent, 1.0), _LEAST_FREEDOM))
-    return fit._replace(augmented=augmented._replace(evidence=weighted(factor)))
+    wider = with_whitening_times(factor, is_line, augmented.evidence)
+    return fit._replace(augmented=augmented._replace(evidence=wider))

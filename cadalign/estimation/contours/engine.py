@@ -15,10 +15,7 @@ import numpy as np
 from cadalign.errors import DegenerateError
 from cadalign.estimation.contours.descent import OutlineFit, first_fit, last_fit
 from cadalign.estimation.contours.mask import MaskSource, convex_hull
-from cadalign.estimation.contours.outline import (
-    OutlineSource,
-    OutlineSupport,
-)
+from cadalign.estimation.contours.outline import OutlineSource, OutlineSupport
 from cadalign.estimation.contours.photo import PhotoSource
 from cadalign.estimation.contours.photo_lines import photo_of
 from cadalign.estimation.contours.problem import (
@@ -232,7 +229,7 @@ def _hulls_of(views: Sequence[View]) -> list[View]:
     found = []
     for view in views:
         hull = None if view.mask_image is None else convex_hull(view.mask_image)
-        if hull is None and (view.mask is not None or view.image is not None):
+        if hull is None and view.has_outline:
             return []
         found.append(view if hull is None else replace(view, mask=hull))
     return found

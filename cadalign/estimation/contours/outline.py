@@ -21,6 +21,8 @@ LEAST_LOSS_SCALE = 1.0
 """Least scale of Cauchy's loss [px]: where pixels end, they displace a contour by up to that."""
 LEAST_OFFSET = 0.1
 """Least standard deviation of the offset that all of a contour has in common [px]."""
+REGISTRATION = 0.3
+"""Standard deviation of a contour's registration along x and y [px]."""
 _LEAST_OWN = 0.3  # [px], standard deviation of the part that is the model's
 _FIRST_SHARE, _LARGEST_SHARE = 0.8, 0.99  # of a contour, that is the model's
 _ROUNDS = 30
@@ -127,10 +129,6 @@ def cost_of_contour(residuals: FloatArray, reach: float) -> float:
         share = min(float(belongs.mean()), _LARGEST_SHARE)
         variance = max(float(belongs @ squares / max(belongs.sum(), 1e-9)), _LEAST_OWN**2)
     return float(-np.log(density).mean())
-
-
-REGISTRATION = 0.3
-"""Standard deviation of a contour's registration along x and y [px]."""
 
 
 class Outline(NamedTuple):

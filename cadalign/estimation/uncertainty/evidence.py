@@ -88,7 +88,7 @@ def summaries_of(
     found = []
     for piece in pieces_of(evidence):
         if piece.view is None or piece.kind == "camera height":
-            found.append(_ofdistances_beside(evidence, state, piece))
+            found.append(_of_distances(evidence, state, piece))
         elif piece.kind == "gravity":
             found.append(_of_gravity(evidence, state, piece.view))
         elif piece.kind == "keypoints":
@@ -164,7 +164,7 @@ def _of_gravity(evidence: Evidence, state: State, view: int) -> EvidenceSummary:
     return _summary("gravity", view, angles, np.linalg.norm(whitened, axis=1), "deg", 2)
 
 
-def _ofdistances_beside(evidence: Evidence, state: State, piece: Piece) -> EvidenceSummary:
+def _of_distances(evidence: Evidence, state: State, piece: Piece) -> EvidenceSummary:
     expected, measured, weights = distances_beside(evidence, state, piece)
     errors = expected - measured
     return _summary(*piece, errors, errors * weights, "")

@@ -11,7 +11,7 @@ from cadalign.estimation.options import pixel_information
 from cadalign.estimation.uncertainty.misfit import (
     Misfit,
     find_misfit,
-    has_large_sigma,
+    is_large_sigma,
     unexplained,
     unverified_stretch,
 )
@@ -52,8 +52,7 @@ def keypoint_warnings(
     """
     misfit = find_misfit(fitted)
     ahead = np.isfinite(fitted.residuals).all(axis=1)
-    in_camera = fitted.alignment.apply(fitted.points_3d[ahead])
-    observed = fitted.camera.project_where_ahead(in_camera) - fitted.residuals[ahead]
+    observed = fitted.observed[ahead]
     if diagnosis is not None and _is_doubtful(fitted, misfit):
         rival = None if misfit is None else misfit.camera
         has_reason = misfit is not None and misfit.has_reason
@@ -85,8 +84,11 @@ def _is_doubtful(fitted: FittedKeypoints, misfit: Misfit | None) -> bool:
     """True if keypoints fail their test, or those that agree were searched for."""
     if fitted.search is not None:
         return True
-    is_doubtful = misfit is not None or has_large_sigma(fitted)
-    return fitted.fisher_covariance is not None and is_doubtful
+    if fitted.fisher_covariance is None:
+        return False
+    if misfit is not None or fitted.options.sigma is not None or fitted.sigma is None:
+        return misfit is not None
+    return is_large_sigma(fitted.sigma, [fitted.observed[fitted.inliers]])
 
 
 def _placed(camera: Camera, observed: FloatArray, misfit: Misfit | None) -> Warnings:

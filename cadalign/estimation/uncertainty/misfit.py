@@ -39,7 +39,7 @@ _MOST_NAMED = 5  # outliers, in a sentence
 _MOST_OUTLIERS = 1 / 3  # of the keypoints; more are no outliers
 # Hands click to about 2 px, and shapes differ by as much: weight of that, as of so many equations.
 _CLICK, _CLICK_EQUATIONS = 2.0, 4
-_LARGE = 0.02  # estimated sigma, over the keypoints' extent, that asks for a mistake
+_LARGE = 0.02  # estimated sigma, over the keypoints' extent, that is large
 _LARGEST_SHARE = 0.45  # of the keypoints' spread, of an estimated sigma
 
 PlacedRows = tuple[Alignment, Camera, FloatArray | None]
@@ -388,10 +388,10 @@ def unexplained(sigma: float, points_2d: Sequence[FloatArray]) -> Warnings:
     return (EstimateWarning("noise", text),)
 
 
-def has_large_sigma(result: FittedKeypoints) -> bool:
-    """True for an estimated sigma that is large beside the extent of the keypoints."""
-    if result.options.sigma is not None or result.sigma is None:
-        return False
-    observed = result.camera.project_where_ahead(result.alignment.apply(result.points_3d))
-    extent = np.ptp((observed - result.residuals)[result.inliers], axis=0).max()
-    return bool(result.sigma > _LARGE * extent)
+def is_large_sigma(sigma: float, points_2d: Sequence[FloatArray]) -> bool:
+    """True for an estimated sigma [px] that is large beside the extent of views' keypoints (n, 2).
+
+    It asks for a mistake.
+    """
+    extents = [float(np.ptp(points, axis=0).max()) for points in points_2d if len(points)]
+    return sigma > _LARGE * max(extents, default=0.0)

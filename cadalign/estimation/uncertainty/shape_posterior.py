@@ -20,6 +20,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError, quote
+from cadalign.estimation.estimates import widen_box
 from cadalign.estimation.options import LOSSES
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.problems import rays_of, whitening_of
@@ -28,19 +29,16 @@ from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import faced, turned_alignment
 from cadalign.geometry.pixels import perspective
+from cadalign.geometry.rotations import by_rotation
 from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import probability_within
+from cadalign.solvers.marginal.problem import Mixture, Seen, coordinates_of, shape_at
 from cadalign.solvers.projection import ray_derivatives
 
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
     from cadalign.estimation.view import View
-
-
-from cadalign.estimation.estimates import widen_box
-from cadalign.geometry.rotations import by_rotation
-from cadalign.solvers.marginal.problem import Mixture, Seen, coordinates_of, shape_at
 
 _POSE = 6
 _FALSE_ALARMS = 0.005  # of all tests of a view together
@@ -258,15 +256,21 @@ def _predicted(seen: SeenShape, inflation: float) -> tuple[FloatArray, FloatArra
     errors, by_pose = whitened_errors(seen.points, seen.pose, seen.rays, seen.whitening)
     by_point = by_pose[:, :, 3:] @ seen.pose.rotation
     errors = errors - (by_point @ (seen.points - seen.mean)[:, :, None])[:, :, 0]
-    by_shape = np.zeros((count, 2, count, 3))
-    by_shape[np.arange(count), :, np.arange(count)] = by_point
-    rows = by_shape.reshape(2 * count, 3 * count)
+    rows = _block_diagonal(by_point)
     spread = inflation**2 * (rows @ seen.covariance @ rows.T) + np.eye(2 * count)
     inverse = np.linalg.inv(spread)
     pose = by_pose.reshape(2 * count, _POSE)
     weighted = inverse @ pose
     weight = inverse - weighted @ np.linalg.solve(pose.T @ weighted, weighted.T)
     return errors.ravel(), np.asarray(weight)
+
+
+def _block_diagonal(blocks: FloatArray) -> FloatArray:
+    """The matrix (2 n, 3 n) with blocks (n, 2, 3) along its diagonal."""
+    count = len(blocks)
+    rows = np.zeros((count, 2, count, 3))
+    rows[np.arange(count), :, np.arange(count)] = blocks
+    return rows.reshape(2 * count, 3 * count)
 
 
 class SinglePosterior(NamedTuple):
@@ -302,9 +306,7 @@ def single_posterior(
     errors, by_pose = whitened_errors(points[seen.points], pose, seen.rays, seen.whitening)
     weights, _ = loss_slopes((errors**2).sum(axis=1), seen.loss, seen.loss_scale)
     by_pose *= np.sqrt(weights)[:, None, None]
-    by_shape = np.zeros((count, 2, count, 3))
-    by_shape[np.arange(count), :, np.arange(count)] = by_pose[:, :, 3:] @ rotation
-    rows, jacobian = by_shape.reshape(2 * count, -1), by_pose.reshape(2 * count, -1)
+    rows, jacobian = _block_diagonal(by_pose[:, :, 3:] @ rotation), by_pose.reshape(2 * count, -1)
     prior = inflation**2 * mixture.covariances[component]
     columns = coordinates_of(seen)
     told = prior[:, columns] @ rows.T  # covariance of the points with the residuals

@@ -56,7 +56,7 @@ def joint_covariance(evidence: Evidence, state: State) -> JointCovariance:
     inverse.border[held, held] = 0.0
     rows, own = _points_by_unknowns(evidence, reduced, fewer, equations, sighted_points(evidence))
     turn, rows_seen = _in_first_camera(reduced, fewer, rows)
-    unknowns = _pose_and_border(inverse, evidence.rig.pose[0])
+    unknowns = pose_and_border(inverse, evidence.rig.pose[0])
     # The modes that the evidence does not tell apart keep their prior.
     basis = reduction.basis[:modes]
     lift = np.zeros((first + modes, first + basis.shape[1]))
@@ -73,10 +73,10 @@ def joint_covariance(evidence: Evidence, state: State) -> JointCovariance:
     )
 
 
-def _pose_and_border(inverse: Arrow, pose: int) -> FloatArray:
-    """Covariance (6 + b, 6 + b) of one pose and the border."""
-    cross = inverse.coupling[pose]
-    return np.block([[inverse.blocks[pose], cross], [cross.T, inverse.border]])
+def pose_and_border(inverse: Arrow | JointCovariance, pose: int) -> FloatArray:
+    """Covariance (6 + b, 6 + b) of one pose and of the unknowns that all views share."""
+    poses, cross, border, *_ = inverse
+    return np.block([[poses[pose], cross[pose]], [cross[pose].T, border]])
 
 
 def _points_by_unknowns(

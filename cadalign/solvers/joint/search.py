@@ -22,6 +22,7 @@ _UNLIKELY = 40.0  # excess cost, after the probe, at which a start is given up
 MOST_PER_VIEW = 8
 _EVALUATION = Effort(0, 0, 0, np.inf)
 _UNLIKELY_POSE = 60.0  # excess cost of a pose of the mean shape that is still a start
+_LEAST_SHARE = 1e-7  # of a direction that the evidence tells apart, over the longest
 
 
 class JointMinima(NamedTuple):
@@ -174,9 +175,6 @@ def view_starts(evidence: Evidence, view: int) -> tuple[FloatArray, FloatArray]:
     place = np.argsort(order)
     rotations = poses[:, :9].reshape(-1, 3, 3)[:, :, place].reshape(-1, 9)
     return np.concatenate([rotations, poses[:, 9:12]], axis=1), np.log(poses[:, 12 + place])
-
-
-_LEAST_SHARE = 1e-7  # of a direction, over the longest
 
 
 class Reduction(NamedTuple):

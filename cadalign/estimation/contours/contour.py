@@ -250,7 +250,8 @@ class Sight(NamedTuple):
     def covers(self, pixels: FloatArray) -> BoolArray:
         """Tell if the object is seen at pixels (..., 2)."""
         origin, directions, valid = self._rays(pixels)
-        covered = self.caster.covered(origin, directions) & valid
+        covered = self.caster.covered(origin, directions)
+        covered &= valid
         return np.asarray(covered.reshape(pixels.shape[:-1]))
 
     def hits(self, pixels: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -260,7 +261,7 @@ class Sight(NamedTuple):
         seen = valid & (face >= 0)
         return np.where(seen, face, -1), origin + np.where(seen, depth, 0.0)[:, None] * directions
 
-    def _rays(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    def _rays(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray | np.bool_]:
         flat, camera = pixels.reshape(-1, 2).astype(float), self.camera
         origin, model_from_ray = model_rays(self.pose)
         if camera.distortion or camera.is_wide:
@@ -268,7 +269,7 @@ class Sight(NamedTuple):
             return origin, flat @ model_from_ray[:, :2].T + model_from_ray[:, 2], valid
         by_pixel = model_from_ray[:, :2] / (camera.fx, camera.fy)  # one affine map, which is faster
         first = model_from_ray[:, 2] - by_pixel @ (camera.cx, camera.cy)
-        return origin, flat @ by_pixel.T + first, np.ones(len(flat), dtype=bool)
+        return origin, flat @ by_pixel.T + first, np.True_
 
 
 def find_rims(sight: Sight, contour: Contour, reach: float) -> Rims:
@@ -404,6 +405,6 @@ def _rendered(
         some[rows, columns] = 1
         near |= np.asarray(cv2.dilate(some, np.ones((band, band), np.uint8)), dtype=np.uint8)
         least = most
-    columns, rows = cv2.findNonZero(near).reshape(-1, 2).T  # five times as fast as NumPy
-    rendered[rows, columns] = sight.covers(np.stack([columns, rows], axis=1) + corner)
+    pixels = cv2.findNonZero(near).reshape(-1, 2)  # five times as fast as NumPy
+    rendered[pixels[:, 1], pixels[:, 0]] = sight.covers(pixels + corner)
     return corner, rendered

@@ -150,35 +150,35 @@ class Descent(NamedTuple):
     def run(self, here: OutlineFit) -> OutlineFit:
         """The place where no step lowers the cost.
 
-        Pixels make the cost rough: whole steps go on for a while where they don't lower it, before
-        the least is tried for shorter ones and for others.
+        Pixels make the cost rough: where whole steps don't lower it, the least is tried for shorter
+        ones and for others.
         """
-        best, since = here, 0
         for _ in range(_MOST_STEPS):
-            step = here.augmented.refined(_ITERATIONS)
-            there = None if step is None else self.at(step.place)
-            if there is not None and there.cost < best.cost - _LEAST_GAIN:
-                here = best = there
-                since = 0
-                continue
-            since += 1
-            if there is not None and since < _PATIENCE:
-                here = there
-                continue
-            better = self._shorter(best) or self._elsewhere(best)
+            better = self._stepped(here) or self._elsewhere(here)
             if better is None:
                 break
-            here = best = better
-            since = 0
-        return best
+            here = better
+        return here
 
-    def _shorter(self, here: OutlineFit) -> OutlineFit | None:
-        """The first place on the way to the goal of a step that costs less."""
-        step = here.augmented.refined(_ITERATIONS)
-        if step is None:
+    def _stepped(self, here: OutlineFit) -> OutlineFit | None:
+        """A place that costs less after whole steps, or on the way to the goal of the first.
+
+        Steps go on for a while where they don't lower the cost.
+        """
+        goal = here.augmented.refined(_ITERATIONS)
+        if goal is None:
             return None
+        last = here
+        for _ in range(_PATIENCE):
+            step = goal if last is here else last.augmented.refined(_ITERATIONS)
+            there = None if step is None else self.at(step.place)
+            if there is None:
+                break
+            if there.cost < here.cost - _LEAST_GAIN:
+                return there
+            last = there
         for share in _SHARES:
-            there = self.at(here.place.towards(step.place, share))
+            there = self.at(here.place.towards(goal.place, share))
             if there is not None and there.cost < here.cost - _LEAST_GAIN:
                 return there
         return None

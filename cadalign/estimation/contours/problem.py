@@ -228,7 +228,7 @@ class ContourProblem(NamedTuple):
         state, first = look.place.state, self.keypoints
         full = state._replace(
             coefficients=np.concatenate([state.coefficients, look.place.own.ravel()]),
-            displacements=np.insert(state.displacements, [first] * total, 0.0, axis=0),
+            displacements=_with_room(state.displacements, first, total),
         )
         evidence = _with_rows(self.evidence, first, rows, total)
         return Augmented(evidence, full, look.place, rows, slice(first, first + total))
@@ -300,10 +300,11 @@ def _with_rows(
     evidence: Evidence, keypoints: int, measured: Sequence[OutlineRows | None], total: int
 ) -> Evidence:
     """The evidence with what was measured at ``total`` points, and the contours' own modes."""
-    shape, last, room = evidence.shape, len(evidence.shape.modes), [keypoints] * total
-    mean = np.insert(shape.mean, room, 0.0, axis=0)
+    shape, last = evidence.shape, len(evidence.shape.modes)
+    mean = _with_room(shape.mean, keypoints, total)
     modes = np.zeros((last + OWN_MODES * len(measured), *mean.shape))
-    modes[:last] = np.insert(shape.modes, room, 0.0, axis=1)
+    modes[:last, :keypoints] = shape.modes[:, :keypoints]
+    modes[:last, keypoints + total :] = shape.modes[:, keypoints:]
 
     def moved(points: IntArray) -> IntArray:
         return np.where(points >= keypoints, points + total, points)
@@ -321,11 +322,16 @@ def _with_rows(
         sightings.append(rows.sightings._replace(point=np.arange(there.start, there.stop)))
         first = there.stop
     return evidence._replace(
-        shape=Shape(mean, modes, np.insert(shape.spread, room, 0.0)),
+        shape=Shape(mean, modes, _with_room(shape.spread, keypoints, total)),
         offsets=evidence.offsets._replace(ends=moved(evidence.offsets.ends)),
         image_depths=depths._replace(point=moved(depths.point)),
         sightings=stacked(sightings),
     )
+
+
+def _with_room(rows: FloatArray, first: int, count: int) -> FloatArray:
+    """Rows (m, ...) with ``count`` rows of zeros before that of number ``first``."""
+    return np.concatenate([rows[:first], np.zeros((count, *rows.shape[1:])), rows[first:]])
 
 
 def with_displacement_modes(evidence: Evidence, state: State) -> tuple[Evidence, State]:

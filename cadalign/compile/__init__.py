@@ -13,13 +13,17 @@ from functools import cached_property
 from typing import Any, TypeVar, cast
 
 from llvmlite import binding
+from numba import literal_unroll
 from numba.core import compiler, config, event, types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.registry import CPUDispatcher
 
 from cadalign.compile.files import KernelCache
 
-__all__ = ["KernelFamily", "borrowing", "fast_sums", "inlined", "kernel"]
+__all__ = ["KernelFamily", "borrowing", "fast_sums", "inlined", "kernel", "unrolled"]
+
+unrolled = literal_unroll
+"""Loop over a tuple of several types; the body is compiled for each."""
 
 F = TypeVar("F", bound=Callable[..., Any])
 

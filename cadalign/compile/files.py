@@ -277,13 +277,19 @@ class KernelCache(FunctionCache):
 
 
 def _sources_of(signature: Any) -> tuple[str, ...]:
-    """Hashes of the modules of named tuples among a signature's types.
+    """Hashes of the modules of named tuples among a signature's types, and among their fields'.
 
     Members of kernel families, which the code calls for such a type, stand there.
     """
-    kinds = [getattr(kind, "instance_class", None) for kind in signature]
-    modules = [sys.modules[kind.__module__].__file__ for kind in kinds if kind is not None]
-    return tuple(source_hash(Path(file)) for file in modules if file is not None)
+    waiting, found = list(signature), set[str]()
+    while waiting:
+        kind = waiting.pop()
+        waiting.extend(getattr(kind, "types", ()))
+        named = getattr(kind, "instance_class", None)
+        file = None if named is None else sys.modules[named.__module__].__file__
+        if file is not None:
+            found.add(source_hash(Path(file)))
+    return tuple(sorted(found))
 
 
 @cache

@@ -159,7 +159,7 @@ def without_hidden(found: JointConsensus) -> list[JointConsensus]:
             if (again == shown).all() or again.sum() < min(LEAST_SEEN, len(again)):
                 break
             shown = again
-            evidence = found.evidence._replace(image_depths=kept_rows(depths, shown))
+            evidence = found.evidence.with_block(kept_rows(depths, shown))
             cost, score, state = refine_joint(evidence, _ITERATIONS, state)
             if not cost < np.inf:
                 break

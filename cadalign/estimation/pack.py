@@ -78,10 +78,8 @@ def evidence_of(
         _sightings(rows, views, lenses.cameras, noise, options),
         _rig(views, turns),
         lenses.focals(),
-        directions,
-        offsets,
-        _image_depths(prior.components[0], rows, views),
         scale_priors(prior, _is_metric(offsets, views)),
+        (directions, offsets, _image_depths(prior.components[0], rows, views)),
     )
 
 

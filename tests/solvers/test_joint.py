@@ -22,6 +22,7 @@ from cadalign.solvers.joint.evidence import (
     Shape,
     Sightings,
     State,
+    kept_rows,
     packed,
     points_of,
     unpacked,
@@ -91,7 +92,7 @@ def evidence_of(
         np.full(focals, 30.0),
     )
     rig = Rig(cameras, np.array(poses))
-    return Evidence(shape, sightings, rig, lenses, up, offsets, depths, scales)
+    return Evidence(shape, sightings, rig, lenses, scales, (up, offsets, depths))
 
 
 def gradient_of(evidence: Evidence, state: State, *, integrates: bool = False) -> np.ndarray:
@@ -145,9 +146,9 @@ def test_a_known_direction_costs_nothing_where_the_model_s_is_turned_onto_it() -
     state, up = state_of(0, 2), evidence.directions
     turns = [each[:9].reshape(3, 3) for each in (evidence.rig.cam_from_rig[1], state.poses[1])]
     agreeing = up._replace(camera=up.model @ (turns[0] @ turns[1]).T)
-    without = evidence._replace(directions=Directions(*(each[:0] for each in up)))
+    without = evidence.with_block(Directions(*(each[:0] for each in up)))
     expected = cost_of(without, state)
-    assert cost_of(evidence._replace(directions=agreeing), state) == pytest.approx(expected)
+    assert cost_of(evidence.with_block(agreeing), state) == pytest.approx(expected)
     assert cost_of(evidence, state) > expected * (1 + 1e-3)
 
 
@@ -258,10 +259,8 @@ def test_eliminated_displacements_equal_modes_of_the_same_deviation() -> None:
     evidence = evidence_of(5, spread=spread, poses=(0, 0), loss=LINEAR)
     each = spread * np.eye(3 * POINTS).reshape(-1, POINTS, 3)
     evidence = seen_from(evidence, state_of(5, 1))
-    evidence = evidence._replace(
-        offsets=Offsets(*(column[:0] for column in evidence.offsets)),
-        image_depths=ImageDepths(*(column[:0] for column in evidence.image_depths)),
-    )
+    for block in (evidence.offsets, evidence.image_depths):
+        evidence = evidence.with_block(kept_rows(block, np.arange(0)))
     as_modes = evidence._replace(
         shape=Shape(
             evidence.shape.mean,

@@ -73,10 +73,12 @@ def evidence(rank: int) -> Evidence:
         sightings,
         Rig(np.concatenate([np.eye(3).ravel(), np.zeros(3)])[None], np.zeros(1, dtype=np.int64)),
         Focals(np.full(1, -1), NO_VALUE, NO_VALUE, NO_VALUE, NO_VALUE),
-        Directions(np.empty((0, 3)), np.empty((0, 3)), NONE, np.empty((0, 3, 3))),
-        Offsets(NONE.reshape(0, 2), NONE, np.empty((0, 3)), NO_VALUE, NO_VALUE),
-        ImageDepths(NONE, NONE, NO_VALUE, NO_VALUE),
         ScalePriors(np.zeros(3), np.zeros((3, 3)), ScalePrior(0.0, 0.0)),
+        (
+            Directions(np.empty((0, 3)), np.empty((0, 3)), NONE, np.empty((0, 3, 3))),
+            Offsets(NONE.reshape(0, 2), NONE, np.empty((0, 3)), NO_VALUE, NO_VALUE),
+            ImageDepths(NONE, NONE, NO_VALUE, NO_VALUE),
+        ),
     )
 
 
@@ -137,5 +139,5 @@ def test_covariances_are_those_of_all_modes(evidence: Evidence, rank: int) -> No
 def test_points_of_every_kind_of_evidence_count(evidence: Evidence) -> None:
     ends, along = np.array([[6, 0], [7, -1]]), np.eye(3)[:2]
     offsets = Offsets(ends, np.array([-1, 0]), along, np.ones(2), np.ones(2))
-    more = evidence._replace(offsets=offsets)
+    more = evidence.with_block(offsets)
     assert used_points(more).tolist() == [True] * 8 + [False]

@@ -309,7 +309,7 @@ def _with_rows(
     def moved(points: IntArray) -> IntArray:
         return np.where(points >= keypoints, points + total, points)
 
-    depths = evidence.image_depths
+    offsets, depths = evidence.offsets, evidence.image_depths
     sightings = [evidence.sightings._replace(point=moved(evidence.sightings.point))]
     first = keypoints
     for number, rows in enumerate(measured):
@@ -321,12 +321,12 @@ def _with_rows(
         modes[place : place + OWN_MODES, there] = rows.own
         sightings.append(rows.sightings._replace(point=np.arange(there.start, there.stop)))
         first = there.stop
-    return evidence._replace(
+    whole = evidence._replace(
         shape=Shape(mean, modes, _with_room(shape.spread, keypoints, total)),
-        offsets=evidence.offsets._replace(ends=moved(evidence.offsets.ends)),
-        image_depths=depths._replace(point=moved(depths.point)),
         sightings=stacked(sightings),
     )
+    whole = whole.with_block(offsets._replace(ends=moved(offsets.ends)))
+    return whole.with_block(depths._replace(point=moved(depths.point)))
 
 
 def _with_room(rows: FloatArray, first: int, count: int) -> FloatArray:

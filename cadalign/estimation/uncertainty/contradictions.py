@@ -157,7 +157,7 @@ def _without_hidden(evidence: Evidence, state: State) -> Evidence:
         rows = depths.image == view
         factor = np.median(depths.value[rows] / expected[rows])
         kept[rows] = (np.abs(depths.value / factor - expected) * depths.weight)[rows] < _HIDDEN
-    return evidence._replace(image_depths=kept_rows(depths, kept))
+    return evidence.with_block(kept_rows(depths, kept))
 
 
 def _as_likely(best: _Trial, suspects: Sequence[_Trial], noise: float) -> list[_Trial]:
@@ -281,10 +281,10 @@ def _without(evidence: Evidence, state: State, piece: Piece) -> tuple[Evidence, 
     kind, view, sightings = piece.kind, piece.view, evidence.sightings
     if view is None or kind == "camera height":
         offsets = kept_rows(evidence.offsets, ~offsets_of(evidence, piece))
-        return evidence._replace(offsets=offsets), state
+        return evidence.with_block(offsets), state
     if kind == "gravity":
         directions = kept_rows(evidence.directions, evidence.directions.image != view)
-        return evidence._replace(directions=directions), state
+        return evidence.with_block(directions), state
     if kind == "rig":
         pose: IntArray = evidence.rig.pose.copy()
         own = state.poses[pose[view]]
@@ -294,7 +294,7 @@ def _without(evidence: Evidence, state: State, piece: Piece) -> tuple[Evidence, 
     hidden = told_by(sightings)[kind] & (sightings.image == view)
     if kind == "depth":
         depths = kept_rows(evidence.image_depths, evidence.image_depths.image != view)
-        evidence = evidence._replace(image_depths=depths)
+        evidence = evidence.with_block(depths)
         sightings = sightings._replace(depths=np.where(hidden[:, None], 0.0, sightings.depths))
     else:
         whitening = np.where(hidden[:, None], 0.0, sightings.whitening)

@@ -175,7 +175,7 @@ def distances_beside(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Expected and measured distances of a piece (n,), with the inverse standard deviations."""
     offsets = kept_rows(evidence.offsets, offsets_of(evidence, piece))
-    points, some = points_of(evidence.shape, state), evidence._replace(offsets=offsets)
+    points, some = points_of(evidence.shape, state), evidence.with_block(offsets)
     return distances_of(some, state.poses, points), offsets.value, offsets.weight
 
 

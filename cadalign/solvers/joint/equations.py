@@ -8,8 +8,8 @@ and ``e = -spread^2 D' L^-T (whitened residual)`` follows.
 Coefficients and displacements that are integrated out leave a log determinant. Its slope h_q by
 the point of each equation is that of `cadalign.solvers.projection.slope_of_row`, in the rig's frame
 with the response y_q of the point; the derivative by a turn is ``X_i x h_q + y_q x a_q``, and
-stretch and focal length scale the rows as well. The equations of directions, offsets and depths
-move with the coefficients alone.
+stretch and focal length scale the rows as well. The equations of other blocks move with
+the coefficients alone.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, kernel
 from cadalign.solvers.joint.arrow import Arrow, add_slope, border_start, empty_arrow
+from cadalign.solvers.joint.blocks import count_equations, write_row
 from cadalign.solvers.joint.evidence import (
     Evidence,
     Shape,
@@ -29,10 +30,6 @@ from cadalign.solvers.joint.evidence import (
     stretched_point,
     undisplaced,
     unstretched,
-)
-from cadalign.solvers.joint.rows import (
-    count_block_equations,
-    write_block_row,
 )
 from cadalign.solvers.linalg import cholesky, cross, dot, factorize, solve_factor_rows
 from cadalign.solvers.projection import slope_of_row, turn, turn_back
@@ -217,7 +214,7 @@ def add_log_determinant(evidence: Evidence, state: State, equations: JointEquati
     spread, columns = evidence.shape.spread, equations.layout.columns
     left = _left_of_displacements(spread, equations.rows, columns)
     by_model, response = np.empty((3, total)), np.empty((modes, total))
-    _write_rows(evidence, state, equations, left, by_model, response)
+    _write_point_rows(evidence, state, equations, left, by_model, response)
     solve_factor_rows(factor, response)
     _add_slopes(evidence, state, equations, left, by_model, response, np.empty((3, 4)))
     if modes > 0:
@@ -227,27 +224,27 @@ def add_log_determinant(evidence: Evidence, state: State, equations: JointEquati
 
 @kernel
 def _add_block_slopes(evidence: Evidence, state: State, arrow: Arrow, factor: FloatArray) -> None:
-    """Add half the derivatives that directions, offsets and depths give.
+    """Add half the derivatives that blocks give.
 
     A residual is linear in the coefficients, so that the derivative of its row by these, along
     their response to it, is the change of the row as they move by the response.
     """
-    first, total = 6 + evidence.focals.low.shape[0] + 3, count_block_equations(evidence)
+    first, total = 6 + evidence.focals.low.shape[0] + 3, count_equations(evidence)
     row, moved_row = np.empty(6 + arrow.border.shape[0]), np.empty(6 + arrow.border.shape[0])
     still, moved = undisplaced(state), undisplaced(state)
     response = np.empty((factor.shape[0], total))
     for q in range(total):
-        equation = write_block_row(evidence, still, q, row)
+        equation = write_row(evidence, still, q, row)
         for k in range(factor.shape[0]):
             response[k, q] = equation.root * row[first + k]
     solve_factor_rows(factor, response)
     for q in range(total):
-        equation = write_block_row(evidence, still, q, row)
+        equation = write_row(evidence, still, q, row)
         along = 0.0
         for k in range(factor.shape[0]):
             moved.coefficients[k] = still.coefficients[k] + response[k, q]
             along += equation.root * row[first + k] * response[k, q]
-        write_block_row(evidence, moved, q, moved_row)
+        write_row(evidence, moved, q, moved_row)
         # A weight of a loss falls where the residual grows.
         fall = along * equation.fall * equation.root * equation.residual
         for k in range(row.shape[0]):
@@ -272,7 +269,7 @@ def _left_of_displacements(spread: FloatArray, rows: FloatArray, columns: IntArr
 
 
 @borrowing
-def _write_rows(
+def _write_point_rows(
     evidence: Evidence,
     state: State,
     equations: JointEquations,

@@ -14,7 +14,7 @@ coefficients. Displacements are eliminated.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -142,16 +142,41 @@ class ScalePriors(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """Everything that is known about one object."""
+    """Everything that is known about one object.
+
+    The ``blocks`` are tables of evidence beside sightings, one of a kind, those of directions,
+    offsets and image depths first; `cadalign.solvers.joint.blocks` says what a block is.
+    """
 
     shape: Shape
     sightings: Sightings
     rig: Rig
     focals: Focals
-    directions: Directions
-    offsets: Offsets
-    image_depths: ImageDepths
     scales: ScalePriors
+    blocks: tuple[Any, ...]
+
+    @property
+    def directions(self) -> Directions:
+        """Known directions."""
+        return cast(Directions, self.blocks[0])
+
+    @property
+    def offsets(self) -> Offsets:
+        """Known distances."""
+        return cast(Offsets, self.blocks[1])
+
+    @property
+    def image_depths(self) -> ImageDepths:
+        """Depths by depth images."""
+        return cast(ImageDepths, self.blocks[2])
+
+    def with_block(self, block: Any) -> Evidence:
+        """The evidence with a block in the place of that of its kind, or as one more."""
+        kinds = [type(each) for each in self.blocks]
+        if type(block) not in kinds:
+            return self._replace(blocks=(*self.blocks, block))
+        place = kinds.index(type(block))
+        return self._replace(blocks=(*self.blocks[:place], block, *self.blocks[place + 1 :]))
 
 
 class State(NamedTuple):

@@ -1,36 +1,24 @@
-"""Residuals of all evidence and their derivatives, which the normal equations are made of.
-
-Sightings write rows of one pose. Directions, offsets and depths are equations about one pose and
-the border: a row (6 + b,) of derivatives by the pose, the log focals, the log scales and the
-coefficients, and a residual, which is linear in the coefficients. Displacements don't count.
-"""
+"""Residuals of sightings, with their derivatives, and priors; the parts of normal equations."""
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import borrowing, inlined, kernel
-from cadalign.solvers.constants import CAUCHY
+from cadalign.compile import borrowing, kernel
 from cadalign.solvers.evidence import beyond, fall_of_weight, loss_and_root, weigh_error
 from cadalign.solvers.joint.arrow import Arrow, add_rows, border_start
+from cadalign.solvers.joint.blocks import count_equations, write_row
 from cadalign.solvers.joint.evidence import (
-    DEPTH_LOSS_SCALE,
-    Directions,
     Evidence,
     Focals,
-    Rig,
     ScalePriors,
-    Shape,
     State,
     exp_of,
     stretched_point,
     undisplaced,
-    unstretched,
 )
-from cadalign.solvers.linalg import cross, dot, triple
+from cadalign.solvers.linalg import triple
 from cadalign.solvers.projection import ray_slopes, see, shift, turn, turn_back, write_motion
 
 
@@ -123,8 +111,8 @@ def add_blocks(evidence: Evidence, state: State, arrow: Arrow, products: FloatAr
     cost = _add_priors(evidence.focals, evidence.scales, state, arrow)
     column = np.empty(products.shape[0])
     row, rows, still = column[:-1], column.reshape((-1, 1)), undisplaced(state)
-    for q in range(count_block_equations(evidence)):
-        equation = write_block_row(evidence, still, q, row)
+    for q in range(count_equations(evidence)):
+        equation = write_row(evidence, still, q, row)
         cost += equation.cost
         row *= equation.root
         column[-1] = equation.root * equation.residual
@@ -178,124 +166,3 @@ def _add_priors(focals: Focals, scales: ScalePriors, state: State, arrow: Arrow)
         gradient[first + 3 + k] += value
         border[first + 3 + k, first + 3 + k] += 1.0
     return cost
-
-
-class BlockEquation(NamedTuple):
-    """An equation about one pose and the border: its whitened residual and the loss on that.
-
-    The loss gives the ``cost``, the ``root`` of the residual's weight, and `fall_of_weight`.
-    """
-
-    pose: int
-    residual: float
-    cost: float
-    root: float
-    fall: float
-
-
-@inlined
-def count_block_equations(evidence: Evidence) -> int:
-    """Number of the equations that `write_block_row` writes."""
-    directions, offsets, depths = evidence.directions, evidence.offsets, evidence.image_depths
-    return int(3 * directions.image.shape[0] + offsets.value.shape[0] + depths.value.shape[0])
-
-
-@kernel
-def write_block_row(evidence: Evidence, state: State, q: int, row: FloatArray) -> BlockEquation:
-    """Write derivatives (6 + b,) of the residual of direction, offset or depth number ``q``.
-
-    Directions come first, with three equations each. The state has no displacements.
-    """
-    row[:] = 0.0
-    offset = q - 3 * evidence.directions.image.shape[0]
-    depth = offset - evidence.offsets.value.shape[0]
-    if depth >= 0:
-        pose, residual = _write_depth(evidence, state, depth, row)
-        cost, root = loss_and_root(CAUCHY, DEPTH_LOSS_SCALE, residual * residual)
-        weighted = root * root * residual * residual
-        fall = fall_of_weight(CAUCHY, DEPTH_LOSS_SCALE, root, weighted)
-        return BlockEquation(pose, residual, cost, root, fall)
-    if offset >= 0:
-        pose, residual = _write_offset(evidence, state, offset, row)
-    else:
-        rig, poses = evidence.rig, state.poses
-        pose, residual = _write_direction(evidence.directions, rig, poses, q // 3, q % 3, row)
-    return BlockEquation(pose, residual, residual * residual, 1.0, 0.0)
-
-
-@inlined
-def _write_direction(
-    directions: Directions, rig: Rig, poses: FloatArray, d: int, w: int, row: FloatArray
-) -> tuple[int, float]:
-    """Write equation w of a direction known in a camera, such as gravity; pose and residual.
-
-    The residual is the whitened difference of two unit vectors: its length is 2 sin(angle / 2).
-    """
-    v = directions.image[d]
-    camera, pose = rig.cam_from_rig[v], poses[rig.pose[v]]
-    rotated = turn(pose, triple(directions.model[d]))
-    (x, y, z), known = turn(camera, rotated), directions.camera[d]
-    whitening = triple(directions.whitening[d, w])
-    row[0], row[1], row[2] = cross(rotated, turn_back(camera, whitening))
-    return rig.pose[v], dot(whitening, (x - known[0], y - known[1], z - known[2]))
-
-
-@inlined
-def _write_offset(evidence: Evidence, state: State, j: int, row: FloatArray) -> tuple[int, float]:
-    """Write the equation of a known distance along a direction of the model; pose and residual.
-
-    A camera's place in the model's frame is ``-R' q``, with the pose (R, t), the camera's (C, c) in
-    the rig and ``q = t + C' c``: along the direction d it is ``-(R d) . q``.
-    """
-    offsets, rig = evidence.offsets, evidence.rig
-    v, weight = offsets.image[j], offsets.weight[j]
-    p = 0 if v < 0 else rig.pose[v]
-    value = -offsets.value[j]
-    for end in range(2):
-        sign = 2.0 * end - 1.0
-        i = offsets.ends[j, end]
-        if i < 0:
-            camera, pose = rig.cam_from_rig[v], state.poses[p]
-            turned = turn(pose, triple(offsets.direction[j]))
-            q = shift(pose, turn_back(camera, triple(camera[9:])))
-            value -= sign * dot(turned, q)
-            by_turn = cross(turned, q)
-            for r in range(3):
-                row[r] = -sign * weight * by_turn[r]
-                row[3 + r] = -sign * weight * turned[r]
-            continue
-        for a in range(3):
-            along = sign * offsets.direction[j, a]
-            if along != 0.0:
-                stretched = np.exp(state.log_scales[a]) * unstretched(evidence.shape, state, i, a)
-                value += along * stretched
-                _add_shape(evidence.shape, state, i, a, weight * along, row)
-    return p, value * weight
-
-
-@inlined
-def _write_depth(evidence: Evidence, state: State, j: int, row: FloatArray) -> tuple[int, float]:
-    """Write the equation of a point's depth in a view; pose and residual."""
-    depths, rig = evidence.image_depths, evidence.rig
-    scale = exp_of(state.log_scales)
-    v, i, weight = depths.image[j], depths.point[j], depths.weight[j]
-    camera, pose = rig.cam_from_rig[v], state.poses[rig.pose[v]]
-    rotated = turn(pose, stretched_point(evidence.shape, state, scale, i))
-    _, _, depth = shift(camera, turn(camera, shift(pose, rotated)))
-    by_rig = turn_back(camera, (0.0, 0.0, weight))
-    by_turn, by_model = cross(rotated, by_rig), turn_back(pose, by_rig)
-    for k in range(3):
-        row[k], row[3 + k] = by_turn[k], by_rig[k]
-        _add_shape(evidence.shape, state, i, k, by_model[k], row)
-    return rig.pose[v], (depth - depths.value[j]) * weight
-
-
-@inlined
-def _add_shape(shape: Shape, state: State, i: int, a: int, slope: float, row: FloatArray) -> None:
-    """Add the derivatives by scale and modes of ``slope`` times coordinate a of point i."""
-    modes = shape.modes.shape[0]
-    first = row.shape[0] - modes - 3
-    scale = slope * np.exp(state.log_scales[a])
-    row[first + a] += scale * unstretched(shape, state, i, a)
-    for k in range(modes):
-        row[first + 3 + k] += scale * shape.modes[k, i, a]

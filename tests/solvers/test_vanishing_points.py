@@ -1,0 +1,159 @@
+"""A kind of evidence in one module: the vanishing point of a direction of the model.
+
+It is an example of a block; a line gives it to the evidence.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.compile import kernel
+from cadalign.solvers.constants import ScalePrior
+from cadalign.solvers.joint.blocks import (
+    BlockEquation,
+    equations_of,
+    plain_equation,
+    write_equation,
+)
+from cadalign.solvers.joint.evidence import (
+    Directions,
+    Evidence,
+    Focals,
+    ImageDepths,
+    Offsets,
+    Rig,
+    ScalePriors,
+    Shape,
+    Sightings,
+    State,
+)
+from cadalign.solvers.joint.search import equations_at, packed, refine_joint
+from cadalign.solvers.linalg import cross, triple
+from cadalign.solvers.projection import turn, turn_back
+
+
+class VanishingPoints(NamedTuple):
+    """Directions ``model`` (D, 3) that vanish at ``rays`` (D, 2) of views ``image`` (D,).
+
+    ``weight`` (D,) is the inverse standard deviation of the rays, which are those of the cameras'
+    own focal lengths.
+    """
+
+    model: FloatArray
+    rays: FloatArray
+    image: IntArray
+    weight: FloatArray
+
+
+@equations_of.of(VanishingPoints)
+@kernel
+def _two_each(points: VanishingPoints) -> int:
+    return 2 * points.image.shape[0]
+
+
+@write_equation.of(VanishingPoints)
+@kernel
+def _write_vanishing_point(
+    points: VanishingPoints, evidence: Evidence, state: State, q: int, row: FloatArray
+) -> BlockEquation:
+    """Write the equation ``f d_x / d_z = u`` of the direction d in the camera; v is the other."""
+    n, axis = q // 2, q % 2
+    v, weight = points.image[n], points.weight[n]
+    camera, pose = evidence.rig.cam_from_rig[v], state.poses[evidence.rig.pose[v]]
+    rotated = turn(pose, triple(points.model[n]))
+    seen = turn(camera, rotated)
+    group = evidence.focals.group[v]
+    ratio = np.exp(state.log_focals[group]) if group >= 0 else 1.0
+    place = ratio * seen[axis] / seen[2]
+    by_seen = ratio * weight / seen[2]
+    slopes = (
+        by_seen if axis == 0 else 0.0,
+        by_seen if axis == 1 else 0.0,
+        -place * weight / seen[2],
+    )
+    row[0], row[1], row[2] = cross(rotated, turn_back(camera, slopes))
+    if group >= 0:
+        row[6 + group] = weight * place
+    return plain_equation(evidence.rig.pose[v], weight * (place - points.rays[n, axis]))
+
+
+NONE, NO_VALUE = np.empty(0, dtype=np.int64), np.empty(0)
+UP = np.array([0.0, 1.0, 0.0])
+FOCAL = 1.3  # over that of the rays
+POSE = np.append(Rotation.from_rotvec([0.7, 0.3, 0.2]).as_matrix(), [0.1, 0.2, 9.0])
+
+
+def evidence_of_one_view() -> Evidence:
+    """Keypoints of a small object, whose distance hides the focal length, in a view."""
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 3))
+    seen = points @ POSE[:9].reshape(3, 3).T + POSE[9:]
+    rays = FOCAL * seen[:, :2] / seen[:, 2:]
+    count = len(points)
+    sightings = Sightings(
+        np.arange(count),
+        np.zeros(count, dtype=np.int64),
+        rays + np.random.default_rng(1).normal(0, 1e-3, rays.shape),
+        np.tile([1000.0, 0.0, 1000.0], (count, 1)),
+        np.zeros((count, 2)),
+        np.zeros(count, dtype=np.int64),
+        np.ones(count),
+        np.zeros((count, 2)),
+    )
+    blocks = (
+        Directions(np.empty((0, 3)), np.empty((0, 3)), NONE, np.empty((0, 3, 3))),
+        Offsets(NONE.reshape(0, 2), NONE, np.empty((0, 3)), NO_VALUE, NO_VALUE),
+        ImageDepths(NONE, NONE, NO_VALUE, NO_VALUE),
+    )
+    return Evidence(
+        Shape(points, np.empty((0, count, 3)), np.zeros(count)),
+        sightings,
+        Rig(np.append(np.eye(3), np.zeros(3))[None], np.zeros(1, dtype=np.int64)),
+        Focals(np.zeros(1, dtype=np.int64), -np.ones(1), np.ones(1), np.zeros(1), np.zeros(1)),
+        ScalePriors(np.zeros(3), np.zeros((3, 3)), ScalePrior(0.0, 0.0)),
+        blocks,
+    )
+
+
+def with_vanishing_point(evidence: Evidence) -> Evidence:
+    """The evidence with the place at which the object's up axis vanishes."""
+    x, y, z = POSE[:9].reshape(3, 3) @ UP
+    rays = FOCAL * np.array([[x / z, y / z]])
+    image, weight = np.zeros(1, dtype=np.int64), np.array([500.0])
+    return evidence.with_block(VanishingPoints(UP[None], rays, image, weight))
+
+
+def state_at(turn_by: FloatArray, log_focal: float) -> State:
+    """A state beside the true one."""
+    rotation = Rotation.from_rotvec(turn_by).as_matrix() @ POSE[:9].reshape(3, 3)
+    poses = np.append(rotation, POSE[9:])[None]
+    none = np.empty(0)
+    return State(poses, np.array([log_focal]), np.zeros(3), none, np.zeros((8, 3)))
+
+
+def test_the_gradient_of_an_own_block_is_that_of_finite_differences() -> None:
+    evidence, step = with_vanishing_point(evidence_of_one_view()), 1e-6
+    place = np.array([0.02, -0.03, 0.01])
+    gradient = equations_at(evidence, packed(state_at(place, 0.2)))[1].gradient
+    turned = Rotation.from_rotvec(place)
+    for axis, by in enumerate(np.eye(3) * step):
+        ends = [(Rotation.from_rotvec(s * by) * turned).as_rotvec() for s in (-1, 1)]
+        before, after = (equations_at(evidence, packed(state_at(e, 0.2)))[0] for e in ends)
+        np.testing.assert_allclose(gradient[axis], (after - before) / (4 * step), rtol=1e-5)
+    before, after = (
+        equations_at(evidence, packed(state_at(place, 0.2 + s * step)))[0] for s in (-1, 1)
+    )
+    np.testing.assert_allclose(gradient[6], (after - before) / (4 * step), rtol=1e-5)
+
+
+def test_a_vanishing_point_tells_the_focal_length() -> None:
+    evidence, start = evidence_of_one_view(), state_at(np.array([0.02, -0.03, 0.01]), 0.1)
+    errors = []
+    for each in (evidence, with_vanishing_point(evidence)):
+        _, _, state = refine_joint(each, 100, start)
+        errors.append(abs(float(state.log_focals[0]) - np.log(FOCAL)))
+    assert errors[1] < 0.02
+    assert errors[1] < errors[0] / 5

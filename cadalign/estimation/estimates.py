@@ -158,11 +158,12 @@ def _placed_box(
     return bounds, np.where(bounds != linear, extreme, own)
 
 
-def widen_box(points: FloatArray, rows: IntArray) -> None:
-    """Let the box, last of points (m, 3), hold those that are seen, in place."""
-    seen = points[rows]
-    points[-2] = np.minimum(points[-2], seen.min(axis=0, initial=np.inf))
-    points[-1] = np.maximum(points[-1], seen.max(axis=0, initial=-np.inf))
+def widened_boxes(points: FloatArray, rows: IntArray) -> FloatArray:
+    """Points (..., m, 3), whose last two are a box, with one that holds those of ``rows``."""
+    widened, seen = points.copy(), points[..., rows, :]
+    widened[..., -2, :] = np.minimum(points[..., -2, :], seen.min(axis=-2, initial=np.inf))
+    widened[..., -1, :] = np.maximum(points[..., -1, :], seen.max(axis=-2, initial=-np.inf))
+    return widened
 
 
 def with_boxes(

@@ -24,7 +24,7 @@ from cadalign.estimation.estimates import (
     one_of_equals,
     pose_and_lengths,
     poses_of,
-    widen_box,
+    widened_boxes,
     with_box,
 )
 from cadalign.estimation.fitted import Alternative, FitStats
@@ -312,7 +312,7 @@ def _estimate(minimum: Minimum, likelihood: float, problem: Problem) -> Estimate
     stretched = points_of(evidence.shape, state)[rows]
     if len(evidence.shape.modes):  # a box whose corners were estimated holds what is seen
         sighted = np.unique(evidence.sightings.point)
-        widen_box(stretched, sighted[sighted < keypoints])
+        stretched = widened_boxes(stretched, sighted[sighted < keypoints])
     found, poses = joint_covariance(evidence, state), poses_of(evidence, state)
     cameras = minimum.lenses.cameras_at(state.log_focals)
     estimate = Estimate(

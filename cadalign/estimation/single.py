@@ -30,7 +30,7 @@ from cadalign.estimation.uncertainty.shape_posterior import (
     SeenShape,
     ShapeTails,
     keypoint_misfits,
-    single_posterior,
+    single_posteriors,
 )
 from cadalign.estimation.view import View
 from cadalign.estimation.warning import Warnings
@@ -112,23 +112,24 @@ def align_single(problem: Problem, start: float) -> Result:
     likelihoods = likelihoods[likelihoods >= LEAST_LIKELIHOOD]
     inflation = inflation_with(len(rows), model.inflation, model.few_keypoints)
     placed, chosen = with_boxes(mixture, seen, minima, len(likelihoods), model)
-    labels = chosen.label.tolist()
-    estimates = []
-    for k, likelihood in enumerate(likelihoods.tolist()):
-        each = single_posterior(placed, labels[k], seen, chosen.states[k], inflation)
-        estimates.append(
-            Estimate(
-                each.points,
-                np.ones(3),
-                (each.pose,),
-                each.lengths,
-                (each.covariance,),
-                each.of_points,
-                each.of_seen,
-                likelihood,
-                (view.camera,),
-            )
+    likely = slice(0, len(likelihoods))
+    posteriors = single_posteriors(
+        placed, chosen.label[likely], seen, chosen.states[likely], inflation
+    )
+    estimates = [
+        Estimate(
+            each.points,
+            np.ones(3),
+            (each.pose,),
+            each.lengths,
+            (each.covariance,),
+            each.of_points,
+            each.of_seen,
+            likelihood,
+            (view.camera,),
         )
+        for each, likelihood in zip(posteriors, likelihoods.tolist(), strict=True)
+    ]
     points = estimates[0].points[rows]
     in_camera = estimates[0].poses[0].apply(points)
     errors = in_camera[:, :2] / in_camera[:, 2:] - seen.rays

@@ -171,15 +171,16 @@ def rotation_starts(points: FloatArray, rays: FloatArray, poses: FloatArray) -> 
 def widen_by_shape(
     points: FloatArray, rays: FloatArray, variances: FloatArray, whitening: FloatArray
 ) -> FloatArray:
-    """Whitening (n, 3) of keypoints, widened by the shape's ``variances`` (n,) of each coordinate.
+    """Whitening (..., n, 3) of keypoints, widened by variances (..., n) of the shape's coordinates.
 
-    These are seen from the distance at which the mean ``points`` have the size of their image.
+    These are seen from the distance at which the mean ``points`` (..., n, 3) have the size of their
+    image.
     """
-    extent, size = points.var(axis=0).sum(), rays.var(axis=0).sum()
-    depth = max(np.sqrt(extent * 2.0 / 3.0 / max(size, 1e-30)), _LEAST_DEPTH)
+    extent, size = points.var(axis=-2).sum(axis=-1), rays.var(axis=0).sum()
+    depth = np.maximum(np.sqrt(extent * 2.0 / 3.0 / max(size, 1e-30)), _LEAST_DEPTH)[..., None]
     # The variances add up for a whitening (a, b, c) whose b is small beside a and c.
     information = np.square(whitening[:, ::2]).sum(axis=1) / 2.0
-    return np.asarray(whitening / np.sqrt(1.0 + variances / depth**2 * information)[:, None])
+    return np.asarray(whitening / np.sqrt(1.0 + variances / depth**2 * information)[..., None])
 
 
 @kernel

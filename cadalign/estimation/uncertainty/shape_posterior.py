@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError, quote
-from cadalign.estimation.estimates import widen_box
+from cadalign.estimation.estimates import widened_boxes
 from cadalign.estimation.options import LOSSES
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.problems import rays_of, whitening_of
@@ -266,11 +266,11 @@ def _predicted(seen: SeenShape, inflation: float) -> tuple[FloatArray, FloatArra
 
 
 def _block_diagonal(blocks: FloatArray) -> FloatArray:
-    """The matrix (2 n, 3 n) with blocks (n, 2, 3) along its diagonal."""
-    count = len(blocks)
-    rows = np.zeros((count, 2, count, 3))
-    rows[np.arange(count), :, np.arange(count)] = blocks
-    return rows.reshape(2 * count, 3 * count)
+    """The matrices (..., 2 n, 3 n) with blocks (..., n, 2, 3) along their diagonals."""
+    *several, count, _, _ = blocks.shape
+    rows = np.zeros((*several, count, 2, count, 3))
+    np.einsum("...iaib->...iab", rows)[:] = blocks
+    return rows.reshape(*several, 2 * count, 3 * count)
 
 
 class SinglePosterior(NamedTuple):
@@ -289,53 +289,73 @@ class SinglePosterior(NamedTuple):
     of_seen: FloatArray
 
 
-def single_posterior(
-    mixture: Mixture, component: int, seen: Seen, state: FloatArray, inflation: float
-) -> SinglePosterior:
-    """The posterior at a state, under a prior whose deviations are widened by a factor.
+def single_posteriors(
+    mixture: Mixture, components: IntArray, seen: Seen, states: FloatArray, inflation: float
+) -> list[SinglePosterior]:
+    """The posterior at each state (K, D) of a component (K,), all of them at once.
 
-    The box holds the keypoints that are seen. Covariances are infinite where the pose is not
-    determined.
+    The deviations of the prior are widened by the ``inflation``. The box holds the keypoints that
+    are seen. Covariances are infinite where the pose is not determined.
     """
-    rotation = state[:9].reshape(3, 3)
-    pose = Alignment(rotation, state[9:12], np.ones(3), is_valid=True)
-    points = shape_at(mixture, component, seen, state)
-    widened = points.copy()
-    widen_box(widened, seen.points)
-    lengths, count, m = widened[-1] - widened[-2], len(seen.points), len(points)
-    errors, by_pose = whitened_errors(points[seen.points], pose, seen.rays, seen.whitening)
-    weights, _ = loss_slopes((errors**2).sum(axis=1), seen.loss, seen.loss_scale)
-    by_pose *= np.sqrt(weights)[:, None, None]
-    rows, jacobian = _block_diagonal(by_pose[:, :, 3:] @ rotation), by_pose.reshape(2 * count, -1)
-    prior = inflation**2 * mixture.covariances[component]
+    size, count, m = len(states), len(seen.points), mixture.means.shape[1]
+    rotations = states[:, :9].reshape(-1, 3, 3)
+    poses = [
+        Alignment(row[:9].reshape(3, 3), row[9:12], np.ones(3), is_valid=True) for row in states
+    ]
+    given = zip(components.tolist(), states, strict=True)
+    points = np.array([shape_at(mixture, component, seen, state) for component, state in given])
+    boxes = widened_boxes(points, seen.points)
+    views = [
+        whitened_errors(each[seen.points], pose, seen.rays, seen.whitening)
+        for each, pose in zip(points, poses, strict=True)
+    ]
+    errors, by_pose = np.array([own for own, _ in views]), np.array([slopes for _, slopes in views])
+    weights, _ = loss_slopes((errors**2).sum(axis=-1), seen.loss, seen.loss_scale)
+    by_pose *= np.sqrt(weights)[..., None, None]
+    rows = _block_diagonal(by_pose[..., 3:] @ rotations[:, None])
+    jacobian = by_pose.reshape(size, 2 * count, _POSE)
+    prior = inflation**2 * mixture.covariances[components]
     columns = coordinates_of(seen)
-    told = prior[:, columns] @ rows.T  # covariance of the points with the residuals
-    blocks = prior.reshape(m, 3, m, 3)
+    told = prior[:, :, columns] @ rows.swapaxes(1, 2)  # covariance of points with residuals
     # Behind the points, the difference of the box's corners.
-    told = np.concatenate([told, told[-3:] - told[-6:-3]])
-    corners = blocks[-2:, :, -2:]
-    difference = corners[1, :, 1] + corners[0, :, 0] - corners[1, :, 0] - corners[0, :, 1]
-    own = np.concatenate([blocks[np.arange(m), :, np.arange(m)], difference[None]])
-    both = np.concatenate([told.T, jacobian], axis=1)
-    solved = np.linalg.solve(rows @ told[columns] + np.eye(2 * count), both).T
-    solved, weight = solved[:-_POSE], solved[-_POSE:]
-    by_steps = -solved @ jacobian
+    told = np.concatenate([told, told[:, -3:] - told[:, -6:-3]], axis=1)
+    blocks = prior.reshape(size, m, 3, m, 3)
+    corners = blocks[:, -2:, :, -2:]
+    across = corners[:, 1, :, 0]
+    difference = corners[:, 1, :, 1] + corners[:, 0, :, 0] - across - across.swapaxes(1, 2)
+    own = np.einsum("kiaib->kiab", blocks)
+    own = np.concatenate([own, difference[:, None]], axis=1)
+    both = np.concatenate([told.swapaxes(1, 2), jacobian], axis=2)
+    solved = np.linalg.solve(rows @ told[:, columns] + np.eye(2 * count), both).swapaxes(1, 2)
+    solved, weight = solved[:, :-_POSE], solved[:, -_POSE:]
     try:
         inverse = np.linalg.inv(np.linalg.cholesky(weight @ jacobian))
     except np.linalg.LinAlgError:
+        if size > 1:
+            each = [(components[k : k + 1], seen, states[k : k + 1]) for k in range(size)]
+            return [single_posteriors(mixture, *one, inflation)[0] for one in each]
         unknown = np.full((m, 3, 3), np.inf)
-        return SinglePosterior(pose, widened, lengths, np.full((9, 9), np.inf), unknown, unknown)
-    of_pose, by_steps = inverse.T @ inverse, by_steps.reshape(m + 1, 3, _POSE)
-    given = own - solved.reshape(m + 1, 3, -1) @ told.reshape(m + 1, 3, -1).swapaxes(1, 2)
-    whole = given + by_steps @ of_pose @ by_steps.swapaxes(1, 2)
-    in_camera = rotation @ by_steps[:m]
-    in_camera[:, :, :3] += by_rotation(points @ rotation.T)
-    in_camera[:, :, 3:] += np.eye(3)
-    of_seen = rotation @ given[:m] @ rotation.T
-    of_seen += in_camera @ of_pose @ in_camera.swapaxes(1, 2)
-    extent = points[-1] - points[-2]
+        infinite = np.full((9, 9), np.inf), unknown, unknown
+        return [SinglePosterior(poses[0], boxes[0], np.ptp(boxes[0, -2:], axis=0), *infinite)]
+    of_pose = inverse.swapaxes(1, 2) @ inverse
+    by_steps = (-solved @ jacobian).reshape(size, m + 1, 3, _POSE)
+    shape = size, m + 1, 3, 2 * count
+    left = own - solved.reshape(shape) @ told.reshape(shape).swapaxes(2, 3)
+    whole = left + by_steps @ of_pose[:, None] @ by_steps.swapaxes(2, 3)
+    turns = rotations[:, None]
+    in_camera = turns @ by_steps[:, :m]
+    in_camera[..., :3] += by_rotation(points @ rotations.swapaxes(1, 2))
+    in_camera[..., 3:] += np.eye(3)
+    of_seen = turns @ left[:, :m] @ turns.swapaxes(2, 3)
+    of_seen += in_camera @ of_pose[:, None] @ in_camera.swapaxes(2, 3)
+    extent = points[:, -1] - points[:, -2]
     relative = np.where(extent > 0, 1.0 / np.where(extent > 0, extent, 1.0), 0.0)
-    logs = np.vstack([np.eye(_POSE), relative[:, None] * by_steps[m]])
-    covariance = logs @ of_pose @ logs.T
-    covariance[_POSE:, _POSE:] += np.outer(relative, relative) * given[m]
-    return SinglePosterior(pose, widened, lengths, covariance, whole[:m], of_seen)
+    logs = np.concatenate(
+        [np.broadcast_to(np.eye(_POSE), of_pose.shape), relative[..., None] * by_steps[:, m]],
+        axis=1,
+    )
+    covariances = logs @ of_pose @ logs.swapaxes(1, 2)
+    covariances[:, _POSE:, _POSE:] += relative[:, :, None] * relative[:, None] * left[:, m]
+    lengths = boxes[:, -1] - boxes[:, -2]
+    found = poses, boxes, lengths, covariances, whole[:, :m], of_seen
+    return [SinglePosterior(*each) for each in zip(*found, strict=True)]

@@ -44,11 +44,8 @@ def search_view(mixture: Mixture, seen: Seen, given: FloatArray) -> tuple[Minima
     """
     own = mixture_at(mixture, seen)
     variances = own.covariances.diagonal(axis1=1, axis2=2).reshape(own.means.shape).mean(axis=2)
-    widened = [
-        widen_by_shape(mean, seen.rays, own_variances, seen.whitening)
-        for mean, own_variances in zip(own.means, variances, strict=True)
-    ]
-    return _search_mixture(own, seen, np.stack(widened), given)
+    widened = widen_by_shape(own.means, seen.rays, variances, seen.whitening)
+    return _search_mixture(own, seen, widened, given)
 
 
 @kernel

@@ -127,7 +127,10 @@ def fit_many(
         chosen = replace(options_of(options), inputs=_inputs(observations, folder))
         chosen = replace(chosen, pictures=_as_declared(pictures, ManyOptions, "pictures"))
         run_many(chosen, folder, workers=workers, dask=dask, on_progress=on_progress)
-        return Results.open(folder.path, in_memory=not is_kept)
+        results = Results.open(folder.path)
+        if not is_kept:
+            list(results)  # reads each, before the folder goes away
+        return results
 
 
 def stream_fits(

@@ -212,9 +212,9 @@ def _plain(value: Any) -> Any:
         return [row if np.isfinite(row).all() else None for row in rows]
     if kind is float:
         return value if math.isfinite(value) else None
-    if kind in (list, tuple):
+    if isinstance(value, list | tuple):
         return [_plain(each) for each in value]
-    if kind in (Alignment, Camera, Symmetry):
+    if isinstance(value, Alignment | Camera | Symmetry):
         return value.to_dict()
     if kind is FitOptions and value.sigma is not None:
         value = replace(value, sigma=np.asarray(value.sigma, dtype=float))

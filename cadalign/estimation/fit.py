@@ -6,26 +6,24 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, copied
 from cadalign.errors import CadalignError, InputError, NoConsensusError, require_kind
-from cadalign.estimation.assemble import keypoints_of_solution, result_of_keypoints
+from cadalign.estimation.assemble import SolvedBatch, keypoints_of_solution, result_of_keypoints
 from cadalign.estimation.fitted import FittedKeypoints
 from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.estimation.problems import Problems, each_of, in_threads, pack_many, pack_one
 from cadalign.estimation.result import Result
+from cadalign.estimation.results import Results
 from cadalign.estimation.solve import solve, solve_one
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
-
-if TYPE_CHECKING:
-    from cadalign.estimation.results import Results
 
 
 @np.errstate(all="ignore")  # what is not finite is refused
@@ -212,9 +210,6 @@ def fit_batch(
     >>> batch.scale.shape
     (2, 3)
     """
-    # Only here: one fit has no table.
-    from cadalign.estimation.results import Results, results_of_solutions
-
     per_problem = isinstance(sigma, list | tuple) or np.ndim(sigma) > 0  # type: ignore[arg-type]
     given: Any = 1.0 if per_problem else sigma
     shape, lens = (stretch, stretch_sigma, known_axis), (focal, focal_prior)
@@ -239,15 +234,8 @@ def fit_batch(
             solutions = solve(some, options, own)
             solutions = solutions._replace(errors=dict(solutions.errors))  # which can be pickled
             seconds = (time.perf_counter() - start) / max(len(some), 1)
-            return results_of_solutions(
-                some,
-                solutions,
-                options,
-                sigmas=own,
-                symmetry=symmetry,
-                diagnosis=_diagnosis,
-                seconds=seconds,
-            )
+            batch = SolvedBatch(some, solutions, options, own, symmetry, _diagnosis, seconds)
+            return batch.results()
         fits: list[Result | CadalignError] = []
         for b in range(first, last):
             start, one = time.perf_counter(), options

@@ -3,29 +3,29 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.errors import CadalignError, InputError
-from cadalign.estimation.assemble import keypoints_of_solution, result_of_keypoints
-from cadalign.estimation.fitted import Diagnosis
-from cadalign.estimation.options import FitOptions, Sigma
-from cadalign.estimation.problems import Problems, Solutions, full_covariances
+from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.estimation.result import Result
-from cadalign.estimation.symmetry import carried, held_axes
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.symmetry import Symmetry
-from cadalign.geometry.symmetry_group import group_of
+from cadalign.io.documents import in_file
 from cadalign.io.files import as_path
 from cadalign.solvers.constants import POSE_SIZE
 
 if TYPE_CHECKING:
     import pandas as pd
+
+TABLE, RECORDS = "results.parquet", "records.parquet"
+"""Files of a run's folder, see `cadalign.batch.outputs`."""
+_FIX = "give a folder that `cadalign fit` or `cadalign.fit_many` has written"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -38,10 +38,8 @@ class Results(Sequence[Result | CadalignError]):
 
     Parameters
     ----------
-    rotation : (B, 3, 3) float
-    translation : (B, 3) float
-        [model units]
-    scale : (B, 3) float
+    poses : (B, 15) float
+        ``rotation``, ``translation`` and ``scale`` in one array; see `Alignment.packed`.
     rms : (B,) float
         Root mean square length of the inliers' residuals [px].
     focal_length : (B,) float
@@ -65,9 +63,7 @@ class Results(Sequence[Result | CadalignError]):
         ``fisher_covariance`` only single results have.
     """
 
-    rotation: FloatArray
-    translation: FloatArray
-    scale: FloatArray
+    poses: FloatArray
     rms: FloatArray
     focal_length: FloatArray
     fisher_covariance: FloatArray | None
@@ -81,7 +77,7 @@ class Results(Sequence[Result | CadalignError]):
     _made: dict[int, Result] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        return len(self.rotation)
+        return len(self.poses)
 
     @overload
     def __getitem__(self, place: int) -> Result | CadalignError: ...
@@ -96,6 +92,21 @@ class Results(Sequence[Result | CadalignError]):
         if k not in self._made:
             self._made[k] = self.single(k)
         return self._made[k]
+
+    @property
+    def rotation(self) -> FloatArray:
+        """Rotations (B, 3, 3)."""
+        return self.poses[:, :9].reshape(-1, 3, 3)
+
+    @property
+    def translation(self) -> FloatArray:
+        """Translations (B, 3) [model units]."""
+        return self.poses[:, 9:12]
+
+    @property
+    def scale(self) -> FloatArray:
+        """Scales (B, 3)."""
+        return self.poses[:, 12:]
 
     @property
     def solved(self) -> BoolArray:
@@ -128,8 +139,7 @@ class Results(Sequence[Result | CadalignError]):
         """
         if problem in self.errors:
             raise self.errors[problem]
-        own = (array[problem].copy() for array in (self.rotation, self.translation, self.scale))
-        return Alignment(*own, is_valid=True)
+        return Alignment.from_packed(self.poses[problem].copy())
 
     def to_dataframe(self) -> pd.DataFrame:
         """One row for each view of each problem, as a pandas DataFrame.
@@ -153,15 +163,15 @@ class Results(Sequence[Result | CadalignError]):
         from scipy.spatial.transform import Rotation
 
         table, number, view = self._of_views()
-        vectors = np.full((len(table), 3), np.nan)
-        if table.solved.any():
-            turns = Rotation.from_matrix(table.rotation[table.solved])
-            vectors[table.solved] = turns.as_rotvec(degrees=True)
+        vectors, solved = np.full((len(table), 3), np.nan), table.solved
+        if solved.any():
+            turns = Rotation.from_matrix(table.rotation[solved])
+            vectors[solved] = turns.as_rotvec(degrees=True)
         kept = np.concatenate([[0], np.cumsum(table.inliers)])
         columns: dict[str, Any] = {
             "result": number,
             "view": view,
-            "solved": table.solved,
+            "solved": solved,
             "rms": table.rms,
             "keypoints": np.diff(table.offsets),
             "inliers": np.diff(kept[table.offsets]),
@@ -170,9 +180,7 @@ class Results(Sequence[Result | CadalignError]):
         for name, values in named.items():
             columns |= {f"{name}_{axis}": values[:, k] for k, axis in enumerate("xyz")}
         columns["focal_length"] = table.focal_length
-        columns["error"] = [
-            str(table.errors[row]) if row in table.errors else "" for row in range(len(table))
-        ]
+        columns["error"] = [str(table.errors.get(row, "")) for row in range(len(table))]
         return pd.DataFrame(columns)
 
     def _of_views(self) -> tuple[Results, Sequence[int], Sequence[int]]:
@@ -190,15 +198,13 @@ class Results(Sequence[Result | CadalignError]):
         return table, [k for k, _, _ in rows], [v for _, v, _ in rows]
 
     @classmethod
-    def open(cls, folder: str | os.PathLike[str], *, in_memory: bool = False) -> Results:
+    def open(cls, folder: str | os.PathLike[str]) -> Results:
         """Read the results of a run of `cadalign fit` or `cadalign.fit_many`.
 
         Parameters
         ----------
         folder : str or path-like
             The run's folder.
-        in_memory : bool
-            Read single results at once, not when they are asked for: for a folder that goes away.
 
         Returns
         -------
@@ -216,10 +222,8 @@ class Results(Sequence[Result | CadalignError]):
         >>> results[0].alignment, results.to_dataframe()  # doctest: +SKIP
         """
         path = as_path(folder, "folder")
-        from cadalign.estimation.results_file import StoredResults, read_arrays
-
-        arrays = read_arrays(path)
-        return cls(**arrays, single=StoredResults.open(path, in_memory=in_memory).single)
+        arrays = _read_arrays(path)
+        return cls(**arrays, single=_Stored(path / RECORDS).single)
 
     @classmethod
     def of(
@@ -251,26 +255,17 @@ class Results(Sequence[Result | CadalignError]):
             information = each.fisher_covariance
             if information is not None and len(information) == unknowns:
                 covariance[k] = information
-        return cls(
-            *_split(poses),
-            rms=rms,
-            focal_length=focals,
-            fisher_covariance=covariance,
-            residuals=residuals,
-            inliers=inliers,
-            offsets=offsets,
-            errors=errors,
-            single=found.__getitem__,
-            is_single=all(len(each.views) == 1 for each in found.values()),
-        )
+        is_single = all(len(each.views) == 1 for each in found.values())
+        arrays = poses, rms, focals, covariance, residuals, inliers, offsets
+        return cls(*arrays, errors, found.__getitem__, is_single)
 
     @classmethod
     def joined(cls, parts: Sequence[Results]) -> Results:
         """Put the results of successive parts of a batch together."""
         if len(parts) == 1:
             return parts[0]
-        names = "rotation translation scale rms focal_length fisher_covariance residuals inliers"
-        columns = {name: [getattr(part, name) for part in parts] for name in names.split()}
+        names = ("poses", "rms", "focal_length", "fisher_covariance", "residuals", "inliers")
+        columns = {name: [getattr(part, name) for part in parts] for name in names}
         arrays: dict[str, Any] = {
             name: None if each[0] is None else np.concatenate(each)
             for name, each in columns.items()
@@ -284,81 +279,6 @@ class Results(Sequence[Result | CadalignError]):
             single=partial(_single, places),
             is_single=all(part.is_single for part in parts),
         )
-
-
-def results_of_solutions(
-    problems: Problems,
-    solutions: Solutions,
-    options: FitOptions,
-    *,
-    sigmas: Sequence[Sigma] | None,
-    symmetry: Symmetry | None,
-    diagnosis: Diagnosis,
-    seconds: float,
-) -> Results:
-    """Arrange the solutions of a batch; single results are made one at a time.
-
-    ``sigmas``, one for each problem, take the place of the options' sigma; ``seconds`` is the time
-    of one problem.
-    """
-    failed = np.zeros(len(problems), dtype=bool)
-    failed[list(solutions.errors)] = True
-    focals = np.broadcast_to(problems.calibrations[:, 0], len(problems))
-    poses, residuals = solutions.poses[:, 0].copy(), solutions.residuals
-    covariance = None
-    if solutions.covariances is not None:
-        covariance = full_covariances(solutions.covariances, options.known_axis)
-    inliers = np.repeat(~failed, problems.counts)
-    if failed.any():
-        poses = np.where(failed[:, None], np.nan, poses)
-        residuals = np.where(inliers[:, None], residuals, np.nan)
-        if covariance is not None:
-            covariance[failed] = np.nan
-    if symmetry is not None and not (group := group_of(symmetry)).is_trivial:
-        held = held_axes(options.stretched_axes)
-        for b in np.flatnonzero(~failed).tolist():
-            given = Alignment.from_packed(poses[b].copy())
-            best = group.canonical(given, held=held)
-            poses[b] = best.alignment.packed
-            if covariance is not None:
-                covariance[b] = carried(covariance[b], given, best, held)
-    squares = np.append((residuals**2).sum(axis=1), 0.0)
-    means = np.add.reduceat(squares, problems.offsets[:-1]) / np.maximum(problems.counts, 1)
-    return Results(
-        *_split(poses),
-        rms=np.where(failed, np.nan, np.sqrt(means)),
-        focal_length=np.where(failed, np.nan, focals),
-        fisher_covariance=covariance,
-        residuals=residuals,
-        inliers=inliers,
-        offsets=problems.offsets,
-        errors=dict(solutions.errors),
-        single=partial(_solved, problems, solutions, options, sigmas, symmetry, diagnosis, seconds),
-    )
-
-
-def _solved(
-    problems: Problems,
-    solutions: Solutions,
-    options: FitOptions,
-    sigmas: Sequence[Sigma] | None,
-    symmetry: Symmetry | None,
-    diagnosis: Diagnosis,
-    seconds: float,
-    b: int,
-) -> Result:
-    """The result of one problem of a batch, as `cadalign.fit` gives it."""
-    of_problem: dict[str, Any] = {
-        name: None if value is None else value[b : b + 1].copy()
-        for name, value in solutions._asdict().items()
-        if name not in ("residuals", "errors")
-    }
-    own = Solutions(**of_problem, residuals=solutions.residuals[problems.rows(b)].copy())
-    if sigmas is not None:
-        options = replace(options, sigma=sigmas[b])
-    some = problems.part(b, b + 1)
-    fitted = keypoints_of_solution(some, own, options, seconds)
-    return result_of_keypoints(some.points_2d, fitted, diagnosis=diagnosis, symmetry=symmetry)
 
 
 def to_dataframe(
@@ -412,6 +332,96 @@ def _single(places: Sequence[tuple[Results, int]], k: int) -> Result:
     return part.single(b)
 
 
-def _split(poses: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Rotations, translations and scales of packed poses (B, 15)."""
-    return poses[:, :9].reshape(-1, 3, 3), poses[:, 9:12], poses[:, 12:]
+class _Stored:
+    """Single results of a run, read when they are asked for; one row group of the file is kept."""
+
+    def __init__(self, path: Path) -> None:
+        import pyarrow.parquet as pq
+
+        with _reading(path):
+            found = pq.read_metadata(path)
+        sizes = [found.row_group(k).num_rows for k in range(found.num_row_groups)]
+        self.path, self.starts = path, np.cumsum([0, *sizes]).tolist()
+        self.number, self.group = -1, dict[str, Any]()
+
+    def single(self, row: int) -> Result:
+        """The result of an observation that has one."""
+        import pyarrow.parquet as pq
+
+        number = int(np.searchsorted(self.starts, row, side="right")) - 1
+        if number != self.number:
+            with _reading(self.path), pq.ParquetFile(self.path) as file:
+                self.group, self.number = file.read_row_group(number, use_threads=False), number
+        with in_file(f"{self.path}, row {row}"):
+            return Result.from_json(self.group["result"][row - self.starts[number]].as_py())
+
+
+def _read_arrays(folder: Path) -> dict[str, Any]:
+    """The arguments of `Results` for a run's folder, without ``single``."""
+    import pyarrow.parquet as pq
+    from scipy.spatial.transform import Rotation
+
+    path = folder / TABLE
+    if not path.is_file():
+        is_run = (folder / "run.json").is_file()
+        what = "the run is not finished" if is_run else "not the folder of a run of fits"
+        fix = "start the command that made it again: it goes on" if is_run else _FIX
+        raise DataError(what, where=str(folder), fix=fix)
+    with _reading(path):
+        table = pq.read_table(path, use_threads=False)
+    missing = {"status", "reason", "qw", "residuals", "covariance"} - set(table.column_names)
+    if missing:
+        what = f"not the table of a run of fits: there is no column {min(missing)!r}"
+        raise DataError(what, where=str(path), fix=_FIX)
+
+    def numbers(*names: str) -> FloatArray:
+        return np.column_stack([table[name].to_numpy().astype(float) for name in names])
+
+    solved = np.array([status == "ok" for status in table["status"].to_pylist()], dtype=bool)
+    reasons = table["reason"].to_pylist()
+    poses = np.full((len(table), POSE_SIZE), np.nan)
+    poses[:, 9:] = numbers("tx", "ty", "tz", "scale_x", "scale_y", "scale_z")
+    if solved.any():
+        rotations = Rotation.from_quat(numbers("qx", "qy", "qz", "qw")[solved])
+        poses[solved, :9] = rotations.as_matrix().reshape(-1, 9)
+    flat, inliers = (
+        table[name].combine_chunks().flatten().to_numpy(zero_copy_only=False)
+        for name in ("residuals", "is_inlier")
+    )
+    counts = np.where(solved, numbers("keypoints")[:, 0], 0).astype(np.int64)
+    return {
+        "poses": poses,
+        "rms": numbers("rms_px")[:, 0],
+        "focal_length": numbers("focal_length")[:, 0],
+        "fisher_covariance": None,
+        "stated_covariance": _covariances(table["covariance"].to_pylist()),
+        "residuals": flat.astype(np.float64).reshape(-1, 2),
+        "inliers": inliers.astype(bool),
+        "offsets": np.concatenate([[0], np.cumsum(counts)]),
+        "errors": {row: DataError(reasons[row]) for row in np.flatnonzero(~solved).tolist()},
+        "is_single": not (numbers("views") > 1).any(),
+    }
+
+
+def _covariances(cells: Sequence[list[float] | None]) -> FloatArray | None:
+    """Covariances (B, 9, 9) or (B, 10, 10); None where no method is statistical."""
+    width = int(np.sqrt(max((len(each) for each in cells if each), default=0)))
+    found = np.full((len(cells), width, width), np.nan)
+    for row, values in enumerate(cells):
+        if values:
+            own = int(np.sqrt(len(values)))
+            found[row, :own, :own] = np.reshape(values, (own, own))
+    return found if width else None
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Convert the errors of a Parquet file that cannot be read."""
+    import pyarrow as pa
+
+    try:
+        yield
+    except (OSError, UnicodeError, pa.ArrowException) as error:
+        reason = " ".join(str(error).split())[:200]
+        what = f"not a table that can be read ({reason})"
+        raise DataError(what, where=str(path), fix=_FIX) from None

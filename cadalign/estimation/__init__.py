@@ -10,7 +10,7 @@ from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
     from cadalign.estimation.align import align_batch
-    from cadalign.estimation.fit import fit_batch
+    from cadalign.estimation.fit_batches import fit_batch
     from cadalign.estimation.fitted import Alternative, FitStats
     from cadalign.estimation.focal import FocalPrior
     from cadalign.estimation.model import Model

@@ -1,21 +1,19 @@
-"""From solutions of an exact or stretched model's keypoints in one view to their results."""
+"""From the solution of an exact or stretched model's keypoints in one view to their result."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.estimation.fitted import Alternative, Diagnosis, FitStats, FittedKeypoints, quickly
-from cadalign.estimation.options import FitOptions, Sigma
-from cadalign.estimation.problems import Problems, Solutions, full_covariances
+from cadalign.estimation.options import FitOptions
+from cadalign.estimation.problems import Problems, Solutions
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Posterior, ViewResult
-from cadalign.estimation.results import Results
 from cadalign.estimation.solve import LEAST_LIKELIHOOD, camera_of, fitted_fields
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.symmetry import Symmetry
@@ -101,67 +99,6 @@ def result_of_keypoints(
         "own_bounds": bounds,
     }
     return quickly(Result, of_result)
-
-
-@dataclass(frozen=True, eq=False)
-class SolvedBatch:
-    """Problems of a batch that were solved at once.
-
-    ``sigmas``, one for each problem, take the place of the options' sigma; ``seconds`` is the time
-    of one problem.
-    """
-
-    problems: Problems
-    solutions: Solutions
-    options: FitOptions
-    sigmas: Sequence[Sigma] | None
-    symmetry: Symmetry | None
-    diagnosis: Diagnosis
-    seconds: float
-
-    def single(self, b: int) -> Result:
-        """The result of one problem that has a solution, as `cadalign.fit` gives it."""
-        own: dict[str, Any] = {
-            name: None if value is None else value[b : b + 1].copy()
-            for name, value in self.solutions._asdict().items()
-            if name not in ("residuals", "errors")
-        }
-        own["residuals"] = self.solutions.residuals[self.problems.rows(b)].copy()
-        options, some = self.options, self.problems.part(b, b + 1)
-        if self.sigmas is not None:
-            options = replace(options, sigma=self.sigmas[b])
-        fitted = keypoints_of_solution(some, Solutions(**own), options, self.seconds)
-        of_result = {"diagnosis": self.diagnosis, "symmetry": self.symmetry}
-        return result_of_keypoints(some.points_2d, fitted, **of_result)  # type: ignore[arg-type]
-
-    def results(self) -> Results:
-        """The results of all problems, which are made one at a time."""
-        problems, errors = self.problems, dict(self.solutions.errors)
-        if self.symmetry is not None:
-            every = range(len(problems))
-            found = [errors[b] if b in errors else self.single(b) for b in every]
-            return Results.of(found, counts=problems.counts)
-        failed = np.zeros(len(problems), dtype=bool)
-        failed[list(errors)] = True
-        inliers = np.repeat(~failed, problems.counts)
-        residuals = np.where(inliers[:, None], self.solutions.residuals, np.nan)
-        squares = np.append((residuals**2).sum(axis=1), 0.0)
-        means = np.add.reduceat(squares, problems.offsets[:-1]) / np.maximum(problems.counts, 1)
-        covariance = self.solutions.covariances
-        if covariance is not None:
-            covariance = full_covariances(covariance, self.options.known_axis)
-            covariance[failed] = np.nan
-        return Results(
-            poses=np.where(failed[:, None], np.nan, self.solutions.poses[:, 0]),
-            rms=np.where(failed, np.nan, np.sqrt(means)),
-            focal_length=np.where(failed, np.nan, problems.calibrations[:, 0]),
-            fisher_covariance=covariance,
-            residuals=residuals,
-            inliers=inliers,
-            offsets=problems.offsets,
-            errors=errors,
-            single=self.single,
-        )
 
 
 def _alternatives(

@@ -1,26 +1,23 @@
-"""`fit` and `fit_batch`: from keypoints on models and in images to the models' alignments."""
+"""`fit`: from keypoints on a model and in an image to the model's alignment."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, copied
-from cadalign.errors import CadalignError, InputError, NoConsensusError, require_kind
-from cadalign.estimation.assemble import SolvedBatch, keypoints_of_solution, result_of_keypoints
+from cadalign.arrays import copied
+from cadalign.errors import InputError, NoConsensusError, require_kind
+from cadalign.estimation.assemble import keypoints_of_solution, result_of_keypoints
 from cadalign.estimation.fitted import FittedKeypoints
 from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
-from cadalign.estimation.problems import Problems, each_of, in_threads, pack_many, pack_one
+from cadalign.estimation.problems import Problems, pack_one
 from cadalign.estimation.result import Result
-from cadalign.estimation.results import Results
-from cadalign.estimation.solve import solve, solve_one
+from cadalign.estimation.solve import solve_one
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
@@ -140,120 +137,12 @@ def fit(
     except (TypeError, ValueError):  # an array as sigma has no hash
         options = FitOptions(method, copied(sigma), *chosen[2:])
     problems = pack_one(points_3d, points_2d, camera)
-    _check(ransac, scores, symmetry)
-    return _fit_one(problems, options, ransac, scores, symmetry, start)
+    check_search(ransac, scores, symmetry)
+    return fit_one(problems, options, ransac, scores, symmetry, start)
 
 
 @np.errstate(all="ignore")
-def fit_batch(
-    points_3d: Sequence[npt.ArrayLike] | FloatArray,
-    points_2d: Sequence[npt.ArrayLike] | FloatArray,
-    camera: Camera | Sequence[Camera],
-    *,
-    method: str = FitOptions.method,
-    sigma: Sigma | Sequence[Sigma] | None = FitOptions.sigma,
-    loss: str = FitOptions.loss,
-    loss_scale: float = FitOptions.loss_scale,
-    stretch: str | None = FitOptions.stretch,
-    stretch_sigma: float | None = FitOptions.stretch_sigma,
-    known_axis: str = FitOptions.known_axis,
-    focal: str = FitOptions.focal,
-    focal_prior: PriorOption = FitOptions.focal_prior,
-    ransac: RansacOptions | None = None,
-    scores: Sequence[npt.ArrayLike] | None = None,
-    symmetry: Symmetry | None = None,
-    workers: int = 1,
-) -> Results:
-    """Solve many independent problems in one call; each as `fit` does, bit for bit.
-
-    Parameters
-    ----------
-    points_3d : (B, n, 3) float or sequence of B (n_b, 3) float
-        Model points of every problem.
-    points_2d : (B, n, 2) float or sequence of B (n_b, 2) float
-        Image points of every problem [px].
-    camera : Camera or sequence of B Camera
-        One for all problems, or one each.
-    sigma : float, None, or sequence of B
-        As for `fit`, for all problems; a sequence gives each problem its own.
-    method, loss, loss_scale, stretch, stretch_sigma, known_axis, focal, focal_prior
-        As for `fit`; every problem has a focal length of its own.
-    ransac
-        As for `fit`.
-    scores : sequence of B (n_b,) float, optional
-        As for `fit`, for each problem.
-    symmetry : Symmetry, optional
-        As for `fit`, of all models.
-    workers : int
-        Number of threads that share the problems; -1 for all cores.
-
-    Returns
-    -------
-    Results
-        Arrays over the problems, and a sequence of their `Result`; a problem without solution has
-        its error there, and does not stop the others.
-
-    Raises
-    ------
-    InputError
-        If the arguments of any problem, or an option, are invalid.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from cadalign.evaluation.simulation import simulate_problem
-    >>> rng = np.random.default_rng(1)
-    >>> problems = [simulate_problem(rng, points=n, noise_px=1.0) for n in (8, 20)]
-    >>> batch = fit_batch(
-    ...     [p.points_3d for p in problems], [p.points_2d for p in problems], problems[0].camera
-    ... )
-    >>> batch.scale.shape
-    (2, 3)
-    """
-    per_problem = isinstance(sigma, list | tuple) or np.ndim(sigma) > 0  # type: ignore[arg-type]
-    given: Any = 1.0 if per_problem else sigma
-    shape, lens = (stretch, stretch_sigma, known_axis), (focal, focal_prior)
-    options = FitOptions(method, given, loss, loss_scale, *shape, *lens)
-    problems = pack_many(points_3d, points_2d, camera)
-    sigmas: Sequence[Sigma] | None = None
-    if per_problem:
-        sigmas = list(map(copied, each_of(sigma, "sigma", len(problems), "values")))
-    _check(ransac, scores, symmetry)
-    if scores is not None:
-        scores = each_of(scores, "scores", len(problems), "sets")
-    if len({(each.width, each.height) for each in problems.cameras}) == 1:
-        options = options.for_camera(problems.cameras[0])
-    is_solved_at_once = ransac is None and options.focal == "known"
-    is_solved_at_once &= not options.estimates_in_rounds
-
-    @np.errstate(all="ignore")  # holds for one thread only
-    def run(first: int, last: int) -> Results:
-        some, start = problems.part(first, last), time.perf_counter()
-        own = None if sigmas is None else sigmas[first:last]
-        if is_solved_at_once:
-            solutions = solve(some, options, own)
-            solutions = solutions._replace(errors=dict(solutions.errors))  # which can be pickled
-            seconds = (time.perf_counter() - start) / max(len(some), 1)
-            batch = SolvedBatch(some, solutions, options, own, symmetry, _diagnosis, seconds)
-            return batch.results()
-        fits: list[Result | CadalignError] = []
-        for b in range(first, last):
-            start, one = time.perf_counter(), options
-            if sigmas is not None:
-                one = replace(options, sigma=sigmas[b])
-            trusted = None if scores is None else scores[b]
-            try:
-                part = problems.part(b, b + 1)
-                fits.append(_fit_one(part, one, ransac, trusted, symmetry, start))
-            except CadalignError as error:
-                fits.append(error)
-        unknowns = 10 if options.focal == "estimate" else 9
-        return Results.of(fits, counts=some.counts, unknowns=unknowns)
-
-    return Results.joined(in_threads(run, len(problems), workers))
-
-
-def _check(ransac: object, scores: object, symmetry: Symmetry | None) -> None:
+def check_search(ransac: object, scores: object, symmetry: Symmetry | None) -> None:
     if ransac is not None:
         require_kind(ransac, RansacOptions, "ransac")
     elif scores is not None:
@@ -265,7 +154,7 @@ def _check(ransac: object, scores: object, symmetry: Symmetry | None) -> None:
         check_symmetry(symmetry)
 
 
-def _fit_one(
+def fit_one(
     problems: Problems,
     options: FitOptions,
     ransac: RansacOptions | None,
@@ -284,10 +173,12 @@ def _fit_one(
         )
         error.fix = diagnose_refusal(*data, again, ransac) or error.fix
         raise
-    return result_of_keypoints(problems.points_2d, fitted, diagnosis=_diagnosis, symmetry=symmetry)
+    return result_of_keypoints(
+        problems.points_2d, fitted, diagnosis=diagnosis_of_fit, symmetry=symmetry
+    )
 
 
-def _diagnosis(
+def diagnosis_of_fit(
     fitted: FittedKeypoints, *, has_reason: bool, rival: Camera | None
 ) -> EstimateWarning | None:
     """See `diagnose`, which makes fits anew."""

@@ -340,14 +340,14 @@ def test_options_without_effect_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write(tmp_path, observed(up=UP))
-    assert refusal_line(capsys, "fit", path, "--method", "aepnp") == (
-        "--method: has no effect together with the file's up; leave out one of the two"
+    refusal = (
+        "--method: has no effect together with evidence beyond the keypoints of one image; "
+        "leave out one of the two"
     )
+    assert refusal_line(capsys, "fit", path, "--method", "aepnp") == refusal
     path = write(tmp_path, observed())
     path.write_text(json.dumps(json.loads(path.read_text()) | {"fit": {"image": True}}))
-    assert refusal_line(capsys, "fit", path, "--method", "aepnp") == (
-        "--method: has no effect together with the file's image; leave out one of the two"
-    )
+    assert refusal_line(capsys, "fit", path, "--method", "aepnp") == refusal
 
 
 class TestPhotoAndMaskAlone:

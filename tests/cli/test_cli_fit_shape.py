@@ -133,7 +133,7 @@ def test_shape_of_the_file_is_fitted(
         line = refusal_line(capsys, "fit", path, *flags)
         assert line == f"{path}: keypoints[0].xyz: missing"
     assert refusal_line(capsys, "fit", path, "--similar") == (
-        "--similar: has no effect together with the file's shape; leave out one of the two"
+        "--similar: has no effect together with a learned shape; leave out one of the two"
     )
 
 
@@ -310,8 +310,8 @@ def test_similar_model_needs_xyz(tmp_path: Path, capsys: pytest.CaptureFixture[s
         *(
             (f"{shape} {flag}", f"{flag.split()[0]}: has no effect together with {name}; {FIX}")
             for shape, name, flags in (
-                ("--shape box.shape", "--shape", (*FIT_ALONE, *STRETCH)),
-                ("--shape-sigma 0.1", "--shape-sigma", FIT_ALONE),
+                ("--shape box.shape", "a learned shape", (*FIT_ALONE, *STRETCH)),
+                ("--shape-sigma 0.1", "a similar shape", FIT_ALONE),
             )
             for flag in flags
         ),

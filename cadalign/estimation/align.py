@@ -18,7 +18,7 @@ from cadalign.errors import (
     quote,
     require_kind,
 )
-from cadalign.estimation.contours import refine_with_images
+from cadalign.estimation.contours import refine
 from cadalign.estimation.diagnose import diagnose, diagnose_refusal
 from cadalign.estimation.fitted import FitStats
 from cadalign.estimation.focal import PriorOption
@@ -30,7 +30,7 @@ from cadalign.estimation.problem import Problem, compile_problem, no_pose_error
 from cadalign.estimation.problems import each_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.results import Results
-from cadalign.estimation.search import find_minima, widened_by_noise
+from cadalign.estimation.search import search, widened_by_noise
 from cadalign.estimation.single import align_plain, align_single, is_plain, is_single
 from cadalign.estimation.view import View, numbered
 from cadalign.geometry.alignment import Alignment
@@ -148,14 +148,14 @@ def _estimate(problem: Problem, start: float, *, has_warnings: bool = True) -> R
     if is_single(problem):
         return align_single(problem, start)
     if any(view.mask is not None for view in problem.views):
-        from cadalign.estimation.contours.silhouette_starts import minima_by_masks  # with OpenCV
+        from cadalign.estimation.contours.silhouette_starts import search_by_masks  # with OpenCV
 
-        problem, minima, iterations, hypotheses = minima_by_masks(problem)
+        problem, found, iterations, hypotheses = search_by_masks(problem)
     else:
-        problem, minima, iterations, hypotheses = find_minima(problem, [problem.inits])
-    if not minima:
+        problem, found, iterations, hypotheses = search(problem, [problem.inits])
+    if not found:
         raise no_pose_error(problem)
-    minima, notes = refine_with_images(problem.model, problem.prior, problem.views, minima)
+    minima, notes = refine(problem, found)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
     likely = widened_by_noise(problem, minima)
     return result_of_minima(problem, likely, stats, notes=notes, has_warnings=has_warnings)

@@ -17,7 +17,7 @@ from cadalign.estimation.problems import (
     whitening_of,
     with_log_focal,
 )
-from cadalign.estimation.search import minima_at_noise
+from cadalign.estimation.search import search_at_noise
 from cadalign.estimation.uncertainty.posterior import Likelihood
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
@@ -95,7 +95,7 @@ def _minima(points: FloatArray, view: View, options: FitOptions) -> tuple[FloatA
     local, prior = (points - center) / unit, options.stretch_sigma
     model = Model(points_3d=local, stretch=stretched or "none", stretch_sigma=prior)
     problem = compile_problem(model, [view], None, [None], options, None)
-    minima, iterations, hypotheses = minima_at_noise(problem, [None])
+    _, minima, iterations, hypotheses = search_at_noise(problem, [None])
     minima = sorted(minima, key=lambda minimum: minimum.cost)[:MAX_MINIMA]
     rows = np.empty((len(minima), POSE_SIZE + 2))
     for row, minimum in zip(rows, minima, strict=True):

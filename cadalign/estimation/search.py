@@ -1,4 +1,4 @@
-"""Minima of all evidence about an object, over components of its shape, focal lengths and noise."""
+"""The second stage of an estimate: minima over components of the shape, focal lengths and noise."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from cadalign.estimation.joint_robust import (
 from cadalign.estimation.prior import Lenses
 from cadalign.estimation.problem import Inits, Problem
 from cadalign.estimation.problems import no_redundancy_error
-from cadalign.estimation.search_starts import starts_of_problem
+from cadalign.estimation.propose import propose
 from cadalign.estimation.starts import Starts
 from cadalign.estimation.uncertainty.evidence import count_equations
 from cadalign.estimation.uncertainty.posterior import widening_of
@@ -81,12 +81,24 @@ class Minimum(NamedTuple):
         return points_of(self.evidence.shape, self.state) / np.exp(self.state.log_scales)
 
 
-def minima_at_noise(problem: Problem, init: Inits) -> tuple[list[Minimum], int, int]:
-    """Minima, the likeliest first, and the numbers of iterations and of starts, at one noise."""
+class Found(NamedTuple):
+    """Minima, the likeliest first, of a problem with its noise, and the effort that they took.
+
+    This is numbers of iterations and of starts.
+    """
+
+    problem: Problem
+    minima: list[Minimum]
+    iterations: int
+    hypotheses: int
+
+
+def search_at_noise(problem: Problem, init: Inits) -> Found:
+    """Minima at the noise of a problem."""
     minima: list[Minimum] = []
     iterations = hypotheses = 0
     for number, shape in enumerate(problem.prior.components):
-        lenses, starts = starts_of_problem(problem, shape, init)
+        lenses, starts = propose(problem, shape, init)
         hypotheses += len(starts.poses)
         if not len(starts.poses):
             continue
@@ -108,7 +120,7 @@ def minima_at_noise(problem: Problem, init: Inits) -> tuple[list[Minimum], int, 
     if problem.lenses.are_distorted:
         minima = _distinct([_relinearised(problem, each) for each in minima])
     minima.sort(key=lambda minimum: minimum.score)
-    return minima, iterations, hypotheses
+    return Found(problem, minima, iterations, hypotheses)
 
 
 def _is_left_to_outlines(problem: Problem, evidence: Evidence) -> bool:
@@ -229,14 +241,11 @@ def thresholds(evidence: Evidence, lenses: Lenses, max_reproj_error: float) -> F
     return max_reproj_error / focal[sightings.image] * root
 
 
-def find_minima(
-    problem: Problem, starts: Sequence[Inits]
-) -> tuple[Problem, list[Minimum], int, int]:
-    """Minima, with the likeliest standard deviation of the keypoints where these have none.
+def search(problem: Problem, starts: Sequence[Inits]) -> Found:
+    """Minima from each of the given ``starts``, at the likeliest noise of keypoints without sigma.
 
-    The shape is integrated out, and so is the pose by Laplace's approximation, so that the estimate
-    is free of the bias that fitted unknowns cause. Returns the problem with that noise, minima from
-    each of the given ``starts``, the likeliest first, and numbers of iterations and of starts.
+    The shape is integrated out, and so is the pose by Laplace's approximation, so that the noise is
+    free of the bias that fitted unknowns cause.
 
     Raises DegenerateError if noise is to be estimated, and the keypoints fit exactly whatever they
     are; NoConsensusError if the likeliest has no more support by keypoints than chance gives, with
@@ -250,18 +259,18 @@ def find_minima(
     effort = np.zeros(2, dtype=int)
     for init in starts:
         rounds = _NOISE_ROUNDS if problem.lacks_sigma else 0
-        found, *spent = minima_at_noise(problem, init)
+        _, found, *spent = search_at_noise(problem, init)
         effort += spent
         while rounds and found:
             noise = _likeliest(problem, found[0])
             change = abs(math.log(noise / problem.noise))
             problem = problem._replace(noise=noise)
             rounds = 0 if change < _NOISE_TOLERANCE else rounds - 1
-            found, *spent = minima_at_noise(problem, init)
+            _, found, *spent = search_at_noise(problem, init)
             effort += spent
         minima += found
     minima.sort(key=lambda each: each.score)
-    return problem, minima, int(effort[0]), int(effort[1])
+    return Found(problem, minima, int(effort[0]), int(effort[1]))
 
 
 def widened_by_noise(problem: Problem, minima: Sequence[Minimum]) -> Sequence[Minimum]:

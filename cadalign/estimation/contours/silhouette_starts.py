@@ -31,7 +31,7 @@ from cadalign.estimation.focal import prior_of_camera
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import camera_like
 from cadalign.estimation.problem import Inits, Problem
-from cadalign.estimation.search import Minimum, find_minima
+from cadalign.estimation.search import Found, Minimum, search
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, turned_alignment
@@ -139,16 +139,16 @@ def _ends_near(
     surface = rigid_surface(cast(Mesh, model.mesh))
     found: list[tuple[float, Minimum]] = []
     steps, starts = 0, 0
-    for search in _SEARCHES:
+    for one in _SEARCHES:
         begun = []
-        for each in _resembling(problem, model, search):
+        for each in _resembling(problem, model, one):
             start, iterations = _begun(problem, each, surface, contour)
             starts, steps = starts + 1, steps + iterations
-            tried = None if start is None else start.followed(search.steps)
+            tried = None if start is None else start.followed(one.steps)
             if tried is not None:
                 begun.append(tried)
         begun.sort(key=lambda start: start.cost(contour))
-        ends = [start.followed() for start in begun[: search.kept]]
+        ends = [start.followed() for start in begun[: one.kept]]
         found.extend(start.end(contour) for start in ends if start is not None)
         found.sort(key=lambda end: end[0])
         if found and found[0][0] < _met_by(contour):
@@ -197,7 +197,7 @@ def _begun(
 ) -> tuple[_Start | None, int]:
     """A start before its first step towards the mask's outline; and iterations that led there."""
     alignment = turned_alignment(start.alignment, problem.turns[0])
-    _, minima, iterations, _ = find_minima(problem._replace(ransac=None), [[alignment]])
+    _, minima, iterations, _ = search(problem._replace(ransac=None), [[alignment]])
     if not minima:
         return None, iterations
     part, keypoints = [contour.shown_by(start.line)], len(problem.prior.ids)
@@ -206,12 +206,12 @@ def _begun(
     return _Start(minima[0], shown, approach), iterations
 
 
-def minima_by_masks(problem: Problem) -> tuple[Problem, list[Minimum], int, int]:
-    """As `find_minima`, from starts that masks suggest, too."""
+def search_by_masks(problem: Problem) -> Found:
+    """As `search`, from starts that masks suggest, too."""
     problem, starts = starts_by_masks(problem)
     if len(problem.views) == 1 and not any(problem.inits) and problem.is_mask_alone:
-        return problem, *minima_of_mask(problem)
-    return find_minima(problem, starts)
+        return Found(problem, *minima_of_mask(problem))
+    return search(problem, starts)
 
 
 def starts_by_masks(problem: Problem) -> tuple[Problem, list[Inits]]:
@@ -243,7 +243,7 @@ def _minima_of_view(problem: Problem) -> list[Minimum]:
     """Minima of one view, the likeliest first."""
     if problem.views[0].has_mask_alone and problem.has_own_mesh:
         return minima_of_mask(problem)[0]
-    return find_minima(problem, [problem.inits])[1]
+    return search(problem, [problem.inits]).minima
 
 
 def _starts_of_rig(problem: Problem) -> list[Inits]:

@@ -1,4 +1,4 @@
-"""Starts of a problem's search: at known focal lengths, or over a grid of unknown ones."""
+"""The first stage of an estimate: starts, at known focal lengths or over a grid of unknown ones."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class _AtFocals(NamedTuple):
     costs: FloatArray
 
 
-def starts_of_problem(problem: Problem, shape: Shape, init: Inits) -> tuple[Lenses, Starts]:
+def propose(problem: Problem, shape: Shape, init: Inits) -> tuple[Lenses, Starts]:
     """Starts for one component of the shape, and the lenses that their focal lengths refer to.
 
     Unknown focal lengths are those of a grid. Lenses with distortion are those of the start of the

@@ -6,9 +6,8 @@ leaves. The backward pass solves one linear system for each problem, vectorised 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,54 +25,6 @@ _LARGEST_POLISH = 0.02  # turn [rad] or change of a logarithm beyond which a ste
 _AT_BOUND = 1e-9
 _HELD = 1e12  # information about a log focal length at its bound
 _NO_POSE = np.array([1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1, 1, 1, 1])
-
-
-@dataclass(frozen=True, eq=False)
-class KeypointBatch:
-    """Keypoints of B problems in arrays: what is absent or not finite is 0.
-
-    ``pixels`` (B, n, 2), ``sigmas`` (B, n) [px], ``present`` (B, n), rays (B, n, 2), and
-    ``by_pixels`` (B, n, 2, 2), derivatives of the rays by the pixels.
-    """
-
-    pixels: FloatArray
-    sigmas: FloatArray
-    present: BoolArray
-    rays: FloatArray
-    by_pixels: FloatArray
-    cameras: tuple[Camera, ...]
-
-    @classmethod
-    def of(
-        cls,
-        pixels: FloatArray,
-        sigmas: FloatArray,
-        present: BoolArray,
-        cameras: tuple[Camera, ...],
-    ) -> KeypointBatch:
-        """The batch of checked arrays, seen by cameras that `FitTask` takes."""
-        present = present & np.isfinite(pixels).all(axis=2) & np.isfinite(sigmas) & (sigmas > 0)
-        pixels = np.where(present[..., None], pixels, 0.0)
-        sigmas = np.where(present, sigmas, 1.0)
-        rays, by_pixels = np.zeros_like(pixels), np.zeros((*present.shape, 2, 2))
-        for b, camera in enumerate(cameras):
-            own = slice(None) if len(cameras) == 1 else slice(b, b + 1)
-            flat = np.ascontiguousarray(pixels[own].reshape(-1, 2))
-            if camera.distortion:
-                flat[~present[own].ravel()] = camera.cx, camera.cy
-            seen = rays_of(flat, camera)
-            rays[own] = seen.reshape(rays[own].shape)
-            by_pixels[own] = lens_slopes(seen, camera).reshape(by_pixels[own].shape)
-        return cls(pixels, sigmas, present, rays, by_pixels, cameras)
-
-    @property
-    def information(self) -> FloatArray:
-        """Information (B, n, 2, 2) of the rays; 0 for those that are absent."""
-        (a, b), (c, d) = self.by_pixels.transpose(2, 3, 0, 1)
-        weights = self.present / (self.sigmas * (a * d - b * c)) ** 2
-        mixed = -weights * (a * c + b * d)  # of the inverse's columns; NumPy's takes thrice as long
-        rows = [weights * (c * c + d * d), mixed], [mixed, weights * (a * a + b * b)]
-        return np.ascontiguousarray(np.array(rows).transpose(2, 3, 0, 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,37 +68,15 @@ class FitValues(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BatchFits:
-    """Fits of a batch in the parts that threads have shared."""
-
-    parts: list[_Part]
-
-    @property
-    def values(self) -> FitValues:
-        """The fits."""
-        return FitValues(*_joined(part.values for part in self.parts))
-
-    def pulled_back(self, *slopes: FloatArray) -> tuple[FloatArray, ...]:
-        """Slopes by points, pixels and sigmas from those by rotation, translation, scale, focal."""
-        ends = np.cumsum([len(part.sigmas) for part in self.parts])[:-1]
-        given = zip(self.parts, *(np.split(each, ends) for each in slopes), strict=True)
-        return _joined(part.pulled_back(*own) for part, *own in given)
-
-
-def _joined(parts: Iterable[tuple[Any, ...]]) -> tuple[Any, ...]:
-    return tuple(map(np.concatenate, zip(*parts, strict=True)))
-
-
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """Fits of some problems, and their optima before a Newton step.
+    """Fits of a batch, and their optima before a Newton step.
 
     ``by_pixels`` (B, n, 2, 2) are the derivatives of the optima's rays by the pixels.
     """
 
+    values: FitValues
     optima: Optima
     by_pixels: FloatArray
     sigmas: FloatArray
-    values: FitValues
 
     def pulled_back(
         self,
@@ -156,6 +85,7 @@ class _Part:
         by_scale: FloatArray,
         by_focal: FloatArray,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Slopes by points, pixels and sigmas from those by rotation, translation, scale, focal."""
         values, slopes = self.values, np.empty((len(by_focal), UNKNOWNS))
         slopes[:, :3] = np.cross(values.rotation, by_rotation, axis=1).sum(axis=2)
         slopes[:, 3:6] = by_translation
@@ -167,6 +97,7 @@ class _Part:
         return by_points, by_pixels, by_log_sigma / self.sigmas
 
 
+@np.errstate(all="ignore")
 def fits_of(
     task: FitTask,
     points: FloatArray,
@@ -174,41 +105,28 @@ def fits_of(
     sigmas: FloatArray,
     mask: BoolArray,
 ) -> BatchFits:
-    """The fits of a batch.
+    """The fits of a batch, polished by a Newton step.
 
-    Points (B, n, 3), pixels (B, n, 2), sigmas and mask (B, n).
+    Points (B, n, 3), pixels (B, n, 2), sigmas and mask (B, n). The derivatives are those before the
+    step: it is far below the noise.
     """
-    options = task.options
+    options, cameras = task.options, task.cameras
     if options.focal == "estimate":
-        options = options.for_camera(task.cameras[0])
-
-    @np.errstate(all="ignore")  # holds for one thread only
-    def run(first: int, last: int) -> _Part:
-        some = slice(first, last)
-        cameras = task.cameras if len(task.cameras) == 1 else task.cameras[some]
-        present = mask[some] & np.isfinite(points[some]).all(axis=2)
-        batch = KeypointBatch.of(pixels[some], sigmas[some], present, cameras)
-        known = np.where(batch.present[..., None], points[some], 0.0)
-        return _fitted(known, batch, options, exact=task.exact)
-
-    return BatchFits(in_threads(run, len(points), task.workers))
-
-
-def _fitted(points: FloatArray, batch: KeypointBatch, options: FitOptions, *, exact: bool) -> _Part:
-    """The fits of some problems, polished by a Newton step.
-
-    The derivatives are those before it: it is far below the noise.
-    """
-    poses, focals, valid = _searched(points, batch, options)
+        options = options.for_camera(cameras[0])
+    present = mask & np.isfinite(points).all(axis=2) & np.isfinite(pixels).all(axis=2)
+    present &= np.isfinite(sigmas) & (sigmas > 0)
+    points, pixels = (np.where(present[..., None], each, 0.0) for each in (points, pixels))
+    sigmas = np.where(present, sigmas, 1.0)
+    rays, by_pixels = _rays(pixels, present, cameras)
+    information = _information(by_pixels, present, sigmas)
+    poses, focals, valid = _searched(task, options, points, pixels, sigmas, present)
     pose = poses[:, :9].reshape(-1, 3, 3), poses[:, 9:12], poses[:, 12:]
-    given = np.array([camera.fx for camera in batch.cameras])
-    ratio = (focals / given)[:, None, None]
+    ratio = (focals / np.array([camera.fx for camera in cameras]))[:, None, None]
     offset = weight = np.zeros(len(focals))
-    rays, information, by_pixels = batch.rays, batch.information, batch.by_pixels
     if options.focal == "estimate":
         rays, by_pixels = rays / ratio, by_pixels / ratio[..., None]
         information = information * ratio[..., None] ** 2
-        low, high, mean, of_prior = log_focal_range(batch.cameras[0], options.focal_prior)
+        low, high, mean, of_prior = log_focal_range(cameras[0], options.focal_prior)
         logs = np.log(focals)
         is_held = (logs < low + _AT_BOUND) | (logs > high - _AT_BOUND)
         weight = np.where(is_held, _HELD, of_prior)
@@ -222,7 +140,7 @@ def _fitted(points: FloatArray, batch: KeypointBatch, options: FitOptions, *, ex
         free=options.estimated_unknowns,
         loss=LOSSES[options.loss],
         loss_scale=options.loss_scale,
-        exact=exact,
+        exact=task.exact,
         focal_offset=offset,
         focal_weight=weight,
     )
@@ -241,32 +159,68 @@ def _fitted(points: FloatArray, batch: KeypointBatch, options: FitOptions, *, ex
         covariance,
         valid,
     )
-    return _Part(optima, by_pixels, batch.sigmas, values)
+    return BatchFits(values, optima, by_pixels, sigmas)
+
+
+def _rays(
+    pixels: FloatArray, present: BoolArray, cameras: tuple[Camera, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Rays (B, n, 2) of pixels, and their derivatives (B, n, 2, 2) by these."""
+    rays, by_pixels = np.zeros_like(pixels), np.zeros((*present.shape, 2, 2))
+    for b, camera in enumerate(cameras):
+        own = slice(None) if len(cameras) == 1 else slice(b, b + 1)
+        flat = np.ascontiguousarray(pixels[own].reshape(-1, 2))
+        if camera.distortion:
+            flat[~present[own].ravel()] = camera.cx, camera.cy
+        seen = rays_of(flat, camera)
+        rays[own] = seen.reshape(rays[own].shape)
+        by_pixels[own] = lens_slopes(seen, camera).reshape(by_pixels[own].shape)
+    return rays, by_pixels
+
+
+def _information(by_pixels: FloatArray, present: BoolArray, sigmas: FloatArray) -> FloatArray:
+    """Information (B, n, 2, 2) of the rays; 0 for those that are absent."""
+    (a, b), (c, d) = by_pixels.transpose(2, 3, 0, 1)
+    weights = present / (sigmas * (a * d - b * c)) ** 2
+    mixed = -weights * (a * c + b * d)  # of the inverse's columns; NumPy's takes thrice as long
+    rows = [weights * (c * c + d * d), mixed], [mixed, weights * (a * a + b * b)]
+    return np.ascontiguousarray(np.array(rows).transpose(2, 3, 0, 1))
 
 
 def _searched(
-    points: FloatArray, batch: KeypointBatch, options: FitOptions
+    task: FitTask,
+    options: FitOptions,
+    points: FloatArray,
+    pixels: FloatArray,
+    sigmas: FloatArray,
+    present: BoolArray,
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Poses (B, 15) and focal lengths (B,) of the best minima, and for which problems (B,)."""
-    present, cameras = batch.present, batch.cameras
     offsets = np.concatenate([[0], np.cumsum(present.sum(axis=1))]).astype(np.int64)
-    problems = Problems(points[present], batch.pixels[present], offsets, cameras)
-    sigmas = batch.sigmas[present]
-    rows = [problems.rows(b) for b in range(len(points))]
-    if options.focal == "estimate":
+    problems = Problems(points[present], pixels[present], offsets, task.cameras)
+    known, is_estimated = sigmas[present], options.focal == "estimate"
+
+    @np.errstate(all="ignore")  # holds for one thread only
+    def run(first: int, last: int) -> tuple[FloatArray, FloatArray, BoolArray]:
+        parts = [(b, b + 1) for b in range(first, last)]
+        if len(task.cameras) == 1 and not is_estimated:
+            parts = [(first, last)]  # all at once
         found = [
-            solve(problems.part(b, b + 1), replace(options, sigma=sigmas[own]))
-            for b, own in enumerate(rows)
+            solve(
+                problems.part(*part),
+                replace(options, sigma=known[offsets[part[0]] : offsets[part[1]]]),
+            )
+            for part in parts
         ]
-    elif len(cameras) > 1:
-        found = [solve(problems, options, [sigmas[own] for own in rows])]
-    else:  # those of all problems, one after the other
-        found = [solve(problems, replace(options, sigma=sigmas))]
-    valid = np.concatenate([each.solved for each in found])
-    poses = np.concatenate([each.poses[:, 0] for each in found])
-    poses = np.where(valid[:, None], poses, _NO_POSE)
-    focals = np.array([camera.fx for camera in cameras]) * np.ones(len(points))
-    if options.focal == "estimate":
-        estimated = [np.nan if each.focals is None else each.focals[0, 0] for each in found]
-        focals = np.where(valid, estimated, focals)
+        valid = np.concatenate([each.solved for each in found])
+        poses = np.concatenate([each.poses[:, 0] for each in found])
+        focals = np.array([camera.fx for camera in task.cameras]) * np.ones(len(points))
+        focals = focals[first:last]
+        if is_estimated:
+            estimated = [np.nan if each.focals is None else each.focals[0, 0] for each in found]
+            focals = np.where(valid, estimated, focals)
+        return np.where(valid[:, None], poses, _NO_POSE), focals, valid
+
+    columns = zip(*in_threads(run, len(points), task.workers), strict=True)
+    poses, focals, valid = map(np.concatenate, columns)
     return poses, focals, valid

@@ -8,25 +8,19 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from cadalign.arrays import FloatArray
 from cadalign.datasets import load_mesh
 from cadalign.errors import DataError, InputError
-from cadalign.estimation.observed import model_of, own_ids, shape_ids
-from cadalign.estimation.options import FitOptions
+from cadalign.estimation.observed import own_ids
 from cadalign.estimation.outputs import object_of
 from cadalign.estimation.result import Result
 from cadalign.export.aligned_object import AlignedObject
-from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import in_file, read_json
 from cadalign.io.observation import OBSERVATION, Observation, kind_of
 from cadalign.render.drawing.model_overlay import mesh_of
 from cadalign.shapes.model import ShapeModel
 
-_SAME = 1e-9  # of the model's size
 _FOLDER_ENDING = "_fit"
-_ANY_SIGMA = 1.0
 
 
 def read_exported(
@@ -73,14 +67,8 @@ def exported_object(
         views = tuple(replace(view, ids=own) for view in result.views)
         result = replace(result, ids=own, views=views)
     else:
-        opened = _shape(result, seen, shape)
-        with in_file(path):  # older files lack the ids of keypoints
-            ids: Any = own_ids(seen.views)
-            if opened is not None:
-                ids = [shape_ids(image, opened) for image in seen.views]
-            pairs = zip(result.views, ids, strict=True)
-            result = replace(result, views=tuple(replace(view, ids=own) for view, own in pairs))
-        mesh = _warped(result, seen, opened, path)
+        model = _shape(result, seen, shape)
+        mesh = mesh_of(seen, replace(result, model=model))
     name = "model" if seen.model is None else seen.model.stem
     images = [view.image for view in seen.views]
     return object_of(result, mesh=mesh, images=images, name=name, **how)
@@ -131,29 +119,6 @@ def _shape(aligned: Result, seen: Observation, shape: Path | None) -> ShapeModel
         what = f"{len(opened.ids)} keypoints that are not the fit's {len(aligned.ids)}"
         raise DataError(what, where=str(path), fix="give the shape that was fitted")
     return opened
-
-
-def _warped(
-    aligned: Result, seen: Observation, shape: ShapeModel | None, path: Path
-) -> Mesh | None:
-    if shape is not None:
-        return mesh_of(seen, replace(aligned, model=shape))
-    if seen.model is None:
-        return None
-    mesh = load_mesh(seen.model)
-    if not aligned.ids:  # of a mask alone, or a photo: the model as it is
-        return mesh
-    with in_file(path):
-        model = model_of(seen, options=FitOptions(), shape_sigma=_ANY_SIGMA, mesh=mesh)
-    if tuple(model.ids or ()) != aligned.ids:
-        what = "its keypoints are not those of the fit"
-        fix = "give the observation that was fitted, with the shape that was (--shape)"
-        raise DataError(what, where=str(path), fix=fix)
-    source = np.asarray(model.points_3d)
-    size = float(np.ptp(source, axis=0).max()) or 1.0
-    if np.abs(source - aligned.points_3d).max() <= _SAME * size:
-        return mesh
-    return replace(aligned, model=model).mesh()
 
 
 def _require_same(count: int, expected: int, path: Path, what: str) -> None:

@@ -128,6 +128,7 @@ def _drawn(scene: Scene, camera: Camera, alignment: Alignment, mode: str) -> Geo
     return RaycastRenderer().render(scene, camera, alignment)
 
 
+_SAME = 1e-9  # of the model's size
 _INSIDE = 0.5  # least probability of a pixel of the object
 _CONTOUR_COLOR = (70, 190, 250)
 
@@ -208,18 +209,20 @@ def mesh_of(observation: Observation, result: Result) -> Mesh | None:
     from cadalign.shapes.model import ShapeModel  # takes time to import
     from cadalign.shapes.warp import warp_mesh
 
-    if not isinstance(result.model, ShapeModel):
-        known = result.model is not None and result.model.mesh is not None
-        return result.mesh() if known else None
+    model = result.model
+    if model is not None and not isinstance(model, ShapeModel):
+        return None if model.mesh is None else result.mesh()
     sources = {
         label: xyz
         for image, view in zip(observation.views, result.views, strict=True)
         for label, xyz in zip(view.ids, image.points_3d, strict=True)
     }
-    if observation.model is not None and np.any(list(sources.values())):
-        row_of = {label: row for row, label in enumerate(result.ids)}
-        rows = [row_of[label] for label in sources]
-        mesh = load_mesh(observation.model)
-        targets = result.points_3d[rows]
-        return warp_mesh(mesh, np.array(list(sources.values())), targets, bounds=result.bounds)
-    return result.known_mesh(None)
+    row_of = {label: row for row, label in enumerate(result.ids)}
+    source = np.array(list(sources.values())).reshape(-1, 3)
+    target = result.points_3d[[row_of[label] for label in sources]]
+    if observation.model is None or (model is not None and not source.any()):
+        return None if model is None else result.known_mesh(None)
+    mesh = load_mesh(observation.model)
+    if not sources or np.abs(source - target).max() <= _SAME * np.ptp(source):
+        return mesh
+    return warp_mesh(mesh, source, target, bounds=result.bounds)

@@ -236,7 +236,7 @@ def result_of_minima(
         if likelihood >= LEAST_LIKELIHOOD or each is optimum:
             evidence, state = widened(each.evidence, each.state, inflation)
             wide = each._replace(evidence=evidence, state=state)
-            estimate = _estimate(wide, likelihood, problem)._replace(is_optimum=each is optimum)
+            estimate = _estimate_at(wide, likelihood, problem)._replace(is_optimum=each is optimum)
             if all(np.isfinite(own).all() for own in estimate.covariances):
                 likely = [*likely, estimate]
             elif not likely:
@@ -303,7 +303,7 @@ def _undetermined_error() -> DegenerateError:
     return DegenerateError(what, where="views", fix="give more keypoints, or a size")
 
 
-def _estimate(minimum: Minimum, likelihood: float, problem: Problem) -> Estimate:
+def _estimate_at(minimum: Minimum, likelihood: float, problem: Problem) -> Estimate:
     prior, evidence, state = problem.prior, minimum.evidence, minimum.state
     keypoints = len(prior.ids)
     evidence, state = with_box(evidence, state, prior)

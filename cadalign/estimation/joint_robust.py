@@ -255,12 +255,12 @@ def _hypotheses(
     count, size = len(given.points), SAMPLE_SIZES[MINIMAL_SOLVERS[ransac.minimal]]
     if count < size:
         return np.empty((0, 12))
-    poses, supports = rigid_hypotheses(given, _draws(count, size, ransac, scores), _LIMIT)
+    poses, supports = rigid_hypotheses(given, _samples(count, size, ransac, scores), _LIMIT)
     order = np.argsort(supports)[:_REFINED]
     return poses[order[np.isfinite(supports[order])], :12]
 
 
-def _draws(count: int, size: int, ransac: RansacOptions, scores: FloatArray | None) -> IntArray:
+def _samples(count: int, size: int, ransac: RansacOptions, scores: FloatArray | None) -> IntArray:
     """Samples (S, size) of keypoints: all where these are few, otherwise drawn at random.
 
     So many that one without outliers is among them with the wanted probability, if 40 % of the
@@ -271,11 +271,11 @@ def _draws(count: int, size: int, ransac: RansacOptions, scores: FloatArray | No
     if math.comb(count, size) <= wanted:
         return np.array(list(combinations(range(count), size)))
     told = None if scores is None or not scores.sum() > 0 else tuple(scores.tolist())
-    return _drawn(count, size, wanted, ransac.seed, told)
+    return _random_samples(count, size, wanted, ransac.seed, told)
 
 
 @lru_cache(maxsize=16)  # the same at every focal length, and with every mistake undone
-def _drawn(
+def _random_samples(
     count: int, size: int, wanted: int, seed: int, scores: tuple[float, ...] | None
 ) -> IntArray:
     rng = np.random.default_rng(seed)

@@ -109,7 +109,7 @@ def _sightings(
                 np.full(count, number),
                 rays,
                 np.broadcast_to(whitening_of(sigma, rays, camera), (count, 3)),
-                _depths(view, count),
+                _keypoint_depths(view, count),
                 np.full(count, LOSSES[options.loss]),
                 np.full(count, float(options.loss_scale)),
                 focal_slopes(pixels, camera, rays) if camera.distortion else 0.0 * rays,
@@ -119,7 +119,7 @@ def _sightings(
     return kept_rows(whole, np.argsort(whole.point, kind="stable"))
 
 
-def _depths(view: View, count: int) -> FloatArray:
+def _keypoint_depths(view: View, count: int) -> FloatArray:
     """Depths (n, 2) and their inverse standard deviations, 0 where unknown."""
     found = np.zeros((count, 2))
     if view.depth is not None and view.depth_image is None:

@@ -20,7 +20,7 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray, as_points, is_numbe
 from cadalign.errors import CadalignError, DegenerateError, InputError, quote, require_kind
 from cadalign.estimation.options import SIGMA_HELP, FitOptions, Sigma, pixel_information
 from cadalign.geometry.alignment import are_on_a_line, describe_plane
-from cadalign.geometry.camera import Camera
+from cadalign.geometry.camera import Camera, rays_ahead
 from cadalign.geometry.pixels import check_pixels
 from cadalign.solvers.constants import NOT_FOUND, OK, OUT_OF_RANGE, TOO_FEW, UNOBSERVABLE
 from cadalign.solvers.linear import aepnp_error, out_of_range_error
@@ -176,7 +176,7 @@ def _is_stack(value: object, last: int) -> bool:
     )
 
 
-def _is_plain(points: npt.ArrayLike, dimension: int) -> bool:
+def _is_kernel_array(points: npt.ArrayLike, dimension: int) -> bool:
     """True for a writable array of the right form: frozen ones would compile the kernels again."""
     return (
         type(points) is np.ndarray
@@ -192,7 +192,7 @@ def _check_pair(
 ) -> tuple[FloatArray, FloatArray]:
     """Writable arrays (n, 3) and (n, 2) of finite numbers; the given ones where they are that."""
     model, image = cast(FloatArray, points_3d), cast(FloatArray, points_2d)
-    if not (_is_plain(model, 3) and _is_plain(image, 2) and all_finite(model, image)):
+    if not (_is_kernel_array(model, 3) and _is_kernel_array(image, 2) and all_finite(model, image)):
         model = np.require(as_points(points_3d, name=name_3d, dimension=3), requirements="W")
         image = np.require(as_points(points_2d, name=name_2d, dimension=2), requirements="W")
     if len(model) != len(image):
@@ -207,8 +207,6 @@ def _check_pair(
 def rays_of(points_2d: FloatArray, camera: Camera, *, clips: bool = False) -> FloatArray:
     """Normalised image coordinates (n, 2) of checked pixels (n, 2); see `rays_ahead`."""
     if camera.is_wide:
-        from cadalign.geometry.camera import rays_ahead  # wide lenses are rare
-
         return rays_ahead(points_2d, camera, clips=clips)
     if camera.distortion:
         return camera.normalize(points_2d)

@@ -25,7 +25,13 @@ from cadalign.estimation.problems import (
     whitening_of,
 )
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera, needs_facing
+from cadalign.geometry.camera import (
+    Camera,
+    faced,
+    needs_facing,
+    turned_covariance,
+    turned_poses,
+)
 from cadalign.solvers.constants import OK, OUT_OF_RANGE, POSE_SIZE
 from cadalign.solvers.linear import aepnp_batch
 from cadalign.solvers.optimal import optimal_batch, rigid_flag
@@ -72,7 +78,7 @@ def solve(
             camera.require_focal()
     else:
         check_estimable(problems.cameras)
-    if options.method != "optimal" and not _is_plain(options.sigma, sigmas):
+    if options.method != "optimal" and not _is_one_sigma(options.sigma, sigmas):
         # The other methods would not notice a wrong one.
         check_sigmas([options.sigma] if sigmas is None else sigmas, problems.counts)
     if options.method == "optimal":
@@ -106,9 +112,6 @@ def _solve_facing(
     problems: Problems, options: FitOptions, sigmas: Sequence[Sigma] | None
 ) -> Solutions:
     """Solve in frames that face the keypoints of wide lenses."""
-    # Only here: wide lenses are rare.
-    from cadalign.geometry.camera import faced, turned_covariance, turned_poses
-
     every = range(len(problems))
     cameras = [faced(problems.camera(b), problems.points_2d[problems.rows(b)]) for b in every]
     found = solve(replace(problems, cameras=tuple(cameras)), options, sigmas)
@@ -131,7 +134,7 @@ def _solve_one_linearly(problems: Problems, options: FitOptions) -> Solutions | 
         return None
     camera = problems.cameras[0]
     plain = options.known_axis == "x" and camera.focal_known
-    if not plain or camera.distortion or not _is_plain(options.sigma, None):
+    if not plain or camera.distortion or not _is_one_sigma(options.sigma, None):
         return None
     points, pixels, offsets = problems.points_3d, problems.points_2d, problems.offsets
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
@@ -143,7 +146,7 @@ def _solve_one_linearly(problems: Problems, options: FitOptions) -> Solutions | 
     return Solutions(poses, _NO_COST, None, statuses, _ONE_MINIMUM, residuals=residuals)
 
 
-def _is_plain(sigma: Sigma | None, sigmas: Sequence[Sigma] | None) -> bool:
+def _is_one_sigma(sigma: Sigma | None, sigmas: Sequence[Sigma] | None) -> bool:
     """True for one positive number, which needs no further check."""
     return sigmas is None and type(sigma) is float and 0.0 < sigma < math.inf
 
@@ -194,7 +197,7 @@ def _solve_optimal(
     else:
         rays, errors = _rays(problems)
         whitening = _whitening(problems, options, rays, sigmas)
-        search = partial(_search, problems, options, points, rays, whitening, errors)
+        search = partial(_search_poses, problems, options, points, rays, whitening, errors)
     if options.sigma is None and sigmas is None:
         most = rounds or (_SIGMA_ROUNDS if options.estimates_in_rounds else 1)
         found = _with_estimated_sigmas(problems, options, points, search, most)
@@ -214,7 +217,7 @@ def _solve_optimal(
     return _with_exact_sorted(found, exact & (found.info[:, 0] > 1))
 
 
-def _search(
+def _search_poses(
     problems: Problems,
     options: FitOptions,
     points: FloatArray,

@@ -156,7 +156,7 @@ def _unpack(products: FloatArray, column: int, matrix: FloatArray) -> None:
 
 
 @kernel
-def _whiten(factor: FloatArray, matrix: FloatArray) -> None:
+def _whiten_matrix(factor: FloatArray, matrix: FloatArray) -> None:
     """Replace a symmetric matrix A by L^-1 A L^-T in place, for the Cholesky factor L."""
     for _ in range(2):  # L^-1 A, transposed, and the same once more
         for column in range(4):
@@ -305,9 +305,9 @@ def affine_rows(
     _unpack(products, 1, u_matrix)
     _unpack(products, 2, v_matrix)
     _unpack(products, 3, system)
-    _whiten(factor, u_matrix)
-    _whiten(factor, v_matrix)
-    _whiten(factor, system)
+    _whiten_matrix(factor, u_matrix)
+    _whiten_matrix(factor, v_matrix)
+    _whiten_matrix(factor, system)
     for i in range(4):
         for j in range(i, 4):
             total = system[i, j]

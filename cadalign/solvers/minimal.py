@@ -96,7 +96,7 @@ def ap4p_kernel(points: FloatArray, rays: FloatArray, solutions: FloatArray) -> 
     memory = minimal_memory()
     for i in range(4):
         _write_point(points, i, (rays[i, 0], rays[i, 1], rays[i, 2]), memory, i)
-    return _solve_sample(memory, solutions)
+    return _solve_four(memory, solutions)
 
 
 @kernel
@@ -117,7 +117,7 @@ def solve_subset(
     for i in range(4):
         c = chosen[i]
         _write_point(points, c, (rays[c, 0], rays[c, 1], 1.0), memory, i)
-    return _solve_sample(memory, solutions)
+    return _solve_four(memory, solutions)
 
 
 @inlined
@@ -130,7 +130,7 @@ def _write_point(points: FloatArray, i: int, ray: Triple, memory: FloatArray, ro
 
 
 @inlined
-def _solve_sample(memory: FloatArray, solutions: FloatArray) -> int:
+def _solve_four(memory: FloatArray, solutions: FloatArray) -> int:
     """Solve for the sample in the memory."""
     if not _column_weights(memory):
         return 0

@@ -121,7 +121,7 @@ def _solve_one(
     local = with_points(objective, (points - center) / unit)
     counts = np.zeros(2, dtype=np.int64)
     found = Minima(poses, costs, costs.copy(), np.zeros(MAX_MINIMA, dtype=np.int64), counts)
-    hypotheses = _search(local, rigid, found)
+    hypotheses = _search_minima(local, rigid, found)
     minima, iterations = int(counts[0]), int(counts[1])
     if minima == 0:
         return 0, iterations, hypotheses, -1
@@ -132,7 +132,7 @@ def _solve_one(
 
 
 @kernel
-def _search(objective: Objective, rigid: bool | None, minima: Minima) -> int:
+def _search_minima(objective: Objective, rigid: bool | None, minima: Minima) -> int:
     """Find the minima; returns the number of starts.
 
     Where there are many points the search runs on some of them, and what it finds is refined on

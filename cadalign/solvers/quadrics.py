@@ -52,8 +52,8 @@ def intersect_quadrics(memory: FloatArray) -> int:
     x, y, z, best = 1, 2, 3, -1.0
     for i in range(1, 4):
         j, k = i % 3 + 1, (i + 1) % 3 + 1
-        across = cross(_column(memory, _entry(j, k)), _column(memory, _entry(k, k)))
-        size = abs(dot(_column(memory, _entry(j, j)), across))
+        across = cross(_quadric(memory, _entry(j, k)), _quadric(memory, _entry(k, k)))
+        size = abs(dot(_quadric(memory, _entry(j, j)), across))
         if size > best:
             x, y, z, best = i, j, k, size
     if not best > 0.0:
@@ -72,7 +72,7 @@ def intersect_quadrics(memory: FloatArray) -> int:
         if _least_depth(memory, row) > 0.0:
             is_new = True
             for k in range(POINTS, row):
-                is_new = is_new and not _are_same(memory, row, k)
+                is_new = is_new and not _are_one_root(memory, row, k)
             found += is_new
     return found
 
@@ -91,7 +91,7 @@ def _least_depth(memory: FloatArray, row: int) -> float:
 
 
 @inlined
-def _are_same(memory: FloatArray, row: int, other: int) -> bool:
+def _are_one_root(memory: FloatArray, row: int, other: int) -> bool:
     difference = 0.0
     for i in range(1, 4):
         difference = max(difference, abs(memory[row, i] - memory[other, i]))
@@ -106,7 +106,7 @@ def _entry(i: int, j: int) -> int:
 
 
 @inlined
-def _column(memory: FloatArray, k: int) -> Triple:
+def _quadric(memory: FloatArray, k: int) -> Triple:
     return memory[QUADRICS, k], memory[QUADRICS + 1, k], memory[QUADRICS + 2, k]
 
 
@@ -114,13 +114,13 @@ def _column(memory: FloatArray, k: int) -> Triple:
 def _solve_for_monomials(memory: FloatArray, x: int, y: int, z: int) -> None:
     """Solve for y^2, yz and z^2 (rows from `_TABLE`): coefficients of 1, x, x^2, y, xy, z, xz."""
     products = (0, x, _entry(x, x), y, _entry(x, y), z, _entry(x, z))
-    a = _column(memory, _entry(y, y))
-    b = _column(memory, _entry(y, z))
-    c = _column(memory, _entry(z, z))
+    a = _quadric(memory, _entry(y, y))
+    b = _quadric(memory, _entry(y, z))
+    c = _quadric(memory, _entry(z, z))
     bc, ca, ab = cross(b, c), cross(c, a), cross(a, b)
     scale = -1.0 / dot(a, bc)
     for k in range(7):
-        column = _column(memory, products[k])
+        column = _quadric(memory, products[k])
         memory[_TABLE, k] = scale * dot(bc, column)
         memory[_TABLE + 1, k] = scale * dot(ca, column)
         memory[_TABLE + 2, k] = scale * dot(ab, column)

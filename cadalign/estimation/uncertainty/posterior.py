@@ -31,7 +31,12 @@ from cadalign.estimation.uncertainty.residuals import (
     whitening_matrices,
 )
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import needs_facing
+from cadalign.geometry.camera import (
+    faced,
+    needs_facing,
+    turned_alignment,
+    turned_covariance,
+)
 from cadalign.geometry.rotations import by_rotation
 from cadalign.solvers.draws import Centred, LogPriors, WhitenedPixels, weigh_draws
 
@@ -91,9 +96,6 @@ def posterior_covariance(result: FittedKeypoints) -> FloatArray:
     """Covariance of the errors by the posterior; see `cadalign.Result.covariance`."""
     assert result.fisher_covariance is not None
     if needs_facing([result.camera]):
-        # Wide lenses are rare.
-        from cadalign.geometry.camera import faced, turned_alignment, turned_covariance
-
         kept = result.points_3d[result.inliers]
         camera = faced(result.camera, result.camera.project(result.alignment.apply(kept)))
         turn = camera.lens_from_camera

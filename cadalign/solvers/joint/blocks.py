@@ -54,7 +54,7 @@ class BlockEquation(NamedTuple):
 
 
 @kernel
-def count_equations(evidence: Evidence) -> int:
+def count_block_equations(evidence: Evidence) -> int:
     """Number of the equations of all blocks."""
     count = 0
     for block in unrolled(evidence.blocks):
@@ -63,7 +63,7 @@ def count_equations(evidence: Evidence) -> int:
 
 
 @kernel
-def write_row(evidence: Evidence, state: State, q: int, row: FloatArray) -> BlockEquation:
+def write_block_row(evidence: Evidence, state: State, q: int, row: FloatArray) -> BlockEquation:
     """Write derivatives (6 + b,) of the residual of equation ``q``, block after block."""
     row[:] = 0.0
     first = 0

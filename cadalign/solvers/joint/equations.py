@@ -21,7 +21,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, kernel
 from cadalign.solvers.joint.arrow import Arrow, add_slope, border_start, empty_arrow
-from cadalign.solvers.joint.blocks import count_equations, write_row
+from cadalign.solvers.joint.blocks import count_block_equations, write_block_row
 from cadalign.solvers.joint.evidence import (
     Evidence,
     Shape,
@@ -126,14 +126,16 @@ def eliminate(spread: FloatArray, displacements: FloatArray, equations: JointEqu
             cost += (displacement / spread[i]) ** 2
             for c in range(start, end):
                 rows[last, c] -= rows[last + 1 + a, c] * displacement
-        equations.log_determinant[0] += _whiten(
+        equations.log_determinant[0] += _whiten_columns(
             rows, start, end, spread[i], np.empty((end - start, end - start))
         )
     return cost
 
 
 @borrowing
-def _whiten(rows: FloatArray, start: int, end: int, spread: float, factor: FloatArray) -> float:
+def _whiten_columns(
+    rows: FloatArray, start: int, end: int, spread: float, factor: FloatArray
+) -> float:
     """Whiten the columns of one point; returns the log determinant of their covariance."""
     size = end - start
     last = rows.shape[0] - 3
@@ -229,22 +231,22 @@ def _add_block_slopes(evidence: Evidence, state: State, arrow: Arrow, factor: Fl
     A residual is linear in the coefficients, so that the derivative of its row by these, along
     their response to it, is the change of the row as they move by the response.
     """
-    first, total = 6 + evidence.focals.low.shape[0] + 3, count_equations(evidence)
+    first, total = 6 + evidence.focals.low.shape[0] + 3, count_block_equations(evidence)
     row, moved_row = np.empty(6 + arrow.border.shape[0]), np.empty(6 + arrow.border.shape[0])
     still, moved = undisplaced(state), undisplaced(state)
     response = np.empty((factor.shape[0], total))
     for q in range(total):
-        equation = write_row(evidence, still, q, row)
+        equation = write_block_row(evidence, still, q, row)
         for k in range(factor.shape[0]):
             response[k, q] = equation.root * row[first + k]
     solve_factor_rows(factor, response)
     for q in range(total):
-        equation = write_row(evidence, still, q, row)
+        equation = write_block_row(evidence, still, q, row)
         along = 0.0
         for k in range(factor.shape[0]):
             moved.coefficients[k] = still.coefficients[k] + response[k, q]
             along += equation.root * row[first + k] * response[k, q]
-        write_row(evidence, moved, q, moved_row)
+        write_block_row(evidence, moved, q, moved_row)
         # A weight of a loss falls where the residual grows.
         fall = along * equation.fall * equation.root * equation.residual
         for k in range(row.shape[0]):

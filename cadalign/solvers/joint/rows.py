@@ -8,7 +8,7 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, kernel
 from cadalign.solvers.evidence import beyond, fall_of_weight, loss_and_root, weigh_error
 from cadalign.solvers.joint.arrow import Arrow, add_rows, border_start
-from cadalign.solvers.joint.blocks import count_equations, write_row
+from cadalign.solvers.joint.blocks import count_block_equations, write_block_row
 from cadalign.solvers.joint.evidence import (
     Evidence,
     Focals,
@@ -111,8 +111,8 @@ def add_blocks(evidence: Evidence, state: State, arrow: Arrow, products: FloatAr
     cost = _add_priors(evidence.focals, evidence.scales, state, arrow)
     column = np.empty(products.shape[0])
     row, rows, still = column[:-1], column.reshape((-1, 1)), undisplaced(state)
-    for q in range(count_equations(evidence)):
-        equation = write_row(evidence, still, q, row)
+    for q in range(count_block_equations(evidence)):
+        equation = write_block_row(evidence, still, q, row)
         cost += equation.cost
         row *= equation.root
         column[-1] = equation.root * equation.residual

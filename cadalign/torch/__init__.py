@@ -16,9 +16,9 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray, is_number
 from cadalign.errors import CadalignError, InputError, require_kind
 from cadalign.estimation.focal import PriorOption
-from cadalign.estimation.layers import FitTask, fits_of
 from cadalign.estimation.options import FitOptions
 from cadalign.geometry.camera import Camera
+from cadalign.torch.fits import FitTask, fits_of
 
 if TYPE_CHECKING:
     import torch

@@ -17,9 +17,9 @@ from cadalign.estimation.focal import log_focal_range
 from cadalign.estimation.options import LOSSES, FitOptions
 from cadalign.estimation.problems import Problems, in_threads, rays_of
 from cadalign.estimation.solve import solve
-from cadalign.estimation.uncertainty.derivatives import UNKNOWNS, Optima, lens_slopes
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import rotations_from_vectors
+from cadalign.torch.derivatives import UNKNOWNS, Optima, lens_slopes
 
 _LARGEST_POLISH = 0.02  # turn [rad] or change of a logarithm beyond which a step is no polish
 _AT_BOUND = 1e-9

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 import msgspec
 import numpy as np
 
+from cadalign.batch.observation_fit import ObservationFit
 from cadalign.batch.outputs import COLUMNS, RECORD_COLUMNS, TIMING_COLUMNS, naming_row, result_row
 from cadalign.batch.sources import ObservationTask, read_sources
 from cadalign.datasets.detections.image_keypoints import (
@@ -21,7 +22,6 @@ from cadalign.datasets.detections.image_keypoints import (
 )
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError, DataError, InputError
-from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.result import Result
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.evaluation.options import ExperimentOptions, absolute_paths, plain_value

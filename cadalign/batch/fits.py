@@ -19,11 +19,11 @@ import pyarrow.compute as pc
 
 from cadalign.arrays import is_number
 from cadalign.batch.experiment import FitRunOptions, ManyEstimates, ManyOptions, plan_run
+from cadalign.batch.observation_fit import ObservationFit
 from cadalign.batch.outputs import write_csv
 from cadalign.batch.sources import ObservationTask
 from cadalign.errors import CadalignError, DataError, InputError, require_kind
 from cadalign.estimation.focal import FocalPrior
-from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.result import Result
 from cadalign.estimation.results import Results
@@ -85,7 +85,7 @@ def fit_many(
     on_progress : callable
         Is told of every chunk that is done.
     **options
-        Fields of `cadalign.estimation.observation_fit.ObservationFit`, such as ``similar``,
+        Fields of `cadalign.batch.observation_fit.ObservationFit`, such as ``similar``,
         ``robust``, ``shape``; of `FitOptions`, such as ``method``, ``loss``, ``stretch``; of
         `cadalign.batch.DetectorOptions`, such as ``model``, ``images``; and ``camera``, the file of
         a camera for all. A number as ``focal`` is the focal length [px] of all images. What an

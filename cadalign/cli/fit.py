@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 import tyro
 
+from cadalign.batch.observation_fit import ObservationFit
 from cadalign.cli.common import (
     NOTHING_WORKED,
     answer,
@@ -29,7 +30,6 @@ from cadalign.cli.options import (
 )
 from cadalign.errors import InputError, refuse_unused
 from cadalign.estimation.focal import PriorOption
-from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import read_json

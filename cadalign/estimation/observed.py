@@ -1,10 +1,9 @@
-"""Observations aligned; models and views of observation files and reconstructed photos."""
+"""Models and views of observation files, and views of reconstructed photos."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import fields, replace
+from collections.abc import Hashable, Mapping, Sequence
+from contextlib import nullcontext
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,97 +11,14 @@ import numpy.typing as npt
 
 from cadalign.errors import CadalignError, InputError, quote
 from cadalign.estimation.model import Model
-from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.options import FitOptions, Sigma
-from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.documents import in_file, within
+from cadalign.io.documents import within
 from cadalign.io.evidence import ObservedImage
-from cadalign.io.files import once_per_file
-from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import KeypointId
-
-
-def align_observed(
-    how: ObservationFit,
-    observation: Observation,
-    where: str,
-    options: FitOptions,
-    status: AbstractContextManager[Any] | None,
-) -> tuple[Result, tuple[View, ...]]:
-    """Align all evidence of an observation; see `ObservationFit.fit`. Returns its views, too."""
-    from cadalign.estimation.align import align  # takes time to import
-
-    model = _model(how, observation, where, options)
-    views = _views(how, observation, where, model)
-    with status or nullcontext(), _located(how, where):
-        result = align(
-            model,
-            views,
-            size=observation.size,
-            init=observation.init,
-            loss=options.loss,
-            loss_scale=options.loss_scale,
-            focal=options.focal,
-            focal_prior=options.focal_prior,
-            ransac=how.ransac if how.robust else None,
-        )
-    return result, views
-
-
-def _views(
-    how: ObservationFit, observation: Observation, where: str, model: Model | ShapeModel
-) -> tuple[View, ...]:
-    has_photos, stated = how.uses_photos(observation), how.stated_sigma(observation)
-    if has_photos and all(image.image is None for image in observation.views):
-        raise InputError(
-            "the observation names no photo",
-            where=how.named("image"),
-            fix="write its path as `image` into the file, or leave the option away",
-        )
-    with in_file(where):
-        sigma = stated.get("sigma")
-        views = views_of(observation, model, sigma=sigma, with_photos=has_photos)
-    if stated and sigma is None:
-        return tuple(replace(view, sigma=None) for view in views)
-    return views
-
-
-def _model(
-    how: ObservationFit, observation: Observation, where: str, options: FitOptions
-) -> Model | ShapeModel:
-    shape = how.shape_of(observation)
-    if shape is not None:
-        if observation.symmetry is not None:
-            raise InputError(
-                "has no effect together with a learned shape",
-                where=f"{where}: symmetry",
-                fix="leave out one of the two",
-            )
-        return _opened(shape)
-    mesh = None if observation.model is None else load_mesh(observation.model)
-    sigma = how.shape_sigma_of(observation)
-    with _located(how, where):
-        found = model_of(observation, options=options, shape_sigma=sigma, mesh=mesh)
-        return found if how.up_axis is None else replace(found, up_axis=how.up_axis)
-
-
-_opened = once_per_file(4)(ShapeModel.open)  # which runs use again and again
-
-
-@contextmanager
-def _located(how: ObservationFit, where: str) -> Iterator[None]:
-    """Let errors about arguments name the option, or else the observation."""
-    try:
-        yield
-    except InputError as error:
-        if error.where in {field.name for field in (*fields(how), *fields(how.ransac))}:
-            raise
-        with in_file(where):
-            raise
 
 
 def model_of(

@@ -18,9 +18,9 @@ import cadalign
 from cadalign import Alignment, CadalignError, Camera, FocalPrior, Observation, Result, Results
 from cadalign.batch.experiment import FitRunOptions, plan_run
 from cadalign.batch.fits import options_of, run_many
+from cadalign.batch.observation_fit import ObservationFit
 from cadalign.batch.outputs import COLUMNS
 from cadalign.errors import DataError, InputError
-from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.io.images import write_image

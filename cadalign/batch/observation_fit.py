@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn
@@ -15,12 +15,15 @@ from cadalign.errors import InputError
 from cadalign.estimation.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions, Sigma
 from cadalign.io.documents import in_file, within
+from cadalign.io.files import once_per_file
 from cadalign.io.observation import Observation, ObservationChanges
 from cadalign.io.observation_file import fill_xyz
 
 if TYPE_CHECKING:
+    from cadalign.estimation.model import Model
     from cadalign.estimation.result import Result
     from cadalign.estimation.view import View
+    from cadalign.shapes.model import ShapeModel
 
 _NOT_OF_FIT = ("shape_sigma", "image")  # stored options of the model and of the views
 _OF_THE_MODEL = ("stretch", "known_axis", "stretch_sigma")  # options that a learned shape lacks
@@ -242,13 +245,92 @@ class ObservationFit:
                 symmetry=observation.symmetry,
             )
         else:
-            from cadalign.estimation.observed import align_observed
-
             self.check_for(observation)
-            result, views = align_observed(self, observation, where, options, status)
+            result, views = _aligned(self, observation, where, options, status)
         for text in notes:
             note(text)
         return result, views
+
+
+def _aligned(
+    how: ObservationFit,
+    observation: Observation,
+    where: str,
+    options: FitOptions,
+    status: AbstractContextManager[Any] | None,
+) -> tuple[Result, tuple[View, ...]]:
+    """Align all evidence of an observation; returns its views, too."""
+    from cadalign.estimation.align import align
+    from cadalign.estimation.observed import views_of
+
+    model = _model(how, observation, where, options)
+    stated, has_photos = how.stated_sigma(observation), how.uses_photos(observation)
+    if has_photos and all(image.image is None for image in observation.views):
+        raise InputError(
+            "the observation names no photo",
+            where=how.named("image"),
+            fix="write its path as `image` into the file, or leave the option away",
+        )
+    with in_file(where):
+        sigma = stated.get("sigma")
+        views = views_of(observation, model, sigma=sigma, with_photos=has_photos)
+    if stated and sigma is None:
+        views = tuple(replace(view, sigma=None) for view in views)
+    with status or nullcontext(), _located(how, where):
+        result = align(
+            model,
+            views,
+            size=observation.size,
+            init=observation.init,
+            loss=options.loss,
+            loss_scale=options.loss_scale,
+            focal=options.focal,
+            focal_prior=options.focal_prior,
+            ransac=how.ransac if how.robust else None,
+        )
+    return result, views
+
+
+def _model(
+    how: ObservationFit, observation: Observation, where: str, options: FitOptions
+) -> Model | ShapeModel:
+    from cadalign.estimation.observed import model_of
+    from cadalign.io.meshes.files import load_mesh
+
+    shape = how.shape_of(observation)
+    if shape is not None:
+        if observation.symmetry is not None:
+            raise InputError(
+                "has no effect together with a learned shape",
+                where=f"{where}: symmetry",
+                fix="leave out one of the two",
+            )
+        return _opened(shape)
+    mesh = None if observation.model is None else load_mesh(observation.model)
+    sigma = how.shape_sigma_of(observation)
+    with _located(how, where):
+        found = model_of(observation, options=options, shape_sigma=sigma, mesh=mesh)
+        return found if how.up_axis is None else replace(found, up_axis=how.up_axis)
+
+
+@once_per_file(4)
+def _opened(path: Path) -> ShapeModel:
+    """Open a learned shape, which runs use again and again."""
+    from cadalign.shapes.model import ShapeModel
+
+    return ShapeModel.open(path)
+
+
+@contextmanager
+def _located(how: ObservationFit, where: str) -> Iterator[None]:
+    """Let errors about arguments name the option, or else the observation."""
+    try:
+        yield
+    except InputError as error:
+        if error.where in {field.name for field in (*fields(how), *fields(how.ransac))}:
+            raise
+        with in_file(where):
+            raise
 
 
 def _prior_of_photos(observation: Observation, note: Note) -> FocalPrior | None:

@@ -6,13 +6,12 @@ shape leaves open which side is seen, starts half a turn away are added.
 An estimate that determines the object's size is linear in all but the rotation. For a camera (C, c)
 of a rig, a point of the model is seen at ``X = C (R diag(s) x + t) + c``. Its ray says
 ``X_x = u X_z`` and ``X_y = v X_z``, its depth ``X_z = z``, and known lengths and heights of cameras
-are linear too: all of them hold for ``R diag(s)`` and t, 12 unknowns, and for s and t where R is
-given. None is homogeneous, so that views with one keypoint count.
+are linear in s and t, too. None is homogeneous, so that views with one keypoint count.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -34,10 +33,8 @@ _MOST_SIZED = 3
 _GRID = 400  # rotations
 _SCREENED = 64
 _MOST_METRIC = 16
-_ROUNDS = 3  # of weighting by the depths of the last
-_ROUNDS_GIVEN_ROTATION = 2
-_LEAST_EQUATIONS = 12
-_CONDITION = 1e-7  # least singular value over the largest, of columns of unit length
+_ROUNDS = 2  # of weighting by the depths of the last
+_RIDGE = 1e-14  # over the trace of normal equations
 _LEAST_SCALE = 1e-6
 
 _Start = tuple[FloatArray, FloatArray]  # a pose (12,), or those (P, 12) of all, and log scales (3,)
@@ -231,16 +228,13 @@ class _Rows(NamedTuple):
 def _metric_starts(evidence: Evidence, own: Sequence[_Start]) -> list[_Start]:
     """Poses (1, 12) and log scales (3,) of evidence with one pose, the likeliest first.
 
-    They have the rotations of its ``own`` starts, that of the linear solution and, where there are
-    none, those of a grid.
+    They have the rotations of its ``own`` starts or, where there are none, those of a grid.
     """
     rows, is_tied = _rows_of(evidence), has_scale_prior(evidence.scales)
     basis = np.ones((3, 1)) if is_tied else np.eye(3)  # of scales that a prior holds together
-    linear = _linear_rotation(rows)
-    rotations = [] if linear is None else [linear]
-    rotations.extend(pose[:9].reshape(3, 3) for pose, _ in own)
+    rotations: Iterable[FloatArray] = [pose[:9].reshape(3, 3) for pose, _ in own]
     if not own:
-        rotations.extend(_screened(evidence, rows, spread_rotations(_GRID), basis))
+        rotations = _screened(evidence, rows, spread_rotations(_GRID), basis)
     placed = [_given_rotation(evidence, rows, rotation, basis) for rotation in rotations]
     found = sorted((each for each in placed if each is not None), key=lambda each: each[0])
     return [(pose[None], logs) for _, pose, logs in found[:_MOST_METRIC]]
@@ -277,35 +271,6 @@ def _rows_of(evidence: Evidence) -> _Rows:
     )
 
 
-def _linear_rotation(rows: _Rows) -> FloatArray | None:
-    """The rotation nearest to the linear solution; None where it is not determined."""
-    if len(rows.right) < _LEAST_EQUATIONS:
-        return None
-    by_matrix = (rows.normals[:, :, None] * rows.points[:, None]).reshape(-1, 9)
-    left, weights = np.concatenate([by_matrix, rows.normals], axis=1), rows.weights
-    found = np.zeros(12)
-    for _ in range(_ROUNDS):
-        weighted = left * weights[:, None]
-        sizes = np.linalg.norm(weighted, axis=0)
-        if not (sizes > 0).all():
-            return None
-        solved, _, _, singular = np.linalg.lstsq(weighted / sizes, rows.right * weights, rcond=None)
-        if singular[-1] < _CONDITION * singular[0]:
-            return None
-        found = solved / sizes
-        weights = rows.weights_at(rows.depths(found[:9].reshape(3, 3), found[9:]))
-    matrix = found[:9].reshape(3, 3)
-    lengths = np.linalg.norm(matrix, axis=0)
-    if np.linalg.det(matrix) <= 0 or not (lengths > 0).all():
-        return None
-    rotation = np.eye(3)
-    for _ in range(_ROUNDS):  # nearest rotation and column lengths in turn
-        left_vectors, _, right_vectors = np.linalg.svd(matrix * lengths)
-        rotation = left_vectors @ right_vectors
-        lengths = np.maximum((rotation * matrix).sum(axis=0), 1e-3 * lengths.max())
-    return np.asarray(rotation) if np.linalg.det(rotation) > 0 else None
-
-
 def _given_rotation(
     evidence: Evidence, rows: _Rows, rotation: FloatArray, basis: FloatArray
 ) -> tuple[float, FloatArray, FloatArray] | None:
@@ -318,7 +283,7 @@ def _given_rotation(
     extra_left, extra_right = _other_rows(evidence, rotation, basis)
     weights, cost = rows.weights, np.inf
     found = np.zeros(left.shape[1])
-    for _ in range(_ROUNDS_GIVEN_ROTATION):
+    for _ in range(_ROUNDS):
         weighted = np.concatenate([left * weights[:, None], extra_left])
         target = np.concatenate([rows.right * weights, extra_right])
         sizes = np.linalg.norm(weighted, axis=0)
@@ -349,7 +314,7 @@ def _screened(
     left = np.concatenate([same, by_scale @ basis], axis=2) * rows.weights[:, None]
     right = rows.right * rows.weights
     normal = left.swapaxes(1, 2) @ left
-    ridge = _CONDITION**2 * np.trace(normal, axis1=1, axis2=2)[:, None, None]
+    ridge = _RIDGE * np.trace(normal, axis1=1, axis2=2)[:, None, None]
     normal = normal + ridge * np.eye(left.shape[2])
     projected = (left.swapaxes(1, 2) @ right)[:, :, None]
     try:

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from cadalign.estimation.results import Results, to_dataframe
     from cadalign.estimation.uncertainty.summary import (
         EvidenceSummary,
-        MaskResiduals,
         Uncertainty,
     )
     from cadalign.estimation.view import View
@@ -36,7 +35,6 @@ __all__ = [
     "FitOptions",
     "FitStats",
     "FocalPrior",
-    "MaskResiduals",
     "Model",
     "RansacOptions",
     "Result",

@@ -21,7 +21,7 @@ from cadalign.estimation.fitted import Alternative, FitStats
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import FitOptions, pixel_information
 from cadalign.estimation.result_parts import Posterior, ViewResult
-from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals
+from cadalign.estimation.uncertainty.summary import EvidenceSummary
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -99,23 +99,6 @@ class _Summary(ForeignDocument):
     share: NotNegative | None = None  # of a photo
 
 
-class _Mask(ForeignDocument):
-    """The fields of `MaskResiduals`; null for a number that is not known."""
-
-    points: list[Point2]
-    normals: list[Point2]
-    residuals: list[Finite | None]
-    inliers: list[bool]
-    sigma: NotNegative | None
-    correlation: Positive
-    offset: Finite
-    is_used: bool
-
-    def __post_init__(self) -> None:
-        names = ("normals", "residuals", "inliers")
-        _check_lengths(self, names, len(self.points), "for {} points")
-
-
 class _Result(
     ForeignDocument,
     rename={
@@ -152,13 +135,10 @@ class _Result(
     symmetry: Any = None  # in the form of `Symmetry.from_dict`
     own_equal: str = ""
     rig_from_model: Any = None
-    mask_residuals: tuple[_Mask | None, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.views:
             raise InputError("there are none", where="views")
-        if self.mask_residuals:
-            _check_lengths(self, ("mask_residuals",), len(self.views), "for {} views")
         names = ("ids", "points_covariance", "points_cam_covariance")
         _check_lengths(self, names, len(self.points_3d), "but points_3d has {}", ", ")
 
@@ -179,7 +159,6 @@ _FORMS: Mapping[type, type[ForeignDocument]] = {
     Alternative: _Alternative,
     FitOptions: _Options,
     EvidenceSummary: _Summary,
-    MaskResiduals: _Mask,
 }
 
 
@@ -234,10 +213,10 @@ _VALUES: Mapping[str, Callable[[Any], Any]] = {
     "camera": Camera.from_dict,
     "symmetry": Symmetry.from_dict,
     "ids": tuple,
+    "points_2d": _pixels,
     "inliers": partial(np.array, dtype=bool),
     "points_3d": lambda rows: np.array(rows).reshape(-1, 3),
     **dict.fromkeys(("alignment", "rig_from_model"), Alignment.from_dict),
-    **dict.fromkeys(("points", "normals", "points_2d"), _pixels),
     **dict.fromkeys(("own_bounds", "own_stretch"), np.array),
     **dict.fromkeys(_OF_POINTS, lambda rows: np.array(rows).reshape(-1, 3, 3)),
 }
@@ -286,7 +265,6 @@ def _result(read: _Result, kind: type[Result]) -> Result:
         "views": tuple(views),
         "alternatives": tuple(alternatives),
         "options": read.options and _options(read.options, len(views[0].residuals)),
-        "mask_residuals": tuple(each and _mask(each) for each in read.mask_residuals),
     }
     return kind(**fields, posterior=posterior)
 
@@ -306,12 +284,6 @@ def _summary(read: _Summary) -> EvidenceSummary:
     fields = asdict(read)
     lacking = {name: math.nan for name in ("rms_sigmas", "rms") if fields[name] is None}
     return EvidenceSummary(**fields | lacking)
-
-
-def _mask(read: _Mask) -> MaskResiduals:
-    residuals = np.array(read.residuals, dtype=float)  # NaN for null
-    sigma = math.nan if read.sigma is None else read.sigma
-    return MaskResiduals(**_values(read) | {"residuals": residuals, "sigma": sigma})
 
 
 def _options(read: _Options, count: int) -> FitOptions:

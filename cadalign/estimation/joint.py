@@ -175,7 +175,6 @@ def result_of(
         own_stretch=np.where(
             has_length, best.lengths / np.where(has_length, prior.lengths, 1), 1.0
         ),
-        mask_residuals=notes.mask_residuals,
         **of_result,
     )
 

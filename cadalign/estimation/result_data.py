@@ -24,7 +24,7 @@ from cadalign.geometry.symmetry import Symmetry
 
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
-    from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals
+    from cadalign.estimation.uncertainty.summary import EvidenceSummary
     from cadalign.estimation.warning import EstimateWarning
     from cadalign.geometry.mesh import Mesh
     from cadalign.shapes.model import ShapeModel
@@ -80,8 +80,6 @@ class ResultData:
         Number of the mixture's component that the object belongs to.
     rig_from_model : Alignment, optional
         The alignment in the frame that views with ``cam_from_rig`` share; None without them.
-    mask_residuals : tuple of MaskResiduals or None
-        Agreement of the contour of every view's mask with the estimate; empty without masks.
     own_bounds, own_stretch, own_equal : optional
         ``bounds``, ``stretch`` and ``equal_under_symmetry`` where they do not follow.
     """
@@ -104,7 +102,6 @@ class ResultData:
     model: Model | ShapeModel | None = None
     component: int = 0
     rig_from_model: Alignment | None = None
-    mask_residuals: tuple[MaskResiduals | None, ...] = ()
     own_bounds: FloatArray | None = None
     own_stretch: FloatArray | None = None
     own_equal: str | None = None

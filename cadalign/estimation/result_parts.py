@@ -17,7 +17,6 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.fitted import Diagnosis, FittedKeypoints, quickly
 from cadalign.estimation.uncertainty.summary import (
     EvidenceSummary,
-    MaskResiduals,
     Uncertainty,
     uncertainty_of,
 )
@@ -84,8 +83,6 @@ class OutlineNotes(NamedTuple):
 
     evidence: tuple[EvidenceSummary, ...] = ()
     warnings: Warnings = ()
-    mask_residuals: tuple[MaskResiduals | None, ...] = ()
-    """The contours of every view's mask."""
 
 
 NO_NOTES = OutlineNotes()

@@ -92,8 +92,9 @@ def _measure(cases: list[_Case], kind: str, seed: int) -> Row:
         alone.append(case.errors(without.alignment))
         joint.append(case.errors(result.alignment))
         bounds += case.ideal_errors(contour_bound(case.model, view, case.seen.alignment), rng)
-        (residuals,) = result.mask_residuals
-        further.append((residuals.sigma, not residuals.is_used, wall))
+        of_mask = result.evidence[-1]
+        sigma = of_mask.rms / of_mask.rms_sigmas
+        further.append((sigma, np.isnan(of_mask.rms), wall))
         bottles.append(case.annotated.category.endswith("bottle"))
     row: Row = {"mask": kind}
     for suffix, errors in {"keypoints": alone, "mask": joint, "bound": bounds}.items():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ from matplotlib.figure import Figure
 import cadalign
 from cadalign import Alignment, Camera, Mesh, Model, Result, View
 from cadalign.errors import DataError, InputError
-from cadalign.estimation import MaskResiduals
 
 CAMERA = Camera(640, 480, 900, 900, 319.5, 239.5)
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
@@ -39,42 +37,6 @@ def test_results_are_saved_and_loaded(fitted: Result, aligned: Result, tmp_path:
     assert again.to_dict() == aligned.to_dict()
     assert again.cameras == (CAMERA,)
     np.testing.assert_array_equal(again.views[0].points_2d, SEEN)
-
-
-def test_residuals_of_masks_are_saved_and_loaded(fitted: Result) -> None:
-    along = np.arange(6.0).reshape(3, 2)
-    inliers = np.array([True, False, False])
-    seen = MaskResiduals(along, along, np.array([0.5, np.nan, -9.0]), inliers, 1.5, 3.0, -0.2)
-    lost = replace(seen, inliers=np.zeros(3, bool), sigma=np.nan, offset=0.0, is_used=False)
-    view, many = fitted.views[0], (seen, None, lost)
-    result = replace(fitted, views=(view, view, view), mask_residuals=many)
-    text = result.to_json()
-    again = Result.from_json(text)
-    assert again.to_json() == text
-    assert again.mask_residuals[1] is None
-    for found, given in zip(again.mask_residuals[::2], many[::2], strict=True):
-        for name, value in vars(given).items():
-            np.testing.assert_array_equal(getattr(found, name), value)
-
-
-def test_residuals_of_masks_are_checked(fitted: Result) -> None:
-    data = fitted.to_dict()
-    with pytest.raises(InputError) as caught:
-        Result.from_dict(data | {"mask_residuals": [None, None]})
-    assert str(caught.value) == "result: mask_residuals: 2 entries for 1 views"
-    mask = {
-        "points": [[0, 0]],
-        "normals": [[0, 1]],
-        "residuals": [],
-        "inliers": [True],
-        "sigma": 1,
-        "correlation": 1,
-        "offset": 0,
-        "is_used": True,
-    }
-    with pytest.raises(InputError) as caught:
-        Result.from_dict(data | {"mask_residuals": [mask]})
-    assert str(caught.value).endswith("0 entries for 1 points")
 
 
 def test_damaged_file_is_named(tmp_path: Path) -> None:

@@ -139,20 +139,14 @@ def refine_with_outlines(
         text = f"{source.where} contradicts the rest and is left out: {reason}"
         warnings.append(source.warning(text))
         left = [each for each in left if each is not source]
-    ends = dict(zip(left, best[0].fit.measured, strict=True)) if left else {}
     supports = dict(zip(left, best[0].supports, strict=True)) if left else {}
     by_rank = search.by_rank(left)
     if by_rank and not wrong:
         doubts = {source: source.doubt(each) for source, each in supports.items()}
         warnings += [source.warning(text) for source, text in doubts.items() if text]
-    masks = {each.image: each for each in sources if isinstance(each, MaskSource)}
-    residuals = [
-        masks[number].residuals(ends.get(masks[number])) if number in masks else None
-        for number in range(len(views) if masks else 0)
-    ]
     summaries = [source.summary(supports.get(source, OutlineSupport())) for source in sources]
     found = [each.minimum(by_rank=by_rank) for each in best] if left else list(minima)
-    return found, OutlineNotes(tuple(summaries), tuple(warnings), tuple(residuals))
+    return found, OutlineNotes(tuple(summaries), tuple(warnings))
 
 
 class OutlineSearch(NamedTuple):

@@ -7,6 +7,7 @@ click no better. Both are unknown, and integrated out with the rest of the shape
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -42,7 +43,6 @@ from cadalign.estimation.contours.outline import (
     trimmed_deviation,
 )
 from cadalign.estimation.contours.surface import PosedSurface
-from cadalign.estimation.uncertainty.summary import MaskResiduals
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
 
@@ -191,9 +191,10 @@ class MaskSource(OutlineSource):
         relative = _RELATIVE_TOLERANCE if self.is_exact else _WARPED_TOLERANCE
         tolerance = max(_LEAST_TOLERANCE, relative * self.contour.size)
         within = np.abs(np.nan_to_num(found.residuals, nan=np.inf)) < tolerance
-        seen = self.residuals(found)
-        figures = int(seen.inliers.sum()), seen.rms, seen.rms / seen.sigma
-        return OutlineSupport(float(within.mean()), *figures)
+        sigma = found.noise.sigma
+        near = np.abs(np.nan_to_num(found.residuals, nan=np.inf)) < _INLIER * sigma
+        rms = float(np.sqrt((found.residuals[near] ** 2).mean())) if near.any() else math.nan
+        return OutlineSupport(float(within.mean()), int(near.sum()), rms, rms / sigma)
 
     def refusal(self, support: OutlineSupport) -> str:
         """See `OutlineSource`."""
@@ -211,19 +212,6 @@ class MaskSource(OutlineSource):
             "the best pose found: the object may be partly hidden, the model another, or the pose "
             "wrong"
         )
-
-    def residuals(self, found: MeasuredOutline | None) -> MaskResiduals:
-        """The contour beside the rim; without an outline that of a mask that was left out."""
-        points, normals, _ = self.contour
-        if found is None:
-            lacking = np.full(len(points), np.nan)
-            unused = np.zeros(len(points), dtype=bool)
-            nothing = float("nan"), 1.0, 0.0
-            return MaskResiduals(points, normals, lacking, unused, *nothing, is_used=False)
-        residuals, noise = -found.residuals, found.noise
-        near = np.abs(np.nan_to_num(residuals, nan=np.inf)) < _INLIER * noise.sigma
-        figures = noise.sigma, noise.correlation, float(found.own[0]) * noise.offset
-        return MaskResiduals(points, normals, residuals, near, *figures)
 
 
 def convex_hull(mask: FloatArray | BoolArray) -> BoolArray | None:

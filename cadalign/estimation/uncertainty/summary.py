@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import FloatArray
 from cadalign.estimation.warning import EstimateWarning, Kind, Warnings
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -264,42 +264,6 @@ def name_of(kind: str, view: int | None) -> str:
     ('size', 'views[0].depth')
     """
     return kind if view is None else f"views[{view}].{_FIELDS.get(kind, kind)}"
-
-
-@dataclass(frozen=True, eq=False)
-class MaskResiduals:
-    """The model's rim beside a mask's contour, at samples 2 px apart along it."""
-
-    points: FloatArray
-    """Samples of the contour (s, 2), without those near the image's border [px]; of the mask's
-    convex hull where the model is similar to the object in its outermost points alone."""
-    normals: FloatArray
-    """Unit normals (s, 2), from the object outwards."""
-    residuals: FloatArray
-    """How far outside of the contour the model's rim lies along the normal (s,), ``offset`` added
-    [px]; NaN where no rim is near."""
-    inliers: BoolArray
-    """Samples that agree with the rest (s,)."""
-    sigma: float
-    """Standard deviation of the residuals, given or estimated [px]."""
-    correlation: float
-    """Number of neighbouring samples that count as one, for their residuals are alike."""
-    offset: float
-    """How far outside of the model's rim the whole contour lies, as that of a dilated mask does
-    [px]."""
-    is_used: bool = True
-    """False for a mask that contradicts the rest of the evidence, which was left out."""
-
-    @property
-    def rms(self) -> float:
-        """Root mean square residual of the inliers [px]."""
-        kept = self.residuals[self.inliers]
-        return float(np.sqrt((kept**2).mean())) if len(kept) else float("nan")
-
-    @property
-    def support(self) -> float:
-        """Share of the samples that are inliers."""
-        return float(self.inliers.mean())
 
 
 def outside_image(

@@ -109,15 +109,10 @@ class TestExactMasks:
         assert error < 0.2
         assert error < 4 * result.std.rotation_deg
         assert result.std.rotation_deg < alone.std.rotation_deg / 3
-        (residuals,) = result.mask_residuals
-        assert residuals is not None
-        assert residuals.is_used
-        assert residuals.support > 0.9
-        assert residuals.rms < 0.5
-        assert len(residuals.points) == len(residuals.residuals) > 200
         (summary,) = [each for each in result.evidence if each.kind == "mask"]
         assert summary.view == 0
-        assert summary.rms == pytest.approx(residuals.rms)
+        assert summary.count > 180
+        assert summary.rms < 0.5
         assert summary.rms_sigmas < 1.5
 
     def test_probabilities_and_files_serve_as_well(self, sample_root: Path, tmp_path: Path) -> None:
@@ -154,11 +149,7 @@ def test_damaged_masks_still_help(sample_root: Path, kind: str) -> None:
     result = align(case.model, case.view(mask=mask))
     error = rotation_error(est=result.alignment, gt=case.truth)
     assert error < (0.5 if kind in ("dilated", "eroded") else 1.1) * alone.std.rotation_deg
-    (residuals,) = result.mask_residuals
-    assert residuals is not None
-    assert residuals.is_used
-    if kind in ("dilated", "eroded"):
-        assert abs(residuals.offset) == pytest.approx(2, abs=0.5)
+    assert np.isfinite(result.evidence[-1].rms)
 
 
 @pytest.mark.parametrize("kinds", [["exact"], ["dilated", "eroded"], ["smoothed"]])
@@ -191,9 +182,7 @@ class TestOtherObjects:
         alone = align(case.model, case.view())
         result = align(case.model, case.view(mask=neighbour))
         assert any(each.kind == "mask" for each in result.warnings)
-        (residuals,) = result.mask_residuals
-        assert residuals is not None
-        assert not residuals.is_used
+        assert np.isnan(result.evidence[-1].rms)
         assert rotation_error(est=result.alignment, gt=alone.alignment) < 1e-3
         elsewhere = np.zeros_like(case.mask)
         elsewhere[:20, :20] = True

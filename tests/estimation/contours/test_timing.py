@@ -40,8 +40,6 @@ def test_a_mask_takes_at_most_half_a_second() -> None:
     assert mask.sum() > 60_000
     pixels = CAMERA.project(truth.apply(points)) + rng.normal(0, 1, (8, 2))
     model, view = Model(points_3d=points, mesh=mesh), View(CAMERA, pixels, mask=mask)
-    (residuals,) = align(model, view).mask_residuals  # compiles the kernels, too
-    assert residuals is not None
-    assert residuals.is_used
+    assert np.isfinite(align(model, view).evidence[-1].rms)  # compiles the kernels, too
     measure = timed(lambda: align(model, view))
     assert reference_seconds(measure, below=0.5) < 0.5

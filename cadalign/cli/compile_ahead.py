@@ -74,7 +74,6 @@ def _align_shape(views: int) -> None:
 
 def _align_with_mask() -> None:
     from cadalign.estimation.align import align
-    from cadalign.estimation.contours.silhouettes import colors_at
     from cadalign.estimation.model import Model
     from cadalign.geometry.mesh import Mesh
     from cadalign.render import Scene, cast_geometry
@@ -85,7 +84,6 @@ def _align_with_mask() -> None:
     mask = cast_geometry(Scene(mesh), _CAMERA, _POSE).mask
     view = View(_CAMERA, pixels, sigma=1.0, mask=mask)
     align(Model(points_3d=points, mesh=mesh), view, ransac=_RANSAC)
-    colors_at(np.zeros((1, 1, 3), np.uint8), np.zeros((1, 2)))
 
 
 def _retrieval_and_boxes() -> None:

@@ -20,7 +20,7 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel
 from cadalign.errors import InputError
 from cadalign.estimation.contours.mask import MaskSource
-from cadalign.estimation.contours.outline import Track
+from cadalign.estimation.contours.outline import MeasuredOutline, Track
 from cadalign.estimation.contours.problem import ContourProblem, Place, shift_to
 from cadalign.estimation.contours.surface import surface_of
 from cadalign.estimation.estimates import mean_state, pose_and_lengths
@@ -338,7 +338,6 @@ def _beside(other: np.ndarray, own: np.ndarray, rng: np.random.Generator) -> np.
 
 _REACH = 8.0  # [px]
 _LEAST_OFFSET = 0.1  # [px], that the whole contour may have in common
-_INLIER = 3.5  # in standard deviations
 
 
 def contour_bound(model: Model, view: View, gt: Alignment) -> FloatArray:
@@ -364,11 +363,10 @@ def contour_bound(model: Model, view: View, gt: Alignment) -> FloatArray:
     centred = outline.places[outline.found]
     offset = float(np.median(centred)) if len(centred) else 0.0
     known = track.noise._replace(sigma=1.0, offset=max(abs(offset), _LEAST_OFFSET))
-    own = np.array([offset / known.offset, 0.0, 0.0])
-    noise = source.learned(outline, own, track._replace(noise=known)).noise
-    residuals = np.abs(np.nan_to_num(outline.residuals(own, known)))
-    agreeing = outline._replace(found=outline.found & (residuals < _INLIER * noise.sigma))
-    augmented = problem.augmented(look._replace(outlines=[agreeing]), [noise])
+    learned = source.learned(outline, offset, track._replace(noise=known))
+    agreeing = MeasuredOutline(outline, offset, learned.noise).inliers
+    seen = look._replace(outlines=[outline._replace(found=agreeing)])
+    augmented = problem.augmented(seen, [learned])
     assert augmented is not None
     sightings = augmented.evidence.sightings
     linear = sightings._replace(loss=np.full_like(sightings.loss, LINEAR))

@@ -11,10 +11,11 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import map_coordinates
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import InputError
-from cadalign.estimation.contours.silhouettes import Image, sampled
 from cadalign.geometry.alignment import Alignment, model_rays
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.raycaster import RayCaster
@@ -34,8 +35,6 @@ _LONGEST, _MOST_DIAGONALS = 80_000.0, 45.0
 REACH = 2.0
 """Farthest that a level line is sought from a boundary pixel, or from a rim [px]."""
 _STEP = 0.25
-
-
 _LONGEST_STEP = 1.5  # [px], between rays on a normal: a thinner part may be missed
 _MOST_STEPS = 24  # to either side
 _PRECISION = 0.05  # [px], of a rim
@@ -45,6 +44,9 @@ _STEEPEST = 1.2  # tangent of the angle between rim and contour above which thes
 _BANDS = ((0.25, 3), (1.0, 5), (np.inf, 7))
 _MARGIN = 8  # [px], about the rims: their reach, and that of smoothing
 _LEAST_COSINE = 0.3  # between rim and contour
+
+
+Image = npt.NDArray[np.float32]
 
 
 class Contour(NamedTuple):
@@ -100,6 +102,17 @@ def contour_of(probability: FloatArray | BoolArray) -> Contour:
             curves.append(np.full(len(piece), count))
             count += 1
     return Contour(np.concatenate(points), np.concatenate(normals), np.concatenate(curves))
+
+
+def sampled(image: Image, points: FloatArray) -> FloatArray:
+    """Values (n,) of an image (h, w) at points (n, 2), bilinear; outside those of the border.
+
+    OpenCV 4 rounds places to 1/32 px (`cv2.remap`), which moves contours by more than the precision
+    that is sought.
+    """
+    places = np.clip(np.nan_to_num(points), 0, np.subtract(image.shape[::-1], 1))
+    values = map_coordinates(image, places.T[::-1], order=1, mode="nearest", output=np.float64)
+    return np.asarray(values)
 
 
 def smoothed(image: Image, sigma: float = _SMOOTHING) -> Image:

@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.contours.outline import LEAST_OFFSET, MeasuredOutline, Noise, Track
 from cadalign.estimation.contours.problem import (
     OWN_MODES,
@@ -29,19 +28,17 @@ from cadalign.estimation.contours.problem import (
 from cadalign.estimation.joint_robust import with_whitening_times
 from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import State
-from cadalign.solvers.joint.search import objective_of, score_state
+from cadalign.solvers.joint.search import score_state
 
+_MOST_ROUNDS = 16
+_FEW_ITERATIONS = 4  # of a round, whose rims are not those of its end
 _ITERATIONS = 12
 _MOST_STEPS = 20
-_PATIENCE = 2  # steps that don't lower the cost
-_SHARES = (0.4, 0.1)  # of a step, until one lowers the cost
+_SHARES = (0.3,)  # of a step that does not lower the cost
 _SHARES_OF_OTHERS = (0.5, 0.25)  # of the way to another estimate
-_LEAST_GAIN = 0.1  # of the cost, -2 log likelihood
-_WEAKEST = 2  # directions that are tried before a descent ends
-MOST_ROUNDS = 16
-"""Most rounds of an approach."""
-_FEW_ITERATIONS = 4  # of a round, whose rims are not those of its end
-_MOST_NOISES = 3  # that are learned, each where the cost at the last is least
+_LEAST_GAIN = 0.3  # of the cost, -2 log likelihood
+_WEAKEST = 1  # directions that are tried before a descent ends
+_MOST_NOISES = 1  # that are learned anew, each where the cost at the last is least
 _LEAST_FREEDOM = 0.1  # share of the residuals' degrees of freedom that the unknowns leave
 
 
@@ -72,216 +69,197 @@ class OutlineFit(NamedTuple):
     def measured(self) -> list[MeasuredOutline | None]:
         """The outline that each source measures, and its noise."""
         return [
-            None if outline is None else MeasuredOutline(outline, own, track.noise)
+            outline and MeasuredOutline(outline, own[0] * track.noise.offset, track.noise)
             for outline, own, track in zip(
                 self.look.outlines, self.place.own, self.tracks, strict=True
             )
         ]
 
 
-class Approach(NamedTuple):
-    """A place on the way to the outlines; the step that led there, with the outlines before it."""
-
-    place: Place
-    tracks: list[Track]
-    step: OutlineFit | None = None
-
-    @classmethod
-    def begun(cls, problem: ContourProblem, state: State, *, is_wide: bool = False) -> Approach:
-        """The start, which ``is_wide`` says may be far off."""
-        tracks = [source.first(is_wide=is_wide) for source in problem.sources]
-        return cls(Place.of(state, len(tracks)), tracks)
-
-    def followed(self, problem: ContourProblem, rounds: int = MOST_ROUNDS) -> Approach | None:
-        """So many rounds further, at most; None where no source shows an outline."""
-        here: Approach | None = self
-        for _ in range(rounds):
-            if here is None or all(track.is_settled for track in here.tracks):
-                break
-            here = here._next(problem)
-        return here
-
-    def _next(self, problem: ContourProblem) -> Approach | None:
-        look = problem.look(self.place, self.tracks)
-        tracks = _learned(problem, look, self.tracks)
-        augmented = problem.augmented(look, [track.noise for track in tracks])
-        there = None if augmented is None else augmented.refined(_FEW_ITERATIONS)
-        if there is None:
-            return None
-        tracks, own = with_learned_offsets(there, tracks, there.place.own, problem.learning)
-        moves = problem.moves(look, there)
-        advanced = [
-            source.advanced(track, outline, moved)
-            for source, track, outline, moved in zip(
-                problem.sources, tracks, look.outlines, moves, strict=True
-            )
-        ]
-        step = OutlineFit(look, there, advanced)
-        return Approach(there.place._replace(own=own), advanced, step)
-
-
-class Descent(NamedTuple):
-    """Steps that lower the cost of masks at a known noise.
-
-    The ``others`` are estimates from other starts, towards which the cost is tried, too.
-    """
-
-    problem: ContourProblem
-    tracks: list[Track]
-    others: Sequence[Place] = ()
-
-    def at(self, place: Place) -> OutlineFit | None:
-        """The outlines of a place as evidence; None where there are none."""
-        return self.stacked(self.problem.look(place, self.tracks))
-
-    def stacked(self, look: PosedOutlines) -> OutlineFit | None:
-        """The outlines of a look as evidence; None where there are none."""
-        augmented = self.problem.augmented(look, [track.noise for track in self.tracks])
-        if augmented is None:
-            return None
-        unmatched = sum(
-            track.noise.cost(track.reach) * int((~outline.found).sum())
-            for outline, track in zip(look.outlines, self.tracks, strict=True)
-            if outline is not None
-        )
-        cost = objective_of(augmented.evidence, augmented.state) + unmatched
-        return OutlineFit(look, augmented, self.tracks, cost, unmatched)
-
-    def run(self, here: OutlineFit) -> OutlineFit:
-        """The place where no step lowers the cost.
-
-        Pixels make the cost rough: where whole steps don't lower it, the least is tried for shorter
-        ones and for others.
-        """
-        for _ in range(_MOST_STEPS):
-            better = self._stepped(here) or self._elsewhere(here)
-            if better is None:
-                break
-            here = better
-        return here
-
-    def _stepped(self, here: OutlineFit) -> OutlineFit | None:
-        """A place that costs less after whole steps, or on the way to the goal of the first.
-
-        Steps go on for a while where they don't lower the cost.
-        """
-        goal = here.augmented.refined(_ITERATIONS)
-        if goal is None:
-            return None
-        last = here
-        for _ in range(_PATIENCE):
-            step = goal if last is here else last.augmented.refined(_ITERATIONS)
-            there = None if step is None else self.at(step.place)
-            if there is None:
-                break
-            if there.cost < here.cost - _LEAST_GAIN:
-                return there
-            last = there
-        for share in _SHARES:
-            there = self.at(here.place.towards(goal.place, share))
-            if there is not None and there.cost < here.cost - _LEAST_GAIN:
-                return there
-        return None
-
-    def _elsewhere(self, here: OutlineFit) -> OutlineFit | None:
-        """A place that costs less along the directions of which least is known, or to others."""
-        if not self.problem.surface.is_exact:
-            return None
-        _, information = information_of(here.augmented.evidence, here.augmented.state)
-        steps = weakest_steps(information, _WEAKEST)
-        goals = [here.place.moved(sign * step) for step in steps for sign in (1.0, -1.0)]
-        goals.extend(
-            here.place.towards(other, share) for other in self.others for share in _SHARES_OF_OTHERS
-        )
-        found = [each for each in map(self.at, goals) if each is not None]
-        best = min(found, key=lambda each: each.cost, default=here)
-        return best if best.cost < here.cost - _LEAST_GAIN else None
-
-
-def first_fit(problem: ContourProblem, state: State, *, is_wide: bool = False) -> OutlineFit | None:
-    """The estimate near a start, which ``is_wide`` says may be far off; None without an outline.
-
-    Where costs compare it has the least cost nearby, at the noise that is learned on the way.
-    """
-    here = Approach.begun(problem, state, is_wide=is_wide).followed(problem)
-    if here is None:
-        return None
-    return _lowered(problem, here) if problem.is_comparable else here.step
+def first_fit(problem: ContourProblem, state: State) -> OutlineFit | None:
+    """The estimate that rounds of steps from a start lead to; None without an outline."""
+    tracks = [source.first() for source in problem.sources]
+    return _approached(problem, Place.of(state, len(tracks)), tracks)
 
 
 def last_fit(
-    problem: ContourProblem, place: Place, tracks: Sequence[Track], others: Sequence[Place] = ()
+    problem: ContourProblem,
+    fit: OutlineFit,
+    tracks: Sequence[Track] | None = None,
+    others: Sequence[Place] = (),
 ) -> OutlineFit | None:
-    """The estimate near another one at a place, with the noise of ``tracks`` where costs compare.
+    """The end near another estimate; None without an outline.
 
-    ``others`` are estimates from other starts, towards which the cost is tried, too.
+    Where costs compare, it has the least cost at the noise of ``tracks``, which is learned without
+    them. ``others`` are estimates from other starts, towards which the cost is tried, too.
     """
-    tracks = [source.last(track) for source, track in zip(problem.sources, tracks, strict=True)]
-    if problem.is_comparable:
-        descent = Descent(problem, tracks, others)
-        start = descent.at(place)
-        return None if start is None else descent.run(start)
-    here = Approach(place, tracks).followed(problem)
-    return None if here is None or here.step is None else _with_wider_noise(problem, here.step)
+    begun = fit.tracks if tracks is None else tracks
+    begun = [source.last(track) for source, track in zip(problem.sources, begun, strict=True)]
+    if not problem.is_comparable:
+        end = _approached(problem, fit.place, begun)
+        return None if end is None else _with_wider_noise(problem, end)
+    start = fit_at(problem, fit.place, begun)
+    if start is None:
+        return None
+    if tracks is not None:
+        return descended(problem, start, others)
+    start = _costed(problem, start.look, _learned(problem, start.look, begun)) or start
+    return descended(problem, start, learns=True)
 
 
-def _lowered(problem: ContourProblem, here: Approach) -> OutlineFit | None:
-    """The least cost near the end of an approach, at the noise that its residuals show."""
-    is_exact = problem.surface.is_exact
-    found: OutlineFit | None = None
-    descent = Descent(problem, [track._replace(is_fine=is_exact) for track in here.tracks])
-    look = problem.look(here.place, descent.tracks)
-    for _ in range(_MOST_NOISES):
-        learned = _learned(problem, look, descent.tracks)
-        if found is not None:
-            own, learning = look.place.own, problem.learning
-            learned, own = with_learned_offsets(found.augmented, learned, own, learning)
-            look = look._replace(place=look.place._replace(own=own))
-            before = [track.noise for track in descent.tracks]
-            if not is_exact or all(map(Noise.is_like, before, [each.noise for each in learned])):
-                break  # a similar surface's noise is learned on the way
-        descent = descent._replace(tracks=learned)
-        start = descent.stacked(look)
-        if start is None:
+def _approached(
+    problem: ContourProblem, place: Place, tracks: Sequence[Track]
+) -> OutlineFit | None:
+    """The last of some rounds, each with the noise that the residuals before its step show."""
+    fit: OutlineFit | None = None
+    for _ in range(_MOST_ROUNDS):
+        look = problem.look(place, tracks)
+        learned = _learned(problem, look, tracks)
+        here = problem.augmented(look, learned)
+        there = None if here is None else here.refined(_FEW_ITERATIONS)
+        if here is None or there is None:
             return None
-        found = descent.run(start)
-        look = found.look
-    return found
+        learned, place = _with_likeliest_offsets(problem, there, learned)
+        fit = OutlineFit(look, there._replace(place=place), learned)
+        is_settled = not problem.is_comparable or all(map(Track.is_like, learned, tracks))
+        if is_settled and not any(track.levels for track in tracks):
+            break
+        tracks = [track.next for track in learned]
+    return fit
+
+
+def fit_at(problem: ContourProblem, place: Place, tracks: Sequence[Track]) -> OutlineFit | None:
+    """The outlines of a place as evidence, and what they cost; None where there are none."""
+    return _costed(problem, problem.look(place, tracks), tracks)
+
+
+def _costed(
+    problem: ContourProblem, look: PosedOutlines, tracks: Sequence[Track]
+) -> OutlineFit | None:
+    augmented = problem.augmented(look, tracks)
+    if augmented is None:
+        return None
+    unmatched = sum(
+        float(track.noise.costs(np.full((~outline.found).sum(), track.reach)).sum())
+        for outline, track in zip(look.outlines, tracks, strict=True)
+        if outline is not None
+    )
+    return OutlineFit(look, augmented, list(tracks), augmented.objective + unmatched, unmatched)
+
+
+def descended(
+    problem: ContourProblem, here: OutlineFit, others: Sequence[Place] = (), *, learns: bool = False
+) -> OutlineFit:
+    """The place where no step lowers the cost, at the noise of a fit; or at its own, if it learns.
+
+    Pixels make the cost rough: where whole steps don't lower it, the least is tried for shorter
+    ones and for others.
+    """
+    noises = _MOST_NOISES if learns else 0
+    for _ in range(_MOST_STEPS):
+        better = _stepped(problem, here) or _elsewhere(problem, here, others)
+        if better is None and noises:
+            again, noises = _relearned(problem, here), noises - 1
+            better = None if all(map(Track.is_like, again.tracks, here.tracks)) else again
+        if better is None:
+            break
+        here = better
+    return here
+
+
+def _stepped(problem: ContourProblem, here: OutlineFit) -> OutlineFit | None:
+    """A place that costs less after whole steps, or on the way to the goal of the first.
+
+    Steps go on for a while where they don't lower the cost.
+    """
+    step = here.augmented.refined(_ITERATIONS)
+    if step is None:
+        return None
+    goal = step.place
+    there = fit_at(problem, goal, here.tracks)
+    if there is not None and not _is_lower(there, here):
+        step = there.augmented.refined(_ITERATIONS)
+        there = None if step is None else fit_at(problem, step.place, here.tracks)
+    shares = iter(_SHARES)
+    while not (there and _is_lower(there, here)):
+        share = next(shares, None)
+        if share is None:
+            return None
+        there = fit_at(problem, here.place.towards(goal, share), here.tracks)
+    return there
+
+
+def _is_lower(there: OutlineFit, here: OutlineFit) -> bool:
+    return there.cost < here.cost - _LEAST_GAIN
+
+
+def _elsewhere(
+    problem: ContourProblem, here: OutlineFit, others: Sequence[Place]
+) -> OutlineFit | None:
+    """A place that costs less along the directions of which least is known, or to others."""
+    if not problem.surface.is_exact:
+        return None
+    _, information = information_of(here.augmented.evidence, here.augmented.state)
+    steps = weakest_steps(information, _WEAKEST)
+    goals = [here.place.moved(sign * step) for step in steps for sign in (1.0, -1.0)]
+    goals.extend(
+        here.place.towards(other, share) for other in others for share in _SHARES_OF_OTHERS
+    )
+    found = [fit_at(problem, goal, here.tracks) for goal in goals]
+    best = min(
+        (each for each in found if each is not None), key=lambda each: each.cost, default=here
+    )
+    return best if best.cost < here.cost - _LEAST_GAIN else None
 
 
 def _learned(problem: ContourProblem, look: PosedOutlines, tracks: Sequence[Track]) -> list[Track]:
     """The tracks with the noise that the residuals of a look show."""
     return [
-        track if outline is None else source.learned(outline, own, track)
+        track
+        if outline is None
+        else source.learned(outline, float(own[0]) * track.noise.offset, track)
         for source, track, outline, own in zip(
             problem.sources, tracks, look.outlines, look.place.own, strict=True
         )
     ]
 
 
-def with_learned_offsets(
-    there: Augmented, tracks: Sequence[Track], own: FloatArray, learning: IntArray
-) -> tuple[list[Track], FloatArray]:
-    """Tracks with the deviations of the offsets that masks ``learning`` (L,) have by likelihood.
+def _with_likeliest_offsets(
+    problem: ContourProblem, augmented: Augmented, tracks: Sequence[Track]
+) -> tuple[list[Track], Place]:
+    """Tracks whose offsets have the likeliest deviations, and the place in terms of these.
 
-    All contours' ``own`` coefficients (V, 3), last of the evidence's unknowns, come along.
+    All contours' own coefficients are the last of the evidence's unknowns.
     """
-    learned, own = list(tracks), own.copy()
-    if not len(learning):
-        return learned, own
-    _, information = information_of(there.evidence, there.state)
-    size = len(information)
-    rows = size - own.size + OWN_MODES * learning
-    variances = solved(information, np.eye(size)[:, rows])[rows].diagonal()
-    for number, variance in zip(learning, variances, strict=True):
-        noise = learned[number].noise
-        without_prior = 1 / max(1 / min(variance, 1.0) - 1, 1e-6)  # in squares of the offset
-        free = own[number, 0] * (1 + without_prior)
-        square = noise.offset**2 * max(free**2 - without_prior, 0.0)
-        offset = max(float(np.sqrt(square)), LEAST_OFFSET)
-        learned[number] = learned[number]._replace(noise=noise._replace(offset=offset))
-        own[number, 0] *= noise.offset / offset
-    return learned, own
+    learned, own, learning = list(tracks), augmented.place.own.copy(), problem.learning
+    if len(learning):
+        _, information = information_of(augmented.evidence, augmented.state)
+        rows = len(information) - own.size + OWN_MODES * learning
+        variances = solved(information, np.eye(len(information))[:, rows])[rows].diagonal()
+        for number, variance in zip(learning, variances, strict=True):
+            noise = learned[number].noise
+            offset = likeliest_offset(own[number, 0], variance, noise)
+            learned[number] = learned[number]._replace(noise=noise._replace(offset=offset))
+            own[number, 0] *= noise.offset / offset
+    return learned, augmented.place._replace(own=own)
+
+
+def _relearned(problem: ContourProblem, fit: OutlineFit) -> OutlineFit:
+    """The same at the noise that the residuals show."""
+    learned = _learned(problem, fit.look, fit.tracks)
+    tracks, place = _with_likeliest_offsets(problem, fit.augmented, learned)
+    return _costed(problem, fit.look._replace(place=place), tracks) or fit
+
+
+def likeliest_offset(own: float, variance: float, noise: Noise) -> float:
+    """Likeliest standard deviation [px] of an offset of the coefficient ``own``.
+
+    The ``variance`` is that of the coefficient, whose prior is that of the ``noise``.
+    """
+    without_prior = 1 / max(1 / min(variance, 1.0) - 1, 1e-6)  # in squares of the offset
+    free = own * (1 + without_prior)
+    square = noise.offset**2 * max(free**2 - without_prior, 0.0)
+    return max(float(np.sqrt(square)), LEAST_OFFSET)
 
 
 def _with_wider_noise(problem: ContourProblem, fit: OutlineFit) -> OutlineFit:
@@ -294,7 +272,6 @@ def _with_wider_noise(problem: ContourProblem, fit: OutlineFit) -> OutlineFit:
     for source, rows in zip(problem.sources, augmented.rows, strict=True):
         count = 0 if rows is None else len(rows.mean)
         is_line = np.append(is_line, np.full(count, not source.is_comparable))
-
     (_, whole), (_, rest) = (
         information_of(with_whitening_times(lines, is_line, augmented.evidence), augmented.state)
         for lines in (1.0, 0.0)

@@ -40,21 +40,23 @@ from cadalign.solvers.joint.evidence import State
 from cadalign.solvers.joint.search import cost_of, reduced, score_state
 
 _MOST_STARTS = 4
-_MOST_OPEN_STARTS = 8  # where nothing but masks determines the estimate
-_MOST_FINISHED = 2  # where costs do not compare
+_MOST_OPEN_STARTS = 12  # where nothing but masks determines the estimate
+_MOST_FINISHED = 4
 _UNLIKELY = 60.0  # excess score of a minimum that is still a start
 _LEAST_INFORMATION = 1e-9  # about the worst known direction of the unknowns, relative
-_INDEPENDENT = 10.0  # samples that count as one where estimates near the starts are compared
 # Of further starts: standard deviations along the direction of which an estimate knows least, and
-# that of a logarithm of a scale there, below which the estimate is near enough, or near enough if
-# its outline agrees; standard deviations along directions of the pose, and their turns.
-_SIDEWAYS = (-2.0, -1.0, 1.0, 2.0)
-_LEAST_STRETCH, _OPEN_STRETCH = 0.05, 0.25
+# that of a logarithm of a scale there, below which the estimate is near enough; standard deviations
+# along directions of the pose, and their turns.
+_SIDEWAYS, _LEAST_STRETCH = (-2.0, -1.0, 1.0, 2.0), 0.05
 _WEAKEST, _SIDEWAYS_OF_POSE = 2, (-1.5, 1.5)
 _LEAST_TURN, _MOST_TURN = np.radians(2.0), np.radians(40.0)
 _SAME_TURN_DEG, _SAME_STRETCH = 1.0, 0.2  # logarithms of scales
 _LEAST_SUPPORT = 0.5  # share of a source's samples that must agree with the outline
 _LEAST_PROBABILITY = 1e-5  # of such a rise of the other residuals by chance
+_NO_OUTLINE = (
+    "give an init nearer to it, or keypoints, and check that a mask is nonzero on the object, not "
+    "around it, and that the model is the object's"
+)
 
 
 class Candidate(NamedTuple):
@@ -73,28 +75,11 @@ class Candidate(NamedTuple):
         ]
 
     @property
-    def is_supported(self) -> bool:
-        """True if every source shows enough of the outline."""
-        return all(each.share >= _LEAST_SUPPORT for each in self.supports)
-
-    @property
-    def agrees(self) -> bool:
-        """True if all of the outlines agree, and other starts would not do better."""
-        sources = self.problem.sources
-        shares = zip(sources, self.supports, strict=True)
-        return self.problem.is_comparable and all(
-            each.share >= source.good_share for source, each in shares
-        )
-
-    def rank(self, correlation: float | None = None) -> float:
-        """-2 log of its probability by the other evidence and by the outlines.
-
-        Neighbours of a mask's samples that count as one are as many as the ``correlation``, if it
-        is given.
-        """
+    def rank(self) -> float:
+        """-2 log of its probability by the other evidence and by the outlines, up to a constant."""
         rest = cost_of(self.problem.evidence, self.fit.place.state) + self.start.prior_score
         for source, each in zip(self.problem.sources, self.fit.measured, strict=True):
-            rest += 0.0 if each is None else source.rank(each, correlation)
+            rest += 0.0 if each is None else source.rank(each)
         return rest
 
     def minimum(self, *, by_rank: bool) -> Minimum:
@@ -102,7 +87,7 @@ class Candidate(NamedTuple):
         evidence, state, *_ = self.fit.augmented
         cost, score = cost_of(evidence, state), self.fit.score + self.start.prior_score
         if by_rank and np.isfinite(score):
-            score = score_state(evidence, state) - cost + self.rank()
+            score = score_state(evidence, state) - cost + self.rank
         return self.start._replace(evidence=evidence, state=state, cost=cost, score=score)
 
 
@@ -131,9 +116,7 @@ def refine_with_outlines(
         source, reason = wrong
         if search.is_open and len(left) == 1:
             if not best or not best[0].supports[0].share:
-                raise DegenerateError(
-                    reason, where=source.where, fix="give an init nearer to it, or keypoints"
-                )
+                raise DegenerateError(reason, where=source.where, fix=_NO_OUTLINE)
             warnings.append(source.warning(f"{source.where}: {reason}"))
             break
         text = f"{source.where} contradicts the rest and is left out: {reason}"
@@ -187,30 +170,21 @@ class OutlineSearch(NamedTuple):
 
     def best(self, sources: Sequence[OutlineSource]) -> list[Candidate]:
         """Distinct candidates, the likeliest first."""
-        near = self._near(sources, [(each, each.state) for each in self.minima])
-        by_rank = self.by_rank(sources)
-        if not self.is_open and (self.surface.is_exact or by_rank):
-            least = _OPEN_STRETCH if near and near[0].agrees else _LEAST_STRETCH
-            others = _displaced(self.minima[0], None if by_rank else least)
-            near += self._near(sources, others)
-        found = _finished(_distinct_candidates(near, _INDEPENDENT))
-        return sorted(found, key=lambda each: each.minimum(by_rank=by_rank).score)
-
-    def _near(
-        self, sources: Sequence[OutlineSource], starts: Sequence[tuple[Minimum, State]]
-    ) -> list[Candidate]:
-        """The estimates near starts, the likeliest first."""
-        found = []
+        starts = [(each, each.state) for each in self.minima]
+        is_comparable = all(source.is_comparable for source in sources)
+        if not self.is_open and (self.surface.is_exact or not is_comparable):
+            starts += _displaced(self.minima[0], is_comparable=is_comparable)
+        near = []
         for start, state in starts:
             evidence, moved = with_displacement_modes(start.evidence, state)
             problem = ContourProblem(evidence, self.keypoints, sources, self.surface)
-            for is_wide in (False, True) if self.is_open else (False,):
-                fit = first_fit(problem, moved, is_wide=is_wide)
-                if fit is not None:
-                    found.append(Candidate(start, problem, fit))
-                    if not is_wide and found[-1].is_supported:
-                        break
-        return sorted(found, key=lambda each: each.rank(_INDEPENDENT))
+            fit = first_fit(problem, moved)
+            if fit is not None:
+                near.append(Candidate(start, problem, fit))
+        likely = _distinct_candidates(near)[:_MOST_FINISHED]
+        found = _finished([each for each in likely if each.rank < likely[0].rank + _UNLIKELY])
+        by_rank = self.by_rank(sources)
+        return sorted(found, key=lambda each: each.minimum(by_rank=by_rank).score)
 
 
 def _hulls_of(views: Sequence[View]) -> list[View]:
@@ -249,18 +223,18 @@ def _is_determined(minimum: Minimum) -> bool:
     return bool(np.linalg.eigvalsh(scaled_information(information)[0])[0] > _LEAST_INFORMATION)
 
 
-def _displaced(start: Minimum, least_stretch: float | None) -> list[tuple[Minimum, State]]:
+def _displaced(start: Minimum, *, is_comparable: bool) -> list[tuple[Minimum, State]]:
     """States beside an estimate without outlines, along the directions of which it knows least.
 
-    This is the one of all unknowns, if the standard deviation of a stretch is larger than the least
-    one there; None asks for directions of the pose.
+    This is the one of all unknowns, if a stretch is not well known; where costs do not compare,
+    directions of the pose.
     """
     _, information = information_of(*reduced(start.evidence, start.state))
     count = 6 * len(start.state.poses) + len(start.state.log_focals) + 3
-    if least_stretch is not None:
+    if is_comparable:
         (step,) = weakest_steps(information, 1)
-        is_open = np.abs(step[count - 3 : count]).max() > least_stretch
-        steps = [sign * step[:count] for sign in _SIDEWAYS if is_open]
+        is_near = np.abs(step[count - 3 : count]).max() < _LEAST_STRETCH
+        steps = [] if is_near else [sign * step[:count] for sign in _SIDEWAYS]
     else:
         steps = [
             sign * np.append(step, np.zeros(count - 6))
@@ -272,31 +246,22 @@ def _displaced(start: Minimum, least_stretch: float | None) -> list[tuple[Minimu
     return [(start, place.moved(step).state) for step in steps]
 
 
-def _finished(candidates: list[Candidate]) -> list[Candidate]:
-    """The candidates brought to their ends, at the noise of the likeliest one where costs compare.
-
-    A single one at its own noise is at its end.
-    """
-    if not candidates:
-        return []
-    is_comparable = candidates[0].problem.is_comparable
-    if is_comparable and len(candidates) == 1:
-        return candidates
-    tracks, found = candidates[0].fit.tracks, []
-    for each in candidates if is_comparable else candidates[:_MOST_FINISHED]:
-        others = [other.fit.place for other in candidates if other is not each]
-        fit = last_fit(each.problem, each.fit.place, tracks, others)
+def _finished(near: list[Candidate]) -> list[Candidate]:
+    """The candidates brought to their ends; at the noise of the likeliest where costs compare."""
+    found, tracks = [], None
+    for each in near:
+        others = [other.fit.place for other in near if other is not each]
+        fit = last_fit(each.problem, each.fit, tracks, others)
         if fit is not None:
             found.append(each._replace(fit=fit))
-    return found if is_comparable else _distinct_candidates(found)
+            tracks = fit.tracks if each.problem.is_comparable else None
+    return _distinct_candidates(found)
 
 
-def _distinct_candidates(
-    candidates: list[Candidate], correlation: float | None = None
-) -> list[Candidate]:
+def _distinct_candidates(candidates: list[Candidate]) -> list[Candidate]:
     """Candidates without those that equal a likelier one, the likeliest first."""
     kept: list[Candidate] = []
-    for each in sorted(candidates, key=lambda candidate: candidate.rank(correlation)):
+    for each in sorted(candidates, key=lambda candidate: candidate.rank):
         if not any(_are_alike(each.fit.place.state, other.fit.place.state) for other in kept):
             kept.append(each)
     return kept
@@ -322,17 +287,21 @@ def _contradicting(
 
 
 def _tension(candidate: Candidate) -> str | None:
-    """Report other residuals that rise from a start's more than chance and noise explain."""
+    """Report other residuals that rise from a start's more than chance and noise explain.
+
+    A contour's registration counts with them.
+    """
     start, evidence = candidate.start, candidate.problem.evidence
     equations = 2 * int((evidence.sightings.whitening[:, 2] > 0).sum())
     if not equations:
         return None
     alone = cost_of(*with_displacement_modes(start.evidence, start.state))
-    joint = cost_of(evidence, candidate.fit.place.state)
+    place = candidate.fit.place
+    joint = cost_of(evidence, place.state) + float((place.own[:, 1:] ** 2).sum())
     free = 6 * len(start.state.poses) + int(evidence.scales.free.sum())
     redundancy = equations - free
     scale = max(1.0, alone / redundancy) if redundancy > 0 else 1.0
-    unknowns = min(free + len(evidence.shape.modes), equations)
+    unknowns = min(free + len(evidence.shape.modes), equations) + place.own[:, 1:].size
     if joint - alone <= scale * chi_square_quantile(unknowns, _LEAST_PROBABILITY):
         return None
     times = np.sqrt(joint / max(alone, float(max(redundancy, 1))))

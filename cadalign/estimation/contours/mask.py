@@ -7,8 +7,7 @@ click no better. Both are unknown, and integrated out with the rest of the shape
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import cast
 
 import cv2
@@ -29,42 +28,30 @@ from cadalign.estimation.contours.contour import (
 from cadalign.estimation.contours.outline import (
     LEAST_LOSS_SCALE,
     LEAST_OFFSET,
-    LOSS_SCALE,
     MeasuredOutline,
     Noise,
     Outline,
     OutlineSource,
     OutlineSupport,
     Track,
-    correlation_length,
-    cost_of_contour,
-    influence_length,
-    robust_deviation,
-    trimmed_deviation,
 )
 from cadalign.estimation.contours.surface import PosedSurface
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
 
-LARGEST = 24.0
-"""Distance of a sample without a rim [px], where estimates are compared."""
+_LARGEST = 24.0  # [px], distance of a sample without a rim, where estimates are compared
+_RANKED = Noise(1.0, 10.0, 0.0)  # of the samples, where estimates are compared
 _LEAST_SIGMA = 0.1  # [px]
 _FIRST_OFFSET = 1.0  # [px], standard deviation of the offset that all of a contour has in common
 _UNEVEN = 0.05  # share of the offset by which it differs from edge to edge
 _EDGE = 30.0  # samples of an edge
 _OF_PIXELS = 3.0  # samples that count as one where pixels alone displace them
-_FIRST_CORRELATION = 10.0  # samples, of a surface that is only similar
-_INLIER = 3.5  # in standard deviations
 _FIRST_REACH = 24.0  # [px], and the same relative to the contour's size
 _RELATIVE_REACH = 0.04
-_WIDE_REACH = 0.15  # where nothing but the masks determines the estimate
+_WIDE_REACH = 0.15  # without keypoints
 _LEAST_REACH = 4.0
 _REACH = 6.0  # in standard deviations of the residuals
 _OFFSETS = 2.0  # in standard deviations of the offset that all of a contour has in common
-_SETTLED = 0.02  # [px], step of an outline that ends the rounds, or in standard deviations
-_LEAST_TOLERANCE = 3.0  # [px], of a sample that agrees, and the same relative to the mask's size
-_RELATIVE_TOLERANCE = 0.02
-_WARPED_TOLERANCE = 0.06  # where the model is only similar to the object
 _OPEN_BORDER = 3  # [px], within which a mask may go on outside of the image
 _LEAST_PIECE = 0.003  # of a piece of the mask, relative to the largest
 _LEAST_KEYPOINTS = 4  # that tell whether a mask is inverted
@@ -76,19 +63,22 @@ class MaskSource(OutlineSource):
 
     ``slopes`` (S, 2, 2) are the derivatives of its samples' places [px] by their rays; ``sigma`` is
     the given standard deviation [px], None to estimate it. The contour is that of ``mask``.
-    A ``hint`` tells what may be wrong.
+    Of a view without keypoints it ``is_wide``, for the start may be far off. A ``hint`` tells what
+    may be wrong.
     """
 
     kind = "mask"
     field = "mask"
     is_comparable = True
     good_share = 0.94
+    tolerances = 3.0, 0.02, 0.06
 
     contour: Contour
     slopes: FloatArray
     sigma: float | None
     mask: MaskImage
-    hint: str = ""
+    is_wide: bool
+    hint: str
 
     @classmethod
     def of(cls, image: int, view: View, camera: Camera, *, is_exact: bool = True) -> MaskSource:
@@ -101,24 +91,15 @@ class MaskSource(OutlineSource):
         rays, valid = camera.normalize_where_valid(contour.points)
         slopes = np.array([[camera.fx], [camera.fy]]) * camera.distortion_jacobian(rays[valid])
         contour = contour.taken(valid)
-        given = contour, slopes, view.mask_sigma, mask_image(mask, contour)
+        given = contour, slopes, view.mask_sigma, mask_image(mask, contour), view.has_mask_alone
         return cls(image, view.number, camera, is_exact, *given, _off_mask(view.pixels, mask))
 
-    def shown_by(self, line: FloatArray) -> MaskSource:
-        """The part that no line (3,) hides, beyond which rays have ``line @ ray > 0``."""
-        if not line.any():
-            return self
-        rays, _ = self.camera.normalize_where_valid(self.contour.points)
-        shown = rays @ line[:2] + line[2] <= 0
-        return replace(self, contour=self.contour.taken(shown), slopes=self.slopes[shown])
-
-    def first(self, *, is_wide: bool = False) -> Track:
+    def first(self) -> Track:
         """See `OutlineSource`."""
-        share = _WIDE_REACH if is_wide else _RELATIVE_REACH
+        share = _WIDE_REACH if self.is_wide else _RELATIVE_REACH
         reach = max(_FIRST_REACH, share * self.contour.size)
-        if self.is_exact:
-            return Track(Noise(self.sigma or reach / 3, 1.0, _FIRST_OFFSET), reach)
-        return Track(Noise(reach / 3, _FIRST_CORRELATION, LEAST_OFFSET), reach)
+        offset = _FIRST_OFFSET if self.is_exact else LEAST_OFFSET
+        return Track(Noise(reach / 3, 1.0, offset), reach)
 
     def last(self, track: Track) -> Track:
         """See `OutlineSource`."""
@@ -144,57 +125,33 @@ class MaskSource(OutlineSource):
             track.reach,
         )
 
-    def learned(self, outline: Outline, own: FloatArray, track: Track) -> Track:
+    def learned(self, outline: Outline, offset: float, track: Track) -> Track:
         """See `OutlineSource`.
 
-        The correlation is that of the samples' influence on the estimate, which runs of outliers
-        have, too; what the residuals don't reach of the given ``sigma`` is correlated as pixels
-        are. Beside the rim a contour lies unevenly, by a share of the offset that all of an edge
-        has in common. Where the surface is only similar, samples without a rim count as the
-        farthest: there it lacks a part or has one more.
+        Beside the rim a contour lies unevenly, by a share of the offset that all of an edge has in
+        common. Where the surface is only similar, samples without a rim count as the farthest:
+        there it lacks a part or has one more.
         """
-        noise, residuals = track.noise, outline.residuals(own, track.noise)
-        some = np.nan_to_num(residuals)
+        residuals = outline.residuals(offset)
         if not self.is_exact:
-            everywhere = np.nan_to_num(residuals, nan=track.reach)
-            sigma = max(robust_deviation(everywhere), self.sigma or _LEAST_SIGMA)
-            length = correlation_length(self.contour, some, outline.found)
-            return track._replace(noise=Noise(sigma, length, LEAST_OFFSET))
-        found = trimmed_deviation(residuals[outline.found], LEAST_LOSS_SCALE)
-        measured = max(found, _LEAST_SIGMA)
-        sigma, length = self.sigma or measured, 1.0
-        if track.is_fine:
-            scale = max(LOSS_SCALE * measured, LEAST_LOSS_SCALE)
-            share = min((found / sigma) ** 2, 1.0)
-            along = influence_length(self.contour, some, outline.found, scale)
-            length = share * max(along, _OF_PIXELS) + (1 - share) * _OF_PIXELS
-            length += _EDGE * (_UNEVEN * noise.offset / sigma) ** 2
-        learned = track._replace(noise=Noise(sigma, length, noise.offset))
-        return learned if track.is_fine else self._narrowed(learned)
+            residuals = np.nan_to_num(residuals, nan=track.reach)
+        pixels = _OF_PIXELS if track.is_fine else 1.0
+        least = Noise(self.sigma or _LEAST_SIGMA, pixels, track.noise.offset)
+        noise = outline.noise(residuals, least, LEAST_LOSS_SCALE)
+        if self.is_exact and not track.is_fine:
+            return self._narrowed(track._replace(noise=noise._replace(correlation=1.0)))
+        uneven = _EDGE * (_UNEVEN * noise.offset / noise.sigma) ** 2 * self.is_exact
+        return track._replace(noise=noise._replace(correlation=noise.correlation + uneven))
 
     def _narrowed(self, track: Track) -> Track:
         """The track with a reach as small as its noise allows."""
         least = max(_LEAST_REACH, _OFFSETS * track.noise.offset)
         return track._replace(reach=min(track.reach, max(_REACH * track.noise.sigma, least)))
 
-    def advanced(self, track: Track, outline: Outline | None, moved: float) -> Track:
-        """See `OutlineSource`."""
-        return track._replace(is_settled=moved < _SETTLED * max(1.0, track.noise.sigma))
-
-    def rank(self, found: MeasuredOutline, correlation: float | None) -> float:
-        """See `OutlineSource`; an occluder may have made a part of the contour."""
-        alike = found.noise.correlation if correlation is None else correlation
-        return 2 * len(self.contour.points) / alike * outline_cost(found)
-
-    def support(self, found: MeasuredOutline) -> OutlineSupport:
-        """See `OutlineSource`."""
-        relative = _RELATIVE_TOLERANCE if self.is_exact else _WARPED_TOLERANCE
-        tolerance = max(_LEAST_TOLERANCE, relative * self.contour.size)
-        within = np.abs(np.nan_to_num(found.residuals, nan=np.inf)) < tolerance
-        sigma = found.noise.sigma
-        near = np.abs(np.nan_to_num(found.residuals, nan=np.inf)) < _INLIER * sigma
-        rms = float(np.sqrt((found.residuals[near] ** 2).mean())) if near.any() else math.nan
-        return OutlineSupport(float(within.mean()), int(near.sum()), rms, rms / sigma)
+    def rank(self, found: MeasuredOutline) -> float:
+        """See `OutlineSource`; the noise is not that of the residuals, and the same everywhere."""
+        residuals = np.nan_to_num(found.residuals, nan=_LARGEST)
+        return float(_RANKED.costs(residuals).sum())
 
     def refusal(self, support: OutlineSupport) -> str:
         """See `OutlineSource`."""
@@ -228,12 +185,6 @@ def convex_hull(mask: FloatArray | BoolArray) -> BoolArray | None:
     if kept:
         cv2.fillConvexPoly(filled, cv2.convexHull(np.concatenate(kept)), 1)
     return filled > 0
-
-
-def outline_cost(found: MeasuredOutline) -> float:
-    """The mean of -log density of a contour's samples [1/px]; see `cost_of_contour`."""
-    distances = np.nan_to_num(np.abs(found.residuals), nan=LARGEST)
-    return cost_of_contour(np.minimum(distances, LARGEST), LARGEST)
 
 
 def _off_mask(pixels: FloatArray, mask: FloatArray | BoolArray) -> str:

@@ -23,11 +23,9 @@ LEAST_OFFSET = 0.1
 """Least standard deviation of the offset that all of a contour has in common [px]."""
 REGISTRATION = 0.3
 """Standard deviation of a contour's registration along x and y [px]."""
-_LEAST_OWN = 0.3  # [px], standard deviation of the part that is the model's
-_FIRST_SHARE, _LARGEST_SHARE = 0.8, 0.99  # of a contour, that is the model's
-_ROUNDS = 30
+INLIER = 3.5
+"""Largest residual of an inlier, in standard deviations."""
 _TO_SIGMA = 1.4826  # from the median of absolute values to the standard deviation of a Gaussian
-_OUTLYING = 3.5  # in standard deviations
 _MOST_LAGS = 100
 _LEAST_PAIRS = 20
 _ALIKE = 0.2  # change of a variance's logarithm
@@ -50,21 +48,12 @@ class Noise(NamedTuple):
         """Scale of Cauchy's loss, in standard deviations of a sample."""
         return max(LOSS_SCALE, LEAST_LOSS_SCALE / self.sigma)
 
-    def cost(self, residual: float) -> float:
-        """Cost of one sample's residual [px]."""
+    def costs(self, residuals: FloatArray) -> FloatArray:
+        """Costs of samples' residuals [px]."""
         square = self.loss_scale**2
-        return float(square / self.correlation * np.log1p((residual / self.sigma) ** 2 / square))
-
-    def is_like(self, other: Noise) -> bool:
-        """True if samples weigh about the same."""
-        weights = self.sigma**2 * self.correlation / (other.sigma**2 * other.correlation)
-        offsets = (self.offset / other.offset) ** 2
-        return bool(max(abs(np.log(weights)), abs(np.log(offsets))) < _ALIKE)
-
-
-def robust_deviation(residuals: FloatArray) -> float:
-    """Deviation of residuals (n,) about 0, outliers among them; 0 for none."""
-    return _TO_SIGMA * float(np.median(np.abs(residuals))) if len(residuals) else 0.0
+        return np.asarray(
+            square / self.correlation * np.log1p((residuals / self.sigma) ** 2 / square)
+        )
 
 
 def trimmed_deviation(residuals: FloatArray, least: float) -> float:
@@ -74,18 +63,21 @@ def trimmed_deviation(residuals: FloatArray, least: float) -> float:
     """
     if not len(residuals):
         return 0.0
-    kept = residuals[np.abs(residuals) < max(_OUTLYING * robust_deviation(residuals), least)]
+    robust = _TO_SIGMA * float(np.median(np.abs(residuals)))
+    kept = residuals[np.abs(residuals) < max(INLIER * robust, least)]
     return float(np.sqrt((kept**2).mean()))
 
 
-def correlation_length(contour: Contour, residuals: FloatArray, kept: BoolArray) -> float:
+def correlation_length(
+    contour: Contour, residuals: FloatArray, kept: BoolArray, scale: float = np.inf
+) -> float:
     """Number of neighbouring samples that count as one, at least 1.
 
-    The integrated autocorrelation ``1 + 2 sum of rho`` of the residuals (S,) that are ``kept``, up
-    to the first lag without positive correlation (Geyer, "Practical Markov chain Monte Carlo",
-    1992).
+    The integrated autocorrelation ``1 + 2 sum of rho`` of the influence under Cauchy's loss of a
+    ``scale`` that the residuals (S,) have which are ``kept``, up to the first lag without positive
+    correlation (Geyer, "Practical Markov chain Monte Carlo", 1992). Runs of outliers have it, too.
     """
-    values = np.where(kept, residuals, 0.0)
+    values = np.where(kept, residuals / (1 + (residuals / scale) ** 2), 0.0)
     variance = float((values**2).sum() / max(kept.sum(), 1))
     if not variance > 0:
         return 1.0
@@ -100,35 +92,6 @@ def correlation_length(contour: Contour, residuals: FloatArray, kept: BoolArray)
             break
         total += 2 * rho
     return total
-
-
-def influence_length(
-    contour: Contour, residuals: FloatArray, kept: BoolArray, scale: float
-) -> float:
-    """The `correlation_length` of the residuals' influence under Cauchy's loss of a scale.
-
-    Runs of outliers have it, too.
-    """
-    influence = residuals / (1 + (residuals / scale) ** 2)
-    return correlation_length(contour, influence, kept)
-
-
-def cost_of_contour(residuals: FloatArray, reach: float) -> float:
-    """The mean of -log density of a contour's distances (S,) from a rim, at most ``reach`` [px].
-
-    Part of the contour is an occluder's, and lies anywhere within the reach; the rest is Gaussian.
-    Its share and standard deviation are the likeliest, by expectation and maximisation (Dempster,
-    Laird and Rubin, "Maximum likelihood from incomplete data via the EM algorithm", 1977).
-    """
-    squares, elsewhere = residuals**2, 1 / (2 * reach)
-    share, variance = _FIRST_SHARE, max(float(np.median(squares)), _LEAST_OWN**2)
-    for _ in range(_ROUNDS):
-        own = share * np.exp(-squares / (2 * variance)) / np.sqrt(2 * np.pi * variance)
-        density = own + (1 - share) * elsewhere
-        belongs = own / density
-        share = min(float(belongs.mean()), _LARGEST_SHARE)
-        variance = max(float(belongs @ squares / max(belongs.sum(), 1e-9)), _LEAST_OWN**2)
-    return float(-np.log(density).mean())
 
 
 class Outline(NamedTuple):
@@ -153,37 +116,67 @@ class Outline(NamedTuple):
     reach: float
     contrast: float = 0.0
 
-    def residuals(self, own: FloatArray, noise: Noise) -> FloatArray:
-        """Places (S,) [px] without the offset that all have in common, ``own`` (3,) as `Place`."""
-        return np.where(self.found, self.places - own[0] * noise.offset, np.nan)
+    def residuals(self, offset: float) -> FloatArray:
+        """Places (S,) [px] without an ``offset`` that all have in common; NaN where none is."""
+        return np.where(self.found, self.places - offset, np.nan)
+
+    def noise(self, residuals: FloatArray, least: Noise, outlying: float) -> Noise:
+        """The noise that residuals (S,) show, at ``least`` some; NaN is none.
+
+        Outliers are at least ``outlying`` standard deviations off.
+        """
+        kept = np.isfinite(residuals)
+        relative = np.where(kept, residuals, 0.0) / self.sigmas
+        sigma = max(trimmed_deviation(relative[kept], outlying), least.sigma)
+        scale = least._replace(sigma=sigma).loss_scale * sigma
+        length = correlation_length(self.contour, relative, kept, scale)
+        return Noise(sigma, max(length, least.correlation), least.offset)
 
 
 class MeasuredOutline(NamedTuple):
-    """An outline at an estimate: the coefficients ``own`` (3,) of its modes, and its noise."""
+    """An outline at an estimate, the offset [px] that all of it has in common, and its noise."""
 
     outline: Outline
-    own: FloatArray
+    offset: float
     noise: Noise
 
     @property
     def residuals(self) -> FloatArray:
         """See `Outline`."""
-        return self.outline.residuals(self.own, self.noise)
+        return self.outline.residuals(self.offset)
+
+    @property
+    def inliers(self) -> BoolArray:
+        """Samples (S,) that agree with the rest."""
+        sizes = np.abs(np.nan_to_num(self.residuals, nan=np.inf))
+        return np.asarray(sizes < INLIER * self.noise.sigma * self.outline.sigmas)
 
 
 class Track(NamedTuple):
     """Noise and reach of a source on the way to its outline.
 
     The reach of a mask is in pixels; that of a photo is relative to the silhouette's size, and
-    ``levels`` are the next ones, after so many ``rounds``. A track ``is_fine`` near its end.
+    ``levels`` are those of the next rounds. A track ``is_fine`` near its end.
     """
 
     noise: Noise
     reach: float
     levels: tuple[float, ...] = ()
-    rounds: int = 0
     is_fine: bool = False
-    is_settled: bool = False
+
+    def is_like(self, other: Track) -> bool:
+        """True if samples weigh about the same."""
+        one, two = self.noise, other.noise
+        weights = one.sigma**2 * one.correlation / (two.sigma**2 * two.correlation)
+        offsets = (one.offset / two.offset) ** 2
+        return bool(max(abs(np.log(weights)), abs(np.log(offsets))) < _ALIKE)
+
+    @property
+    def next(self) -> Track:
+        """The track of the next round."""
+        if not self.levels:
+            return self
+        return self._replace(reach=self.levels[0], levels=self.levels[1:])
 
 
 class OutlineSupport(NamedTuple):
@@ -213,6 +206,8 @@ class OutlineSource(ABC):
     is_comparable: ClassVar[bool]
     good_share: ClassVar[float]
     """Share of the outline that agrees, below which a warning says so."""
+    tolerances: ClassVar[tuple[float, float, float]]
+    """Of a sample that agrees: [px], and relative to the size of exact and of similar surfaces."""
 
     image: int
     number: int
@@ -230,8 +225,8 @@ class OutlineSource(ABC):
         return self.is_comparable and self.is_exact
 
     @abstractmethod
-    def first(self, *, is_wide: bool = False) -> Track:
-        """Noise and reach at the start, which ``is_wide`` says may be far off."""
+    def first(self) -> Track:
+        """Noise and reach at the start."""
 
     @abstractmethod
     def last(self, track: Track) -> Track:
@@ -242,23 +237,12 @@ class OutlineSource(ABC):
         """The outline of a posed surface as it is measured; None where nothing is."""
 
     @abstractmethod
-    def learned(self, outline: Outline, own: FloatArray, track: Track) -> Track:
+    def learned(self, outline: Outline, offset: float, track: Track) -> Track:
         """The track with the noise that residuals show before a step."""
 
     @abstractmethod
-    def advanced(self, track: Track, outline: Outline | None, moved: float) -> Track:
-        """The track after a step that moved the outline so far [px]."""
-
-    @abstractmethod
-    def rank(self, found: MeasuredOutline, correlation: float | None) -> float:
-        """-2 log of the probability of what was measured, to compare estimates.
-
-        So many of a mask's samples as the ``correlation`` count as one, if it is given.
-        """
-
-    @abstractmethod
-    def support(self, found: MeasuredOutline) -> OutlineSupport:
-        """The agreement with an outline."""
+    def rank(self, found: MeasuredOutline) -> float:
+        """-2 log of the probability of what was measured, to compare estimates."""
 
     @abstractmethod
     def refusal(self, support: OutlineSupport) -> str:
@@ -267,6 +251,19 @@ class OutlineSource(ABC):
     @abstractmethod
     def doubt(self, support: OutlineSupport) -> str | None:
         """A warning about an estimate that little but the outlines determines."""
+
+    def support(self, found: MeasuredOutline) -> OutlineSupport:
+        """The agreement with an outline."""
+        least, exact, similar = self.tolerances
+        tolerance = max(least, (exact if self.is_exact else similar) * found.outline.contour.size)
+        near = np.abs(np.nan_to_num(found.residuals, nan=np.inf)) < tolerance
+        kept = found.residuals[found.inliers]
+        if not near.any() or not len(kept):
+            return OutlineSupport()
+        sigmas = found.outline.sigmas[found.inliers]
+        sigmas = sigmas * found.noise.sigma if self.is_comparable else sigmas
+        rms, rms_sigmas = (float(np.sqrt((x**2).mean())) for x in (kept, kept / sigmas))
+        return OutlineSupport(float(near.mean()), len(kept), rms, rms_sigmas)
 
     def warning(self, text: str) -> EstimateWarning:
         """A warning about it."""

@@ -15,36 +15,27 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.estimation.contours.contour import Sight
 from cadalign.estimation.contours.outline import (
-    LOSS_SCALE,
     MeasuredOutline,
     Noise,
     Outline,
     OutlineSource,
     OutlineSupport,
     Track,
-    influence_length,
-    trimmed_deviation,
 )
 from cadalign.estimation.contours.photo_lines import PhotoPyramid, outline_of, silhouette_of
 from cadalign.estimation.contours.surface import PosedSurface
 
-_COARSE, _FINE = (0.16, 0.08), (0.04, 0.02)  # reaches of lines, relative to the silhouette's size
+# Reaches of the lines of every round, relative to the silhouette's size.
+_COARSE, _FINE = (0.16, 0.08), (0.04, 0.02, 0.02)
 _LEAST_REACH = 5.0  # [px]
-_ROUNDS = 3  # of every reach, at most
-_FORESIGHT = 4.0  # reach of lines that a step may need, relative to the last one
 _REACH_CELLS = 6.4  # of a silhouette in which lines are sought, that these reach across
 _FEWEST_CELLS, _MOST_CELLS = 80, 220  # along the longer side of a silhouette
-_FIRST_CORRELATION = 4.0  # lines
-_LEAST_CORRELATION = 16.0  # lines: pixels and blur displace neighbours alike
-_LEAST_FACTOR = 0.5
 _LEAST_OUTLIER = 2.0  # in standard deviations
 # Standard deviation [px] of the offset outwards that all of an outline has in common, where light
 # and blur differ from side to side.
 _OFFSET = 0.4
-_FIRST = Noise(1.0, _FIRST_CORRELATION, _OFFSET)
-_TOLERANCE = 2.0  # [px], of a line that agrees, and the same relative to the silhouette's length
-_RELATIVE_TOLERANCE = 0.01
-_SIMILAR_TOLERANCE = 0.04  # where the model is only similar to the object
+_FIRST = Noise(1.0, 4.0, _OFFSET)  # by lines
+_LEAST = Noise(0.5, 16.0, _OFFSET)  # pixels and blur displace neighbours alike
 _STRAY = 0.2  # share of the lines whose places are of other things
 _LINES_OF_PATCH = 5.0  # of which the colours count as independent
 _LEAST_CONTRAST = 2.0  # [nats], that colours must give the silhouette: noise gives one
@@ -59,17 +50,17 @@ class PhotoSource(OutlineSource):
     field = "image"
     is_comparable = False
     good_share = 0.75
+    tolerances = 2.0, 0.01, 0.04
 
     photo: PhotoPyramid
 
-    def first(self, *, is_wide: bool = False) -> Track:
+    def first(self) -> Track:
         """See `OutlineSource`."""
         return Track(_FIRST, _COARSE[0], _COARSE[1:])
 
     def last(self, track: Track) -> Track:
         """See `OutlineSource`."""
-        levels = (*_FINE, _FINE[-1])  # again with the noise that is learned
-        return Track(_FIRST, levels[0], levels[1:], is_fine=True)
+        return Track(_FIRST, _FINE[0], _FINE[1:], is_fine=True)
 
     def outline(self, sight: Sight, surface: PosedSurface, track: Track) -> Outline | None:
         """See `OutlineSource`."""
@@ -80,55 +71,32 @@ class PhotoSource(OutlineSource):
         found = outline_of(self.photo, silhouette, max(track.reach * silhouette.size, _LEAST_REACH))
         return found if found is not None and found.found.any() else None
 
-    def learned(self, outline: Outline, own: FloatArray, track: Track) -> Track:
+    def learned(self, outline: Outline, offset: float, track: Track) -> Track:
         """See `OutlineSource`; noise is learned at the last level."""
         if not track.is_fine or track.levels:
             return track
-        return track._replace(noise=_noise_of(outline, outline.residuals(own, _FIRST)))
+        return track._replace(noise=_noise_of(outline, outline.residuals(offset)))
 
-    def advanced(self, track: Track, outline: Outline | None, moved: float) -> Track:
-        """See `OutlineSource`; the next steps are expected to be much smaller."""
-        size = np.inf if outline is None else outline.size
-        rounds, reach, levels = track.rounds + 1, track.reach, track.levels
-        while rounds >= _ROUNDS or _FORESIGHT * moved / size < reach / 2:
-            if not levels:
-                return track._replace(is_settled=True)
-            rounds, reach, levels = 0, levels[0], levels[1:]
-            if track.is_fine and not levels:
-                break
-        return track._replace(reach=reach, levels=levels, rounds=rounds)
-
-    def rank(self, found: MeasuredOutline, correlation: float | None) -> float:
+    def rank(self, found: MeasuredOutline) -> float:
         """See `OutlineSource`.
 
         The log likelihoods are those that the colours give the silhouette, over one anywhere, and
         that the lines' places give the outline, over places anywhere on the lines.
         """
         outline, residuals = found.outline, found.residuals
-        factor, alike, _ = _noise_of(outline, residuals)
-        sigmas = factor * outline.sigmas[outline.found]
+        noise = _noise_of(outline, residuals)
+        sigmas = noise.sigma * outline.sigmas[outline.found]
         squares = (residuals[outline.found] / sigmas) ** 2
         density = np.exp(-squares / 2) / np.sqrt(2 * np.pi) / sigmas
-        gains = np.log(
-            (1 - _STRAY) * density * 2 * outline.reach + _STRAY
-        )  # some are other things'
-        return -2 * (float(gains.sum() / alike) + _contrast(outline))
+        # Some places are those of other things.
+        gains = np.log((1 - _STRAY) * density * 2 * outline.reach + _STRAY)
+        return -2 * (float(gains.sum() / noise.correlation) + _contrast(outline))
 
     def support(self, found: MeasuredOutline) -> OutlineSupport:
         """See `OutlineSource`; nothing is told by colours that are the same on both sides."""
-        outline, distances = found.outline, found.residuals
-        if _contrast(outline) < _LEAST_CONTRAST:
+        if _contrast(found.outline) < _LEAST_CONTRAST:
             return OutlineSupport()
-        relative = _RELATIVE_TOLERANCE if self.is_exact else _SIMILAR_TOLERANCE
-        length = float(np.ptp(outline.contour.points, axis=0).max())
-        near = outline.found & (np.abs(distances) < max(_TOLERANCE, relative * length))
-        if not near.any():
-            return OutlineSupport()
-        kept = distances[near]
-        rms, rms_sigmas = (
-            float(np.sqrt((each**2).mean())) for each in (kept, kept / outline.sigmas[near])
-        )
-        return OutlineSupport(float(near.mean()), int(near.sum()), rms, rms_sigmas)
+        return super().support(found)
 
     def refusal(self, support: OutlineSupport) -> str:
         """See `OutlineSource`."""
@@ -153,8 +121,4 @@ def _contrast(outline: Outline) -> float:
 
 def _noise_of(outline: Outline, residuals: FloatArray) -> Noise:
     """The noise that residuals (S,) [px] show."""
-    found = outline.found
-    sigmas = np.where(found, residuals, 0.0) / outline.sigmas
-    factor = max(trimmed_deviation(sigmas[found], _LEAST_OUTLIER), _LEAST_FACTOR)
-    length = influence_length(outline.contour, sigmas, found, LOSS_SCALE * factor)
-    return Noise(factor, max(length, _LEAST_CORRELATION), _OFFSET)
+    return outline.noise(residuals, _LEAST, _LEAST_OUTLIER)

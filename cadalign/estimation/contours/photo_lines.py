@@ -24,7 +24,6 @@ from cadalign.estimation.contours.contour import (
     without_steep,
 )
 from cadalign.estimation.contours.outline import Outline
-from cadalign.estimation.contours.silhouettes import colors_at
 from cadalign.estimation.contours.surface import PosedSurface
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -172,29 +171,17 @@ class PhotoPyramid(NamedTuple):
     levels: tuple[ByteImage, ...]
 
     def colors(self, points: FloatArray, step: float) -> ByteImage:
-        """Colours (n, 3) at pixels (n, 2), of details larger than a step [px]."""
-        level = self._level(step)
-        return colors_at(self.levels[level], rescaled_pixels(points, 0.5**level))
-
-    def cells(
-        self, corner: FloatArray, cell: float, shape: tuple[int, ...], step: float
-    ) -> tuple[ByteImage, BoolArray]:
-        """Colours (h, w, 3) of cells ``cell`` [px] apart from a pixel on, and if they are seen."""
-        columns, rows = (corner[axis] + cell * np.arange(shape[1 - axis]) for axis in (0, 1))
-        places = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-        colors = self.colors(places, step).reshape(*shape, 3)
-        is_column = (columns >= 0) & (columns <= self.camera.width - 1)
-        is_row = (rows >= 0) & (rows <= self.camera.height - 1)
-        return colors, is_row[:, None] & is_column
-
-    def _level(self, step: float) -> int:
-        """Number of the copy whose pixels are at most as large as a step [px]."""
-        return min(int(np.log2(max(step, 1.0))), len(self.levels) - 1)
+        """Colours (h, w, 3) at pixels (h, w, 2), of details larger than a step [px]."""
+        level = min(int(np.log2(max(step, 1.0))), len(self.levels) - 1)
+        x, y = np.moveaxis(rescaled_pixels(points, 0.5**level), -1, 0).astype(np.float32)
+        border = cv2.BORDER_REPLICATE
+        found = cv2.remap(self.levels[level], x, y, cv2.INTER_LINEAR, borderMode=border)
+        return np.asarray(found, dtype=np.uint8)
 
 
 def photo_of(camera: Camera, pixels: ByteImage) -> PhotoPyramid:
     """A photo (h, w, 3) with its smaller copies."""
-    levels = [np.array(pixels, order="C")]  # kernels are compiled anew for read-only arrays
+    levels = [pixels]
     while min(levels[-1].shape[:2]) > _SMALLEST:
         height, width = levels[-1].shape[:2]
         size = (width // 2, height // 2)
@@ -310,7 +297,7 @@ def outline_of(photo: PhotoPyramid, silhouette: Silhouette, reach: float) -> Out
     contour = silhouette.contour
     steps = step * np.arange(-STEPS, STEPS + 1)
     pixels = contour.points[:, None] + steps[:, None] * contour.normals[:, None]
-    colors = photo.colors(pixels.reshape(-1, 2), step).reshape(*pixels.shape[:2], 3)
+    colors = photo.colors(pixels, step)
     valid = _on_own_side(photo, silhouette, pixels)
     logs = changes_of(odds[bins_of(colors)], valid)
     if step <= _EDGE_STEP:
@@ -348,7 +335,10 @@ def _colors_beside(
         for side in (inside, 1 - inside)
     )
     margin = min(reach / 4, float(depth.max()) / 2)
-    colors, seen = photo.cells(silhouette.corner - cell * room, cell, inside.shape, step)
+    rows, columns = np.indices(inside.shape)
+    pixels = silhouette.corner + cell * (np.stack([columns, rows], axis=-1) - room)
+    colors = photo.colors(pixels, step)
+    seen = photo.camera.contains(pixels, margin=PIXEL_CENTRE)
     own = seen & (depth > margin)
     other = seen & (height > margin) & (height < _BAND * reach)
     return bins_of(colors[own]), bins_of(colors[other])

@@ -35,7 +35,7 @@ from cadalign.solvers.joint.evidence import (
     log_focals_of,
     stacked,
 )
-from cadalign.solvers.joint.search import displaced_modes, refine_joint
+from cadalign.solvers.joint.search import displaced_modes, objective_of, refine_joint
 
 OWN_MODES = 3
 """Unknowns of a contour: its offset outwards, its registration along x and along y."""
@@ -60,14 +60,18 @@ class Place(NamedTuple):
     def towards(self, other: Place, share: float) -> Place:
         """The place a share of the way to another one."""
         a, b = self.state, other.state
-        poses = a.poses.copy()
-        for pose, start, end in zip(poses, a.poses, b.poses, strict=True):
-            pose[9:] = shifted(start[9:], share * shift_to(start[9:], end[9:]))
+        steps = []
+        for start, end in zip(a.poses, b.poses, strict=True):
             turn = end[:9].reshape(3, 3) @ start[:9].reshape(3, 3).T
-            part = rotation_from_vector(share * vector_from_rotation(turn))
-            pose[:9] = (part @ start[:9].reshape(3, 3)).ravel()
-        rest = [x + share * (y - x) for x, y in zip(a[1:], b[1:], strict=True)]
-        return Place(State(poses, *rest), self.own + share * (other.own - self.own))
+            steps.append(np.append(vector_from_rotation(turn), shift_to(start[9:], end[9:])))
+        step = [*steps, b.log_focals - a.log_focals, b.log_scales - a.log_scales]
+        own = (other.own - self.own).ravel()
+        there = self.moved(share * np.concatenate([*step, own]))
+        rest = {
+            name: (1 - share) * getattr(a, name) + share * getattr(b, name)
+            for name in ("coefficients", "displacements")
+        }
+        return there._replace(state=there.state._replace(**rest))
 
     def moved(self, step: FloatArray) -> Place:
         """The place after a step (U,) of poses, focal lengths, scales and own modes."""
@@ -92,24 +96,19 @@ def shifted(place: FloatArray, step: FloatArray) -> FloatArray:
     if not distance > 0:
         return place + step
     direction = place / distance
-    along = float(direction @ step)
-    across = step - along * direction
-    angle = float(np.linalg.norm(across)) / distance
-    turned = np.cos(angle) * direction + np.sinc(angle / np.pi) * across / distance
-    return np.asarray(distance * np.exp(along / distance) * turned)
+    along = float(direction @ step) / distance
+    across = place + step - along * place
+    return np.asarray(distance * np.exp(along) * across / np.linalg.norm(across))
 
 
 def shift_to(place: FloatArray, other: FloatArray) -> FloatArray:
     """The step that `shifted` takes from a place to another one."""
     distance, far = float(np.linalg.norm(place)), float(np.linalg.norm(other))
-    if not distance > 0 or not far > 0:
+    along = float(place @ other)
+    if not along > 0:
         return other - place
-    direction, goal = place / distance, other / far
-    across = goal - (goal @ direction) * direction
-    sine = float(np.linalg.norm(across))
-    angle = np.arctan2(sine, goal @ direction)
-    across *= angle / sine if sine > 0 else 0.0
-    return np.asarray(distance * (np.log(far / distance) * direction + across))
+    across = distance**2 / along * other - place
+    return np.asarray(np.log(far / distance) * place + across)
 
 
 def solved(information: FloatArray, right: FloatArray) -> FloatArray:
@@ -162,10 +161,15 @@ class Augmented(NamedTuple):
     rows: list[OutlineRows | None]
     points: slice
 
+    @property
+    def objective(self) -> float:
+        """-2 log likelihood, up to a constant of the noise."""
+        return objective_of(self.evidence, self.state)
+
     def refined(self, iterations: int) -> Augmented | None:
-        """The place of the least cost, where every point of the surface stays."""
-        cost, _, state = refine_joint(self.evidence, iterations, self.state)
-        if not cost < np.inf:
+        """The place of the least objective, where every point of the surface stays."""
+        least, _, state = refine_joint(self.evidence, iterations, self.state)
+        if not least < np.inf:
             return None
         last = len(state.coefficients) - self.place.own.size
         bare = state._replace(
@@ -214,12 +218,12 @@ class ContourProblem(NamedTuple):
             outlines.append(source.outline(sights[-1], posed, track))
         return PosedOutlines(place, posed, sights, outlines)
 
-    def augmented(self, look: PosedOutlines, noises: Sequence[Noise]) -> Augmented | None:
+    def augmented(self, look: PosedOutlines, tracks: Sequence[Track]) -> Augmented | None:
         """The evidence with what was measured; None where there is nothing."""
         rows = [
-            outline and rows_of(source, outline, noise, look.posed, sight)
-            for source, outline, noise, sight in zip(
-                self.sources, look.outlines, noises, look.sights, strict=True
+            outline and rows_of(source, outline, track.noise, look.posed, sight)
+            for source, outline, track, sight in zip(
+                self.sources, look.outlines, tracks, look.sights, strict=True
             )
         ]
         total = sum(len(each.mean) for each in rows if each is not None)
@@ -232,29 +236,6 @@ class ContourProblem(NamedTuple):
         )
         evidence = _with_rows(self.evidence, first, rows, total)
         return Augmented(evidence, full, look.place, rows, slice(first, first + total))
-
-    def moves(self, look: PosedOutlines, there: Augmented) -> list[float]:
-        """Root mean squares [px] by which a step moved the outlines of a look along its normals.
-
-        They are infinite where a step leads behind the camera.
-        """
-        poses, found = poses_of(self.evidence, there.place.state), []
-        for source, outline, rows in zip(self.sources, look.outlines, there.rows, strict=True):
-            if outline is None or rows is None or not len(rows.mean):
-                found.append(0.0)
-                continue
-            coefficients = there.state.coefficients[: len(rows.modes)]  # none if it is rigid
-            points = rows.mean + np.tensordot(coefficients, rows.modes, axes=1)
-            before = look.sights[len(found)].pose.apply(outline.points[outline.found])
-            after = poses[source.image].apply(points)
-            if (np.minimum(before[:, 2], after[:, 2]) <= 0).any():
-                found.append(np.inf)
-                continue
-            moved = self.camera_at(source, there.place.state).project(after)
-            moved -= self.camera_at(source, look.place.state).project(before)
-            along = (moved * outline.contour.normals[outline.found]).sum(axis=1)
-            found.append(float(np.sqrt((along**2).mean())))
-        return found
 
 
 def rows_of(

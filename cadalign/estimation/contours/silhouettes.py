@@ -1,95 +1,64 @@
-"""Silhouettes of models and masks, whitened by their second moments, and how much they overlap.
+"""Poses and stretches of a model whose silhouette resembles a mask's, without any start.
 
 Seen from afar, a stretched model under any pose is an affine image of the model, and silhouettes
 along one direction of the model differ by an affine map of the plane: whitened by their second
 moments, by a turn. So silhouettes along directions all around are rendered once for a model, and
 compared with a mask's at all turns. Near objects look larger where they are nearer, by an amount
 that a stretch changes little: silhouettes are rendered from about as far as the mask's size says,
-for there are few classes of distances. What an occluder or the image's border leaves of a
-silhouette has moments of its own: so each one is kept whole and cut by straight lines.
+for there are few classes of distances.
+
+Each silhouette that resembles the mask's at some turn gives an affine camera ``M = R[:2] S / Z``.
+The rows of ``M S^-1`` are orthogonal and of one length, so that the stretch follows by two linear
+equations in the inverse squares of its scales.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterable
 from functools import cache, lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.compile import kernel
-from cadalign.estimation.contours.surface import RigidSurface, rigid_surface
-from cadalign.geometry.camera import Camera
+from cadalign.estimation.contours.contour import Image, sampled
+from cadalign.estimation.contours.surface import rigid_surface
+from cadalign.geometry.alignment import Alignment, model_rays
+from cadalign.geometry.camera import Camera, turned_alignment
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import RayCaster
-from cadalign.io.images import ByteImage
+from cadalign.geometry.rotations import angle_between
+from cadalign.geometry.symmetry import Symmetry
+from cadalign.geometry.symmetry_group import group_of
 
-Image = npt.NDArray[np.float32]
-
-
-def sampled(image: Image, points: FloatArray) -> FloatArray:
-    """Values (n,) of an image (h, w) at points (n, 2), bilinear; outside those of the border.
-
-    OpenCV 4 rounds places to 1/32 px (`cv2.remap`, `cv2.warpAffine`), which moves contours by more
-    than the precision that is sought.
-    """
-    return np.asarray(_bilinear(image[..., None], np.ascontiguousarray(points))[:, 0])
-
-
-def colors_at(photo: ByteImage, points: FloatArray) -> ByteImage:
-    """Colours (n, c) of a photo (h, w, c) at points (n, 2), as `sampled`."""
-    return np.rint(_bilinear(photo, np.ascontiguousarray(points))).astype(np.uint8)
-
-
-@kernel
-def _bilinear(image: npt.NDArray[np.generic], points: FloatArray) -> FloatArray:
-    height, width, channels = image.shape
-    found = np.empty((len(points), channels))
-    for row in range(len(points)):
-        x, y = points[row, 0], points[row, 1]
-        x = min(x, width - 1.0) if x > 0.0 else 0.0  # also where it is no number
-        y = min(y, height - 1.0) if y > 0.0 else 0.0
-        left, top = int(x), int(y)
-        right, bottom = min(left + 1, width - 1), min(top + 1, height - 1)
-        x -= left
-        y -= top
-        for k in range(channels):
-            upper_left, upper_right = float(image[top, left, k]), float(image[top, right, k])
-            lower_left, lower_right = float(image[bottom, left, k]), float(image[bottom, right, k])
-            upper = upper_left + x * (upper_right - upper_left)
-            lower = lower_left + x * (lower_right - lower_left)
-            found[row, k] = upper + y * (lower - upper)
-    return found
-
-
-CELLS = 80
-"""Rows and columns of a silhouette's or a mask's image."""
-TURNS = 64
-"""Turns at which silhouettes are compared."""
-COMPARED = np.arange(0, CELLS, 2)
-"""Rows and columns of a mask's image that are compared with what a pose covers."""
-
-_DIRECTIONS = 400  # over half of the sphere, 7 degrees apart
+_CELLS = 80  # rows and columns of a silhouette's or a mask's image
+_TURNS = 64  # at which silhouettes are compared
+_DIRECTIONS = 800  # all around, 7 degrees apart
 _AFAR = 60.0  # distance of an eye whose rays are almost parallel, relative to half a box's diagonal
 _EYES = (5.0, 12.0, _AFAR)  # distances from which silhouettes are rendered
 _RINGS = 24
 _OUTERMOST = 3.0  # [standard deviations], of the rings
 _LEAST_CELLS = 4
 _CELL_VARIANCE = 1e-3  # that every silhouette has at least
-_CUT_EVERY = 2  # directions, of which the silhouettes are cut
-_CUT_SHARES = (0.15, 0.3)  # of the area that lies beyond a line
-_CUT_ANGLES = 12
 _MARGIN = 1.5  # of the image in which silhouettes are compared, relative to the mask's
+_LEAST_OF_BEST = 0.97  # overlap of another turn, relative to the best one of the same direction
+_MOST_AFFINE = 200  # cameras of which the silhouettes are rendered
+_ITERATIONS = 8
+_PRIOR = 0.05  # weight of the logarithms of scales
+_MOST_LOG = 1.3
+_DISTINCT_DEG = 10.0
+_DISTINCT_STRETCH = 0.2
+
+T = TypeVar("T")
 
 
 class Whitened(NamedTuple):
     """Silhouettes by their first and second moments, N of them.
 
     ``mean`` (N, 2) and ``spread`` (N, 2, 2), the square root of the covariance, and ``rings``
-    (N, `_RINGS`, `TURNS`): the share in 255ths that is covered at these radii and angles, after
+    (N, `_RINGS`, `_TURNS`): the share in 255ths that is covered at these radii and angles, after
     both are removed.
     """
 
@@ -107,72 +76,71 @@ class Atlas(NamedTuple):
     views: Whitened
 
 
-def overlaps(views: Whitened, query: Whitened) -> FloatArray:
-    """Intersections over unions (N, turns) of silhouettes and one that is turned."""
-    rings = query.rings[0].astype(np.float32) / 255
-    count, turns = rings.shape
-    weights = np.repeat(_radii(count), turns)
-    around = (np.arange(turns)[:, None] + np.arange(turns)) % turns
-    turned = rings[:, around].transpose(0, 2, 1).reshape(-1, turns)
-    weighted = turned * weights[:, None].astype(np.float32)
-    flat = views.rings.reshape(len(views.rings), -1).astype(np.float32) / 255
-    common = flat @ weighted
-    areas = flat @ weights.astype(np.float32)
-    return np.asarray(common / (areas[:, None] + weighted[:, 0].sum() - common), dtype=np.float64)
+def resembling_poses(
+    mesh: Mesh,
+    mask: FloatArray | BoolArray,
+    camera: Camera,
+    *,
+    free: BoolArray,
+    count: int,
+    symmetry: Symmetry | None = None,
+) -> list[tuple[Alignment, float]]:
+    """Distinct alignments whose silhouettes resemble a mask (h, w), and their overlaps.
 
-
-def _radii(count: int) -> FloatArray:
-    return np.asarray(_OUTERMOST * (np.arange(count) + 0.5) / count)
+    The overlap is the intersection over union, the best first. ``free`` (3,) marks the scales that
+    are unknown. Of alignments that are equal under the ``symmetry`` one is kept.
+    """
+    view = FacedMask.of(mask, camera)
+    atlas = atlas_of(mesh, _eye_of(mesh, view.outline))
+    poses = _poses_of(*_affine_cameras(atlas, view.outline), atlas, free)
+    found = [(pose, view.overlap(atlas.caster, pose)) for pose in poses]
+    found.sort(key=lambda each: -each[1])
+    kept = distinct(((each[0], each) for each in found), count, symmetry)
+    turn = view.camera_from_facing
+    return [(turned_alignment(pose, turn), overlap) for pose, overlap in kept]
 
 
 @lru_cache(maxsize=32)
-def atlas_of(mesh: Mesh, eye: float, *, is_cut: bool = False) -> Atlas:
-    """The silhouettes of a mesh, whole or the parts that lines leave, rendered once.
+def atlas_of(mesh: Mesh, eye: float) -> Atlas:
+    """The silhouettes of a mesh, rendered once.
 
     The ``eye`` is so far from the middle of the box, relative to half of its diagonal.
     """
-    surface, around = rigid_surface(mesh), _half_sphere(_DIRECTIONS)
-    directions = np.concatenate([around, -around])
-    if is_cut:
-        return _atlas(surface, directions[::_CUT_EVERY], eye, _cuts)
-    return _atlas(surface, directions, eye, _uncut)
-
-
-def _atlas(
-    surface: RigidSurface,
-    directions: FloatArray,
-    eye: float,
-    parts_of: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
-) -> Atlas:
-    """Silhouettes along directions, and the parts of each by their moments and lines."""
+    surface = rigid_surface(mesh)
     caster, corners = surface.caster, surface.corners
     middle = corners.mean(axis=0)
     far = eye * float(np.linalg.norm(corners - middle, axis=1).max())
     bases, views = [], []
-    for direction in directions:
+    for direction in _directions():
         base = np.linalg.svd(direction[None])[2][1:]
         base[1] *= np.sign(np.cross(*base) @ direction)  # the image as it is seen, not mirrored
         across = (corners - middle) @ base.T
         across *= far / (far + (corners - middle) @ direction)[:, None]
         low, high = across.min(axis=0), across.max(axis=0)
-        cell = float((high - low).max()) / CELLS or 1.0
-        columns, rows = np.minimum((high - low) // cell + 2, CELLS + 1).astype(int)
-        x, y = low[:, None] + cell * np.arange(CELLS + 1)
+        cell = float((high - low).max()) / _CELLS or 1.0
+        columns, rows = np.minimum((high - low) // cell + 2, _CELLS + 1).astype(int)
+        x, y = low[:, None] + cell * np.arange(_CELLS + 1)
         grid = np.stack(np.meshgrid(x[:columns], y[:rows]), axis=-1).reshape(-1, 2)
-        rays = (grid / far) @ base + direction
-        covered = caster.covered(middle - far * direction, rays)
-        image = covered.reshape(rows, columns).astype(np.float32)
-        points = _cells(image)
-        if len(points) < _LEAST_CELLS:
-            continue
-        moments, lines = parts_of(points)
-        views.append(_sampled(image, moments, lines, low + base @ middle, cell))
-        bases.append(np.broadcast_to(base, (len(moments), 2, 3)))
+        covered = caster.covered(middle - far * direction, (grid / far) @ base + direction)
+        if covered.sum() >= _LEAST_CELLS:
+            image = covered.reshape(rows, columns).astype(np.float32)
+            views.append(_whitened(image, low + base @ middle, cell))
+            bases.append(base)
     every = [np.concatenate(column) for column in zip(*views, strict=True)]
-    return Atlas(caster, corners, np.concatenate(bases), Whitened(*every))
+    return Atlas(caster, corners, np.array(bases), Whitened(*every))
 
 
-def eye_of(mesh: Mesh, query: Whitened) -> float:
+def _directions() -> FloatArray:
+    """Directions (n, 3) spread evenly: a Fibonacci lattice, and the opposite ones."""
+    k = np.arange(_DIRECTIONS // 2) + 0.5
+    z = 1 - 2 * k / _DIRECTIONS
+    angle = np.pi * (1 + 5**0.5) * k
+    radius = np.sqrt(1 - z**2)
+    half = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
+    return np.concatenate([half, -half])
+
+
+def _eye_of(mesh: Mesh, query: Whitened) -> float:
     """One of `_EYES` from which a box of the mesh's size looks as large as a silhouette."""
     sides = np.ptp(mesh.bounds, axis=0)
     area = float((sides * np.roll(sides, 1)).sum()) / 2  # a quarter of the surface (Cauchy)
@@ -182,95 +150,51 @@ def eye_of(mesh: Mesh, query: Whitened) -> float:
 
 
 @cache
-def around(count: int) -> FloatArray:
-    """Unit vectors (count, 2) in equal steps, all around."""
-    angles = 2 * np.pi * np.arange(count) / count
+def _around() -> FloatArray:
+    """Unit vectors (`_TURNS`, 2) in equal steps, all around."""
+    angles = 2 * np.pi * np.arange(_TURNS) / _TURNS
     return np.column_stack([np.cos(angles), np.sin(angles)])
 
 
-def _half_sphere(count: int) -> FloatArray:
-    """Directions (count, 3) spread evenly: a Fibonacci lattice."""
-    k = np.arange(count) + 0.5
-    z = 1 - k / count
-    angle = np.pi * (1 + 5**0.5) * k
-    radius = np.sqrt(1 - z**2)
-    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
+@cache
+def _radii() -> FloatArray:
+    """Radii (`_RINGS`,) of rings [standard deviations]."""
+    return np.asarray(_OUTERMOST * (np.arange(_RINGS) + 0.5) / _RINGS)
 
 
-def _cells(image: Image) -> FloatArray:
-    rows, columns = np.nonzero(image > 0.5)
-    return np.column_stack([columns, rows]).astype(float)
-
-
-def _terms(points: FloatArray) -> FloatArray:
-    """1, x, y, x², xy, y² of points (n, 2), as (6, n)."""
-    x, y = points.T
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
-
-
-def _uncut(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    return _terms(points).sum(axis=1)[None], np.array([[0.0, 0.0, np.inf]])
-
-
-def _cuts(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Moments (N, 6) of what lines leave, and the lines (N, 3): kept is ``n x <= c``.
-
-    Their directions are spread evenly after whitening.
-    """
-    root = np.linalg.cholesky(np.cov(points.T) + _CELL_VARIANCE * np.eye(2))
-    normals = around(_CUT_ANGLES) @ np.linalg.inv(root)
-    last = [max(int((1 - share) * len(points)) - 1, 2) for share in _CUT_SHARES]
-    along = normals @ points.T
-    limits = np.partition(along, last, axis=1)[:, last]
-    kept = (along[:, None] <= limits[:, :, None]).reshape(-1, len(points))
-    lines = np.column_stack([np.repeat(normals, len(last), axis=0), limits.ravel()])
-    return kept @ _terms(points).T, lines
-
-
-def _sampled(
-    image: Image, moments: FloatArray, lines: FloatArray, corner: FloatArray, cell: float
-) -> Whitened:
-    """Moments (N, 6) of the parts of an image that lines (N, 3) leave."""
-    count = moments[:, 0]
-    mean = moments[:, 1:3] / count[:, None]
-    xx, xy, yy = (moments[:, 3:] / count[:, None]).T
-    square = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
-    square -= mean[:, :, None] * mean[:, None, :]
-    variances, axes = np.linalg.eigh(square + _CELL_VARIANCE * np.eye(2))
-    spread = (axes * np.sqrt(np.maximum(variances, _CELL_VARIANCE))[:, None]) @ axes.swapaxes(1, 2)
-    rays = (_radii(_RINGS)[:, None, None] * around(TURNS)).reshape(-1, 2)
-    places = mean[:, None] + rays @ spread
-    padded = np.asarray(np.pad(image, 1), dtype=np.float32)
-    covered = sampled(padded, places.reshape(-1, 2) + 1).reshape(len(mean), -1)
-    kept = (places @ lines[:, :2, None])[..., 0] <= lines[:, 2:]
-    rings = np.rint(255 * covered * kept).astype(np.uint8).reshape(-1, _RINGS, TURNS)
-    return Whitened(corner + cell * mean, cell * spread, rings)
+def _whitened(image: Image, corner: FloatArray, cell: float) -> Whitened:
+    """The silhouette of an image whose cells lie ``cell`` apart from the ``corner`` (2,) on."""
+    points = np.argwhere(image > 0.5)[:, ::-1].astype(float)
+    mean = points.mean(axis=0)
+    covariance = np.cov(points.T, bias=True) + _CELL_VARIANCE * np.eye(2)
+    variances, axes = np.linalg.eigh(covariance)
+    spread = (axes * np.sqrt(variances)) @ axes.T
+    rays = (_radii()[:, None, None] * _around()).reshape(-1, 2)
+    covered = sampled(np.pad(image, 1), mean + rays @ spread + 1)
+    rings = np.rint(255 * covered).astype(np.uint8).reshape(1, _RINGS, _TURNS)
+    return Whitened((corner + cell * mean)[None], cell * spread[None], rings)
 
 
 class FacedMask(NamedTuple):
     """A mask as a camera sees it that looks at its middle.
 
-    The ``outline`` is its silhouette. Cells of its image lie on the plane at depth 1, a ``cell``
-    apart, about the ``middle`` (2,). Those of `COMPARED` have values ``inside`` (m,), ``rays``
-    (m, 3) through them, and lie in the photo where ``is_seen`` (m,).
+    The ``outline`` is its silhouette. Of every second row and column of its image on the plane at
+    depth 1 the cells have values ``inside`` (m,), ``rays`` (m, 3) through them, and lie in the
+    photo where ``is_seen`` (m,).
     """
 
     outline: Whitened
     inside: FloatArray
     rays: FloatArray
     is_seen: BoolArray
-    middle: FloatArray
-    cell: float
     camera_from_facing: FloatArray
 
     @classmethod
     def of(cls, mask: FloatArray | BoolArray, camera: Camera) -> FacedMask:
         """The mask (h, w) of a camera."""
         inside: BoolArray = np.asarray(mask, dtype=np.float64) >= 0.5
-        rows, columns = np.nonzero(inside)
-        every = max(1, len(rows) // 20_000)
-        pixels = np.column_stack([columns, rows])[::every].astype(float)
-        found, valid = camera.rays_where_valid(pixels)
+        pixels = np.argwhere(inside)[:, ::-1].astype(float)
+        found, valid = camera.rays_where_valid(pixels[:: max(1, len(pixels) // 20_000)])
         seen = found[valid]
         axis = seen.mean(axis=0)
         axis /= np.linalg.norm(axis)
@@ -281,8 +205,8 @@ class FacedMask(NamedTuple):
         flat = turned[:, :2] / turned[:, 2:]
         low, high = flat.min(axis=0), flat.max(axis=0)
         middle, width = (low + high) / 2, _MARGIN * float((high - low).max())
-        cell, corner = width / (CELLS - 1), middle - width / 2
-        places = cell * np.arange(CELLS)
+        cell, corner = width / (_CELLS - 1), middle - width / 2
+        places = cell * np.arange(_CELLS)
         x, y = np.meshgrid(corner[0] + places, corner[1] + places)
         rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
         in_camera = rays @ turn.T
@@ -291,8 +215,114 @@ class FacedMask(NamedTuple):
         # Averages over a cell, where it holds several pixels.
         blur = max(cell * camera.fx / 3, 0.3)
         soft = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), blur)
-        image = sampled(np.pad(soft, 1), pixels + 1).reshape(CELLS, CELLS).astype(np.float32)
-        outline = _sampled(image, *_uncut(_cells(image)), corner, cell)
-        some = (CELLS * COMPARED[:, None] + COMPARED).ravel()
+        image = sampled(np.pad(soft, 1), pixels + 1).reshape(_CELLS, _CELLS).astype(np.float32)
+        some = np.arange(_CELLS**2).reshape(_CELLS, _CELLS)[::2, ::2].ravel()
         compared = image.ravel()[some].astype(float), rays[some], camera.contains(pixels)[some]
-        return cls(outline, *compared, corner + cell * (CELLS - 1) / 2, cell, turn)
+        return cls(_whitened(image, corner, cell), *compared, turn)
+
+    def overlap(self, caster: RayCaster, pose: Alignment) -> float:
+        """Intersection over union of the mask and the silhouette of a pose in this view."""
+        origin, model_from_ray = model_rays(pose)
+        seen = caster.covered(origin, self.rays @ model_from_ray.T) & self.is_seen
+        common = float(self.inside[seen].sum())
+        return common / (float(self.inside.sum()) + int(seen.sum()) - common)
+
+
+def _overlaps(views: Whitened, query: Whitened) -> FloatArray:
+    """Intersections over unions (N, turns) of silhouettes and one that is turned."""
+    rings = query.rings[0].astype(np.float32) / 255
+    weights = np.repeat(_radii(), _TURNS).astype(np.float32)
+    turns = (np.arange(_TURNS)[:, None] + np.arange(_TURNS)) % _TURNS
+    weighted = rings[:, turns].transpose(0, 2, 1).reshape(-1, _TURNS) * weights[:, None]
+    flat = views.rings.reshape(len(views.rings), -1).astype(np.float32) / 255
+    common = flat @ weighted
+    areas = flat @ weights
+    return np.asarray(common / (areas[:, None] + weighted[:, 0].sum() - common), dtype=np.float64)
+
+
+def _affine_cameras(atlas: Atlas, query: Whitened) -> tuple[FloatArray, FloatArray]:
+    """Maps ``M x + b`` of the model to the query's plane, those of the best overlaps.
+
+    Matrices (n, 2, 3) and shifts (n, 2).
+    """
+    overlap = _overlaps(atlas.views, query)
+    # A whitened silhouette may fit at several turns.
+    is_peak = (overlap >= np.roll(overlap, 1, 1)) & (overlap >= np.roll(overlap, -1, 1))
+    is_peak &= overlap > _LEAST_OF_BEST * overlap.max(axis=1, keepdims=True)
+    peaks = np.nonzero(is_peak)
+    best = np.argsort(-overlap[peaks])[:_MOST_AFFINE]
+    row, number = (each[best] for each in peaks)
+    cosine, sine = _around()[number].T
+    turns = np.stack([cosine, -sine, sine, cosine], axis=1).reshape(-1, 2, 2)
+    planes = query.spread[0] @ turns @ np.linalg.inv(atlas.views.spread[row])
+    shifts = query.mean[0] - (planes @ atlas.views.mean[row][:, :, None])[:, :, 0]
+    return planes @ atlas.bases[row], shifts
+
+
+def _poses_of(
+    matrices: FloatArray, shifts: FloatArray, atlas: Atlas, free: BoolArray
+) -> list[Alignment]:
+    """Alignments of affine cameras: ``matrices`` (n, 2, 3) and ``shifts`` (n, 2)."""
+    scales = _stretches_of(matrices, free)
+    rows = matrices / scales[:, None]
+    sizes = np.sqrt(np.linalg.norm(rows, axis=2).prod(axis=1))
+    left, _, right = np.linalg.svd(rows, full_matrices=False)
+    first = left @ right
+    rotations = np.concatenate([first, np.cross(first[:, 0], first[:, 1])[:, None]], axis=1)
+    middle = atlas.corners.mean(axis=0)
+    seen = np.column_stack([matrices @ middle + shifts, np.ones(len(matrices))]) / sizes[:, None]
+    places = seen - (rotations @ (scales * middle)[:, :, None])[:, :, 0]
+    return [Alignment(*each) for each in zip(rotations, places, scales, strict=True)]
+
+
+def _stretches_of(matrices: FloatArray, free: BoolArray) -> FloatArray:
+    """Scales (n, 3) that make the rows of ``matrix / scale`` orthogonal and of one length.
+
+    Least squares by Gauss and Newton, with a weak prior on the logarithms: some views leave a
+    stretch open.
+    """
+    first, second = matrices[:, 0], matrices[:, 1]
+    terms = np.stack([first * second, (first**2 - second**2) / 2], axis=1)
+    squares = (first**2 + second**2) / 2
+    logs, count = np.zeros((len(matrices), 3)), int(free.sum())
+    for _ in range(_ITERATIONS if count else 0):
+        inverse = np.exp(-2 * logs)
+        relative = terms * (inverse / (squares * inverse).sum(axis=1, keepdims=True))[:, None]
+        slopes = -2 * relative[:, :, free]
+        transposed = slopes.swapaxes(1, 2)
+        normal = transposed @ slopes + _PRIOR**2 * np.eye(count)
+        gradient = (transposed @ relative.sum(axis=2)[:, :, None])[:, :, 0]
+        gradient += _PRIOR**2 * logs[:, free]
+        step = np.linalg.solve(normal, -gradient[:, :, None])[:, :, 0]
+        moved = logs[:, free] + np.clip(step, -0.5, 0.5)
+        logs[:, free] = np.clip(moved, -_MOST_LOG, _MOST_LOG)
+    return np.asarray(np.exp(logs))
+
+
+def distinct(
+    found: Iterable[tuple[Alignment, T]], count: int, symmetry: Symmetry | None
+) -> list[T]:
+    """The first ones, so many at most, whose alignments are too far apart for a common minimum.
+
+    Of alignments that are equal under the symmetry the canonical ones are compared.
+    """
+    group = None if symmetry is None else group_of(symmetry)
+    poses: list[Alignment] = []
+    kept: list[T] = []
+    for given, each in found:
+        pose = given
+        if group is not None:
+            pose = group.canonical(given, tolerance=_DISTINCT_STRETCH).alignment
+        if all(_differ(pose, other) for other in poses):
+            poses.append(pose)
+            kept.append(each)
+        if len(kept) == count:
+            break
+    return kept
+
+
+def _differ(one: Alignment, other: Alignment) -> bool:
+    """True if rotations or scales are too far apart for one start to lead to both."""
+    turn = angle_between(one.rotation, other.rotation)
+    stretch = np.abs(np.log(one.scale / other.scale)).max()
+    return bool(turn > _DISTINCT_DEG or stretch > _DISTINCT_STRETCH)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
@@ -128,8 +129,6 @@ def _barycentric(triangles: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def _hull_faces(vertices: FloatArray) -> IntArray:
-    from scipy.spatial import ConvexHull  # takes longer to import than all that is compiled
-
     return cast(IntArray, ConvexHull(vertices, qhull_options=_QHULL).simplices.astype(np.int64))
 
 

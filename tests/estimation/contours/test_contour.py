@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.optimize import minimize
 
 from cadalign.errors import InputError
 from cadalign.estimation.contours.contour import (
@@ -19,11 +18,10 @@ from cadalign.estimation.contours.contour import (
     crossings,
     find_rims,
     mask_contour,
+    sampled,
 )
-from cadalign.estimation.contours.descent import with_learned_offsets
-from cadalign.estimation.contours.outline import Noise, Track, correlation_length, cost_of_contour
-from cadalign.estimation.contours.problem import Augmented
-from cadalign.estimation.contours.silhouettes import colors_at, sampled
+from cadalign.estimation.contours.descent import likeliest_offset
+from cadalign.estimation.contours.outline import Noise, correlation_length
 
 WIDTH, HEIGHT = 160, 120
 
@@ -40,9 +38,6 @@ def test_images_are_read_at_exact_places_and_beyond_them_at_their_border() -> No
     assert np.abs(sampled(ramp, inside) - inside @ [1, 7]).max() < 1e-9
     outside = np.array([[-5.0, 1.25], [4100.0, -np.inf], [12.5, np.inf], [np.nan, 9.0]])
     assert sampled(ramp, outside).tolist() == [8.75, 3999.0, 26.5, 14.0]
-    photo = np.stack([ramp[:, :200], 255 - ramp[:, :200]], axis=-1).astype(np.uint8)
-    places = np.array([[17.6, 0.0], [300.0, 1.5]])
-    assert colors_at(photo, places).tolist() == [[18, 237], [210, 46]]
 
 
 def disc(center: tuple[float, float], radius: float) -> np.ndarray:
@@ -119,36 +114,11 @@ def test_correlated_residuals_count_less() -> None:
     assert 8 < correlation_length(contour, alike, every) < 12
 
 
-def test_the_cost_of_a_contour_is_the_least_over_share_and_deviation() -> None:
-    rng, reach = np.random.default_rng(1), 20.0
-    residuals = np.concatenate([rng.normal(0, 1.5, 700), rng.uniform(-reach, reach, 300)])
-
-    def cost(unknowns: np.ndarray) -> float:
-        share, sigma = unknowns
-        own = share * np.exp(-((residuals / sigma) ** 2) / 2) / (np.sqrt(2 * np.pi) * sigma)
-        return float(-np.log(own + (1 - share) / (2 * reach)).mean())
-
-    best = minimize(cost, (0.5, 1.0), bounds=[(0.01, 0.99), (0.3, 10)])
-    assert best.x == pytest.approx((0.7, 1.5), abs=0.1)
-    assert cost_of_contour(residuals, reach) == pytest.approx(best.fun, abs=1e-6)
-
-
 @pytest.mark.parametrize("place", [2.0, 0.7, 0.5, 0.0])
-def test_an_offset_has_the_deviation_that_its_own_place_shows(
-    monkeypatch: pytest.MonkeyPatch, place: float
-) -> None:
+def test_an_offset_has_the_deviation_that_its_own_place_shows(place: float) -> None:
     """A contour lies ``place`` before a prior of 1 px, with a variance of .36 px^2."""
-    information = np.diag([1 / 0.36 + 1, 1.0, 1.0])
-    module = "cadalign.estimation.contours.descent.information_of"
-    monkeypatch.setattr(module, lambda *_: (None, information))
-    own = np.array([[place / (1 + 0.36), 0.2, 0.3]])
-    nothing = Augmented(*[cast(Any, None)] * 5)
-    tracks = [Track(Noise(1.0, 1.0, 1.0), 4.0)]
-    (learned,), moved = with_learned_offsets(nothing, tracks, own, np.arange(1))
-    offset = learned.noise.offset
+    offset = likeliest_offset(place / (1 + 0.36), 1 / (1 / 0.36 + 1), Noise(1.0, 1.0, 1.0))
     assert offset == pytest.approx(max(np.sqrt(max(place**2 - 0.36, 0.0)), 0.1))
-    assert moved[0, 0] * offset == pytest.approx(own[0, 0])
-    assert moved[0, 1:] == pytest.approx(own[0, 1:])
 
 
 @pytest.mark.parametrize("shift", [-0.3, -0.1, 0.1, 0.3])

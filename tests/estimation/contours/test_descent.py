@@ -12,7 +12,7 @@ from support.scenes import CAMERA, truth_of
 from cadalign import Alignment, Camera, Mesh, Model, Result, View, align
 from cadalign.datasets import KeypointNet
 from cadalign.estimation.contours.contour import Contour, Rims, across_rims
-from cadalign.estimation.contours.descent import Descent, first_fit
+from cadalign.estimation.contours.descent import descended, first_fit, fit_at, last_fit
 from cadalign.estimation.contours.mask import MaskSource
 from cadalign.estimation.contours.problem import ContourProblem, Place, shift_to, shifted
 from cadalign.estimation.contours.surface import RigidSurface
@@ -134,37 +134,17 @@ def test_no_step_from_the_end_of_a_descent_lowers_the_cost() -> None:
     start = State(pose, np.zeros(0), np.log(truth.scale), np.zeros(0), still)
     start.poses[0, 9:] *= 1.03
     problem = ContourProblem(evidence, 8, [MaskSource.of(0, view, view.camera)], RigidSurface(BOX))
-    found = first_fit(problem, start)
-    assert found is not None
-    descent, place = Descent(problem, found.tracks), found.place
-    end = descent.at(place)
+    near = first_fit(problem, start)
+    assert near is not None
+    end = last_fit(problem, near)
     assert end is not None
-    again = descent.run(end)
-    assert again is end
+    assert descended(problem, end) is end
     for _ in range(20):
         step = np.zeros(6 + 3 + 3)
         step[:9] = rng.normal(0, 1e-3, 9) * [1, 1, 1, 1, 1, 1, 0, 1, 1]
-        there = descent.at(place.moved(step))
+        there = fit_at(problem, end.place.moved(step), end.tracks)
         assert there is not None
         assert there.cost > end.cost
-
-
-def test_a_step_behind_the_camera_moves_the_outline_without_limit() -> None:
-    truth = truth_of((0.6, 0.4, 0.8))
-    mask = cast_geometry(Scene(BOX), CAMERA, truth).mask
-    view = View(CAMERA, CAMERA.project(truth.apply(CORNERS)), mask=mask)
-    evidence = evidence_of(prior_of(Model(points_3d=CORNERS, mesh=BOX)), [view])
-    source = MaskSource.of(0, view, CAMERA)
-    problem, track = ContourProblem(evidence, 8, [source], RigidSurface(BOX)), source.first()
-    pose = np.append(truth.rotation.ravel(), truth.translation)[None]
-    still = np.zeros_like(evidence.shape.mean)
-    state = State(pose, np.zeros(0), np.log(truth.scale), np.zeros(0), still)
-    look = problem.look(Place.of(state, 1), [track])
-    here = problem.augmented(look, [track.noise])
-    assert here is not None
-    assert problem.moves(look, here) == pytest.approx([0.0], abs=1e-9)
-    behind = state._replace(poses=pose * np.append(np.ones(11), -1.0))
-    assert problem.moves(look, here._replace(place=Place.of(behind, 1))) == [np.inf]
 
 
 def test_places_move_and_go_towards_others() -> None:

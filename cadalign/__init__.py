@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from cadalign.estimation.observed import views_from
     from cadalign.estimation.options import RansacOptions
     from cadalign.estimation.result import Result
+    from cadalign.estimation.result_parts import EvidenceSummary
     from cadalign.estimation.results import Results, to_dataframe
-    from cadalign.estimation.uncertainty.summary import EvidenceSummary
     from cadalign.estimation.view import View
     from cadalign.evaluation.api import evaluate, simulate
     from cadalign.geometry.alignment import Alignment, Box

@@ -23,7 +23,7 @@ from cadalign.estimation.model import Model
 from cadalign.estimation.observed import model_of, views_of
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.result import Result
-from cadalign.estimation.uncertainty.misfit import PlacedRows, Rows, find_outliers
+from cadalign.estimation.uncertainty.residuals import PlacedRows, Rows, find_outliers
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera

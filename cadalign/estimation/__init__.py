@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from cadalign.estimation.options import FitOptions, RansacOptions
     from cadalign.estimation.outputs import object_of
     from cadalign.estimation.result import Result
-    from cadalign.estimation.result_parts import ViewResult
-    from cadalign.estimation.results import Results, to_dataframe
-    from cadalign.estimation.uncertainty.summary import (
+    from cadalign.estimation.result_parts import (
         EvidenceSummary,
         Uncertainty,
+        ViewResult,
     )
+    from cadalign.estimation.results import Results, to_dataframe
     from cadalign.estimation.view import View
     from cadalign.estimation.warning import EstimateWarning
     from cadalign.io.evidence import Size

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -18,11 +19,12 @@ from cadalign.errors import (
     quote,
     require_kind,
 )
+from cadalign.estimation.agreement import Case
 from cadalign.estimation.contours import refine
 from cadalign.estimation.diagnose import diagnose, diagnose_refusal
 from cadalign.estimation.fitted import FitStats
 from cadalign.estimation.focal import PriorOption
-from cadalign.estimation.joint import result_of_minima, with_mistake
+from cadalign.estimation.joint import Causes, result_of_minima, with_causes
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.prior import Lenses
@@ -122,28 +124,24 @@ def align(
         return align_plain(exact, given[0], options=options, ransac=ransac)
     problem = compile_problem(model, given, size, inits, options, ransac)
 
-    def again(model: Model | ShapeModel, views: Sequence[View]) -> Result:
-        some = [None] * len(views)
-        problem = compile_problem(model, views, size, some, options, ransac)
-        return _estimate(problem, start, has_warnings=False)
+    def again(model: Model | ShapeModel, views: Sequence[View], /, **changes: Any) -> Result:
+        some, own = [None] * len(views), replace(options, **changes)
+        problem = compile_problem(model, views, size, some, own, ransac)
+        return _estimate(problem, start)[0]
 
-    taking_part = [given[number] for number in problem.numbers]
+    case = Case(model, [given[number] for number in problem.numbers], again, ransac)
     try:
-        result = _estimate(problem, start)
+        result, causes = _estimate(problem, start)
     except (NoConsensusError, DegenerateError) as error:
-        named = diagnose_refusal(
-            model, taking_part, again, ransac, with_keypoints=isinstance(error, NoConsensusError)
-        )
+        named = diagnose_refusal(case, with_keypoints=isinstance(error, NoConsensusError))
         error.fix = named or error.fix
         raise
-    if loss == FitOptions.loss:
-        mistake = diagnose(model, taking_part, again, result=result, ransac=ransac)
-        if mistake is not None:
-            return with_mistake(result, mistake)
-    return result
+    mistake = diagnose(case, result=result) if loss == FitOptions.loss else None
+    found = causes() if mistake is None else (mistake,)
+    return with_causes(result, found, problem.views)
 
 
-def _estimate(problem: Problem, start: float, *, has_warnings: bool = True) -> Result:
+def _estimate(problem: Problem, start: float) -> tuple[Result, Causes]:
     """All stages of an estimate that was begun at ``start`` [s]."""
     if is_single(problem):
         return align_single(problem, start)
@@ -158,7 +156,7 @@ def _estimate(problem: Problem, start: float, *, has_warnings: bool = True) -> R
     minima, notes = refine(problem, found)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
     likely = widened_by_noise(problem, minima)
-    return result_of_minima(problem, likely, stats, notes=notes, has_warnings=has_warnings)
+    return result_of_minima(problem, likely, stats, notes=notes)
 
 
 def align_batch(

@@ -1,66 +1,203 @@
-"""Usual mistakes in data that do not fit: each is undone, and the estimate is made again.
+"""Causes of residuals that fail their test, such as swapped coordinates or a wrong focal length.
 
-A mistake is named where the data without it fit, and explain the keypoints far better. To add one,
-write a `Mistake` and list it in `_mistakes_in`.
+Each cause is a `Rule`: what is undone in the data, what the estimate without it must explain, and
+what is said. Of the rules that explain the residuals the likeliest is named. To add one, list it in
+`_rules_for`, or in `_mistakes_in` if it is a usual mistake.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple, cast
+from functools import partial
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
-from cadalign.errors import CadalignError
+from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.estimation.agreement import AS_GIVEN, Agreement, AnyModel, Case, Rule
 from cadalign.estimation.assemble import result_of_keypoints
+from cadalign.estimation.fit import fit_once
 from cadalign.estimation.fitted import FittedKeypoints
-from cadalign.estimation.model import Model, is_exact_model
-from cadalign.estimation.options import FitOptions, RansacOptions, Sigma, pixel_information
+from cadalign.estimation.model import Model
+from cadalign.estimation.options import FitOptions, RansacOptions, pixel_information
 from cadalign.estimation.problems import pack_one
-from cadalign.estimation.uncertainty.misfit import is_large_sigma
-from cadalign.estimation.uncertainty.residuals import area_of, chi_square_tail, f_quantile
-from cadalign.estimation.uncertainty.summary import OTHER_SIZES
-from cadalign.estimation.view import View, numbered
+from cadalign.estimation.result_parts import listed, uncertainty_of
+from cadalign.estimation.uncertainty.doubts import (
+    CAMERA_GAIN,
+    FALSE_ALARMS,
+    OTHER_SIZES,
+    may_fit_other_cameras,
+    percent,
+)
+from cadalign.estimation.uncertainty.residuals import (
+    PlacedRows,
+    Rows,
+    find_outliers,
+    named_keypoints,
+)
+from cadalign.estimation.view import View
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import rescaled_pixels
-from cadalign.shapes.model import ShapeModel
 
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
 
-AnyModel = Model | ShapeModel
-Again = Callable[[AnyModel, Sequence[View]], "Result"]
-"""Estimate without a diagnosis."""
-
-_DOUBTFUL = 1e-4  # probability of such residuals by chance, below which mistakes are looked for
-_FITTING = 0.004  # the same, at which data without a mistake fit
-_MOST_CORRECTED = 1.6  # residuals of uncertain shapes without a mistake, over their deviations
-_LEAST_RATIO = 1.7  # of the residuals with and without it
-_MORE_AGREE = 2.0  # of -2 log likelihood, that is gained where more keypoints agree
-_AS_MANY_AGREE = 12.0  # the same where as many do
-_AS_MANY_ARE_FOUND = 2 * math.log(100)  # the same after a robust search
 _AS_LIKELY = 6.0  # difference of -2 log likelihoods of mistakes that are both named
-_FEW_REJECTED = 0.1  # share of the keypoints, up to which an uncertain shape is not doubted
-_CHANCE_OF_RATIO = 1e-3  # that residuals of an unknown noise differ by as much
-_UPRIGHT = 0.5  # cosine between the model's y axis and the photo's upwards, at least
 _MOST_INSIDE = 0.8  # share of the keypoints that lie in their image
-_EQUATIONS = {"keypoints": 2, "gravity": 2, "depth": 1, "size": 1, "camera height": 1}
+_MOST_OUTLIERS = 1 / 3  # of the keypoints; more are no outliers
+_TESTED_TO = 0.1  # relative standard deviation to which a held scale must be tested
 
 
-class Mistake(NamedTuple):
-    """A usual mistake: a clause that names it, and the functions that undo it.
+@np.errstate(all="ignore")
+def diagnose(case: Case, *, result: Result | None = None) -> EstimateWarning | None:
+    """Name the likeliest cause without which all data agree, where the residuals fail their test.
 
-    ``factor`` is the size of the images that the keypoints are of, over the camera's.
+    ``case`` has the views that take part in the estimate, whose masks and photos are left out, and
+    ``result`` is the estimate; by default it is made again.
     """
+    shown = replace(case, views=_without_outlines(case.views))
+    if not any(len(view.keypoint_ids) for view in shown.views):
+        return None
+    given = None if result is None else case.agreement(result)
+    if given is not None and not case.is_doubtful(given):
+        return None
+    if given is None or any(view.has_outline for view in case.views):
+        given = shown.without(AS_GIVEN)
+    return None if given is None else _likeliest(shown, given)
 
-    clause: str
-    undo_view: Callable[[View], View] = lambda view: view
-    undo_model: Callable[[Model], Model] = lambda model: model
-    factor: float = 1.0
+
+def _likeliest(case: Case, given: Agreement) -> EstimateWarning | None:
+    rules = list(_rules_for(case, given))
+    # About a centred principal point, flips are the same as a mirrored model. Where perspective is
+    # weak, all keypoints agree with a mirrored model if with any.
+    rest = [each for each in rules if each in (FLIPPED, UPSIDE_DOWN) and MIRRORED in rules]
+    if case.ransac is not None and given.inliers == given.keypoints and case.is_exact:
+        rest = [each for each in rules if each is not MIRRORED]
+    found: list[tuple[Rule, Agreement]] = []
+    explaining: list[tuple[Rule, Agreement]] = []
+    for some in ([each for each in rules if each not in rest], rest):
+        tried = [(rule, each) for rule in some if (each := case.without(rule)) is not None]
+        found += tried
+        explaining += [each for each in tried if case.explains(*each, given)]
+        if not explaining:
+            return _unexplained(case, given)
+    rule, best = min(explaining, key=lambda each: each[1].score)
+    if rule.says is not None:
+        return rule.says(best, given)
+    named = _named([each for each in found if each[0].clause], best)
+    return EstimateWarning("mistake", f"{named}: corrected, {_compared(best, given)}")
+
+
+def _unexplained(case: Case, given: Agreement) -> EstimateWarning | None:
+    """The warning about residuals that no rule explains, or a stretch that these do not test."""
+    if case.options is None:
+        return None
+    if not case.has_chance(given, FALSE_ALARMS):
+        text = (
+            "the keypoints do not fit the model together (wrong pairs, model, stretch or camera), "
+            "or sigma is too small; sigma=None suits a model that is only similar"
+        )
+        return EstimateWarning("misfit", _too_large(given) + text)
+    held = set("xyz") - {given.result.known_axis} - set(given.result.stretched_axes)
+    free = case.without(HELD) if held else None
+    covariance = None if free is None else free.result.fisher_covariance
+    if covariance is None:
+        return None
+    scale = dict(zip("xyz", uncertainty_of(covariance).scale, strict=True))
+    open_axes = [axis for axis in sorted(held) if scale[axis] > _TESTED_TO]
+    if not open_axes:
+        return None
+    known = " and ".join(f"s_{axis} to +-{percent(scale[axis])}" for axis in open_axes)
+    text = (
+        f"the scale is held at 1, which is not tested: free, the keypoints determine {known} only"
+    )
+    return EstimateWarning("scale", text)
+
+
+def _without_outlines(views: Sequence[View]) -> tuple[View, ...]:
+    """The views with evidence beside masks and photos."""
+    given = [replace(view, mask=None, mask_sigma=None, image=None) for view in views]
+    return tuple(view for view in given if view.has_evidence)
+
+
+def diagnose_fit(fitted: FittedKeypoints) -> EstimateWarning | None:
+    """As `diagnose`, of keypoints in one view; after a robust search also of its inliers."""
+    ransac = None if fitted.search is None else fitted.search.ransac
+    ahead = np.asarray(np.isfinite(fitted.residuals).all(axis=1))
+    if ransac is not None:
+        own = None if fitted.inliers.all() else ransac  # samples need not be drawn where all agree
+        cause = diagnose(replace(_case_of_rows(fitted, ahead, own), ransac=ransac, options=None))
+        if cause is not None or fitted.options.sigma is None:
+            return cause
+    if fitted.fisher_covariance is None:
+        return None
+    return diagnose(
+        _case_of_rows(fitted, ahead if fitted.options.sigma is None else fitted.inliers)
+    )
+
+
+@np.errstate(all="ignore")
+def diagnose_refusal(case: Case, *, with_keypoints: bool = True) -> str | None:
+    """Name the mistake without which there is an estimate, where there is none of the data.
+
+    Mistakes in keypoints are tried ``with_keypoints``, otherwise those in other evidence alone.
+    """
+    shown = replace(case, views=_without_outlines(case.views))
+    if not shown.views:
+        return None
+    found = [
+        (mistake, each)
+        for mistake in (*_mistakes_in(shown), *_other_sizes(shown))
+        if (with_keypoints or mistake in (INVERTED, DOWNWARD))
+        and (each := shown.without(mistake)) is not None
+    ]
+    if not found:
+        return None
+    best = min((each for _, each in found), key=lambda each: each.score)
+    return f"{_named(found, best)}: corrected, {best.inliers} of {best.keypoints} keypoints agree"
+
+
+def _case_of_rows(
+    fitted: FittedKeypoints, kept: BoolArray, ransac: RansacOptions | None = None
+) -> Case:
+    rows, sigma = np.flatnonzero(kept), fitted.options.sigma
+    if sigma is not None and np.ndim(sigma) > 0:
+        sigma = np.asarray(sigma)[rows]
+    view = View(fitted.camera, fitted.observed[rows], ids=rows.tolist(), sigma=sigma)
+    return case_of_fit(fitted.points_3d, view, fitted.options, ransac)
+
+
+def case_of_fit(
+    points_3d: FloatArray, view: View, options: FitOptions, ransac: RansacOptions | None
+) -> Case:
+    """The case of a fit of a model's keypoints (n, 3) to a view, whose ids are rows of these."""
+    model = Model(
+        points_3d=points_3d,
+        stretch=options.stretch,
+        stretch_sigma=options.stretch_sigma,
+        known_axis=options.known_axis,
+    )
+
+    def again(model: AnyModel, views: Sequence[View], /, **changes: Any) -> Result:
+        exact, (view,) = cast(Model, model), views
+        points = cast(FloatArray, exact.points_3d)[_rows_of(view)]
+        of_model = {"stretch": exact.stretch, "stretch_sigma": exact.stretch_sigma}
+        own = replace(options, sigma=view.sigma, **(of_model | changes))
+        problems = pack_one(points, view.pixels, view.camera)
+        return result_of_keypoints(view.pixels, fit_once(problems, own, ransac, None, 0.0))
+
+    is_tested = ransac is None and options.sigma is not None
+    return Case(model, (view,), again, ransac, options if is_tested else None)
+
+
+def _rows_of(view: View) -> IntArray:
+    return np.array(view.keypoint_ids, dtype=np.intp)
+
+
+# Rules -------------------------------------------------------------------------------------------
 
 
 def _mirrored(model: Model) -> Model:
@@ -76,354 +213,163 @@ def _flipped(view: View, *, axis: int) -> View:
     return replace(view, points_2d=pixels)
 
 
-def _of_size(clause: str, factor: float) -> Mistake:
-    def undo(view: View) -> View:
-        return replace(view, points_2d=rescaled_pixels(view.pixels, 1 / factor))
+def _resized(view: View, *, factor: float, noise: float) -> View:
+    """The view of images that are larger by a factor, with keypoints whose noise is."""
+    sigma, power = view.sigma, 2 if np.ndim(cast(FloatArray, view.sigma)) == 3 else 1
+    if sigma is not None:
+        sigma = np.asarray(sigma) * noise**power
+    return replace(view, camera=view.camera.resized(*_size(view.camera, factor)), sigma=sigma)
 
-    return Mistake(clause, undo, factor=factor)
+
+def _size(camera: Camera, factor: float) -> tuple[int, int]:
+    return max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
 
 
-MIRRORED = Mistake("the model is mirrored", undo_model=_mirrored)
-SWAPPED = Mistake(
+def _say_stretch(best: Agreement, _: Agreement) -> EstimateWarning:
+    listed = ", ".join(f"{value:.3g}" for value in best.result.alignment.scale.tolist())
+    text = (
+        "the keypoints contradict the constraint on the stretch: without it they fit better, "
+        f"with the scale ({listed})"
+    )
+    return EstimateWarning("stretch", text)
+
+
+def _say_camera(best: Agreement, _: Agreement) -> EstimateWarning:
+    text = (
+        "the keypoints contradict the camera: they fit one better that has a focal length of "
+        f"{best.result.camera.fx:.4g} px"
+    )
+    return EstimateWarning("camera", text, 0)
+
+
+MIRRORED = Rule("the model is mirrored", undo_model=_mirrored)
+SWAPPED = Rule(
     "u and v are swapped", lambda view: replace(view, points_2d=view.pixels[:, ::-1].copy())
 )
-FLIPPED = Mistake("the photo is flipped", lambda view: _flipped(view, axis=0))
-UPSIDE_DOWN = Mistake("v counts from the bottom", lambda view: _flipped(view, axis=1))
-DOWNWARD = Mistake(
+FLIPPED = Rule("the photo is flipped", lambda view: _flipped(view, axis=0))
+UPSIDE_DOWN = Rule("v counts from the bottom", lambda view: _flipped(view, axis=1))
+DOWNWARD = Rule(
     "`up` points down (give its opposite)",
     lambda view: view if view.up is None else replace(view, up=np.negative(view.up)),
 )
-INVERTED = Mistake(
+INVERTED = Rule(
     "`cam_from_rig` is the inverse, rig_from_cam (give np.linalg.inv of each)",
     lambda view: replace(view, cam_from_rig=np.linalg.inv(np.asarray(view.cam_from_rig))),
 )
+HELD = Rule(
+    undo_model=lambda model: replace(model, stretch=None, stretch_sigma=None), says=_say_stretch
+)
+ANOTHER_FOCAL = Rule(changes={"focal": "estimate"}, gain=CAMERA_GAIN, says=_say_camera)
 
 
-class Agreement(NamedTuple):
-    """Agreement of all evidence with an estimate.
+def _rules_for(case: Case, given: Agreement) -> Iterator[Rule]:
+    """The rules that may explain such residuals."""
+    options, is_doubtful = case.options, case.is_doubtful(given)
+    if is_doubtful:
+        yield from _mistakes_in(case)
+    if options is None:
+        yield from _other_sizes(case) if is_doubtful else ()
+        return
+    if options.stretch is not None or options.stretch_sigma is not None:
+        yield HELD
+    fails = not case.has_chance(given, FALSE_ALARMS)
+    if may_fit_other_cameras(cast(FittedKeypoints, given.result.posterior.keypoints), fails):
+        yield ANOTHER_FOCAL
+        yield from _other_sizes(case)
+    if fails:
+        yield from _outliers(case, given)
 
-    The ``score`` is -2 log likelihood of all keypoints, of which outliers lie anywhere, in the
-    pixels that were given; ``up`` the cosine between the model's y axis and the photo's upwards.
-    """
 
-    score: float
-    chi_square: float
-    redundancy: int
-    inliers: int
-    keypoints: int
-    sigma: float | None  # estimated [px]
-    up: float
+def _outliers(case: Case, given: Agreement) -> Iterator[Rule]:
+    """The few keypoints without which the others may fit."""
+    (view,), count = case.views, given.keypoints
+    rows = _rows_of(view)
+    covariances = np.asarray(np.linalg.inv(pixel_information(view.sigma, count)), dtype=np.float64)
+    points = cast(FloatArray, cast(Model, case.model).points_3d)[rows]
 
-    @classmethod
-    @np.errstate(all="ignore")  # residuals that overflow are outliers'
-    def of(
-        cls,
-        result: Result,
-        model: AnyModel,
-        views: Sequence[View],
-        ransac: RansacOptions | None,
-        factor: float = 1.0,
-    ) -> Agreement:
-        """The agreement of views that take part in a result."""
-        score, squares, inliers, count = 0.0, 0.0, 0, 0
-        for view in views:
-            own = result.views[view.number]
-            sigma: Sigma = result.sigma or 1.0 if view.sigma is None else view.sigma
-            information, kept = pixel_information(sigma, len(own.residuals)), own.inliers
-            threshold = (ransac or RansacOptions()).threshold(view.sigma)
-            if ransac is not None and result.options is not None:
-                kept = kept & (np.linalg.norm(own.residuals, axis=1) < threshold)
-            inliers, count = inliers + int(kept.sum()), count + len(kept)
-            if len(kept):
-                seen = own.residuals[kept], information[kept]
-                squares += float(np.einsum("ni,nij,nj->", seen[0], seen[1], seen[0]))
-                score += float((math.log(4 * math.pi**2) - np.log(np.linalg.det(seen[1]))).sum())
-                area = area_of(own.points_2d, own.camera, threshold)
-                score += 2 * math.log(area) * int((~kept).sum())
-        kinds = {each.kind for each in result.evidence}
-        is_whole = inliers == int(result.inliers.sum())
-        if result.cost is not None and is_whole and not kinds & {"mask", "photo"}:
-            squares = result.cost
-        score += squares
-        equations = sum(_EQUATIONS.get(each.kind, 0) * each.count for each in result.evidence)
-        unknowns = 6 * (1 if views[0].cam_from_rig is not None else len(views))
-        unknowns += len(result.stretched_axes) + (result.focal == "estimate")
-        equations += result.focal == "estimate" and result.focal_prior is not None
-        if isinstance(model, Model):
-            options = model.fit_options()
-            equations += len(options.stretched_axes) * (options.stretch_sigma is not None)
-            logs = np.log(result.alignment.scale / result.alignment.scale.mean())
-            score += float((logs**2).sum())  # outliers invite extremes
-        return cls(
-            score + 4 * count * math.log(factor),
-            squares,
-            equations - unknowns,
-            inliers,
-            count,
-            result.sigma if any(view.sigma is None for view in views) else None,
-            -float(result.alignment.rotation[1, 1]),
+    def fit_rows(some: Rows, robust: bool) -> PlacedRows:
+        shown = replace(
+            view, points_2d=view.pixels[some], ids=rows[some].tolist(), sigma=covariances[some]
+        )
+        loss = {"loss": "cauchy" if robust else "linear", "loss_scale": FitOptions.loss_scale}
+        found = case.again(case.model, [shown], **loss)
+        return found.alignment, found.camera, found.fisher_covariance
+
+    unknowns = cast(FitOptions, case.options).unknowns
+    found = find_outliers(points, view.pixels, fit_rows, unknowns=unknowns, noise=covariances)
+    if not 0 < len(found) <= _MOST_OUTLIERS * count:
+        return
+    kept = np.setdiff1d(np.arange(count), list(found))
+    named = {int(rows[row]): length for row, length in found.items()}
+
+    def says(_: Agreement, given: Agreement) -> EstimateWarning:
+        one = len(named) == 1
+        text = (
+            f"keypoint{'' if one else 's'} {named_keypoints(named)} {'does' if one else 'do'} not "
+            "fit the others (counted from 0, with the distance from where those put it)"
+        )
+        return EstimateWarning("outlier", _too_large(given) + text, 0, tuple(sorted(named)))
+
+    def undo(view: View) -> View:
+        return replace(
+            view, points_2d=view.pixels[kept], ids=rows[kept].tolist(), sigma=covariances[kept]
         )
 
-    @property
-    def ratio(self) -> float:
-        """Residuals over their standard deviations; 0 where nothing is redundant."""
-        return math.sqrt(self.chi_square / self.redundancy) if self.redundancy > 0 else 0.0
-
-    def has_chance(self, probability: float, inflation: float) -> bool:
-        """True if noise leaves such residuals with this probability at least."""
-        squares = self.chi_square / inflation**2
-        return self.redundancy <= 0 or chi_square_tail(squares, self.redundancy) >= probability
-
-    def explains(
-        self, given: Agreement, inflation: float, *, is_exact: bool, is_robust: bool
-    ) -> bool:
-        """True if data without a mistake fit, and much better than those that were ``given``."""
-        if is_robust and (is_exact or given.inliers < given.keypoints):
-            more = self.inliers > given.inliers or self.inliers == self.keypoints
-            return more and self.score < given.score - _MORE_AGREE
-        least = _AS_MANY_ARE_FOUND if is_robust else _AS_MANY_AGREE
-        if not self.score < given.score - least * inflation**2:
-            return False
-        if self.sigma is not None and given.sigma is not None:
-            ratio = f_quantile(self.redundancy, self.redundancy, _CHANCE_OF_RATIO)
-            return self.sigma < given.sigma / math.sqrt(ratio)
-        most = min(_MOST_CORRECTED, given.ratio / _LEAST_RATIO)
-        return self.has_chance(_FITTING, inflation) or self.ratio < most
+    yield Rule(undo_view=undo, left_out=len(found), gain=-math.inf, says=says)
 
 
-@np.errstate(all="ignore")
-def diagnose(
-    model: AnyModel,
-    views: Sequence[View],
-    again: Again,
-    *,
-    result: Result | None = None,
-    ransac: RansacOptions | None = None,
-    has_reason: bool = False,
-    rival: Camera | None = None,
-) -> EstimateWarning | None:
-    """Name the mistake without which all data agree, where the residuals fail their test.
-
-    Parameters
-    ----------
-    model : Model or ShapeModel
-    views : sequence of View
-        Those that take part in the estimate. Masks and photos are left out.
-    again : callable
-        Estimates of a model and views.
-    result : Result, optional
-        The estimate; by default it is made again.
-    ransac : RansacOptions, optional
-        The search for inliers, if there was one.
-    has_reason : bool
-        True where a few keypoints, or a stretch, are known to be to blame: smaller images are not,
-        then, which leave as much open.
-    rival : Camera, optional
-        A camera that the keypoints fit as they are: a mistake must explain more.
-    """
-    inflation, shown = getattr(model, "inflation", 1.0), _without_outlines(views)
-    if not any(len(view.keypoint_ids) for view in shown):
-        return None
-    kind = {"is_exact": is_exact_model(model), "is_robust": ransac is not None}
-    given = None if result is None else Agreement.of(result, model, views, ransac)
-    if given is not None and not _is_doubtful(given, views, inflation, **kind):
-        return None
-    if given is None or any(view.has_outline for view in views):
-        given = _agreement_without(Mistake(""), model, shown, again, ransac)
-    if given is None or not _is_doubtful(given, shown, inflation, **kind):
-        return None
-    limit = given
-    if rival is not None:
-        seen = [replace(view, camera=rival) for view in shown]
-        other = _agreement_without(Mistake(""), model, seen, again, ransac)
-        if other is not None:
-            limit = given._replace(score=other.score + _AS_MANY_AGREE)
-    mistakes = _mistakes_in(model, shown, has_reason=has_reason or ransac is not None)
-    # About a centred principal point, flips are the same as a mirrored model. Where perspective is
-    # weak, all keypoints agree with a mirrored model if with any.
-    rest = [each for each in mistakes if each in (FLIPPED, UPSIDE_DOWN) and MIRRORED in mistakes]
-    if ransac is not None and given.inliers == given.keypoints and kind["is_exact"]:
-        rest = [each for each in mistakes if each is not MIRRORED]
-    found: list[tuple[Mistake, Agreement]] = []
-    explaining: list[Agreement] = []
-    for some in ([each for each in mistakes if each not in rest], rest):
-        for mistake in some:
-            each = _agreement_without(mistake, model, shown, again, ransac)
-            if each is not None:
-                found.append((mistake, each))
-                if each.explains(limit, inflation, **kind):
-                    explaining.append(each)
-        if not explaining:
-            return None
-    best = min(explaining, key=lambda each: each.score)
-    named = _named(found, best)
-    return EstimateWarning("mistake", f"{named}: corrected, {_compared(best, given)}")
-
-
-def diagnose_fit(
-    fitted: FittedKeypoints, *, has_reason: bool, rival: Camera | None
-) -> EstimateWarning | None:
-    """As `diagnose`, of keypoints in one view."""
-    ahead, options = np.isfinite(fitted.residuals).all(axis=1), fitted.options
-    if options.sigma is not None and np.ndim(options.sigma) > 0:
-        options = replace(options, sigma=np.asarray(options.sigma)[ahead])
-    ransac = None if fitted.search is None else fitted.search.ransac
-    own = None if fitted.inliers.all() else ransac  # samples need not be drawn where all agree
-    points, observed = fitted.points_3d[ahead], fitted.observed[ahead]
-    (model, views), again = estimates_by_fit(points, observed, fitted.camera, options, own)
-    return diagnose(model, views, again, ransac=ransac, has_reason=has_reason, rival=rival)
-
-
-@np.errstate(all="ignore")
-def diagnose_refusal(
-    model: AnyModel,
-    views: Sequence[View],
-    again: Again,
-    ransac: RansacOptions | None,
-    *,
-    with_keypoints: bool = True,
-) -> str | None:
-    """Name the mistake without which there is an estimate, where there is none of the data.
-
-    Mistakes in keypoints are tried ``with_keypoints``, otherwise those in other evidence alone.
-    """
-    shown = _without_outlines(views)
-    if not shown:
-        return None
-    found = [
-        (mistake, each)
-        for mistake in _mistakes_in(model, shown, has_reason=True)
-        if (with_keypoints or mistake in (INVERTED, DOWNWARD))
-        and (each := _agreement_without(mistake, model, shown, again, ransac)) is not None
-    ]
-    if not found:
-        return None
-    best = min((each for _, each in found), key=lambda each: each.score)
-    return f"{_named(found, best)}: corrected, {best.inliers} of {best.keypoints} keypoints agree"
-
-
-def estimates_by_fit(
-    points_3d: FloatArray,
-    points_2d: FloatArray,
-    camera: Camera,
-    options: FitOptions,
-    ransac: RansacOptions | None,
-) -> tuple[tuple[Model, tuple[View]], Again]:
-    """Model and view of a fit's keypoints, and the fit as a function of these."""
-    from cadalign.estimation.fit import fit_once  # which imports this module
-
-    model = Model(
-        points_3d=points_3d,
-        stretch=options.stretch,
-        stretch_sigma=options.stretch_sigma,
-        known_axis=options.known_axis,
-    )
-
-    def again(model: AnyModel, views: Sequence[View]) -> Result:
-        (view,), points = views, cast(FloatArray, cast(Model, model).points_3d)
-        problems = pack_one(points, view.pixels, view.camera)
-        fitted = fit_once(problems, options, ransac, None, 0.0)
-        return result_of_keypoints(view.pixels, fitted)
-
-    return (model, (View(camera, points_2d, sigma=options.sigma),)), again
-
-
-def _named(found: Sequence[tuple[Mistake, Agreement]], best: Agreement) -> str:
-    """Names of the mistakes that are as likely as the best; first those of an upright object."""
-    likely = [each for each in found if each[1].score <= best.score + _AS_LIKELY]
-    upright = [mistake.clause for mistake, each in likely if each.up > _UPRIGHT]
-    others = [mistake.clause for mistake, each in likely if each.up <= _UPRIGHT]
-    named = _listed(upright or others)
-    if upright and others:
-        named += f" (or, if y is not up in the photo, {_listed(others)})"
-    return named
-
-
-def _without_outlines(views: Sequence[View]) -> tuple[View, ...]:
-    """The views with evidence beside masks and photos."""
-    given = [replace(view, mask=None, mask_sigma=None, image=None) for view in views]
-    return tuple(view for view in given if view.has_evidence)
-
-
-def _is_doubtful(
-    given: Agreement, views: Sequence[View], inflation: float, *, is_exact: bool, is_robust: bool
-) -> bool:
-    """True if the residuals fail their test.
-
-    An uncertain shape follows keypoints that a robust search would reject of an exact one, which
-    may agree with its mirror image.
-    """
-    rejected = given.keypoints - given.inliers
-    if rejected > (0 if is_exact else _FEW_REJECTED * given.keypoints):
-        return True
-    if is_robust and (is_exact or given.ratio >= 1):
-        return True
-    if given.sigma is None:
-        return not given.has_chance(_DOUBTFUL, inflation)
-    return given.redundancy > 0 and is_large_sigma(given.sigma, [each.pixels for each in views])
-
-
-def _mistakes_in(model: AnyModel, views: Sequence[View], *, has_reason: bool) -> list[Mistake]:
+def _mistakes_in(case: Case) -> Iterator[Rule]:
     """Mistakes that such data may have."""
-    found = [MIRRORED] if isinstance(model, Model) else []  # learned models share one frame
+    model, views = case.model, case.views
+    if isinstance(model, Model):  # learned models share one frame
+        yield MIRRORED
     if any(len(view.keypoint_ids) for view in views):
-        found += [SWAPPED, FLIPPED, UPSIDE_DOWN]
+        yield from (SWAPPED, FLIPPED, UPSIDE_DOWN)
     if len(views) > 1 and views[0].cam_from_rig is not None:
-        found.append(INVERTED)
+        yield INVERTED
     if any(view.up is not None for view in views):
-        found.append(DOWNWARD)
-    sizes = {(view.camera.width, view.camera.height) for view in views}
-    # Another size leaves much open, so that other evidence which is wrong would pass for it.
-    if len(sizes) == 1 and not any(view.sources for view in views):
-        pixels = np.concatenate([view.pixels for view in views])
-        found += _other_sizes(pixels, views[0].camera, may_be_smaller=not has_reason)
-    return found
+        yield DOWNWARD
 
 
-def _other_sizes(points_2d: FloatArray, camera: Camera, *, may_be_smaller: bool) -> list[Mistake]:
-    """Mistakes in the resolution of keypoints (n, 2), of images that hold most of them.
+def _other_sizes(case: Case) -> Iterator[Rule]:
+    """Mistakes in the resolution of keypoints, whose noise may grow with it.
 
-    Larger ones where the camera's image does not.
+    Where their noise is not known: images that hold most of them, and the camera's does not.
     """
+    camera, points = case.views[0].camera, np.concatenate([view.pixels for view in case.views])
+    sizes = {(view.camera.width, view.camera.height) for view in case.views}
+    # Another size leaves much open, so that other evidence which is wrong would pass for it.
+    if len(sizes) > 1 or any(view.sources for view in case.views):
+        return
 
     def holds_most(factor: float) -> bool:
-        inside = camera.contains(rescaled_pixels(points_2d, 1 / factor))
-        return bool(inside.sum() > _MOST_INSIDE * len(points_2d))
+        inside = camera.contains(rescaled_pixels(points, 1 / factor))
+        return bool(inside.sum() > _MOST_INSIDE * len(points))
 
-    usual = [each for each in OTHER_SIZES if (each > 1) != holds_most(1.0)]
-    own = f"{camera.width} x {camera.height} px"
-    return [
-        _of_size(
-            f"the keypoints are of images of {camera.width * factor:.0f} x "
-            f"{camera.height * factor:.0f} px, the camera of {own}",
-            factor,
-        )
-        for factor in usual
-        if holds_most(factor) and (factor > 1 or may_be_smaller)
-    ]
-
-
-@np.errstate(all="ignore")  # what is not finite is refused
-def _agreement_without(
-    mistake: Mistake,
-    model: AnyModel,
-    views: Sequence[View],
-    again: Again,
-    ransac: RansacOptions | None,
-) -> Agreement | None:
-    """The agreement after a mistake is undone; None where there is no estimate."""
-    try:
-        if isinstance(model, Model):
-            model = mistake.undo_model(replace(model, mesh=None) if model.mesh else model)
-        undone = numbered([mistake.undo_view(view) for view in views])
-        return Agreement.of(again(model, undone), model, undone, ransac, mistake.factor)
-    except CadalignError:
-        return None
+    own, is_inside = f"{camera.width} x {camera.height} px", holds_most(1.0)
+    for factor in OTHER_SIZES:
+        is_usual = (factor > 1) != is_inside and (factor > 1 or case.ransac is None)
+        if case.options is not None or (is_usual and holds_most(factor)):
+            width, height = _size(camera, factor)
+            yield Rule(
+                f"the keypoints are of images of {width} x {height} px, the camera of {own}",
+                partial(_resized, factor=factor, noise=1.0 if is_inside else max(factor, 1.0)),
+                gain=CAMERA_GAIN,
+            )
 
 
-def _listed(clauses: Sequence[str]) -> str:
-    *some, last = clauses
-    return f"{', '.join(some)} or {last}" if some else last
+# Texts -------------------------------------------------------------------------------------------
+
+
+def _named(found: Sequence[tuple[Rule, Agreement]], best: Agreement) -> str:
+    """Names of the mistakes that are as likely as the best; first those of an upright object."""
+    likely = [each for each in found if each[1].score <= best.score + _AS_LIKELY]
+    upright = [mistake.clause for mistake, each in likely if each.is_upright]
+    others = [mistake.clause for mistake, each in likely if not each.is_upright]
+    named = listed(upright or others)
+    if upright and others:
+        named += f" (or, if y is not up in the photo, {listed(others)})"
+    return named
 
 
 def _compared(best: Agreement, given: Agreement) -> str:
@@ -437,3 +383,7 @@ def _compared(best: Agreement, given: Agreement) -> str:
         return f"sigma is {best.sigma:.2g} px; as given, {given.sigma:.2g} px"
     what = "times what their standard deviations allow"
     return f"the residuals are {best.ratio:.2g} {what}; as given, {given.ratio:.2g} times"
+
+
+def _too_large(given: Agreement) -> str:
+    return f"the residuals are {given.ratio:.2g} times as large as sigma explains: "

@@ -20,8 +20,7 @@ from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.fitted import Alternative, FitStats
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import FitOptions, pixel_information
-from cadalign.estimation.result_parts import Posterior, ViewResult
-from cadalign.estimation.uncertainty.summary import EvidenceSummary
+from cadalign.estimation.result_parts import EvidenceSummary, Posterior, ViewResult
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera

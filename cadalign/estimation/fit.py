@@ -166,25 +166,23 @@ def fit_one(
     try:
         fitted = fit_once(problems, options, ransac, scores, start)
     except NoConsensusError as error:
-        from cadalign.estimation.diagnose import diagnose_refusal, estimates_by_fit
+        from cadalign.estimation.diagnose import case_of_fit, diagnose_refusal
+        from cadalign.estimation.view import View
 
-        data, again = estimates_by_fit(
-            problems.points_3d, problems.points_2d, problems.camera(0), options, ransac
-        )
-        error.fix = diagnose_refusal(*data, again, ransac) or error.fix
+        view = View(problems.camera(0), problems.points_2d, sigma=options.sigma)
+        case = case_of_fit(problems.points_3d, view, options, ransac)
+        error.fix = diagnose_refusal(case) or error.fix
         raise
     return result_of_keypoints(
         problems.points_2d, fitted, diagnosis=diagnosis_of_fit, symmetry=symmetry
     )
 
 
-def diagnosis_of_fit(
-    fitted: FittedKeypoints, *, has_reason: bool, rival: Camera | None
-) -> EstimateWarning | None:
-    """See `diagnose`, which makes fits anew."""
+def diagnosis_of_fit(fitted: FittedKeypoints) -> EstimateWarning | None:
+    """See `diagnose_fit`, which makes fits anew."""
     from cadalign.estimation.diagnose import diagnose_fit  # rarely asked
 
-    return diagnose_fit(fitted, has_reason=has_reason, rival=rival)
+    return diagnose_fit(fitted)
 
 
 def fit_once(

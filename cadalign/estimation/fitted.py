@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
@@ -90,15 +91,6 @@ class KeypointSearch(Protocol):
         """Warn where chance supports as many."""
 
 
-class Diagnosis(Protocol):
-    """A function that names a usual mistake in keypoints that fail their test."""
-
-    def __call__(
-        self, fitted: FittedKeypoints, *, has_reason: bool, rival: Camera | None
-    ) -> EstimateWarning | None:
-        """See `cadalign.estimation.diagnose.diagnose`."""
-
-
 @dataclass(frozen=True, eq=False)
 class FittedKeypoints:
     """Keypoints of an exact or stretched model in one view, with the alignment that fits them.
@@ -132,6 +124,10 @@ class FittedKeypoints:
     def chosen_sigma(self) -> Any:
         """The keypoints' standard deviation or covariances [px]: given, or estimated."""
         return self.sigma if self.options.sigma is None else self.options.sigma
+
+
+Diagnosis = Callable[[FittedKeypoints], EstimateWarning | None]
+"""A function that names the cause of a misfit; see `cadalign.estimation.diagnose.diagnose_fit`."""
 
 
 def quickly(kind: type[T], fields: dict[str, Any]) -> T:

@@ -6,7 +6,7 @@ stands for all.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -33,7 +33,13 @@ from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import camera_like, is_exact, widened, with_known_shape
 from cadalign.estimation.problem import Problem
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import NO_NOTES, OutlineNotes, Posterior, ViewResult
+from cadalign.estimation.result_parts import (
+    NO_NOTES,
+    EvidenceSummary,
+    OutlineNotes,
+    Posterior,
+    ViewResult,
+)
 from cadalign.estimation.search import Minimum
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.symmetry import (
@@ -41,16 +47,14 @@ from cadalign.estimation.symmetry import (
     stretched_axes,
 )
 from cadalign.estimation.uncertainty.contradictions import warnings_of
-from cadalign.estimation.uncertainty.evidence import summaries_of
-from cadalign.estimation.uncertainty.misfit import unexplained
-from cadalign.estimation.uncertainty.shape_posterior import ShapeTails
-from cadalign.estimation.uncertainty.summary import (
-    EvidenceSummary,
+from cadalign.estimation.uncertainty.doubts import (
     another_pose,
     outside_image,
-    uncertainty_of,
+    unexplained,
     weaknesses,
 )
+from cadalign.estimation.uncertainty.evidence import summaries_of
+from cadalign.estimation.uncertainty.shape_posterior import ShapeTails
 from cadalign.estimation.view import View
 from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment
@@ -62,7 +66,9 @@ from cadalign.solvers.joint.evidence import points_of
 from cadalign.solvers.joint.search import refine_joint
 
 _ITERATIONS = 50
-_EXPLAINED_KINDS = ("contradiction", "misfit", "outlier", "unit", "noise")
+
+Causes = Callable[[], Warnings]
+"""Warnings about contradictions and residuals, which take time to find."""
 
 
 def result_of(
@@ -71,7 +77,6 @@ def result_of(
     *,
     inliers: Sequence[BoolArray],
     is_curved: bool,
-    warnings: Warnings,
     evidence: tuple[EvidenceSummary, ...],
     notes: OutlineNotes = NO_NOTES,
     **of_result: Any,
@@ -82,8 +87,7 @@ def result_of(
     the likely ones are.
 
     The rotations' covariances lack `curvature_of_rotations` where the estimate ``is_curved``;
-    ``warnings`` are those beside the ones about uncertainties and alternatives, and ``of_result``
-    further fields of `cadalign.Result`.
+    ``of_result`` are further fields of `cadalign.Result`.
     """
     prior, views, numbers = problem.prior, problem.given, problem.numbers
     best = estimates[0]
@@ -109,19 +113,7 @@ def result_of(
         points_covariance=of_points[:-2],
         points_cam_covariance=of_seen[:-2],
         warnings=(
-            *(
-                warning
-                for view in problem.views
-                for warning in outside_image(
-                    view.pixels,
-                    view.camera,
-                    agree=not warnings,
-                    view=view.number,
-                    where=f"views[{view.number}]: " if len(views) > 1 else "",
-                )
-            ),
-            *weaknesses(pose, uncertainty_of(covariances[0]), best.lengths),
-            *warnings,
+            *weaknesses(pose, covariances[0], lengths=best.lengths),
             *another_pose(
                 pose,
                 [(each.poses[0], each.likelihood) for each in others],
@@ -211,11 +203,8 @@ def result_of_minima(
     stats: FitStats,
     *,
     notes: OutlineNotes = NO_NOTES,
-    has_warnings: bool = True,
-) -> Result:
+) -> tuple[Result, Causes]:
     """The result of minima, of which the likely ones count, with a widened prior of the shape.
-
-    Warnings about contradictions take time.
 
     Raises DegenerateError if the evidence determines none of them.
     """
@@ -251,25 +240,22 @@ def result_of_minima(
         turned = nearest_rotation(rotation.T @ pose.rotation)
         in_rig = Alignment(turned, rotation.T @ (pose.translation - camera[:3, 3]), best.scale)
     tails = ShapeTails(inflation, prior.degrees_of_freedom)
-    numbers = [view.number for view in views]
     seen_by = minimum.lenses.cameras_at(minimum.state.log_focals)
-    warnings: Warnings = ()
-    if has_warnings:
-        warnings = warnings_of(minimum.evidence, minimum.state, minimum.cost, tails, numbers)
-    if problem.lacks_sigma:
+
+    def causes() -> Warnings:
+        found = warnings_of(minimum.evidence, minimum.state, minimum.cost, tails)
+        if not problem.lacks_sigma:
+            return found
         pixels = [view.pixels for view in views if view.sigma is None]
-        warnings = (*unexplained(problem.noise, pixels), *warnings)
-    return result_of(
+        return (*unexplained(problem.noise, pixels), *found)
+
+    result = result_of(
         problem,
         likely,
         inliers=_inliers(problem, minimum),
         is_curved=symmetry is None and not is_exact(minimum.evidence),
-        warnings=tuple(warnings),
         notes=notes,
-        evidence=tuple(
-            each if each.view is None else replace(each, view=numbers[each.view])
-            for each in summaries_of(minimum.evidence, minimum.state, seen_by)
-        ),
+        evidence=summaries_of(minimum.evidence, minimum.state, seen_by),
         cost=minimum.cost,
         stats=stats,
         component=minimum.component,
@@ -281,12 +267,24 @@ def result_of_minima(
         focal="estimate" if minimum.lenses.count else "known",
         focal_prior=prior_of_camera(minimum.lenses.prior, views[0].camera),
     )
+    return result, causes
 
 
-def with_mistake(result: Result, mistake: EstimateWarning) -> Result:
-    """The result with a mistake in the data in the place of the warnings that it explains."""
-    others = [each for each in result.warnings if each.kind not in _EXPLAINED_KINDS]
-    return replace(result, posterior=result.posterior.stating(warnings=(mistake, *others)))
+def with_causes(result: Result, causes: Warnings, views: Sequence[View]) -> Result:
+    """The result with warnings about the causes of a misfit, and keypoints off their images."""
+    placed = (
+        warning
+        for view in views
+        for warning in outside_image(
+            view.pixels,
+            view.camera,
+            agree=not causes,
+            view=view.number,
+            where=f"views[{view.number}]: " if len(views) > 1 else "",
+        )
+    )
+    warnings = (*causes, *placed, *result.warnings)
+    return replace(result, posterior=result.posterior.stating(warnings=warnings))
 
 
 def common_sigma(views: Sequence[View]) -> float | None:

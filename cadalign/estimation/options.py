@@ -192,6 +192,16 @@ class FitOptions(AlignmentOptions):
         stretched = [6 + axis for axis in cyclic if "xyz"[axis] in self.stretched_axes]
         return np.array([*range(6), *stretched, *[9][: self.focal == "estimate"]])
 
+    def prior_equations(self, scale: FloatArray) -> int:
+        """The number of equations of the priors on the focal length and the scale (3,) found.
+
+        A scale that the keypoints leave to the bounding prior has its equation there.
+        """
+        count = int(self.focal_prior is not None)
+        if self.stretch_sigma is not None:
+            return count + len(self.stretched_axes)
+        return count + int((np.abs(np.log(scale)) > BOUNDING_PRIOR.width).sum())
+
     @property
     def min_points(self) -> int:
         """The number of keypoints that the method needs."""

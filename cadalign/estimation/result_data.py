@@ -16,15 +16,21 @@ from cadalign.errors import CadalignError, InputError, quote
 from cadalign.estimation.fitted import NO_STATS, Alternative, FitStats
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import FitOptions
-from cadalign.estimation.result_parts import Posterior, ViewResult, points_covariances, rms_of
-from cadalign.estimation.uncertainty.summary import Uncertainty, uncertainty_of
+from cadalign.estimation.result_parts import (
+    Posterior,
+    Uncertainty,
+    ViewResult,
+    points_covariances,
+    rms_of,
+    uncertainty_of,
+)
 from cadalign.geometry.alignment import Alignment, Box, extent
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
-    from cadalign.estimation.uncertainty.summary import EvidenceSummary
+    from cadalign.estimation.result_parts import EvidenceSummary
     from cadalign.estimation.warning import EstimateWarning
     from cadalign.geometry.mesh import Mesh
     from cadalign.shapes.model import ShapeModel

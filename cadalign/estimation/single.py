@@ -17,7 +17,7 @@ from cadalign.estimation.assemble import result_of_keypoints
 from cadalign.estimation.estimates import Estimate, as_given, with_boxes
 from cadalign.estimation.fit import fit
 from cadalign.estimation.fitted import FitStats, FittedKeypoints
-from cadalign.estimation.joint import common_sigma, result_of
+from cadalign.estimation.joint import Causes, common_sigma, result_of
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.pack import seen_keypoints
@@ -85,7 +85,7 @@ def align_plain(
     )
 
 
-def align_single(problem: Problem, start: float) -> Result:
+def align_single(problem: Problem, start: float) -> tuple[Result, Causes]:
     """The result of `cadalign.align` where `is_single` holds, which was begun at ``start`` [s].
 
     Raises InputError if the view names a keypoint that the model lacks; DegenerateError if no pose
@@ -134,10 +134,12 @@ def align_single(problem: Problem, start: float) -> Result:
     in_camera = estimates[0].poses[0].apply(points)
     errors = in_camera[:, :2] / in_camera[:, 2:] - seen.rays
     component, cost = int(minima.label[0]), float(minima.costs[0])
-    warnings: Warnings = ()
-    if seen.loss == LINEAR:
+
+    def causes() -> Warnings:
+        if seen.loss != LINEAR:
+            return ()
         beside = (3 * np.array(rows)[:, None] + np.arange(3)).ravel()
-        warnings = keypoint_misfits(
+        return keypoint_misfits(
             SeenShape(
                 points,
                 means[component].reshape(-1, 3)[rows],
@@ -151,12 +153,12 @@ def align_single(problem: Problem, start: float) -> Result:
             tails=ShapeTails(inflation, model.degrees_of_freedom),
             focal=view.camera.fx,
         )
-    return result_of(
+
+    result = result_of(
         problem,
         [as_given(each, problem) for each in estimates],
         inliers=[np.ones(len(rows), dtype=bool)],
         is_curved=bool(covariances.any()),
-        warnings=warnings,
         evidence=(summary_of_keypoints(errors, seen.rays, seen.whitening, 0, view.camera),),
         cost=cost,
         stats=stats,
@@ -165,6 +167,7 @@ def align_single(problem: Problem, start: float) -> Result:
         known_axis=None,
         stretched_axes="",
     )
+    return result, causes
 
 
 def _given(init: Alignment | None) -> FloatArray:

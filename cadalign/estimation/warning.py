@@ -50,7 +50,7 @@ class EstimateWarning:
         - "chance": keypoints at random would agree as well;
         - "untested": no equation is left that tests the estimate;
         - "outside-image": keypoints lie outside of the image;
-        - "camera": the camera is contradicted, or is that of an image of another size;
+        - "camera": the focal length is contradicted, or the principal point is another image's;
         - "stretch": the constraint on the stretch is contradicted;
         - "contradiction": a piece of evidence contradicts the rest;
         - "unit": depths or distances are in another unit;

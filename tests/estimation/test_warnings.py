@@ -15,11 +15,9 @@ from support.problems import problem_of
 
 from cadalign import Alignment, Camera, Model, Result, ShapeModel, View, align, fit
 from cadalign.datasets import KeypointNet
-from cadalign.estimation.uncertainty.summary import (
+from cadalign.estimation.uncertainty.doubts import (
     another_pose,
-    uncertainty_of,
     weaknesses,
-    weaknesses_of_keypoints,
 )
 from cadalign.estimation.warning import Warnings
 from cadalign.geometry.rotations import angle_between, rotation_from_vector
@@ -84,9 +82,9 @@ def test_poses_that_are_concealed_together_are_one_warning() -> None:
 
 
 def test_the_thickness_of_a_flat_object_is_not_warned_of() -> None:
-    std = uncertainty_of(deviations(np.diag([0.01, 0.01, 2.0**2])))
-    assert weaknesses(POSE, std, np.array([0.4, 0.9, 0.02])) == ()
-    (found,) = weaknesses(POSE, std, np.array([0.4, 0.9, 0.8]))
+    covariance = deviations(np.diag([0.01, 0.01, 2.0**2]))
+    assert weaknesses(POSE, covariance, lengths=np.array([0.4, 0.9, 0.02])) == ()
+    (found,) = weaknesses(POSE, covariance, lengths=np.array([0.4, 0.9, 0.8]))
     assert found.text == "the length along z is known only to +-200 %"
 
 
@@ -94,11 +92,10 @@ def test_a_size_that_one_image_leaves_open_is_not_warned_of() -> None:
     """Scales that are open together, as those of a knife whose known axis is thin."""
     points = np.random.default_rng(0).normal(size=(8, 3)) * [0.01, 1, 1]
     common = np.array([0.0, 1.5, 1.5])
-    given: dict[str, Any] = {"redundancy": 8, "stretch_sigma": None, "doubt": None}
     together = deviations(np.outer(common, common))
-    assert weaknesses_of_keypoints(points, POSE, together, **given) == ()
+    assert weaknesses(POSE, together, keypoints=points) == ()
     apart = deviations(np.diag(common**2))
-    found = weaknesses_of_keypoints(points, POSE, apart, **given)
+    found = weaknesses(POSE, apart, keypoints=points)
     assert [each.text[:3] for each in found] == ["s_y", "s_z"]
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from cadalign import Alignment, Camera, Model, View, align, fit
+from cadalign.estimation import diagnose
+from cadalign.estimation.fit import fit_once
 from cadalign.estimation.result import Result
-from cadalign.estimation.solve import solve_one
-from cadalign.estimation.uncertainty import misfit
 from cadalign.geometry.rotations import rotation_from_vector
 
 CAMERA = Camera(640, 480, 935, 935, 319.5, 239.5)
@@ -65,16 +65,16 @@ def test_few_right_keypoints_are_fitted_once(monkeypatch: pytest.MonkeyPatch) ->
 
     def counted(*given: Any) -> Any:
         fits.append(given)
-        return solve_one(*given)
+        return fit_once(*given)
 
-    monkeypatch.setattr(misfit, "solve_one", counted)
+    monkeypatch.setattr(diagnose, "fit_once", counted)
     assert not any(result.warnings for result in results)
     assert len(fits) <= 3
 
 
 def test_named_camera_is_kept_in_json() -> None:
     found = map(_of_double_size, range(20))
-    result = next(each for each in found if each.warnings[0].kind == "camera")
+    result = next(each for each in found if each.warnings[0].kind == "mistake")
     assert Result.from_json(result.to_json()).warnings == result.warnings
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.contours.contour import Contour, Sight
 from cadalign.estimation.contours.surface import PosedSurface
-from cadalign.estimation.uncertainty.summary import EvidenceSummary
+from cadalign.estimation.result_parts import EvidenceSummary
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
 

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import IntArray
+from cadalign.estimation.result_parts import listed, name_of
 from cadalign.estimation.starts import starts_of
 from cadalign.estimation.uncertainty.evidence import (
     Piece,
@@ -22,17 +23,16 @@ from cadalign.estimation.uncertainty.evidence import (
     depths_of,
     distances_beside,
     image_depths_at,
-    offsets_of,
+    image_of,
     pieces_of,
     redundancy_of,
     told_by,
 )
 from cadalign.estimation.uncertainty.residuals import chi_square_quantile, chi_square_tail
 from cadalign.estimation.uncertainty.shape_posterior import ShapeTails, misfits
-from cadalign.estimation.uncertainty.summary import name_of
 from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.solvers.joint.covariance import information_of, scaled_information
-from cadalign.solvers.joint.evidence import Evidence, Rig, State, kept_rows
+from cadalign.solvers.joint.evidence import Evidence, Rig, State, kept_rows, seen_in_cameras
 from cadalign.solvers.joint.search import cost_of, reduced, refine_joint, search_joint
 
 _FALSE_ALARMS = 0.005  # of all tests of an estimate together
@@ -56,28 +56,25 @@ class _Trial(NamedTuple):
     misfit: float  # reduced chi-square of the rest, at least 1
     state: State
 
-    def is_unlikely(self, level: float) -> bool:
-        """True if a piece that agrees with the rest saves as much with less than this chance."""
-        return chi_square_tail(self.saved / self.misfit, self.equations) < level
 
-
-def warnings_of(
-    evidence: Evidence, state: State, cost: float, tails: ShapeTails, numbers: Sequence[int]
-) -> Warnings:
+def warnings_of(evidence: Evidence, state: State, cost: float, tails: ShapeTails) -> Warnings:
     """Warnings about evidence that contradicts the rest, and residuals beyond their sigma.
 
-    ``state`` is the estimate, ``cost`` its cost; ``tails`` are those of the shape's prior,
-    ``numbers`` those of the views.
+    ``state`` is the estimate, ``cost`` its cost; ``tails`` are those of the shape's prior.
     """
-    contradicting = _contradictions(evidence, state, cost)
-    blamed = [trial.piece for trial in contradicting]
-    warnings = list(_wrong_units(evidence, state, blamed, numbers))
-    if contradicting:
-        warnings.append(_contradiction_warning(evidence, contradicting, numbers))
-    is_robust = evidence.sightings.loss.any() or len(evidence.image_depths.point)
-    if not contradicting and not is_robust:
-        warnings += misfits(cost, redundancy_of(evidence), tails)
-    return tuple(warnings)
+    trials = _contradictions(evidence, state, cost)
+    found = list(_wrong_units(evidence, state, [trial.piece for trial in trials]))
+    if trials:
+        best, views = trials[0], {trial.piece.view for trial in trials}
+        named = listed([name_of(*trial.piece) for trial in trials])
+        sigmas = np.sqrt(best.saved / best.misfit / best.equations)
+        hint = next(filter(None, (_hint(evidence, trial) for trial in trials)), "")
+        text = f"{named} contradicts the other evidence, by {sigmas:.2g} sigma{hint}"
+        view = views.pop() if len(views) == 1 else None
+        return (*found, EstimateWarning("contradiction", text, view))
+    if not evidence.sightings.loss.any() and not len(evidence.image_depths.point):
+        found.extend(misfits(cost, redundancy_of(evidence), tails))
+    return tuple(found)
 
 
 def _contradictions(evidence: Evidence, state: State, cost: float) -> Sequence[_Trial]:
@@ -91,40 +88,41 @@ def _contradictions(evidence: Evidence, state: State, cost: float) -> Sequence[_
         evidence = _without_hidden(evidence, state)
         cost, _, state = refine_joint(evidence, 10 * _REFITTING, state)
     if len(pieces) > _MOST_TESTED:  # those of the largest own cost
-        trials = [_without(evidence, state, piece) for piece in pieces]
-        rests = [cost_of(rest, start) for rest, start in trials]
-        pieces = [
-            pieces[k] for k in sorted(np.argsort(rests, kind="stable")[:_MOST_TESTED].tolist())
-        ]
-    level = _FALSE_ALARMS / len(every)
-    if not any(_is_suspicious(evidence, state, cost, piece, level) for piece in pieces):
+        rests = [cost_of(*_without(evidence, state, piece)) for piece in pieces]
+        pieces = [pieces[k] for k in np.sort(np.argsort(rests, kind="stable")[:_MOST_TESTED])]
+    whole, level = _determined(evidence, state), _FALSE_ALARMS / len(every)
+
+    def suspects(*, searches: bool) -> Iterator[_Trial]:
+        """Trials whose piece saves more than one that agrees with the rest."""
+        for piece in pieces:
+            rest, start = _without(evidence, state, piece)
+            lower, refitted = _refitted(rest, start, searches=searches)
+            if cost - lower < chi_square_quantile(1, level):  # of one equation; of more, more
+                continue
+            redundancy, rank = _determined(rest, refitted)
+            equations = whole[0] - redundancy
+            is_open = piece.kind != "rig" and rank < whole[1]
+            if equations <= 0 or is_open or not lower < np.inf:
+                continue
+            misfit = max(lower / redundancy, 1.0) if redundancy > 0 else 1.0
+            if chi_square_tail((cost - lower) / misfit, equations) < level:
+                yield _Trial(piece, cost - lower, equations, misfit, refitted)
+
+    if next(suspects(searches=False), None) is None:
         return ()
-    whole = _determined(evidence, state)
-    found = [_searched(evidence, state, cost, whole, piece) for piece in pieces]
-    suspects = [trial for trial in found if trial is not None and trial.is_unlikely(level)]
-    if not suspects:
-        return ()
-    noise = min(trial.misfit for trial in suspects)
-    suspects.sort(key=lambda trial: _PER_EQUATION * trial.equations - trial.saved / noise)
-    return _as_likely(suspects[0], suspects, noise)
+    found = list(suspects(searches=True))
+    noise = min((trial.misfit for trial in found), default=1.0)
+    found.sort(key=lambda trial: _PER_EQUATION * trial.equations - trial.saved / noise)
 
+    def is_likely(trial: _Trial) -> bool:
+        """True if it explains the misfit as well as the best."""
+        fewer = max(found[0].equations - trial.equations, 0)
+        return (found[0].saved - trial.saved) / noise < _AS_LIKELY + _PER_EQUATION * fewer
 
-def _contradiction_warning(
-    evidence: Evidence, trials: Sequence[_Trial], numbers: Sequence[int]
-) -> EstimateWarning:
-    best = trials[0]
-    *names, last = [_name_of(trial.piece, numbers) for trial in trials]
-    sigmas = np.sqrt(best.saved / best.misfit / best.equations)
-    hint = next(filter(None, (_hint(evidence, trial, numbers) for trial in trials)), "")
-    named = f"{', '.join(names)} or {last}" if names else last
-    text = f"{named} contradicts the other evidence, by {sigmas:.2g} sigma{hint}"
-    views = {trial.piece.view for trial in trials}
-    view = None if len(views) > 1 or best.piece.view is None else numbers[best.piece.view]
-    return EstimateWarning("contradiction", text, view)
-
-
-def _name_of(piece: Piece, numbers: Sequence[int]) -> str:
-    return name_of(piece.kind, None if piece.view is None else numbers[piece.view])
+    likely = [each for each in found if is_likely(each)]
+    # Without its known motion, a view leaves its keypoints as free as without these.
+    freed = [Piece("keypoints", each.piece.view) for each in likely if each.piece.kind == "rig"]
+    return [each for each in likely if each is found[0] or each.piece not in freed]
 
 
 def _determines_its_pose(evidence: Evidence, piece: Piece) -> bool:
@@ -135,18 +133,6 @@ def _determines_its_pose(evidence: Evidence, piece: Piece) -> bool:
     others = (sightings.image == piece.view) & ~told_by(sightings)["keypoints"]
     depths = (evidence.image_depths.image == piece.view).any()
     return (rig.pose == rig.pose[piece.view]).sum() == 1 and not others.any() and not depths
-
-
-def _is_suspicious(
-    evidence: Evidence, state: State, cost: float, piece: Piece, level: float
-) -> bool:
-    """True if leaving out a piece, by a short refinement, saves more than is likely."""
-    rest, start = _without(evidence, state, piece)
-    lower, _, refitted = refine_joint(rest, _REFITTING, start)
-    if not cost - lower >= chi_square_quantile(1, level):  # of one equation; of more, more
-        return False
-    trial = _trial(piece, _determined(evidence, state), rest, refitted, cost, lower)
-    return trial is not None and trial.is_unlikely(level)
 
 
 def _without_hidden(evidence: Evidence, state: State) -> Evidence:
@@ -160,49 +146,16 @@ def _without_hidden(evidence: Evidence, state: State) -> Evidence:
     return evidence.with_block(kept_rows(depths, kept))
 
 
-def _as_likely(best: _Trial, suspects: Sequence[_Trial], noise: float) -> list[_Trial]:
-    """Trials that explain the misfit as well as the best; the fewest equations of one view."""
-    found = []
-    for trial in suspects:
-        shortfall = (best.saved - trial.saved) / noise
-        fewer = max(best.equations - trial.equations, 0)
-        if shortfall < _AS_LIKELY + _PER_EQUATION * fewer:
-            found.append(trial)
-    freed = {trial.piece.view for trial in found if trial.piece.kind == "rig"}
-    return [
-        trial
-        for trial in found
-        if trial is best or trial.piece.kind != "keypoints" or trial.piece.view not in freed
-    ]
-
-
-def _searched(
-    evidence: Evidence, state: State, cost: float, whole: tuple[int, int], piece: Piece
-) -> _Trial | None:
-    """The trial of a piece by a search, since the estimate may lie far from that without it."""
-    rest, start = _without(evidence, state, piece)
-    lower, _, refitted = refine_joint(rest, 10 * _REFITTING, start)
-    starts = starts_of(rest)
-    minima = search_joint(rest, *starts)[0] if len(starts.poses) else None
-    if minima is not None and minima.states:
-        best = int(np.argmin(minima.costs))
-        if minima.costs[best] < lower:
-            refitted, lower = minima.states[best], float(minima.costs[best])
-    return _trial(piece, whole, rest, refitted, cost, lower)
-
-
-def _trial(
-    piece: Piece, whole: tuple[int, int], rest: Evidence, state: State, cost: float, lower: float
-) -> _Trial | None:
-    """Trial of leaving out a piece; None if the rest does not determine the estimate."""
-    redundancy, rank = _determined(rest, state)
-    equations = whole[0] - redundancy
-    if equations <= 0 or not lower < np.inf:
-        return None
-    if piece.kind != "rig" and rank < whole[1]:
-        return None
-    misfit = lower / redundancy if redundancy > 0 else 1.0
-    return _Trial(piece, cost - lower, equations, max(misfit, 1.0), state)
+def _refitted(rest: Evidence, start: State, *, searches: bool) -> tuple[float, State]:
+    """Cost and state of the estimate without a piece, which may lie far from that with it."""
+    cost, _, state = refine_joint(rest, (10 if searches else 1) * _REFITTING, start)
+    starts = starts_of(rest) if searches else None
+    if starts is not None and len(starts.poses):
+        minima = search_joint(rest, *starts)[0]
+        best = min(range(len(minima.states)), key=lambda k: minima.costs[k], default=None)
+        if best is not None and minima.costs[best] < cost:
+            return float(minima.costs[best]), minima.states[best]
+    return cost, state
 
 
 def _determined(evidence: Evidence, state: State) -> tuple[int, int]:
@@ -219,31 +172,28 @@ def _determined(evidence: Evidence, state: State) -> tuple[int, int]:
 # Hints -------------------------------------------------------------------------------------------
 
 
-def _hint(evidence: Evidence, trial: _Trial, numbers: Sequence[int]) -> str:
+def _hint(evidence: Evidence, trial: _Trial) -> str:
     """A hint at another unit of measurements, or at another axis or sign; else nothing."""
     factor = _measured_factor(evidence, trial.state, trial.piece)
     if factor is not None and not _is_plausible(factor):
-        name = _name_of(trial.piece, numbers)
-        return f": {name} is {factor:.3g} times what is expected, {_UNIT}"
+        return f": {name_of(*trial.piece)} is {factor:.3g} times what is expected, {_UNIT}"
     if trial.piece.kind != "gravity":
         return ""
-    directions, rig = evidence.directions, evidence.rig
-    row = int(np.flatnonzero(directions.image == trial.piece.view)[0])
-    view = directions.image[row]
-    turn = trial.state.poses[rig.pose[view], :9].reshape(3, 3)
-    axes = rig.cam_from_rig[view, :9].reshape(3, 3) @ turn
-    cosines = directions.camera[row] @ axes
-    if cosines @ directions.model[row] < -_ALONG:
+    given = kept_rows(evidence.directions, evidence.directions.image == trial.piece.view)
+    axes = np.vstack([np.zeros(3), np.eye(3)])
+    seen = seen_in_cameras(evidence, trial.state.poses, axes, np.repeat(given.image[:1], 4))
+    cosines = (seen[1:] - seen[0]) @ given.camera[0]
+    if cosines @ given.model[0] < -_ALONG:
         return ": it seems to point down, give its opposite"
     axis = int(np.argmax(np.abs(cosines)))
-    if directions.model[row, axis] or abs(cosines[axis]) < _ALONG:
+    if given.model[0, axis] or abs(cosines[axis]) < _ALONG:
         return ""
     name, way = "xyz"[axis], "up" if cosines[axis] > 0 else "down"
     return f": the model's {name} axis points {way} there, is it the up axis (up_axis={name!r})?"
 
 
 def _wrong_units(
-    evidence: Evidence, state: State, blamed: Sequence[Piece], numbers: Sequence[int]
+    evidence: Evidence, state: State, blamed: Sequence[Piece]
 ) -> Iterator[EstimateWarning]:
     """Warnings about measurements in another unit than the model and the rest of the evidence.
 
@@ -265,8 +215,7 @@ def _wrong_units(
             text = f"the object is {size:.2g} times as large as the model, is it {_UNIT}"
         else:
             continue
-        view = None if piece.view is None else numbers[piece.view]
-        yield EstimateWarning("unit", f"{_name_of(piece, numbers)}: {text}", view)
+        yield EstimateWarning("unit", f"{name_of(*piece)}: {text}", piece.view)
 
 
 def _is_plausible(factor: float) -> bool:
@@ -279,12 +228,9 @@ def _without(evidence: Evidence, state: State, piece: Piece) -> tuple[Evidence, 
     Without the known motion of its camera, a view has a pose of its own.
     """
     kind, view, sightings = piece.kind, piece.view, evidence.sightings
-    if view is None or kind == "camera height":
-        offsets = kept_rows(evidence.offsets, ~offsets_of(evidence, piece))
-        return evidence.with_block(offsets), state
-    if kind == "gravity":
-        directions = kept_rows(evidence.directions, evidence.directions.image != view)
-        return evidence.with_block(directions), state
+    if view is None or kind in ("gravity", "camera height"):
+        block = evidence.directions if kind == "gravity" else evidence.offsets
+        return evidence.with_block(kept_rows(block, block.image != image_of(piece))), state
     if kind == "rig":
         pose: IntArray = evidence.rig.pose.copy()
         own = state.poses[pose[view]]

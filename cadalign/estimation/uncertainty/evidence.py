@@ -9,7 +9,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.prior import has_scale_prior
-from cadalign.estimation.uncertainty.summary import EvidenceSummary
+from cadalign.estimation.result_parts import EvidenceSummary
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.joint.evidence import (
     Evidence,
@@ -56,9 +56,9 @@ def pieces_of(evidence: Evidence) -> list[Piece]:
     return pieces
 
 
-def offsets_of(evidence: Evidence, piece: Piece) -> BoolArray:
-    """Known distances (L,) that belong to a piece: the size, or a camera's height."""
-    return np.asarray(evidence.offsets.image == (-1 if piece.view is None else piece.view))
+def image_of(piece: Piece) -> int:
+    """The number that a piece's rows have as their image; -1 for the object's size."""
+    return -1 if piece.view is None else piece.view
 
 
 def count_equations(evidence: Evidence) -> int:
@@ -174,7 +174,7 @@ def distances_beside(
     evidence: Evidence, state: State, piece: Piece
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Expected and measured distances of a piece (n,), with the inverse standard deviations."""
-    offsets = kept_rows(evidence.offsets, offsets_of(evidence, piece))
+    offsets = kept_rows(evidence.offsets, evidence.offsets.image == image_of(piece))
     points, some = points_of(evidence.shape, state), evidence.with_block(offsets)
     return distances_of(some, state.poses, points), offsets.value, offsets.weight
 

@@ -92,6 +92,24 @@ class Likelihood:
         return loss_slopes(self.squares(residuals), loss, bend)[0]
 
 
+def keypoint_covariance(fitted: FittedKeypoints) -> FloatArray | None:
+    """The covariance (9, 9) or (10, 10) by the posterior; None without a Fisher information.
+
+    Rotations about the axes of a symmetry count nothing.
+    """
+    if fitted.fisher_covariance is None:
+        return None
+    covariance = posterior_covariance(fitted)
+    if fitted.symmetry is None:
+        return covariance
+    from cadalign.estimation.symmetry import held_axes, without_free_turns
+    from cadalign.geometry.symmetry_group import group_of  # most models have none
+
+    held = held_axes(fitted.options.stretched_axes)
+    best = group_of(fitted.symmetry).canonical(fitted.alignment, held=held)
+    return without_free_turns(covariance, best)
+
+
 def posterior_covariance(result: FittedKeypoints) -> FloatArray:
     """Covariance of the errors by the posterior; see `cadalign.Result.covariance`."""
     assert result.fisher_covariance is not None

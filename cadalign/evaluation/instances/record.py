@@ -16,7 +16,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.result import Result
-from cadalign.estimation.uncertainty.summary import Uncertainty
+from cadalign.estimation.result_parts import Uncertainty
 from cadalign.estimation.warning import Warnings
 from cadalign.evaluation.runs.work import Columns, Outcome, Row
 from cadalign.geometry.alignment import Alignment

@@ -1,0 +1,315 @@
+"""Warnings of an estimate: what its evidence leaves open, other poses, keypoints off the image."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.estimation.fitted import Diagnosis, FittedKeypoints
+from cadalign.estimation.focal import focal_doubt
+from cadalign.estimation.options import pixel_information
+from cadalign.estimation.result_parts import uncertainty_of
+from cadalign.estimation.uncertainty.residuals import chi_square_tail
+from cadalign.estimation.warning import EstimateWarning, Kind, Warnings
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera, projection_jacobian
+from cadalign.geometry.pixels import PIXEL_CENTRE
+from cadalign.geometry.rotations import vector_from_rotation
+from cadalign.shapes.parts import probability_within
+
+UNDETERMINED = 1.0
+"""Relative standard deviation beyond which a length, distance or focal length is undetermined."""
+UNDETERMINED_ROTATION_DEG = 30.0
+OTHER_SIZES = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2.0, 3.0, 4.0)
+"""Usual sizes of other images of a photo, over that of its camera."""
+FALSE_ALARMS = 0.004
+"""Probability of residuals by chance, below which they fail their test."""
+CAMERA_GAIN = 19.5
+"""Decrease of the sum of squares by a focal length of its own, by chance in one of 100,000."""
+_WORTH_A_SEARCH = 4.0  # the same, linearised
+_LARGE = 0.02  # estimated sigma, over the keypoints' extent, that is large
+_LARGEST_SHARE = 0.45  # of the keypoints' spread, of an estimated sigma
+_SAME_MIDDLE = 0.02  # of an image's size, from its middle to a principal point taken for it
+_LEAST_GAIN = 0.9  # of a standard deviation, relative to that of the prior alone
+_ANY_ROTATION = math.sqrt(math.pi**2 / 3 + 2)  # standard deviation of uniform rotations [rad]
+_SHALLOW = 0.5  # differences of depth over the distance
+_THIN = 0.1  # spread along an axis over the largest that counts as nearly a plane
+_END_ON_DEG = 15.0
+_ANOTHER_DEG = 10.0
+_LEAST_TURN = 1e-12  # [rad], and of a relative variance
+_REGION = 0.95  # probability of the stated region, which alternatives outside of it contradict
+
+
+def keypoint_warnings(
+    fitted: FittedKeypoints, covariance: FloatArray | None, diagnosis: Diagnosis | None
+) -> Warnings:
+    """Warnings about the cause of a misfit, and what the keypoints do not determine."""
+    cause = diagnosis(fitted) if diagnosis is not None and _is_doubtful(fitted) else None
+    observed = fitted.observed[np.isfinite(fitted.residuals).all(axis=1)]
+    fits = cause is None or cause.kind == "scale"
+    is_mistake = cause is not None and cause.kind == "mistake"
+    placed = outside_image(observed, fitted.camera, agree=fits or is_mistake)
+    found = [*(() if cause is None else (cause,)), *placed]
+    if covariance is None or is_mistake:  # of the alignment nothing else can be said
+        return tuple(found)
+    options, kept = fitted.options, fitted.points_3d[fitted.inliers]
+    if fitted.sigma is not None and options.sigma is None:
+        found += unexplained(fitted.sigma, [observed])
+    if fitted.search is not None:
+        chance = fitted.search.doubt(fitted.residuals, fitted.inliers)
+        found += () if chance is None else (chance,)
+    if 2 * len(kept) <= options.unknowns:
+        text = (
+            f"{len(kept)} keypoints fit exactly whatever they are: "
+            "the residuals say nothing about the quality of the fit"
+        )
+        found.append(EstimateWarning("untested", text))
+    if options.focal == "estimate":
+        doubt = focal_doubt(fitted.camera, options.focal_prior)
+        found += () if doubt is None else (doubt,)
+    prior = options.stretch_sigma
+    found += weaknesses(fitted.alignment, covariance, keypoints=kept, stretch_sigma=prior)
+    # Likelihoods tell nothing where keypoints do not fit, or others than these were rejected.
+    if fits and fitted.search is None:
+        poses = [(each.alignment, each.relative_likelihood) for each in fitted.alternatives]
+        found += another_pose(fitted.alignment, poses, covariance)
+    return tuple(found)
+
+
+def _is_doubtful(fitted: FittedKeypoints) -> bool:
+    """True if keypoints may have a cause of misfit, which takes longer to find.
+
+    They fail their test, those that agree were searched for, the scale is constrained, or another
+    focal length promises a better fit.
+    """
+    options, inliers = fitted.options, fitted.inliers
+    if fitted.search is not None:
+        return True
+    if fitted.fisher_covariance is None or fitted.cost is None:
+        return False
+    if options.sigma is None:
+        return is_large_sigma(fitted.sigma or 0.0, [fitted.observed[inliers]])
+    redundancy = 2 * int(inliers.sum()) - options.unknowns
+    redundancy += options.prior_equations(fitted.alignment.scale)
+    fails = redundancy > 0 and chi_square_tail(fitted.cost, redundancy) < FALSE_ALARMS
+    if fails or options.stretch is not None or options.stretch_sigma is not None:
+        return True
+    return redundancy > 0 and may_fit_other_cameras(fitted, fails)
+
+
+def may_fit_other_cameras(fitted: FittedKeypoints, fails: bool) -> bool:
+    """True if other cameras may fit keypoints better than chance explains, whose test ``fails``."""
+    if fitted.options.focal == "estimate" or (fitted.cost or 0.0) < CAMERA_GAIN:
+        return False
+    return fails or _decrease_by_focal(fitted) > _WORTH_A_SEARCH
+
+
+def _decrease_by_focal(fitted: FittedKeypoints) -> float:
+    """Decrease of the sum of squares by a focal length of its own, to first order."""
+    derivatives = projection_jacobian(fitted.points_3d, fitted.camera, fitted.alignment)
+    information = pixel_information(fitted.options.sigma, len(fitted.residuals))
+    whitening = np.linalg.cholesky(information).swapaxes(1, 2)
+    free = [*fitted.options.estimated_unknowns, 9]
+    rows = (whitening @ derivatives[:, :, free])[fitted.inliers].reshape(-1, len(free))
+    errors = (whitening @ fitted.residuals[:, :, None])[fitted.inliers].ravel()
+    others, _ = np.linalg.qr(rows[:, :-1])
+    alone = rows[:, -1] - others @ (others.T @ rows[:, -1])
+    length, along = float(alone @ alone), float(alone @ errors)
+    return along * (along / length) if length > 0 else 0.0  # a power raises where it overflows
+
+
+@np.errstate(all="ignore")  # lengths that overflow are of translations known well enough
+def weaknesses(
+    alignment: Alignment,
+    covariance: FloatArray,
+    *,
+    lengths: FloatArray | None = None,
+    keypoints: FloatArray | None = None,
+    stretch_sigma: float | None = None,
+) -> Warnings:
+    """Warn about lengths, motion and focal length that are not determined.
+
+    ``lengths`` (3,) are those of the object: what is open of one counts relative to all, for that
+    of a flat object's thickness changes little. If ``keypoints`` (n, 3) are all evidence, the
+    reason is said, and the rotation counts. Two scales that are open together, whose ratio is not,
+    are none then: one image leaves size and distance open as far as the known axis does not tell
+    them, and the standard deviations of both say so. Beside a prior on the scales the keypoints
+    must determine them better than the prior does.
+    """
+    warnings, std = [], uncertainty_of(covariance)
+    if std.focal > UNDETERMINED:
+        why = "" if keypoints is None else _why_focal_is_weak(alignment.apply(keypoints))
+        warnings.append(_known_only("focal", "the focal length", percent(std.focal), why))
+    most = min(UNDETERMINED, _LEAST_GAIN * (stretch_sigma or math.inf))
+    shares = np.ones(3) if lengths is None else lengths / np.linalg.norm(lengths)
+    is_open = np.flatnonzero(np.multiply(std.scale, shares) > most).tolist()
+    if keypoints is None or len(is_open) == 1 or _ratio_deviation(covariance, is_open) > most:
+        for axis in is_open:
+            why = "" if keypoints is None else _why_scale_is_weak(keypoints, alignment, axis)
+            what = f"{'the length along ' if keypoints is None else 's_'}{'xyz'[axis]}"
+            warnings.append(_known_only("scale", what, percent(std.scale[axis]), why))
+    if keypoints is not None and std.rotation_deg > UNDETERMINED_ROTATION_DEG:
+        warnings.append(_known_only("rotation", "the rotation", f"{std.rotation_deg:.2g} deg"))
+    share = float(np.linalg.norm(std.translation) / np.linalg.norm(alignment.translation))
+    if share > UNDETERMINED and not is_open and std.focal <= UNDETERMINED:
+        warnings.append(_known_only("translation", "the distance", percent(share)))
+    return tuple(warnings)
+
+
+def _ratio_deviation(covariance: FloatArray, axes: Sequence[int]) -> float:
+    """Standard deviation of the logarithm of the ratio of two scales; 0 without two."""
+    if len(axes) < 2:
+        return 0.0
+    logs = np.zeros(len(covariance))
+    logs[[6 + axes[0], 6 + axes[1]]] = 1.0, -1.0
+    return math.sqrt(max(float(logs @ covariance @ logs), 0.0))
+
+
+def _known_only(kind: Kind, what: str, to: str, why: str = "") -> EstimateWarning:
+    reason = f": {why}" if why else ""
+    return EstimateWarning(kind, f"{what} is known only to +-{to}{reason}")
+
+
+def _are_flat(points: FloatArray) -> bool:
+    thickness = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(thickness[-1] < _THIN * thickness[0])
+
+
+def _why_focal_is_weak(in_camera: FloatArray) -> str:
+    if _are_flat(in_camera):
+        return "the keypoints lie nearly in one plane"
+    if np.ptp(in_camera[:, 2]) < _SHALLOW * in_camera[:, 2].mean():
+        return "the keypoints differ little in depth for their distance"
+    return "the keypoints show little perspective for their noise"
+
+
+def _why_scale_is_weak(points_3d: FloatArray, alignment: Alignment, axis: int) -> str:
+    name, spread, center = "xyz"[axis], points_3d.std(axis=0), points_3d.mean(axis=0)
+    if spread[axis] < _THIN * spread.max():
+        return f"the keypoints lie nearly in the plane {name} = {center[axis]:.3g}"
+    ray = alignment.apply(center[None])[0]
+    cosine = abs(ray @ alignment.rotation[:, axis]) / np.linalg.norm(ray)
+    if np.degrees(np.arccos(min(1.0, cosine))) < _END_ON_DEG:
+        return f"the model's {name} axis is seen nearly end-on"
+    if _are_flat(points_3d):
+        return "the keypoints lie nearly in one plane"
+    return "there are few keypoints for their noise"
+
+
+def percent(fraction: float) -> str:
+    """A share in percent, for a sentence."""
+    return f"{100 * fraction:.0f} %" if fraction < 100 else "more than 10000 %"
+
+
+def another_pose(
+    best: Alignment,
+    others: Sequence[tuple[Alignment, float]],
+    covariance: FloatArray,
+    degrees_of_freedom: float | None = None,
+    *,
+    near: float = 0.0,
+) -> Warnings:
+    """Warn about other poses, with likelihoods relative to the best, that the deviations conceal.
+
+    Those outside of the stated 95 % interval of the turn to them, where they have more than the 5 %
+    that it leaves them together; any, where the deviations leave every rotation open. ``near`` is
+    the likelihood of all further estimates whose pose is hardly another one.
+    """
+    total = 1 + near + sum(likelihood for _, likelihood in others)
+    is_open = covariance[:3, :3].trace() > (_LEAST_GAIN * _ANY_ROTATION) ** 2
+    concealed = []
+    for other, likelihood in others:
+        turn = vector_from_rotation(other.rotation @ best.rotation.T)
+        angle = float(np.linalg.norm(turn))
+        along = float(turn @ covariance[:3, :3] @ turn) / max(angle, _LEAST_TURN) ** 4
+        within = probability_within(1 / max(along, _LEAST_TURN), 1, degrees_of_freedom)
+        if math.degrees(angle) > _ANOTHER_DEG and (is_open or within > _REGION):
+            concealed.append((likelihood / total, math.degrees(angle)))
+    share = sum(probability for probability, _ in concealed)
+    if share <= 1 - _REGION:
+        return ()
+    _, angle = max(concealed)
+    which = f"another pose, {angle:.0f} deg away, has"
+    if len(concealed) > 1:
+        which = f"other poses, the likeliest {angle:.0f} deg away, have"
+    text = f"{which} a probability of {percent(share)}: see `alternatives`"
+    return (EstimateWarning("alternative", text),)
+
+
+def outside_image(
+    points_2d: FloatArray, camera: Camera, *, agree: bool, view: int = 0, where: str = ""
+) -> Warnings:
+    """Warn about keypoints (n, 2) and a principal point that are none of the image's.
+
+    ``view`` is the number of the view, ``where`` what the texts begin with.
+
+    All keypoints lie beyond one side, or, where they do not ``agree``, most outside: of an object
+    that is hidden or cropped, some may, and they may surround the image.
+    """
+    wrong = _wrong_principal_point(camera)
+    doubts = () if wrong is None else (EstimateWarning("camera", where + wrong, view),)
+    outside = np.flatnonzero(~camera.contains(points_2d)).tolist()
+    count = len(outside)
+    if 2 * count <= len(points_2d):
+        return doubts
+    last = np.array([camera.width, camera.height]) - PIXEL_CENTRE
+    beyond = (points_2d < -PIXEL_CENTRE).all(axis=0) | (points_2d > last).all(axis=0)
+    if agree and not beyond.any():
+        return doubts
+    text = (
+        f"{where}{count} of {len(points_2d)} keypoints lie outside of the image of {camera.width} "
+        f"x {camera.height} px: are they of another resolution than the camera, or of another "
+        "photo?"
+    )
+    return (*doubts, EstimateWarning("outside-image", text, view, tuple(outside)))
+
+
+def _wrong_principal_point(camera: Camera) -> str | None:
+    """Says that a principal point is the middle of another image, or outside of its own."""
+    if camera.is_centred:
+        return None
+    size, own = f"{camera.width} x {camera.height} px", f"({camera.cx:.4g}, {camera.cy:.4g})"
+    middle = 2 * (camera.cx + PIXEL_CENTRE), 2 * (camera.cy + PIXEL_CENTRE)
+    for factor in OTHER_SIZES:
+        other = camera.width * factor, camera.height * factor
+        apart = (abs(a - b) / b for a, b in zip(middle, other, strict=True))
+        if max(apart) < _SAME_MIDDLE:
+            return (
+                f"the camera's principal point {own} is the middle of an image of "
+                f"{other[0]:.0f} x {other[1]:.0f} px, its own has {size}: if the photo was resized "
+                f"(not cut out), give Camera.resized({camera.width}, {camera.height}) of the "
+                "camera of that size"
+            )
+    if camera.contains(np.array([[camera.cx, camera.cy]])).all():
+        return None
+    return (
+        f"the camera's principal point {own} lies outside of its image of {size}, which is right "
+        "only for a photo cut out of a larger one: compare the camera with the photo's size"
+    )
+
+
+def unexplained(sigma: float, points_2d: Sequence[FloatArray]) -> Warnings:
+    """Warn of an estimated sigma [px] that is nearly the spread of the keypoints of views (n, 2).
+
+    In 98 % of pairs of a category's models it is a smaller share, of keypoints in random order in
+    2 %.
+    """
+    with np.errstate(over="ignore"):  # of keypoints beyond all images
+        spread = max(float(points.std(axis=0).max()) for points in points_2d if len(points))
+    if sigma <= _LARGEST_SHARE * spread:
+        return ()
+    share = f"{sigma:.3g} px, {100 * sigma / spread:.0f} % of the keypoints' standard deviation"
+    text = f"sigma is {share}: the model explains next to nothing of them, check which is which"
+    return (EstimateWarning("noise", text),)
+
+
+def is_large_sigma(sigma: float, points_2d: Sequence[FloatArray]) -> bool:
+    """True for an estimated sigma [px] that is large beside the extent of views' keypoints (n, 2).
+
+    It asks for a mistake.
+    """
+    extents = [float(np.ptp(points, axis=0).max()) for points in points_2d if len(points)]
+    return sigma > _LARGE * max(extents, default=0.0)

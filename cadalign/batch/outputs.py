@@ -33,9 +33,6 @@ rms_px, cost
 alternatives, warning_count, warning_kinds, warnings
     Number of other alignments that explain the keypoints, number of warnings, the kind of each (see
     `cadalign.estimation.EstimateWarning`; "picture" for one that is not drawn), and their texts.
-component, coefficients
-    Component of a learned shape's mixture that the object belongs to, and the coefficients of its
-    modes, each of unit variance; empty without a learned shape.
 covariance
     Covariance (9, 9), or (10, 10) with an estimated focal length, by rows; see
     `cadalign.Result.covariance`.
@@ -55,7 +52,6 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
-from cadalign.arrays import FloatArray
 from cadalign.datasets.models.shapenet import name_of_synset
 from cadalign.errors import CadalignError, DataError, RenderError
 from cadalign.estimation.result import Result
@@ -75,12 +71,10 @@ from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.model_overlay import mesh_of
 from cadalign.render.drawing.overlay import draw_overlay
-from cadalign.shapes.model import ShapeModel
 
 _AXES = "xyz"
 _LISTS: Columns = (
-    *(("coefficients", list[float]), ("covariance", list[float])),
-    *(("residuals", list[float]), ("is_inlier", list[bool])),
+    *(("covariance", list[float]), ("residuals", list[float]), ("is_inlier", list[bool])),
 )
 COLUMNS: Columns = (
     *(("row", int), ("source", str), ("image", str), ("object", str), ("model", str)),
@@ -94,7 +88,6 @@ COLUMNS: Columns = (
     *((f"scale_{axis}_std", float) for axis in _AXES),
     *(("focal_length_std", float), ("rms_px", float), ("cost", float)),
     *(("alternatives", int), ("warning_count", int), ("warning_kinds", str), ("warnings", str)),
-    ("component", int),
     *_LISTS,
 )
 TIMING_COLUMNS: Columns = (("row", int), ("seconds", float))
@@ -147,28 +140,7 @@ def result_row(result: Result) -> Row:
     row |= {f"q{axis}": value for axis, value in zip("wxyz", quaternion, strict=True)}
     if result.covariance is not None:
         row["covariance"] = result.covariance.ravel().tolist()
-    if isinstance(result.model, ShapeModel):
-        row["component"] = result.component
-        row["coefficients"] = shape_coefficients(result, result.model).tolist()
     return row
-
-
-def shape_coefficients(result: Result, shape: ShapeModel) -> FloatArray:
-    """The likeliest coefficients (K,) of the modes of a learned shape for an estimated object.
-
-    Each keypoint may also be displaced by the component's ``residual_sigma``.
-    """
-    component = shape.components[result.component]
-    count = len(shape.ids)
-    modes = component.modes[:, :count].reshape(len(component.modes), -1)
-    offsets = (result.points_3d - component.mean[:count]).ravel()
-    if not len(modes):
-        return np.zeros(0)
-    if component.residual_sigma == 0:
-        return np.asarray(np.linalg.lstsq(modes.T, offsets, rcond=None)[0])
-    weight = component.residual_sigma**-2
-    normal = weight * modes @ modes.T + np.eye(len(modes))
-    return np.asarray(np.linalg.solve(normal, weight * modes @ offsets))
 
 
 def write_csv(folder: RunFolder) -> None:

@@ -15,12 +15,15 @@ import pyarrow as pa
 from cadalign.batch.experiment import FitRunOptions, plan_run
 from cadalign.batch.outputs import COLUMNS as TABLE_COLUMNS
 from cadalign.batch.outputs import NAMING, RECORD_COLUMNS, page_names, without_lists
+from cadalign.errors import DataError
+from cadalign.estimation.result import Result
 from cadalign.evaluation import metrics
+from cadalign.evaluation.instances.record import record_of
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.plots import Plot, cumulative_curves
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.tables import Cells, Run
-from cadalign.evaluation.runs.work import Columns, Row
+from cadalign.evaluation.runs.work import Columns, Outcome, Row
 from cadalign.evaluation.summary import (
     ALL,
     Summary,
@@ -29,8 +32,8 @@ from cadalign.evaluation.summary import (
     median,
     median_of,
 )
-from cadalign.geometry.alignment import Alignment, extent
-from cadalign.geometry.camera import Camera
+from cadalign.geometry.alignment import extent
+from cadalign.io.observation import Observation
 
 Statistics = Mapping[str, Callable[[Cells], float]]
 METHOD = "alignment"
@@ -68,9 +71,8 @@ class FitRun(Run):
         places = {row: place for place, row in enumerate(self.results["row"].to_pylist())}
         for stored in super().records(RECORD_COLUMNS):
             if stored["observation"]:
-                (row,) = table.slice(places[stored["row"]], 1).to_pylist()
-                reason = row.pop("reason")
-                yield {**row, "exhibit": _exhibit(stored, reason)}
+                (names,) = table.slice(places[stored["row"]], 1).to_pylist()
+                yield _record(stored, names | {"method": METHOD})
 
 
 def _as_instances(table: pa.Table) -> pa.Table:
@@ -89,58 +91,33 @@ def _as_instances(table: pa.Table) -> pa.Table:
     return shown.set_column(place, "method", pa.array([METHOD] * len(shown), pa.string()))
 
 
-def _exhibit(stored: Row, reason: str) -> str:
-    """The instance record of a stored result; see `cadalign.evaluation.instances.record`."""
-    estimate: Row = {"method": METHOD}
-    if not stored["result"]:
-        seen = msgspec.json.decode(stored["observation"])
-        view = seen["views"][0] if "views" in seen else seen
-        points = [each["xyz"] for each in view["keypoints"]]
-        pixels = [each["uv"] for each in view["keypoints"]]
-        bounds = _extent(points)
-        estimate["reason"] = reason
+def _record(stored: Row, names: Row) -> Row:
+    """The instance record of a stored result, or of the observation that has none."""
+    reason, result = names.pop("reason"), None
+    if stored["result"]:
+        result = Result.from_json(stored["result"])
+        view, bounds = result.views[0], result.bounds
+        camera, pixels, places = view.camera, view.points_2d, result.points_3d
+        row_of = {label: row for row, label in enumerate(result.ids)}
+        points = places[[row_of[label] for label in view.ids]]
+        outcome = Outcome(names, {"rms_px": result.rms})
     else:
-        found = msgspec.json.decode(stored["result"])
-        view, places = found["views"][0], found["points_3d"]
-        row_of = {label: row for row, label in enumerate(found["ids"])}
-        points = [places[row_of[label]] for label in view["ids"] or ()] or places
-        pixels, bounds = view["points_2d"], found["bounds"] or _extent(places)
-        estimate |= _pose(found["alignment"])
-        estimate |= {name: found[name] for name in ("sigma", "std")}
-        estimate["warnings"] = [each["text"] for each in found["warnings"]]
-        estimate["rms_px"] = round(found["rms"], 4)
-        estimate["alternatives"] = [
-            {**_pose(other["alignment"]), "likelihood": other["relative_likelihood"]}
-            for other in found["alternatives"]
-        ]
-    camera = Camera.from_dict(view["camera"])
-    shown = [k for k, pixel in enumerate(pixels) if pixel is not None]
-    names = ("width", "height", "fx", "fy", "cx", "cy")
-    record = {
-        "camera": {name: getattr(camera, name) for name in names},
-        "gt": None,
-        "stretch": [1.0, 1.0, 1.0],
-        "bounds": bounds,
-        "points_3d": [points[k] for k in shown],
-        "points_2d": [pixels[k] for k in shown],
-        "semantic_ids": shown,
-        "estimates": [estimate],
-    }
-    return msgspec.json.encode(record).decode()
-
-
-def _pose(data: Row) -> Row:
-    pose = Alignment.from_dict(data)
-    return {
-        "rotation": pose.rotation.ravel().tolist(),
-        "translation": pose.translation.tolist(),
-        "scale": pose.scale.tolist(),
-    }
-
-
-def _extent(points: Sequence[Sequence[float]]) -> list[list[float]]:
-    found: list[list[float]] = extent(np.array(points or [[0.0] * 3])).tolist()
-    return found
+        seen = Observation.from_dict(msgspec.json.decode(stored["observation"]))
+        camera, pixels, points = seen.camera, seen.points_2d, seen.points_3d
+        bounds = extent(points if len(points) else np.zeros((1, 3)))
+        outcome = Outcome.failure(reason, names)
+    shown = np.isfinite(pixels).all(axis=1)
+    estimate = DataError(reason) if result is None else result
+    return record_of(
+        [outcome],
+        [estimate],
+        camera=camera,
+        gt=None,
+        bounds=bounds,
+        points_3d=points[shown],
+        points_2d=pixels[shown],
+        ids=np.flatnonzero(shown),
+    )
 
 
 _STATISTICS = {

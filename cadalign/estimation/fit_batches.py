@@ -20,7 +20,7 @@ from cadalign.estimation.problems import (
     Problems,
     Solutions,
     each_of,
-    full_covariances,
+    full_covariance,
     in_threads,
     pack_many,
 )
@@ -187,7 +187,7 @@ class _SolvedBatch:
         means = np.add.reduceat(squares, problems.offsets[:-1]) / np.maximum(problems.counts, 1)
         covariance = self.solutions.covariances
         if covariance is not None:
-            covariance = full_covariances(covariance, self.options.known_axis)
+            covariance = full_covariance(covariance, self.options.known_axis)
             covariance[failed] = np.nan
         return Results(
             poses=np.where(failed[:, None], np.nan, self.solutions.poses[:, 0]),

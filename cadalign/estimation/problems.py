@@ -295,23 +295,15 @@ class Solutions(NamedTuple):
         return np.asarray(solved)
 
 
-def full_covariances(of_solver: FloatArray, known_axis: str) -> FloatArray:
-    """Covariances (B, 9, 9) or (B, 10, 10) of results from solvers' (8, 8) or (9, 9).
+def full_covariance(of_solver: FloatArray, known_axis: str) -> FloatArray:
+    """Covariances (..., 9, 9) or (..., 10, 10) of results from solvers' (8, 8) or (9, 9).
 
     Solvers leave out the scale that is known, whose rows are zero in a result.
     """
-    count, size = len(of_solver), of_solver.shape[-1] + 1
-    full = np.zeros((count, size * size))
-    full[:, _places(size, known_axis)] = of_solver.reshape(count, (size - 1) ** 2)
-    return full.reshape(count, size, size)
-
-
-def full_covariance(of_solver: FloatArray, known_axis: str) -> FloatArray:
-    """The covariance of one result; takes less time than `full_covariances` of one."""
-    size = len(of_solver) + 1
-    full = np.zeros((size, size))
-    full.put(_places(size, known_axis), of_solver)
-    return full
+    problems, size = of_solver.shape[:-2], of_solver.shape[-1] + 1
+    full = np.zeros((*problems, size * size))
+    full[..., _places(size, known_axis)] = of_solver.reshape(*problems, (size - 1) ** 2)
+    return full.reshape(*problems, size, size)
 
 
 def with_log_focal(

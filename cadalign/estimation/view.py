@@ -283,24 +283,12 @@ def _photo(given: Any, camera: Camera) -> ByteImage:
     pixels = np.asarray(given)
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
         what = f"{pixels.dtype} of shape {pixels.shape}, expected an RGB image (h, w, 3) of uint8"
-        raise InputError(what, where="image", fix=_as_photo(pixels))
+        raise InputError(what, where="image", fix="give the photo's array, or its path")
     if pixels.shape[:2] != (camera.height, camera.width):
         size = f"{pixels.shape[1]} x {pixels.shape[0]}"
         what = f"the photo is {size}, the camera {camera.width} x {camera.height}"
         raise InputError(what, where="image", fix="give the photo that the camera is of")
     return pixels
-
-
-def _as_photo(pixels: npt.NDArray[Any]) -> str:
-    """The fix for an array of another form: what makes a photo of it."""
-    if pixels.ndim == 2:
-        return "of one channel give np.dstack([image] * 3)"
-    if pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
-        return "give the photo's array, or its path"
-    steps = "image[..., :3]" if pixels.shape[2] == 4 else "image"
-    if pixels.dtype.kind == "f" and pixels.size and pixels.max() <= 1:
-        steps = f"(255 * {steps}).round()"
-    return f"give {steps}" + ("" if pixels.dtype == np.uint8 else ".astype(np.uint8)")
 
 
 def _upwards(given: Any, sigma: Any) -> FloatArray:

@@ -53,12 +53,12 @@ def changed(pose: np.ndarray, rows: slice | int, columns: slice | int, factor: f
         (
             lambda: View(CAMERA, PIXELS, image=np.dstack([NOTHING / 1.0] * 4)),
             "image: float64 of shape (480, 640, 4), expected an RGB image (h, w, 3) of uint8; "
-            "give (255 * image[..., :3]).round().astype(np.uint8)",
+            "give the photo's array, or its path",
         ),
         (
             lambda: View(CAMERA, PIXELS, image=NOTHING.astype(np.uint8)),
             "image: uint8 of shape (480, 640), expected an RGB image (h, w, 3) of uint8; "
-            "of one channel give np.dstack([image] * 3)",
+            "give the photo's array, or its path",
         ),
         (
             lambda: align(MODEL, [View(CAMERA, PIXELS), View(CAMERA, PIXELS, mask=NOTHING)]),

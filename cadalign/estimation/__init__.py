@@ -11,7 +11,6 @@ from cadalign.names import lazy_names
 if TYPE_CHECKING:
     from cadalign.estimation.align import align_batch
     from cadalign.estimation.fit_batches import fit_batch
-    from cadalign.estimation.fitted import Alternative, FitStats
     from cadalign.estimation.focal import FocalPrior
     from cadalign.estimation.model import Model
     from cadalign.estimation.observed import model_of, views_from, views_of
@@ -19,7 +18,9 @@ if TYPE_CHECKING:
     from cadalign.estimation.outputs import object_of
     from cadalign.estimation.result import Result
     from cadalign.estimation.result_parts import (
+        Alternative,
         EvidenceSummary,
+        FitStats,
         Uncertainty,
         ViewResult,
     )

@@ -22,7 +22,6 @@ from cadalign.errors import (
 from cadalign.estimation.agreement import Case
 from cadalign.estimation.contours import refine
 from cadalign.estimation.diagnose import diagnose, diagnose_refusal
-from cadalign.estimation.fitted import FitStats
 from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.joint import Causes, result_of_minima, with_causes
 from cadalign.estimation.model import Model
@@ -31,6 +30,7 @@ from cadalign.estimation.prior import Lenses
 from cadalign.estimation.problem import Problem, compile_problem, no_pose_error
 from cadalign.estimation.problems import each_of
 from cadalign.estimation.result import Result
+from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.results import Results
 from cadalign.estimation.search import search, widened_by_noise
 from cadalign.estimation.single import align_plain, align_single, is_plain, is_single

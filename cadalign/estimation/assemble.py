@@ -3,24 +3,73 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.fitted import Alternative, Diagnosis, FitStats, FittedKeypoints, quickly
-from cadalign.estimation.options import FitOptions
+from cadalign.estimation.options import FitOptions, pixel_information
 from cadalign.estimation.problems import Problems, Solutions
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import Posterior, ViewResult
+from cadalign.estimation.result_parts import (
+    Alternative,
+    Diagnosis,
+    EvidenceSummary,
+    FitStats,
+    FittedKeypoints,
+    Posterior,
+    ViewResult,
+    quickly,
+)
 from cadalign.estimation.solve import LEAST_LIKELIHOOD, camera_of, fitted_fields
+from cadalign.estimation.warning import Warnings
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.symmetry import Symmetry
 
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
     from cadalign.estimation.view import View
+
+
+class KeypointPosterior(Posterior):
+    """Posterior of keypoints of one view, computed when it is asked for."""
+
+    keypoints: FittedKeypoints
+    diagnosis: Diagnosis | None
+
+    @cached_property
+    def covariance(self) -> FloatArray | None:
+        from cadalign.estimation.uncertainty.posterior import keypoint_covariance
+
+        return keypoint_covariance(self.keypoints)
+
+    @cached_property
+    def warnings(self) -> Warnings:
+        from cadalign.estimation.uncertainty.doubts import keypoint_warnings
+
+        return keypoint_warnings(self.keypoints, self.covariance, self.diagnosis)
+
+    @cached_property
+    def evidence(self) -> tuple[EvidenceSummary, ...]:
+        return keypoint_evidence(self.keypoints)
+
+
+def keypoint_evidence(fitted: FittedKeypoints) -> tuple[EvidenceSummary, ...]:
+    """Agreement of the keypoints that the estimate rests on."""
+    residuals = fitted.residuals[fitted.inliers]
+    count = max(len(residuals), 1)
+    rms = float(np.sqrt((residuals * residuals).sum() / count))
+    sigma = fitted.chosen_sigma
+    if np.ndim(sigma) == 0:
+        unit = 1.0 if sigma is None else float(sigma)
+        with np.errstate(over="ignore"):  # of the least positive number
+            in_sigmas = float(np.nan_to_num(np.divide(rms / np.sqrt(2.0), unit)))
+    else:
+        information = pixel_information(sigma, len(fitted.residuals))[fitted.inliers]
+        whitened = np.einsum("ni,nij,nj->", residuals, information, residuals)
+        in_sigmas = float(np.sqrt(whitened / (2 * count)))
+    return (EvidenceSummary("keypoints", 0, len(residuals), in_sigmas, rms, "px"),)
 
 
 def keypoints_of_solution(
@@ -69,7 +118,7 @@ def result_of_keypoints(
         "diagnosis": diagnosis,
         "fisher_covariance": fitted.fisher_covariance,
     }
-    posterior = quickly(Posterior, of_posterior)
+    posterior = quickly(KeypointPosterior, of_posterior)
     of_view = {
         "camera": fitted.camera,
         "alignment": fitted.alignment,

@@ -17,13 +17,12 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.agreement import AS_GIVEN, Agreement, AnyModel, Case, Rule
-from cadalign.estimation.assemble import result_of_keypoints
+from cadalign.estimation.assemble import KeypointPosterior, result_of_keypoints
 from cadalign.estimation.fit import fit_once
-from cadalign.estimation.fitted import FittedKeypoints
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions, pixel_information
 from cadalign.estimation.problems import pack_one
-from cadalign.estimation.result_parts import listed, uncertainty_of
+from cadalign.estimation.result_parts import FittedKeypoints, listed, uncertainty_of
 from cadalign.estimation.uncertainty.doubts import (
     CAMERA_GAIN,
     FALSE_ALARMS,
@@ -273,7 +272,7 @@ def _rules_for(case: Case, given: Agreement) -> Iterator[Rule]:
     if options.stretch is not None or options.stretch_sigma is not None:
         yield HELD
     fails = not case.has_chance(given, FALSE_ALARMS)
-    if may_fit_other_cameras(cast(FittedKeypoints, given.result.posterior.keypoints), fails):
+    if may_fit_other_cameras(cast(KeypointPosterior, given.result.posterior).keypoints, fails):
         yield ANOTHER_FOCAL
         yield from _other_sizes(case)
     if fails:

@@ -17,10 +17,15 @@ from msgspec.structs import asdict
 
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import CadalignError, InputError
-from cadalign.estimation.fitted import Alternative, FitStats
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import FitOptions, pixel_information
-from cadalign.estimation.result_parts import EvidenceSummary, Posterior, ViewResult
+from cadalign.estimation.result_parts import (
+    Alternative,
+    EvidenceSummary,
+    FitStats,
+    Posterior,
+    ViewResult,
+)
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -258,7 +263,7 @@ def _result(read: _Result, kind: type[Result]) -> Result:
         "fisher_covariance": _square(read.fisher_covariance, "fisher_covariance", unknowns),
         "evidence": tuple(map(_summary, read.evidence)),
     }
-    posterior = Posterior.stated(views[0].covariance, **of_posterior)
+    posterior = Posterior(views[0].covariance, **of_posterior)
     views[0] = replace(views[0], posterior=posterior)
     fields |= {
         "views": tuple(views),
@@ -272,7 +277,7 @@ def _view(read: _View, unknowns: int) -> ViewResult:
     fields = _values(read)
     covariance = _square(fields.pop("covariance"), "covariance", unknowns)
     residuals = np.nan_to_num(_pixels(read.residuals), nan=np.inf)  # behind the camera
-    return ViewResult(**fields | {"residuals": residuals}, posterior=Posterior.stated(covariance))
+    return ViewResult(**fields | {"residuals": residuals}, posterior=Posterior(covariance))
 
 
 def _square(rows: Matrix | None, name: str, size: int) -> FloatArray | None:

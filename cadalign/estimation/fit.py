@@ -12,11 +12,11 @@ import numpy.typing as npt
 from cadalign.arrays import copied
 from cadalign.errors import InputError, NoConsensusError, require_kind
 from cadalign.estimation.assemble import keypoints_of_solution, result_of_keypoints
-from cadalign.estimation.fitted import FittedKeypoints
 from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.estimation.problems import Problems, pack_one
 from cadalign.estimation.result import Result
+from cadalign.estimation.result_parts import FittedKeypoints
 from cadalign.estimation.solve import solve_one
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera

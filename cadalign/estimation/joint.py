@@ -27,7 +27,6 @@ from cadalign.estimation.estimates import (
     widened_boxes,
     with_box,
 )
-from cadalign.estimation.fitted import Alternative, FitStats
 from cadalign.estimation.focal import prior_of_camera
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import camera_like, is_exact, widened, with_known_shape
@@ -35,7 +34,9 @@ from cadalign.estimation.problem import Problem
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import (
     NO_NOTES,
+    Alternative,
     EvidenceSummary,
+    FitStats,
     OutlineNotes,
     Posterior,
     ViewResult,
@@ -107,7 +108,7 @@ def result_of(
     )
     pose, points = best.poses[0], best.points[:-2]
     of_points, of_seen = moments_of_points(estimates)
-    posterior = Posterior.stated(
+    posterior = Posterior(
         covariances[0],
         fisher_covariance=best.covariances[0],
         points_covariance=of_points[:-2],
@@ -146,7 +147,7 @@ def result_of(
         if number in numbers:
             place = numbers.index(number)
             camera, alignment, kept = best.cameras[place], best.poses[place], inliers[place]
-            own = Posterior.stated(covariances[place]) if number else posterior
+            own = Posterior(covariances[place]) if number else posterior
         else:
             camera, alignment = _pose_beside(problem, number, best)
             kept, own = np.zeros(len(rows), dtype=bool), Posterior()

@@ -13,10 +13,12 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, is_number
 from cadalign.errors import CadalignError, InputError, quote
-from cadalign.estimation.fitted import NO_STATS, Alternative, FitStats
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.result_parts import (
+    NO_STATS,
+    Alternative,
+    FitStats,
     Posterior,
     Uncertainty,
     ViewResult,

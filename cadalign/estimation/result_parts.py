@@ -1,4 +1,4 @@
-"""Parts of a result: a view, the agreement of each piece of evidence, and the posterior.
+"""Parts of a result: views, alternatives, evidence, the posterior, and keypoints that are fitted.
 
 Covariances are those of the rotation vector in the camera frame [rad], the translation, the
 logarithms of the lengths along x, y, z, and, where it was estimated, of the focal length.
@@ -6,20 +6,21 @@ logarithms of the lengths along x, y, z, and, where it was estimated, of the foc
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.estimation.fitted import Diagnosis, FittedKeypoints, quickly
-from cadalign.estimation.options import pixel_information
-from cadalign.estimation.warning import Warnings
-from cadalign.geometry.alignment import Alignment
+from cadalign.estimation.options import FitOptions, RansacOptions
+from cadalign.estimation.warning import EstimateWarning, Warnings
+from cadalign.geometry.alignment import Alignment, Box, extent
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import by_rotation
+from cadalign.geometry.symmetry import Symmetry
+
+T = TypeVar("T")
 
 _ROUNDING = 1e-12  # relative standard deviation below which a length is known
 _FIELDS = {
@@ -29,6 +30,118 @@ _FIELDS = {
     "camera height": "camera_height",
     "rig": "cam_from_rig",
 }
+
+
+@dataclass(frozen=True, eq=False)
+class Alternative:
+    """Another estimate that the evidence cannot tell from the best one.
+
+    Parameters
+    ----------
+    alignment : Alignment
+        In the first view's camera.
+    relative_likelihood : float
+        Its likelihood over that of the best one, 1 for an equally good one.
+    camera : Camera
+        The camera that goes with it; the best one's, unless the focal length was estimated.
+    points_3d : (m, 3) float
+        Its keypoints in the model's frame.
+    own_bounds : (2, 3) float, optional
+        Its box in the model's frame; None for that of the keypoints.
+    """
+
+    alignment: Alignment
+    relative_likelihood: float
+    camera: Camera
+    points_3d: FloatArray
+    own_bounds: FloatArray | None = field(default=None, repr=False)
+
+    @property
+    def bounds(self) -> FloatArray:
+        """Its box (2, 3) in the model's frame."""
+        return extent(self.points_3d) if self.own_bounds is None else self.own_bounds
+
+    @property
+    def box(self) -> Box:
+        """Its box in the first camera's frame."""
+        return Box.from_model(self.bounds, self.alignment)
+
+
+@dataclass(frozen=True)
+class FitStats:
+    """Effort of an estimate.
+
+    Parameters
+    ----------
+    iterations : int
+        Refinement steps over all starts; samples, where inliers were searched for.
+    hypotheses : int
+        Alignments from which a refinement could start.
+    seconds : float
+    inlier_ratio : float, optional
+        Share of the keypoints that were kept, where they were searched for.
+    score : float, optional
+        Sum of squared errors, each at most the threshold's square [px^2], of the robust search.
+    """
+
+    iterations: int
+    hypotheses: int
+    seconds: float
+    inlier_ratio: float | None = None
+    score: float | None = None
+
+
+NO_STATS = FitStats(0, 0, 0.0)
+
+
+class KeypointSearch(Protocol):
+    """The search for inliers, by which those that were found may be doubted."""
+
+    @property
+    def ransac(self) -> RansacOptions:
+        """Its options."""
+
+    def doubt(self, residuals: FloatArray, inliers: BoolArray) -> EstimateWarning | None:
+        """Warn where chance supports as many."""
+
+
+@dataclass(frozen=True, eq=False)
+class FittedKeypoints:
+    """Keypoints of an exact or stretched model in one view, with the alignment that fits them.
+
+    Fields without a comment are those of `cadalign.Result`.
+    """
+
+    points_3d: FloatArray  # (n, 3) on the model, of the keypoints that the view shows
+    residuals: FloatArray
+    inliers: BoolArray
+    alignment: Alignment
+    camera: Camera
+    options: FitOptions
+    sigma: float | None = None
+    fisher_covariance: FloatArray | None = None
+    symmetry: Symmetry | None = None
+    method: str = "optimal"
+    cost: float | None = None
+    alternatives: tuple[Alternative, ...] = ()
+    stats: FitStats = NO_STATS
+    search: KeypointSearch | None = None  # for the inliers, where they were searched for
+
+    @property
+    def observed(self) -> FloatArray:
+        """The keypoints (n, 2) [px] as they were given; NaN for those behind the camera."""
+        projected = self.camera.project_where_ahead(self.alignment.apply(self.points_3d))
+        with np.errstate(invalid="ignore"):  # infinite residuals
+            return np.asarray(projected - self.residuals)
+
+    @property
+    def chosen_sigma(self) -> Any:
+        """The keypoints' standard deviation or covariances [px]: given, or estimated."""
+        return self.sigma if self.options.sigma is None else self.options.sigma
+
+
+Diagnosis = Callable[[FittedKeypoints], EstimateWarning | None]
+"""A function that names the cause of a misfit; see `cadalign.estimation.diagnose.diagnose_fit`."""
 
 
 @dataclass(frozen=True)
@@ -111,69 +224,31 @@ def listed(clauses: Sequence[str]) -> str:
     return f"{', '.join(some)} or {last}" if some else last
 
 
-def keypoint_evidence(fitted: FittedKeypoints) -> tuple[EvidenceSummary, ...]:
-    """Agreement of the keypoints that the estimate rests on."""
-    residuals = fitted.residuals[fitted.inliers]
-    count = max(len(residuals), 1)
-    rms = float(np.sqrt((residuals * residuals).sum() / count))
-    sigma = fitted.chosen_sigma
-    if np.ndim(sigma) == 0:
-        unit = 1.0 if sigma is None else float(sigma)
-        with np.errstate(over="ignore"):  # of the least positive number
-            in_sigmas = float(np.nan_to_num(np.divide(rms / np.sqrt(2.0), unit)))
-    else:
-        information = pixel_information(sigma, len(fitted.residuals))[fitted.inliers]
-        whitened = np.einsum("ni,nij,nj->", residuals, information, residuals)
-        in_sigmas = float(np.sqrt(whitened / (2 * count)))
-    return (EvidenceSummary("keypoints", 0, len(residuals), in_sigmas, rms, "px"),)
+def quickly(kind: type[T], fields: dict[str, Any]) -> T:
+    """A frozen dataclass with these fields, unchecked; those left out have their defaults.
+
+    Setting them one by one takes longer than solving a small problem linearly.
+    """
+    made = object.__new__(kind)
+    made.__dict__.update(fields)
+    return made
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Uncertainty of an estimate, and warnings about it; see `cadalign.Result`.
+    """Uncertainty of an estimate, and warnings about it; see `cadalign.Result`."""
 
-    That of ``keypoints`` alone is computed when it is asked for; that of other evidence is made by
-    `stated`. Without anything it says nothing.
-    """
-
-    keypoints: FittedKeypoints | None = None
-    diagnosis: Diagnosis | None = None
+    covariance: FloatArray | None = None
     fisher_covariance: FloatArray | None = None
     points_covariance: FloatArray | None = None
     points_cam_covariance: FloatArray | None = None
     degrees_of_freedom: float | None = None
-
-    @classmethod
-    def stated(cls, covariance: FloatArray | None, **known: Any) -> Posterior:
-        """With a covariance, and any of the fields and properties."""
-        return cls().stating(covariance=covariance, **known)
+    warnings: Warnings = ()
+    evidence: tuple[EvidenceSummary, ...] = ()
 
     def stating(self, **known: Any) -> Posterior:
-        """A copy with other values of any of the fields and properties."""
-        return quickly(Posterior, vars(self) | known)
-
-    @cached_property
-    def covariance(self) -> FloatArray | None:
-        """See `cadalign.Result.covariance`."""
-        if self.keypoints is None:
-            return None
-        from cadalign.estimation.uncertainty.posterior import keypoint_covariance
-
-        return keypoint_covariance(self.keypoints)
-
-    @cached_property
-    def warnings(self) -> Warnings:
-        """See `cadalign.Result.warnings`."""
-        if self.keypoints is None:
-            return ()
-        from cadalign.estimation.uncertainty.doubts import keypoint_warnings
-
-        return keypoint_warnings(self.keypoints, self.covariance, self.diagnosis)
-
-    @cached_property
-    def evidence(self) -> tuple[EvidenceSummary, ...]:
-        """See `cadalign.Result.evidence`."""
-        return () if self.keypoints is None else keypoint_evidence(self.keypoints)
+        """A copy with other values of some fields; what is computed when asked for stays so."""
+        return quickly(type(self), vars(self) | known)
 
 
 class OutlineNotes(NamedTuple):

@@ -16,9 +16,9 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError, InputError, NoConsensusError
 from cadalign.estimation.assemble import keypoints_of_solution
 from cadalign.estimation.consensus import RobustSearch, find_consensus, refined
-from cadalign.estimation.fitted import FitStats, FittedKeypoints
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.problems import Problems, check_sigmas
+from cadalign.estimation.result_parts import FitStats, FittedKeypoints
 from cadalign.estimation.solve import solve_one
 from cadalign.estimation.uncertainty.residuals import (
     LEAST_ERROR,

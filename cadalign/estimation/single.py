@@ -13,10 +13,9 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
-from cadalign.estimation.assemble import result_of_keypoints
+from cadalign.estimation.assemble import KeypointPosterior, result_of_keypoints
 from cadalign.estimation.estimates import Estimate, as_given, with_boxes
 from cadalign.estimation.fit import fit
-from cadalign.estimation.fitted import FitStats, FittedKeypoints
 from cadalign.estimation.joint import Causes, common_sigma, result_of
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions, RansacOptions
@@ -24,6 +23,7 @@ from cadalign.estimation.pack import seen_keypoints
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.problem import Problem
 from cadalign.estimation.result import Result
+from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.uncertainty.evidence import summary_of_keypoints
 from cadalign.estimation.uncertainty.shape_posterior import (
@@ -75,10 +75,11 @@ def align_plain(
         ransac=ransac,
         scores=view.scores if ransac is not None else None,
     )
+    posterior = cast(KeypointPosterior, found.posterior)
     return result_of_keypoints(
         view.pixels,
-        cast(FittedKeypoints, found.posterior.keypoints),
-        diagnosis=found.posterior.diagnosis,
+        posterior.keypoints,
+        diagnosis=posterior.diagnosis,
         symmetry=model.symmetry,
         model=model,
         view=view,

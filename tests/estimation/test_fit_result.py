@@ -12,15 +12,22 @@ from support.problems import fit_problem, problem_of
 
 from cadalign import Alignment, FocalPrior, Result
 from cadalign.errors import InputError
-from cadalign.estimation.fitted import Alternative, FitStats, FittedKeypoints
+from cadalign.estimation.assemble import KeypointPosterior
 from cadalign.estimation.options import FitOptions
-from cadalign.estimation.result_parts import Posterior, ViewResult
+from cadalign.estimation.result_parts import (
+    Alternative,
+    FitStats,
+    FittedKeypoints,
+    Posterior,
+    ViewResult,
+    quickly,
+)
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.evaluation.simulation import SIMULATION_CAMERA
 
 COVARIANCE = np.diag([1e-4, 1e-4, 1e-4, 0.0004, 0.0009, 0.01, 0, 0.0001, 0.0225])
 WARNING = "s_z is known only to +-15 %: there are few keypoints for their noise"
-STATED = Posterior.stated(
+STATED = Posterior(
     COVARIANCE,
     fisher_covariance=COVARIANCE,
     warnings=(EstimateWarning("scale", WARNING),),
@@ -156,6 +163,7 @@ def test_warnings_look_at_the_inliers_alone() -> None:
     fitted = FittedKeypoints(
         points, np.zeros((7, 2)), inliers, POSE, SIMULATION_CAMERA, options, 1.0, COVARIANCE
     )
-    posterior = Posterior(fitted).stating(covariance=100 * COVARIANCE)
+    known = {"keypoints": fitted, "diagnosis": None, "covariance": 100 * COVARIANCE}
+    posterior = quickly(KeypointPosterior, known)
     text = "s_z is known only to +-150 %: the keypoints lie nearly in the plane z = 0.25"
     assert posterior.warnings == (EstimateWarning("scale", text),)

@@ -8,10 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.fitted import Diagnosis, FittedKeypoints
 from cadalign.estimation.focal import focal_doubt
 from cadalign.estimation.options import pixel_information
-from cadalign.estimation.result_parts import uncertainty_of
+from cadalign.estimation.result_parts import Diagnosis, FittedKeypoints, uncertainty_of
 from cadalign.estimation.uncertainty.residuals import chi_square_tail
 from cadalign.estimation.warning import EstimateWarning, Kind, Warnings
 from cadalign.geometry.alignment import Alignment

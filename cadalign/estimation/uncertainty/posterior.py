@@ -19,10 +19,10 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
-from cadalign.estimation.fitted import FittedKeypoints
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import LOSSES, FitOptions, pixel_information
 from cadalign.estimation.problems import distinct_rows, whitening_by
+from cadalign.estimation.result_parts import FittedKeypoints
 from cadalign.estimation.uncertainty.residuals import (
     bent,
     chi_square_quantile,

@@ -14,6 +14,7 @@ from typing import Any, cast
 import numpy as np
 
 from cadalign.annotate.models import ObjectShape
+from cadalign.annotate.outliers import PlacedRows, Rows, find_outliers
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import CadalignError
@@ -23,7 +24,6 @@ from cadalign.estimation.model import Model
 from cadalign.estimation.observed import model_of, views_of
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.result import Result
-from cadalign.estimation.uncertainty.residuals import PlacedRows, Rows, find_outliers
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera

@@ -31,6 +31,7 @@ _LEAST_RATIO = 1.7  # of the residuals with and without it
 _MORE_AGREE = 2.0  # of -2 log likelihood, that is gained where more keypoints agree
 _AS_MANY_ARE_FOUND = 2 * math.log(100)  # the same after a robust search, where as many do
 _FEW_REJECTED = 0.1  # share of the keypoints, up to which an uncertain shape is not doubted
+_MOST_REJECTED = 1 / 3  # share of the keypoints that are outliers; more are none
 _CHANCE_OF_RATIO = 1e-3  # that residuals of an unknown noise differ by as much
 _UPRIGHT = 0.5  # cosine between the model's y axis and the photo's upwards, at least
 _EQUATIONS = {"keypoints": 2, "gravity": 2, "depth": 1, "size": 1, "camera height": 1}
@@ -55,7 +56,6 @@ class Rule(NamedTuple):
     undo_view: Callable[[View], View] = lambda view: view
     undo_model: Callable[[Model], Model] = lambda model: model
     changes: Mapping[str, Any] = {}
-    left_out: int = 0  # keypoints
     gain: float = AS_MANY_AGREE
     says: Callable[[Agreement, Agreement], EstimateWarning] | None = None
 
@@ -118,13 +118,13 @@ class Case:
                 model = rule.undo_model(replace(model, mesh=None) if model.mesh else model)
             views = numbered([rule.undo_view(view) for view in self.views])
             result = self.again(model, views, **rule.changes)
-            return replace(self, model=model, views=views).agreement(result, rule)
+            return replace(self, model=model, views=views).agreement(result)
         except CadalignError:
             return None
 
     @np.errstate(all="ignore")  # residuals that overflow are outliers'
-    def agreement(self, result: Result, rule: Rule = AS_GIVEN) -> Agreement:
-        """The agreement of views that take part in a result, after a cause is undone."""
+    def agreement(self, result: Result) -> Agreement:
+        """The agreement of views that take part in a result."""
         views, ransac = self.views, self.ransac
         score, squares, inliers, count = 0.0, 0.0, 0, 0
         for view in views:
@@ -140,7 +140,7 @@ class Case:
                 squares += float(np.einsum("ni,nij,nj->", seen[0], seen[1], seen[0]))
                 score += float((math.log(4 * math.pi**2) - np.log(np.linalg.det(seen[1]))).sum())
                 area = area_of(own.points_2d, own.camera, threshold)
-                score += 2 * math.log(area) * (int((~kept).sum()) + rule.left_out)
+                score += 2 * math.log(area) * int((~kept).sum())
         kinds = {each.kind for each in result.evidence}
         is_whole = inliers == int(result.inliers.sum())
         if result.cost is not None and is_whole and not kinds & {"mask", "photo"}:
@@ -196,6 +196,7 @@ class Case:
         if found.sigma is not None and given.sigma is not None:
             ratio = f_quantile(found.redundancy, found.redundancy, _CHANCE_OF_RATIO)
             return found.sigma < given.sigma / math.sqrt(ratio)
-        if rule.left_out or self.has_chance(found, FALSE_ALARMS):
-            return self.has_chance(found, FALSE_ALARMS)
-        return found.ratio < min(_MOST_CORRECTED, given.ratio / _LEAST_RATIO)
+        rejected, fits = found.keypoints - found.inliers, self.has_chance(found, FALSE_ALARMS)
+        if rejected:
+            return fits and rejected <= _MOST_REJECTED * found.keypoints
+        return fits or found.ratio < min(_MOST_CORRECTED, given.ratio / _LEAST_RATIO)

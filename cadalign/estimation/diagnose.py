@@ -20,7 +20,7 @@ from cadalign.estimation.agreement import AS_GIVEN, Agreement, AnyModel, Case, R
 from cadalign.estimation.assemble import KeypointPosterior, result_of_keypoints
 from cadalign.estimation.fit import fit_once
 from cadalign.estimation.model import Model
-from cadalign.estimation.options import FitOptions, RansacOptions, pixel_information
+from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.problems import pack_one
 from cadalign.estimation.result_parts import FittedKeypoints, listed, uncertainty_of
 from cadalign.estimation.uncertainty.doubts import (
@@ -31,9 +31,6 @@ from cadalign.estimation.uncertainty.doubts import (
     percent,
 )
 from cadalign.estimation.uncertainty.residuals import (
-    PlacedRows,
-    Rows,
-    find_outliers,
     named_keypoints,
 )
 from cadalign.estimation.view import View
@@ -46,7 +43,6 @@ if TYPE_CHECKING:
 
 _AS_LIKELY = 6.0  # difference of -2 log likelihoods of mistakes that are both named
 _MOST_INSIDE = 0.8  # share of the keypoints that lie in their image
-_MOST_OUTLIERS = 1 / 3  # of the keypoints; more are no outliers
 _TESTED_TO = 0.1  # relative standard deviation to which a held scale must be tested
 
 
@@ -184,9 +180,11 @@ def case_of_fit(
         exact, (view,) = cast(Model, model), views
         points = cast(FloatArray, exact.points_3d)[_rows_of(view)]
         of_model = {"stretch": exact.stretch, "stretch_sigma": exact.stretch_sigma}
+        search = changes.pop("ransac", ransac)
         own = replace(options, sigma=view.sigma, **(of_model | changes))
         problems = pack_one(points, view.pixels, view.camera)
-        return result_of_keypoints(view.pixels, fit_once(problems, own, ransac, None, 0.0))
+        fitted = fit_once(problems, own, search, None, 0.0)
+        return result_of_keypoints(view.pixels, fitted, view=view)
 
     is_tested = ransac is None and options.sigma is not None
     return Case(model, (view,), again, ransac, options if is_tested else None)
@@ -233,6 +231,21 @@ def _say_stretch(best: Agreement, _: Agreement) -> EstimateWarning:
     return EstimateWarning("stretch", text)
 
 
+def _say_outliers(best: Agreement, given: Agreement) -> EstimateWarning:
+    (view,) = best.result.views
+    lengths = np.linalg.norm(view.residuals, axis=1)
+    wrong = {
+        int(cast(int, view.ids[row])): lengths[row]
+        for row in np.flatnonzero(~view.inliers).tolist()
+    }
+    keypoints, do = ("keypoint", "does") if len(wrong) == 1 else ("keypoints", "do")
+    text = (
+        f"{keypoints} {named_keypoints(wrong)} {do} not fit the others (counted from 0, with the "
+        "distance from where those put it)"
+    )
+    return EstimateWarning("outlier", _too_large(given) + text, 0, tuple(sorted(wrong)))
+
+
 def _say_camera(best: Agreement, _: Agreement) -> EstimateWarning:
     text = (
         "the keypoints contradict the camera: they fit one better that has a focal length of "
@@ -258,6 +271,7 @@ INVERTED = Rule(
 HELD = Rule(
     undo_model=lambda model: replace(model, stretch=None, stretch_sigma=None), says=_say_stretch
 )
+OUTLIERS = Rule(changes={"ransac": RansacOptions()}, gain=-math.inf, says=_say_outliers)
 ANOTHER_FOCAL = Rule(changes={"focal": "estimate"}, gain=CAMERA_GAIN, says=_say_camera)
 
 
@@ -276,45 +290,7 @@ def _rules_for(case: Case, given: Agreement) -> Iterator[Rule]:
         yield ANOTHER_FOCAL
         yield from _other_sizes(case)
     if fails:
-        yield from _outliers(case, given)
-
-
-def _outliers(case: Case, given: Agreement) -> Iterator[Rule]:
-    """The few keypoints without which the others may fit."""
-    (view,), count = case.views, given.keypoints
-    rows = _rows_of(view)
-    covariances = np.asarray(np.linalg.inv(pixel_information(view.sigma, count)), dtype=np.float64)
-    points = cast(FloatArray, cast(Model, case.model).points_3d)[rows]
-
-    def fit_rows(some: Rows, robust: bool) -> PlacedRows:
-        shown = replace(
-            view, points_2d=view.pixels[some], ids=rows[some].tolist(), sigma=covariances[some]
-        )
-        loss = {"loss": "cauchy" if robust else "linear", "loss_scale": FitOptions.loss_scale}
-        found = case.again(case.model, [shown], **loss)
-        return found.alignment, found.camera, found.fisher_covariance
-
-    unknowns = cast(FitOptions, case.options).unknowns
-    found = find_outliers(points, view.pixels, fit_rows, unknowns=unknowns, noise=covariances)
-    if not 0 < len(found) <= _MOST_OUTLIERS * count:
-        return
-    kept = np.setdiff1d(np.arange(count), list(found))
-    named = {int(rows[row]): length for row, length in found.items()}
-
-    def says(_: Agreement, given: Agreement) -> EstimateWarning:
-        one = len(named) == 1
-        text = (
-            f"keypoint{'' if one else 's'} {named_keypoints(named)} {'does' if one else 'do'} not "
-            "fit the others (counted from 0, with the distance from where those put it)"
-        )
-        return EstimateWarning("outlier", _too_large(given) + text, 0, tuple(sorted(named)))
-
-    def undo(view: View) -> View:
-        return replace(
-            view, points_2d=view.pixels[kept], ids=rows[kept].tolist(), sigma=covariances[kept]
-        )
-
-    yield Rule(undo_view=undo, left_out=len(found), gain=-math.inf, says=says)
+        yield OUTLIERS
 
 
 def _mistakes_in(case: Case) -> Iterator[Rule]:

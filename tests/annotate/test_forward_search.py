@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign import Alignment, Camera
-from cadalign.estimation.uncertainty.residuals import PlacedRows, Rows, find_outliers
+from cadalign.annotate.outliers import PlacedRows, Rows, find_outliers
 
 
 def test_a_search_that_goes_round_in_circles_ends() -> None:

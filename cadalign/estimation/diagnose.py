@@ -66,19 +66,15 @@ def diagnose(case: Case, *, result: Result | None = None) -> EstimateWarning | N
 
 def _likeliest(case: Case, given: Agreement) -> EstimateWarning | None:
     rules = list(_rules_for(case, given))
-    # About a centred principal point, flips are the same as a mirrored model. Where perspective is
-    # weak, all keypoints agree with a mirrored model if with any.
-    rest = [each for each in rules if each in (FLIPPED, UPSIDE_DOWN) and MIRRORED in rules]
     if case.ransac is not None and given.inliers == given.keypoints and case.is_exact:
-        rest = [each for each in rules if each is not MIRRORED]
-    found: list[tuple[Rule, Agreement]] = []
-    explaining: list[tuple[Rule, Agreement]] = []
-    for some in ([each for each in rules if each not in rest], rest):
-        tried = [(rule, each) for rule in some if (each := case.without(rule)) is not None]
-        found += tried
-        explaining += [each for each in tried if case.explains(*each, given)]
-        if not explaining:
-            return _unexplained(case, given)
+        # Where perspective is weak, all keypoints agree with a mirrored model if with any.
+        first = case.without(MIRRORED)
+        if first is None or not case.explains(MIRRORED, first, given):
+            return None
+    found = [(rule, each) for rule in rules if (each := case.without(rule)) is not None]
+    explaining = [each for each in found if case.explains(*each, given)]
+    if not explaining:
+        return _unexplained(case, given)
     rule, best = min(explaining, key=lambda each: each[1].score)
     if rule.says is not None:
         return rule.says(best, given)

@@ -245,7 +245,9 @@ class Results(Sequence[Result | CadalignError]):
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         poses = np.full((len(given), POSE_SIZE), np.nan)
         rms, focals = np.full((2, len(given)), np.nan)
-        covariance = np.full((len(given), unknowns, unknowns), np.nan)
+        covariance: FloatArray | None = np.full((len(given), unknowns, unknowns), np.nan)
+        if found and all(each.fisher_covariance is None for each in found.values()):
+            covariance = None
         residuals = np.full((int(offsets[-1]), 2), np.nan)
         inliers = np.zeros(len(residuals), dtype=bool)
         for k, each in found.items():
@@ -253,7 +255,7 @@ class Results(Sequence[Result | CadalignError]):
             poses[k], rms[k], focals[k] = each.alignment.packed, each.rms, each.camera.fx
             residuals[rows], inliers[rows] = each.residuals, each.inliers
             information = each.fisher_covariance
-            if information is not None and len(information) == unknowns:
+            if covariance is not None and information is not None and len(information) == unknowns:
                 covariance[k] = information
         is_single = all(len(each.views) == 1 for each in found.values())
         arrays = poses, rms, focals, covariance, residuals, inliers, offsets
@@ -267,7 +269,7 @@ class Results(Sequence[Result | CadalignError]):
         names = ("poses", "rms", "focal_length", "fisher_covariance", "residuals", "inliers")
         columns = {name: [getattr(part, name) for part in parts] for name in names}
         arrays: dict[str, Any] = {
-            name: None if each[0] is None else np.concatenate(each)
+            name: None if any(one is None for one in each) else np.concatenate(each)
             for name, each in columns.items()
         }
         sizes = np.concatenate([np.diff(part.offsets) for part in parts])

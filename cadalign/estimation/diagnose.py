@@ -320,13 +320,13 @@ def _other_sizes(case: Case) -> Iterator[Rule]:
     own, is_inside = f"{camera.width} x {camera.height} px", holds_most(1.0)
     for factor in OTHER_SIZES:
         is_usual = (factor > 1) != is_inside and (factor > 1 or case.ransac is None)
-        if case.options is not None or (is_usual and holds_most(factor)):
-            width, height = _size(camera, factor)
-            yield Rule(
-                f"the keypoints are of images of {width} x {height} px, the camera of {own}",
-                partial(_resized, factor=factor, noise=1.0 if is_inside else max(factor, 1.0)),
-                gain=CAMERA_GAIN,
-            )
+        if case.options is None and not (is_usual and holds_most(factor)):
+            continue
+        width, height = _size(camera, factor)
+        clause = f"the keypoints are of images of {width} x {height} px, the camera of {own}"
+        for noise in sorted({1.0, 1.0 if is_inside else max(factor, 1.0)}):
+            undo = partial(_resized, factor=factor, noise=noise)
+            yield Rule(clause, undo, gain=CAMERA_GAIN)
 
 
 # Texts -------------------------------------------------------------------------------------------
@@ -335,11 +335,11 @@ def _other_sizes(case: Case) -> Iterator[Rule]:
 def _named(found: Sequence[tuple[Rule, Agreement]], best: Agreement) -> str:
     """Names of the mistakes that are as likely as the best; first those of an upright object."""
     likely = [each for each in found if each[1].score <= best.score + _AS_LIKELY]
-    upright = [mistake.clause for mistake, each in likely if each.is_upright]
-    others = [mistake.clause for mistake, each in likely if not each.is_upright]
-    named = listed(upright or others)
+    upright = {mistake.clause: None for mistake, each in likely if each.is_upright}
+    others = {mistake.clause: None for mistake, each in likely if not each.is_upright}
+    named = listed(list(upright or others))
     if upright and others:
-        named += f" (or, if y is not up in the photo, {listed(others)})"
+        named += f" (or, if y is not up in the photo, {listed(list(others))})"
     return named
 
 

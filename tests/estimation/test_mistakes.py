@@ -189,6 +189,14 @@ def test_the_share_of_chance_rises_with_the_stretch() -> None:
         check_support([few], 4, share=shares[0], **options)  # type: ignore[arg-type]
 
 
+def test_a_flip_about_another_point_than_the_middle_is_named() -> None:
+    """There it is no mirrored model's."""
+    for seed in range(10):
+        problem = seen(seed, camera=OFF_CENTRE).mistaken("flipped")
+        found = fit(problem.points_3d, problem.points_2d, problem.camera)
+        assert NAMES["flipped"] in found.warnings[0].text
+
+
 def test_outliers_beside_a_mistake_hide_it_not() -> None:
     for seed in range(20):
         problem = spoiled(seen(seed, count=12), seed).mistaken("swapped")

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -14,9 +14,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, IntArray, as_floats, is_number, is_whole
 from cadalign.errors import InputError, quote, require_kind
 from cadalign.shapes.basis import component_of_basis, component_of_covariance, symmetric_component
-from cadalign.shapes.examples import LEAST_MODELS, Dataset, Example, examples_of
 from cadalign.shapes.gaussians import Gaussians
-from cadalign.shapes.learning import learn_parts
 from cadalign.shapes.outputs import read_shape, write_shape
 from cadalign.shapes.parts import (
     BOX_ROWS,
@@ -34,6 +32,9 @@ from cadalign.shapes.parts import (
     checked_box,
     given_ids,
 )
+
+if TYPE_CHECKING:
+    from cadalign.shapes.examples import Dataset, Example
 
 OnProgress = Callable[[int, int], object]
 """Called with the number of steps that are done and that of all."""
@@ -164,6 +165,8 @@ class ShapeModel:
             If there are too few models, a model id occurs twice, the models' ids are partly numbers
             and partly names, or an option is out of range.
         """
+        from cadalign.shapes.learning import learn_parts  # an estimate learns nothing
+
         learned = learn_parts(
             list(models), on_progress, components=components, modes=modes, reflection=reflection
         )
@@ -202,6 +205,8 @@ class ShapeModel:
         InputError
             If category or split is unknown, or the category has too few models.
         """
+        from cadalign.shapes.examples import LEAST_MODELS, examples_of
+
         models = dataset.subset(categories=[category], split=split)[category]
         if len(models) < LEAST_MODELS:
             where = f"{category}, split {split}" if split else category

@@ -21,7 +21,7 @@ from cadalign.estimation.assemble import KeypointPosterior, result_of_keypoints
 from cadalign.estimation.fit import fit_once
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
-from cadalign.estimation.problems import pack_one
+from cadalign.estimation.problems import Problems, pack_one
 from cadalign.estimation.result_parts import FittedKeypoints, listed, uncertainty_of
 from cadalign.estimation.uncertainty.doubts import (
     CAMERA_GAIN,
@@ -151,6 +151,14 @@ def diagnose_refusal(case: Case, *, with_keypoints: bool = True) -> str | None:
     return f"{_named(found, best)}: corrected, {best.inliers} of {best.keypoints} keypoints agree"
 
 
+def diagnose_refused_fit(
+    problems: Problems, options: FitOptions, ransac: RansacOptions | None
+) -> str | None:
+    """As `diagnose_refusal`, of the only problem."""
+    view = View(problems.camera(0), problems.points_2d, sigma=options.sigma)
+    return diagnose_refusal(_case_of_fit(problems.points_3d, view, options, ransac))
+
+
 def _case_of_rows(
     fitted: FittedKeypoints, kept: BoolArray, ransac: RansacOptions | None = None
 ) -> Case:
@@ -158,10 +166,10 @@ def _case_of_rows(
     if sigma is not None and np.ndim(sigma) > 0:
         sigma = np.asarray(sigma)[rows]
     view = View(fitted.camera, fitted.observed[rows], ids=rows.tolist(), sigma=sigma)
-    return case_of_fit(fitted.points_3d, view, fitted.options, ransac)
+    return _case_of_fit(fitted.points_3d, view, fitted.options, ransac)
 
 
-def case_of_fit(
+def _case_of_fit(
     points_3d: FloatArray, view: View, options: FitOptions, ransac: RansacOptions | None
 ) -> Case:
     """The case of a fit of a model's keypoints (n, 3) to a view, whose ids are rows of these."""

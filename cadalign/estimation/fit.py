@@ -166,12 +166,9 @@ def fit_one(
     try:
         fitted = fit_once(problems, options, ransac, scores, start)
     except NoConsensusError as error:
-        from cadalign.estimation.diagnose import case_of_fit, diagnose_refusal
-        from cadalign.estimation.view import View
+        from cadalign.estimation.diagnose import diagnose_refused_fit  # which makes fits anew
 
-        view = View(problems.camera(0), problems.points_2d, sigma=options.sigma)
-        case = case_of_fit(problems.points_3d, view, options, ransac)
-        error.fix = diagnose_refusal(case) or error.fix
+        error.fix = diagnose_refused_fit(problems, options, ransac) or error.fix
         raise
     return result_of_keypoints(
         problems.points_2d, fitted, diagnosis=diagnosis_of_fit, symmetry=symmetry

@@ -21,7 +21,7 @@ from cadalign.datasets import AnnotatedModel
 from cadalign.errors import InputError
 from cadalign.estimation.contours.mask import MaskSource
 from cadalign.estimation.contours.outline import MeasuredOutline, Track
-from cadalign.estimation.contours.problem import ContourProblem, Place, shift_to
+from cadalign.estimation.contours.problem import ContourProblem, Place
 from cadalign.estimation.contours.surface import surface_of
 from cadalign.estimation.estimates import mean_state, pose_and_lengths
 from cadalign.estimation.pack import evidence_of
@@ -277,7 +277,7 @@ def _ends_of(models: list[_Meshed], fill: tuple[float, float], count: int, seed:
         est, truth = result.alignment, case.seen.alignment
         # With the logarithm of the distance: it rises with the stretches where the size is open.
         error = section.deviation(est=truth, gt=est)[_FREE]
-        error[3:6] = shift_to(est.translation, truth.translation)
+        error[3:6] = _shift_to(est.translation, truth.translation)
         square = error @ np.linalg.solve(result.covariance[np.ix_(_FREE, _FREE)], error)
         lengths = np.linalg.norm([truth.translation, est.translation], axis=1)
         errors = np.abs([*error[6:], np.log(lengths[1] / lengths[0])])
@@ -298,6 +298,13 @@ def _ends_of(models: list[_Meshed], fill: tuple[float, float], count: int, seed:
         "distance, %": 100 * float(np.median(distance)),
         "seconds": float(np.median(walls)),
     }
+
+
+def _shift_to(place: FloatArray, other: FloatArray) -> FloatArray:
+    """The step to another place, of which the part along the direction is that of a logarithm."""
+    square, along = float(place @ place), float(place @ other)
+    ratio = np.log(np.linalg.norm(other) / np.sqrt(square))
+    return np.asarray(ratio * place + square / along * other - place)
 
 
 def _damaged(

@@ -37,7 +37,7 @@ REACH = 2.0
 _STEP = 0.25
 _LONGEST_STEP = 1.5  # [px], between rays on a normal: a thinner part may be missed
 _MOST_STEPS = 24  # to either side
-_PRECISION = 0.05  # [px], of a rim
+_PRECISION, _ROUGH = 0.05, 0.2  # [px], of a rim
 _STEEPEST = 1.2  # tangent of the angle between rim and contour above which these don't match
 # Widths [px] of the band about a rim where pixels may differ from the mask's, by the largest
 # distance [px] of the rim from the contour; smoothing does not reach beyond the last.
@@ -110,7 +110,7 @@ def sampled(image: Image, points: FloatArray) -> FloatArray:
     OpenCV 4 rounds places to 1/32 px (`cv2.remap`), which moves contours by more than the precision
     that is sought.
     """
-    places = np.clip(np.nan_to_num(points), 0, np.subtract(image.shape[::-1], 1))
+    places = np.fmin(np.fmax(points, 0.0), np.subtract(image.shape[::-1], 1))  # 0 for NaN
     values = map_coordinates(image, places.T[::-1], order=1, mode="nearest", output=np.float64)
     return np.asarray(values)
 
@@ -285,19 +285,20 @@ class Sight(NamedTuple):
         return origin, flat @ by_pixel.T + first, np.True_
 
 
-def find_rims(sight: Sight, contour: Contour, reach: float) -> Rims:
+def find_rims(sight: Sight, contour: Contour, reach: float, *, is_rough: bool = False) -> Rims:
     """Find the rims that are nearest to a contour, at most ``reach`` [px] away.
 
-    A rim is a change from the object to the background in the contour's outward direction.
+    A rim is a change from the object to the background in the contour's outward direction. It
+    ``is_rough`` where the `extraction_bias` is taken of it, which is as accurate for a rough one.
     """
-    count = len(contour.points)
+    count, precision = len(contour.points), _ROUGH if is_rough else _PRECISION
     intervals = 2 * min(int(np.ceil(reach / _LONGEST_STEP)), _MOST_STEPS)
     steps = np.linspace(-reach, reach, intervals + 1)
     first, found = _nearest_exits(sight, contour, steps)
     rows = np.flatnonzero(found)
     some = contour.taken(rows)
     inner, outer = steps[first[rows]], steps[first[rows] + 1]
-    for _ in range(int(np.ceil(np.log2((steps[1] - steps[0]) / _PRECISION)))):
+    for _ in range(int(np.ceil(np.log2((steps[1] - steps[0]) / precision)))):
         half = (inner + outer) / 2
         inside = sight.covers(some.at(half))
         inner, outer = np.where(inside, half, inner), np.where(inside, outer, half)

@@ -34,11 +34,8 @@ _MOST_ROUNDS = 16
 _FEW_ITERATIONS = 4  # of a round, whose rims are not those of its end
 _ITERATIONS = 12
 _MOST_STEPS = 20
-_SHARES = (0.3,)  # of a step that does not lower the cost
-_SHARES_OF_OTHERS = (0.5, 0.25)  # of the way to another estimate
+_PATIENCE = 2  # steps that don't lower the cost
 _LEAST_GAIN = 0.3  # of the cost, -2 log likelihood
-_WEAKEST = 1  # directions that are tried before a descent ends
-_MOST_NOISES = 1  # that are learned anew, each where the cost at the last is least
 _LEAST_FREEDOM = 0.1  # share of the residuals' degrees of freedom that the unknowns leave
 
 
@@ -83,15 +80,12 @@ def first_fit(problem: ContourProblem, state: State) -> OutlineFit | None:
 
 
 def last_fit(
-    problem: ContourProblem,
-    fit: OutlineFit,
-    tracks: Sequence[Track] | None = None,
-    others: Sequence[Place] = (),
+    problem: ContourProblem, fit: OutlineFit, tracks: Sequence[Track] | None = None
 ) -> OutlineFit | None:
     """The end near another estimate; None without an outline.
 
     Where costs compare, it has the least cost at the noise of ``tracks``, which is learned without
-    them. ``others`` are estimates from other starts, towards which the cost is tried, too.
+    them.
     """
     begun = fit.tracks if tracks is None else tracks
     begun = [source.last(track) for source, track in zip(problem.sources, begun, strict=True)]
@@ -102,7 +96,7 @@ def last_fit(
     if start is None:
         return None
     if tracks is not None:
-        return descended(problem, start, others)
+        return descended(problem, start)
     start = _costed(problem, start.look, _learned(problem, start.look, begun)) or start
     return descended(problem, start, learns=True)
 
@@ -147,19 +141,15 @@ def _costed(
     return OutlineFit(look, augmented, list(tracks), augmented.objective + unmatched, unmatched)
 
 
-def descended(
-    problem: ContourProblem, here: OutlineFit, others: Sequence[Place] = (), *, learns: bool = False
-) -> OutlineFit:
-    """The place where no step lowers the cost, at the noise of a fit; or at its own, if it learns.
+def descended(problem: ContourProblem, here: OutlineFit, *, learns: bool = False) -> OutlineFit:
+    """The place where no step lowers the cost, at the noise of a fit, or what it learns at the end.
 
-    Pixels make the cost rough: where whole steps don't lower it, the least is tried for shorter
-    ones and for others.
+    Pixels make the cost rough: where whole steps don't lower it, others are tried.
     """
-    noises = _MOST_NOISES if learns else 0
     for _ in range(_MOST_STEPS):
-        better = _stepped(problem, here) or _elsewhere(problem, here, others)
-        if better is None and noises:
-            again, noises = _relearned(problem, here), noises - 1
+        better = _stepped(problem, here) or _elsewhere(problem, here)
+        if better is None and learns:
+            again, learns = _relearned(problem, here), False
             better = None if all(map(Track.is_like, again.tracks, here.tracks)) else again
         if better is None:
             break
@@ -168,47 +158,25 @@ def descended(
 
 
 def _stepped(problem: ContourProblem, here: OutlineFit) -> OutlineFit | None:
-    """A place that costs less after whole steps, or on the way to the goal of the first.
-
-    Steps go on for a while where they don't lower the cost.
-    """
-    step = here.augmented.refined(_ITERATIONS)
-    if step is None:
-        return None
-    goal = step.place
-    there = fit_at(problem, goal, here.tracks)
-    if there is not None and not _is_lower(there, here):
+    """A place that costs less after whole steps, which go on for a while where they don't."""
+    there = here
+    for _ in range(_PATIENCE):
         step = there.augmented.refined(_ITERATIONS)
-        there = None if step is None else fit_at(problem, step.place, here.tracks)
-    shares = iter(_SHARES)
-    while not (there and _is_lower(there, here)):
-        share = next(shares, None)
-        if share is None:
-            return None
-        there = fit_at(problem, here.place.towards(goal, share), here.tracks)
-    return there
+        after = None if step is None else fit_at(problem, step.place, here.tracks)
+        if after is None or after.cost < here.cost - _LEAST_GAIN:
+            return after
+        there = after
+    return None
 
 
-def _is_lower(there: OutlineFit, here: OutlineFit) -> bool:
-    return there.cost < here.cost - _LEAST_GAIN
-
-
-def _elsewhere(
-    problem: ContourProblem, here: OutlineFit, others: Sequence[Place]
-) -> OutlineFit | None:
-    """A place that costs less along the directions of which least is known, or to others."""
+def _elsewhere(problem: ContourProblem, here: OutlineFit) -> OutlineFit | None:
+    """A place that costs less along the direction of which least is known."""
     if not problem.surface.is_exact:
         return None
     _, information = information_of(here.augmented.evidence, here.augmented.state)
-    steps = weakest_steps(information, _WEAKEST)
-    goals = [here.place.moved(sign * step) for step in steps for sign in (1.0, -1.0)]
-    goals.extend(
-        here.place.towards(other, share) for other in others for share in _SHARES_OF_OTHERS
-    )
-    found = [fit_at(problem, goal, here.tracks) for goal in goals]
-    best = min(
-        (each for each in found if each is not None), key=lambda each: each.cost, default=here
-    )
+    (step,) = weakest_steps(information, 1)
+    found = [fit_at(problem, here.place.moved(sign * step), here.tracks) for sign in (1.0, -1.0)]
+    best = min((each for each in found if each), key=lambda each: each.cost, default=here)
     return best if best.cost < here.cost - _LEAST_GAIN else None
 
 

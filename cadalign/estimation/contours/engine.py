@@ -44,12 +44,10 @@ _MOST_OPEN_STARTS = 12  # where nothing but masks determines the estimate
 _MOST_FINISHED = 4
 _UNLIKELY = 60.0  # excess score of a minimum that is still a start
 _LEAST_INFORMATION = 1e-9  # about the worst known direction of the unknowns, relative
-# Of further starts: standard deviations along the direction of which an estimate knows least, and
-# that of a logarithm of a scale there, below which the estimate is near enough; standard deviations
-# along directions of the pose, and their turns.
-_SIDEWAYS, _LEAST_STRETCH = (-2.0, -1.0, 1.0, 2.0), 0.05
-_WEAKEST, _SIDEWAYS_OF_POSE = 2, (-1.5, 1.5)
-_LEAST_TURN, _MOST_TURN = np.radians(2.0), np.radians(40.0)
+# Of further starts: directions of which an estimate knows least, standard deviations along these,
+# and turns and logarithms of scales of one standard deviation that are worth a start.
+_WEAKEST, _SIDEWAYS = 2, (-1.5, 1.5)
+_LEAST_TURN, _MOST_TURN, _LEAST_STRETCH = np.radians(1.3), np.radians(40.0), 0.05
 _SAME_TURN_DEG, _SAME_STRETCH = 1.0, 0.2  # logarithms of scales
 _LEAST_SUPPORT = 0.5  # share of a source's samples that must agree with the outline
 _LEAST_PROBABILITY = 1e-5  # of such a rise of the other residuals by chance
@@ -173,7 +171,7 @@ class OutlineSearch(NamedTuple):
         starts = [(each, each.state) for each in self.minima]
         is_comparable = all(source.is_comparable for source in sources)
         if not self.is_open and (self.surface.is_exact or not is_comparable):
-            starts += _displaced(self.minima[0], is_comparable=is_comparable)
+            starts += _displaced(self.minima[0], is_exact=self.surface.is_exact)
         near = []
         for start, state in starts:
             evidence, moved = with_displacement_modes(start.evidence, state)
@@ -223,35 +221,29 @@ def _is_determined(minimum: Minimum) -> bool:
     return bool(np.linalg.eigvalsh(scaled_information(information)[0])[0] > _LEAST_INFORMATION)
 
 
-def _displaced(start: Minimum, *, is_comparable: bool) -> list[tuple[Minimum, State]]:
+def _displaced(start: Minimum, *, is_exact: bool) -> list[tuple[Minimum, State]]:
     """States beside an estimate without outlines, along the directions of which it knows least.
 
-    This is the one of all unknowns, if a stretch is not well known; where costs do not compare,
-    directions of the pose.
+    These are the ones that change a pose, or the stretch of an exact model, by much.
     """
     _, information = information_of(*reduced(start.evidence, start.state))
-    count = 6 * len(start.state.poses) + len(start.state.log_focals) + 3
-    if is_comparable:
-        (step,) = weakest_steps(information, 1)
-        is_near = np.abs(step[count - 3 : count]).max() < _LEAST_STRETCH
-        steps = [] if is_near else [sign * step[:count] for sign in _SIDEWAYS]
-    else:
-        steps = [
-            sign * np.append(step, np.zeros(count - 6))
-            for step in weakest_steps(information[:6, :6], _WEAKEST)
-            for sign in _SIDEWAYS_OF_POSE
-        ]
-        steps = [each for each in steps if _LEAST_TURN < np.linalg.norm(each[:3]) < _MOST_TURN]
-    place = Place.of(start.state)
-    return [(start, place.moved(step).state) for step in steps]
+    poses, rest = 6 * len(start.state.poses), len(start.state.log_focals) + 3
+    count = poses + rest * is_exact
+    place, found = Place.of(start.state), []
+    for weak in weakest_steps(information[:count, :count], _WEAKEST):
+        step = np.append(weak, np.zeros(poses + rest - count))
+        turn = np.linalg.norm(step[:poses].reshape(-1, 6)[:, :3], axis=1).max()
+        stretch = np.abs(step[-3:]).max()
+        if max(turn / _LEAST_TURN, stretch / _LEAST_STRETCH) > 1 and turn < _MOST_TURN:
+            found += [(start, place.moved(sign * step).state) for sign in _SIDEWAYS]
+    return found
 
 
 def _finished(near: list[Candidate]) -> list[Candidate]:
     """The candidates brought to their ends; at the noise of the likeliest where costs compare."""
     found, tracks = [], None
     for each in near:
-        others = [other.fit.place for other in near if other is not each]
-        fit = last_fit(each.problem, each.fit, tracks, others)
+        fit = last_fit(each.problem, each.fit, tracks)
         if fit is not None:
             found.append(each._replace(fit=fit))
             tracks = fit.tracks if each.problem.is_comparable else None

@@ -24,7 +24,7 @@ from cadalign.estimation.contours.outline import (
 from cadalign.estimation.contours.surface import PosedSurface, Surface
 from cadalign.estimation.estimates import poses_of
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
+from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.joint.covariance import scaled_information
 from cadalign.solvers.joint.evidence import (
@@ -57,22 +57,6 @@ class Place(NamedTuple):
         """The place of a state, nothing known of the contours' own modes."""
         return cls(state, np.zeros((contours, OWN_MODES)))
 
-    def towards(self, other: Place, share: float) -> Place:
-        """The place a share of the way to another one."""
-        a, b = self.state, other.state
-        steps = []
-        for start, end in zip(a.poses, b.poses, strict=True):
-            turn = end[:9].reshape(3, 3) @ start[:9].reshape(3, 3).T
-            steps.append(np.append(vector_from_rotation(turn), shift_to(start[9:], end[9:])))
-        step = [*steps, b.log_focals - a.log_focals, b.log_scales - a.log_scales]
-        own = (other.own - self.own).ravel()
-        there = self.moved(share * np.concatenate([*step, own]))
-        rest = {
-            name: (1 - share) * getattr(a, name) + share * getattr(b, name)
-            for name in ("coefficients", "displacements")
-        }
-        return there._replace(state=there.state._replace(**rest))
-
     def moved(self, step: FloatArray) -> Place:
         """The place after a step (U,) of poses, focal lengths, scales and own modes."""
         state, count = self.state, len(self.state.poses)
@@ -99,16 +83,6 @@ def shifted(place: FloatArray, step: FloatArray) -> FloatArray:
     along = float(direction @ step) / distance
     across = place + step - along * place
     return np.asarray(distance * np.exp(along) * across / np.linalg.norm(across))
-
-
-def shift_to(place: FloatArray, other: FloatArray) -> FloatArray:
-    """The step that `shifted` takes from a place to another one."""
-    distance, far = float(np.linalg.norm(place)), float(np.linalg.norm(other))
-    along = float(place @ other)
-    if not along > 0:
-        return other - place
-    across = distance**2 / along * other - place
-    return np.asarray(np.log(far / distance) * place + across)
 
 
 def solved(information: FloatArray, right: FloatArray) -> FloatArray:

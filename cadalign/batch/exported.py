@@ -68,6 +68,10 @@ def exported_object(
         result = replace(result, ids=own, views=views)
     else:
         model = _shape(result, seen, shape)
+        pairs = zip(result.views, own_ids(seen.views), strict=True)
+        if model is None and any(tuple(view.ids) != own for view, own in pairs):
+            what, fix = "its keypoints are not the fit's", "give the observation that was fitted"
+            raise DataError(what, where=str(path), fix=fix)
         mesh = mesh_of(seen, replace(result, model=model))
     name = "model" if seen.model is None else seen.model.stem
     images = [view.image for view in seen.views]

@@ -134,6 +134,20 @@ def test_an_observation_that_was_changed_is_refused(
     assert f"{observed}: 8 keypoints, but the fit has 7" in said or "the fit has 8" in said
 
 
+def test_an_observation_with_other_keypoints_is_refused(
+    tmp_path: Path, observed: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = json.loads(observed.read_text())
+    for number, keypoint in enumerate(data["keypoints"]):
+        keypoint["name"] = f"corner {number}"
+    observed.write_text(json.dumps(data))
+    assert main(["fit", str(observed), "--shape-sigma", "0.05", "--no-picture"]) == 0
+    data["keypoints"][0]["name"] = "another corner"
+    observed.write_text(json.dumps(data))
+    said = refusal(capsys, tmp_path / "photo_fit" / "fit.json", "--to", tmp_path / "a.glb")
+    assert f"{observed.name}: its keypoints are not the fit's; give the observation" in said
+
+
 @pytest.mark.long
 def test_views_and_warped_mesh_of_a_joint_fit(tmp_path: Path, observed: Path) -> None:
     first = Observation.load(observed)

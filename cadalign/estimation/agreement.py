@@ -139,8 +139,9 @@ class Case:
                 seen = own.residuals[kept], information[kept]
                 squares += float(np.einsum("ni,nij,nj->", seen[0], seen[1], seen[0]))
                 score += float((math.log(4 * math.pi**2) - np.log(np.linalg.det(seen[1]))).sum())
-                area = area_of(own.points_2d, own.camera, threshold)
-                score += 2 * math.log(area) * int((~kept).sum())
+                if not kept.all():
+                    area = area_of(own.points_2d, own.camera, threshold)
+                    score += 2 * math.log(area) * int((~kept).sum())
         kinds = {each.kind for each in result.evidence}
         is_whole = inliers == int(result.inliers.sum())
         if result.cost is not None and is_whole and not kinds & {"mask", "photo"}:

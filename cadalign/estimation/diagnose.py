@@ -53,12 +53,12 @@ def diagnose(case: Case, *, result: Result | None = None) -> EstimateWarning | N
     ``case`` has the views that take part in the estimate, whose masks and photos are left out, and
     ``result`` is the estimate; by default it is made again.
     """
-    shown = replace(case, views=_without_outlines(case.views))
-    if not any(len(view.keypoint_ids) for view in shown.views):
+    if not any(len(view.keypoint_ids) for view in case.views):
         return None
     given = None if result is None else case.agreement(result)
     if given is not None and not case.is_doubtful(given):
         return None
+    shown = replace(case, views=_without_outlines(case.views))
     if given is None or any(view.has_outline for view in case.views):
         given = shown.without(AS_GIVEN)
     return None if given is None else _likeliest(shown, given)
@@ -110,7 +110,10 @@ def _unexplained(case: Case, given: Agreement) -> EstimateWarning | None:
 
 def _without_outlines(views: Sequence[View]) -> tuple[View, ...]:
     """The views with evidence beside masks and photos."""
-    given = [replace(view, mask=None, mask_sigma=None, image=None) for view in views]
+    given = [
+        replace(view, mask=None, mask_sigma=None, image=None) if view.has_outline else view
+        for view in views
+    ]
     return tuple(view for view in given if view.has_evidence)
 
 

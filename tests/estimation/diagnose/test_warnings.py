@@ -139,7 +139,7 @@ def learned(root: Path, category: str) -> ShapeModel:
 @pytest.fixture
 def measured(real_data: Path, monkeypatch: pytest.MonkeyPatch) -> Measured:
     """Cases of the benchmark, by its options."""
-    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "scripts")
+    monkeypatch.syspath_prepend(Path(__file__).parents[3] / "scripts")
     section = importlib.import_module("benchmarks.section")
     monkeypatch.setattr(section, "learned_shape", lambda data, name: learned(data.root, name))
     warned = importlib.import_module("benchmarks.warned")

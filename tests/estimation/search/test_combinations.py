@@ -33,7 +33,7 @@ from cadalign import Alignment, Camera, View, align
 from cadalign.estimation.result import Result
 from cadalign.metrics import rotation_error
 
-PAGE = Path(__file__).parents[2] / "docs" / "how_to" / "combinations.md"
+PAGE = Path(__file__).parents[3] / "docs" / "how_to" / "combinations.md"
 SIGMAS = 5.0
 LARGEST_ROTATION_DEG = 12.0
 LARGEST_LOG_FOCAL = 0.4

@@ -7,7 +7,8 @@ Masks and photos that contradict the rest are left out.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -57,14 +58,15 @@ _NO_OUTLINE = (
 )
 
 
-class Candidate(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Candidate:
     """A start, what is to be refined from there, and where that led."""
 
     start: Minimum
     problem: ContourProblem
     fit: OutlineFit
 
-    @property
+    @cached_property
     def supports(self) -> list[OutlineSupport]:
         """The agreement of each source with the outline."""
         return [
@@ -72,7 +74,7 @@ class Candidate(NamedTuple):
             for source, each in zip(self.problem.sources, self.fit.measured, strict=True)
         ]
 
-    @property
+    @cached_property
     def rank(self) -> float:
         """-2 log of its probability by the other evidence and by the outlines, up to a constant."""
         rest = cost_of(self.problem.evidence, self.fit.place.state) + self.start.prior_score
@@ -245,7 +247,7 @@ def _finished(near: list[Candidate]) -> list[Candidate]:
     for each in near:
         fit = last_fit(each.problem, each.fit, tracks)
         if fit is not None:
-            found.append(each._replace(fit=fit))
+            found.append(replace(each, fit=fit))
             tracks = fit.tracks if each.problem.is_comparable else None
     return _distinct_candidates(found)
 

@@ -41,7 +41,7 @@ _PRECISION, _ROUGH = 0.05, 0.2  # [px], of a rim
 _STEEPEST = 1.2  # tangent of the angle between rim and contour above which these don't match
 # Widths [px] of the band about a rim where pixels may differ from the mask's, by the largest
 # distance [px] of the rim from the contour; smoothing does not reach beyond the last.
-_BANDS = ((0.25, 3), (1.0, 5), (np.inf, 7))
+_BANDS = ((0.5, 3), (1.5, 5), (np.inf, 7))
 _MARGIN = 8  # [px], about the rims: their reach, and that of smoothing
 _LEAST_COSINE = 0.3  # between rim and contour
 

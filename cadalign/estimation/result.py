@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from cadalign.errors import InputError
 from cadalign.estimation.result_data import ResultData
+from cadalign.io.files import as_path, write_json
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -127,8 +128,6 @@ class Result(ResultData):
         DataError
             If the file cannot be written.
         """
-        from cadalign.io.files import as_path, write_json
-
         write_json(as_path(path), self.to_dict())
 
     @classmethod
@@ -141,7 +140,6 @@ class Result(ResultData):
             If the file cannot be read, or a field is missing or invalid; the message names both.
         """
         from cadalign.io.documents import in_file, read_json
-        from cadalign.io.files import as_path
 
         path = as_path(path)
         data = read_json(path)

@@ -7,7 +7,7 @@ import os
 from collections.abc import Hashable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -313,11 +313,9 @@ class ResultData:
             If there is no mesh to warp.
         """
         from cadalign.io.meshes.files import as_mesh
-        from cadalign.shapes.model import ShapeModel
         from cadalign.shapes.warp import warp_mesh
 
-        model = self.model
-        if isinstance(model, ShapeModel):
+        if self._learned_shape is not None:
             source = self.nearest.points_3d
             known = np.isfinite(source).all(axis=1)
             path = self.nearest.mesh_path if mesh is None else mesh
@@ -326,6 +324,7 @@ class ResultData:
                 raise InputError("the training models have no meshes", where="mesh", fix=fix)
             own = as_mesh(path, where="mesh")
             return warp_mesh(own, source[known], self.points_3d[known], bounds=self.bounds)
+        model = cast("Model | None", self.model)
         given = mesh if mesh is not None or model is None else model.mesh
         if given is None:
             raise InputError("the model has no mesh", where="mesh", fix="give one")
@@ -339,13 +338,12 @@ class ResultData:
 
         A training model's mesh that cannot be read is warned of (logger "cadalign").
         """
-        from cadalign.shapes.model import ShapeModel
-
+        shape = self._learned_shape
         if mesh is not None:
             return self.mesh(mesh)
-        if not isinstance(self.model, ShapeModel):
-            return None if self.model is None or self.model.mesh is None else self.mesh()
-        training = self.model.training
+        if shape is None:
+            return None if getattr(self.model, "mesh", None) is None else self.mesh()
+        training = shape.training
         if training is None or not len(training) or self.nearest.mesh_path is None:
             return None
         try:
@@ -363,8 +361,12 @@ class ResultData:
         InputError
             If the model is not learned, or its training models are not known.
         """
+        if self._learned_shape is None:
+            raise InputError("only a learned shape has training models", where="model")
+        return self._learned_shape.nearest(self.points_3d)
+
+    @property
+    def _learned_shape(self) -> ShapeModel | None:
         from cadalign.shapes.model import ShapeModel
 
-        if not isinstance(self.model, ShapeModel):
-            raise InputError("only a learned shape has training models", where="model")
-        return self.model.nearest(self.points_3d)
+        return self.model if isinstance(self.model, ShapeModel) else None

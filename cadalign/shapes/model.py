@@ -55,6 +55,7 @@ class ShapeModel:
 
     Examples
     --------
+    >>> from cadalign import Example
     >>> rng = np.random.default_rng(0)
     >>> names = ["origin", "right", "top", "front"]
     >>> corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)

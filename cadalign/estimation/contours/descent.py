@@ -35,7 +35,7 @@ _FEW_ITERATIONS = 4  # of a round, whose rims are not those of its end
 _ITERATIONS = 12
 _MOST_STEPS = 20
 _PATIENCE = 2  # steps that don't lower the cost
-_LEAST_GAIN = 0.3  # of the cost, -2 log likelihood
+_LEAST_GAIN = 1.0  # of the cost, -2 log likelihood
 _LEAST_FREEDOM = 0.1  # share of the residuals' degrees of freedom that the unknowns leave
 
 
@@ -142,15 +142,21 @@ def _costed(
 
 
 def descended(problem: ContourProblem, here: OutlineFit, *, learns: bool = False) -> OutlineFit:
-    """The place where no step lowers the cost, at the noise of a fit, or what it learns at the end.
+    """The place where no step lowers the cost, at the noise of a fit, or what it learns on the way.
 
-    Pixels make the cost rough: where whole steps don't lower it, others are tried.
+    Pixels make the cost rough: where whole steps don't lower it, the noise is learned once more
+    and others are tried.
     """
+    is_searched = False  # along the direction of which least is known
     for _ in range(_MOST_STEPS):
-        better = _stepped(problem, here) or _elsewhere(problem, here)
+        better = _stepped(problem, here)
         if better is None and learns:
             again, learns = _relearned(problem, here), False
             better = None if all(map(Track.is_like, again.tracks, here.tracks)) else again
+        if better is None and not is_searched:
+            better, is_searched = _elsewhere(problem, here), True
+        else:
+            is_searched = False
         if better is None:
             break
         here = better
@@ -170,14 +176,21 @@ def _stepped(problem: ContourProblem, here: OutlineFit) -> OutlineFit | None:
 
 
 def _elsewhere(problem: ContourProblem, here: OutlineFit) -> OutlineFit | None:
-    """A place that costs less along the direction of which least is known."""
+    """The first place along the direction of which least is known where no step costs less."""
     if not problem.surface.is_exact:
         return None
     _, information = information_of(here.augmented.evidence, here.augmented.state)
     (step,) = weakest_steps(information, 1)
-    found = [fit_at(problem, here.place.moved(sign * step), here.tracks) for sign in (1.0, -1.0)]
-    best = min((each for each in found if each), key=lambda each: each.cost, default=here)
-    return best if best.cost < here.cost - _LEAST_GAIN else None
+    best = here
+    for sign in (1.0, -1.0):
+        for _ in range(_MOST_STEPS):
+            there = fit_at(problem, best.place.moved(sign * step), here.tracks)
+            if there is None or not there.cost < best.cost - _LEAST_GAIN:
+                break
+            best = there
+        if best is not here:
+            return best
+    return None
 
 
 def _learned(problem: ContourProblem, look: PosedOutlines, tracks: Sequence[Track]) -> list[Track]:

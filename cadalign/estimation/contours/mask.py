@@ -40,7 +40,9 @@ from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
 
 _LARGEST = 24.0  # [px], distance of a sample without a rim, where estimates are compared
-_RANKED = Noise(1.0, 10.0, 0.0)  # of the samples, where estimates are compared
+# Of the samples where estimates are compared: their least and largest deviation, and neighbours
+# that count as one.
+_RANKED, _RANKED_CORRELATION = (0.2, 1.0), 10.0
 _LEAST_SIGMA = 0.1  # [px]
 _FIRST_OFFSET = 1.0  # [px], standard deviation of the offset that all of a contour has in common
 _UNEVEN = 0.05  # share of the offset by which it differs from edge to edge
@@ -149,9 +151,11 @@ class MaskSource(OutlineSource):
         return track._replace(reach=min(track.reach, max(_REACH * track.noise.sigma, least)))
 
     def rank(self, found: MeasuredOutline) -> float:
-        """See `OutlineSource`; the noise is not that of the residuals, and the same everywhere."""
+        """See `OutlineSource`; the noise is that of the estimate, within bounds."""
         residuals = np.nan_to_num(found.residuals, nan=_LARGEST)
-        return float(_RANKED.costs(residuals).sum())
+        noise = Noise(float(np.clip(found.noise.sigma, *_RANKED)), _RANKED_CORRELATION, 0.0)
+        normalization = 2 * len(residuals) / _RANKED_CORRELATION * float(np.log(noise.sigma))
+        return float(noise.costs(residuals).sum()) + normalization
 
     def refusal(self, support: OutlineSupport) -> str:
         """See `OutlineSource`."""

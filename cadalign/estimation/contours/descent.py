@@ -34,8 +34,9 @@ _MOST_ROUNDS = 16
 _FEW_ITERATIONS = 4  # of a round, whose rims are not those of its end
 _ITERATIONS = 12
 _MOST_STEPS = 20
+_MOST_NOISES = 2  # that a descent learns
 _PATIENCE = 2  # steps that don't lower the cost
-_LEAST_GAIN = 1.0  # of the cost, -2 log likelihood
+_LEAST_GAIN = 0.3  # of the cost, -2 log likelihood
 _LEAST_FREEDOM = 0.1  # share of the residuals' degrees of freedom that the unknowns leave
 
 
@@ -144,15 +145,17 @@ def _costed(
 def descended(problem: ContourProblem, here: OutlineFit, *, learns: bool = False) -> OutlineFit:
     """The place where no step lowers the cost, at the noise of a fit, or what it learns on the way.
 
-    Pixels make the cost rough: where whole steps don't lower it, the noise is learned once more
+    Pixels make the cost rough: where whole steps don't lower it, the noise is learned anew
     and others are tried.
     """
+    noises = _MOST_NOISES if learns else 0
     is_searched = False  # along the direction of which least is known
     for _ in range(_MOST_STEPS):
         better = _stepped(problem, here)
-        if better is None and learns:
-            again, learns = _relearned(problem, here), False
-            better = None if all(map(Track.is_like, again.tracks, here.tracks)) else again
+        if better is None and noises:
+            again = _relearned(problem, here)
+            if not all(map(Track.is_like, again.tracks, here.tracks)):
+                better, noises = again, noises - 1
         if better is None and not is_searched:
             better, is_searched = _elsewhere(problem, here), True
         else:

@@ -90,7 +90,7 @@ class Agreement(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class DiagnosisCase:
     """The data of an estimate, the estimate as a function of these, and the search for inliers."""
 
     model: AnyModel

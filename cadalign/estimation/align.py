@@ -19,7 +19,7 @@ from cadalign.errors import (
     quote,
     require_kind,
 )
-from cadalign.estimation.agreement import Case
+from cadalign.estimation.agreement import DiagnosisCase
 from cadalign.estimation.contours import refine
 from cadalign.estimation.diagnose import diagnose, diagnose_refusal
 from cadalign.estimation.focal import PriorOption
@@ -129,7 +129,7 @@ def align(
         problem = compile_problem(model, views, size, some, own, ransac)
         return _estimate(problem, start)[0]
 
-    case = Case(model, [given[number] for number in problem.numbers], again, ransac)
+    case = DiagnosisCase(model, [given[number] for number in problem.numbers], again, ransac)
     try:
         result, causes = _estimate(problem, start)
     except (NoConsensusError, DegenerateError) as error:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.estimation.agreement import AS_GIVEN, Agreement, AnyModel, Case, Rule
+from cadalign.estimation.agreement import AS_GIVEN, Agreement, AnyModel, DiagnosisCase, Rule
 from cadalign.estimation.assemble import KeypointPosterior, result_of_keypoints
 from cadalign.estimation.fit import fit_once
 from cadalign.estimation.model import Model
@@ -47,7 +47,7 @@ _TESTED_TO = 0.1  # relative standard deviation to which a held scale must be te
 
 
 @np.errstate(all="ignore")
-def diagnose(case: Case, *, result: Result | None = None) -> EstimateWarning | None:
+def diagnose(case: DiagnosisCase, *, result: Result | None = None) -> EstimateWarning | None:
     """Name the likeliest cause without which all data agree, where the residuals fail their test.
 
     ``case`` has the views that take part in the estimate, whose masks and photos are left out, and
@@ -64,7 +64,7 @@ def diagnose(case: Case, *, result: Result | None = None) -> EstimateWarning | N
     return None if given is None else _likeliest(shown, given)
 
 
-def _likeliest(case: Case, given: Agreement) -> EstimateWarning | None:
+def _likeliest(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
     rules = list(_rules_for(case, given))
     if case.ransac is not None and given.inliers == given.keypoints and case.is_exact:
         # Where perspective is weak, all keypoints agree with a mirrored model if with any.
@@ -82,7 +82,7 @@ def _likeliest(case: Case, given: Agreement) -> EstimateWarning | None:
     return EstimateWarning("mistake", f"{named}: corrected, {_compared(best, given)}")
 
 
-def _unexplained(case: Case, given: Agreement) -> EstimateWarning | None:
+def _unexplained(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
     """The warning about residuals that no rule explains, or a stretch that these do not test."""
     if case.options is None:
         return None
@@ -134,7 +134,7 @@ def diagnose_fit(fitted: FittedKeypoints) -> EstimateWarning | None:
 
 
 @np.errstate(all="ignore")
-def diagnose_refusal(case: Case, *, with_keypoints: bool = True) -> str | None:
+def diagnose_refusal(case: DiagnosisCase, *, with_keypoints: bool = True) -> str | None:
     """Name the mistake without which there is an estimate, where there is none of the data.
 
     Mistakes in keypoints are tried ``with_keypoints``, otherwise those in other evidence alone.
@@ -164,7 +164,7 @@ def diagnose_refused_fit(
 
 def _case_of_rows(
     fitted: FittedKeypoints, kept: BoolArray, ransac: RansacOptions | None = None
-) -> Case:
+) -> DiagnosisCase:
     rows, sigma = np.flatnonzero(kept), fitted.options.sigma
     if sigma is not None and np.ndim(sigma) > 0:
         sigma = np.asarray(sigma)[rows]
@@ -174,7 +174,7 @@ def _case_of_rows(
 
 def _case_of_fit(
     points_3d: FloatArray, view: View, options: FitOptions, ransac: RansacOptions | None
-) -> Case:
+) -> DiagnosisCase:
     """The case of a fit of a model's keypoints (n, 3) to a view, whose ids are rows of these."""
     model = Model(
         points_3d=points_3d,
@@ -194,7 +194,7 @@ def _case_of_fit(
         return result_of_keypoints(view.pixels, fitted, view=view)
 
     is_tested = ransac is None and options.sigma is not None
-    return Case(model, (view,), again, ransac, options if is_tested else None)
+    return DiagnosisCase(model, (view,), again, ransac, options if is_tested else None)
 
 
 def _rows_of(view: View) -> IntArray:
@@ -282,7 +282,7 @@ OUTLIERS = Rule(changes={"ransac": RansacOptions()}, gain=-math.inf, says=_say_o
 ANOTHER_FOCAL = Rule(changes={"focal": "estimate"}, gain=CAMERA_GAIN, says=_say_camera)
 
 
-def _rules_for(case: Case, given: Agreement) -> Iterator[Rule]:
+def _rules_for(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
     """The rules that may explain such residuals."""
     options, is_doubtful = case.options, case.is_doubtful(given)
     if is_doubtful:
@@ -300,7 +300,7 @@ def _rules_for(case: Case, given: Agreement) -> Iterator[Rule]:
         yield OUTLIERS
 
 
-def _mistakes_in(case: Case) -> Iterator[Rule]:
+def _mistakes_in(case: DiagnosisCase) -> Iterator[Rule]:
     """Mistakes that such data may have."""
     model, views = case.model, case.views
     if isinstance(model, Model):  # learned models share one frame
@@ -313,7 +313,7 @@ def _mistakes_in(case: Case) -> Iterator[Rule]:
         yield DOWNWARD
 
 
-def _other_sizes(case: Case) -> Iterator[Rule]:
+def _other_sizes(case: DiagnosisCase) -> Iterator[Rule]:
     """Mistakes in the resolution of keypoints, whose noise may grow with it.
 
     Where their noise is not known: images that hold most of them, and the camera's does not.

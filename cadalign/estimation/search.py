@@ -81,7 +81,7 @@ class Minimum(NamedTuple):
         return points_of(self.evidence.shape, self.state) / np.exp(self.state.log_scales)
 
 
-class Found(NamedTuple):
+class SearchResult(NamedTuple):
     """Minima, the likeliest first, of a problem with its noise, and the effort that they took.
 
     This is numbers of iterations and of starts.
@@ -93,7 +93,7 @@ class Found(NamedTuple):
     hypotheses: int
 
 
-def search_at_noise(problem: Problem, init: Inits) -> Found:
+def search_at_noise(problem: Problem, init: Inits) -> SearchResult:
     """Minima at the noise of a problem."""
     minima: list[Minimum] = []
     iterations = hypotheses = 0
@@ -120,7 +120,7 @@ def search_at_noise(problem: Problem, init: Inits) -> Found:
     if problem.lenses.are_distorted:
         minima = _distinct([_relinearised(problem, each) for each in minima])
     minima.sort(key=lambda minimum: minimum.score)
-    return Found(problem, minima, iterations, hypotheses)
+    return SearchResult(problem, minima, iterations, hypotheses)
 
 
 def _is_left_to_outlines(problem: Problem, evidence: Evidence) -> bool:
@@ -241,7 +241,7 @@ def thresholds(evidence: Evidence, lenses: Lenses, max_reproj_error: float) -> F
     return max_reproj_error / focal[sightings.image] * root
 
 
-def search(problem: Problem, starts: Sequence[Inits]) -> Found:
+def search(problem: Problem, starts: Sequence[Inits]) -> SearchResult:
     """Minima from each of the given ``starts``, at the likeliest noise of keypoints without sigma.
 
     The shape is integrated out, and so is the pose by Laplace's approximation, so that the noise is
@@ -270,7 +270,7 @@ def search(problem: Problem, starts: Sequence[Inits]) -> Found:
             effort += spent
         minima += found
     minima.sort(key=lambda each: each.score)
-    return Found(problem, minima, int(effort[0]), int(effort[1]))
+    return SearchResult(problem, minima, int(effort[0]), int(effort[1]))
 
 
 def widened_by_noise(problem: Problem, minima: Sequence[Minimum]) -> Sequence[Minimum]:

@@ -22,7 +22,7 @@ from cadalign.estimation.focal import prior_of_camera
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import camera_like
 from cadalign.estimation.problem import Inits, Problem
-from cadalign.estimation.search import Found, Minimum, search
+from cadalign.estimation.search import Minimum, SearchResult, search
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import turned_alignment
 from cadalign.geometry.mesh import Mesh
@@ -35,7 +35,7 @@ _LARGEST_FOCAL_SIGMA = 0.25  # relative: poses are sought at the focal length of
 _View = tuple[FloatArray, FloatArray, FloatArray]
 
 
-def search_by_masks(problem: Problem) -> Found:
+def search_by_masks(problem: Problem) -> SearchResult:
     """As `search`, from starts that masks suggest, too.
 
     The problem that is returned lacks the views whose mask alone leads to no pose.

@@ -54,6 +54,7 @@ _WIDE_REACH = 0.15  # without keypoints
 _LEAST_REACH = 4.0
 _REACH = 6.0  # in standard deviations of the residuals
 _OFFSETS = 2.0  # in standard deviations of the offset that all of a contour has in common
+_INSIDE = 0.5  # probability of a mask's pixel
 _OPEN_BORDER = 3  # [px], within which a mask may go on outside of the image
 _LEAST_PIECE = 0.003  # of a piece of the mask, relative to the largest
 _LEAST_KEYPOINTS = 4  # that tell whether a mask is inverted
@@ -167,7 +168,12 @@ class MaskSource(OutlineSource):
     def doubt(self, support: OutlineSupport) -> str | None:
         """See `OutlineSource`."""
         if support.share >= self.good_share:
-            return None
+            if not self.is_wide or not _leaves_image(self.mask[0] >= _INSIDE):
+                return None
+            return (
+                f"{self.where} reaches the image's border, where the object may go on: alone it "
+                "may lead to another pose, give three keypoints beside it"
+            )
         return (
             f"{self.where}: only {100 * support.share:.0f} % of its contour meets the outline of "
             "the best pose found: the object may be partly hidden, the model another, or the pose "
@@ -177,8 +183,8 @@ class MaskSource(OutlineSource):
 
 def convex_hull(mask: FloatArray | BoolArray) -> BoolArray | None:
     """The convex hull of a mask (h, w) without small pieces; None where it leaves the image."""
-    inside = mask >= 0.5
-    if inside.sum() > inside[_OPEN_BORDER:-_OPEN_BORDER, _OPEN_BORDER:-_OPEN_BORDER].sum():
+    inside = mask >= _INSIDE
+    if _leaves_image(inside):
         return None
     pieces, _ = cv2.findContours(
         inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE
@@ -189,6 +195,12 @@ def convex_hull(mask: FloatArray | BoolArray) -> BoolArray | None:
     if kept:
         cv2.fillConvexPoly(filled, cv2.convexHull(np.concatenate(kept)), 1)
     return filled > 0
+
+
+def _leaves_image(inside: BoolArray) -> bool:
+    """True if an object may go on outside of the image."""
+    middle = inside[_OPEN_BORDER:-_OPEN_BORDER, _OPEN_BORDER:-_OPEN_BORDER]
+    return bool(inside.sum() > middle.sum())
 
 
 def _off_mask(pixels: FloatArray, mask: FloatArray | BoolArray) -> str:

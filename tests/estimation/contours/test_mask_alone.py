@@ -142,13 +142,26 @@ class TestOwnModel:
     @pytest.mark.parametrize("seed", [0, 2])
     def test_pose_and_stretch_are_found(self, seed: int) -> None:
         truth = posed(seed, (1.0, 1.4, 0.7))
-        found = align(Model(mesh=body()), View(CAMERA, mask=mask_of(body(), truth)))
+        mask = mask_of(body(), truth)
+        found = align(Model(mesh=body()), View(CAMERA, mask=mask))
         assert rotation_error(est=found.alignment, gt=truth) < 1.0
         assert found.alignment.scale == pytest.approx(truth.scale, rel=0.02)
-        assert not any(each.kind == "mask" for each in found.warnings)
+        is_cut = bool(mask[-1].any())  # by the image's lower border
+        assert any(each.kind == "mask" for each in found.warnings) == is_cut
         assert found.std is not None
         assert found.std.scale[0] == 0.0  # it is the known length
         assert "stretch      (1, " in str(found)
+
+    def test_a_mask_that_the_border_cuts_is_warned_of(self) -> None:
+        mask = mask_of(body(), posed(0, (1.0, 1.4, 0.7)))
+        columns = np.flatnonzero(mask.any(axis=0))
+        cut = np.zeros_like(mask)
+        shift = columns[0] + 3 * len(columns) // 10
+        cut[:, :-shift] = mask[:, shift:]
+        found = align(Model(mesh=body()), View(CAMERA, mask=cut))
+        (text,) = [str(each) for each in found.warnings if each.kind == "mask"]
+        assert text.startswith("views[0].mask")
+        assert "border" in text or "meets the outline" in text
 
     def test_held_stretch_is_held(self) -> None:
         truth = posed(3)

@@ -5,20 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.sighted import sighted_evidence
 
-from cadalign.solvers.constants import ScalePrior
 from cadalign.solvers.joint.covariance import information_of, joint_covariance
 from cadalign.solvers.joint.equations import joint_room
 from cadalign.solvers.joint.evidence import (
-    Directions,
     Evidence,
-    Focals,
-    ImageDepths,
     Offsets,
-    Rig,
-    ScalePriors,
     Shape,
-    Sightings,
     State,
     packed,
     points_of,
@@ -28,7 +22,6 @@ from cadalign.solvers.joint.system import joint_system
 from cadalign.solvers.search import evaluate
 
 POINTS, SEEN, MODES, RANK = 9, 6, 24, 15
-NONE, NO_VALUE = np.empty(0, dtype=np.int64), np.empty(0)
 
 
 @pytest.fixture(params=[RANK, MODES])
@@ -58,28 +51,7 @@ def evidence(rank: int) -> Evidence:
     seen = points_of(shape, truth)[:SEEN] @ truth.poses[0, :9].reshape(3, 3).T
     seen += truth.poses[0, 9:]
     rays = seen[:, :2] / seen[:, 2:] + rng.normal(0, 1e-3, (SEEN, 2))
-    sightings = Sightings(
-        np.arange(SEEN),
-        np.zeros(SEEN, dtype=np.int64),
-        rays,
-        np.tile([1000.0, 0.0, 1000.0], (SEEN, 1)),
-        np.zeros((SEEN, 2)),
-        np.zeros(SEEN, dtype=np.int64),
-        np.ones(SEEN),
-        np.zeros((SEEN, 2)),
-    )
-    return Evidence(
-        shape,
-        sightings,
-        Rig(np.concatenate([np.eye(3).ravel(), np.zeros(3)])[None], np.zeros(1, dtype=np.int64)),
-        Focals(np.full(1, -1), NO_VALUE, NO_VALUE, NO_VALUE, NO_VALUE),
-        ScalePriors(np.zeros(3), np.zeros((3, 3)), ScalePrior(0.0, 0.0)),
-        (
-            Directions(np.empty((0, 3)), np.empty((0, 3)), NONE, np.empty((0, 3, 3))),
-            Offsets(NONE.reshape(0, 2), NONE, np.empty((0, 3)), NO_VALUE, NO_VALUE),
-            ImageDepths(NONE, NONE, NO_VALUE, NO_VALUE),
-        ),
-    )
+    return sighted_evidence(shape, rays)
 
 
 def best_of(evidence: Evidence, rank: int) -> tuple[State, float]:

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from support.sighted import sighted_evidence
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import kernel
-from cadalign.solvers.constants import ScalePrior
 from cadalign.solvers.joint.blocks import (
     BlockEquation,
     equations_of,
@@ -20,15 +20,9 @@ from cadalign.solvers.joint.blocks import (
     write_equation,
 )
 from cadalign.solvers.joint.evidence import (
-    Directions,
     Evidence,
     Focals,
-    ImageDepths,
-    Offsets,
-    Rig,
-    ScalePriors,
     Shape,
-    Sightings,
     State,
 )
 from cadalign.solvers.joint.search import equations_at, packed, refine_joint
@@ -81,7 +75,6 @@ def _write_vanishing_point(
     return plain_equation(evidence.rig.pose[v], weight * (place - points.rays[n, axis]))
 
 
-NONE, NO_VALUE = np.empty(0, dtype=np.int64), np.empty(0)
 UP = np.array([0.0, 1.0, 0.0])
 FOCAL = 1.3  # over that of the rays
 POSE = np.append(Rotation.from_rotvec([0.7, 0.3, 0.2]).as_matrix(), [0.1, 0.2, 9.0])
@@ -92,30 +85,10 @@ def evidence_of_one_view() -> Evidence:
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 3))
     seen = points @ POSE[:9].reshape(3, 3).T + POSE[9:]
     rays = FOCAL * seen[:, :2] / seen[:, 2:]
-    count = len(points)
-    sightings = Sightings(
-        np.arange(count),
-        np.zeros(count, dtype=np.int64),
-        rays + np.random.default_rng(1).normal(0, 1e-3, rays.shape),
-        np.tile([1000.0, 0.0, 1000.0], (count, 1)),
-        np.zeros((count, 2)),
-        np.zeros(count, dtype=np.int64),
-        np.ones(count),
-        np.zeros((count, 2)),
-    )
-    blocks = (
-        Directions(np.empty((0, 3)), np.empty((0, 3)), NONE, np.empty((0, 3, 3))),
-        Offsets(NONE.reshape(0, 2), NONE, np.empty((0, 3)), NO_VALUE, NO_VALUE),
-        ImageDepths(NONE, NONE, NO_VALUE, NO_VALUE),
-    )
-    return Evidence(
-        Shape(points, np.empty((0, count, 3)), np.zeros(count)),
-        sightings,
-        Rig(np.append(np.eye(3), np.zeros(3))[None], np.zeros(1, dtype=np.int64)),
-        Focals(np.zeros(1, dtype=np.int64), -np.ones(1), np.ones(1), np.zeros(1), np.zeros(1)),
-        ScalePriors(np.zeros(3), np.zeros((3, 3)), ScalePrior(0.0, 0.0)),
-        blocks,
-    )
+    rays += np.random.default_rng(1).normal(0, 1e-3, rays.shape)
+    shape = Shape(points, np.empty((0, len(points), 3)), np.zeros(len(points)))
+    unknown = Focals(np.zeros(1, dtype=np.int64), -np.ones(1), np.ones(1), np.zeros(1), np.zeros(1))
+    return sighted_evidence(shape, rays, unknown)
 
 
 def with_vanishing_point(evidence: Evidence) -> Evidence:

@@ -207,7 +207,7 @@ def _off_mask(pixels: FloatArray, mask: FloatArray | BoolArray) -> str:
     """Report that most keypoints lie off a mask, as they do where it is inverted."""
     places = np.round(pixels).astype(int)
     u, v = places[((places >= 0) & (places < mask.shape[::-1])).all(axis=1)].T
-    count, off = len(u), int((mask[v, u] < 0.5).sum())
+    count, off = len(u), int((mask[v, u] < _INSIDE).sum())
     if count < _LEAST_KEYPOINTS or 2 * off <= count:
         return ""
     return f"; {off} of {count} keypoints lie off it: it may be inverted, or another object's"

@@ -6,8 +6,8 @@ from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
     from cadalign.batch.experiment import FitRunOptions
-    from cadalign.batch.fits import fit_many, run_many, stream_fits
-    from cadalign.batch.libraries import RetrieveRunOptions
+    from cadalign.batch.fits import fit_many, run_many
+    from cadalign.batch.retrievals import RetrieveRunOptions
     from cadalign.io.observation import DetectorOptions
 
 __all__ = [
@@ -16,7 +16,6 @@ __all__ = [
     "RetrieveRunOptions",
     "fit_many",
     "run_many",
-    "stream_fits",
 ]
 
 __getattr__ = lazy_names(__name__)

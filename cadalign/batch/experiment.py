@@ -90,10 +90,6 @@ class ManyOptions(ExperimentOptions):
         """The learned shape that keypoints of detectors may be named after."""
         raise NotImplementedError
 
-    def warm_up(self, seen: Observation) -> Result:
-        """Compile the kernels by the estimate of a model's points."""
-        raise NotImplementedError
-
     def read(self, data: Any, where: str, *, folder: Path) -> Observation:
         """Read the parsed form of an observation, which messages call ``where``."""
         raise NotImplementedError
@@ -132,9 +128,6 @@ class FitRunOptions(ManyOptions):
     @property
     def learned(self) -> Path | None:
         return self.estimate.shape
-
-    def warm_up(self, seen: Observation) -> Result:
-        return replace(self.estimate, shape=None).fit(seen, "warm-up")[0]
 
     def read(self, data: Any, where: str, *, folder: Path) -> Observation:
         return self.estimate.read(data, where, folder=folder, changes=self.changes)
@@ -212,13 +205,6 @@ class ManyEstimates:
     def record_columns(self) -> Columns:
         """The columns of the table of observations and results."""
         return RECORD_COLUMNS + self.options.record_columns
-
-    def warm_up(self) -> None:
-        """Compile the kernels."""
-        points = np.random.default_rng(0).uniform(-0.3, 0.3, (9, 3))
-        camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
-        seen = Observation(points, camera.project(points + [0.0, 0.0, 2.0]), camera)
-        result_row(self.options.warm_up(seen))
 
     def evaluate(self, tasks: Sequence[ObservationTask]) -> Rows:
         """The rows of some observations."""

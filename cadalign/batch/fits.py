@@ -1,4 +1,4 @@
-"""`fit_many` and `stream_fits`: many observations aligned, as a run or as they come."""
+"""Many observations aligned as a run."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import filecmp
 import os
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import fields, replace
-from itertools import chain, count, islice, starmap
+from itertools import chain, starmap
 from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_type_hints
 
@@ -18,18 +18,15 @@ import numpy as np
 import pyarrow.compute as pc
 
 from cadalign.arrays import is_number
-from cadalign.batch.experiment import FitRunOptions, ManyEstimates, ManyOptions, plan_run
+from cadalign.batch.experiment import FitRunOptions, ManyOptions, plan_run
 from cadalign.batch.observation_fit import ObservationFit
 from cadalign.batch.outputs import write_csv
-from cadalign.batch.sources import ObservationTask
-from cadalign.errors import CadalignError, DataError, InputError, require_kind
+from cadalign.errors import DataError, InputError, require_kind
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import FitOptions
-from cadalign.estimation.result import Result
 from cadalign.estimation.results import Results
-from cadalign.evaluation.options import absolute_paths
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.parallel import Chunk, Workers
+from cadalign.evaluation.runs.parallel import Workers
 from cadalign.evaluation.runs.run import OnProgress, execute, workers_of
 from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
 from cadalign.evaluation.runs.work import OK
@@ -39,7 +36,6 @@ from cadalign.io.files import as_path, write_whole
 from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
 
 _FEW = 200  # observations, which are aligned sooner than processes start
-_STREAMED = 16  # observations that a worker gets at a time
 _SPOOL = "observations.jsonl"
 
 Observed = str | os.PathLike[str] | Iterable[str | os.PathLike[str]] | Iterable[Observation]
@@ -131,45 +127,6 @@ def fit_many(
         if not is_kept:
             list(results)  # reads each, before the folder goes away
         return results
-
-
-def stream_fits(
-    observations: Iterable[Observation],
-    *,
-    workers: int = 0,
-    dask: str | None = None,
-    **options: Any,
-) -> Iterator[tuple[int, Result | CadalignError]]:
-    """Align observations as they come, without a folder; results arrive as they finish.
-
-    Parameters
-    ----------
-    observations : iterable of Observation
-        May be endless: only as many are asked for as workers are busy with.
-    workers, dask, **options
-        As for `fit_many`.
-
-    Yields
-    ------
-    int
-        Number of the observation, from 0; with workers they come in any order.
-    Result or CadalignError
-        Its result, or the reason why there is none.
-
-    Examples
-    --------
-    >>> for number, found in stream_fits(camera_feed(), similar=True):  # doctest: +SKIP
-    ...     print(number, found.alignment.translation)
-    """
-    experiment = ManyEstimates(absolute_paths(options_of(options)))
-    pool = workers_of(workers, dask)
-    size = 1 if not workers and dask is None else _STREAMED
-    for _, rows in pool(experiment, _chunks(observations, size)):
-        for row, record in zip(rows.rows, rows.records, strict=True):
-            if row["status"] == OK:
-                yield row["row"], Result.from_json(record["result"])
-            else:
-                yield row["row"], DataError(row["reason"])
 
 
 def run_many(
@@ -274,18 +231,6 @@ def _line(number: int, observation: Any) -> bytes:
     require_kind(observation, Observation, f"observations[{number}]")
     data = observation.to_dict(states_origins=True)
     return msgspec.json.encode(data, enc_hook=np.generic.item) + b"\n"  # names may be NumPy's
-
-
-def _chunks(observations: Iterable[Observation], size: int) -> Iterator[Chunk[ObservationTask]]:
-    source = enumerate(observations)
-    for index in count():
-        tasks = [
-            ObservationTask(row, f"observation {row}", _line(row, each), os.getcwd())
-            for row, each in islice(source, size)
-        ]
-        if not tasks:
-            return
-        yield index, tasks
 
 
 def _tally(folder: RunFolder) -> Tally:

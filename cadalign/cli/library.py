@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,11 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LibraryBuild:
-    """Build a library of a data set's annotated models, as one file.
-
-    The build is a run, which goes on where it was killed. Its folder stays beside the library where
-    models are left out, or meshes cannot be read: results.parquet has a row for each.
-    """
+    """Build a library of a data set's annotated models, as one file."""
 
     root: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ROOT")]
     """Folder in KeypointNet's layout."""
@@ -35,11 +32,6 @@ class LibraryBuild:
     """Split of the data set to include, such as train; all models by default."""
     shapenet: Path | None = None
     """Folder of ShapeNetCore, for the meshes, if they are not below the root."""
-
-    workers: int | None = None
-    """Processes; -1 for one for each core, 0 for none. By default -1, for few models 0."""
-    dask: str | None = None
-    """Address of a Dask scheduler, whose workers are used instead."""
 
     def run(self) -> int:
         """Build the library; returns the exit code."""
@@ -56,28 +48,18 @@ class LibraryBuild:
             return self._build(dataset)
 
     def _build(self, dataset: KeypointNet) -> int:
-        from cadalign.batch.libraries import build_library
-        from cadalign.cli.runs import run_progress
-        from cadalign.evaluation.runs.folder import RunFolder
+        from cadalign.cli.runs import progress_bar
+        from cadalign.retrieval import Library
 
-        folder = self.out.with_name(f"{self.out.stem}_build")
-        with run_progress("reading models") as on_progress:
-            library, troubles = build_library(
-                dataset, folder, workers=self.workers, dask=self.dask, on_progress=on_progress
-            )
+        total, done = len(dataset.ids()), count(1)
+        with progress_bar("reading models") as show:
+            library = Library.from_dataset(dataset, on_model=lambda: show(next(done), total))
         library.save(self.out)
         megabytes = self.out.stat().st_size / 1e6
         say(f"{_describe(library)}\nWritten: {self.out} ({megabytes:.1f} MB)")
         left_out = len(dataset.problems)
         if left_out:
             say(f"Left out: {left_out} models with malformed annotations")
-        without = sum(bool(row["warning"]) for row in troubles)
-        if without:
-            say(f"Without their meshes, which cannot be read: {without}")
-        if troubles:
-            say(f"Rows: {folder / 'results.parquet'}")
-        else:
-            RunFolder(folder).remove()
         return 0
 
 

@@ -70,7 +70,7 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
 
     def _retrieve_many(self) -> int:
         """Retrieve the models of all observations; returns the exit code."""
-        from cadalign.batch.libraries import RetrieveRunOptions
+        from cadalign.batch.retrievals import RetrieveRunOptions
         from cadalign.cli.runs import inputs_of, run_command
 
         given = {each.name: getattr(self, each.name) for each in fields(ObservationRetrieval)}

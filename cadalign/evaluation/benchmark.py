@@ -15,7 +15,6 @@ from typing import Any, ClassVar, TypeVar
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.functions import (
     Compared,
-    FunctionMethod,
     FunctionMetric,
     choose_methods,
     choose_metrics,
@@ -86,10 +85,6 @@ class Setting:
     def columns(self) -> Columns:
         """All columns of the result table."""
         raise NotImplementedError
-
-    def warm_up(self) -> Sequence[Any]:
-        """Compile what all workers need; returns tasks whose evaluation compiles the rest."""
-        return ()
 
     def case(self, task: Any) -> Case:
         """The instance of a task; one that cannot be made raises."""
@@ -183,11 +178,6 @@ class Benchmark:
         """Metrics of users in a run's configuration; empty without any."""
         functions = [text_of(each.function) for each in self.metrics]
         return {"metrics": functions} if functions else {}
-
-    def warm_up(self) -> None:
-        """Compile solvers and metrics; functions of users are not called."""
-        built_in = tuple(m for m in self.methods if not isinstance(m.solve, FunctionMethod))
-        replace(self, methods=built_in).evaluate(self.setting.warm_up())
 
     def evaluate(self, tasks: Sequence[Any]) -> Rows:
         """A row for every instance and method, and a record for every instance."""

@@ -16,7 +16,7 @@ from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run
 from cadalign.io.files import as_path, refuse_nul
 
-BATCHES.update(fit="cadalign.batch.spec", retrieve="cadalign.batch.libraries")
+BATCHES.update(fit="cadalign.batch.spec", retrieve="cadalign.batch.retrievals")
 
 _LABELS = {
     "root": "dataset",

@@ -1,4 +1,4 @@
-"""`fit_many` and `stream_fits`: results, the table, resuming, workers, and bad input."""
+"""`fit_many`: results, the table, resuming, workers, and bad input."""
 
 from __future__ import annotations
 
@@ -97,20 +97,6 @@ def test_the_table_has_the_documented_columns(tmp_path: Path) -> None:
     head = (tmp_path / "run" / "results.csv").read_text().splitlines()[0]
     assert '"qw","qx","qy","qz","tx","ty","tz"' in head
     assert "covariance" not in head
-
-
-def test_a_stream_is_read_only_as_fast_as_it_is_aligned() -> None:
-    asked = []
-
-    def camera_feed() -> Iterator[Observation]:
-        for number, each in enumerate(observations(10**9)):
-            asked.append(number)
-            yield each
-
-    found = cadalign.stream_fits(camera_feed(), method="aepnp")
-    numbers = [next(found)[0] for _ in range(3)]
-    assert numbers == [0, 1, 2]
-    assert len(asked) <= 4
 
 
 @pytest.mark.slow
@@ -256,13 +242,11 @@ def test_numbers_as_focal_are_the_focal_length_of_all_cameras() -> None:
     seen = [replace(each, camera=unknown) for each in observations(2)]
     cameras = [each.camera.fx for each in cadalign.fit_many(seen, focal=650)]  # type: ignore[union-attr]
     assert cameras == [650.0, 650.0]
-    streamed = cadalign.stream_fits(seen, focal=650.0)
-    assert [found.camera.fx for _, found in streamed] == cameras  # type: ignore[union-attr]
 
 
 def test_priors_of_focal_lengths_are_taken_as_such_and_none_is_the_default() -> None:
     given, usual = (
-        next(iter(cadalign.stream_fits(observations(1), focal="estimate", focal_prior=prior)))[1]
+        cadalign.fit_many(observations(1), focal="estimate", focal_prior=prior)[0]
         for prior in (FocalPrior(900.0, 0.1), None)
     )
     assert isinstance(given, Result)

@@ -14,7 +14,7 @@ import pytest
 
 import cadalign
 from cadalign import Camera, Library, Observation, Result, Results
-from cadalign.batch.libraries import RetrieveRunOptions
+from cadalign.batch.retrievals import RetrieveRunOptions
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.render import look_at
@@ -173,7 +173,7 @@ def test_a_match_is_a_result(case: Case, tmp_path: Path) -> None:
 
 
 def test_the_columns_are_documented() -> None:
-    import cadalign.batch.libraries as module
+    import cadalign.batch.retrievals as module
 
     assert module.__doc__ is not None
     columns = (*RetrieveRunOptions.columns, *RetrieveRunOptions.record_columns)

@@ -72,9 +72,6 @@ class Middle:
     def timing_columns(self) -> Columns:
         return (*COLUMNS[:3], ("seconds", float))
 
-    def warm_up(self) -> None:
-        pass
-
     def evaluate(self, tasks: Sequence[tuple[str, int]]) -> Rows:
         return Rows.of(outcome for task in tasks for outcome in self._outcomes(*task))
 

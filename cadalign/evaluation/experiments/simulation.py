@@ -196,10 +196,6 @@ class SweepProblems(Setting):
     kind: SweepKind
     seed: int
 
-    def warm_up(self) -> Sequence[SweepTask]:
-        """A task whose evaluation compiles the solvers."""
-        return [(self.kind.values[0], 0)]
-
     def case(self, task: SweepTask) -> Case:
         instance = self.problem(task), self._setting(task)["noise_px"] or 1.0
         return Case(self._names(task), instance=instance)

@@ -7,7 +7,6 @@ result columns are those of docs/formats/runs.md, as in all settings.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -24,7 +23,7 @@ from cadalign.evaluation.experiments.correspondences import COLUMNS, NAMES, Corr
 from cadalign.evaluation.methods import Method, MethodInput
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.runs.work import Row, fingerprint
-from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
+from cadalign.evaluation.simulation import SimulatedProblem
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 
@@ -119,16 +118,6 @@ class SpoiledImages(Setting):
     columns = COLUMNS
 
     options: CorrespondenceOptions
-
-    def warm_up(self) -> Sequence[CorrespondenceTask]:
-        """A task whose evaluation compiles the solvers."""
-        problem = simulate_problem(
-            np.random.default_rng(0), points=40, noise_px=0.5, stretch=(1.0, 1.0)
-        )
-        seen = Correspondences(
-            "", problem.points_3d, problem.points_2d, problem.camera, problem.alignment
-        )
-        return [CorrespondenceTask("warm-up", 0.2, 0, seen)]
 
     def failed(self, task: CorrespondenceTask) -> list[Case]:
         points = None if task.seen is None else len(task.seen)

@@ -118,13 +118,6 @@ class Instance:
         return Box.from_model(self.bounds, self.gt)
 
 
-def example_view() -> tuple[FloatArray, FloatArray, Alignment]:
-    """Nine points, their pixels and their pose, to compile kernels with."""
-    points = np.random.default_rng(0).uniform(-0.3, 0.3, (9, 3))
-    pose = Alignment(np.eye(3), np.array([0.0, 0.0, 2.0]), np.ones(3))
-    return points, KEYPOINT_CAMERA.project(pose.apply(points)), pose
-
-
 def load_scene(model: AnnotatedModel) -> Scene:
     """Read a model's mesh for `make_instance`."""
     from cadalign.render import Scene

@@ -29,7 +29,7 @@ from cadalign.evaluation.experiments.retrieval import (
     RetrievalRunOptions,
 )
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
-from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE, example_view
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
 from cadalign.evaluation.methods import Method
 from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
 from cadalign.evaluation.runs.work import Row
@@ -138,16 +138,6 @@ class RetrievalQueries(Setting):
 
     library: str
     options: RetrievalRunOptions
-
-    def warm_up(self) -> Sequence[RetrievalTask]:
-        """Compile the kernels."""
-        (points, pixels, _), ids = example_view(), np.arange(9)
-        models = [
-            LibraryModel("box", str(k), points[:, turn], ids, _UNIT_BOUNDS)
-            for k, turn in enumerate(([0, 1, 2], [1, 2, 0], [2, 0, 1]))
-        ]
-        Library.from_models(models).retrieve(pixels, ids, KEYPOINT_CAMERA)
-        return ()
 
     def failed(self, task: RetrievalTask) -> list[Case]:
         return [Case(task.names(protocol), _NO_MATCH) for protocol in self.options.protocols]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, cast
@@ -19,8 +19,8 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.benchmark import VIEW_NAMES, Benchmark, Case, Setting
 from cadalign.evaluation.experiments.unseen import COLUMNS, METHODS, UnseenOptions
-from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
-from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, KeypointTask, example_view
+from cadalign.evaluation.instances.hull import sample_hull_view
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, KeypointTask
 from cadalign.evaluation.instances.pictures import keep_preview
 from cadalign.evaluation.instances.record import (
     RECORD_COLUMNS,
@@ -254,18 +254,6 @@ class UnseenObjects(Setting):
     learned: LearnedFiles
     options: UnseenOptions
     previews: RunFolder | None = None  # of the objects' meshes
-
-    def warm_up(self) -> Sequence[KeypointTask]:
-        """Compile the kernels."""
-        (points, pixels, pose), ids = example_view(), np.arange(9)
-        task = KeypointTask("", "", hull=KeypointHull(points), ids=ids)
-        seen = UnseenObject(task, self.options, pose, ids, pixels, np.zeros(9, dtype=bool))
-        view = View(KEYPOINT_CAMERA, pixels)
-        for model in (Model(points_3d=points), ShapeModel.from_basis(points, [points], [0.1])):
-            _coverage(align(model, view), seen, ids, ids)
-        box = Box.from_model(task.hull.bounds, pose)
-        overlap_up_to_scale(est=box, gt=box)
-        return ()
 
     def case(self, task: KeypointTask) -> Case:
         seen = observe_object(task, self.options)

@@ -24,7 +24,6 @@ from cadalign.evaluation.benchmark import (
     write_picture,
 )
 from cadalign.evaluation.experiments.keypointnet import COLUMNS, KeypointNetOptions
-from cadalign.evaluation.instances.hull import KeypointHull
 from cadalign.evaluation.instances.instance import (
     Instance,
     KeypointTask,
@@ -116,12 +115,6 @@ class KeypointViews(Setting):
     def columns(self) -> Columns:
         """The columns of the result table."""
         return (*COLUMNS, (BOX_IOU_UP_TO_SCALE.key, float)) if self.shapes.paths else COLUMNS
-
-    def warm_up(self) -> Sequence[KeypointTask]:
-        """A task whose evaluation compiles solvers and metrics."""
-        rng = np.random.default_rng(0)
-        hull = KeypointHull(rng.uniform(-0.3, 0.3, (12, 3)))
-        return [KeypointTask("warm-up", "", hull=hull, ids=np.arange(12))]
 
     def cases(self, tasks: Sequence[KeypointTask]) -> list[Case]:
         start = time.perf_counter()

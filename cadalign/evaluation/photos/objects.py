@@ -10,10 +10,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.errors import DataError
-from cadalign.estimation.align import align
-from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
-from cadalign.estimation.view import View
 from cadalign.evaluation.benchmark import (
     VIEW_NAMES,
     Benchmark,
@@ -23,7 +20,6 @@ from cadalign.evaluation.benchmark import (
     write_picture,
 )
 from cadalign.evaluation.experiments.photos import COLUMNS, PhotosOptions
-from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, example_view
 from cadalign.evaluation.instances.pictures import (
     NO_PHOTO,
     cut_out,
@@ -74,13 +70,6 @@ class PhotoObjects(Setting):
 
     options: PhotosOptions
     drawn_in: RunFolder  # the folder that pictures go to
-
-    def warm_up(self) -> Sequence[PhotoTask]:
-        """Compile the kernels."""
-        points, pixels, _ = example_view()
-        for model in (Model(points_3d=points), Model(points_3d=points, shape_sigma=0.01)):
-            align(model, View(KEYPOINT_CAMERA, pixels))
-        return ()
 
     def failed(self, task: PhotoTask) -> list[Case]:
         return [Case(task.names, _NO_SOURCE)]

@@ -20,7 +20,6 @@ from cadalign.io.files import (
     locked,
     made_folder,
     read_text,
-    reading,
     refuse_nul,
     write_json,
 )
@@ -83,13 +82,6 @@ class RunFolder:
     def make(self) -> None:
         """Make the folder."""
         made_folder(self.path)
-
-    def refuse_foreign(self) -> None:
-        """Raise a DataError for a folder of other files; what is hidden may be a killed run's."""
-        with reading(self.path):
-            found = list(self.path.iterdir()) if self.path.is_dir() else []
-        if not self.config_file.exists() and any(each.name[0] != "." for each in found):
-            raise DataError("holds files that are no run's", where=str(self.path), fix=_FIX_FOREIGN)
 
     def refuse_others(self, *names: str) -> None:
         """Raise a DataError for a file of these names that no run has written."""

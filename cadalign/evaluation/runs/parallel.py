@@ -1,9 +1,9 @@
-"""Workers of runs, here or on a cluster: chunks of tasks handed out, and deaths survived.
+"""Workers of runs: chunks handed to processes, or to a Dask cluster, and lost workers survived.
 
-Processes on this machine and a Dask cluster are used through the standard library's executor
-interface, so one loop serves both. A process that dies, by a segmentation fault, the system's
-out-of-memory killer or a signal, takes the chunks with it that were under way. These are then done
-again, one at a time; one that kills its worker then, too, becomes failed rows.
+Both are used through the standard library's executor interface, so one loop serves both. The first
+chunk is evaluated alone, which compiles the kernels that all workers need. A process that dies
+takes the chunks with it that were under way. These are done again, one at a time; one that kills
+its worker then, too, becomes failed rows.
 """
 
 from __future__ import annotations
@@ -28,27 +28,25 @@ from concurrent.futures import (
     wait,
 )
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import lru_cache, partial
 from types import ModuleType
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, TypeVar
 
 from cadalign.arrays import worker_count
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.evaluation.runs.work import AbortError, Experiment, Rows, reason_of
 from cadalign.io.files import printable
 
-P = ParamSpec("P")
-R = TypeVar("R")
 T = TypeVar("T")
 
 # Sums that several threads share are rounded in another order than those of one.
 _ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 KILLED_REASON = "its chunk killed a worker process twice (a crash, or out of memory)"
-
+_STARTS = 3  # of workers that die before they evaluate anything
 
 Chunk = tuple[int, Sequence[T]]
-"""Successive tasks of a run, which has many, and their number."""
+"""Number of a chunk, and its tasks."""
 Evaluated = Iterator[tuple[Chunk[T], Rows]]
 Workers = Callable[[Experiment[Any], Iterable[Chunk[Any]]], Evaluated[Any]]
 """Place where chunks are evaluated, which yields each with its result, in any order."""
@@ -57,18 +55,14 @@ Workers = Callable[[Experiment[Any], Iterable[Chunk[Any]]], Evaluated[Any]]
 def in_this_process(
     experiment: Experiment[T], chunks: Iterable[Chunk[T]], *, threads: int = 1
 ) -> Evaluated[T]:
-    """Evaluate chunks here, in so many threads; a crash ends this process.
-
-    Threads serve what lets go of the interpreter lock, such as drawing.
-    """
+    """Evaluate chunks in threads of this process, for what lets go of the interpreter lock."""
     call = partial(evaluate_chunk, experiment)
-    if threads > 1:
-        experiment.warm_up()
-        with ThreadPoolExecutor(threads) as pool:
-            yield from _evaluated(lambda: pool, call, experiment, chunks, window=threads)
+    if threads == 1:
+        for chunk in chunks:
+            yield chunk, call(chunk[1])
         return
-    for chunk in chunks:
-        yield chunk, call(chunk[1])
+    with ThreadPoolExecutor(threads) as pool:
+        yield from _evaluated(lambda: pool, call, experiment, chunks, window=threads)
 
 
 def in_processes(
@@ -76,43 +70,28 @@ def in_processes(
 ) -> Evaluated[T]:
     """Evaluate chunks in so many processes on this machine; -1 for one for each core."""
     count = worker_count(count)
-    pools: list[_Processes] = []
-
-    def start() -> Executor:
-        pools.append(_Processes(count))
-        return pools[-1]
-
-    try:
+    context = multiprocessing.get_context("spawn")
+    make = partial(_Processes, count, mp_context=context, initializer=_start_worker)
+    with ExitStack() as stack:
         yield from _evaluated_elsewhere(
-            start, experiment, chunks, window=count + 1, deadly=BrokenProcessPool
+            lambda: stack.enter_context(make()),
+            experiment,
+            chunks,
+            window=count + 1,
+            deadly=BrokenProcessPool,
         )
-    finally:
-        for pool in pools:
-            pool.kill()
 
 
 class _Processes(ProcessPoolExecutor):
-    """Processes that end with this one, and that do not run its script again."""
+    """Processes that do not run this one's script again."""
 
-    def __init__(self, count: int) -> None:
-        context = multiprocessing.get_context("spawn")
-        super().__init__(count, mp_context=context, initializer=_start_worker)
-
-    def submit(self, function: Callable[P, R], /, *args: P.args, **options: P.kwargs) -> Future[R]:
+    def submit(self, *arguments: Any, **options: Any) -> Future[Any]:
         """Hand out a call; a process is started where all are busy."""
         try:
             with _spawning():
-                return super().submit(function, *args, **options)
+                return super().submit(*arguments, **options)
         except OSError as error:  # no process can be started, or the pool is just breaking
             raise BrokenProcessPool(reason_of(error)) from None
-
-    def kill(self) -> None:
-        """End the processes, whatever they are doing."""
-        processes = list((self._processes or {}).values())
-        self.shutdown(wait=False, cancel_futures=True)
-        for process in processes:
-            process.kill()
-            process.join()
 
 
 @contextmanager
@@ -146,7 +125,7 @@ def _end_with_parent() -> None:
 
 
 def _evaluated_elsewhere(
-    start: Callable[[], Executor],
+    make: Callable[[], Executor],
     experiment: Experiment[T],
     chunks: Iterable[Chunk[T]],
     *,
@@ -155,9 +134,8 @@ def _evaluated_elsewhere(
 ) -> Evaluated[T]:
     """Evaluate chunks on an executor of other processes; see `_evaluated`."""
     pickled = _pickled(experiment)
-    living = partial(_living, start, pickled, deadly)
-    call = partial(_evaluate_pickled, pickled)
-    yield from _evaluated(living, call, experiment, chunks, window=window, deadly=(deadly,))
+    start, call = partial(_started, make, pickled, deadly), partial(_evaluate_pickled, pickled)
+    yield from _evaluated(start, call, experiment, chunks, window=window, deadly=deadly)
 
 
 def _evaluated(
@@ -167,66 +145,82 @@ def _evaluated(
     chunks: Iterable[Chunk[T]],
     *,
     window: int,
-    deadly: tuple[type[Exception], ...] = (),
+    deadly: type[Exception] = BrokenProcessPool,
 ) -> Evaluated[T]:
-    """Evaluate chunks on an executor, ``window`` at a time.
+    """Evaluate chunks on an executor, at most ``window`` at a time.
 
     ``start`` gives one that works, and is asked again after every death; ``deadly`` is raised by a
-    future whose worker has died. Chunks are asked for only as fast as they are evaluated.
+    future whose worker has died. Chunks are taken only as fast as they are evaluated.
     """
-    executor = start()
-    source = iter(chunks)
+    executor, source = start(), iter(chunks)
+    is_warm = is_broken = False
     running: dict[Future[Rows], Chunk[T]] = {}
-    suspects: list[Chunk[T]] = []
+    lost: list[Chunk[T]] = []  # to be done again
+    again: set[int] = set()
     try:
         while True:
-            while not suspects and len(running) < window:
-                chunk = next(source, None)
+            if is_broken and not running:
+                executor, is_broken = start(), False
+            is_alone = lost or not is_warm or again.intersection(k for k, _ in running.values())
+            while len(running) < (1 if is_alone else window):
+                chunk = lost.pop(0) if lost else next(source, None)
                 if chunk is None:
                     break
-                try:
-                    running[executor.submit(call, chunk[1])] = chunk
-                except deadly:
-                    suspects.append(chunk)
-            if not running and not suspects:
+                running[_submitted(executor, deadly, call, chunk[1])] = chunk
+            if not running:
                 return
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 chunk = running.pop(future)
                 try:
-                    yield chunk, _result(future, deadly)
+                    rows = _result(future, deadly)
                 except deadly:
-                    suspects.append(chunk)
-            if suspects and not running:
-                executor = start()
-                for chunk in suspects:
-                    try:
-                        rows = _result(executor.submit(call, chunk[1]), deadly)
-                    except deadly:
-                        executor = start()
-                        failures = [experiment.failure(task, KILLED_REASON) for task in chunk[1]]
-                        rows = Rows.joined(failures)
-                    yield chunk, rows
-                suspects = []
+                    is_broken = True
+                    if chunk[0] not in again:
+                        again.add(chunk[0])
+                        lost.append(chunk)
+                        continue
+                    rows = Rows.joined(
+                        [experiment.failure(each, KILLED_REASON) for each in chunk[1]]
+                    )
+                is_warm = True
+                yield chunk, rows
     finally:
         for future in running:
             future.cancel()
 
 
-def _result(future: Future[R], deadly: tuple[type[Exception], ...]) -> R:
+def _submitted(
+    executor: Executor, deadly: type[Exception], call: Callable[..., Any], *arguments: Any
+) -> Future[Any]:
+    """Hand out a call; the future of a dead executor has the error that says so."""
+    try:
+        return executor.submit(call, *arguments)
+    except deadly as error:
+        future: Future[Any] = Future()
+        future.set_exception(error)
+        return future
+
+
+def _result(future: Future[Any], deadly: type[Exception]) -> Any:
     try:
         return future.result()
+    except (CadalignError, CancelledError, deadly):
+        raise
     except Exception as error:
-        if isinstance(error, (CadalignError, CancelledError, *deadly)):
-            raise
-        raise _cannot_work(reason_of(error)) from error
+        raise CadalignError(
+            f"a worker cannot work: {reason_of(error)}",
+            where="workers",
+            fix="cadalign must be installed there, in the same version as here, and modules of "
+            "your functions, too",
+        ) from error
 
 
-def _living(start: Callable[[], Executor], pickled: bytes, deadly: type[Exception]) -> Executor:
-    """Start an executor, of which one worker has compiled what all will need."""
-    for _ in range(3):  # someone may have killed it; not three times, though
-        executor = start()
+def _started(make: Callable[[], Executor], pickled: bytes, deadly: type[Exception]) -> Executor:
+    """An executor of which one worker has loaded the experiment."""
+    for _ in range(_STARTS):
+        executor = make()
         try:
-            _result(executor.submit(_warm_up, pickled), (deadly,))
+            _result(_submitted(executor, deadly, _load, pickled), deadly)
             return executor
         except deadly as error:
             reason = reason_of(error)
@@ -234,15 +228,6 @@ def _living(start: Callable[[], Executor], pickled: bytes, deadly: type[Exceptio
         f"worker processes die before they are given any task: {reason}",
         where="workers",
         fix="is there enough memory? Try fewer workers, or none (0) to see the error",
-    )
-
-
-def _cannot_work(reason: str) -> CadalignError:
-    return CadalignError(
-        f"a worker cannot work: {reason}",
-        where="workers",
-        fix="cadalign must be installed there, in the same version as here, and modules of your "
-        "functions, too",
     )
 
 
@@ -264,13 +249,11 @@ def _pickled(experiment: Experiment[Any]) -> bytes:
 
 
 # One object for all chunks of a process: what it keeps at hand is not made anew.
-@lru_cache(maxsize=1)
-def _unpickled(pickled: bytes) -> Any:
-    return pickle.loads(pickled)
+_unpickled = lru_cache(maxsize=1)(pickle.loads)
 
 
-def _warm_up(pickled: bytes) -> None:
-    _unpickled(pickled).warm_up()
+def _load(pickled: bytes) -> None:
+    _unpickled(pickled)
 
 
 def _evaluate_pickled(pickled: bytes, tasks: Sequence[Any]) -> Rows:
@@ -290,6 +273,57 @@ def evaluate_chunk(experiment: Experiment[T], tasks: Sequence[T]) -> Rows:
 
 
 # Workers of a cluster -----------------------------------------------------------------------------
+
+
+def on_dask(
+    experiment: Experiment[T], chunks: Iterable[Chunk[T]], *, address: str, timeout: float = 30.0
+) -> Evaluated[T]:
+    """Evaluate chunks on the Dask cluster of a scheduler's address, such as tcp://10.0.0.1:8786.
+
+    Its workers need the same version of cadalign, and the same folders under the same names. Dask
+    itself hands a chunk whose worker dies to others, until its ``allowed-failures`` are exceeded.
+    ``timeout`` is that of the scheduler, and of its first worker [s].
+    """
+    try:
+        from distributed import Client, KilledWorker
+    except ImportError:
+        raise CadalignError(
+            "Dask is not installed", where="--dask", fix="pip install 'cadalign[dask]'"
+        ) from None
+    try:
+        _check_address(address)
+        # `distributed` is not typed throughout.
+        client: Any = Client(  # type: ignore[no-untyped-call]
+            address, timeout=timeout, set_as_default=False
+        )
+    except (OSError, ValueError) as error:
+        raise DataError(
+            f"no Dask scheduler answers ({str(error)[:200]})",
+            where=printable(address),
+            fix="start one with `dask scheduler`, and give its address, tcp://host:8786",
+        ) from None
+    with _quiet(), client:
+        try:
+            client.wait_for_workers(1, timeout=timeout)
+        except TimeoutError:
+            fix = "start some with `dask worker ADDRESS`"
+            raise DataError("the Dask cluster has no workers", where=address, fix=fix) from None
+        # Named by chance: to name a chunk by its content takes longer than to evaluate it.
+        executor = client.get_executor(pure=False)
+        # Clusters grow, and a round trip may cost more than a chunk.
+        window = 2 * sum(client.nthreads().values()) + 2
+        try:
+            yield from _evaluated_elsewhere(
+                lambda: executor, experiment, chunks, window=window, deadly=KilledWorker
+            )
+        except Exception as error:
+            if client.status == "running" and not isinstance(error, CancelledError):
+                raise
+            fix = "start the same command again with a cluster: the run goes on"
+            what = "the Dask cluster has gone away"
+            raise CadalignError(what, where=address, fix=fix) from None
+        finally:
+            executor.shutdown(wait=False)
 
 
 def _check_address(address: str) -> None:
@@ -315,61 +349,3 @@ def _quiet() -> Iterator[None]:
     finally:
         for logger, level in zip(loggers, levels, strict=True):
             logger.setLevel(level)
-
-
-def on_dask(
-    experiment: Experiment[T], chunks: Iterable[Chunk[T]], *, address: str, timeout: float = 30.0
-) -> Evaluated[T]:
-    """Evaluate chunks on a Dask cluster, whose scheduler's address is such as tcp://10.0.0.1:8786.
-
-    Its workers need the same version of cadalign, and for meshes and overlays the same folders
-    under the same names. Dask itself hands a chunk whose worker dies to others, until the cluster's
-    ``distributed.scheduler.allowed-failures`` is exceeded. ``timeout`` is that of the scheduler,
-    and of its first worker [s].
-    """
-    try:
-        from distributed import Client, KilledWorker
-    except ImportError:
-        raise CadalignError(
-            "Dask is not installed", where="--dask", fix="pip install 'cadalign[dask]'"
-        ) from None
-    try:
-        _check_address(address)
-        # `distributed` is not typed throughout.
-        client: Any = Client(  # type: ignore[no-untyped-call]
-            address, timeout=timeout, set_as_default=False
-        )
-    except (OSError, ValueError) as error:
-        raise DataError(
-            f"no Dask scheduler answers ({str(error)[:200]})",
-            where=printable(address),
-            fix="start one with `dask scheduler`, and give its address, tcp://host:8786",
-        ) from None
-    with _quiet(), client:
-        try:
-            client.wait_for_workers(1, timeout=timeout)
-        except TimeoutError:
-            raise DataError(
-                "the Dask cluster has no workers",
-                where=address,
-                fix="start some with `dask worker ADDRESS`",
-            ) from None
-        threads = sum(client.nthreads().values())
-        # Named by chance: to name a chunk by its content takes longer than to evaluate it.
-        executor = client.get_executor(pure=False)
-        try:
-            # Clusters grow, and a round trip may cost more than a chunk.
-            window = 2 * threads + 2
-            yield from _evaluated_elsewhere(
-                lambda: executor, experiment, chunks, window=window, deadly=KilledWorker
-            )
-        except Exception as error:
-            if client.status == "running" and not isinstance(error, CancelledError):
-                raise
-            raise CadalignError(
-                "the Dask cluster has gone away",
-                where=address,
-                fix="start the same command again with a cluster: the run goes on",
-            ) from None
-        finally:
-            executor.shutdown(wait=False)

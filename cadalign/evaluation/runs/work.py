@@ -132,9 +132,6 @@ class Experiment(Protocol[T_contra]):
     def timing_columns(self) -> Columns:
         """The columns of the table of timings."""
 
-    def warm_up(self) -> None:
-        """Compile, in one worker, what all workers will need; must not depend on tasks."""
-
     def evaluate(self, tasks: Sequence[T_contra]) -> Rows:
         """The rows of some tasks, in their order."""
 

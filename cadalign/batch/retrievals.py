@@ -1,0 +1,104 @@
+"""Retrieval for many observations as a run.
+
+Table, records and exports are those of the best match of each observation, whose model has these
+columns besides:
+
+match_category, match_id, match_score
+    The model of the library, and its probability; see `cadalign.Match.score`.
+match_log_likelihood, none_probability
+    As of `cadalign.Match`.
+mirrored, missing
+    True if the labels are mirrored, and the number of keypoints that the model lacks.
+top_categories, top_ids, top_scores
+    All matches, the best first.
+
+The records hold all matches as JSON (`cadalign.Match.to_dict`) in the column ``matches``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+from cadalign.arrays import worker_count
+from cadalign.batch.experiment import Estimated, ManyOptions, plan_run
+from cadalign.batch.spec import SPEC as FIT_SPEC
+from cadalign.batch.spec import summarize_by
+from cadalign.evaluation.metrics import Metric
+from cadalign.evaluation.runs.work import Columns
+from cadalign.evaluation.summary import median
+from cadalign.io.documents import in_file
+from cadalign.io.files import dense_json
+from cadalign.io.observation import Observation
+from cadalign.io.observation_file import fill_xyz
+from cadalign.retrieval.query import ObservationRetrieval
+
+SCORE = Metric("match_score", "score", "%", 0, better="high", factor=100.0, log=False)
+NONE = Metric("none_probability", "none of these", "%", 0, factor=100.0, log=False)
+_SHOWN = (SCORE, NONE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RetrieveRunOptions(ManyOptions):
+    """A run that retrieves the models of many observations; see `ManyOptions`."""
+
+    experiment: ClassVar[str] = "retrieve"
+    command: ClassVar[str] = "retrieve"
+    columns: ClassVar[Columns] = (
+        *(("match_category", str), ("match_id", str), ("match_score", float)),
+        *(("match_log_likelihood", float), ("none_probability", float)),
+        *(("mirrored", bool), ("missing", int)),
+        *(("top_categories", list[str]), ("top_ids", list[str]), ("top_scores", list[float])),
+    )
+    record_columns: ClassVar[Columns] = (("matches", str),)
+
+    estimate: ObservationRetrieval
+
+    @property
+    def threads(self) -> int:
+        """The search lets go of the interpreter lock: a run without workers takes all cores."""
+        return worker_count(-1)
+
+    @property
+    def learned(self) -> Path | None:
+        return self.estimate.shape[0] if len(self.estimate.shape) == 1 else None
+
+    def read(self, data: Any, where: str, *, folder: Path) -> Observation:
+        with in_file(where):
+            seen = Observation.from_dict(fill_xyz(data), folder=folder)
+        return self.changes.applied_to(seen, where)
+
+    def estimate_of(self, seen: Observation, where: str) -> Estimated:
+        matches = self.estimate.retrieve(seen, where, workers=1)
+        best = matches[0]
+        cells = {
+            "match_category": best.category,
+            "match_id": best.model_id,
+            "match_score": best.score,
+            "match_log_likelihood": best.log_likelihood,
+            "none_probability": best.none_probability,
+            "mirrored": best.mirrored,
+            "missing": len(best.missing_ids),
+            "top_categories": [match.category for match in matches],
+            "top_ids": [match.model_id for match in matches],
+            "top_scores": [match.score for match in matches],
+        }
+        record = {"matches": dense_json([match.to_dict() for match in matches])}
+        return Estimated(best.observation(seen), best.result, cells, record)
+
+    def contents(self) -> dict[str, Any]:
+        self.estimate.opened()  # which refuses what cannot be read
+        return super().contents()
+
+
+SPEC = replace(
+    FIT_SPEC,
+    options=RetrieveRunOptions,
+    plan=plan_run,
+    columns=(*FIT_SPEC.columns[:3], *_SHOWN, *FIT_SPEC.columns[3:]),
+    summarize=summarize_by({metric.key: median(metric.key) for metric in _SHOWN}),
+    metrics=(*_SHOWN, *FIT_SPEC.metrics),
+    title=lambda runs: "retrieved models",
+    about="Red is the best match: its box and model, posed and stretched.",
+)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from cadalign.estimation.options import RansacOptions
     from cadalign.estimation.result import Result
     from cadalign.estimation.result_parts import EvidenceSummary
-    from cadalign.estimation.results import Results, to_dataframe
+    from cadalign.estimation.results import Results
     from cadalign.estimation.view import View
     from cadalign.evaluation.api import evaluate, simulate
     from cadalign.geometry.alignment import Alignment, Box
@@ -71,7 +71,6 @@ __all__ = [
     "shapes",
     "simulate",
     "solvers",
-    "to_dataframe",
     "views_from",
 ]
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
         Uncertainty,
         ViewResult,
     )
-    from cadalign.estimation.results import Results, to_dataframe
+    from cadalign.estimation.results import Results
     from cadalign.estimation.view import View
     from cadalign.estimation.warning import EstimateWarning
     from cadalign.io.evidence import Size
@@ -48,7 +48,6 @@ __all__ = [
     "fit_batch",
     "model_of",
     "object_of",
-    "to_dataframe",
     "views_from",
     "views_of",
 ]

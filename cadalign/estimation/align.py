@@ -229,9 +229,9 @@ def align_batch(
             return error
 
     if threads == 1:
-        return Results.of([one(*each) for each in zip(objects, sizes, starts, strict=True)])
+        return Results([one(*each) for each in zip(objects, sizes, starts, strict=True)])
     with ThreadPoolExecutor(threads) as pool:
-        return Results.of(list(pool.map(one, objects, sizes, starts)))
+        return Results(list(pool.map(one, objects, sizes, starts)))
 
 
 def _one_each(

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,18 +20,17 @@ from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.estimation.problems import (
     Problems,
     Solutions,
+    check_sigmas,
     each_of,
-    full_covariance,
     in_threads,
     pack_many,
 )
 from cadalign.estimation.result import Result
-from cadalign.estimation.results import Results
+from cadalign.estimation.results import COLUMNS, Entry, Results
 from cadalign.estimation.solve import solve
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
-
-T = TypeVar("T")
+from cadalign.solvers.constants import POSE_SIZE
 
 
 def fit_batch(
@@ -103,100 +103,71 @@ def fit_batch(
     shape, lens = (stretch, stretch_sigma, known_axis), (focal, focal_prior)
     options = FitOptions(method, given, loss, loss_scale, *shape, *lens)
     problems = pack_many(points_3d, points_2d, camera)
-    sigmas: Sequence[Sigma] | None = None
+    count = len(problems)
+    each_options = [options] * count
     if per_problem:
-        sigmas = list(map(copied, each_of(sigma, "sigma", len(problems), "values")))
+        sigmas = list(map(copied, each_of(sigma, "sigma", count, "values")))
+        check_sigmas(sigmas, problems.counts)
+        each_options = [replace(options, sigma=one) for one in sigmas]
     check_search(ransac, scores, symmetry)
     if scores is not None:
-        scores = each_of(scores, "scores", len(problems), "sets")
+        scores = each_of(scores, "scores", count, "sets")
     if len({(each.width, each.height) for each in problems.cameras}) == 1:
         options = options.for_camera(problems.cameras[0])
-    is_solved_at_once = ransac is None and options.focal == "known"
-    is_solved_at_once &= not options.estimates_in_rounds
+    is_alone = per_problem or ransac is not None or symmetry is not None
+    is_alone |= options.focal == "estimate" or options.estimates_in_rounds
+    entries: list[Any] = [None] * count
+    table = np.full((count, COLUMNS), np.nan)
+
+    def fit_alone(b: int) -> Result | CadalignError:
+        start, trusted = time.perf_counter(), None if scores is None else scores[b]
+        one = problems.part(b, b + 1)
+        try:
+            return fit_one(one, each_options[b], ransac, trusted, symmetry, start)
+        except CadalignError as error:
+            return error
 
     @np.errstate(all="ignore")  # holds for one thread only
-    def run(first: int, last: int) -> Results:
-        some, start = problems.part(first, last), time.perf_counter()
-        own = None if sigmas is None else sigmas[first:last]
-        if is_solved_at_once:
-            solutions = solve(some, options, own)
-            solutions = solutions._replace(errors=dict(solutions.errors))  # which can be pickled
-            seconds = (time.perf_counter() - start) / max(len(some), 1)
-            batch = _SolvedBatch(some, solutions, options, own, symmetry, seconds)
-            return batch.results()
-        fits: list[Result | CadalignError] = []
-        for b in range(first, last):
-            start, one = time.perf_counter(), options
-            if sigmas is not None:
-                one = replace(options, sigma=sigmas[b])
-            trusted = None if scores is None else scores[b]
-            try:
-                part = problems.part(b, b + 1)
-                fits.append(fit_one(part, one, ransac, trusted, symmetry, start))
-            except CadalignError as error:
-                fits.append(error)
-        unknowns = 10 if options.focal == "estimate" else 9
-        return Results.of(fits, counts=some.counts, unknowns=unknowns)
+    def run(first: int, last: int) -> None:
+        if is_alone:
+            entries[first:last] = map(fit_alone, range(first, last))
+        else:
+            some = problems.part(first, last)
+            entries[first:last], table[first:last] = _solve_at_once(some, options)
 
-    return Results.joined(in_threads(run, len(problems), workers))
+    in_threads(run, count, workers)
+    return Results(entries, None if is_alone else table)
 
 
-@dataclass(frozen=True, eq=False)
-class _SolvedBatch:
-    """Problems of a batch that were solved at once.
+def _solve_at_once(problems: Problems, options: FitOptions) -> tuple[list[Entry], FloatArray]:
+    """The entries of `Results`, each made when it is asked for, and their table (B, 17)."""
+    start = time.perf_counter()
+    solutions = solve(problems, options)
+    errors = dict(solutions.errors)
+    solutions = solutions._replace(errors=errors)  # which can be pickled
+    seconds = (time.perf_counter() - start) / max(len(problems), 1)
+    squares = np.append((solutions.residuals**2).sum(axis=1), 0.0)
+    means = np.add.reduceat(squares, problems.offsets[:-1]) / np.maximum(problems.counts, 1)
+    table = np.empty((len(problems), COLUMNS))
+    table[:, :POSE_SIZE] = solutions.poses[:, 0]
+    table[:, POSE_SIZE], table[:, POSE_SIZE + 1] = np.sqrt(means), problems.calibrations[:, 0]
+    table[list(errors)] = np.nan
+    return [
+        errors.get(b) or partial(_single, problems, solutions, options, seconds, b)
+        for b in range(len(problems))
+    ], table
 
-    ``sigmas``, one for each problem, take the place of the options' sigma; ``seconds`` is the time
-    of one problem.
-    """
 
-    problems: Problems
-    solutions: Solutions
-    options: FitOptions
-    sigmas: Sequence[Sigma] | None
-    symmetry: Symmetry | None
-    seconds: float
-
-    def single(self, b: int) -> Result:
-        """The result of one problem that has a solution, as `cadalign.fit` gives it."""
-        own: dict[str, Any] = {
-            name: None if value is None else value[b : b + 1].copy()
-            for name, value in self.solutions._asdict().items()
-            if name not in ("residuals", "errors")
-        }
-        own["residuals"] = self.solutions.residuals[self.problems.rows(b)].copy()
-        options, some = self.options, self.problems.part(b, b + 1)
-        if self.sigmas is not None:
-            options = replace(options, sigma=self.sigmas[b])
-        fitted = keypoints_of_solution(some, Solutions(**own), options, self.seconds)
-        return result_of_keypoints(
-            some.points_2d, fitted, diagnosis=diagnosis_of_fit, symmetry=self.symmetry
-        )
-
-    def results(self) -> Results:
-        """The results of all problems, which are made one at a time."""
-        problems, errors = self.problems, dict(self.solutions.errors)
-        if self.symmetry is not None:
-            every = range(len(problems))
-            found = [errors[b] if b in errors else self.single(b) for b in every]
-            return Results.of(found, counts=problems.counts)
-        failed = np.zeros(len(problems), dtype=bool)
-        failed[list(errors)] = True
-        inliers = np.repeat(~failed, problems.counts)
-        residuals = np.where(inliers[:, None], self.solutions.residuals, np.nan)
-        squares = np.append((residuals**2).sum(axis=1), 0.0)
-        means = np.add.reduceat(squares, problems.offsets[:-1]) / np.maximum(problems.counts, 1)
-        covariance = self.solutions.covariances
-        if covariance is not None:
-            covariance = full_covariance(covariance, self.options.known_axis)
-            covariance[failed] = np.nan
-        return Results(
-            poses=np.where(failed[:, None], np.nan, self.solutions.poses[:, 0]),
-            rms=np.where(failed, np.nan, np.sqrt(means)),
-            focal_length=np.where(failed, np.nan, problems.calibrations[:, 0]),
-            fisher_covariance=covariance,
-            residuals=residuals,
-            inliers=inliers,
-            offsets=problems.offsets,
-            errors=errors,
-            single=self.single,
-        )
+def _single(
+    problems: Problems, solutions: Solutions, options: FitOptions, seconds: float, b: int
+) -> Result:
+    """The result of one problem that has a solution, as `cadalign.fit` gives it."""
+    own: dict[str, Any] = {
+        name: None if value is None else value[b : b + 1].copy()
+        for name, value in solutions._asdict().items()
+        if name not in ("residuals", "errors")
+    }
+    own["residuals"] = solutions.residuals[problems.rows(b)].copy()
+    some = problems.part(b, b + 1)
+    fitted = keypoints_of_solution(some, Solutions(**own), options, seconds)
+    return result_of_keypoints(some.points_2d, fitted, diagnosis=diagnosis_of_fit)

@@ -59,13 +59,11 @@ def test_a_generator_becomes_results_in_its_order(tmp_path: Path) -> None:
             np.testing.assert_array_equal(single.alignment.packed, expected.alignment.packed)
             np.testing.assert_allclose(found.rotation[number], expected.alignment.rotation)
             np.testing.assert_allclose(found.scale[number], expected.alignment.scale)
-            assert found.covariance is not None
+            assert single.covariance is not None
             assert expected.covariance is not None
-            np.testing.assert_allclose(found.covariance[number], expected.covariance)
+            np.testing.assert_allclose(single.covariance, expected.covariance)
             np.testing.assert_allclose(found.rms[number], expected.rms)
             assert single.warnings == expected.warnings
-    rows = slice(again.offsets[3], again.offsets[4])
-    np.testing.assert_allclose(again.residuals[rows], again[3].residuals)  # type: ignore[union-attr]
     frame = again.to_dataframe()
     assert frame["solved"].all()
     assert frame["keypoints"].tolist() == [8] * 5

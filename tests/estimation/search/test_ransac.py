@@ -164,8 +164,7 @@ def test_batch_equals_single_fits_and_keeps_errors() -> None:
         for b in range(3):
             alone = fit(points_3d[b], points_2d[b], CAMERA, ransac=RansacOptions())
             assert batch.alignment(b) == alone.alignment
-            rows = slice(batch.offsets[b], batch.offsets[b + 1])
-            assert (batch.inliers[rows] == alone.inliers).all()
+            assert (batch[b].inliers == alone.inliers).all()
         assert isinstance(batch.errors[3], NoConsensusError)
         assert np.isnan(batch.rotation[3]).all()
 

@@ -13,10 +13,8 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
 from cadalign.estimation.options import MINIMAL_SOLVERS, RansacOptions
 from cadalign.estimation.starts import Start, Starts, in_rig, starts_of
-from cadalign.estimation.uncertainty.evidence import image_depths_at
 from cadalign.solvers.constants import CAUCHY, LINEAR, SAMPLE_SIZES
 from cadalign.solvers.joint.evidence import (
-    DEPTH_LOSS_SCALE,
     Evidence,
     State,
     kept_rows,
@@ -24,11 +22,9 @@ from cadalign.solvers.joint.evidence import (
     points_of,
     seen_in_cameras,
 )
-from cadalign.solvers.joint.search import keypoints_of, refine_joint, score_state, search_joint
+from cadalign.solvers.joint.search import keypoints_of, search_joint
 from cadalign.solvers.ransac import rigid_hypotheses
 
-LEAST_SEEN = 3
-"""Depths of keypoints that are estimated from, the least: two agree by chance."""
 OUTLIER_COST = 5.0
 """Cost of a keypoint that is left out, beyond the square of its threshold."""
 _WIDENING = 3.0  # standard deviations of a displacement that a threshold allows for
@@ -40,10 +36,6 @@ _REFINED = 8
 _ROUNDS = 5
 _KEPT = 4  # minima of the robust search that are settled on their inliers
 _LEAST_INLIERS = 3
-_HIDDEN = 2.5  # [sigma], least, of a keypoint that is taken for one behind what its image shows
-_SIZES = 8  # that are tried
-_UNLIKELY_SIZE = 20.0  # excess cost of one that is
-_ITERATIONS = 30
 
 
 class JointConsensus(NamedTuple):
@@ -131,74 +123,6 @@ def _settle(
             break
         inliers = again
     return best
-
-
-def without_hidden(found: JointConsensus) -> list[JointConsensus]:
-    """Estimates without the depths of keypoints that something nearer may hide.
-
-    A depth image shows what hides them: all such depths are too small, so that several make the
-    object smaller and nearer. Where the keypoints tell no more of its size, every size at which
-    single depths are right is an estimate, as likely as it leaves few depths out: a hidden keypoint
-    lies anywhere within the object's depth behind what is seen.
-    """
-    depths = found.evidence.image_depths
-    if not len(depths.point):
-        return [found]
-    beside = found.score - score_state(found.evidence, found.state)  # of keypoints left out
-    if not np.isfinite(beside):
-        return [found]
-    estimates: dict[bytes, JointConsensus] = {}
-    for factor in _likely_sizes(found):
-        state = found.state
-        poses = state.poses.copy()
-        poses[:, 9:] *= factor
-        state = state._replace(poses=poses, log_scales=state.log_scales + math.log(factor))
-        shown, settled = np.zeros(len(depths.point), dtype=bool), None
-        for _ in range(_ROUNDS):
-            limits, again = hidden_limits(found.evidence, state)
-            if (again == shown).all() or again.sum() < min(LEAST_SEEN, len(again)):
-                break
-            shown = again
-            evidence = found.evidence.with_block(kept_rows(depths, shown))
-            cost, score, state = refine_joint(evidence, _ITERATIONS, state)
-            if not cost < np.inf:
-                break
-            score += beside + cost_of_hidden(limits, shown)
-            settled = JointConsensus(found.inliers, evidence, state, cost, score)
-        if settled is not None and np.isfinite(settled.score):
-            estimates.setdefault(shown.tobytes(), settled)
-    return list(estimates.values()) or [found]
-
-
-def _likely_sizes(found: JointConsensus) -> list[float]:
-    """Factors of the size at which the depths of keypoints agree, the best first."""
-    depths = found.evidence.image_depths
-    expected = image_depths_at(found.evidence, found.state)
-    factors = np.append(1.0, depths.value / expected)
-    factors = factors[factors > 0]
-    errors = (factors[:, None] * expected - depths.value) * depths.weight
-    scale, limits = DEPTH_LOSS_SCALE**2, hidden_limits(found.evidence, found.state)[0]
-    costs = np.where(errors < limits, scale * np.log1p(errors**2 / scale), limits**2).sum(axis=1)
-    order = np.argsort(costs, kind="stable")
-    likely = order[costs[order] < costs[order[0]] + _UNLIKELY_SIZE]
-    return [float(factors[k]) for k in likely[:_SIZES]]
-
-
-def hidden_limits(evidence: Evidence, state: State) -> tuple[FloatArray, BoolArray]:
-    """Errors of depths (m,) [sigma] beyond which it is likelier that they are of something else.
-
-    They are those of what hides a keypoint anywhere within the depth of all. Also tells which
-    depths (m,) do not exceed them.
-    """
-    depths, expected = evidence.image_depths, image_depths_at(evidence, state)
-    densities = np.ptp(expected) * depths.weight / math.sqrt(2 * math.pi)
-    limits = np.sqrt(np.maximum(2 * np.log(np.maximum(densities, 1.0)), _HIDDEN**2))
-    return limits, (expected - depths.value) * depths.weight < limits
-
-
-def cost_of_hidden(limits: FloatArray, shown: BoolArray) -> float:
-    """Cost of the depths (m,) that are not shown: that of one at its limit."""
-    return float((limits[~shown] ** 2).sum())
 
 
 def whitened_lengths(evidence: Evidence, state: State) -> FloatArray:

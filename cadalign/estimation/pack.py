@@ -22,16 +22,15 @@ from cadalign.io.evidence import LENGTHS, Size
 from cadalign.solvers.joint.evidence import (
     Directions,
     Evidence,
-    ImageDepths,
     Offsets,
     Rig,
-    Shape,
     Sightings,
     kept_rows,
     stacked,
 )
 from cadalign.solvers.marginal.problem import Seen
 
+_DEPTH_LOSS_SCALE = 3.0  # [sigma], of depths in an image: what hides a keypoint has another
 _RADIUS = 2  # of the window about a keypoint [px]
 _GAP = 4.0  # between surfaces in a window [sigma]
 _LEAST_PIXELS = 3  # of a surface in a window
@@ -65,30 +64,24 @@ def evidence_of(
         rows.append(prior.rows_of(view.keypoint_ids, f"views[{view.number}].ids"))
     offsets = known_distances(prior, views, size)
     directions = known_directions(prior, views)
-    if any(camera.turn for camera in lenses.cameras):
-        # What is known in the lenses' frames, in those of cameras that are turned.
-        of_lenses = np.array([camera.lens_from_camera for camera in lenses.cameras])
-        turned = of_lenses[directions.image]
-        directions = directions._replace(
-            camera=np.einsum("dij,di->dj", turned, directions.camera),
-            whitening=directions.whitening @ turned,
-        )
+    sightings = _sightings(rows, views, lenses.cameras, noise, options)
+    # What is known in the lenses' frames, in those of cameras that are turned.
+    of_lenses = np.array([camera.lens_from_camera for camera in lenses.cameras])
+    turned = of_lenses[directions.image]
+    directions = directions._replace(
+        camera=np.einsum("dij,di->dj", turned, directions.camera),
+        whitening=directions.whitening @ turned,
+    )
+    is_rig = len(views) > 1 and views[0].cam_from_rig is not None
+    is_metric = bool(is_rig or len(offsets.value) or sightings.depths[:, 1].any())
     return Evidence(
         prior.components[0],
-        _sightings(rows, views, lenses.cameras, noise, options),
-        _rig(views, turns),
+        sightings,
+        _rig(views, turns, of_lenses[:, 2]),
         lenses.focals(),
-        scale_priors(prior, _is_metric(offsets, views)),
-        (directions, offsets, _image_depths(prior.components[0], rows, views)),
+        scale_priors(prior, is_metric),
+        (directions, offsets),
     )
-
-
-def _is_metric(offsets: Offsets, views: Sequence[View]) -> bool:
-    """True if the object's size is told: by distances, depths, or known camera poses."""
-    depths = [cast(FloatArray, view.depth) for view in views if view.depth is not None]
-    if len(offsets.value) or any(np.isfinite(depth).any() for depth in depths):
-        return True
-    return len(views) > 1 and views[0].cam_from_rig is not None
 
 
 def _sightings(
@@ -120,18 +113,22 @@ def _sightings(
 
 
 def _keypoint_depths(view: View, count: int) -> FloatArray:
-    """Depths (n, 2) and their inverse standard deviations, 0 where unknown."""
-    found = np.zeros((count, 2))
-    if view.depth is not None and view.depth_image is None:
+    """Depths (n, 3) as of `Sightings`; a keypoint in a depth image may be hidden."""
+    found = np.zeros((count, 3))
+    if view.depth is None:
+        return found
+    if view.depth_image is None:
         depth = cast(FloatArray, view.depth)
-        known = np.isfinite(depth)
-        relative = np.broadcast_to(np.asarray(view.depth_sigma, dtype=np.float64), (count,))
-        found[known, 0] = depth[known]
-        found[known, 1] = 1.0 / (depth[known] * relative[known])
+        deviations, scale = depth * np.asarray(view.depth_sigma, dtype=np.float64), 0.0
+    else:
+        relative, scale = float(cast(float, view.depth_sigma)), _DEPTH_LOSS_SCALE
+        depth, deviations = sample_depth(view.depth_image, view.pixels, sigma=relative)
+    known = np.isfinite(depth)
+    found[known] = np.column_stack([depth, 1.0 / deviations, np.full(count, scale)])[known]
     return found
 
 
-def _rig(views: Sequence[View], turns: Sequence[FloatArray] | None) -> Rig:
+def _rig(views: Sequence[View], turns: Sequence[FloatArray] | None, axes: FloatArray) -> Rig:
     """Motions of the cameras, with the turns of lenses, and the pose that each belongs to.
 
     The pose of a view without evidence is -1.
@@ -151,25 +148,9 @@ def _rig(views: Sequence[View], turns: Sequence[FloatArray] | None) -> Rig:
             motion = turns[number].T @ motion
         rows.append(np.append(motion[:, :3], motion[:, 3]))
     if is_rig:
-        return Rig(np.array(rows), np.zeros(len(views), dtype=np.int64))
+        return Rig(np.array(rows), np.zeros(len(views), dtype=np.int64), axes)
     takes_part = np.array([view.has_evidence for view in views])
-    return Rig(np.array(rows), np.where(takes_part, takes_part.cumsum() - 1, -1))
-
-
-def _image_depths(shape: Shape, rows: Sequence[list[int]], views: Sequence[View]) -> ImageDepths:
-    """Depths of the keypoints ``rows`` of every view that its depth image holds."""
-    none, no_value = np.empty(0, dtype=np.int64), np.empty(0)
-    tables = [ImageDepths(none, none, no_value, no_value)]
-    for number, view in enumerate(views):
-        if view.depth_image is None:
-            continue
-        relative = float(cast(float, view.depth_sigma))
-        found, deviations = sample_depth(view.depth_image, view.pixels, sigma=relative)
-        known = np.isfinite(found)
-        point = np.array(rows[number], dtype=np.int64)[known]
-        weight = 1.0 / np.hypot(deviations[known], shape.spread[point])
-        tables.append(ImageDepths(point, np.full(len(point), number), found[known], weight))
-    return stacked(tables)
+    return Rig(np.array(rows), np.where(takes_part, takes_part.cumsum() - 1, -1), axes)
 
 
 def sample_depth(

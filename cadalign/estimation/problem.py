@@ -18,12 +18,12 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.model import Model, is_exact_model
-from cadalign.estimation.options import FitOptions, RansacOptions, pixel_information
+from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import Lenses, ShapePrior, prior_of
 from cadalign.estimation.view import View, without_evidence
 from cadalign.geometry.alignment import Alignment, are_on_a_line
-from cadalign.geometry.camera import Camera, faced, needs_facing, rays_ahead
+from cadalign.geometry.camera import faced, needs_facing, rays_ahead
 from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import LEAST_POINTS
@@ -33,7 +33,6 @@ Inits = Sequence[Alignment | None]
 """Given starts: one for each view of unknown motion, or one in the frame that the views share."""
 
 _ON_A_LINE = 1e-3  # second over first extent of keypoints that determine no rotation about it
-_LEAST_AHEAD = 0.05  # cosine off a wide lens's axis below which a depth says nothing of a point
 _MOST_PIXELS = 500  # of a mask, amid which a wide lens is turned
 
 
@@ -274,14 +273,13 @@ def _lie_on_a_line(points: FloatArray) -> bool:
 
 
 def _facing_view(view: View) -> View:
-    """The view of a wide lens that is turned to what it shows; ``up`` stays in the lens's frame.
+    """The view of a wide lens that is turned to what it shows.
 
-    Depths, along the lens's axis as they are given, become those along the turned axis.
+    Its direction and depths stay those in the lens's frame.
     """
     if not needs_facing([view.camera]):
         return view
-    turned = replace(view, camera=faced(view.camera, _pixels_of_object(view)))
-    return turned if view.depth is None else _with_facing_depths(turned, view.camera)
+    return replace(view, camera=faced(view.camera, _pixels_of_object(view)))
 
 
 def _pixels_of_object(view: View) -> FloatArray:
@@ -290,28 +288,3 @@ def _pixels_of_object(view: View) -> FloatArray:
         return view.pixels
     inside = np.argwhere(np.asarray(view.mask) > 0.5)[:, ::-1]
     return inside[:: max(len(inside) // _MOST_PIXELS, 1)].astype(float)
-
-
-def _with_facing_depths(turned: View, lens: Camera) -> View:
-    """A turned view whose depths, along the axis of its lens, become those along its own.
-
-    NaN for those of points beside the lens, of which that axis says nothing. A keypoint's noise
-    turns its ray, which adds to the standard deviation of its depth.
-    """
-    depth = np.array(turned.depth, dtype=np.float64)
-    known = np.isfinite(depth)
-    is_image = depth.ndim == 2
-    pixels = np.argwhere(known)[:, ::-1].astype(float) if is_image else turned.pixels[known]
-    rays, valid = lens.rays_where_valid(pixels)
-    along, ahead = rays[:, 2], rays @ turned.camera.lens_from_camera[:, 2]
-    usable = valid & (along > _LEAST_AHEAD) & (ahead > _LEAST_AHEAD)
-    along, ahead = (np.where(usable, each, 1.0) for each in (along, ahead))
-    depth[known] *= np.where(usable, ahead / along, np.nan)
-    if is_image:
-        return replace(turned, depth=depth)
-    noise = 1.0 if turned.sigma is None else turned.sigma
-    variances = np.linalg.inv(pixel_information(noise, len(depth)))[known]
-    angles = np.sqrt(np.trace(variances, axis1=1, axis2=2) / 2) / lens.fx
-    sigma = np.broadcast_to(np.asarray(turned.depth_sigma, dtype=np.float64), depth.shape).copy()
-    sigma[known] = np.sqrt(sigma[known] ** 2 + angles**2 * (along**-2 - 1 + ahead**-2 - 1))
-    return replace(turned, depth=depth, depth_sigma=sigma)

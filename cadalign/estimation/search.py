@@ -18,7 +18,6 @@ from cadalign.estimation.joint_robust import (
     whitened_lengths,
     with_sightings,
     with_whitening_times,
-    without_hidden,
 )
 from cadalign.estimation.prior import Lenses
 from cadalign.estimation.problem import Inits, Problem
@@ -111,8 +110,7 @@ def search_at_noise(problem: Problem, init: Inits) -> SearchResult:
         prior_score = -2 * float(np.log(problem.prior.weights[number]))
         minima.extend(
             Minimum(number, *each._replace(score=each.score + prior_score), lenses)
-            for minimum in found
-            for each in without_hidden(minimum)
+            for each in found
         )
     if problem.ransac is not None and minima:
         best = min(minima, key=lambda each: each.score)

@@ -21,7 +21,7 @@ from cadalign.estimation.prior import has_scale_prior
 from cadalign.estimation.uncertainty.evidence import count_equations
 from cadalign.geometry.rotations import spread_rotations
 from cadalign.solvers.constants import LEAST_POINTS
-from cadalign.solvers.joint.evidence import Evidence, distances_of, seen_in_cameras
+from cadalign.solvers.joint.evidence import Evidence, depths_along_axes, distances_of
 from cadalign.solvers.joint.search import view_starts
 from cadalign.solvers.marginal.problem import GaussianTarget
 from cadalign.solvers.marginal.search import after_motion, half_turns
@@ -126,16 +126,11 @@ def _sized(evidence: Evidence, poses: FloatArray, log_scales: FloatArray) -> _St
 def _size_factor(evidence: Evidence, poses: FloatArray, scale: FloatArray) -> float:
     """Median of measured over predicted lengths; NaN where nothing is measured."""
     sightings, mean = evidence.sightings, evidence.shape.mean
-    sampled, offsets = evidence.image_depths, evidence.offsets
-
-    def seen(point: IntArray, image: IntArray) -> FloatArray:
-        return seen_in_cameras(evidence, poses, mean[point] * scale, image)
-
-    has_depth = sightings.depths[:, 1] > 0
-    depths = seen(sightings.point[has_depth], sightings.image[has_depth])[:, 2]
+    has_depth, offsets = sightings.depths[:, 1] > 0, evidence.offsets
+    points, image = mean[sightings.point[has_depth]] * scale, sightings.image[has_depth]
+    depths = depths_along_axes(evidence, poses, points, image)
     ratios = [
         sightings.depths[has_depth, 0] / depths,
-        sampled.value / seen(sampled.point, sampled.image)[:, 2],
         offsets.value / distances_of(evidence, poses, mean * scale),
     ]
     told = np.concatenate(ratios)
@@ -241,21 +236,19 @@ def _metric_starts(evidence: Evidence, own: Sequence[_Start]) -> list[_Start]:
 
 
 def _rows_of(evidence: Evidence) -> _Rows:
-    sightings, sampled, shape = evidence.sightings, evidence.image_depths, evidence.shape
+    sightings, shape = evidence.sightings, evidence.shape
     u, v = sightings.rays.T
-    zeros, ones = np.zeros_like(u), np.ones_like(u)
+    zeros = np.zeros_like(u)
     a, b, c = sightings.whitening.T
     normals = [
         np.stack([a, b, -(a * u + b * v)], axis=1),
         np.stack([zeros, c, -c * v], axis=1),
-        np.stack([zeros, zeros, ones], axis=1),
-        np.tile([0.0, 0.0, 1.0], (len(sampled.point), 1)),
+        evidence.rig.axes[sightings.image],
     ]
-    right = [zeros, zeros, sightings.depths[:, 0], sampled.value]
-    weights = [(c > 0).astype(float), (c > 0).astype(float), sightings.depths[:, 1], sampled.weight]
-    point = np.concatenate([np.tile(sightings.point, 3), sampled.point])
-    image = np.concatenate([np.tile(sightings.image, 3), sampled.image])
-    is_ray = np.concatenate([np.ones(2 * len(u)), np.zeros(len(u) + len(sampled.point))])
+    right = [zeros, zeros, sightings.depths[:, 0]]
+    weights = [(c > 0).astype(float), (c > 0).astype(float), sightings.depths[:, 1]]
+    point, image = np.tile(sightings.point, 3), np.tile(sightings.image, 3)
+    is_ray = np.repeat([1.0, 1.0, 0.0], len(u))
     weight, normal = np.concatenate(weights), np.concatenate(normals)
     kept = weight > 0
     cameras, normal = evidence.rig.cam_from_rig[image[kept]], normal[kept]

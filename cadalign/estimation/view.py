@@ -62,9 +62,8 @@ class View(BeyondKeypoints):
         Depths of the keypoints, their z in the camera's frame, also of a wide lens, or an image of
         such depths that is registered to the photo, as an array or as a 16-bit PNG [model units, or
         the unit in which the object's size is wanted]; NaN where unknown, in an image also 0. An
-        image is sampled robustly at the keypoints. Those that the object itself hides are told
-        apart by the model's mesh; without one, only those that lie some ``depth_sigma`` behind what
-        is seen.
+        image is sampled robustly at the keypoints. One or two of eight that something else hides
+        hardly count, by Cauchy's loss; give NaN for keypoints on the object's far side.
     depth_sigma : float or (n,) float
         Standard deviation of the depths, relative; by default 0.01, 1 %.
     depth_scale : float, optional

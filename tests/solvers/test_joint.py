@@ -15,7 +15,6 @@ from cadalign.solvers.joint.evidence import (
     Directions,
     Evidence,
     Focals,
-    ImageDepths,
     Offsets,
     Rig,
     ScalePriors,
@@ -51,7 +50,9 @@ def evidence_of(
     )
     point, view = np.repeat(np.arange(POINTS), VIEWS), np.tile(np.arange(VIEWS), POINTS)
     count = len(point)
-    depths = np.stack([np.full(count, 5.0), np.where(np.arange(count) % 2, 10.0, 0.0)], axis=1)
+    weights = np.where(np.arange(count) % 2, 10.0, 0.0)
+    scales = np.where(np.arange(count) % 4 == 3, 3.0, 0.0)  # of depths in an image
+    depths = np.stack([np.full(count, 5.0), weights, scales], axis=1)
     sightings = Sightings(
         point,
         view,
@@ -79,9 +80,6 @@ def evidence_of(
         np.array([1.0, 2.0, 2.0, -3.0]),
         np.array([10.0, 20.0, 20.0, 10.0]),
     )
-    depths = ImageDepths(
-        np.array([2, 6]), np.array([0, 1]), np.array([4.0, 5.0]), np.array([30.0, 20.0])
-    )
     precision = rng.normal(size=(3, 3))
     scales = ScalePriors(np.ones(3), precision @ precision.T, ScalePrior(3.0, width))
     lenses = Focals(
@@ -91,8 +89,8 @@ def evidence_of(
         0.1 * rng.normal(size=focals),
         np.full(focals, 30.0),
     )
-    rig = Rig(cameras, np.array(poses))
-    return Evidence(shape, sightings, rig, lenses, scales, (up, offsets, depths))
+    rig = Rig(cameras, np.array(poses), np.array([[0.0, 0, 1], [0, 0.6, 0.8]]))
+    return Evidence(shape, sightings, rig, lenses, scales, (up, offsets))
 
 
 def gradient_of(evidence: Evidence, state: State, *, integrates: bool = False) -> np.ndarray:
@@ -137,7 +135,8 @@ def seen_from(evidence: Evidence, state: State) -> Evidence:
         seen = np.einsum("nij,nj->ni", rotations, seen) + motion[:, 9:]
     noise = np.random.default_rng(0).normal(0, 0.01, (len(seen), 2))
     rays = seen[:, :2] / seen[:, 2:] + noise
-    depths = np.stack([seen[:, 2], sightings.depths[:, 1]], axis=1)
+    depths = sightings.depths.copy()
+    depths[:, 0] = (seen * rig.axes[sightings.image]).sum(axis=1)
     return evidence._replace(sightings=sightings._replace(rays=rays, depths=depths))
 
 
@@ -259,8 +258,7 @@ def test_eliminated_displacements_equal_modes_of_the_same_deviation() -> None:
     evidence = evidence_of(5, spread=spread, poses=(0, 0), loss=LINEAR)
     each = spread * np.eye(3 * POINTS).reshape(-1, POINTS, 3)
     evidence = seen_from(evidence, state_of(5, 1))
-    for block in (evidence.offsets, evidence.image_depths):
-        evidence = evidence.with_block(kept_rows(block, np.arange(0)))
+    evidence = evidence.with_block(kept_rows(evidence.offsets, np.arange(0)))
     as_modes = evidence._replace(
         shape=Shape(
             evidence.shape.mean,

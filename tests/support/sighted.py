@@ -9,7 +9,6 @@ from cadalign.solvers.joint.evidence import (
     Directions,
     Evidence,
     Focals,
-    ImageDepths,
     Offsets,
     Rig,
     ScalePriors,
@@ -29,7 +28,7 @@ def sighted_evidence(shape: Shape, rays: np.ndarray, focals: Focals = KNOWN_FOCA
         np.zeros(count, dtype=np.int64),
         rays,
         np.tile([1000.0, 0.0, 1000.0], (count, 1)),
-        np.zeros((count, 2)),
+        np.zeros((count, 3)),
         np.zeros(count, dtype=np.int64),
         np.ones(count),
         np.zeros((count, 2)),
@@ -37,12 +36,11 @@ def sighted_evidence(shape: Shape, rays: np.ndarray, focals: Focals = KNOWN_FOCA
     blocks = (
         Directions(np.empty((0, 3)), np.empty((0, 3)), _NONE, np.empty((0, 3, 3))),
         Offsets(_NONE.reshape(0, 2), _NONE, np.empty((0, 3)), _NO_VALUE, _NO_VALUE),
-        ImageDepths(_NONE, _NONE, _NO_VALUE, _NO_VALUE),
     )
     return Evidence(
         shape,
         sightings,
-        Rig(np.append(np.eye(3), np.zeros(3))[None], np.zeros(1, dtype=np.int64)),
+        Rig(np.append(np.eye(3), np.zeros(3))[None], np.zeros(1, dtype=np.int64), np.eye(3)[2:]),
         focals,
         ScalePriors(np.zeros(3), np.zeros((3, 3)), ScalePrior(0.0, 0.0)),
         blocks,

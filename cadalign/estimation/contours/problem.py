@@ -242,7 +242,7 @@ def rows_of(
             np.full(count, source.image),
             rays,
             np.column_stack([across * weights[:, None], np.zeros(count)]),
-            np.zeros((count, 2)),
+            np.zeros((count, 3)),
             np.full(count, CAUCHY),
             np.full(count, noise.loss_scale / root),
             np.zeros((count, 2)),
@@ -264,7 +264,7 @@ def _with_rows(
     def moved(points: IntArray) -> IntArray:
         return np.where(points >= keypoints, points + total, points)
 
-    offsets, depths = evidence.offsets, evidence.image_depths
+    offsets = evidence.offsets
     sightings = [evidence.sightings._replace(point=moved(evidence.sightings.point))]
     first = keypoints
     for number, rows in enumerate(measured):
@@ -280,8 +280,7 @@ def _with_rows(
         shape=Shape(mean, modes, _with_room(shape.spread, keypoints, total)),
         sightings=stacked(sightings),
     )
-    whole = whole.with_block(offsets._replace(ends=moved(offsets.ends)))
-    return whole.with_block(depths._replace(point=moved(depths.point)))
+    return whole.with_block(offsets._replace(ends=moved(offsets.ends)))
 
 
 def _with_room(rows: FloatArray, first: int, count: int) -> FloatArray:

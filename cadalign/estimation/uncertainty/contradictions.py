@@ -22,7 +22,6 @@ from cadalign.estimation.uncertainty.evidence import (
     count_equations,
     depths_of,
     distances_beside,
-    image_depths_at,
     image_of,
     pieces_of,
     redundancy_of,
@@ -32,7 +31,7 @@ from cadalign.estimation.uncertainty.residuals import chi_square_quantile, chi_s
 from cadalign.estimation.uncertainty.shape_posterior import ShapeTails, misfits
 from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.solvers.joint.covariance import information_of, scaled_information
-from cadalign.solvers.joint.evidence import Evidence, Rig, State, kept_rows, seen_in_cameras
+from cadalign.solvers.joint.evidence import Evidence, State, kept_rows, seen_in_cameras
 from cadalign.solvers.joint.search import cost_of, reduced, refine_joint, search_joint
 
 _FALSE_ALARMS = 0.005  # of all tests of an estimate together
@@ -72,7 +71,7 @@ def warnings_of(evidence: Evidence, state: State, cost: float, tails: ShapeTails
         text = f"{named} contradicts the other evidence, by {sigmas:.2g} sigma{hint}"
         view = views.pop() if len(views) == 1 else None
         return (*found, EstimateWarning("contradiction", text, view))
-    if not evidence.sightings.loss.any() and not len(evidence.image_depths.point):
+    if not evidence.sightings.loss.any() and not evidence.sightings.depths[:, 2].any():
         found.extend(misfits(cost, redundancy_of(evidence), tails))
     return tuple(found)
 
@@ -84,7 +83,7 @@ def _contradictions(evidence: Evidence, state: State, cost: float) -> Sequence[_
     if len(every) < 2 or not pieces:
         return ()
     evidence, state = reduced(evidence, state)
-    if len(evidence.image_depths.point):
+    if evidence.sightings.depths[:, 2].any():
         evidence = _without_hidden(evidence, state)
         cost, _, state = refine_joint(evidence, 10 * _REFITTING, state)
     if len(pieces) > _MOST_TESTED:  # those of the largest own cost
@@ -130,20 +129,22 @@ def _determines_its_pose(evidence: Evidence, piece: Piece) -> bool:
     if piece.kind != "keypoints" or piece.view is None:
         return False
     rig, sightings = evidence.rig, evidence.sightings
-    others = (sightings.image == piece.view) & ~told_by(sightings)["keypoints"]
-    depths = (evidence.image_depths.image == piece.view).any()
-    return (rig.pose == rig.pose[piece.view]).sum() == 1 and not others.any() and not depths
+    told = told_by(sightings)
+    others = (sightings.image == piece.view) & (~told["keypoints"] | (sightings.depths[:, 2] > 0))
+    return (rig.pose == rig.pose[piece.view]).sum() == 1 and not others.any()
 
 
 def _without_hidden(evidence: Evidence, state: State) -> Evidence:
     """The evidence without depths that differ from most of their image: of something else."""
-    depths, expected = evidence.image_depths, image_depths_at(evidence, state)
-    kept = np.ones(len(expected), dtype=bool)
-    for view in np.unique(depths.image):
-        rows = depths.image == view
-        factor = np.median(depths.value[rows] / expected[rows])
-        kept[rows] = (np.abs(depths.value / factor - expected) * depths.weight)[rows] < _HIDDEN
-    return evidence.with_block(kept_rows(depths, kept))
+    sightings = evidence.sightings
+    depths = sightings.depths.copy()
+    for view in np.unique(sightings.image[depths[:, 2] > 0]):
+        rows = (sightings.image == view) & (depths[:, 1] > 0)
+        expected, measured, weights = depths_of(evidence, state, view)
+        factor = np.median(measured / expected)
+        is_other = np.abs(measured / factor - expected) * weights >= _HIDDEN
+        depths[rows] = np.where(is_other[:, None], 0.0, depths[rows])
+    return evidence._replace(sightings=sightings._replace(depths=depths))
 
 
 def _refitted(rest: Evidence, start: State, *, searches: bool) -> tuple[float, State]:
@@ -235,12 +236,10 @@ def _without(evidence: Evidence, state: State, piece: Piece) -> tuple[Evidence, 
         pose: IntArray = evidence.rig.pose.copy()
         own = state.poses[pose[view]]
         pose[view] = len(state.poses)
-        rig = Rig(evidence.rig.cam_from_rig, pose)
+        rig = evidence.rig._replace(pose=pose)
         return evidence._replace(rig=rig), state._replace(poses=np.vstack([state.poses, own]))
     hidden = told_by(sightings)[kind] & (sightings.image == view)
     if kind == "depth":
-        depths = kept_rows(evidence.image_depths, evidence.image_depths.image != view)
-        evidence = evidence.with_block(depths)
         sightings = sightings._replace(depths=np.where(hidden[:, None], 0.0, sightings.depths))
     else:
         whitening = np.where(hidden[:, None], 0.0, sightings.whitening)

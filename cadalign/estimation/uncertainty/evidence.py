@@ -15,6 +15,7 @@ from cadalign.solvers.joint.evidence import (
     Evidence,
     Sightings,
     State,
+    depths_along_axes,
     distances_of,
     kept_rows,
     log_focals_of,
@@ -43,7 +44,6 @@ def pieces_of(evidence: Evidence) -> list[Piece]:
     """All pieces, view by view."""
     rig, offsets = evidence.rig, evidence.offsets
     told = {kind: evidence.sightings.image[on] for kind, on in told_by(evidence.sightings).items()}
-    told["depth"] = np.append(told["depth"], evidence.image_depths.image)
     told["gravity"] = evidence.directions.image
     told["camera height"] = offsets.image[offsets.image >= 0]
     told["rig"] = np.flatnonzero(rig.is_shared)
@@ -66,7 +66,7 @@ def count_equations(evidence: Evidence) -> int:
     told = {kind: int(rows.sum()) for kind, rows in told_by(evidence.sightings).items()}
     count = 2 * told["keypoints"] + told["mask"] + told["depth"]
     count += 2 * len(evidence.directions.image) + len(evidence.offsets.weight)
-    count += len(evidence.image_depths.weight) + len(evidence.shape.modes)
+    count += len(evidence.shape.modes)
     if has_scale_prior(evidence.scales):
         count += int(np.linalg.matrix_rank(evidence.scales.precision))
     return count
@@ -138,19 +138,9 @@ def depths_of(
     """Expected and measured depths of a view (n,), with the inverse standard deviations."""
     sightings = evidence.sightings
     rows = told_by(sightings)["depth"] & (sightings.image == view)
-    expected, others = image_depths_at(evidence, state), evidence.image_depths.image == view
-    return (
-        np.concatenate([_sighted(evidence, state, rows)[:, 2], expected[others]]),
-        np.concatenate([sightings.depths[rows, 0], evidence.image_depths.value[others]]),
-        np.concatenate([sightings.depths[rows, 1], evidence.image_depths.weight[others]]),
-    )
-
-
-def image_depths_at(evidence: Evidence, state: State) -> FloatArray:
-    """Depths (m,) that a state has in the place of the evidence's image depths."""
-    depths = evidence.image_depths
-    points = points_of(evidence.shape, state)[depths.point]
-    return seen_in_cameras(evidence, state.poses, points, depths.image)[:, 2]
+    points = points_of(evidence.shape, state)[sightings.point[rows]]
+    expected = depths_along_axes(evidence, state.poses, points, sightings.image[rows])
+    return expected, sightings.depths[rows, 0], sightings.depths[rows, 1]
 
 
 def _of_gravity(evidence: Evidence, state: State, view: int) -> EvidenceSummary:

@@ -14,18 +14,12 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import KernelFamily, inlined, kernel, unrolled
-from cadalign.solvers.constants import CAUCHY
-from cadalign.solvers.evidence import fall_of_weight, loss_and_root
 from cadalign.solvers.joint.evidence import (
-    DEPTH_LOSS_SCALE,
     Directions,
     Evidence,
-    ImageDepths,
     Offsets,
     Shape,
     State,
-    exp_of,
-    stretched_point,
     unstretched,
 )
 from cadalign.solvers.linalg import cross, dot, triple
@@ -149,35 +143,6 @@ def _write_offset(
                 value += along * stretched
                 _add_shape(evidence.shape, state, i, a, weight * along, row)
     return plain_equation(p, value * weight)
-
-
-@equations_of.of(ImageDepths)
-@inlined
-def _equations_of_depths(depths: ImageDepths) -> int:
-    return int(depths.value.shape[0])
-
-
-@write_equation.of(ImageDepths)
-@kernel
-def _write_depth(
-    depths: ImageDepths, evidence: Evidence, state: State, j: int, row: FloatArray
-) -> BlockEquation:
-    """Write the equation of a point's depth in a view."""
-    rig = evidence.rig
-    scale = exp_of(state.log_scales)
-    v, i, weight = depths.image[j], depths.point[j], depths.weight[j]
-    camera, pose = rig.cam_from_rig[v], state.poses[rig.pose[v]]
-    rotated = turn(pose, stretched_point(evidence.shape, state, scale, i))
-    _, _, depth = shift(camera, turn(camera, shift(pose, rotated)))
-    by_rig = turn_back(camera, (0.0, 0.0, weight))
-    by_turn, by_model = cross(rotated, by_rig), turn_back(pose, by_rig)
-    for k in range(3):
-        row[k], row[3 + k] = by_turn[k], by_rig[k]
-        _add_shape(evidence.shape, state, i, k, by_model[k], row)
-    residual = (depth - depths.value[j]) * weight
-    cost, root = loss_and_root(CAUCHY, DEPTH_LOSS_SCALE, residual * residual)
-    fall = fall_of_weight(CAUCHY, DEPTH_LOSS_SCALE, root, root * root * residual * residual)
-    return BlockEquation(rig.pose[v], residual, cost, root, fall)
 
 
 @inlined

@@ -38,10 +38,11 @@ class Sightings(NamedTuple):
     """Measurements of points in images, N of them.
 
     ``point`` and ``image`` (N,) number point and view; ``rays`` (N, 2) are normalised, with
-    ``whitening`` (N, 3) as in `cadalign.solvers.evidence.KeypointEvidence`; ``depths`` (N, 2) holds
-    depths and their inverse standard deviations, 0 where there is none. ``loss`` (N,) and
-    ``loss_scale`` (N,) say how the length of each residual counts. ``slopes`` (N, 2) are changes of
-    undistorted pixels, over the focal length, by its logarithm.
+    ``whitening`` (N, 3) as in `cadalign.solvers.evidence.KeypointEvidence`; ``depths`` (N, 3) holds
+    depths, their inverse standard deviations, 0 where there is none, and the scale of Cauchy's loss
+    on them, 0 for that of the ray. ``loss`` (N,) and ``loss_scale`` (N,) say how the length of each
+    residual counts. ``slopes`` (N, 2) are changes of undistorted pixels, over the focal length, by
+    its logarithm.
     """
 
     point: IntArray
@@ -57,11 +58,12 @@ class Sightings(NamedTuple):
 class Rig(NamedTuple):
     """Cameras (V, 12), rotation row by row and translation, and the pose (V,) each belongs to.
 
-    The pose of a view without evidence is -1.
+    The pose of a view without evidence is -1. Depths are along the ``axes`` (V, 3) in the cameras.
     """
 
     cam_from_rig: FloatArray
     pose: IntArray
+    axes: FloatArray
 
     @property
     def is_shared(self) -> BoolArray:
@@ -112,23 +114,6 @@ class Offsets(NamedTuple):
     weight: FloatArray
 
 
-class ImageDepths(NamedTuple):
-    """Depths ``value`` (D,) of points in views by depth images, where something may hide them.
-
-    ``point`` and ``image`` (D,) are as in `Sightings`, ``weight`` (D,) are the inverse standard
-    deviations. They count under Cauchy's loss: what hides a point has another depth.
-    """
-
-    point: IntArray
-    image: IntArray
-    value: FloatArray
-    weight: FloatArray
-
-
-DEPTH_LOSS_SCALE = 3.0
-"""Length [sigma] at which the loss of image depths begins to bend."""
-
-
 class ScalePriors(NamedTuple):
     """Log scales: 1 in ``free`` (3,) where estimated, and their priors.
 
@@ -144,8 +129,8 @@ class ScalePriors(NamedTuple):
 class Evidence(NamedTuple):
     """Everything that is known about one object.
 
-    The ``blocks`` are tables of evidence beside sightings, one of a kind, those of directions,
-    offsets and image depths first; `cadalign.solvers.joint.blocks` says what a block is.
+    The ``blocks`` are tables of evidence beside sightings, one of a kind, those of directions and
+    offsets first; `cadalign.solvers.joint.blocks` says what a block is.
     """
 
     shape: Shape
@@ -164,11 +149,6 @@ class Evidence(NamedTuple):
     def offsets(self) -> Offsets:
         """Known distances."""
         return cast(Offsets, self.blocks[1])
-
-    @property
-    def image_depths(self) -> ImageDepths:
-        """Depths by depth images."""
-        return cast(ImageDepths, self.blocks[2])
 
     def with_block(self, block: Any) -> Evidence:
         """The evidence with a block in the place of that of its kind, or as one more."""
@@ -255,6 +235,14 @@ def seen_in_cameras(
         turned = np.einsum("nij,nj->ni", motion[:, :9].reshape(-1, 3, 3), points)
         points = turned + motion[:, 9:]
     return points
+
+
+def depths_along_axes(
+    evidence: Evidence, poses: FloatArray, points: FloatArray, image: IntArray
+) -> FloatArray:
+    """Depths (N,) of points as `seen_in_cameras` takes them."""
+    seen = seen_in_cameras(evidence, poses, points, image)
+    return np.asarray((seen * evidence.rig.axes[image]).sum(axis=1))
 
 
 @inlined

@@ -6,6 +6,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, kernel
+from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.evidence import beyond, fall_of_weight, loss_and_root, weigh_error
 from cadalign.solvers.joint.arrow import Arrow, add_rows, border_start
 from cadalign.solvers.joint.blocks import count_block_equations, write_block_row
@@ -18,7 +19,7 @@ from cadalign.solvers.joint.evidence import (
     stretched_point,
     undisplaced,
 )
-from cadalign.solvers.linalg import triple
+from cadalign.solvers.linalg import dot, scaled, triple
 from cadalign.solvers.projection import ray_slopes, see, shift, turn, turn_back, write_motion
 
 
@@ -52,7 +53,8 @@ def write_rows(
         camera, motion = rig.cam_from_rig[v], state.poses[rig.pose[v]]
         point = stretched_point(shape, state, scale, i)
         turned = turn(motion, point)
-        place = see(shift(camera, turn(camera, shift(motion, turned))))
+        in_camera, axis = shift(camera, turn(camera, shift(motion, turned))), triple(rig.axes[v])
+        place = see(in_camera)
         u, w, depth = place
         if not depth > 0:
             return np.inf
@@ -67,15 +69,19 @@ def write_rows(
         error = weigh_error(triple(sightings.whitening[n]), du, dw, loss, loss_scale)
         a, b, c = error.whitening
         weight = sightings.depths[n, 1]
-        rz = weight * (depth - sightings.depths[n, 0])
-        depth_part, depth_root = loss_and_root(loss, loss_scale, rz * rz)
+        rz = weight * (dot(axis, in_camera) - sightings.depths[n, 0])
+        if sightings.depths[n, 2] > 0.0:
+            depth_loss, depth_scale = CAUCHY, sightings.depths[n, 2]
+        else:
+            depth_loss, depth_scale = loss, loss_scale
+        depth_part, depth_root = loss_and_root(depth_loss, depth_scale, rz * rz)
         cost += error.cost + depth_part
         by_u, by_w = ray_slopes(place, (ratio * a, ratio * b, ratio * c))
         counts = True, c > 0.0, weight > 0.0
-        slopes = by_u, by_w, (0.0, 0.0, depth_root * weight)
+        slopes = by_u, by_w, scaled(axis, depth_root * weight)
         residuals = error.u, error.v, depth_root * rz
         fall = fall_of_weight(loss, loss_scale, error.root, error.u**2 + error.v**2)
-        depth_fall = fall_of_weight(loss, loss_scale, depth_root, residuals[2] ** 2)
+        depth_fall = fall_of_weight(depth_loss, depth_scale, depth_root, residuals[2] ** 2)
         falls = fall, fall, depth_fall
         by_focal = a * by_log_u + b * by_log_w, c * by_log_w, 0.0
         for q in range(3):

@@ -260,7 +260,7 @@ def reduced_row(evidence: Evidence, state: State) -> tuple[Reduction, FloatArray
 def used_points(evidence: Evidence) -> BoolArray:
     """True for the points (m,) that a piece of evidence names."""
     used, ends = sighted_points(evidence), evidence.offsets.ends
-    used[evidence.image_depths.point] = used[ends[ends >= 0]] = True
+    used[ends[ends >= 0]] = True
     return used
 
 

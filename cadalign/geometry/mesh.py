@@ -196,13 +196,9 @@ class Mesh:
 
 def join(pieces: Sequence[Mesh], source: str) -> Mesh:
     """Put meshes together, such as those of a file, faces one after the other."""
-    first_vertex = first_material = 0
-    faces, materials = [], []
-    for piece in pieces:
-        faces.append(piece.faces + first_vertex)
-        materials.append(piece.face_material + first_material)
-        first_vertex += len(piece.vertices)
-        first_material += len(piece.materials)
+    starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
+    materials = list(dict.fromkeys(each for piece in pieces for each in piece.materials))
+    number = {each: k for k, each in enumerate(materials)}
     colored = any(piece.vertex_colors is not None for piece in pieces)
     textured = any(piece.corner_uv is not None for piece in pieces)
     uv = [
@@ -211,13 +207,29 @@ def join(pieces: Sequence[Mesh], source: str) -> Mesh:
     ]
     return Mesh(
         vertices=np.concatenate([piece.vertices for piece in pieces]),
-        faces=np.concatenate(faces),
+        faces=np.concatenate([k + piece.faces for k, piece in zip(starts, pieces, strict=False)]),
         vertex_colors=np.concatenate([*map(spread_colors, pieces)]) if colored else None,
         corner_uv=np.concatenate(uv) if textured else None,
-        materials=tuple(material for piece in pieces for material in piece.materials),
-        face_material=np.concatenate(materials),
+        materials=tuple(materials),
+        face_material=np.concatenate(
+            [np.array([number[m] for m in each.materials])[each.face_material] for each in pieces]
+        ),
         source=source,
     )
+
+
+def fan_triangles(sizes: IntArray) -> tuple[IntArray, IntArray]:
+    """Cut polygons, whose corners are listed one after the other, into fans of triangles.
+
+    From the polygons' numbers of corners (p,), at least 3, follow the triangles (m, 3) as positions
+    in the list of all corners, and the polygons (m,), ascending, that they were cut from.
+    """
+    first_corner = np.cumsum(sizes) - sizes
+    counts = sizes - 2
+    polygon = np.repeat(np.arange(len(sizes)), counts)
+    step = np.arange(len(polygon)) - np.repeat(np.cumsum(counts) - counts, counts)
+    first = first_corner[polygon]
+    return np.stack([first, first + step + 1, first + step + 2], axis=1), polygon
 
 
 def spread_colors(mesh: Mesh, palette: FloatArray | None = None) -> FloatArray:

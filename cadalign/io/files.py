@@ -6,6 +6,7 @@ import fcntl
 import hashlib
 import io
 import json
+import logging
 import math
 import os
 import stat
@@ -19,6 +20,8 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from cadalign.errors import DataError, InputError, quote
+
+logger = logging.getLogger("cadalign")
 
 F = TypeVar("F", bound=Callable[..., Any])
 _MAX_NAME = 50  # such that the unfinished file's name stays below the 255 bytes of file systems
@@ -169,6 +172,14 @@ def damaged(what: str, where: object) -> DataError:
     """The error of a file whose content cannot be that of a whole file."""
     fix = "the file is cut short or damaged; get it again"
     return DataError(what, where=str(where), fix=fix)
+
+
+def require_count(what: str, announced: int, found: int, surplus: int, path: Path) -> None:
+    """Raise a DataError for a file with less than it announces; warn of bytes behind its data."""
+    if found < announced:
+        raise damaged(f"the header announces {announced} {what}, but only {found} are there", path)
+    if surplus:
+        logger.warning("%s: %d bytes behind its data are left out", path, surplus)
 
 
 def as_path(given: object, where: str = "path") -> Path:

@@ -189,14 +189,6 @@ def test_damaged_obj_says_file_and_line(write, text, told):
     assert told in str(caught.value)
 
 
-def test_obj_of_assimp_cut_between_lines_is_noticed(write):
-    head = "# File produced by Open Asset Import Library (x)\n"
-    text = f"{head}{SQUARE}# Mesh 'a' with 3 faces\nf 1 2 3\nl 1 2\n"
-    with pytest.raises(DataError, match="announce 3 faces and lines, but only 2"):
-        load_mesh(write(text))
-    assert len(load_mesh(write(f"{text}f 2 3 4\n")).faces) == 2
-
-
 # --- any file
 
 
@@ -365,6 +357,27 @@ def test_scenes_cut_short_are_noticed(write, colored_sphere, kind):
     end = content.index("\n", len(content) * 3 // 4) if kind == "off" else len(content) // 2
     with pytest.raises(DataError, match=rf"a\.{kind}"):
         load_mesh(write(content[:end], f"a.{kind}"))
+
+
+@pytest.mark.parametrize("kind", ["ply", "stl"])
+def test_bytes_behind_binary_data_are_warned_of(write, colored_sphere, kind, caplog):
+    mesh = load_mesh(write(colored_sphere.export(file_type=kind) + b"\n", f"a.{kind}"))
+    np.testing.assert_allclose(mesh.triangles, colored_sphere.triangles, atol=1e-6)
+    assert "1 bytes behind its data are left out" in caplog.text
+
+
+def test_off_counts_are_compared_and_comments_left_out(write):
+    text = "OFF # a square\n# b\n4 2 0\n0 0 0 # c\n1 0 0\n1 1 0\n0 1 0\n# d\n3 0 1 2\n4 0 1 2 3\n"
+    mesh = load_mesh(write(text, "a.off"))
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 1, 2], [0, 2, 3]]
+    assert mesh.polygon.tolist() == [0, 1, 1]
+    with pytest.raises(DataError, match="the header announces 2 faces, but only 1 are there"):
+        load_mesh(write(text.replace("3 0 1 2\n", ""), "a.off"))
+
+
+def test_faces_without_area_are_refused(write):
+    with pytest.raises(DataError, match="no face of the mesh has an area"):
+        load_mesh(write(f"{SQUARE}f 1 2 2\n"))
 
 
 # --- thickness

@@ -8,32 +8,35 @@ from pathlib import Path
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.errors import DataError, InputError
-from cadalign.geometry.mesh import Mesh, spread_colors
-from cadalign.io.files import as_path, keep, made_folder, refuse_folder, write_text, write_whole
+from cadalign.errors import CadalignError, DataError, InputError, brief
+from cadalign.geometry.mesh import Mesh, face_normals, spread_colors
+from cadalign.io.files import (
+    as_path,
+    damaged,
+    keep,
+    made_folder,
+    refuse_folder,
+    write_text,
+    write_whole,
+)
 from cadalign.io.images import write_image
-from cadalign.io.meshes.gltf_scene import read_gltf
+from cadalign.io.meshes.gltf import read_gltf
 from cadalign.io.meshes.obj import read_obj
+from cadalign.io.meshes.ply import read_ply
+from cadalign.io.meshes.solids import read_off, read_stl
 
 # Coordinates in ShapeNet's files have 6 decimals; less than ten of these steps is rounding.
 FLAT_TOLERANCE = 1e-5
 _DIGITS = 9  # of coordinates in OBJ files
 
 
-def _read_by_trimesh(path: Path) -> Mesh:
-    # Only here: trimesh takes longer to import than an OBJ file to be read.
-    from cadalign.io.meshes.trimesh_files import read_ply, read_solids
-
-    return read_ply(path) if path.suffix.lower() == ".ply" else read_solids(path)
-
-
 _READERS = {
     ".obj": read_obj,
-    ".ply": _read_by_trimesh,
+    ".ply": read_ply,
     ".glb": read_gltf,
     ".gltf": read_gltf,
-    ".stl": _read_by_trimesh,
-    ".off": _read_by_trimesh,
+    ".stl": read_stl,
+    ".off": read_off,
 }
 
 
@@ -82,19 +85,24 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
             where=str(path),
             fix=f"known are {', '.join(_READERS)}",
         )
+    if path.is_file() and not path.stat().st_size:
+        raise DataError("the mesh file is empty", where=str(path), fix="get it again")
+    keep(path)
     try:
-        if not path.stat().st_size and path.is_file():
-            raise DataError("the mesh file is empty", where=str(path), fix="get it again")
-        keep(path)
-        return reader(path)
-    except InputError as error:  # what Mesh refuses
+        with np.errstate(all="ignore"):  # what is not finite, Mesh refuses
+            mesh = reader(path)
+    except CadalignError as error:
         where = str(path) if error.where is None else error.where
+        if str(path) not in where:
+            where = f"{path}: {where}"
         raise DataError(error.what, where=where, fix=error.fix) from None
-    except FileNotFoundError:
-        raise DataError("no such mesh file", where=str(path)) from None
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
-        reason = getattr(error, "strerror", None) or error
-        raise DataError(f"the mesh file cannot be read ({reason})", where=str(path)) from None
+    except Exception as error:  # of damaged content any kind
+        reason = f"{type(error).__name__}: {brief(error)}"
+        kind = path.suffix[1:].upper()
+        raise damaged(f"cannot be read as a {kind} file ({reason})", path) from None
+    if not np.linalg.norm(face_normals(mesh.triangles), axis=1).any():
+        raise DataError("no face of the mesh has an area", where=str(path))
+    return mesh
 
 
 def as_mesh(given: object, *, where: str) -> Mesh:

@@ -1,40 +1,34 @@
-"""glTF 2.0 files, text or binary: the document, and the arrays in its buffers.
+"""glTF 2.0 files, text or binary, as one mesh.
 
-After the Khronos Group's specification of glTF 2.0 and of the extensions that are named; declared
-are the parts that a mesh needs, which `cadalign.io.meshes.gltf_scene` makes of them.
+After the Khronos Group's specification of glTF 2.0 and of the extensions that are named. A part
+that is missing or of another type ends in one of Python's errors, which `cadalign.load_mesh` turns
+into a DataError.
 """
 
 from __future__ import annotations
 
 import base64
-import binascii
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Any
 from urllib.parse import unquote, unquote_to_bytes
 
 import numpy as np
 import numpy.typing as npt
-from msgspec import Meta, field
 
+from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import DataError, brief, quote
-from cadalign.io.documents import (
-    Count,
-    Finite,
-    ForeignDocument,
-    Point2,
-    Point3,
-    convert,
-    in_file,
-    parse_json,
-)
+from cadalign.geometry.mesh import GREY, Material, Mesh, join
+from cadalign.geometry.rotations import rotation_from_quat_wxyz
+from cadalign.io.documents import parse_json
 from cadalign.io.files import damaged, read_bytes, reading
+from cadalign.io.meshes.materials import WHITE, Texture, Textures
 
-Array = npt.NDArray[Any]
-_T = TypeVar("_T")
-_Point4 = tuple[Finite, Finite, Finite, Finite]
+logger = logging.getLogger("cadalign")
 
-_JSON_CHUNK, _BINARY_CHUNK = b"JSON", b"BIN\0"
+_Part = dict[str, Any]
 _NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 # What they add is read here, or is nothing but the look of surfaces and their light.
@@ -43,324 +37,142 @@ _EXTENSIONS = (
     "KHR_xmp_json_ld",
 )
 _LOOKS = "KHR_materials_"
+_INSTANCES = "EXT_mesh_gpu_instancing"
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+# A node of some 20 bytes repeats a whole mesh: what all take together is bounded by the file.
+_FREE_BYTES, _EXPANSION = 2**27, 64
+_VERTEX_BYTES, _FACE_BYTES = 24 + 32, 24 + 48 + 8 + 8  # colours, texture coordinates included
 
 
-class _Part(ForeignDocument, rename="camel", kw_only=True):
-    """Base of the document's parts."""
+def read_gltf(path: Path) -> Mesh:
+    """Read a glTF or GLB file as one mesh, each node placed by its transform.
 
-
-class Asset(_Part):
-    """Statements of the file about itself."""
-
-    version: str = "2.0"
-
-
-class GltfScene(_Part):
-    """The roots of a scene's trees of nodes."""
-
-    nodes: list[Count] = field(default_factory=list)
-
-
-class Node(_Part):
-    """A node, placed by a matrix (by columns) or by scale, rotation (x, y, z, w), translation."""
-
-    mesh: Count | None = None
-    skin: Count | None = None
-    children: list[Count] = field(default_factory=list)
-    matrix: Annotated[list[Finite], Meta(min_length=16, max_length=16)] | None = None
-    translation: Point3 = (0.0, 0.0, 0.0)
-    rotation: _Point4 = (0.0, 0.0, 0.0, 1.0)
-    scale: Point3 = (1.0, 1.0, 1.0)
-
-
-class Primitive(_Part):
-    """A part of a mesh with one material; attributes and indices are numbers of accessors."""
-
-    attributes: dict[str, Count]
-    indices: Count | None = None
-    material: Count | None = None
-    mode: int = 4
-
-
-class GltfMesh(_Part):
-    """The primitives of a mesh."""
-
-    primitives: list[Primitive]
-    weights: list[Finite] = field(default_factory=list)  # of shapes that it may take
-
-
-class SparsePart(_Part):
-    """Places at which a sparse accessor has values of its own, or these values."""
-
-    buffer_view: Count
-    component_type: int = 0  # of the places
-    byte_offset: Count = 0
-
-
-class Sparse(_Part):
-    """Values that a sparse accessor changes."""
-
-    count: Count
-    indices: SparsePart
-    values: SparsePart
-
-
-class Accessor(_Part):
-    """An array in a buffer."""
-
-    count: Count
-    component_type: int
-    type: str
-    buffer_view: Count | None = None
-    byte_offset: Count = 0
-    normalized: bool = False
-    sparse: Sparse | None = None
-
-
-class BufferView(_Part):
-    """A part of a buffer."""
-
-    buffer: Count
-    byte_length: Count
-    byte_offset: Count = 0
-    byte_stride: Count | None = None
-
-
-class Buffer(_Part):
-    """Bytes: a file, data in the text, or the binary part of a GLB file."""
-
-    byte_length: Count
-    uri: str | None = None
-
-
-class Image(_Part):
-    """A picture: a file, data in the text, or a part of a buffer."""
-
-    uri: str | None = None
-    buffer_view: Count | None = None
-
-
-class Texture(_Part):
-    """The picture of a texture."""
-
-    source: Count | None = None
-    extensions: Extensions = field(default_factory=lambda: Extensions())
-
-
-class TextureTransform(_Part):
-    """Change of texture coordinates: scaled, rotated [rad], moved."""
-
-    offset: Point2 = (0.0, 0.0)
-    rotation: Finite = 0.0
-    scale: Point2 = (1.0, 1.0)
-    tex_coord: Count | None = None
-
-
-class TextureUse(_Part):
-    """A texture as a material uses it, with the number of its set of coordinates."""
-
-    index: Count
-    tex_coord: Count = 0
-    extensions: Extensions = field(default_factory=lambda: Extensions())
-
-
-class BaseColor(_Part):
-    """The base colour of a material, in linear light; an older extension calls it diffuse."""
-
-    base_color_factor: _Point4 | None = None
-    base_color_texture: TextureUse | None = None
-    diffuse_factor: _Point4 | None = None
-    diffuse_texture: TextureUse | None = None
-
-
-class Extensions(_Part):
-    """The extensions that are read: of textures, of their uses, and of materials."""
-
-    webp: Texture | None = field(name="EXT_texture_webp", default=None)
-    transform: TextureTransform | None = field(name="KHR_texture_transform", default=None)
-    glossiness: BaseColor | None = field(name="KHR_materials_pbrSpecularGlossiness", default=None)
-
-
-class MaterialPart(_Part):
-    """The look of a surface."""
-
-    name: str = ""
-    pbr_metallic_roughness: BaseColor = field(default_factory=BaseColor)
-    extensions: Extensions = field(default_factory=Extensions)
-
-
-class GltfDocument(_Part):
-    """The whole document."""
-
-    asset: Asset = field(default_factory=Asset)
-    scene: Count = 0
-    scenes: list[GltfScene] = field(default_factory=list)
-    nodes: list[Node] = field(default_factory=list)
-    meshes: list[GltfMesh] = field(default_factory=list)
-    accessors: list[Accessor] = field(default_factory=list)
-    buffer_views: list[BufferView] = field(default_factory=list)
-    buffers: list[Buffer] = field(default_factory=list)
-    materials: list[MaterialPart] = field(default_factory=list)
-    textures: list[Texture] = field(default_factory=list)
-    images: list[Image] = field(default_factory=list)
-    extensions_used: list[str] = field(default_factory=list)
-    extensions_required: list[str] = field(default_factory=list)
-
-
-class GltfFile:
-    """A glTF file: its document, and the arrays of its buffers, which are read when asked for.
-
-    Errors of arrays name their place in the document; who asks for them names the file. ``size``
-    counts the bytes read so far, of the files that it names, too.
-
-    Raises DataError if it is no glTF 2.0 file, cut short, or needs an extension that is not read.
+    Raises DataError if it is no glTF 2.0 file, has no faces, is no tree of nodes, needs an
+    extension that is not read, or repeats its meshes to more than 128 MB and 64 times its bytes.
     """
+    file = _GltfFile(path)
+    placed = [
+        (primitive, transform)
+        for number, transform in _placements(file.document)
+        for primitive in nth(file.document, "meshes", number)["primitives"]
+        if _count_faces(file.document, primitive)
+    ]
+    if not placed:
+        raise DataError("the file has no faces", fix="is it whole?")
+    _check_size(file, placed)
+    _warn_of_what_moves(file)
+    looks, surfaces = _Looks(file), dict[int, Mesh]()
+    for primitive, _ in placed:
+        if id(primitive) not in surfaces:
+            surfaces[id(primitive)] = _surface(file, primitive, looks)
+    return join([_moved(surfaces[id(primitive)], at) for primitive, at in placed], str(path))
+
+
+class _GltfFile:
+    """The document of a file, and the arrays of its buffers; ``size`` is the bytes of all."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         data = read_bytes(path)
         self.size = len(data)
-        text, self._binary = _chunks(data, path) if data[:4] == b"glTF" else (data, None)
+        text, self._binary = _chunks(data, path) if data[:4] == b"glTF" else (data, b"")
         with reading(path):
-            parsed = parse_json(str(text, "utf-8-sig"), str(path))
-        with in_file(path):
-            self.document: GltfDocument = convert(parsed, GltfDocument)
-            _check(self.document)
-        self._buffers: dict[int, memoryview] = {}
-        self._files: dict[str, bytes] = {}
-
-    def array(self, number: int) -> Array:
-        """The array (n, width) of an accessor; of normalized integers as fractions."""
-        accessor = nth(self.document.accessors, number, "accessors")
-        place = f"accessors[{number}]"
-        if accessor.component_type not in _NUMBERS:
-            raise damaged(f"componentType {accessor.component_type} is not known", place)
-        if accessor.type not in _WIDTHS:
-            raise damaged(f"{quote(accessor.type)} are no points or numbers", place)
-        dtype, width = np.dtype(_NUMBERS[accessor.component_type]), _WIDTHS[accessor.type]
-        if accessor.buffer_view is None:
-            if accessor.count > self.size:
-                raise damaged(f"{accessor.count} values, but no data", place)
-            values = np.zeros((accessor.count, width), dtype=dtype)
-        else:
-            values = self._values(
-                accessor.buffer_view, accessor.byte_offset, (accessor.count, width), dtype
-            )
-        if accessor.sparse is not None:
-            values = self._with_sparse(values, accessor.sparse, place)
-        if accessor.normalized and dtype.kind != "f":
-            values = np.maximum(values / np.iinfo(dtype).max, -1.0)
-        return values
+            self.document: _Part = parse_json(str(text, "utf-8-sig"), str(path))
+        _check(self.document)
+        self._buffers: dict[str, bytes] = {}
 
     def view(self, number: int) -> memoryview:
         """The bytes of a buffer view."""
-        part = nth(self.document.buffer_views, number, "bufferViews")
-        data = self._buffer(part.buffer)
-        if part.byte_offset + part.byte_length > len(data):
-            what = f"it ends after the {len(data)} bytes of its buffer"
+        part = nth(self.document, "bufferViews", number)
+        buffer = nth(self.document, "buffers", part["buffer"])
+        data = self._binary if "uri" not in buffer else self._named(buffer["uri"])
+        start, length = part.get("byteOffset", 0), part["byteLength"]
+        if len(data) < buffer["byteLength"] or not 0 <= start <= start + length <= len(data):
+            announced = max(buffer["byteLength"], start + length)
+            what = f"{len(data)} bytes in its buffer, {announced} announced"
             raise damaged(what, f"bufferViews[{number}]")
-        return data[part.byte_offset : part.byte_offset + part.byte_length]
+        return memoryview(data)[start : start + length]
 
-    def _values(self, number: int, offset: int, shape: tuple[int, int], dtype: Any) -> Array:
-        """An array in a buffer view, which is not copied."""
-        data = self.view(number)
-        row = shape[1] * dtype.itemsize
-        stride = self.document.buffer_views[number].byte_stride or row
-        end = offset + (shape[0] - 1) * stride + row if shape[0] else offset
-        if stride < row or end > len(data):
-            what = f"{shape[0]} values of {row} bytes do not fit into {len(data)} bytes"
-            raise damaged(what, f"bufferViews[{number}]")
-        strides = (stride, dtype.itemsize)
-        return np.ndarray(shape, dtype, buffer=data, offset=offset, strides=strides)
-
-    def _with_sparse(self, values: Array, sparse: Sparse, place: str) -> Array:
-        kind = np.dtype(_NUMBERS.get(sparse.indices.component_type, "<f4"))
-
-        def part(of: SparsePart, width: int, dtype: Any) -> Array:
-            return self._values(of.buffer_view, of.byte_offset, (sparse.count, width), dtype)
-
-        rows = part(sparse.indices, 1, kind)[:, 0]
-        given = part(sparse.values, values.shape[1], values.dtype)
-        if kind.kind != "u" or (len(rows) and rows.max() >= len(values)):
-            raise damaged("its sparse indices are out of range", place)
-        changed = values.copy()
-        changed[rows] = given
-        return changed
-
-    def _buffer(self, number: int) -> memoryview:
-        if number not in self._buffers:
-            buffer = nth(self.document.buffers, number, "buffers")
-            data = self._read(buffer, number)
-            if len(data) < buffer.byte_length:
-                what = f"{len(data)} bytes, {buffer.byte_length} announced"
-                raise damaged(what, f"buffers[{number}]")
-            self._buffers[number] = memoryview(data)[: buffer.byte_length]
-        return self._buffers[number]
-
-    def _read(self, buffer: Buffer, number: int) -> bytes:
-        if buffer.uri is None:
-            if self._binary is None or number:
-                raise damaged("it has no data", f"buffers[{number}]")
-            return self._binary
-        if buffer.uri not in self._files:
-            data = embedded(buffer.uri)
+    def _named(self, uri: str) -> bytes:
+        if uri not in self._buffers:
+            data = _embedded(uri)
             if data is None:
-                data = read_bytes(self.path.parent / unquote(buffer.uri))
+                data = read_bytes(self.path.parent / unquote(uri))
                 self.size += len(data)
-            self._files[buffer.uri] = data
-        return self._files[buffer.uri]
+            self._buffers[uri] = data
+        return self._buffers[uri]
+
+    def array(self, number: int) -> npt.NDArray[Any]:
+        """The array (n, width) of an accessor; of normalized integers as fractions."""
+        accessor = nth(self.document, "accessors", number)
+        if "sparse" in accessor or "bufferView" not in accessor:
+            what = "sparse values, or none, are not read"
+            raise DataError(what, where=f"accessors[{number}]", fix="export it without them")
+        dtype, width = np.dtype(_NUMBERS[accessor["componentType"]]), _WIDTHS[accessor["type"]]
+        data, row = self.view(accessor["bufferView"]), width * dtype.itemsize
+        stride = self.document["bufferViews"][accessor["bufferView"]].get("byteStride", row)
+        count, offset = accessor["count"], accessor.get("byteOffset", 0)
+        if stride < row or offset < 0 or offset + (count - 1) * stride + row > len(data):
+            what = f"{count} values of {row} bytes do not fit into {len(data)} bytes"
+            raise damaged(what, f"accessors[{number}]")
+        strides = (stride, dtype.itemsize)
+        values = np.ndarray((count, width), dtype, buffer=data, offset=offset, strides=strides)
+        if accessor.get("normalized") and dtype.kind != "f":
+            return np.maximum(values / np.iinfo(dtype).max, -1.0)
+        return values
+
+    def attribute(self, primitive: _Part, name: str, width: int = 0) -> npt.NDArray[Any]:
+        """The values (n, width) of a primitive's vertices."""
+        numbers = primitive["attributes"]
+        values = self.array(numbers[name])
+        count = self.document["accessors"][numbers["POSITION"]]["count"]
+        if len(values) != count or (width and values.shape[1] != width):
+            what = f"{values.shape} values of {name} for {count} vertices"
+            raise damaged(what, f"accessors[{numbers[name]}]")
+        return values
 
 
-def nth(parts: Sequence[_T], number: int, name: str) -> _T:
-    """The part of a number; raises DataError where there is none."""
-    if number >= len(parts):
-        what = f"named, but there are {len(parts)} {name}"
-        raise damaged(what, f"{name}[{number}]")
-    return parts[number]
+def nth(document: _Part, name: str, number: int) -> _Part:
+    """The part of a list of the document by its number; raises DataError where there is none."""
+    parts = document.get(name, [])
+    if not 0 <= number < len(parts):
+        raise damaged(f"named, but there are {len(parts)} {name}", f"{name}[{number}]")
+    found: _Part = parts[number]
+    return found
 
 
-def embedded(uri: str) -> bytes | None:
+def _embedded(uri: str) -> bytes | None:
     """The data that stand in the text of a ``data:`` URI; None of the name of a file."""
     if not uri.startswith("data:"):
         return None
     form, _, data = uri.partition(",")
-    if not form.endswith(";base64"):
-        return unquote_to_bytes(data)
-    try:
-        return base64.b64decode(data)
-    except (binascii.Error, ValueError) as error:
-        raise damaged(f"not base64 ({brief(error)})", "uri") from None
+    return base64.b64decode(data) if form.endswith(";base64") else unquote_to_bytes(data)
 
 
-def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
+def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes]:
     """The document of a GLB file, and its binary part."""
-    version = int.from_bytes(data[4:8], "little")
-    if version != 2:
-        raise DataError(f"version {version} of GLB; only version 2 is read", where=str(path))
-    found: dict[bytes, bytes] = {}
+    found: list[bytes] = []
     place = 12
-    while place + 8 <= len(data) and len(found) < 2:
-        length, kind = (
-            int.from_bytes(data[place : place + 4], "little"),
-            data[place + 4 : place + 8],
-        )
-        if place + 8 + length > len(data):
-            raise damaged(f"a part of {length} bytes is cut short", path)
-        found.setdefault(kind, data[place + 8 : place + 8 + length])
+    for kind in (b"JSON", b"BIN\0"):
+        length = int.from_bytes(data[place : place + 4], "little")
+        if data[place + 4 : place + 8] != kind:
+            break
+        found.append(data[place + 8 : place + 8 + length])
         place += 8 + length
-    if _JSON_CHUNK not in found:
-        raise damaged("the GLB file has no JSON", path)
-    return found[_JSON_CHUNK], found.get(_BINARY_CHUNK)
+    if not found or place > len(data):
+        raise damaged("a part of the GLB file is missing or cut short", path)
+    return found[0], b"".join(found[1:])
 
 
-def _check(document: GltfDocument) -> None:
+def _check(document: _Part) -> None:
     """Refuse other versions, and extensions without which the file means something else."""
-    if not document.asset.version.startswith("2."):
-        what = f"version {quote(document.asset.version)} of glTF; only version 2 is read"
+    version = document["asset"]["version"]
+    if not version.startswith("2."):
+        what = f"version {quote(version)} of glTF; only version 2 is read"
         raise DataError(what, where="asset")
     unknown = [
         name
-        for name in document.extensions_required
+        for name in document.get("extensionsRequired", [])
         if name not in _EXTENSIONS and not name.startswith(_LOOKS)
     ]
     if unknown:
@@ -369,3 +181,199 @@ def _check(document: GltfDocument) -> None:
             where="extensionsRequired",
             fix="export it without this extension; of compressed geometry, uncompressed",
         )
+
+
+def _warn_of_what_moves(file: _GltfFile) -> None:
+    """Warn of what places vertices elsewhere in viewers, and is not read."""
+    document = file.document
+    left_out = [
+        name
+        for name, is_there in (
+            ("skins", any("skin" in node for node in document["nodes"])),
+            ("morph targets", any(any(each.get("weights", [])) for each in document["meshes"])),
+            (_INSTANCES, _INSTANCES in document.get("extensionsUsed", [])),
+        )
+        if is_there
+    ]
+    if left_out:
+        said = "%s: not read are %s, by which its vertices lie elsewhere; export it with them"
+        logger.warning(f"{said} applied", file.path, " and ".join(left_out))
+
+
+def _placements(document: _Part) -> Iterator[tuple[int, FloatArray]]:
+    """Meshes and their transforms, in the order of the nodes from the scene's roots down."""
+    if document.get("scenes"):
+        roots: Sequence[int] = nth(document, "scenes", document.get("scene", 0)).get("nodes", [])
+    else:  # a library of parts; shown are all
+        children = {k for node in document.get("nodes", []) for k in node.get("children", [])}
+        roots = [k for k in range(len(document.get("nodes", []))) if k not in children]
+    waiting = [(root, np.eye(4)) for root in reversed(roots)]
+    seen: set[int] = set()
+    while waiting:
+        number, parent = waiting.pop()
+        if number in seen:
+            what = "the node has two parents, or is its own ancestor"
+            raise DataError(what, where=f"nodes[{number}]", fix="the nodes of a scene are a tree")
+        seen.add(number)
+        node = nth(document, "nodes", number)
+        transform = parent @ _local(node)
+        if "mesh" in node:
+            yield node["mesh"], transform
+        waiting += [(child, transform) for child in reversed(node.get("children", []))]
+
+
+def _local(node: _Part) -> FloatArray:
+    """A node's transform (4, 4) in its parent's frame."""
+    if "matrix" in node:
+        return np.array(node["matrix"], dtype=float).reshape(4, 4).T
+    transform = np.eye(4)
+    x, y, z, w = node.get("rotation", (0, 0, 0, 1))
+    if x or y or z:
+        transform[:3, :3] = rotation_from_quat_wxyz(np.array([w, x, y, z]))
+    transform[:3, :3] *= node.get("scale", (1, 1, 1))
+    transform[:3, 3] = node.get("translation", (0, 0, 0))
+    return transform
+
+
+def _count_faces(document: _Part, primitive: _Part) -> int:
+    """The number of a primitive's triangles; 0 of points and lines."""
+    position, mode = primitive["attributes"].get("POSITION"), primitive.get("mode", _TRIANGLES)
+    if position is None or mode not in (_TRIANGLES, _STRIP, _FAN):
+        return 0
+    count: int = nth(document, "accessors", primitive.get("indices", position))["count"]
+    return count // 3 if mode == _TRIANGLES else max(count - 2, 0)
+
+
+def _check_size(file: _GltfFile, placed: list[tuple[_Part, FloatArray]]) -> None:
+    """Refuse a scene that repeats its meshes to far more than its file."""
+    distinct = {id(primitive): primitive for primitive, _ in placed}
+    vertices = {key: len(file.attribute(each, "POSITION")) for key, each in distinct.items()}
+    faces = size = 0
+    for primitive, _ in placed:
+        count = _count_faces(file.document, primitive)
+        faces += count
+        # Many primitives may share one array; files that are named count as well.
+        size += _VERTEX_BYTES * min(vertices[id(primitive)], 3 * count)
+    size += _FACE_BYTES * faces
+    if size > _FREE_BYTES + _EXPANSION * file.size:
+        what = f"its nodes repeat meshes to {faces} faces, from {file.size} bytes"
+        raise DataError(what, fix="simplify it, or leave copies out")
+
+
+class _Looks:
+    """The materials of a file with the use of their textures, each made once."""
+
+    def __init__(self, file: _GltfFile) -> None:
+        self._file = file
+        self._textures = Textures()
+        self._images: dict[int, Texture | None] = {}
+        self._looks: dict[int | None, tuple[Material, _Part]] = {None: (Material(), {})}
+
+    def of(self, number: int | None) -> tuple[Material, _Part]:
+        """A material, and its reference to a texture, empty if it has none."""
+        if number not in self._looks:
+            self._looks[number] = self._make(nth(self._file.document, "materials", number or 0))
+        return self._looks[number]
+
+    def _make(self, part: _Part) -> tuple[Material, _Part]:
+        metallic = part.get("pbrMetallicRoughness", {})
+        older = part.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
+        factor = metallic.get("baseColorFactor") or older.get("diffuseFactor")
+        use = metallic.get("baseColorTexture") or older.get("diffuseTexture") or {}
+        texture = self._texture(use["index"]) if use else None
+        color = GREY if texture is None else WHITE
+        if factor is not None:
+            red, green, blue, opacity = _encoded(np.clip(factor, 0, 1)).tolist()
+            color = (red, green, blue, opacity)
+        name = str(part.get("name", ""))
+        return Material(name, color, texture), use if texture is not None else {}
+
+    def _texture(self, number: int) -> Texture | None:
+        part = nth(self._file.document, "textures", number)
+        part = {**part, **part.get("extensions", {}).get("EXT_texture_webp", {})}
+        if "source" not in part:
+            return None
+        if part["source"] not in self._images:
+            self._images[part["source"]] = self._read(part["source"])
+        return self._images[part["source"]]
+
+    def _read(self, number: int) -> Texture | None:
+        image, path = nth(self._file.document, "images", number), self._file.path
+        uri = image.get("uri", "")
+        data = bytes(self._file.view(image["bufferView"])) if not uri else _embedded(uri)
+        if data is None:
+            return self._textures.read(path, unquote(uri))
+        return self._textures.decode(data, within=path, name=f"images[{number}]")
+
+
+def _surface(file: _GltfFile, primitive: _Part, looks: _Looks) -> Mesh:
+    """The mesh of a primitive in its own frame."""
+    material, use = looks.of(primitive.get("material"))
+    vertices = file.attribute(primitive, "POSITION", 3).astype(np.float64)
+    corners = np.arange(len(vertices))
+    if "indices" in primitive:
+        corners = file.array(primitive["indices"])[:, 0].astype(np.int64)
+    faces = _triangles(corners, primitive.get("mode", _TRIANGLES))
+    uv, colors = _texture_coordinates(file, primitive, use), _colors(file, primitive)
+    if len(vertices) > faces.size:  # they are shared with other primitives
+        kept, faces = np.unique(faces, return_inverse=True)
+        vertices, faces = vertices[kept], faces.reshape(-1, 3)
+        uv, colors = (None if each is None else each[kept] for each in (uv, colors))
+    if "material" not in primitive and colors is not None:
+        material = Material(color=WHITE)
+    uv = None if uv is None else uv[faces]
+    return Mesh(vertices, faces, vertex_colors=colors, corner_uv=uv, materials=(material,))
+
+
+def _triangles(corners: IntArray, mode: int) -> IntArray:
+    """The triangles (m, 3) of a list of triangles, a strip or a fan."""
+    if mode == _TRIANGLES:
+        return corners[: len(corners) // 3 * 3].reshape(-1, 3)
+    first = np.arange(len(corners) - 2)
+    if mode == _FAN:
+        return corners[np.stack([first + 1, first + 2, np.zeros_like(first)], axis=1)]
+    odd = first % 2
+    return corners[np.stack([first, first + 1 + odd, first + 2 - odd], axis=1)]
+
+
+def _texture_coordinates(file: _GltfFile, primitive: _Part, use: _Part) -> FloatArray | None:
+    """Texture coordinates (n, 2) from the bottom left, which glTF has from the top left."""
+    change = use.get("extensions", {}).get("KHR_texture_transform", {})
+    name = f"TEXCOORD_{change.get('texCoord', use.get('texCoord', 0))}"
+    if not use or name not in primitive["attributes"]:
+        return None
+    uv = file.attribute(primitive, name, 2)
+    cos, sin = np.cos(change.get("rotation", 0.0)), np.sin(change.get("rotation", 0.0))
+    turned = uv * change.get("scale", (1, 1)) @ np.array([[cos, -sin], [sin, cos]])
+    turned = turned + change.get("offset", (0, 0))
+    return np.stack([turned[:, 0], 1 - turned[:, 1]], axis=1)
+
+
+def _colors(file: _GltfFile, primitive: _Part) -> FloatArray | None:
+    """Vertex colours (n, 4), sRGB from 0 to 1."""
+    if "COLOR_0" not in primitive["attributes"]:
+        return None
+    values = file.attribute(primitive, "COLOR_0")
+    if values.dtype.kind in "ui":  # of exporters that leave out that they are normalized
+        values = values / np.iinfo(values.dtype).max
+    colors = np.ones((len(values), 4))
+    colors[:, : values.shape[1]] = np.nan_to_num(np.clip(values, 0, 1))
+    return _encoded(colors)
+
+
+def _encoded(colors: FloatArray) -> FloatArray:
+    """glTF's factors and vertex colours (..., 4), which are linear light, as sRGB."""
+    light = colors[..., :3]
+    bright = 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055
+    found = np.array(colors, dtype=np.float64)
+    found[..., :3] = np.where(light <= 0.0031308, 12.92 * light, bright)
+    return found
+
+
+def _moved(mesh: Mesh, transform: FloatArray) -> Mesh:
+    """A mesh at the transform (4, 4) of a node; mirrored, its triangles are turned round."""
+    vertices = mesh.vertices @ transform[:3, :3].T + transform[:3, 3]
+    if np.linalg.det(transform[:3, :3]) >= 0:
+        return replace(mesh, vertices=vertices)
+    uv = None if mesh.corner_uv is None else mesh.corner_uv[:, ::-1]
+    return replace(mesh, vertices=vertices, faces=mesh.faces[:, ::-1], corner_uv=uv)

@@ -39,7 +39,6 @@ from benchmarks.warned import warned
 from rich.console import Console
 from rich.table import Table
 
-from cadalign.cli import plain_help
 from cadalign.io.files import write_json
 
 USUAL: dict[str, Callable[..., Tables]] = {
@@ -98,7 +97,7 @@ def main(arguments: list[str] | None = None) -> int:
         for name, section in SECTIONS.items()
     ]
     options_type: Any = make_dataclass("Options", own, bases=(BenchmarkData,), kw_only=True)
-    options = tyro.cli(options_type, description=__doc__, args=arguments, registry=plain_help())
+    options = tyro.cli(options_type, description=__doc__, args=arguments)
     named = [name.replace("-", "_") for name in options.sections]
     unknown = ", ".join(name for name in named if name not in SECTIONS)
     if unknown:

@@ -5,25 +5,15 @@ from __future__ import annotations
 import gc
 import logging
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import reduce
 from importlib import import_module
 from inspect import cleandoc
 from operator import or_
-from types import ModuleType, NoneType
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any
 
 import tyro
-from tyro.constructors import (
-    ConstructorRegistry,
-    PrimitiveConstructorSpec,
-    PrimitiveTypeInfo,
-    StructConstructorSpec,
-    StructFieldSpec,
-    StructTypeInfo,
-)
 
 from cadalign import __version__
 from cadalign.cli.common import UsageError
@@ -31,71 +21,6 @@ from cadalign.errors import CadalignError
 from cadalign.io.files import keeping
 
 _OBJECTS_BETWEEN_COLLECTIONS = 50_000
-
-
-def plain_help() -> ConstructorRegistry:
-    """Rules by which tyro adds neither line breaks nor "(default: None)" to an option's text.
-
-    The text of an option that is unset or empty by default says what then holds, and its form is
-    that of a value, ``PATH`` rather than ``{None}|PATH``.
-    """
-    registry = ConstructorRegistry()
-    own_primitive = _own_rules(ConstructorRegistry.get_primitive_spec)
-    own_struct = _own_rules(ConstructorRegistry.get_struct_spec)
-
-    @registry.primitive_rule
-    def optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-        spec = own_primitive(info) if NoneType in get_args(info.type) else None
-        if not isinstance(spec, PrimitiveConstructorSpec):
-            return None
-        metavar = spec.metavar.removeprefix("{None}|").replace("{None,", "{")
-        if metavar.startswith("{") and metavar.find("}") == len(metavar) - 1 and " " in metavar:
-            metavar = metavar[1:-1]  # several values; a choice keeps its braces
-        return replace(spec, metavar=metavar)
-
-    @registry.struct_rule
-    def plain(info: StructTypeInfo) -> StructConstructorSpec | None:
-        spec = own_struct(info)
-        if not isinstance(spec, StructConstructorSpec):
-            return None
-        return replace(spec, fields=tuple(map(_plain, spec.fields)))
-
-    return registry
-
-
-def _own_rules(get_spec: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Ask tyro's own rules: while they are asked, the rule that asks gets None."""
-    asked: list[Any] = []
-
-    def get(info: Any) -> Any:
-        if asked:
-            return None
-        asked.append(info)
-        try:
-            return get_spec(info)
-        finally:
-            asked.pop()
-
-    return get
-
-
-def _plain(field: StructFieldSpec) -> StructFieldSpec:
-    kind: Any = field.type
-    if field.default in (None, ()):
-        kind = Annotated[kind, tyro.conf.arg(help_behavior_hint="")]
-    return replace(field, type=kind, helptext=_paragraph(field.helptext))
-
-
-def _paragraph(text: str | Callable[[], str | None] | None) -> Callable[[], str | None]:
-    """The text without its line breaks, once it is asked for."""
-
-    def joined() -> str | None:
-        found = text() if callable(text) else text
-        return None if found is None else " ".join(found.split())
-
-    return joined
-
-
 COMMANDS = {  # the class of each in its module, and the first sentence of its description
     "demo": (
         "evaluate.Demo",
@@ -174,16 +99,10 @@ def _parse(arguments: list[str]) -> Any:
     config = (tyro.conf.OmitSubcommandPrefixes,)
     name, *rest = arguments or [""]
     if name in COMMANDS:
-        with _defaults_taken_as_typed():
-            command = class_of(name)
-            return tyro.cli(
-                command,
-                prog=f"cadalign {name}",
-                description=cleandoc(str(command.__doc__)),
-                args=rest,
-                config=config,
-                registry=plain_help(),
-            )
+        command = class_of(name)
+        about = cleandoc(str(command.__doc__))
+        prog = f"cadalign {name}"
+        return tyro.cli(command, prog=prog, description=about, args=rest, config=config)
     stubs = [
         Annotated[_Listed, tyro.conf.subcommand(name, description=summary)]
         for name, (_, summary) in COMMANDS.items()
@@ -197,24 +116,6 @@ def _parse(arguments: list[str]) -> Any:
         args=arguments,
         config=config,
     )
-
-
-@contextmanager
-def _defaults_taken_as_typed() -> Iterator[None]:
-    """Spare tyro the import of typeguard, by which it compares each option's default to its type.
-
-    That import takes a tenth of a fit's time, and mypy has compared them.
-    """
-    if "typeguard" in sys.modules:
-        yield
-        return
-    module = ModuleType("typeguard")
-    vars(module).update(check_type=lambda value, _: value, TypeCheckError=TypeError)
-    sys.modules["typeguard"] = module
-    try:
-        yield
-    finally:
-        del sys.modules["typeguard"]
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,12 @@ from typing import Any, get_type_hints
 import msgspec
 
 from cadalign.annotate.annotation import Annotation
-from cadalign.annotate.document import Pair, Pixel
 from cadalign.annotate.evidence_actions import EVIDENCE_ACTIONS, ActionOutcome
-from cadalign.annotate.photos import Mark, WorkList, nearest_corner
 from cadalign.annotate.session import Session
 from cadalign.errors import InputError, quote
 from cadalign.io.documents import ForeignDocument, Index, NotNegative, Point2, Point3, Text, convert
 
-_LONGEST_REACH = 200.0  # of a corner of the photo [px]
 _MISSED = "That click missed the model."
-MIRRORED = 0.01
-"""Largest distance of a point from a mirror image that it counts as [diagonals]."""
 
 
 def perform(session: Session, number: int, action: Mapping[str, Any]) -> ActionOutcome:
@@ -55,14 +50,12 @@ def _arguments_of(function: Callable[..., ActionOutcome | None]) -> type[msgspec
     return msgspec.defstruct(function.__name__, fields, bases=(ForeignDocument,), kw_only=True)
 
 
-def place_uv(
-    state: Annotation, *, uv: Point2, pair: Index | None = None, snap: NotNegative = 0.0
-) -> ActionOutcome:
-    """Place a photo half, by preference of the given pair; see `move` for ``snap``."""
-    place, message = _snapped(uv, snap, state)
-    document, number = state.document.place_uv(place, pair)
+def place_uv(state: Annotation, *, uv: Point2, pair: Index | None = None) -> ActionOutcome:
+    """Place a photo half, by preference of the given pair."""
+    state.require_inside(uv)
+    document, number = state.document.place_uv(uv, pair)
     state.record(document)
-    return ActionOutcome(number, message)
+    return ActionOutcome(number)
 
 
 def place_keypoint(
@@ -108,60 +101,25 @@ def repick(
     return ActionOutcome(pair)
 
 
-def mirrored(state: Annotation, *, pair: Index) -> ActionOutcome:
-    """Begin a pair at the mirror image of another's model point."""
-    keypoint = state.document.pair(pair).keypoint
-    registry, model = state.model.registry, state.model.cad
-    point = None if keypoint is None else model.mirrored(registry[keypoint].xyz)
-    if point is None:
-        what = "its model point has no mirror image"
-        raise InputError(what, where="pair", fix="choose another pair")
-    near = registry.placed(point, tolerance=MIRRORED * model.diagonal)
-    return place_keypoint(state, keypoint=near)
-
-
-def suggested(
-    state: Annotation,
-    *,
-    pair: Index | None = None,
-    uv: Point2 | None = None,
-    snap: NotNegative = 0.0,
-) -> ActionOutcome:
-    """Place the suggested keypoint, by preference of the given pair; at ``uv``, both its halves.
-
-    See `move` for ``snap``.
-    """
+def suggested(state: Annotation, *, pair: Index | None = None) -> ActionOutcome:
+    """Place the model half at the suggested keypoint, by preference of the given pair."""
     _, suggestion = state.session.live(state)
     if suggestion is None:
         what = "there is no suggested keypoint yet"
         raise InputError(what, where="suggestion", fix="place more pairs")
     keypoint = suggestion.point.semantic_id
-    if keypoint is None:
-        keypoint = state.model.registry.add(suggestion.point)
-    if uv is None:
-        return place_keypoint(state, keypoint=keypoint, pair=pair)
-    place, message = _snapped(uv, snap, state)
-    number = state.document.next_number
-    state.record(state.document.append(Pair(number, place, keypoint)))
-    return ActionOutcome(number, message)
+    assert keypoint is not None  # of the registry
+    return place_keypoint(state, keypoint=keypoint, pair=pair)
 
 
 def move(
-    state: Annotation,
-    *,
-    pair: Index,
-    uv: Point2,
-    gesture: Index | None = None,
-    snap: NotNegative = 0.0,
+    state: Annotation, *, pair: Index, uv: Point2, gesture: Index | None = None
 ) -> ActionOutcome:
-    """Move a photo half; moves of one gesture are undone together.
-
-    It goes to a corner of the photo at most ``snap`` px away.
-    """
-    place, message = _snapped(uv, snap, state)
+    """Move a photo half; moves of one gesture are undone together."""
+    state.require_inside(uv)
     step = None if gesture is None else (pair, gesture)
-    state.record(state.document.move(pair, place), step=step)
-    return ActionOutcome(pair, message)
+    state.record(state.document.move(pair, uv), step=step)
+    return ActionOutcome(pair)
 
 
 def release(state: Annotation, *, pair: Index) -> ActionOutcome:
@@ -202,28 +160,6 @@ def identify(state: Annotation, *, pair: Index, label: Index | Text) -> ActionOu
     return ActionOutcome(pair)
 
 
-def accept(state: Annotation, *, keypoints: list[Index] | None = None) -> ActionOutcome:
-    """Place pairs at a detector's places of some keypoints, or of all that are left."""
-    document, number = state.document, None
-    for found in state.detected:
-        keypoint = found.keypoint
-        if (keypoints is None or keypoint in keypoints) and keypoint not in document.keypoints:
-            number = document.next_number
-            document = document.append(Pair(number, found.uv, keypoint))
-    if number is None:
-        return ActionOutcome(message="No keypoint of a detector is left to place.")
-    state.record(document)
-    return ActionOutcome(number)
-
-
-def mark(state: Annotation, *, mark: Mark | None = None) -> None:
-    """Say that a photo is done or skipped, or neither."""
-    session = state.session
-    # As the file is by now, which others may have changed.
-    kept = WorkList.open(session.worklist.path.parent)
-    session.worklist = kept.marked(state.listed, mark)
-
-
 def undo(state: Annotation) -> ActionOutcome | None:
     """Undo the last change."""
     return None if state.history.undo() else ActionOutcome(message="There is nothing to undo.")
@@ -237,8 +173,8 @@ def redo(state: Annotation) -> ActionOutcome | None:
 ACTIONS: dict[str, Callable[..., ActionOutcome | None]] = {
     function.__name__: function
     for function in (
-        *(place_uv, place_keypoint, pick, repick, mirrored, suggested, move, release, delete),
-        *(rename, identify, *EVIDENCE_ACTIONS, accept, mark, undo, redo),
+        *(place_uv, place_keypoint, pick, repick, suggested, move, release, delete),
+        *(rename, identify, *EVIDENCE_ACTIONS, undo, redo),
     )
 }
 """Actions by the name that the page sends as ``do``."""
@@ -259,15 +195,3 @@ def _aimed_at(
         return near
     point = model.pick(start, direction, snap=snap)
     return None if point is None else state.model.registry.placed(point)
-
-
-def _snapped(uv: Pixel, reach: float, state: Annotation) -> tuple[Pixel, str]:
-    """The nearest corner of the photo within reach [px], or the place itself, and a message."""
-    state.require_inside(uv)
-    if not reach > 0:
-        return uv, ""
-    pixels = state.session.pixels(state)
-    corner = nearest_corner(pixels, uv, reach=min(reach, _LONGEST_REACH))
-    if corner is None or corner == uv:
-        return uv, "No corner of the photo near this place."
-    return corner, ""

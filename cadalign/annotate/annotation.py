@@ -1,4 +1,4 @@
-"""An annotation: one object in one photo, and its files."""
+"""An annotation: the object in a photo, and its files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cadalign.annotate.document import AnnotationDocument, History, Pair, Pixel
 from cadalign.annotate.evidence import MarkedMask
 from cadalign.annotate.files import AnnotationFiles, stored_sigma, written_half
 from cadalign.annotate.live import LiveAlignment
-from cadalign.annotate.models import Detected, OpenedModel
+from cadalign.annotate.models import OpenedModel
 from cadalign.annotate.names import free_mask_file
 from cadalign.annotate.photos import Intrinsics, PhotoFile
 from cadalign.annotate.problem import LEAST_JOINT_PAIRS
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(eq=False)
 class Annotation:
-    """An object in a photo, its files, and the outcome of the last save."""
+    """The object in a photo, its files, and the outcome of the last save."""
 
     session: Session = field(repr=False)
     photo: PhotoFile
@@ -40,8 +40,6 @@ class Annotation:
     stored: Observation
     """Content of the file when it was opened, of which marks take the place."""
     history: History
-    is_further: bool = False  # True for the file of another object in the photo
-    detected: tuple[Detected, ...] = ()  # by a detector
     saved_at: float | None = None
     save_error: str = ""
     fit_pending: bool = False
@@ -75,14 +73,8 @@ class Annotation:
 
     @property
     def name(self) -> str:
-        """The photo's name, for a further object with that of its file."""
-        name = self.photo.path.name
-        return f"{name} ({self.files.observation.name})" if self.is_further else name
-
-    @property
-    def listed(self) -> Path:
-        """The path by which the work list knows it."""
-        return self.files.observation if self.is_further else self.photo.path
+        """The photo's name."""
+        return self.photo.path.name
 
     @property
     def number(self) -> int:
@@ -148,7 +140,8 @@ class Annotation:
         points = self.model.points_of(pairs)
         depths = [np.nan if pair.depth is None else pair.depth for pair in pairs]
         has_depths = bool(np.isfinite(depths).any())
-        evidence = marks.in_place_of(self.stored.evidence, self.camera, self._mask_file())
+        mask_sigma = None if marks.mask is None else marks.mask.sigma
+        evidence = replace(self.stored.evidence, mask=self._mask_file(), mask_sigma=mask_sigma)
         if not has_depths and evidence.depth is None:  # all keypoints with depths may be gone
             evidence = replace(evidence, depth_sigma=None)
         return replace(
@@ -165,7 +158,6 @@ class Annotation:
             evidence=evidence,
             model=self.model.path,
             fit_options=options,
-            size=None if marks.lengths is None else marks.lengths.size,
             shape=shape.path,
             init=marks.start.alignment if marks.start is not None and self.begins else None,
             unfinished=self._unfinished if to_write else None,
@@ -173,11 +165,10 @@ class Annotation:
 
     @property
     def _unfinished(self) -> dict[str, Any] | None:
-        """Pairs that are no keypoints of the observation, and edges that it has as a direction."""
-        used, verticals = self.known_pairs, self.document.evidence.verticals
+        """Pairs that are no keypoints of the observation."""
+        used = self.known_pairs
         halves = [written_half(pair) for pair in self.document.pairs if pair not in used]
-        parts = {"pairs": halves, "verticals": verticals}
-        return {name: part for name, part in parts.items() if part} or None
+        return {"pairs": halves} if halves else None
 
     def _mask_file(self) -> Path | None:
         """The file of the mask, if there is one; a drawn one is written if it is not yet."""

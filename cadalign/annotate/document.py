@@ -5,7 +5,6 @@ Documents are immutable; every edit makes a new one, which the history keeps.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -173,11 +172,6 @@ class History:
     def redo(self) -> bool:
         """Redo the last undone change; returns False if there is none."""
         return self._go(self.after, self.before)
-
-    def changed(self, change: Callable[[AnnotationDocument], AnnotationDocument]) -> History:
-        """The history with a change made to each of its documents."""
-        before, after = ([change(each) for each in side] for side in (self.before, self.after))
-        return History(change(self.document), before, after)
 
     def _go(self, source: list[AnnotationDocument], target: list[AnnotationDocument]) -> bool:
         self._step = None

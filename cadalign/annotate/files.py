@@ -2,7 +2,7 @@
 
 Beside the observation `photo.json` is `photo_fit/fit.json`, the alignment as `cadalign fit` finds
 and writes it. The observation's field ``unfinished`` has what a fit cannot use: pairs with only one
-half placed, those whose keypoint the category's shape lacks, and edges that are vertical.
+half placed, and those whose keypoint the category's shape lacks.
 """
 
 from __future__ import annotations
@@ -59,7 +59,6 @@ class _Half(SeenKeypoint, kw_only=True):
 
 class _Unfinished(Document):
     pairs: list[_Half] = msgspec.field(default_factory=list)
-    verticals: list[tuple[Point2, Point2]] = msgspec.field(default_factory=list)
 
 
 @dataclass(eq=False)
@@ -93,9 +92,7 @@ class AnnotationFiles:
             unfinished = convert(observation.unfinished or {}, _Unfinished)
         document = _with_pairs(AnnotationDocument(), observation, model.registry)
         document = _with_halves(document, unfinished.pairs, model.registry)
-        marks = MarkedEvidence.of(observation)
-        marks = replace(marks, verticals=tuple(unfinished.verticals))
-        return observation, replace(document, evidence=marks)
+        return observation, replace(document, evidence=MarkedEvidence.of(observation))
 
     def write(self, observation: Observation) -> None:
         """Write the observation as a whole; raises DataError on failure.

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
-from trimesh.triangles import closest_point
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
-from cadalign.geometry.mesh import Mesh, farthest_rows, random_points
+from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import FaceArray, RayCaster
 from cadalign.geometry.simplify import mesh_edges, simplify
 from cadalign.render.drawing.canvas import bytes_from_linear
@@ -23,9 +20,6 @@ from cadalign.render.raycast.surface import coincident_faces
 from cadalign.render.scene import Scene
 
 MOST_FACES = 150_000  # that are displayed
-_SAMPLES = 96
-_SAMPLED_FROM = 20_000
-_NEAREST_SAMPLES = 2e-3  # in diagonals
 # Depth beneath the surface at which markers can still be clicked [diagonals]: keypoints sit in
 # corners, where rays to them graze other parts. The page uses the same value.
 _BENEATH = 0.02
@@ -39,13 +33,6 @@ _WELD = 1e-6  # distance of vertices in one place [diagonals]
 _JUMP = 0.05  # in depth, that makes a silhouette of one part before another [diagonals]
 _RINGS, _SPOKES = 8, 24
 _BISECTIONS = 14
-_MIRROR_AXES = (0, 2)  # left and right, front and back; y is up
-_MIRROR_SAMPLES = 60_000
-_MIRROR_TESTED = 4_000
-_MIRROR_NEAR = 0.015  # of a mirrored point to the surface [diagonals]
-_MIRROR_SHARE = 0.97  # of the surface that must have its mirror image
-_MIRROR_APART = 0.05  # least distance of a point and its mirror image [diagonals]
-_MIRROR_CANDIDATES = 8  # samples near a point, on whose triangles the nearest one is searched for
 
 
 class ClickableModel:
@@ -98,36 +85,10 @@ class ClickableModel:
         _, distance = self.scene.caster.first_hits(start, sight[None])
         return bool(distance[0] >= 1 - _BENEATH * self.diagonal / length)
 
-    def mirrored(self, xyz: npt.ArrayLike) -> ModelKeypoint | None:
-        """The mirror image of a point of a symmetric model; None without one."""
-        image = self.mirror_planes.image(as_floats(xyz, name="xyz", shape=(3,)))
-        return None if image is None else self._on_triangle(*image)
-
-    @cached_property
-    def mirror_planes(self) -> MirrorPlanes:
-        """Planes that take the model to itself."""
-        return MirrorPlanes.of_mesh(self.scene.mesh, self.center, self.diagonal)
-
     @cached_property
     def snap_points(self) -> SnapPoints:
         """Vertices that clicks snap to."""
         return SnapPoints.of_mesh(self.scene.mesh, self.diagonal)
-
-    @cached_property
-    def samples(self) -> tuple[ModelKeypoint, ...]:
-        """Vertices by farthest-point sampling, starting with the one farthest from the centre."""
-        mesh = self.scene.mesh
-        used, first = np.unique(mesh.faces, return_index=True)
-        step = -(-len(used) // _SAMPLED_FROM)
-        used, first = used[::step], first[::step]
-        points, apart = mesh.vertices[used], _NEAREST_SAMPLES * self.diagonal
-        rows = farthest_rows(points, _SAMPLES, center=self.center, apart=apart)
-        return tuple(self._on_triangle(int(first[row]) // 3, points[row]) for row in rows)
-
-    @cached_property
-    def sample_points(self) -> FloatArray:
-        """The positions of `samples`, (k, 3) float."""
-        return np.array([point.xyz for point in self.samples])
 
     @cached_property
     def displayed(self) -> tuple[Mesh, npt.NDArray[np.float32], BoolArray]:
@@ -323,55 +284,3 @@ def _kinds(xyz: FloatArray, faces: IntArray) -> npt.NDArray[np.int8]:
     kind[degree > 0] = CREASE
     kind[(degree == 1) | (degree > 2) | ((degree == 2) & bent)] = CORNER
     return kind
-
-
-@dataclass(frozen=True, eq=False)
-class MirrorPlanes:
-    """Planes across x or z through the middle of a model that take its surface to itself."""
-
-    triangles: FloatArray  # (m, 3, 3)
-    center: FloatArray
-    diagonal: float
-    axes: tuple[int, ...]
-    _tree: cKDTree
-    _sampled: IntArray  # the triangle of each point of the tree
-
-    @classmethod
-    def of_mesh(cls, mesh: Mesh, center: FloatArray, diagonal: float) -> MirrorPlanes:
-        """Compare samples of the surface with their mirror images."""
-        number, points = random_points(mesh, _MIRROR_SAMPLES)
-        tree = cKDTree(points, balanced_tree=False, compact_nodes=False)  # half the time
-        axes = []
-        for axis in _MIRROR_AXES if len(points) else ():
-            image = _reflect(points[:_MIRROR_TESTED], axis, center)
-            gaps, _ = tree.query(image, distance_upper_bound=_MIRROR_NEAR * diagonal)
-            if np.isfinite(gaps).mean() >= _MIRROR_SHARE:
-                axes.append(axis)
-        return cls(mesh.triangles, center, diagonal, tuple(axes), tree, number)
-
-    def image(self, point: Iterable[float]) -> tuple[int, FloatArray] | None:
-        """The mirror image of a point: its triangle and place (3,) on the surface.
-
-        None if the model has no such plane, the point lies on it, or the surface is not there.
-        """
-        xyz = np.array(list(point), dtype=float)
-        for axis in self.axes:
-            wanted = _reflect(xyz[None], axis, self.center)
-            if np.linalg.norm(wanted[0] - xyz) < _MIRROR_APART * self.diagonal:
-                continue
-            _, rows = self._tree.query(wanted[0], k=_MIRROR_CANDIDATES)
-            candidates = np.unique(self._sampled[rows])
-            places: FloatArray = closest_point(  # type: ignore[no-untyped-call]
-                self.triangles[candidates], np.repeat(wanted, len(candidates), axis=0)
-            )
-            gaps = np.linalg.norm(places - wanted, axis=1)
-            best = int(np.argmin(gaps))
-            if gaps[best] <= _MIRROR_NEAR * self.diagonal:
-                return int(candidates[best]), places[best]
-        return None
-
-
-def _reflect(points: FloatArray, axis: int, center: FloatArray) -> FloatArray:
-    image = points.copy()
-    image[:, axis] = 2 * center[axis] - image[:, axis]
-    return image

@@ -270,14 +270,6 @@ class ObjectShape:
         return np.asarray(np.sqrt(squares) / safe)
 
 
-@dataclass(frozen=True)
-class Detected:
-    """A keypoint of the model, where a detector puts it [px]."""
-
-    keypoint: int
-    uv: tuple[float, float]
-
-
 @dataclass(eq=False)
 class OpenedModel:
     """A model that can be clicked on, its keypoints, and the file they are written to."""
@@ -290,22 +282,14 @@ class OpenedModel:
 
     def __post_init__(self) -> None:
         self.wireframe = Wireframe.of_model(self.cad)
-        self._mirrored: dict[int, ModelKeypoint | None] = {}
 
     def points_of(self, pairs: Iterable[Pair]) -> list[ModelKeypoint]:
         """The model points of pairs that have one."""
         return [self.registry[pair.keypoint] for pair in pairs if pair.keypoint is not None]
 
-    def mirrored(self, keypoint: int) -> ModelKeypoint | None:
-        """The mirror image of a keypoint; found once, since keypoints don't move."""
-        if keypoint not in self._mirrored:
-            self._mirrored[keypoint] = self.cad.mirrored(self.registry[keypoint].xyz)
-        return self._mirrored[keypoint]
-
     def prepare(self) -> None:
         """Compute what takes seconds on millions of faces, which the first click would wait for."""
-        _ = self.cad.scene.caster, self.cad.samples
-        _ = self.cad.snap_points, self.cad.mirror_planes
+        _ = self.cad.scene.caster, self.cad.snap_points
 
     def write_keypoints(self, used: frozenset[int]) -> None:
         """Write the given keypoints and those in use; raises DataError on failure."""

@@ -3,15 +3,13 @@
 The observation of `photo.jpg` is `photo.json`. It is `photo.jpg.json` where the shorter name might
 be another file's: photos of one folder differ only in their endings, or the name without its ending
 ends like a derived one (`chair.keypoints.jpg`, `photo.png.jpg`). An observation of an earlier
-session that names the photo is found under either name. Further objects of the photo are
-`photo-2.json` and so on.
+session that names the photo is found under either name.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
-import re
 import unicodedata
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -20,7 +18,6 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from cadalign.annotate.photos import FILE
 from cadalign.datasets.models.model_keypoints import SUFFIX
 from cadalign.errors import DataError, InputError
 from cadalign.io.documents import path_from, read_json
@@ -28,7 +25,7 @@ from cadalign.io.files import checksum, locked, read_bytes
 from cadalign.io.images import PHOTO_ENDINGS
 
 _MOST_BYTES = 255  # of a file's name, in the common file systems
-_AMBIGUOUS = (*(name.removesuffix(".json") for name in (SUFFIX, FILE)), *PHOTO_ENDINGS)
+_AMBIGUOUS = (SUFFIX.removesuffix(".json"), *PHOTO_ENDINGS)
 _OTHER_FOLDER = "give another --observation or --out"
 _LOCK = ".annotate-lock"
 
@@ -85,23 +82,6 @@ def free_mask_file(observation: Path) -> Path:
     endings = (f".mask{'' if number == 1 else f'-{number}'}.png" for number in count(1))
     paths = (observation.with_name(file_name(observation.stem, ending)) for ending in endings)
     return next(path for path in paths if not path.exists())
-
-
-def further_file(observation: Path, number: int) -> Path:
-    """Path of the observation of a photo's object of a number, beside that of the first."""
-    return observation.with_name(file_name(f"{observation.stem}-{number}", ".json"))
-
-
-def further_files(observation: Path, photo: Path) -> list[Path]:
-    """Observations of a photo's further objects beside that of its first one, by number."""
-    try:
-        names = os.listdir(observation.parent)
-    except OSError:  # it is not there yet
-        return []
-    pattern = re.compile(re.escape(observation.stem) + r"-([1-9][0-9]*)\.json")
-    numbers = sorted(int(found[1]) for name in names if (found := pattern.fullmatch(name)))
-    paths = [further_file(observation, number) for number in numbers]
-    return [path for path in paths if any(each.samefile(photo) for each in _named_photos(path))]
 
 
 def observation_file(photo: Path, folder: Path, others: Iterable[Path] = ()) -> Path:

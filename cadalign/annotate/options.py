@@ -37,9 +37,6 @@ class FileOptions:
     up_axis: Literal["x", "y", "z"] | None = None
     """The model's axis that points up, for its view and for gravity; by default the observation
     file's, or y."""
-    detections: Path | None = None
-    """Keypoints of a detector, to confirm or correct: COCO's JSON, MMPose's, ultralytics'
-    or CSV, with the photos' file names and the names of the model's keypoints."""
     shape: Path | None = None
     """File of `cadalign shape learn`: estimate the object's own shape, of that category, from
     keypoints that it knows by semantic id or name."""

@@ -1,4 +1,4 @@
-"""State of the page as plain data for JSON: one object of a photo, and the list of photos."""
+"""State of the page as plain data for JSON: a photo's annotation, and the list of photos."""
 
 from __future__ import annotations
 
@@ -8,16 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.annotate.actions import MIRRORED
 from cadalign.annotate.annotation import Annotation
-from cadalign.annotate.evidence import MarkedLengths, find_up
 from cadalign.annotate.evidence_actions import ActionOutcome
 from cadalign.annotate.live import LiveAlignment, drawing_of, facts_of, notes_of
 from cadalign.annotate.problem import LIKELY_STRETCH
 from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError
 from cadalign.io.documents import read_json
-from cadalign.io.evidence import LENGTHS
 
 
 def page_state(
@@ -25,11 +22,11 @@ def page_state(
 ) -> dict[str, Any]:
     """Collect everything that the page shows of an annotation, after an action of that outcome.
 
-    It is the one of a number, or the one that the outcome goes on with.
+    It is the one of a number.
     """
     outcome = outcome or ActionOutcome()
     with session.lock:
-        state = outcome.shown or session.annotation(number)
+        state = session.annotation(number)
         live, suggestion = session.live(state)
         document, registry, cad = state.document, state.model.registry, state.model.cad
         history, used = state.history, document.keypoints
@@ -41,7 +38,6 @@ def page_state(
                 "width": state.photo.width,
                 "height": state.photo.height,
                 "up_axis": state.stored.up_axis or "y",
-                "state": session.work_state(state),
             },
             "saved": {
                 "path": state.files.observation.name,
@@ -70,11 +66,6 @@ def page_state(
                 }
                 for keypoint, point in registry
             ],
-            "detected": [
-                {**asdict(found), "name": registry[found.keypoint].name}
-                for found in state.detected
-                if found.keypoint not in used
-            ],
             "shape": _shape(state),
             "alignment": _alignment(state, live),
             "suggestion": None
@@ -89,13 +80,12 @@ def page_state(
 
 
 def worklist_state(session: Session) -> list[dict[str, Any]]:
-    """All annotations with their state, number of pairs, and residual [px]."""
+    """All annotations with their numbers of pairs and residuals [px]."""
     with session.lock:
         return [
             {
                 "number": number,
                 "name": each.name,
-                "state": session.work_state(each),
                 "pairs": len(each.document.complete_pairs),
                 "rms": _rms(each),
             }
@@ -105,19 +95,8 @@ def worklist_state(session: Session) -> list[dict[str, Any]]:
 
 def _evidence(state: Annotation) -> dict[str, Any]:
     """Marks beside the pairs; ``mask`` changes with the mask, None without one."""
-    evidence = state.document.evidence
-    found = find_up(evidence.verticals, state.camera)
-    sigma = evidence.up_sigma_deg if found is None else found[1]
-    lengths = evidence.lengths or MarkedLengths()
-    return {
-        "mask": None if evidence.mask is None else f"{hash(evidence.mask) & 0xFFFFFFFF:x}",
-        "verticals": evidence.verticals,
-        "gravity": found is not None or evidence.up is not None,
-        "gravity_sigma": None if sigma is None else round(sigma, 1),
-        "lengths": {name: getattr(lengths, name) for name in LENGTHS},
-        "length_sigma": lengths.sigmas[0] if lengths.sigmas else None,
-        "photo": evidence.photo,
-    }
+    mask, photo = state.document.evidence.mask, state.document.evidence.photo
+    return {"mask": None if mask is None else f"{hash(mask) & 0xFFFFFFFF:x}", "photo": photo}
 
 
 def _priors(state: Annotation) -> dict[str, Any]:
@@ -162,23 +141,17 @@ def _pairs(state: Annotation, live: LiveAlignment) -> list[dict[str, Any]]:
     """The pairs with their residuals and, of pairs with one half, the other one's likely place."""
     session, opened, document = state.session, state.model, state.document
     cad, pairs, row = opened.cad, [], 0
-    used = opened.registry.xyz(document.keypoints)
     for pair in document.pairs:
         entry: dict[str, Any] = {
             "pair": pair.number,
             "uv": pair.uv,
             "keypoint": pair.keypoint,
             "name": "",
-            **dict.fromkeys(("xyz", "mirrored", "expected", "residual", "off")),
+            **dict.fromkeys(("xyz", "expected", "residual", "off")),
             "counts": True,
         }
         if pair.keypoint is not None:
             point = opened.registry[pair.keypoint]
-            image = opened.mirrored(pair.keypoint) if session.ready else None
-            if image is not None:
-                gaps = np.linalg.norm(used - image.xyz, axis=1)
-                if gaps.min() > MIRRORED * cad.diagonal:  # or there is a pair already
-                    entry["mirrored"] = cad.to_display(image.xyz).tolist()
             in_camera = np.array([point.xyz])
             if not pair.uv and not session.shape.is_estimated and live.result is not None:
                 in_camera = live.alignment.apply(in_camera)

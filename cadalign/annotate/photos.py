@@ -1,44 +1,31 @@
-"""Photos to annotate: upright pixels, cameras' intrinsics, and which of them are done."""
+"""Photos to annotate: upright pixels and cameras' intrinsics."""
 
 from __future__ import annotations
 
 import io
 import re
-from collections.abc import Mapping, Set
-from dataclasses import dataclass, field
+from collections.abc import Set
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, cast
+from typing import cast
 
-import cv2
-import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
 from cadalign.datasets.sfm.colmap import Colmap
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.geometry.camera import Camera, require_perspective
-from cadalign.io.documents import Document, in_file, read_document, written_path
-from cadalign.io.files import listed, read_bytes, reading, require_utf8, write_json
+from cadalign.io.documents import in_file
+from cadalign.io.files import listed, read_bytes, reading, require_utf8
 from cadalign.io.images import PHOTO_ENDINGS, open_photo, photo_size, upright_pixels
 from cadalign.io.observation import read_camera as read_camera_file
 
-Pixel = tuple[float, float]
-Mark = Literal["done", "skipped"]
-State = Literal["to do", "begun", "done", "skipped"]
-FILE = "cadalign.worklist.json"
-_FORMAT = "cadalign work list"
 _MASK = re.compile(r"\.mask(-[0-9]+)?\.png$")  # at the end of the name of a mask's file
 _SHOWN_AS_IS = {"JPEG": "image/jpeg", "PNG": "image/png", "WEBP": "image/webp"}
 _ORIENTATION = 0x0112  # the EXIF tag
 _TURNED = range(2, 9)  # its values for photos that are not stored upright
 _QUALITY = 95
 _THUMBNAIL = (240, 180)  # [px]
-_MARGIN = 8  # around the reach, for the derivatives [px]
-_CORNER_QUALITY = 0.3  # of a corner, over the best one within reach
-_CONTRAST = 3.0  # least standard deviation of grey values within reach
-_WINDOW = 3
-_DRIFT = 4.0  # that the refinement may move a corner [px]
 
 
 @dataclass(frozen=True)
@@ -107,8 +94,7 @@ def find_photos(path: Path) -> list[Path]:
 def _is_mask(path: Path, stems: Set[str]) -> bool:
     """True for a mask of another photo of the folder, as the annotator names them."""
     stem = _MASK.sub("", path.name)
-    # The mask of a further object has its number between the photo's name and the ending.
-    return stem != path.name and not stems.isdisjoint({stem, re.sub(r"-[0-9]+$", "", stem)})
+    return stem != path.name and stem in stems
 
 
 @dataclass(frozen=True)
@@ -209,72 +195,3 @@ def natural_key(name: str) -> tuple[tuple[str, int, str], ...]:
         ("", int(part), part) if part.isdecimal() else (part.casefold(), 0, part) for part in parts
     )
     return cast(tuple[tuple[str, int, str], ...], key)
-
-
-class _File(Document):
-    format: str
-    photos: dict[str, Mark]
-
-
-@dataclass(frozen=True)
-class WorkList:
-    """Photos that are marked as done or skipped, by their paths, and the file of the list."""
-
-    path: Path
-    marks: Mapping[str, Mark] = field(default_factory=dict)
-
-    @classmethod
-    def open(cls, folder: Path) -> WorkList:
-        """Read the list of a folder; an empty one if there is none."""
-        path = folder / FILE
-        if not path.exists():
-            return cls(path)
-        read = read_document(path, _File)
-        if read.format != _FORMAT:
-            raise DataError(f"not a {_FORMAT}", where=str(path), fix="rename it")
-        return cls(path, read.photos)
-
-    def state(self, photo: Path, *, pairs: int) -> State:
-        """The state of a photo of so many pairs."""
-        return self.marks.get(self._key(photo)) or ("begun" if pairs else "to do")
-
-    def marked(self, photo: Path, mark: Mark | None) -> WorkList:
-        """The list with a photo marked, or without its mark; its file is written."""
-        key = self._key(photo)
-        marks = {name: kept for name, kept in self.marks.items() if name != key}
-        if mark is not None:
-            marks[key] = mark
-        write_json(self.path, {"format": _FORMAT, "photos": dict(sorted(marks.items()))})
-        return WorkList(self.path, marks)
-
-    def _key(self, photo: Path) -> str:
-        """The path of a photo, relative to the list's folder."""
-        return written_path(photo.absolute(), folder=self.path.parent.absolute())
-
-
-def nearest_corner(image: npt.NDArray[np.uint8], uv: Pixel, *, reach: float) -> Pixel | None:
-    """The nearest corner of a photo (h, w, 3) within ``reach`` [px], to parts of a pixel.
-
-    Shi, Tomasi, "Good features to track" (1994), refined by the gradients about it. None without
-    one.
-    """
-    height, width = image.shape[:2]
-    size = int(np.ceil(reach)) + _MARGIN
-    left, top = max(0, round(uv[0]) - size), max(0, round(uv[1]) - size)
-    right, bottom = min(width, round(uv[0]) + size + 1), min(height, round(uv[1]) + size + 1)
-    patch = cv2.cvtColor(np.ascontiguousarray(image[top:bottom, left:right]), cv2.COLOR_RGB2GRAY)
-    rows, columns = np.indices(patch.shape)
-    inside = np.hypot(columns + left - uv[0], rows + top - uv[1]) <= reach
-    if not inside.any() or np.std(patch[inside]) < _CONTRAST:
-        return None
-    mask = np.where(inside, 255, 0).astype(np.uint8)
-    found = cv2.goodFeaturesToTrack(patch, 16, _CORNER_QUALITY, 3.0, mask=mask)
-    if found is None:
-        return None  # type: ignore[unreachable]
-    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.01)
-    refined = cv2.cornerSubPix(patch, found.copy(), (_WINDOW, _WINDOW), (-1, -1), stop)
-    drift = np.linalg.norm(refined - found, axis=2)
-    places = np.where(drift[..., None] <= _DRIFT, refined, found)[:, 0] + (left, top)
-    gaps = np.linalg.norm(places - uv, axis=1)
-    u, v = places[int(np.argmin(gaps))].tolist()
-    return min(max(u, -0.5), width - 0.5), min(max(v, -0.5), height - 0.5)

@@ -21,7 +21,7 @@ from starlette.types import ASGIApp
 
 from cadalign.annotate.actions import perform
 from cadalign.annotate.annotation import Annotation
-from cadalign.annotate.guard import Access, BoundedProtocol, Guard
+from cadalign.annotate.guard import Access, Guard
 from cadalign.annotate.model import detail_bytes, display_bytes
 from cadalign.annotate.options import LOOPBACK
 from cadalign.annotate.page_state import page_state, worklist_state
@@ -30,6 +30,7 @@ from cadalign.errors import CadalignError, InputError
 from cadalign.web import asset
 
 _BYTES = "application/octet-stream"
+_MOST_CONNECTIONS = 256
 
 
 def make_app(session: Session, access: Access) -> ASGIApp:
@@ -79,7 +80,8 @@ def make_server(app: ASGIApp) -> uvicorn.Server:
     """Make the server of an application, which `serve` runs."""
     config = uvicorn.Config(
         app,
-        http=BoundedProtocol,
+        http="h11",
+        limit_concurrency=_MOST_CONNECTIONS,
         log_level="warning",
         access_log=False,
         lifespan="off",

@@ -15,7 +15,6 @@ from cadalign.annotate.annotation import Annotation
 from cadalign.annotate.files import AnnotationFiles
 from cadalign.annotate.live import LiveAlignment, live_alignment, missing_text
 from cadalign.annotate.models import ObjectShape, OpenedModel
-from cadalign.annotate.photos import State, WorkList
 from cadalign.annotate.problem import Known, warm_up
 from cadalign.annotate.suggestion import Suggestion, suggest
 from cadalign.errors import CadalignError, DegenerateError, InputError
@@ -28,7 +27,6 @@ class Session:
     """All state of an annotator; safe to use from several threads."""
 
     model: OpenedModel
-    worklist: WorkList
     shape: ObjectShape = field(default_factory=ObjectShape)
     photos: list[Annotation] = field(default_factory=list)
     ready: bool = False  # True once the solvers are compiled and loaded, so that a fit is instant
@@ -62,10 +60,6 @@ class Session:
             raise InputError(f"there is no photo {number + 1}", where="image")
         return self.photos[number]
 
-    def work_state(self, annotation: Annotation) -> State:
-        """State of an annotation in the list."""
-        return self.worklist.state(annotation.listed, pairs=len(annotation.document.pairs))
-
     def pixels(self, annotation: Annotation) -> npt.NDArray[np.uint8]:
         """The upright photo (h, w, 3); the last one asked for is kept."""
         path = annotation.photo.path
@@ -83,7 +77,7 @@ class Session:
         suggestion = None
         try:
             live = self._align(annotation)
-            suggestion = suggest(live, model.cad, model.registry, document.keypoints, self.shape)
+            suggestion = suggest(live, model.registry, document.keypoints, self.shape)
         except DegenerateError as error:
             live = LiveAlignment(message=f"No alignment yet: {error.what}.")
         except CadalignError as error:  # also of a mask that cannot be written or read

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from cadalign.annotate.live import LiveAlignment, short
-from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.models import KeypointRegistry, ObjectShape
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.geometry.camera import predicted_covariances, projection_jacobian
@@ -16,12 +15,11 @@ from cadalign.render.viewpoints import visible_keypoints
 
 # Depth of visible points beneath the surface, and beneath one that is warped [diagonals].
 _BENEATH, _BENEATH_WARPED = 2e-3, 0.02
-_APART = 0.02  # least distance of a corner from marked points [diagonals]
 
 
 @dataclass(frozen=True)
 class Suggestion:
-    """A keypoint of the model, or a corner of the surface without a semantic id."""
+    """A keypoint of the model."""
 
     point: ModelKeypoint
     uv: tuple[float, float]  # its predicted place in the photo [px]
@@ -30,18 +28,16 @@ class Suggestion:
     @property
     def text(self) -> str:
         """Name of the point, and what is known of it."""
-        name = self.point.name or "The marked corner"
-        return f"{name}: so far known to ± {short(self.sigma)} px; it would tell most"
+        return f"{self.point.name}: so far known to ± {short(self.sigma)} px; it would tell most"
 
 
 def suggest(
     live: LiveAlignment,
-    model: ClickableModel,
     registry: KeypointRegistry,
     used: Collection[int],
     shape: ObjectShape,
 ) -> Suggestion | None:
-    """Choose the visible keypoint that tells most; without one, the corner of the surface.
+    """Choose the visible keypoint that tells most.
 
     A click of the standard deviation s tells log det(1 + C / s^2) / 2 of the estimate, where C is
     the covariance of the point's predicted place.
@@ -60,14 +56,9 @@ def suggest(
     elif "x" in result.stretched_axes:
         return None
     else:
-        gaps = np.linalg.norm(model.sample_points[:, None] - registry.xyz(used), axis=2)
-        apart = (gaps > _APART * model.diagonal).all(axis=1).tolist()
-        points += [point for point, far in zip(model.samples, apart, strict=True) if far]
         xyz = np.array([point.xyz for point in points]).reshape(-1, 3)
     beneath = _BENEATH_WARPED if shape.is_estimated else _BENEATH
     seen = np.flatnonzero(visible_keypoints(lines.scene, xyz, camera, pose, tolerance=beneath))
-    named = [row for row in seen if points[row].semantic_id is not None]
-    seen = np.array(named or seen, dtype=np.int64)
     if not len(seen):
         return None
     if shape.is_estimated:

@@ -39,7 +39,7 @@ from support.web import axe_script
 from benchmarks.section import BenchmarkData, Row, Tables, clocked
 from cadalign import Camera
 from cadalign.annotate.actions import perform
-from cadalign.annotate.evidence import encode_runs
+from cadalign.annotate.evidence import MarkedMask
 from cadalign.annotate.session import Session
 from cadalign.datasets import write_sample_dataset
 from cadalign.io.images import read_photo
@@ -131,7 +131,8 @@ def _times(clicks: int, given: BenchmarkData, browser: Browser, folder: Path) ->
         if kind == "mask":
             pose = own.instance.cam_from_model
             mask = cast_geometry(session.model.cad.scene, own.instance.camera, pose).mask
-            perform(session, 0, {"do": "mask_load", "runs": list(encode_runs(mask))})
+            session.annotation(0).mark(mask=MarkedMask.of(mask))
+            session.save(session.annotation(0))
         last = session.photos[0].document.pairs[-1]
         perform(session, 0, {"do": "delete", "pair": last.number})
         with _page(browser, session, WATCH_PAINT) as page:
@@ -249,7 +250,7 @@ def _panels(given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Ro
                 own = original.copied_to(folder / f"{screen} {scheme} {with_axe}")
                 session, how = prepare(own), {"screen": screen, "scheme": scheme}
                 with _page(browser, session, WATCH_SHIFTS, **how) as page:
-                    keyboard = Keyboard(page)
+                    keyboard = Keyboard(page, own.clicks[:7])
                     if with_axe:
                         page.evaluate(axe)
                         keyboard.seen = lambda name, p=page, s=serious: s.update(_serious(p))

@@ -1,4 +1,4 @@
-"""Snapping, mirror images, dragging on the model, the loupe, and undo after a restart."""
+"""Snapping, dragging on the model, and the loupe."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page
-from support.annotating import IDLE, Case, opened_page, place, place_all, wait
+from support.annotating import IDLE, Case, opened_page, place_all, wait
 
 from cadalign.annotate.actions import perform
-from cadalign.annotate.model import ClickableModel, MirrorPlanes
+from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.page_state import page_state
-from cadalign.annotate.photos import nearest_corner
 from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError
 from cadalign.geometry.mesh import Mesh
@@ -68,71 +67,6 @@ def test_click_near_the_silhouette_snaps_to_it(radius: float) -> None:
     x, y, _ = snapped.xyz
     assert np.hypot(x, y) == pytest.approx(1, abs=4e-3)
     assert np.arctan2(y, x) == pytest.approx(0.3, abs=0.15)
-
-
-def test_corner_of_a_photo_is_found_to_parts_of_a_pixel() -> None:
-    rows, columns = np.indices((80, 90))
-    soft = 1 / (1 + np.exp(-(columns - 40.3) / 0.6)) / (1 + np.exp(-(rows - 30.6) / 0.6))
-    photo = np.repeat((30 + 200 * soft)[..., None], 3, axis=2).astype(np.uint8)
-    found = nearest_corner(photo, (44, 27), reach=8)
-    assert found is not None
-    np.testing.assert_allclose(found, (40.3, 30.6), atol=0.7)
-    assert nearest_corner(photo, (80, 70), reach=8) is None  # nothing there
-    assert nearest_corner(np.zeros((80, 90, 3), dtype=np.uint8), (1, 1), reach=8) is None
-
-
-def test_snapped_photo_points_are_placed_and_moved(case: Case) -> None:
-    session = case.open()
-    perform(session, 0, {"do": "place_uv", "uv": [200, 200], "snap": 60})
-    (pair,) = session.photos[0].document.pairs
-    assert pair.uv is not None
-    assert pair.uv != (200, 200)
-    u, v = pair.uv
-    perform(session, 0, {"do": "move", "pair": 1, "uv": [u + 1, v - 1], "snap": 3})
-    moved = session.photos[0].document.pairs[0].uv
-    assert moved is not None
-    np.testing.assert_allclose(moved, pair.uv, atol=1.5)
-    empty = {"do": "place_uv", "uv": [3, 3], "snap": 2}
-    assert "No corner" in perform(session, 0, empty).message
-
-
-# --- mirror images -----------------------------------------------------------------------------
-
-
-def test_mirror_planes_are_those_of_the_surface() -> None:
-    mesh = cube()
-    assert ClickableModel(mesh).mirror_planes.axes == (0, 2)
-    vertices = mesh.vertices.copy()
-    vertices[vertices[:, 2] > 0, 0] *= 0.5  # tapers to the front: left and right alone are alike
-    model = ClickableModel(Mesh(vertices, mesh.faces))
-    assert model.mirror_planes.axes == (0,)
-    image = model.mirrored([-0.5, 0.2, 1])
-    assert image is not None
-    np.testing.assert_allclose(image.xyz, [0.5, 0.2, 1], atol=1e-9)
-    assert model.mirrored([0, 1, 0.3]) is None  # on the plane
-    vertices[-1] += 0.6
-    lopsided = ClickableModel(Mesh(vertices, mesh.faces))
-    assert lopsided.mirror_planes.axes == ()
-    flat = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
-    assert MirrorPlanes.of_mesh(flat, np.zeros(3), 1.0).axes == ()
-
-
-def test_mirrored_pair_is_offered_until_it_is_there(case: Case) -> None:
-    session = case.open()
-    corner = max(session.model.cad.samples, key=lambda point: abs(point.xyz[0]))
-    keypoint = session.model.registry.add(corner)
-    place(session, keypoint, [100, 100])
-    (pair,) = page_state(session, 0)["pairs"]
-    assert pair["mirrored"] is not None
-    perform(session, 0, {"do": "mirrored", "pair": 1})
-    first, second = page_state(session, 0)["pairs"]
-    assert second["uv"] is None
-    np.testing.assert_allclose(second["xyz"], pair["mirrored"], atol=1e-9)
-    assert first["mirrored"] is None
-    perform(session, 0, {"do": "place_uv", "uv": [100, 120]})  # completes the second
-    perform(session, 0, {"do": "place_uv", "uv": [120, 120]})
-    with pytest.raises(CadalignError, match="no mirror image"):
-        perform(session, 0, {"do": "mirrored", "pair": 3})
 
 
 def aim(session: Session) -> dict[str, Any]:
@@ -255,20 +189,6 @@ def test_key_held_snaps_and_points_are_dragged_on_the_model(
     page.mouse.move(middle[0] + 60, middle[1], steps=4)
     page.mouse.up()
     wait(page, f"Math.abs({eye}[0] - {before[0]}) > 1e-4")  # beside points it is turned as before
-
-
-def test_mirror_image_is_taken_by_key(opened: tuple[Page, Session]) -> None:
-    page, session = opened
-    corner = max(session.model.cad.samples, key=lambda point: abs(point.xyz[0]))
-    place(session, session.model.registry.add(corner), [100, 100])
-    page.evaluate("annotator.api.refresh()")
-    wait(page, "annotator.api.idle && annotator.state.pairs.length === 1")
-    page.get_by_role("button", name="mirror image of pair 1").wait_for()
-    page.keyboard.press("m")
-    wait(page, "annotator.api.idle && annotator.state.pairs.length === 2")
-    page.keyboard.press("m")
-    page.wait_for_timeout(200)
-    assert "No pair has a mirror image" in page.locator("[role=alert]").inner_text()
 
 
 def test_loupe_magnifies_about_the_pointer(opened: tuple[Page, Session]) -> None:

@@ -24,8 +24,7 @@ def content(state: dict[str, Any]) -> dict[str, Any]:
     evidence = state["evidence"]
     return {
         "pairs": sorted(map(json.dumps, pairs)),
-        "evidence": [evidence["mask"] is not None, evidence["lengths"]],
-        "mark": state["image"]["state"],
+        "evidence": [evidence["mask"] is not None, evidence["photo"]],
     }
 
 
@@ -39,9 +38,8 @@ def content(state: dict[str, Any]) -> dict[str, Any]:
         "delete",
         "undo",
         "rename",
-        "mask_load",
-        "lengths",
-        "mark",
+        "mask_cut",
+        "use_photo",
     ],
 )
 def test_stopped_before_any_write_an_action_is_done_or_not(
@@ -54,9 +52,8 @@ def test_stopped_before_any_write_an_action_is_done_or_not(
         "move": {"pair": 5, "uv": [50.0, 60.0]},
         "delete": {"pair": 5},
         "rename": {"pair": 1, "name": "knee"},
-        "mask_load": {"runs": [1000, 5000, 640 * 480 - 6000]},
-        "lengths": {"height": 2.0},
-        "mark": {"mark": "done"},
+        "mask_cut": {"corners": [[150, 80], [450, 420]]},
+        "use_photo": {"on": True},
     }
     write, written = files.write_whole, [0]
 

@@ -120,16 +120,6 @@ def test_display_coordinates_are_centred_with_diagonal_1() -> None:
     np.testing.assert_allclose(model.from_display(shown), model.scene.bounds)
 
 
-def test_samples_are_corners_far_from_each_other() -> None:
-    model = ClickableModel(box_mesh())
-    assert len(model.samples) == 8
-    for point in model.samples:
-        assert point.face_index is not None
-        rebuilt = model.scene.mesh.surface_points([point.face_index], [point.barycentric])
-        np.testing.assert_allclose(rebuilt[0], point.xyz, atol=1e-12)
-    assert len(ClickableModel(sphere(60)).samples) == 96
-
-
 # --- what is shown ---------------------------------------------------------------------------
 
 

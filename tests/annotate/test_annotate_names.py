@@ -23,7 +23,6 @@ from cadalign.io.observation import Observation
 AWKWARD = (
     *("x.jpg", "x.png", "X.webp", "x.jpg.jpg", "x.jpg.json.jpg", "x.unfinished.jpg"),
     *(
-        "cadalign.worklist.jpg",
         "x.unfinished.png",
         "x.unfinished.unfinished.jpg",
         "x_fit.jpg",

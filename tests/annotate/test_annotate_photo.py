@@ -8,11 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.annotating import Case, agree_with_fit, masks_searched_once, place_all
+from support.annotating import Case, agree_with_fit, draw_mask, masks_searched_once, place_all
 
 from cadalign import ShapeModel
 from cadalign.annotate.actions import perform
-from cadalign.annotate.evidence import encode_runs
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.datasets import KeypointNet
@@ -33,7 +32,7 @@ def draw_true_mask(session: Session, case: Case) -> None:
     instance = case.instance
     assert instance.scene is not None
     mask = cast_geometry(instance.scene, instance.camera, instance.cam_from_model).mask
-    perform(session, 0, {"do": "mask_load", "runs": list(encode_runs(mask))})
+    draw_mask(session, mask)
 
 
 def test_a_mask_alone_is_aligned(case: Case, capsys: pytest.CaptureFixture[str]) -> None:

@@ -121,7 +121,7 @@ def test_result_is_shown_in_three_dimensions(opened: tuple[Page, Session], case:
     )
     live, _ = session.live(session.photos[0])
     assert live.result is not None
-    xyz = session.model.cad.sample_points[0]
+    xyz = session.model.cad.snap_points.xyz[0]
     display = session.model.cad.to_display(xyz)
     seen = (np.reshape(placed, (4, 4)).T @ [*display, 1.0])[:3] * [1, -1, -1]
     np.testing.assert_allclose(seen, live.result.alignment.apply(xyz[None])[0], atol=1e-6)

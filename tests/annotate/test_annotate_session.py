@@ -264,19 +264,6 @@ def test_suggested_point_becomes_the_pairs_model_half(case: Case) -> None:
     assert session.photos[0].document.pair(outcome.selected).keypoint == suggestion["keypoint"]
 
 
-def test_corners_of_the_surface_are_suggested_where_no_keypoint_is_left(case: Case) -> None:
-    session = case.open(keypoints=None)
-    given = {point.semantic_id: point for point in ModelKeypoints.load(case.keypoints).keypoints}
-    for keypoint, uv in case.clicks:
-        place(session, session.model.registry.add(given[keypoint]), uv)
-    suggestion = page_state(session, 0)["suggestion"]
-    assert suggestion is not None
-    assert suggestion["keypoint"] is None
-    before = len(session.model.registry)
-    perform(session, 0, {"do": "suggested"})
-    assert len(session.model.registry) == before + 1
-
-
 def test_click_near_a_keypoint_takes_it_only_where_it_is_seen(case: Case) -> None:
     session = case.open()
     model, registry = session.model.cad, session.model.registry

@@ -9,11 +9,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page
-from support.annotating import IDLE, Case, fitted, flat, opened_page, place, place_all, wait
+from support.annotating import (
+    IDLE,
+    Case,
+    corners_of,
+    fitted,
+    flat,
+    opened_page,
+    place,
+    place_all,
+    wait,
+)
 
 from cadalign.annotate.actions import perform
 from cadalign.annotate.page_state import page_state
-from cadalign.annotate.session import Session
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.io.meshes.files import load_mesh, write_obj_mesh
 from cadalign.io.observation import Observation
@@ -40,24 +49,14 @@ def turned(case: Case, axis: str) -> Case:
     return replace(case, model=path, keypoints=keypoints)
 
 
-def add_verticals(session: Session, case: Case) -> None:
-    """Mark vertical edges about the object, as the photo shows them."""
-    camera, pose = case.instance.camera, case.instance.cam_from_model
-    for x, z in ((-0.3, -0.3), (0.3, -0.3), (0.3, 0.3)):
-        ends = camera.project(pose.apply(np.array([[x, -0.2, z], [x, 0.2, z]]))).tolist()
-        perform(session, 0, {"do": "vertical", "ends": ends})
-
-
 def test_the_up_axis_is_written_and_kept(case: Case) -> None:
     z_up = turned(case, "z")
     place_all(z_up.open(up_axis="z"), z_up)
     assert Observation.load(case.observation).up_axis == "z"
     again = z_up.open()
     assert page_state(again, 0)["image"]["up_axis"] == "z"
-    place(again, again.model.registry.add(again.model.cad.samples[0]), [300.0, 200.0])
+    place(again, again.model.registry.add(corners_of(again)[0]), [300.0, 200.0])
     assert Observation.load(case.observation).up_axis == "z"
-    perform(again, 0, {"do": "another"})
-    assert page_state(again, 1)["image"]["up_axis"] == "z"
     for pair in again.photos[0].document.pairs:  # a file without keypoints keeps it, too
         perform(again, 0, {"do": "delete", "pair": pair.number})
     assert page_state(z_up.open(), 0)["image"]["up_axis"] == "z"
@@ -70,9 +69,12 @@ def test_a_model_with_y_up_needs_no_word(case: Case) -> None:
 
 def test_gravity_is_that_of_the_up_axis(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
     z_up = turned(case, "z")
-    session = z_up.open(up_axis="z")
-    place_all(session, z_up)
-    add_verticals(session, z_up)
+    place_all(z_up.open(up_axis="z"), z_up)
+    stored = json.loads(case.observation.read_text())
+    up = case.instance.cam_from_model.rotation @ [0.0, 1.0, 0.0]
+    case.observation.write_text(json.dumps(stored | {"up": up.tolist()}))
+    session = z_up.open()
+    perform(session, 0, {"do": "move", "pair": 1, "uv": case.clicks[0][1]})
     live, _ = session.live(session.photos[0])
     assert live.result is not None
     assert not any("gravity" in warning for warning in map(str, live.result.warnings))

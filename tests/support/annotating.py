@@ -18,6 +18,7 @@ from playwright.sync_api import Browser, Page
 
 from cadalign import Result, View, align
 from cadalign.annotate.actions import perform
+from cadalign.annotate.evidence import MarkedMask
 from cadalign.annotate.guard import Access
 from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
@@ -26,7 +27,9 @@ from cadalign.annotate.server import listen, make_app, make_server
 from cadalign.annotate.session import Session
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, ModelKeypoints
+from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.evaluation.instances.instance import Instance, load_scene, make_instance
+from cadalign.geometry.mesh import farthest_rows
 from cadalign.io.images import write_image
 from cadalign.render import RaycastRenderer, visible_keypoints
 
@@ -137,13 +140,14 @@ def place_twenty(session: Session, case: Case) -> None:
     """Place all visible keypoints, and corners of the surface up to 20 pairs."""
     place_all(session, case)
     rng = np.random.default_rng(0)
+    corners = corners_of(session)
     seen = visible_keypoints(
         session.model.cad.scene,
-        session.model.cad.sample_points,
+        np.array([point.xyz for point in corners]),
         case.instance.camera,
         case.instance.cam_from_model,
     )
-    for point in (p for p, is_seen in zip(session.model.cad.samples, seen, strict=True) if is_seen):
+    for point in (p for p, is_seen in zip(corners, seen, strict=True) if is_seen):
         if len(session.photos[0].document.pairs) >= 20:
             return
         if session.model.registry.find(point.xyz, tolerance=1e-3) is None:
@@ -153,6 +157,21 @@ def place_twenty(session: Session, case: Case) -> None:
             noise = rng.normal(size=2)
             u, v = float(u + noise[0]), float(v + noise[1])
             place(session, session.model.registry.add(point), [u, v])
+
+
+def corners_of(session: Session, count: int = 96) -> list[ModelKeypoint]:
+    """Vertices of the model that are far from each other."""
+    points = session.model.cad.snap_points.xyz
+    rows = farthest_rows(points, count, center=session.model.cad.center)
+    return [ModelKeypoint("", (x, y, z)) for x, y, z in points[rows].tolist()]
+
+
+def draw_mask(session: Session, mask: np.ndarray) -> None:
+    """Have a mask drawn on the first photo."""
+    with session.lock:
+        state = session.annotation(0)
+        state.mark(mask=MarkedMask.of(mask))
+        session.save(state)
 
 
 @contextmanager

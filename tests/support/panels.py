@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -40,26 +39,21 @@ _TWO_FRAMES = """async () => {
 
 
 def prepare(case: Case, *, photos: int = 3) -> Session:
-    """A folder of photos with a detector's keypoints, opened."""
+    """A folder of photos, opened."""
     for number in range(2, photos + 1):
         shutil.copy(case.photo, case.folder / f"photo_{number}.png")
-    names = [f"keypoint {number}" for number, _ in case.clicks]
-    points = [value for _, uv in case.clicks[:7] for value in (*uv, 2)]
-    points += [0, 0, 0] * (len(case.clicks) - 7)
-    found = {
-        "images": [{"id": 1, "file_name": case.photo.name, "width": 640, "height": 480}],
-        "categories": [{"id": 1, "name": "chair", "keypoints": names}],
-        "annotations": [{"id": 1, "image_id": 1, "category_id": 1, "keypoints": points}],
-    }
-    (case.folder / "found.json").write_text(json.dumps(found))
-    return case.open(image=case.folder, detections=case.folder / "found.json")
+    return case.open(image=case.folder)
 
 
 @dataclass
 class Keyboard:
-    """A page used by its keys; ``seen`` is called in every panel with the panel's name."""
+    """A page used by its keys; ``seen`` is called in every panel with the panel's name.
+
+    ``clicks`` are the keypoints that are marked and their pixels.
+    """
 
     page: Page
+    clicks: Sequence[tuple[int, list[float]]] = ()
     seen: Callable[[str], None] = lambda name: None
     visited: list[str] = field(default_factory=list)
 
@@ -115,16 +109,17 @@ class Keyboard:
         self.page.locator(PHOTO).focus()
 
     def _pairs(self) -> None:
-        self.keys("a", then=f"{SETTLED} && annotator.state.alignment.status === 'done'")
+        for keypoint, uv in self.clicks:
+            for action in ({"do": "place_uv", "uv": uv}, _placed(keypoint)):
+                self.page.evaluate("action => annotator.act(action)", action)
+        self.wait(f"{SETTLED} && annotator.state.alignment.status === 'done'")
         self.look("aligned")
         self.disclose(".keypoints-list > summary")
         self.look("details")
         self.keys("]")
         self.type("td.name input", "left knee")
         self.page.locator(PHOTO).focus()
-        self.keys("m")
-        self.look("mirrored")
-        self.keys("Delete", "]", *["Shift+ArrowRight"] * 12)
+        self.keys(*["Shift+ArrowRight"] * 12)
         (wrong,) = self.page.locator("tr.wrong").all_inner_texts()
         assert "contradicts the others: " in wrong
         self.look("contradiction")
@@ -133,22 +128,10 @@ class Keyboard:
         self.keys("n", "Control+z")
 
     def _evidence(self) -> None:
-        self.disclose("button[aria-expanded]")
-        self.look("evidence")
         self.page.locator(PHOTO).focus()
         self.keys("x", "Enter")
         self.look("box")
-        self.keys("Escape")
-        for edge in range(2):
-            self.keys(
-                "u", "Enter", "ArrowDown", "ArrowDown", "Enter", *["ArrowLeft"] * (3 * edge + 2)
-            )
-        self.look("vertical edges")
-        self.press("[aria-label='Clear the vertical edges']")
-        self.type("[aria-label='Known height (along y)']", "0.9")
-        self.look("known size")
-        self.page.locator(PHOTO).focus()
-        self.keys("Control+z", "p")
+        self.keys("Escape", "p")
 
     def _seeing(self) -> None:
         self.keys("l", "1", "2", "5", "v", "f", "+", "-")
@@ -173,10 +156,12 @@ class Keyboard:
 
     def _end(self) -> None:
         self.page.locator(PHOTO).focus()
-        self.keys("f", "k", then=f"{SETTLED} && annotator.state.image.number === 1")
-        self.keys("PageUp", then=f"{SETTLED} && annotator.state.image.number === 0")
-        self.keys("d", then=f"{SETTLED} && annotator.state.image.number === 1")
+        self.keys("f", "PageDown", then=f"{SETTLED} && annotator.state.image.number === 1")
         self.look("next photo")
+
+
+def _placed(keypoint: int) -> dict[str, Any]:
+    return {"do": "place_keypoint", "keypoint": keypoint}
 
 
 def open_page(

@@ -9,7 +9,6 @@ const KEYS = [
   ["Wheel, pinch, + and −", "zoom"],
   ["Arrow keys", "nudge the selected point by 0.25 px, with Shift by 2.5 px; in the model they turn it"],
   ["Enter", "places a point at the middle of the view that has the focus"],
-  ["A", "takes all keypoints of a detector"],
   ["[ and ]", "select the pair before and after"],
   ["N", "uses the suggested model point"],
   ["Delete", "deletes the selected pair"],
@@ -17,19 +16,16 @@ const KEYS = [
   ["F", "shows all of the photo and the model"],
   ["V", "looks at the model from where the photo was taken"],
   ["1 to 6", "look at the model from its front, right, back, left, top, bottom"],
-  ["S held", "snaps clicks and drags: on the model to corners, creases and silhouette, in the photo to corners"],
+  ["S held", "snaps clicks and drags on the model to corners, creases and silhouette"],
   ["L", "a loupe beside the pointer, or none"],
-  ["M", "begins a pair at the mirror image of the selected one, on a symmetric model"],
-  ["P X U", "what is marked in the photo: points; the mask by a box; a vertical edge"],
+  ["P X", "what is marked in the photo: points; the mask by a box"],
   ["I", "fits to the photo itself, too, or no more: the outline is sought in it"],
-  ["Right button", "pans the photo while a box or an edge is drawn"],
+  ["Right button", "pans the photo while a box is drawn"],
   ["H held", "hides the alignment over the photo"],
   ["R", "shows the aligned model before the photo in 3D, or the model to click on again"],
   ["O", "draws the alignment as edges, shaded, as a box, or not"],
-  ["Page up, Page down", "the photo before and after, as the list is filtered"],
-  ["T", "begins another object of the photo"],
-  ["W", "the list of photos with their states"],
-  ["D, K", "marks the photo as done or skipped, and goes on"],
+  ["Page up, Page down", "the photo before and after"],
+  ["W", "the list of photos"],
   ["Escape", "gives up what is begun, goes back to points, selects nothing"],
   ["?", "this help"],
 ];
@@ -46,19 +42,14 @@ export class Layout {
     this.next = button("Next ›", handlers.next, { title: "Page down" });
     this.undo = button("Undo", handlers.undo, { title: "Ctrl+Z" });
     this.redo = button("Redo", handlers.redo, { title: "Ctrl+Y" });
-    this.list = button("Photos…", handlers.list, { title: "All photos with their states (W)", "aria-haspopup": "dialog" });
-    this.done = toggle("Done", () => handlers.mark("done"), { title: "This photo is done: go on (D)" });
-    this.skip = toggle("Skip", () => handlers.mark("skipped"), { title: "Leave this photo out: go on (K)" });
-    this.photos = h("nav", { "aria-label": "Photos" }, this.previous, this.place, this.next, this.done, this.skip, this.list);
+    this.list = button("Photos…", handlers.list, { title: "All photos (W)", "aria-haspopup": "dialog" });
+    this.photos = h("nav", { "aria-label": "Photos" }, this.previous, this.place, this.next, this.list);
     this.help = helpDialog(handlers.tour);
     this.message = h("p", { class: "message", role: "alert", hidden: true });
     this.photo = h("div", { class: "host" });
     this.model = h("div", { class: "host" });
     this.overlay = makeOverlay(handlers.overlay);
     this.tools = makeTools(handlers);
-    this.another = button("Another object", handlers.another, {
-      title: "Begin another object of this photo, in a file of its own (T)",
-    });
     this.shown = h("span", { class: "soft" });
     this.snapping = toggle("Snap", handlers.snap, { title: "Clicks go to corners, creases and silhouette (hold S)" });
     this.loupe = toggle("Loupe", handlers.loupe, { title: "Magnify about the pointer (L)" });
@@ -87,7 +78,7 @@ export class Layout {
         "main",
         {},
         view("Photo", this.photo, handlers.photo, {
-          above: h("div", { class: "above" }, this.another, this.tools.root),
+          above: h("div", { class: "above" }, this.tools.root),
           below: this.overlay.root,
         }),
         view("Model", this.model, handlers.model, { below: [this.shown, this.result, this.asPhoto] }),
@@ -104,8 +95,6 @@ export class Layout {
     this.title.textContent = image.name;
     this.photos.hidden = image.count < 2;
     this.place.textContent = `${image.number + 1} of ${image.count}`;
-    press(this.done, image.state === "done");
-    press(this.skip, image.state === "skipped");
     this.previous.disabled = image.number === 0;
     this.next.disabled = image.number === image.count - 1;
     this.undo.disabled = !state.can_undo;

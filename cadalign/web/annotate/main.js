@@ -31,9 +31,6 @@ class App {
       act,
       select: (pair) => this.select(pair),
       suggested: () => this.suggested(),
-      accept: () => this.accept(),
-      mirror: (pair) => this.mirror(pair),
-      tell: (text) => this.layout.tell(text),
     });
     this.worklist = new WorkList({ go: (number) => this.goTo(number), tell: (text) => this.layout.tell(text) });
     this.layout = new Layout(
@@ -44,11 +41,9 @@ class App {
         next: () => this.go(1),
         tour: () => this.tour.start(),
         list: () => this.showPhotos(),
-        mark: (mark) => this.mark(mark),
         asPhoto: () => this.model.frameAsPhoto(),
         result: (on) => this.showResult(on),
         tool: (tool) => this.choose(tool),
-        another: () => act({ do: "another" }),
         snap: (on) => this.snap({ on }),
         loupe: (on) => this.magnify(on),
         overlay: (changed) => this.photo.setOverlay(changed),
@@ -59,7 +54,6 @@ class App {
     );
     this.photo = new PhotoView(this.layout.photo, {
       onPlace: (uv) => this.place(uv),
-      onAccept: (keypoint) => this.act({ do: "accept", keypoints: [keypoint] }),
       onMark: (action) => this.act(action),
       onSelect: (pair) => this.select(pair),
       onMove: (pair, uv, done) => this.mover.drag(pair, uv, done),
@@ -68,7 +62,6 @@ class App {
     this.model = new ModelView(this.layout.model, {
       onPick: (aim) => this.act({ do: "pick", ...aim, pair: this.selected, snap: this.modelReach }),
       onRepick: (pair, aim) => this.repick(pair, aim),
-      onMirrored: (pair) => this.mirror(pair),
       onSelect: (pair) => this.select(pair),
       onSuggested: () => this.suggested(),
     });
@@ -171,7 +164,7 @@ class App {
 
   /** Place a point in the photo. */
   place(uv) {
-    this.act({ do: "place_uv", uv, pair: this.selected, snap: this.photoReach });
+    this.act({ do: "place_uv", uv, pair: this.selected });
   }
 
   /** Choose what clicks in the photo mark. */
@@ -187,11 +180,7 @@ class App {
     else this.select(null);
   }
 
-  /** How far clicks snap in the photo [its px], and on the model [tangent]; 0 if they don't. */
-  get photoReach() {
-    return this.isSnapping ? SNAP / this.photo.scale : 0;
-  }
-
+  /** How far clicks snap on the model [tangent]; 0 if they don't. */
   get modelReach() {
     return this.isSnapping ? this.model.tangent(SNAP) : 0;
   }
@@ -220,14 +209,6 @@ class App {
     this.model.stage.invalidate();
   }
 
-  /** Begin a pair at the mirror image of another, by default the selected or last one. */
-  mirror(pair) {
-    const having = this.state?.pairs.filter((each) => each.mirrored) ?? [];
-    const chosen = pair ?? (having.find((each) => each.pair === this.selected) ?? having.at(-1))?.pair;
-    if (chosen === undefined) this.layout.tell("No pair has a mirror image that is not marked.");
-    else this.act({ do: "mirrored", pair: chosen });
-  }
-
   suggested() {
     if (this.state?.suggestion) this.act({ do: "suggested", pair: this.selected });
   }
@@ -239,41 +220,20 @@ class App {
     if (on && !shown) this.layout.tell("There is no stretched model to show yet.");
   }
 
-  /** Go to the photo some places on, among those of the work list's filter. */
+  /** Go to the photo some places on. */
   go(by) {
     const { image } = this.state ?? { image: { number: 0, count: 1 } };
-    if (!this.worklist.filter.value) {
-      const number = image.number + by;
-      if (number < 0 || number >= image.count) return false;
-      return this.goTo(number);
-    }
-    this.worklist.next(image.number, by).then((number) => {
-      if (number === null) this.layout.tell(`No other photo is "${this.worklist.filter.value}" in this direction.`);
-      else this.goTo(number);
-    });
-    return true;
+    const number = image.number + by;
+    if (number < 0 || number >= image.count) return false;
+    return this.goTo(number);
   }
 
   goTo(number) {
     location.hash = String(number + 1);
   }
 
-  /** Take all keypoints of a detector. */
-  accept() {
-    if (!this.state?.detected.length) return false;
-    return this.act({ do: "accept" });
-  }
-
   showPhotos() {
     if (this.state?.image.count > 1) this.worklist.open(this.state.image.number);
-  }
-
-  /** Mark the photo as done or skipped and go on, or take the mark back. */
-  async mark(mark) {
-    const { state, count, number } = this.state.image;
-    const isNew = state !== mark;
-    const answer = await this.act({ do: "mark", mark: isNew ? mark : null });
-    if (answer && isNew && number < count - 1) this.go(1);
   }
 }
 

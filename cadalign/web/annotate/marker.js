@@ -5,7 +5,6 @@ export const KINDS = {
   selected: { fill: "#0b2e66", ring: "#ffd23f", radius: 13 },
   wrong: { fill: "#b3261e", ring: "#ffffff", radius: 11 },
   free: { fill: "#ffffff", ring: "#3a4048", radius: 5 },
-  detected: { fill: "#00000066", ring: "#5fe3ff", radius: 9 },
   suggested: { fill: "transparent", ring: "#ffd23f", radius: 12 },
 };
 

@@ -1,14 +1,12 @@
-// Marking a mask or vertical edges in the photo, in place of points.
+// Marking a mask in the photo by a box, in place of points.
 import { strokeTwice } from "./marker.js";
 
 const MASK = "#b04dff";
-const VERTICAL = "#4be38a";
 
 /** Tools by name: label, key, and what to do with it. */
 export const TOOLS = {
   points: { label: "Points", key: "p", how: "" },
   box: { label: "Mask: box", key: "x", how: "Draw a box around the object: it is cut out by its colours." },
-  vertical: { label: "Vertical edge", key: "u", how: "Draw along two or more vertical edges, far apart." },
 };
 
 export class Marking {
@@ -52,12 +50,12 @@ export class Marking {
     this.view.invalidate();
   }
 
-  /** A box or an edge is drawn by dragging, or by two clicks. */
+  /** A box is drawn by dragging, or by two clicks. */
   release(uv, moved) {
     if (!moved && this.path.length < 2) return;
     const ends = [this.path[0], uv];
     this.cancel();
-    this.act(this.tool === "box" ? { do: "mask_cut", corners: ends } : { do: "vertical", ends });
+    this.act({ do: "mask_cut", corners: ends });
   }
 
   /** The same by the keyboard, at the middle of the view. */
@@ -72,18 +70,13 @@ export class Marking {
     this.view.invalidate();
   }
 
-  /** Draw the mask, the vertical edges and what is begun. */
+  /** Draw the mask and the box that is begun. */
   draw(context, evidence) {
     this.drawMask(context, evidence);
-    for (const ends of evidence?.verticals ?? []) this.stroke(context, ends, VERTICAL, 3);
     const path = this.hover ? [this.path[0], this.hover] : this.path;
     if (!path.length) return;
-    if (this.tool === "box" && path.length > 1) {
-      const [[x1, y1], [x2, y2]] = path;
-      this.stroke(context, [[x1, y1], [x2, y1], [x2, y2], [x1, y2], [x1, y1]], MASK, 2);
-    } else {
-      this.stroke(context, path, this.tool === "vertical" ? VERTICAL : MASK, 2);
-    }
+    const [[x1, y1], [x2, y2] = path[0]] = path;
+    this.stroke(context, [[x1, y1], [x2, y1], [x2, y2], [x1, y2], [x1, y1]]);
   }
 
   drawMask(context, evidence) {
@@ -125,38 +118,15 @@ export class Marking {
     this.view.invalidate();
   }
 
-  stroke(context, path, color, width) {
+  stroke(context, path) {
     context.save();
     context.lineCap = context.lineJoin = "round";
     context.beginPath();
     for (const uv of path) {
       const { x, y } = this.view.toView(uv);
       context.lineTo(x, y);
-      if (path.length === 1) context.lineTo(x + 0.1, y);
     }
-    strokeTwice(context, color, width, 2.5);
+    strokeTwice(context, MASK, 2, 2.5);
     context.restore();
   }
-}
-
-/** The runs of a mask's pixels outside and inside in turn, row by row, from a file of that size. */
-export async function readMask(file, { width, height }) {
-  const picture = await createImageBitmap(file);
-  if (picture.width !== width || picture.height !== height) {
-    throw new Error(`${file.name} has ${picture.width} x ${picture.height} pixels, the photo ${width} x ${height}.`);
-  }
-  const canvas = document.createElement("canvas");
-  [canvas.width, canvas.height] = [width, height];
-  const context = canvas.getContext("2d");
-  context.drawImage(picture, 0, 0);
-  const { data } = context.getImageData(0, 0, width, height);
-  const runs = [0];
-  let inside = false;
-  for (let k = 0; k < data.length; k += 4) {
-    const now = data[k + 3] > 0 && data[k] + data[k + 1] + data[k + 2] > 0;
-    if (now !== inside) runs.push(0);
-    inside = now;
-    runs[runs.length - 1] += 1;
-  }
-  return runs;
 }

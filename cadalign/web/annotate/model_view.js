@@ -17,7 +17,7 @@ const STANDING = { x: (x, y, z) => [y, z, x], y: (x, y, z) => [x, y, z], z: (x, 
 export class ModelView {
   /**
    * @param {HTMLElement} host - the element to fill
-   * @param {object} handlers - onPick(aim), onRepick(pair, aim), onSelect(pair), onMirrored(pair),
+   * @param {object} handlers - onPick(aim), onRepick(pair, aim), onSelect(pair),
    *   onSuggested(), where an aim has origin, direction and near
    */
   constructor(host, handlers) {
@@ -118,9 +118,6 @@ export class ModelView {
     }
     for (const pair of state.pairs) {
       if (pair.xyz) {
-        if (pair.pair === selected && pair.mirrored) {
-          shown.push({ kind: "suggested", label: "⇋", xyz: pair.mirrored, mirrored: pair.pair, name: "its mirror image" });
-        }
         shown.push({ kind: kindOf(pair, selected), label: String(pair.pair), xyz: pair.xyz, pair: pair.pair, name: pair.name });
       }
     }
@@ -209,8 +206,6 @@ export class ModelView {
       this.handlers.onSelect(marker.pair);
     } else if (marker?.suggested) {
       this.handlers.onSuggested();
-    } else if (marker?.mirrored !== undefined) {
-      this.handlers.onMirrored(marker.mirrored);
     } else {
       this.handlers.onPick(this.target(place));
     }

@@ -19,8 +19,7 @@ export class Mover {
     while (this.draggedTo) {
       const { done: last, ...move } = this.draggedTo;
       this.draggedTo = null;
-      const snap = last ? this.app.photoReach : 0;
-      await this.app.api.act({ do: "move", gesture: this.gesture, ...move, snap });
+      await this.app.api.act({ do: "move", gesture: this.gesture, ...move });
       if (last) this.app.photo.dragged = null;
       this.app.photo.invalidate();
     }

@@ -3,7 +3,7 @@ import { button, h } from "../common/dom.js";
 import { EvidencePanel } from "./evidence_panel.js";
 
 export class Panel {
-  /** @param {object} handlers - act(action), select(pair), suggested(), mirror(pair), tell(text) */
+  /** @param {object} handlers - act(action), select(pair), suggested() */
   constructor(handlers) {
     this.handlers = handlers;
     this.alignment = h("div", { class: "alignment" });
@@ -131,29 +131,16 @@ export class Panel {
     this.priors.hidden = !ofStretch && !ofFocal;
   }
 
-  /** Keypoints of a detector, if there are any. */
-  detected(detected) {
-    if (!detected.length) return "";
-    const count = `${detected.length} keypoint${detected.length === 1 ? "" : "s"} of a detector`;
-    return h(
-      "p",
-      {},
-      `${count}, dashed in the photo: click one to take it, then drag it if need be. `,
-      button("Take all", this.handlers.accept, { title: "A" }),
-    );
-  }
-
-  showAdvice({ suggestion, alignment, shape, detected }) {
+  showAdvice({ suggestion, alignment, shape }) {
     if (!suggestion) {
       const text =
         alignment.status === "done"
           ? nothingLeft(shape)
           : `Mark the same place in the photo and on the model; either comes first. ${shape ? "Three" : "Four"} pairs give the first alignment.`;
-      this.advice.replaceChildren(this.detected(detected), h("p", { class: "soft" }, text));
+      this.advice.replaceChildren(h("p", { class: "soft" }, text));
       return;
     }
     this.advice.replaceChildren(
-      this.detected(detected),
       h("p", {}, suggestion.text),
       h(
         "p",
@@ -218,12 +205,6 @@ export class Panel {
               "aria-label": `Repick the model point of pair ${pair.pair}`,
               title: "Choose another model point",
               "data-key": `release ${pair.pair}`,
-            })
-          : null,
-        pair.mirrored
-          ? button("⇋", () => this.handlers.mirror(pair.pair), {
-              "aria-label": `Begin a pair at the mirror image of pair ${pair.pair}`,
-              title: "Mirror image (M)", "data-key": `mirror ${pair.pair}`,
             })
           : null,
         button("✕", () => act({ do: "delete", pair: pair.pair }), {

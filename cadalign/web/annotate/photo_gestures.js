@@ -97,10 +97,8 @@ export class PhotoGestures {
     } else if (press.pair) {
       view.handlers.onSelect(press.pair.pair);
     } else if (press.button === 0) {
-      const detected = view.detectedAt(press.start);
       const uv = view.toPixel(press.start);
-      if (detected) view.handlers.onAccept(detected.keypoint);
-      else if (view.contains(uv)) view.handlers.onPlace(uv);
+      if (view.contains(uv)) view.handlers.onPlace(uv);
     }
   }
 

@@ -148,7 +148,12 @@ export class PhotoView {
 
   /** The pair whose point is at a place of the view, if any. */
   pairAt(place) {
-    return this.nearest(this.state?.pairs.filter(({ uv }) => uv), place);
+    const gap = ({ uv }) => {
+      const own = this.toView(uv);
+      return Math.hypot(own.x - place.x, own.y - place.y);
+    };
+    const points = this.state?.pairs.filter((pair) => pair.uv && gap(pair) < REACH) ?? [];
+    return points.sort((a, b) => gap(a) - gap(b))[0] ?? null;
   }
 
   resize() {
@@ -189,8 +194,7 @@ export class PhotoView {
         this.drawAlignment(this.state.alignment, mode);
         this.context.globalAlpha = 1;
       }
-      const { detected, suggestion } = this.state;
-      for (const { uv } of detected) this.drawDashed("detected", "?", uv);
+      const { suggestion } = this.state;
       if (suggestion) this.drawDashed("suggested", "", suggestion.uv);
       this.drawPairs(this.state.pairs);
     }
@@ -257,7 +261,7 @@ export class PhotoView {
     strokeTwice(context, style, width, 1.6, 45);
   }
 
-  /** A dashed badge at a pixel: what a detector has found, or where a point is expected. */
+  /** A dashed badge at a pixel where a point is expected. */
   drawDashed(kind, label, uv) {
     const { x, y } = this.toView(uv);
     this.context.setLineDash([4, 3]);
@@ -278,19 +282,6 @@ export class PhotoView {
       this.drawCross(place, kind);
       drawBadge(this.context, kind, String(pair.pair), place.x + BADGE_OFFSET, place.y - BADGE_OFFSET);
     }
-  }
-
-  /** The detector's keypoint at a place of the view, if any. */
-  detectedAt(place) {
-    return this.nearest(this.state?.detected, place);
-  }
-
-  nearest(points = [], place) {
-    const gap = ({ uv }) => {
-      const own = this.toView(uv);
-      return Math.hypot(own.x - place.x, own.y - place.y);
-    };
-    return points.filter((each) => gap(each) < REACH).sort((a, b) => gap(a) - gap(b))[0] ?? null;
   }
 
   /** A cross that leaves the pixel itself free. */

@@ -3,8 +3,8 @@ import { button, h } from "../common/dom.js";
 
 const SEEN = "cadalign-tour-seen";
 const STEPS = [
-  ["section[aria-label=Photo]", "1. Mark a point in the photo", "Click a corner or tip of the object. The wheel zooms at the pointer, dragging pans, L shows a loupe, and S held snaps to corners."],
-  ["section[aria-label=Model]", "2. Mark the same point on the model", "Drag to turn it, or look from a side by 1 to 6; then click the same place. Both clicks make a pair; either comes first."],
+  ["section[aria-label=Photo]", "1. Mark a point in the photo", "Click a corner or tip of the object. The wheel zooms at the pointer, dragging pans, and L shows a loupe."],
+  ["section[aria-label=Model]", "2. Mark the same point on the model", "Drag to turn it, or look from a side by 1 to 6; S held snaps to corners; then click the same place. Both clicks make a pair; either comes first."],
   ["section[aria-label=Results]", "3. From four pairs on it is aligned", "The model is drawn over the photo, with what is known of its pose and stretch. Drag points that are off. Everything is saved at once; ? lists all keys."],
 ];
 

@@ -18,12 +18,36 @@ from cadalign.geometry.rotations import angle_between
 from cadalign.render import look_at
 from cadalign.solvers.constants import UNKNOWNS
 
+_CATEGORIES = ("chair", "bottle", "airplane", "mug", "bathtub", "guitar")
+_SIMILAR = ("chair", "bottle", "mug")
+_SHAPE_SIGMA = 0.02  # of similar models [diagonals]
 _NOISE_PX, _OUTLIERS = 1.0, 0.3
 _FEWEST, _MOST = 7, 16  # keypoints
 _STRETCH_SIGMA = 0.25  # of log scales
 _DISTANCE, _ELEVATION_DEG = (2.0, 4.0), (-10.0, 50.0)
 _WRONG_DEG = 10.0
 _CLAUSES = ("is mirrored", "are swapped", "is flipped", "from the bottom")
+_SIZE = KEYPOINT_CAMERA.width, KEYPOINT_CAMERA.height
+
+
+def mistakes(given: BenchmarkData) -> Tables:
+    """Shares of mistakes that stay unnoticed, and of right keypoints that raise an alarm [%].
+
+    Keypoints of KeypointNet's models, stretched, with 1 px of noise. Unnoticed is an estimate
+    without a warning but for uncertainties, and with a rotation that is more than 10 degrees off.
+    """
+    dataset, models = KeypointNet(given.needed()), {}
+    for category in _CATEGORIES:
+        points = (each.keypoints.xyz for each in dataset[category])
+        models[category] = [each for each in points if len(each) >= _FEWEST]
+    for title, names, count, sigma in (
+        ("mistakes [%]", _CATEGORIES, given.count or 300, 0.0),
+        ("of similar models [%]", _SIMILAR, given.count or 100, _SHAPE_SIGMA),
+    ):
+        rows = [
+            {"category": name} | _shares(models[name], given.seed, count, sigma) for name in names
+        ]
+        yield title, rows
 
 
 class SeenModel(NamedTuple):
@@ -33,66 +57,22 @@ class SeenModel(NamedTuple):
     points_2d: FloatArray
     rotation: FloatArray
 
-    def mirrored(self) -> SeenModel:
-        """The same with the model mirrored."""
-        return self._replace(points_3d=self.points_3d * [-1, 1, 1])
-
-    def flipped(self) -> SeenModel:
-        """The same with u counted from the other side."""
+    def changed(self) -> dict[str, SeenModel]:
+        """The same with the model mirrored, u from the other side, and u and v swapped."""
         last = KEYPOINT_CAMERA.width - 2 * PIXEL_CENTRE
-        return self._replace(points_2d=self.points_2d * [-1, 1] + [last, 0])
-
-    def swapped(self) -> SeenModel:
-        """The same with u and v swapped."""
-        return self._replace(points_2d=self.points_2d[:, ::-1].copy())
+        return {
+            "mirrored": self._replace(points_3d=self.points_3d * [-1, 1, 1]),
+            "flipped": self._replace(points_2d=self.points_2d * [-1, 1] + [last, 0]),
+            "swapped": self._replace(points_2d=self.points_2d[:, ::-1].copy()),
+        }
 
     def with_outliers(self, rng: np.random.Generator) -> SeenModel:
         """The same, some keypoints anywhere in the image."""
         count = len(self.points_2d)
         wrong = rng.choice(count, round(_OUTLIERS * count), replace=False)
         pixels = self.points_2d.copy()
-        pixels[wrong] = rng.uniform(
-            0, [KEYPOINT_CAMERA.width, KEYPOINT_CAMERA.height], (len(wrong), 2)
-        )
+        pixels[wrong] = rng.uniform(0, _SIZE, (len(wrong), 2))
         return self._replace(points_2d=pixels)
-
-
-def mistakes(
-    given: BenchmarkData,
-    *,
-    problems: int = 300,
-    similar: int = 100,
-    categories: tuple[str, ...] = ("chair", "bottle", "airplane", "mug", "bathtub", "guitar"),
-    shape_sigma: float = 0.02,
-) -> Tables:
-    """Shares of mistakes that stay unnoticed, and of right keypoints that raise an alarm [%].
-
-    Keypoints of KeypointNet's models, stretched, with 1 px of noise. Unnoticed is an estimate
-    without a warning but for uncertainties, and with a rotation that is more than 10 degrees off.
-
-    Parameters
-    ----------
-    problems : int
-        Problems of every category and mistake.
-    similar : int
-        The same of models that are only similar, which take longer.
-    categories : tuple[str, ...]
-        Categories of KeypointNet.
-    shape_sigma : float
-        Displacement of the keypoints of similar models, in diagonals.
-    """
-    dataset, models = KeypointNet(given.needed()), {}
-    for category in categories:
-        points = (each.keypoints.xyz for each in dataset[category])
-        models[category] = [each for each in points if len(each) >= _FEWEST]
-    own = f"mistakes, {problems} problems each: %", problems, 0.0
-    title = f"of similar models, shape_sigma {shape_sigma:g}, {similar} each: %"
-    for name, count, sigma in (own, (title, similar, shape_sigma)):
-        if count:
-            yield (
-                name,
-                [{"category": c} | _shares(models[c], given.seed, count, sigma) for c in models],
-            )
 
 
 def _shares(models: list[FloatArray], seed: int, problems: int, shape_sigma: float) -> Row:
@@ -102,13 +82,7 @@ def _shares(models: list[FloatArray], seed: int, problems: int, shape_sigma: flo
         seen, few = _seen(models, rng), _seen(models, rng, _FEWEST)
         moved = rng.normal(0, shape_sigma, seen.points_3d.shape)
         seen = seen._replace(points_3d=seen.points_3d + moved)
-        given = {
-            "mirrored": seen.mirrored(),
-            "flipped": seen.flipped(),
-            "swapped": seen.swapped(),
-            "right": seen,
-            "outliers": seen.with_outliers(rng),
-        }
+        given = seen.changed() | {"right": seen, "outliers": seen.with_outliers(rng)}
         if not shape_sigma:
             given["7 keypoints"] = few.with_outliers(rng)
         for kind, each in given.items():
@@ -122,8 +96,7 @@ def _shares(models: list[FloatArray], seed: int, problems: int, shape_sigma: flo
             unnoticed, explained = unnoticed + silent.sum(), explained + (silent & fits).sum()
         else:
             row[f"{kind} named"], row[f"{kind} refused"] = percent(named), percent(refused)
-    row["of the unnoticed, all keypoints fit"] = f"{explained} of {unnoticed}"
-    return row
+    return row | {"of the unnoticed, all keypoints fit": f"{explained} of {unnoticed}"}
 
 
 def _seen(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain, islice
@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from benchmarks import section
-from benchmarks.section import BenchmarkData, Row, Table, Tables
+from benchmarks.section import COMMAND, BenchmarkData, Row, Table, Tables
 from cadalign import Box, Library, Observation, ShapeModel
 from cadalign.datasets import KeypointNet
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
@@ -25,7 +25,6 @@ from cadalign.evaluation.instances.queries import (
     observe_model,
     same_shapes,
 )
-from cadalign.evaluation.instances.unseen import UnseenObject
 from cadalign.metrics import box_iou_up_to_scale
 from cadalign.retrieval import LibraryModel, Match
 
@@ -33,40 +32,28 @@ _KEYPOINTS = 8
 _CALLS = 3
 _LEAST_SHARED = 4
 _FLAT = 1e-9
+_NOISE_PX = 2.0  # of unseen objects
+_RUN_QUERIES = 1000
+_RANKINGS: dict[str, dict[str, Any]] = {"fit": {}, "fit, shape_sigma": {"shape_sigma": 0.02}}
 
 
-def retrieval(
-    given: BenchmarkData,
-    *,
-    queries: int = 20,
-    sizes: tuple[int, ...] = (50_000,),
-    run_queries: int = 1000,
-) -> Tables:
+def retrieval(given: BenchmarkData) -> Tables:
     """Time of a query and memory, for real models and growing synthetic libraries.
 
     The synthetic models are the real ones with their keypoints moved by 3 % of the extent, models
     of all categories are compared. Times are the least of three calls with as many threads as there
-    are cores, after warm-up. Ratios are those of processor time to `reference_seconds`.
-
-    Parameters
-    ----------
-    queries : int
-        Timed queries per size of the library and noise.
-    sizes : tuple[int, ...]
-        Models of the libraries that are filled up with synthetic ones; a curve: 1000 10000 50000
-        200000.
-    run_queries : int
-        Queries of a run of `cadalign retrieve` by two processes, for each of these sizes.
+    are cores, after warm-up. Ratios are those of processor time to `reference_seconds`. A run of
+    `cadalign retrieve` has two processes.
     """
     real = list(Library.from_dataset(KeypointNet(given.needed())))
     mixed = [real[k] for k in np.random.default_rng(0).permutation(len(real)).tolist()]
-    for size in (len(real), *sizes):
+    for size in (len(real), *given.sizes):
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, "library")
             _jittered(mixed, size).save(path)
-            yield _measure(path, mixed[:size], queries)
-            if size in sizes:
-                yield "Queries as a run", [_run(path, mixed[:size], run_queries)]
+            yield _measure(path, mixed[:size], given.count or 20)
+            if size in given.sizes:
+                yield "Queries as a run", [_run(path, mixed[:size])]
 
 
 def _measure(path: Path, models: Sequence[LibraryModel], queries: int) -> Table:
@@ -75,49 +62,44 @@ def _measure(path: Path, models: Sequence[LibraryModel], queries: int) -> Table:
     size = f"{len(library):,}"
     rows = [section.figure(f"opening {size} models", 1e3 * wall, "ms", busy / reference)]
     shown = [model for model in models if len(model.xyz) >= _KEYPOINTS]
-    warm_up = next(_observed(shown, 1.0, seed=1), None)
-    if warm_up is None:
-        raise SystemExit("no model shows enough keypoints")
-    _retrieve(library, warm_up[1], 1.0)
+    _, warm_up = next(_observed(shown, 1.0, seed=1))
+    _retrieve(library, warm_up, 1.0)
     for noise_px in (1.0, 3.0, 5.0):
         rows += _queries(library, shown, noise_px, queries)
     return f"{size} models, {path.stat().st_size / 1e6:.1f} MB", rows
 
 
-def _run(path: Path, models: Sequence[LibraryModel], run_queries: int) -> Row:
-    seeds = range(1 + run_queries)  # each model may show enough keypoints once only
+def _run(path: Path, models: Sequence[LibraryModel]) -> Row:
+    seeds = range(1 + _RUN_QUERIES)  # each model may show enough keypoints once only
     found = chain.from_iterable(_observed(models, 1.0, seed=seed) for seed in seeds)
     file = path.with_name("queries.jsonl")
     with file.open("wb") as queries:
-        for _, seen in islice(found, run_queries):
+        for _, seen in islice(found, _RUN_QUERIES):
             points, ids = np.zeros((len(seen.points_2d), 3)), np.asarray(seen.ids)
             query = Observation(points, seen.points_2d, KEYPOINT_CAMERA, ids=ids)
             queries.write(msgspec.json.encode(query.to_dict(states_origins=True)) + b"\n")
     command = ["retrieve", str(file), f"--library={path}", f"--out={path.with_name('run')}"]
-    call = partial(section.used_by_command, [*command, "--no-picture", "--workers=2"])
+    call = partial(section.used_by, [*COMMAND, *command, "--no-picture", "--workers=2"])
     used, reference = section.with_reference(call)
-    name = f"run of {run_queries:,} queries, two processes"
-    row = section.figure(name, run_queries / used.wall, "1/s", used.processor / reference)
+    name = f"run of {_RUN_QUERIES:,} queries, two processes"
+    row = section.figure(name, _RUN_QUERIES / used.wall, "1/s", used.processor / reference)
     return row | {"MB": used.megabytes}
 
 
 def _queries(
     library: Library, models: Sequence[LibraryModel], noise_px: float, queries: int
 ) -> list[Row]:
-    wall, busy, found = [], [], 0
+    wall, busy = [], []
     reference = section.reference_seconds()
-    for model, seen in islice(_observed(models, noise_px, seed=0), queries):
+    for _, seen in islice(_observed(models, noise_px, seed=0), queries):
         call = partial(_retrieve, library, seen, noise_px)
-        walls, busies, matches = zip(*(section.clocked(call) for _ in range(_CALLS)), strict=True)
+        walls, busies, _ = zip(*(section.clocked(call) for _ in range(_CALLS)), strict=True)
         wall.append(1e3 * min(walls))
         busy.append(1e3 * min(busies))
         reference = min(reference, section.reference_seconds())
-        first = matches[0][0]
-        found += (first.category, first.model_id) == model.key
     name = f"query among {len(library):,}, {noise_px:g} px"
-    own = {"found first": f"{found} of {len(wall)}"}
     return [
-        section.figure(f"{name}, {which}", take(wall), "ms", take(busy) / (1e3 * reference)) | own
+        section.figure(f"{name}, {which}", take(wall), "ms", take(busy) / (1e3 * reference))
         for which, take in (("median", np.median), ("longest", max))
     ]
 
@@ -148,53 +130,28 @@ def _retrieve(library: Library, seen: RetrievalQuery, noise_px: float) -> Any:
     return library.retrieve(seen.points_2d, seen.ids, KEYPOINT_CAMERA, sigma=noise_px)
 
 
-def unseen_retrieval(
-    given: BenchmarkData,
-    *,
-    categories: tuple[str, ...] = ("chair", "airplane", "bottle", "mug", "guitar"),
-    objects: int = 40,
-    keypoints: tuple[int, ...] = (0, 7),
-    noise_px: float = 2.0,
-) -> Tables:
+def unseen_retrieval(given: BenchmarkData) -> Tables:
     """Retrieval of objects that are not in the library: box IoU up to scale of the first match.
 
-    Objects are those of the split val; shape models are learned from the split train. The library
-    holds all models but the object's own and those that are the same after a stretch. Each row is a
-    ranking: by the fit of each model, exact or with an uncertainty of its shape, and by the
-    estimated shape; models are stretched, or not. Boxes are those of the keypoints.
-
-    Parameters
-    ----------
-    categories : tuple[str, ...]
-        Categories; each is a library of its own.
-    objects : int
-        Objects of each category.
-    keypoints : tuple[int, ...]
-        Numbers of given keypoints; 0 for all.
-    noise_px : float
-        Standard deviation of the keypoints, in pixels.
+    Objects are those of the split val, with all keypoints and 2 px of noise; shape models are
+    learned from the split train. The library holds all models but the object's own and those that
+    are the same after a stretch. Each column is a ranking: by the fit of each model, exact or with
+    an uncertainty of its shape, and by the estimated shape. Boxes are those of the keypoints.
     """
-    dataset = KeypointNet(given.needed())
-    for category in categories:
+    dataset, rows = KeypointNet(given.needed()), []
+    for category in ("chair", "airplane", "bottle", "mug", "guitar"):
         shape = section.learned_shape(dataset, category)
         library = Library.from_models(
             [LibraryModel.of_annotated(model, with_mesh=False) for model in dataset[category]]
         )
-        for count in keypoints:
-            how = {"keypoints": count or None, "noise_px": noise_px}
-            seen = section.unseen_objects(dataset, category, objects, **how)
-            rows = list(_rankings(library, shape, seen, noise_px))
-            yield f"{category}, {count or 'all'} keypoints", rows
+        rows.append({"category": category} | _ranked(dataset, library, shape, given.count or 40))
+    yield "first matches: median IoU", rows
 
 
-def _rankings(
-    library: Library,
-    shape: ShapeModel,
-    objects: Iterable[tuple[int, UnseenObject]],
-    noise_px: float,
-) -> Iterator[Row]:
-    found: dict[str, list[tuple[float, float]]] = defaultdict(list)
-    for _, seen in objects:
+def _ranked(dataset: KeypointNet, library: Library, shape: ShapeModel, count: int) -> Row:
+    found: dict[str, list[float]] = defaultdict(list)
+    how = {"keypoints": None, "noise_px": _NOISE_PX}
+    for _, seen in section.unseen_objects(dataset, str(shape.category), count, **how):
         known = np.isin(seen.ids, shape.ids)
         gt = Box.from_model(seen.task.hull.bounds, seen.gt)
         if known.sum() < _LEAST_SHARED or gt.volume < _FLAT:
@@ -206,31 +163,13 @@ def _rankings(
             KEYPOINT_CAMERA,
             top=1,
             category=shape.category,
-            sigma=noise_px,
-            exclude=same_shapes(library, (shape.category, seen.task.model_id)),
+            sigma=_NOISE_PX,
+            exclude=same_shapes(library, (str(shape.category), seen.task.model_id)),
             workers=1,
         )
-        for name, options in _ranking_options(shape).items():
-            wall, _, matches = section.clocked(partial(section.attempt, call, **options))
-            found[name].append((_first_iou(matches, gt), 1e3 * wall))
-    for name, values in found.items():
-        ious, milliseconds = np.transpose(values)
-        yield {
-            "ranking": name,
-            "objects": len(values),
-            "median IoU": float(np.median(ious)),
-            "mean IoU": float(np.mean(ious)),
-            "ms": float(np.median(milliseconds)),
-        }
-
-
-def _ranking_options(shape: ShapeModel) -> dict[str, dict[str, Any]]:
-    found: dict[str, dict[str, Any]] = {}
-    for suffix, stretch in (("", {}), (", unstretched", {"stretch": "none"})):
-        found[f"fit{suffix}"] = stretch
-        found[f"fit, shape_sigma{suffix}"] = {"shape_sigma": 0.02, **stretch}
-        found[f"shape{suffix}"] = {"shape": shape, **stretch}
-    return found
+        for name, options in (_RANKINGS | {"shape": {"shape": shape}}).items():
+            found[name].append(_first_iou(section.attempt(call, **options), gt))
+    return {name: float(np.median(ious)) for name, ious in found.items()}
 
 
 def _first_iou(matches: list[Match] | None, gt: Box) -> float:

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from resource import RUSAGE_CHILDREN, getrusage
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -29,7 +28,6 @@ COMMAND = (sys.executable, "-c", "import sys; from cadalign.cli import main; sys
 """What runs `cadalign`, wherever it is installed."""
 LIMIT_DRAWS = 20
 """Draws of an ideal estimator's errors for each problem."""
-WITHIN_95 = 1.96
 _DATA = Path(os.environ["CADALIGN_DATA"]) if os.environ.get("CADALIGN_DATA") else None
 
 Row = dict[str, Any]
@@ -50,8 +48,12 @@ class BenchmarkData:
     """Folder of a COLMAP model."""
     seed: int = 0
     """Seed of random problems."""
+    count: int | None = None
+    """Problems, objects, queries or calls of a row; by default the section's own number."""
+    sizes: tuple[int, ...] = (50_000,)
+    """Models of the synthetic libraries of the section retrieval."""
     out: Path = Path("bench")
-    """Folder for what is measured: <section>.json, and pictures of the annotator."""
+    """Folder for what is measured: <section>.json."""
     sections: tyro.conf.Positional[tuple[str, ...]] = ()
     """Sections to run; by default all that need no asking for."""
     stored: Path = Path(__file__).parents[1] / "benchmark_ratios.json"
@@ -74,7 +76,23 @@ class BenchmarkData:
 Table = tuple[str, Iterable[Row]]
 """A title, and rows by column; a cell may be a median with a 90th percentile."""
 Tables = Iterator[Table]
-"""What a section yields: it is a function of the data, whose keywords are its options."""
+Section = Callable[[BenchmarkData], Tables]
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """The rows as a table in Markdown."""
+    columns = list(dict.fromkeys(column for row in rows for column in row))
+    lines = [[_cell(row.get(column)) for column in columns] for row in rows]
+    head = [columns, ["---:"] * len(columns)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in head + lines)
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, tuple):
+        return f"{_cell(value[0])} ({_cell(value[1])})"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def figure(name: str, value: float, unit: str, ratio: float, to: str = "") -> Row:
@@ -174,10 +192,9 @@ def unseen_objects(
     chosen = UnseenOptions(root=dataset.root, categories=(category,), **options)
     tasks = UnseenTasks(dataset, chosen)
     for place in range(0, len(tasks), -(-len(tasks) // count)):
-        try:
-            yield place, observe_object(tasks[place], chosen)
-        except CadalignError as error:
-            print(f"left out: {tasks[place].model_id}: {error}")
+        seen = attempt(observe_object, tasks[place], chosen)
+        if seen is not None:
+            yield place, seen
 
 
 # Clocks -------------------------------------------------------------------------------------------
@@ -213,19 +230,6 @@ def with_reference(call: Callable[[], T]) -> tuple[T, float]:
     return found, min(before, reference_seconds())
 
 
-def seconds_of_process(
-    command: list[str], *, environment: Mapping[str, str] | None = None
-) -> tuple[float, float]:
-    """Wall clock and processor time of a command that keeps byte code, as installed packages do."""
-    environment = {**(environment or os.environ), "PYTHONDONTWRITEBYTECODE": ""}
-    before = getrusage(RUSAGE_CHILDREN)
-    wall = seconds(
-        lambda: subprocess.run(command, check=True, capture_output=True, env=environment)
-    )
-    after = getrusage(RUSAGE_CHILDREN)
-    return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-
-
 class Used(NamedTuple):
     """Wall clock and processor time of a command [s], and its largest process [MB]."""
 
@@ -234,15 +238,19 @@ class Used(NamedTuple):
     megabytes: float
 
 
-def used_by_command(call: list[str]) -> Used:
-    """Run a command of cadalign, and measure it with its workers; some of its rows may fail."""
+def used_by(command: Sequence[str], **environment: str) -> Used:
+    """Run a command that keeps byte code, and measure it with its workers; its rows may fail."""
     begun = time.perf_counter()
-    process = subprocess.Popen([*COMMAND, *call], stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "", **environment},
+    )
     _, status, usage = os.wait4(process.pid, 0)
     wall = time.perf_counter() - begun
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode not in (0, 3):  # 3: some rows failed
-        raise subprocess.CalledProcessError(process.returncode, call)
+        raise subprocess.CalledProcessError(process.returncode, list(command))
     return Used(wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024)
 
 
@@ -260,11 +268,3 @@ def medians_in_turns(
         for name, measure in measures.items():
             times[name] += [measure() for _ in range(per_turn)]
     return {name: float(np.median(values)) for name, values in times.items()}
-
-
-def median_and_ratio(
-    own: Callable[[], float], other: Callable[[], float], count: int
-) -> tuple[float, float]:
-    """Median of a measurement, and its ratio to that of another one, taken in turns."""
-    medians = medians_in_turns({"own": own, "other": other}, count)
-    return medians["own"], medians["own"] / medians["other"]

@@ -1,11 +1,10 @@
-"""Times of first calls, of small calls, and of pictures."""
+"""Times of first calls, and of small calls."""
 
 from __future__ import annotations
 
-import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -15,22 +14,10 @@ import numpy as np
 import cadalign
 from benchmarks import section
 from benchmarks.section import COMMAND, BenchmarkData, Row, Tables
-from cadalign import Camera, Observation
+from cadalign import Observation
 from cadalign.datasets import sample_models
-from cadalign.errors import RenderError
 from cadalign.evaluation.simulation import simulate_problem
 from cadalign.io.images import write_image
-from cadalign.render import (
-    RaycastRenderer,
-    Scene,
-    Studio,
-    cast_geometry,
-    frame_object,
-    look_at,
-    make_renderer,
-    visible_keypoints,
-)
-from cadalign.render.probe import ball
 from cadalign.solvers.linear import aepnp_batch
 
 _POINTS = """
@@ -59,13 +46,7 @@ def total(a):
     return np.sqrt(found).sum()
 total(np.ones((3, 3)))
 """
-# The largest allowed medians [ms], on two cores.
-_LIMITS = {
-    "raycast: geometry": 40.0,
-    "raycast: colour": 150.0,
-    "pyrender: colour": 100.0,
-    "visibility of 20 keypoints": 1.0,
-}
+_LIBRARIES = "import numpy, numba"
 
 
 def cold(given: BenchmarkData) -> Tables:
@@ -76,50 +57,45 @@ def cold(given: BenchmarkData) -> Tables:
     """
     with tempfile.TemporaryDirectory() as folder:
 
-        def called(code: str, place: str) -> tuple[float, float]:
-            environment = {**os.environ, "NUMBA_CACHE_DIR": str(Path(folder, place))}
-            return section.seconds_of_process([sys.executable, "-c", code], environment=environment)
+        def called(code: str, place: str) -> section.Used:
+            command = [sys.executable, "-c", code]
+            return section.used_by(command, NUMBA_CACHE_DIR=str(Path(folder, place)))
 
-        _, reference = called(_SMALL_FUNCTION, "small")
+        reference = called(_SMALL_FUNCTION, "small").processor
         rows = []
         for name, code in _FIRST_CALLS.items():
-            wall, busy = called(code, "all" if "doctor" in name else "fit")
-            rows.append(section.figure(name, wall, "s", busy / reference, "a first small call"))
+            used = called(code, "all" if "doctor" in name else "fit")
+            ratio = used.processor / reference
+            rows.append(section.figure(name, used.wall, "s", ratio, "a first small call"))
     yield "First calls", rows
 
 
-def calls(given: BenchmarkData, *, runs: int = 7, calls: int = 2000) -> Tables:
-    """Cost of calls beside their solving: the warm command line, and small fits in Python.
-
-    Parameters
-    ----------
-    runs : int
-        Runs of each command.
-    calls : int
-        Calls of each fit.
-    """
+def calls(given: BenchmarkData) -> Tables:
+    """Cost of calls beside their solving: the warm command line, and small fits in Python."""
     with tempfile.TemporaryDirectory() as folder:
-        yield "Commands, processor time", _commands(Path(folder), runs)
-    yield "Fits", _fits(calls)
+        yield "Commands, processor time", _commands(Path(folder), given.count or 7)
+    yield "Fits", _fits(given.count or 2000)
 
 
 def _commands(folder: Path, runs: int) -> Iterator[Row]:
     seen = str(_observation(folder))
-    libraries = "import numpy, numba"
-    for name, given in {
-        "cadalign --help": ["--help"],
-        "cadalign fit": ["fit", seen],
-        "cadalign fit --json --no-picture": ["fit", seen, "--json", "--no-picture"],
-        "cadalign demo": ["demo", "--out", str(folder / "demo"), "--workers", "0"],
-    }.items():
-        command = [*COMMAND, *given]
-        section.seconds_of_process(command)  # compiles what is not yet on disk
-        processor, ratio = section.median_and_ratio(
-            lambda command=command: section.seconds_of_process(command)[1],
-            lambda: section.seconds_of_process([sys.executable, "-c", libraries])[1],
-            1 if name == "cadalign demo" else runs,
-        )
-        yield section.figure(name, processor, "s", ratio, libraries)
+
+    def processor(command: list[str]) -> float:
+        return section.used_by(command).processor
+
+    for options in (
+        ["--help"],
+        ["fit", seen],
+        ["fit", seen, "--json", "--no-picture"],
+        ["demo", "--out", str(folder / "demo"), "--workers", "0"],
+    ):
+        own = partial(processor, [*COMMAND, *options])
+        other = partial(processor, [sys.executable, "-c", _LIBRARIES])
+        is_demo = options[0] == "demo"
+        found = section.medians_in_turns({"own": own, "other": other}, 1 if is_demo else runs)
+        shown = [each for each in options[: 1 if is_demo else None] if each != seen]
+        name, ratio = " ".join(["cadalign", *shown]), found["own"] / found["other"]
+        yield section.figure(name, found["own"], "s", ratio, _LIBRARIES)
 
 
 def _fits(calls: int) -> Iterator[Row]:
@@ -143,9 +119,9 @@ def _fits(calls: int) -> Iterator[Row]:
             "OpenCV's ITERATIVE, 10 points",
         ),
     ):
-        timed = (partial(section.seconds, call) for call in (ours, theirs))
-        median, ratio = section.median_and_ratio(*timed, calls)
-        yield section.figure(name, 1e6 * median, "us", ratio, to)
+        timed = {"own": partial(section.seconds, ours), "other": partial(section.seconds, theirs)}
+        found = section.medians_in_turns(timed, calls)
+        yield section.figure(name, 1e6 * found["own"], "us", found["own"] / found["other"], to)
 
 
 def _observation(folder: Path) -> Path:
@@ -160,48 +136,3 @@ def _observation(folder: Path) -> Path:
     seen = Observation(problem.points_3d, problem.points_2d, camera, image=photo, model=path)
     seen.save(folder / "seen.json")
     return folder / "seen.json"
-
-
-def rendering(given: BenchmarkData, *, repetitions: int = 15) -> Tables:
-    """Milliseconds a frame of the renderers, and of what is done once per mesh.
-
-    640 x 480 px on 20,480 triangles. Medians, and the smallest beside them, since other programs
-    may share the machine.
-
-    Parameters
-    ----------
-    repetitions : int
-        Timed frames per figure; the median counts.
-    """
-    camera = Camera.from_fov(640, 480, fov_x=50.0)
-    scene = Scene(ball(5))
-    rotation = look_at(azimuth=35, elevation=20, distance=3).rotation
-    pose = frame_object(scene.bounds, camera, rotation=rotation, fill=0.9)
-    vertices = scene.mesh.vertices
-    keypoints = vertices[np.random.default_rng(0).choice(len(vertices), 20)]
-    shown = scene, camera, pose
-    plain = RaycastRenderer(studio=Studio(occlusion=0))
-    tasks: dict[str, Callable[[], object]] = {
-        "once per mesh: ray hierarchy": lambda: Scene(scene.mesh).caster,
-        "once per mesh: smooth normals": lambda: Scene(scene.mesh).corner_normals,
-        "visibility of 20 keypoints": lambda: visible_keypoints(scene, keypoints, camera, pose),
-        "raycast: geometry": lambda: cast_geometry(*shown),
-        "raycast: colour": partial(RaycastRenderer().render, *shown),
-        "raycast: colour, no ambient occlusion": partial(plain.render, *shown),
-    }
-    for name in ("open3d", "pyrender"):
-        try:
-            tasks[f"{name}: colour"] = partial(make_renderer(name).render, *shown)
-        except RenderError as error:
-            print(error, file=sys.stderr)
-            continue
-        if name == "open3d":
-            tasks["open3d: geometry"] = lambda: cast_geometry(*shown, caster=scene.open3d_caster)
-    rows = []
-    for name, task in tasks.items():
-        task()  # prepares what is prepared once
-        times = [1e3 * section.seconds(task) for _ in range(repetitions)]
-        median, limit = float(np.median(times)), _LIMITS.get(name)
-        rows.append({"task": name, "median ms": median, "smallest": min(times), "limit": limit})
-    share = 100 * float(cast_geometry(*shown).mask.mean())
-    yield f"20,480 triangles on {share:.0f} % of the image, {os.cpu_count()} cores", rows

@@ -12,10 +12,9 @@ import numpy as np
 import cadalign
 from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Tables, percent
-from cadalign import Alignment, Model, Result, ShapeModel, View
+from cadalign import Alignment, Model, ShapeModel, View
 from cadalign.arrays import FloatArray, instance_rng
 from cadalign.datasets import KeypointNet
-from cadalign.estimation.warning import UNDETERMINED_KINDS
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.unseen import UnseenObject
 from cadalign.evaluation.metrics.cramer_rao import probability_level
@@ -28,12 +27,7 @@ _LARGE_DEG, _REGION = 10.0, 0.99
 _FARTHER = np.array([0.0, 0.0, 0.2])  # until a drawn object is in the image
 _MOVED_PX = 40.0
 _MIRRORED = 0.05  # distance of a keypoint from the other one's mirror image [diagonals]
-_KINDS = {
-    "another pose": {"alternative"},
-    "not determined": UNDETERMINED_KINDS,
-    "nothing to test": {"untested"},
-    "misfit": {"misfit", "outlier", "stretch", "camera", "contradiction", "mistake"},
-}
+_MISFIT = {"misfit", "outlier", "stretch", "camera", "contradiction", "mistake"}
 
 
 _Differ = tuple[float, float]
@@ -56,41 +50,22 @@ class _Case(NamedTuple):
         return _Case(model, kept, self.points_3d[shared], self.points_2d[shared], self.gt)
 
 
-def warned(
-    given: BenchmarkData,
-    *,
-    objects: int = 40,
-    noise_px: float = 2.0,
-    categories: tuple[str, ...] = (),
-    wrong: bool = True,
-) -> Tables:
-    """Warnings on right data by kind, and how many of them are of large errors; on wrong data.
+def warned(given: BenchmarkData) -> Tables:
+    """Warnings on right data, and how many of them are of large errors; on wrong data.
 
-    Objects of KeypointNet's split val with all keypoints, up to so many of each category. Right
-    models are: the object's own one, stretched; one from which its keypoints are displaced at
-    random, and a random other one, by as much as models of the category differ (`shape_sigma`,
-    `stretch_sigma`); the shape that was learned from the split train. Whether warnings tell good
-    estimates from bad ones is seen in rotations off by more than 10 deg or beyond the stated 99 %
-    region, among those warned of and among the others.
-
-    Parameters
-    ----------
-    objects : int
-        Objects of each category.
-    noise_px : float
-        Standard deviation of the keypoints [px].
-    categories : tuple[str, ...]
-        Categories; all by default.
-    wrong : bool
-        Measure wrong data, too.
+    Objects of KeypointNet's split val with all keypoints and 2 px of noise, up to 40 of each
+    category. Right models are: the object's own one, stretched; one from which its keypoints are
+    displaced at random, and a random other one, by as much as models of the category differ
+    (`shape_sigma`, `stretch_sigma`); the shape that was learned from the split train. Whether
+    warnings tell good estimates from bad ones is seen in rotations off by more than 10 deg or
+    beyond the stated 99 % region, among those warned of and among the others.
     """
-    how = {"objects": objects, "noise_px": noise_px, "categories": categories, "wrong": wrong}
+    how = {"objects": given.count or 40, "noise_px": 2.0, "categories": (), "wrong": True}
     rows = list(warned_cases(KeypointNet(given.needed()), **how))
     right = [row for row in rows if row["data"] == "right"]
     others = [row for row in rows if row["data"] != "right"]
     yield "Warned of on right data [%]", _by(right, ("model", "category"), _shares)
-    if others:
-        yield "Wrong data named [%]", _by(others, ("data", "model"), _named)
+    yield "Wrong data named [%]", _by(others, ("data", "model"), _named)
 
 
 def warned_cases(
@@ -220,21 +195,16 @@ def _outcome(case: _Case, noise_px: float) -> Row:
     result = section.attempt(cadalign.align, case.model, view)
     if result is None:
         return {"refused": True}
-    texts = [warning.text for warning in result.warnings]
-    row: Row = {"refused": False, "texts": texts, "warned": bool(texts)}
-    found = {warning.kind for warning in result.warnings}
-    return (
-        row
-        | {name: bool(found & kinds) for name, kinds in _KINDS.items()}
-        | _errors(result, case.gt)
-    )
-
-
-def _errors(result: Result, gt: Alignment) -> Row:
-    turn = section.deviation(est=result.alignment, gt=gt)[:3]
+    kinds = {warning.kind for warning in result.warnings}
+    turn = section.deviation(est=result.alignment, gt=case.gt)[:3]
     level = probability_level(turn, result.covariance[:3, :3], result.degrees_of_freedom)
-    is_large = rotation_error(est=result.alignment, gt=gt) > _LARGE_DEG
-    return {"large": is_large, "beyond": level is not None and level > _REGION}
+    return {
+        "refused": False,
+        "warned": bool(kinds),
+        "misfit": bool(kinds & _MISFIT),
+        "large": rotation_error(est=result.alignment, gt=case.gt) > _LARGE_DEG,
+        "beyond": level is not None and level > _REGION,
+    }
 
 
 def _by(rows: list[Row], names: tuple[str, str], columns: Callable[[list[Row]], Row]) -> list[Row]:
@@ -255,7 +225,6 @@ def _shares(rows: list[Row]) -> Row:
     return {
         "count": len(rows),
         "warned": percent([row["warned"] for row in rows]),
-        **{kind: percent([row[kind] for row in rows]) for kind in _KINDS},
         "> 10 deg, warned": _share(warned, "large"),
         "> 10 deg, others": _share(others, "large"),
         "beyond 99 %, warned": _share(warned, "beyond"),
@@ -268,8 +237,4 @@ def _share(rows: list[Row], name: str) -> float | None:
 
 
 def _named(rows: list[Row]) -> Row:
-    return {
-        "count": len(rows),
-        "named": percent([row["misfit"] for row in rows]),
-        "warned": percent([row["warned"] for row in rows]),
-    }
+    return {"count": len(rows), "named": percent([row["misfit"] for row in rows])}

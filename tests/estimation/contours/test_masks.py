@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from itertools import cycle, islice
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import pytest
-from benchmarks.evidence import damaged_mask
-from benchmarks.masks import contour_bound
+from benchmarks.masks import damaged_mask
 
 from cadalign import Alignment, Camera, Model, Result, View, align
 from cadalign.datasets import KeypointNet
@@ -60,6 +59,17 @@ def stretch_error(case: Case, estimate: Alignment) -> float:
     return float(np.abs(estimate.scale / case.truth.scale - 1).max())
 
 
+def with_disc(mask: np.ndarray, kind: str, rng: np.random.Generator) -> np.ndarray:
+    """The mask with a hole in it, or with a blob of the background at its edge."""
+    pixels = mask.astype(np.uint8)
+    edge = (pixels > 0) & (cv2.erode(pixels, np.ones((3, 3), np.uint8)) == 0)
+    places = np.argwhere(edge if kind == "blob" else pixels > 0)
+    row, column = places[rng.integers(len(places))].tolist()
+    radius = round(0.13 * float(np.sqrt(pixels.sum())))
+    cv2.circle(pixels, (column, row), radius, int(kind == "blob"), thickness=-1)
+    return pixels > 0
+
+
 def moved(alignment: Alignment, angle_deg: float, shift: float, stretch: float) -> Alignment:
     turn = rotation_from_vector(np.radians(angle_deg) * np.array([0.6, -0.64, 0.48]))
     return Alignment(
@@ -70,7 +80,7 @@ def moved(alignment: Alignment, angle_deg: float, shift: float, stretch: float) 
 
 
 class TestExactMasks:
-    def test_real_models_are_aligned_as_well_as_the_bound_allows(self, real_data: Path) -> None:
+    def test_real_models_are_aligned_as_well_as_stated(self, real_data: Path) -> None:
         root = real_data / "keypointnet"
         dataset = KeypointNet(root)
         found = []
@@ -80,12 +90,11 @@ class TestExactMasks:
                 case = case_of(model, number)
                 alone = align(case.model, case.view()).alignment
                 result = align(case.model, case.view(mask=case.mask))
-                bound = contour_bound(case.model, case.view(mask=case.mask), case.truth)
                 found.append(
                     [
                         rotation_error(est=alone, gt=case.truth),
                         rotation_error(est=result.alignment, gt=case.truth),
-                        np.degrees(np.sqrt(np.trace(bound[:3, :3]))),
+                        result.std.rotation_deg,
                         stretch_error(case, result.alignment),
                         alignment_box_iou(
                             est=result.alignment, gt=case.truth, bounds=case.scene.bounds
@@ -141,18 +150,19 @@ class TestExactMasks:
         assert stretch_error(first, result.alignment) < 0.003
 
 
-@pytest.mark.parametrize("kind", ["dilated", "eroded", "smoothed", "hidden", "hole", "blob"])
+@pytest.mark.parametrize("kind", ["dilated", "smoothed", "hidden", "hole", "blob"])
 def test_damaged_masks_still_help(sample_root: Path, kind: str) -> None:
     case = chair(sample_root)
-    mask = damaged_mask(case.mask, kind, np.random.default_rng(0))
+    damage = with_disc if kind in ("hole", "blob") else damaged_mask
+    mask = damage(case.mask, kind, np.random.default_rng(0))
     alone = align(case.model, case.view())
     result = align(case.model, case.view(mask=mask))
     error = rotation_error(est=result.alignment, gt=case.truth)
-    assert error < (0.5 if kind in ("dilated", "eroded") else 1.1) * alone.std.rotation_deg
+    assert error < (0.5 if kind == "dilated" else 1.1) * alone.std.rotation_deg
     assert np.isfinite(result.evidence[-1].rms)
 
 
-@pytest.mark.parametrize("kinds", [["exact"], ["dilated", "eroded"], ["smoothed"]])
+@pytest.mark.parametrize("kinds", [["exact"], ["dilated"], ["smoothed"]])
 def test_deviations_are_those_of_the_errors(sample_root: Path, kinds: list[str]) -> None:
     dataset = KeypointNet(sample_root)
     whitened = []
@@ -247,10 +257,3 @@ class TestBadInput:
         path.write_text("no picture")
         with pytest.raises(DataError, match=r"mask\.png"):
             chair(sample_root).view(mask=path)
-
-    def test_a_bound_without_a_mask_or_an_exact_model(self, sample_root: Path) -> None:
-        case = chair(sample_root)
-        similar = replace(case.model, shape_sigma=0.02)
-        for model, view in ((case.model, case.view()), (similar, case.view(mask=case.mask))):
-            with pytest.raises(InputError, match="expected a view with a mask, and an exact model"):
-                contour_bound(model, view, case.truth)

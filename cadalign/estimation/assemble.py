@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, cast
@@ -10,7 +12,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.estimation.options import FitOptions, pixel_information
-from cadalign.estimation.problems import Problems, Solutions
+from cadalign.estimation.problems import Problems, Solutions, full_covariance
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import (
     Alternative,
@@ -22,9 +24,10 @@ from cadalign.estimation.result_parts import (
     ViewResult,
     quickly,
 )
-from cadalign.estimation.solve import LEAST_LIKELIHOOD, camera_of, fitted_fields
+from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.warning import Warnings
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 
 if TYPE_CHECKING:
@@ -77,12 +80,30 @@ def keypoints_of_solution(
 ) -> FittedKeypoints:
     """The fitted keypoints of the only problem, which has a solution."""
     minima, iterations, hypotheses, _ = solutions.info[0].tolist()
-    fitted = fitted_fields(problems, solutions, options)
-    fitted["method"] = options.method
-    if fitted["fisher_covariance"] is not None:
+    points = problems.points_3d.copy()  # the caller may go on to change theirs
+    sigma = solutions.sigma
+    if options.method == "optimal" and isinstance(options.sigma, int | float):
+        sigma = float(options.sigma)
+    inliers = np.empty(len(points), dtype=bool)
+    inliers.fill(True)
+    fitted = {
+        "points_3d": points,
+        "residuals": solutions.residuals,
+        "inliers": inliers,
+        "alignment": Alignment.from_packed(solutions.poses[0, 0]),
+        "camera": problems.cameras[0],
+        "options": options,
+        "sigma": sigma,
+        "method": options.method,
+    }
+    if solutions.covariances is not None:
+        of_solver = solutions.covariances[0]
+        fitted["fisher_covariance"] = full_covariance(of_solver, options.known_axis)
         fitted["cost"] = solutions.costs.item(0)
     if minima > 1:
-        fitted["alternatives"] = _alternatives(problems, solutions, minima, options)
+        poses = [Alignment.from_packed(pose) for pose in solutions.poses[0, :minima]]
+        cameras, costs = problems.cameras * minima, solutions.costs[0, :minima].tolist()
+        fitted["alternatives"] = alternatives_of(points, poses, cameras, costs, options)
     effort = {"iterations": iterations, "hypotheses": hypotheses, "seconds": seconds}
     fitted["stats"] = quickly(FitStats, effort)
     return quickly(FittedKeypoints, fitted)
@@ -150,27 +171,24 @@ def result_of_keypoints(
     return quickly(Result, of_result)
 
 
-def _alternatives(
-    problems: Problems, solutions: Solutions, minima: int, options: FitOptions
+def alternatives_of(
+    points: FloatArray,
+    poses: Sequence[Alignment],
+    cameras: Sequence[Camera],
+    costs: Sequence[float],
+    options: FitOptions,
 ) -> tuple[Alternative, ...]:
-    """The other minima that are likely enough."""
-    costs = solutions.costs[0, :minima]
+    """The minima beside the first, of points (n, 3), that are likely enough."""
     if options.sigma is None:  # the likelihood at the sigma that is best for each minimum
         # Costs are in units of sigma^2; below 1 they are those of exact fits.
         least = max(costs[0], 1.0)
-        ratios = (least / np.maximum(costs, least)) ** len(problems.points_3d)
+        ratios = [(least / max(cost, least)) ** len(points) for cost in costs]
     else:
-        ratios = np.exp(np.minimum(0.0, costs[0] - costs) / 2)
-    points = problems.points_3d.copy()
+        ratios = [math.exp(min(0.0, costs[0] - cost) / 2) for cost in costs]
     return tuple(
-        Alternative(
-            Alignment.from_packed(solutions.poses[0, k]),
-            float(ratios[k]),
-            camera_of(problems, solutions, k),
-            points,
-        )
-        for k in range(1, minima)
-        if ratios[k] >= LEAST_LIKELIHOOD and np.isfinite(solutions.poses[0, k]).all()
+        Alternative(pose, ratio, camera, points)
+        for pose, ratio, camera in list(zip(poses, ratios, cameras, strict=True))[1:]
+        if ratio >= LEAST_LIKELIHOOD and np.isfinite(pose.packed).all()
     )
 
 

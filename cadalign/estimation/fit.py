@@ -191,16 +191,19 @@ def fit_once(
 ) -> FittedKeypoints:
     """Fit the only problem, without a diagnosis of keypoints that no alignment explains."""
     options = options.for_camera(problems.camera(0))
+    if options.focal == "estimate":
+        # Only here: most cameras are calibrated, and its kernels take time to import.
+        from cadalign.estimation.joint_keypoints import fit_jointly
+
+        return fit_jointly(problems, options, ransac, scores, start)
     if ransac is None:
         solutions = solve_one(problems, options)
         seconds = time.perf_counter() - start
         return keypoints_of_solution(problems, solutions, options, seconds)
     # Only here: most programs never search for outliers, and its kernels take time to import.
-    from cadalign.estimation.robust import fit_robustly, fit_similar_robustly
+    from cadalign.estimation.consensus import fit_robustly
 
-    is_noise_known = options.sigma is not None or ransac.max_reproj_error is not None
-    search = fit_robustly if is_noise_known else fit_similar_robustly
-    return search(problems, options, ransac, scores, start)
+    return fit_robustly(problems, options, ransac, scores, start)
 
 
 # Checking options takes as long as solving a small problem linearly, and calls repeat them.

@@ -27,7 +27,7 @@ from cadalign.estimation.problems import (
 )
 from cadalign.estimation.result import Result
 from cadalign.estimation.results import COLUMNS, Entry, Results
-from cadalign.estimation.solve import solve
+from cadalign.estimation.solve import are_solved_at_once, solve
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.solvers.constants import POSE_SIZE
@@ -112,10 +112,8 @@ def fit_batch(
     check_search(ransac, scores, symmetry)
     if scores is not None:
         scores = each_of(scores, "scores", count, "sets")
-    if len({(each.width, each.height) for each in problems.cameras}) == 1:
-        options = options.for_camera(problems.cameras[0])
     is_alone = per_problem or ransac is not None or symmetry is not None
-    is_alone |= options.focal == "estimate" or options.estimates_in_rounds
+    is_alone |= not are_solved_at_once(problems, options)
     entries: list[Any] = [None] * count
     table = np.full((count, COLUMNS), np.nan)
 

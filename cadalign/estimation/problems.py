@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from itertools import pairwise
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar, cast
@@ -22,7 +22,7 @@ from cadalign.estimation.options import SIGMA_HELP, FitOptions, Sigma, pixel_inf
 from cadalign.geometry.alignment import are_on_a_line, describe_plane
 from cadalign.geometry.camera import Camera, rays_ahead
 from cadalign.geometry.pixels import check_pixels
-from cadalign.solvers.constants import NOT_FOUND, OK, OUT_OF_RANGE, TOO_FEW, UNOBSERVABLE
+from cadalign.solvers.constants import NOT_FOUND, OUT_OF_RANGE, TOO_FEW
 from cadalign.solvers.linear import aepnp_error, out_of_range_error
 from cadalign.solvers.projection import all_finite, pinhole_rays
 
@@ -66,12 +66,6 @@ class Problems:
     def counts(self) -> IntArray:
         """Number of points of each problem, (B,) int."""
         return self.offsets[1:] - self.offsets[:-1]
-
-    @cached_property
-    def distinct_counts(self) -> IntArray:
-        """Number of different pairs of points of each problem, (B,) int."""
-        pairs = np.concatenate([self.points_3d, self.points_2d], axis=1)
-        return np.array([distinct_rows(pairs[self.rows(b)]) for b in range(len(self))])
 
     def part(self, first: int, last: int) -> Problems:
         """Problems ``first`` to ``last``, that one left out."""
@@ -253,28 +247,23 @@ def whitening_by(information: FloatArray) -> FloatArray:
 
 
 def check_sigmas(sigmas: Sequence[Sigma | None], counts: IntArray) -> None:
-    """Check the standard deviations of problems of so many keypoints each, or one for all.
+    """Check the standard deviations of problems of so many keypoints each.
 
     Raises InputError if one is no standard deviation, or has another shape than its keypoints.
     """
-    for b, sigma in enumerate(sigmas):
-        if sigma is None or (isinstance(sigma, int | float) and is_number(sigma) and sigma > 0):
-            continue
-        if np.ndim(sigma) == 0 or len(sigmas) > 1:
-            pixel_information(sigma, int(counts[b]))
-        else:
-            for count in set(counts.tolist()):
-                pixel_information(sigma, count)
+    for sigma, count in zip(sigmas, counts.tolist(), strict=True):
+        if sigma is not None:
+            pixel_information(sigma, count)
 
 
 class Solutions(NamedTuple):
     """Minima of every problem, the best first.
 
     ``poses`` (B, k, 15) are packed, ``costs`` (B, k) their whitened squared errors, infinite where
-    there is none; ``covariances`` (B, 8, 8) or (B, 9, 9) and ``residuals`` (n, 2) [px] are those of
-    the best. ``info`` (B, 4) counts minima, iterations and hypotheses, and names an undetermined
-    unknown or -1. ``sigmas`` (B,) [px] and, of the only problem, ``focals`` (1, k) [px] are there
-    where they were estimated.
+    there is none; ``covariances`` (B, 8, 8) and ``residuals`` (n, 2) [px] are those of the best.
+    ``info`` (B, 4) counts minima, iterations and hypotheses, and names an undetermined unknown or
+    -1. ``errors`` are those of the problems without a solution; ``sigma`` [px] is there where it
+    was estimated, of the only problem.
     """
 
     poses: FloatArray
@@ -282,54 +271,24 @@ class Solutions(NamedTuple):
     covariances: FloatArray | None
     statuses: IntArray
     info: IntArray
-    focals: FloatArray | None = None
-    sigmas: FloatArray | None = None
     residuals: FloatArray = _NO_RESIDUALS
     errors: Mapping[int, CadalignError] = _NO_ERRORS
-
-    @property
-    def solved(self) -> BoolArray:
-        """True for the problems (B,) that have a solution."""
-        solved = (self.statuses == OK) & np.isfinite(self.poses[:, 0]).all(axis=1)
-        solved[list(self.errors)] = False
-        return np.asarray(solved)
+    sigma: float | None = None
 
 
 def full_covariance(of_solver: FloatArray, known_axis: str) -> FloatArray:
-    """Covariances (..., 9, 9) or (..., 10, 10) of results from solvers' (8, 8) or (9, 9).
-
-    Solvers leave out the scale that is known, whose rows are zero in a result.
-    """
-    problems, size = of_solver.shape[:-2], of_solver.shape[-1] + 1
-    full = np.zeros((*problems, size * size))
-    full[..., _places(size, known_axis)] = of_solver.reshape(*problems, (size - 1) ** 2)
-    return full.reshape(*problems, size, size)
+    """Covariances (..., 9, 9) of results from solvers' (..., 8, 8), which lack the known scale."""
+    problems = of_solver.shape[:-2]
+    full = np.zeros((*problems, 81))
+    full[..., _places(known_axis)] = of_solver.reshape(*problems, 64)
+    return full.reshape(*problems, 9, 9)
 
 
-def with_log_focal(
-    covariance: FloatArray, rows: FloatArray, of_scales: FloatArray, of_focal: float
-) -> FloatArray:
-    """Covariance (9, 9) of the solvers' unknowns and a log focal length from that without (8, 8).
-
-    ``rows`` (n, 2, 9) are whitened derivatives of the residuals, ``of_scales`` (2,) and
-    ``of_focal`` the information of priors. A focal length that the others leave open has as large a
-    variance as rounding errors let it be known.
-    """
-    others, own = rows.reshape(-1, 9)[:, :8], rows.reshape(-1, 9)[:, 8]
-    gain = covariance @ (own @ others)
-    alone = own - others @ gain
-    information = float(alone @ alone + of_scales @ gain[6:] ** 2) + of_focal
-    gain = np.append(-gain, 1.0)
-    whole = np.zeros((9, 9))
-    whole[:8, :8] = covariance
-    return whole + np.outer(gain, gain) / max(information, UNOBSERVABLE * float(own @ own))
-
-
-@lru_cache(maxsize=6)
-def _places(size: int, known_axis: str) -> IntArray:
+@lru_cache(maxsize=3)
+def _places(known_axis: str) -> IntArray:
     """Entries of a flattened covariance that belong to unknowns of the solvers."""
-    rows = np.delete(np.arange(size), 6 + "xyz".index(known_axis))
-    return (size * rows[:, None] + rows).ravel()
+    rows = np.delete(np.arange(9), 6 + "xyz".index(known_axis))
+    return (9 * rows[:, None] + rows).ravel()
 
 
 def are_in_one_plane(points: FloatArray) -> bool:
@@ -343,21 +302,11 @@ def solver_error(
 ) -> DegenerateError:
     """Convert a solver's status to an exception; ``undetermined`` is an unknown's number, or -1."""
     if status == TOO_FEW:
-        method = f"the method {options.method!r}"
-        fix = f"give at least {options.min_points}"
-        if options.method == "optimal":
-            method = f"{options.unknowns} unknowns"
-            fix += ", fewer unknowns by stretch=, or a prior"
-        what = f"{len(points_3d)} keypoints are too few for {method}"
-        return DegenerateError(what, where="points_3d", fix=fix)
+        return too_few_error(len(points_3d), options)
     if status == OUT_OF_RANGE:
         return out_of_range_error()
     if status == NOT_FOUND:
-        return DegenerateError(
-            "no alignment with all keypoints in front of the camera was found",
-            where="points_2d",
-            fix="check that points_3d and points_2d correspond, row by row, and the camera",
-        )
+        return no_alignment_error()
     if undetermined < 0:
         return aepnp_error(points_3d)
     reason = describe_plane(points_3d)
@@ -381,6 +330,26 @@ def solver_error(
         f"{missing} is not determined: {reason or 'seen from there, the keypoints leave it open'}",
         where="points_3d",
         fix=fix,
+    )
+
+
+def too_few_error(count: int, options: FitOptions) -> DegenerateError:
+    """The error of fewer keypoints than the method needs."""
+    method = f"the method {options.method!r}"
+    fix = f"give at least {options.min_points}"
+    if options.method == "optimal":
+        method = f"{options.unknowns} unknowns"
+        fix += ", fewer unknowns by stretch=, or a prior"
+    what = f"{count} keypoints are too few for {method}"
+    return DegenerateError(what, where="points_3d", fix=fix)
+
+
+def no_alignment_error() -> DegenerateError:
+    """The error of keypoints that no alignment has in front of the camera."""
+    return DegenerateError(
+        "no alignment with all keypoints in front of the camera was found",
+        where="points_2d",
+        fix="check that points_3d and points_2d correspond, row by row, and the camera",
     )
 
 

@@ -6,19 +6,22 @@ leaves. The backward pass solves one linear system for each problem, vectorised 
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.errors import InputError
+from cadalign.errors import CadalignError, InputError
+from cadalign.estimation.fit import fit_once
 from cadalign.estimation.focal import log_focal_range
 from cadalign.estimation.options import LOSSES, FitOptions
 from cadalign.estimation.problems import Problems, in_threads, rays_of
-from cadalign.estimation.solve import solve
+from cadalign.estimation.solve import are_solved_at_once, solve
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import rotations_from_vectors
+from cadalign.solvers.constants import OK
 from cadalign.torch.derivatives import UNKNOWNS, Optima, lens_slopes
 
 _LARGEST_POLISH = 0.02  # turn [rad] or change of a logarithm beyond which a step is no polish
@@ -198,29 +201,26 @@ def _searched(
     """Poses (B, 15) and focal lengths (B,) of the best minima, and for which problems (B,)."""
     offsets = np.concatenate([[0], np.cumsum(present.sum(axis=1))]).astype(np.int64)
     problems = Problems(points[present], pixels[present], offsets, task.cameras)
-    known, is_estimated = sigmas[present], options.focal == "estimate"
+    known = sigmas[present]
+    focals = np.array([camera.fx for camera in task.cameras]) * np.ones(len(points))
+    poses, valid = np.tile(_NO_POSE, (len(points), 1)), np.zeros(len(points), dtype=bool)
+
+    def fit_alone(b: int) -> None:
+        part = replace(options, sigma=known[problems.rows(b)])
+        with suppress(CadalignError):
+            found = fit_once(problems.part(b, b + 1), part, None, None, 0.0)
+            poses[b], focals[b], valid[b] = found.alignment.packed, found.camera.fx, True
 
     @np.errstate(all="ignore")  # holds for one thread only
-    def run(first: int, last: int) -> tuple[FloatArray, FloatArray, BoolArray]:
-        parts = [(b, b + 1) for b in range(first, last)]
-        if len(task.cameras) == 1 and not is_estimated:
-            parts = [(first, last)]  # all at once
-        found = [
-            solve(
-                problems.part(*part),
-                replace(options, sigma=known[offsets[part[0]] : offsets[part[1]]]),
-            )
-            for part in parts
-        ]
-        valid = np.concatenate([each.solved for each in found])
-        poses = np.concatenate([each.poses[:, 0] for each in found])
-        focals = np.array([camera.fx for camera in task.cameras]) * np.ones(len(points))
-        focals = focals[first:last]
-        if is_estimated:
-            estimated = [np.nan if each.focals is None else each.focals[0, 0] for each in found]
-            focals = np.where(valid, estimated, focals)
-        return np.where(valid[:, None], poses, _NO_POSE), focals, valid
+    def run(first: int, last: int) -> None:
+        if not are_solved_at_once(problems, options):
+            for b in range(first, last):
+                fit_alone(b)
+            return
+        part = replace(options, sigma=known[offsets[first] : offsets[last]])
+        found = solve(problems.part(first, last), part)
+        solved = first + np.flatnonzero(found.statuses == OK)
+        poses[solved], valid[solved] = found.poses[solved - first, 0], True
 
-    columns = zip(*in_threads(run, len(points), task.workers), strict=True)
-    poses, focals, valid = map(np.concatenate, columns)
+    in_threads(run, len(points), task.workers)
     return poses, focals, valid

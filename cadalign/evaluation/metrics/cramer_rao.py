@@ -7,7 +7,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
 from cadalign.estimation.options import Sigma, pixel_information
-from cadalign.estimation.problems import full_covariance, whitening_of, with_log_focal
+from cadalign.estimation.problems import full_covariance, whitening_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import (
     Camera,
@@ -21,7 +21,7 @@ from cadalign.geometry.pixels import perspective
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.shapes.parts import probability_within
 from cadalign.solvers.alignment import covariance_of, keypoint_objective
-from cadalign.solvers.constants import UNKNOWNS
+from cadalign.solvers.constants import UNKNOWNS, UNOBSERVABLE
 
 _LEAST_INFORMATION = 1e-12
 _LARGEST_LOG = 50.0
@@ -52,11 +52,20 @@ def cramer_rao_bound(
     covariance = np.zeros((UNKNOWNS, UNKNOWNS))
     if covariance_of(objective, gt.packed, covariance) >= 0:
         raise DegenerateError("the points do not determine the alignment", where="points_3d")
-    if focal == "estimate":
-        whitening = np.linalg.cholesky(pixel_information(sigma, len(points_3d))).swapaxes(1, 2)
-        rows = whitening @ projection_jacobian(points_3d, camera, gt)[:, :, _OF_STRETCHED]
-        covariance = with_log_focal(covariance, rows, np.zeros(2), 0.0)
-    return full_covariance(covariance, "x")
+    if focal != "estimate":
+        return full_covariance(covariance, "x")
+    whitening = np.linalg.cholesky(pixel_information(sigma, len(points_3d))).swapaxes(1, 2)
+    rows = whitening @ projection_jacobian(points_3d, camera, gt)[:, :, _OF_STRETCHED]
+    others, own = rows.reshape(-1, UNKNOWNS + 1)[:, :-1], rows[..., -1].ravel()
+    gain = covariance @ (own @ others)
+    alone = own - others @ gain
+    gain = np.append(-gain, 1.0)
+    bound, free = np.zeros((_FOCAL + 1, _FOCAL + 1)), np.ix_(_OF_STRETCHED, _OF_STRETCHED)
+    bound[:_FOCAL, :_FOCAL] = full_covariance(covariance, "x")
+    # A focal length that the others leave open is as uncertain as rounding errors let it be known.
+    information = max(float(alone @ alone), UNOBSERVABLE * float(own @ own))
+    bound[free] += np.outer(gain, gain) / information
+    return bound
 
 
 def sample_limit(

@@ -378,7 +378,7 @@ def test_numbers_beyond_the_range_give_a_rotation_or_a_clear_error(
     ("sigma", "message"),
     [
         (np.ones(7), "sigma: shape (7,), expected (8)"),
-        (np.inf, "sigma: is inf"),
+        (np.inf, "sigma: inf is not a standard deviation"),
         (np.ones((2, 2, 8)), "sigma: shape (2, 2, 8), expected (8, 2, 2)"),
     ],
 )

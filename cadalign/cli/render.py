@@ -28,14 +28,11 @@ class Render:
     """File to write: .png or .jpg."""
     view: tuple[str, ...] = ("iso",)
     """Views: iso, front, right, back, left, top, bottom, azimuth,elevation[,roll] in
-    degrees (write --view=-30,20 if it begins with a minus), all, or the folder of a COLMAP model,
-    for its cameras."""
+    degrees (write --view=-30,20 if it begins with a minus), or all."""
     size: str = "640x480"
     """Image size WIDTHxHEIGHT in pixels; of a contact sheet, each picture's."""
     style: Literal["color", "depth", "normals", "faces", "lines"] = "color"
     """Quantity to draw."""
-    background: str = "grey"
-    """grey, white, black, #rrggbb, or transparent (PNG stills)."""
     keypoints: Path | None = None
     """JSON file with keypoints to draw: a list of [x, y, z], a model's .keypoints.json, or
     KeypointNet's annotations."""

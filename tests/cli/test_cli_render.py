@@ -11,15 +11,12 @@ import pytest
 import trimesh
 import tyro
 from PIL import Image
-from support.files import write_cameras
 from support.refusals import refusal_line
 
-from cadalign import Camera
 from cadalign.cli.doctor import Doctor, Health, compiled_cache
 from cadalign.cli.render import Render
 from cadalign.datasets import load_mesh
 from cadalign.errors import DataError, InputError, RenderError
-from cadalign.render import look_at
 from cadalign.render.probe import RENDERERS, Probe, probe_renderer
 
 
@@ -68,14 +65,6 @@ def test_one_view_gives_a_still(model, tmp_path):
     assert 0.15 < changed.mean() < 0.8
 
 
-def test_a_transparent_still_has_opacity(model, tmp_path):
-    _run(model, "--out", tmp_path / "s.png", "--size", "80x60", "--background", "transparent")
-    pixels = _pixels(tmp_path / "s.png")
-    assert pixels.shape == (60, 80, 4)
-    assert pixels[0, 0, 3] == 0
-    assert pixels[30, 40, 3] == 255
-
-
 @pytest.mark.parametrize("views", [["front", "top"], ["30,20", "-30,20,10", "left"], ["all"]])
 def test_several_views_give_a_contact_sheet(model, tmp_path, views):
     _run(model, "--out", tmp_path / "s.png", "--size", "80x60", "--view", *views)
@@ -89,30 +78,6 @@ def test_a_jpg_is_a_still(model, tmp_path):
     _run(model, "--out", out, "--size", "80x60")
     assert out.read_bytes()[:2] == b"\xff\xd8"
     assert _pixels(out).shape[:2] == (60, 80)
-
-
-def test_a_model_of_colmap_gives_the_view(model, tmp_path):
-    camera = Camera.from_fov(120, 90, fov_x=40)
-    pose = look_at(azimuth=90, elevation=0, distance=2)
-    folder = write_cameras(tmp_path / "sparse", {"a.jpg": (camera, pose)})
-    out = tmp_path / "v.png"
-    _run(model, "--out", out, "--view", folder, "--style", "depth")
-    pixels = _pixels(out)
-    assert pixels.shape == (90, 120, 3)
-    changed = (pixels != pixels[0, 0]).any(axis=2)
-    rows, columns = np.nonzero(changed)
-    # The side of 0.8 x 0.6, at a depth of 2 - 0.2.
-    assert np.ptp(rows) + 1 == pytest.approx(0.8 / 1.8 * camera.fx, abs=1.5)
-    assert np.ptp(columns) + 1 == pytest.approx(0.6 / 1.8 * camera.fx, abs=1.5)
-    views = ("--view", folder, "iso", "--size")
-    with pytest.raises(InputError, match=r"--view: .* 120x90 \(a.jpg\), 200x100 \(iso\); give"):
-        _run(model, "--out", out, *views, "200x100")
-    assert _run(model, "--out", tmp_path / "sheet.png", *views, "120x90") == 0
-    for option in (("--size", "64x48"), ("--fov", "20")):
-        with pytest.raises(
-            InputError, match=f"{option[0]}: has no effect beside a model of COLMAP"
-        ):
-            _run(model, "--out", out, "--view", folder, *option)
 
 
 @pytest.mark.long
@@ -178,8 +143,6 @@ def test_keypoints_from_a_list_and_from_annotations(model, tmp_path):
         (["--view", "sideways"], InputError, "is not a view"),
         (["--view", "nothing.json"], InputError, "is not a view"),
         (["--out", "picture.jpeg"], InputError, "neither a PNG nor a JPEG"),
-        (["--background", "mauve"], InputError, "is not a colour"),
-        (["--background", "transparent", "--view", "all"], InputError, "can be transparent"),
         (["--scale", "1", "0", "1"], InputError, "is not positive"),
         (["--fov", "180"], InputError, "--fov: 180.0 is not between 0 and 180"),
         (["--view", "10,200"], InputError, "--view: 200 is not between -90 and 90"),

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 Matrix = list[list[Finite]]
 Matrix3 = tuple[Point3, Point3, Point3]
-_REPEATED = ("alignment", "camera", "rms", "std", "covariance")
+_REPEATED = ("alignment", "camera", "rms", "std", "covariance", "equal_under_symmetry")
 """Properties of a result that a file holds for other readers."""
 _OF_POINTS = ("points_covariance", "points_cam_covariance")
 _OF_POSTERIOR = (*("fisher_covariance", *_OF_POINTS, "degrees_of_freedom", "warnings", "evidence"),)
@@ -108,7 +108,6 @@ class _Result(
     rename={
         "own_bounds": "bounds",
         "own_stretch": "stretch",
-        "own_equal": "equal_under_symmetry",
     },
 ):
     """The fields of `cadalign.Result` and of its posterior."""
@@ -137,7 +136,6 @@ class _Result(
     options: _Options | None = None
     focal_prior: FocalPrior | None = None
     symmetry: Any = None  # in the form of `Symmetry.from_dict`
-    own_equal: str = ""
     rig_from_model: Any = None
 
     def __post_init__(self) -> None:
@@ -169,9 +167,9 @@ _FORMS: Mapping[type, type[ForeignDocument]] = {
 def write_result(result: Result) -> dict[str, Any]:
     """A result as plain lists and numbers; its model is not part of it."""
     posterior = {name: getattr(result.posterior, name) for name in _OF_POSTERIOR}
-    derived = {"own_stretch": result.stretch, "own_equal": result.equal_under_symmetry}
+    others = {"version": 1, **posterior, "own_stretch": result.stretch}
     repeated = {name: _plain(getattr(result, name)) for name in _REPEATED}
-    return _written(result, _Result, {"version": 1, **posterior, **derived}) | repeated
+    return _written(result, _Result, others) | repeated
 
 
 def _written(value: Any, form: type[ForeignDocument], others: Mapping[str, Any]) -> dict[str, Any]:

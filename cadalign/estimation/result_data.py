@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, is_number
-from cadalign.errors import CadalignError, InputError, quote
+from cadalign.errors import DataError, InputError, quote
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.result_parts import (
@@ -88,8 +88,8 @@ class ResultData:
         Number of the mixture's component that the object belongs to.
     rig_from_model : Alignment, optional
         The alignment in the frame that views with ``cam_from_rig`` share; None without them.
-    own_bounds, own_stretch, own_equal : optional
-        ``bounds``, ``stretch`` and ``equal_under_symmetry`` where they do not follow.
+    own_bounds, own_stretch : optional
+        ``bounds`` and ``stretch`` where they do not follow.
     """
 
     views: tuple[ViewResult, ...]
@@ -112,7 +112,6 @@ class ResultData:
     rig_from_model: Alignment | None = None
     own_bounds: FloatArray | None = None
     own_stretch: FloatArray | None = None
-    own_equal: str | None = None
 
     @property
     def alignment(self) -> Alignment:
@@ -143,15 +142,11 @@ class ResultData:
 
         Infinite for keypoints that were rejected and lie behind the camera.
         """
-        if len(self.views) == 1:
-            return self.views[0].residuals
         return np.concatenate([view.residuals for view in self.views])
 
     @property
     def inliers(self) -> BoolArray:
         """Marks the keypoints (n,) of all views that the estimate rests on."""
-        if len(self.views) == 1:
-            return self.views[0].inliers
         return np.concatenate([view.inliers for view in self.views])
 
     @property
@@ -255,18 +250,11 @@ class ResultData:
     @property
     def equal_under_symmetry(self) -> str:
         """Clause about the alignments that are equal under the model's symmetry; empty without."""
-        if self.own_equal is not None:
-            return self.own_equal
         if self.symmetry is None or self.symmetry.is_trivial:
             return ""
         from cadalign.estimation.symmetry import equal_text, held_axes  # most models have none
 
         return equal_text(self.alignment, self.symmetry, held=held_axes(self.stretched_axes))
-
-    @property
-    def probability(self) -> float:
-        """Probability of the estimate itself rather than of one of its alternatives."""
-        return 1 / (1 + sum(other.relative_likelihood for other in self.alternatives))
 
     def radius(self, probability: float, *, dimension: int = 1) -> float:
         """Radius, in standard deviations, of the region that holds the truth with a probability.
@@ -313,44 +301,39 @@ class ResultData:
             If there is no mesh to warp.
         """
         from cadalign.io.meshes.files import as_mesh
+        from cadalign.shapes.model import ShapeModel
         from cadalign.shapes.warp import warp_mesh
 
-        if self._learned_shape is not None:
-            source = self.nearest.points_3d
-            known = np.isfinite(source).all(axis=1)
-            path = self.nearest.mesh_path if mesh is None else mesh
-            if path is None:
-                fix = "give the mesh of `nearest`"
-                raise InputError("the training models have no meshes", where="mesh", fix=fix)
-            own = as_mesh(path, where="mesh")
-            return warp_mesh(own, source[known], self.points_3d[known], bounds=self.bounds)
-        model = cast("Model | None", self.model)
-        given = mesh if mesh is not None or model is None else model.mesh
-        if given is None:
+        model, source = self.model, cast(FloatArray | None, None)
+        if isinstance(model, ShapeModel):
+            nearest = self.nearest
+            source, mesh = nearest.points_3d, nearest.mesh_path if mesh is None else mesh
+        elif model is not None:
+            source = None if model.shape_sigma is None else cast(FloatArray, model.points_3d)
+            mesh = model.mesh if mesh is None else mesh
+        if mesh is None:
             raise InputError("the model has no mesh", where="mesh", fix="give one")
-        given = as_mesh(given, where="mesh")
-        if model is None or model.shape_sigma is None:
-            return given
-        return warp_mesh(given, model.points_3d, self.points_3d, bounds=self.bounds)
+        own = as_mesh(mesh, where="mesh")
+        if source is None:
+            return own
+        known = np.isfinite(source).all(axis=1)
+        return warp_mesh(own, source[known], self.points_3d[known], bounds=self.bounds)
 
     def known_mesh(self, mesh: Mesh | str | os.PathLike[str] | None) -> Mesh | None:
         """As `mesh`; None where there is no mesh to warp.
 
-        A training model's mesh that cannot be read is warned of (logger "cadalign").
+        A mesh of the model that cannot be read is warned of (logger "cadalign").
         """
-        shape = self._learned_shape
-        if mesh is not None:
-            return self.mesh(mesh)
-        if shape is None:
-            return None if getattr(self.model, "mesh", None) is None else self.mesh()
-        training = shape.training
-        if training is None or not len(training) or self.nearest.mesh_path is None:
-            return None
         try:
-            return self.mesh()
-        except CadalignError as error:
+            return self.mesh(mesh)
+        except InputError:
+            if mesh is not None:
+                raise
+        except DataError as error:
+            if mesh is not None:
+                raise
             logger.warning("the nearest training model is not drawn: %s", error)
-            return None
+        return None
 
     @property
     def nearest(self) -> NearestShape:
@@ -361,12 +344,8 @@ class ResultData:
         InputError
             If the model is not learned, or its training models are not known.
         """
-        if self._learned_shape is None:
-            raise InputError("only a learned shape has training models", where="model")
-        return self._learned_shape.nearest(self.points_3d)
-
-    @property
-    def _learned_shape(self) -> ShapeModel | None:
         from cadalign.shapes.model import ShapeModel
 
-        return self.model if isinstance(self.model, ShapeModel) else None
+        if not isinstance(self.model, ShapeModel):
+            raise InputError("only a learned shape has training models", where="model")
+        return self.model.nearest(self.points_3d)

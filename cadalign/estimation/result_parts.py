@@ -15,7 +15,7 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.warning import EstimateWarning, Warnings
-from cadalign.geometry.alignment import Alignment, Box, extent
+from cadalign.geometry.alignment import Alignment, extent
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import by_rotation
 from cadalign.geometry.symmetry import Symmetry
@@ -60,11 +60,6 @@ class Alternative:
     def bounds(self) -> FloatArray:
         """Its box (2, 3) in the model's frame."""
         return extent(self.points_3d) if self.own_bounds is None else self.own_bounds
-
-    @property
-    def box(self) -> Box:
-        """Its box in the first camera's frame."""
-        return Box.from_model(self.bounds, self.alignment)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ from msgspec.structs import asdict
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.focal import FocalPrior
-from cadalign.estimation.options import FitOptions, pixel_information
 from cadalign.estimation.result_parts import (
     Alternative,
     EvidenceSummary,
@@ -46,7 +45,7 @@ if TYPE_CHECKING:
 
 Matrix = list[list[Finite]]
 Matrix3 = tuple[Point3, Point3, Point3]
-_REPEATED = ("alignment", "camera", "rms", "std", "covariance", "equal_under_symmetry")
+_REPEATED = ("alignment", "camera", "rms", "std", "covariance")
 """Properties of a result that a file holds for other readers."""
 _OF_POINTS = ("points_covariance", "points_cam_covariance")
 _OF_POSTERIOR = (*("fisher_covariance", *_OF_POINTS, "degrees_of_freedom", "warnings", "evidence"),)
@@ -58,20 +57,6 @@ class _Alternative(ForeignDocument, rename={"own_bounds": "bounds"}):
     camera: Any  # in the form of `Camera.from_dict`
     points_3d: list[Point3]
     own_bounds: tuple[Point3, Point3] | None = None
-
-
-class _Options(ForeignDocument):
-    """The fields of `FitOptions`."""
-
-    method: str
-    sigma: Any  # None, a number, one for each keypoint, or a 2 x 2 covariance for each
-    loss: str
-    loss_scale: Positive
-    stretch: str | None
-    known_axis: str
-    focal: str
-    focal_prior: FocalPrior | Literal["usual"] | None
-    stretch_sigma: Positive | None = None
 
 
 class _View(ForeignDocument):
@@ -133,7 +118,6 @@ class _Result(
     cost: float | None = None
     alternatives: tuple[_Alternative, ...] = ()
     evidence: tuple[_Summary, ...] = ()
-    options: _Options | None = None
     focal_prior: FocalPrior | None = None
     symmetry: Any = None  # in the form of `Symmetry.from_dict`
     rig_from_model: Any = None
@@ -159,7 +143,6 @@ def _check_lengths(
 _FORMS: Mapping[type, type[ForeignDocument]] = {
     ViewResult: _View,
     Alternative: _Alternative,
-    FitOptions: _Options,
     EvidenceSummary: _Summary,
 }
 
@@ -197,8 +180,6 @@ def _plain(value: Any) -> Any:
         return [_plain(each) for each in value]
     if isinstance(value, Alignment | Camera | Symmetry):
         return value.to_dict()
-    if kind is FitOptions and value.sigma is not None:
-        value = replace(value, sigma=np.asarray(value.sigma, dtype=float))
     if kind in _FORMS:
         return _written(value, _FORMS[kind], {})
     if is_dataclass(value):
@@ -266,7 +247,6 @@ def _result(read: _Result, kind: type[Result]) -> Result:
     fields |= {
         "views": tuple(views),
         "alternatives": tuple(alternatives),
-        "options": read.options and _options(read.options, len(views[0].residuals)),
     }
     return kind(**fields, posterior=posterior)
 
@@ -286,17 +266,3 @@ def _summary(read: _Summary) -> EvidenceSummary:
     fields = asdict(read)
     lacking = {name: math.nan for name in ("rms_sigmas", "rms") if fields[name] is None}
     return EvidenceSummary(**fields | lacking)
-
-
-def _options(read: _Options, count: int) -> FitOptions:
-    with within("options"):
-        sigma: Any = read.sigma
-        if isinstance(sigma, list):
-            covariances = sigma and isinstance(sigma[0], list)
-            shape = (count, 2, 2) if covariances else (count,)
-            sigma = as_floats(sigma, name="sigma", shape=shape)
-        elif sigma is not None:
-            sigma = float(as_floats(sigma, name="sigma", shape=()))
-        if sigma is not None:
-            pixel_information(sigma, count)  # checks it
-        return FitOptions(**asdict(read) | {"sigma": sigma})

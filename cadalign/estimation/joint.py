@@ -18,7 +18,6 @@ from cadalign.estimation.estimates import (
     Estimate,
     as_given,
     curvature_of_rotations,
-    mean_state,
     moments_of_points,
     moments_of_poses,
     one_of_equals,
@@ -28,8 +27,7 @@ from cadalign.estimation.estimates import (
     with_box,
 )
 from cadalign.estimation.focal import prior_of_camera
-from cadalign.estimation.pack import evidence_of
-from cadalign.estimation.prior import camera_like, is_exact, widened, with_known_shape
+from cadalign.estimation.prior import is_exact, widened
 from cadalign.estimation.problem import Problem
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import (
@@ -59,14 +57,10 @@ from cadalign.estimation.uncertainty.shape_posterior import ShapeTails
 from cadalign.estimation.view import View
 from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.shapes.parts import inflation_with
 from cadalign.solvers.joint.covariance import joint_covariance, pose_and_border
 from cadalign.solvers.joint.evidence import points_of
-from cadalign.solvers.joint.search import refine_joint
-
-_ITERATIONS = 50
 
 Causes = Callable[[], Warnings]
 """Warnings about contradictions and residuals, which take time to find."""
@@ -148,8 +142,8 @@ def result_of(
             place = numbers.index(number)
             camera, alignment, kept = best.cameras[place], best.poses[place], inliers[place]
             own = Posterior(covariances[place]) if number else posterior
-        else:
-            camera, alignment = _pose_beside(problem, number, best)
+        else:  # a pose as good as any
+            camera, alignment = view.camera, best.poses[0]
             kept, own = np.zeros(len(rows), dtype=bool), Posterior()
         residuals = camera.project(alignment.apply(points[rows])) - observed
         of_views.append(
@@ -170,32 +164,6 @@ def result_of(
         ),
         **of_result,
     )
-
-
-def _pose_beside(problem: Problem, number: int, best: Estimate) -> tuple[Camera, Alignment]:
-    """Camera and pose of a view that takes no part: near the first view's, where its keypoints fit.
-
-    The pose is one of those that explain its keypoints.
-    """
-    view, facing = problem.given[number], problem.views[number].camera
-    cameras = [problem.given[k].camera for k in problem.numbers]
-    camera = camera_like(view.camera, dict(zip(cameras, best.cameras, strict=True)))
-    if not len(view.keypoint_ids) and view.up is None:
-        return camera, best.poses[0]
-    alone = View(
-        facing if camera.is_wide else camera,
-        view.points_2d,
-        ids=view.ids,
-        sigma=view.sigma,
-        up=view.up,
-        up_sigma_deg=view.up_sigma_deg,
-    )
-    turns = [problem.turns[number]]
-    evidence = with_known_shape(evidence_of(problem.prior, [alone], turns=turns), best.points)
-    state = mean_state(evidence, best.poses[0].packed[None, :12], np.log(best.scale))
-    _, _, state = refine_joint(evidence, _ITERATIONS, state)
-    pose = state.poses[0]
-    return camera, Alignment(pose[:9].reshape(3, 3), pose[9:], best.scale)
 
 
 def result_of_minima(

@@ -163,15 +163,6 @@ def widened(evidence: Evidence, state: State, factor: float) -> tuple[Evidence, 
     return evidence._replace(shape=wide), state._replace(coefficients=state.coefficients / factor)
 
 
-def with_known_shape(evidence: Evidence, points: FloatArray) -> Evidence:
-    """The evidence about known points (m, 3), whose stretch stays."""
-    shape, scales = evidence.shape, evidence.scales
-    return evidence._replace(
-        shape=Shape(points, shape.modes[:0], np.zeros(len(points))),
-        scales=scales._replace(free=np.zeros(3), precision=np.zeros((3, 3))),
-    )
-
-
 def is_exact(evidence: Evidence) -> bool:
     """True if the shape is known but for its scales."""
     return not (len(evidence.shape.modes) or evidence.shape.spread.any())

@@ -211,8 +211,6 @@ def _text_of(result: ResultData) -> str:
         f"  translation  {translation}",
         f"  stretch      ({', '.join(stretch)})",
     ]
-    if result.equal_under_symmetry:
-        lines.append(f"  symmetry     {result.equal_under_symmetry}")
     if result.focal == "estimate":
         prior = "" if result.focal_prior is None else f" (prior: {result.focal_prior})"
         lines.append(f"  focal length {result.camera.fx:.4g} px{known_to}{prior}")

@@ -247,15 +247,6 @@ class ResultData:
         """Lengths (3,) of the object over the model's or, for a learned shape, the mean's."""
         return self.alignment.scale if self.own_stretch is None else self.own_stretch
 
-    @property
-    def equal_under_symmetry(self) -> str:
-        """Clause about the alignments that are equal under the model's symmetry; empty without."""
-        if self.symmetry is None or self.symmetry.is_trivial:
-            return ""
-        from cadalign.estimation.symmetry import equal_text, held_axes  # most models have none
-
-        return equal_text(self.alignment, self.symmetry, held=held_axes(self.stretched_axes))
-
     def radius(self, probability: float, *, dimension: int = 1) -> float:
         """Radius, in standard deviations, of the region that holds the truth with a probability.
 

@@ -74,21 +74,6 @@ def is_same(
     return bool(step @ information @ step <= SAME_SQUARES)
 
 
-def equal_text(alignment: Alignment, symmetry: Symmetry, *, held: tuple[bool, bool, bool]) -> str:
-    """A clause about the alignments that are equal to one."""
-    group = group_of(symmetry)
-    found = group.canonical(alignment, held=held)
-    if len(found.free) > 1:
-        return "any rotation is equal under the model's symmetry"
-    if len(found.free):
-        axis = ", ".join(f"{value:.3g}" for value in (found.free[0] + 0.0).tolist())
-        return f"any rotation about ({axis}) is equal under the model's symmetry"
-    count = group.count(alignment, held)
-    if count == 1:
-        return "the stretch leaves no other alignment equal under the model's symmetry"
-    return f"{count} alignments are equal under the model's symmetry"
-
-
 def carried(
     covariance: FloatArray,
     given: Alignment,

@@ -179,11 +179,6 @@ class SymmetryGroup:
         turned = alignment.rotation @ best
         return Alignment(turned, alignment.translation + shift, alignment.scale, is_valid=True)
 
-    def count(self, alignment: Alignment, held: tuple[bool, bool, bool]) -> int | None:
-        """Number of alignments that are equal to one; None for any number."""
-        kept = list(self._kept(alignment.scale, held, 1e-4))
-        return None if any(len(axes) for (_, axes), _ in kept) else len(kept)
-
     def _kept(
         self, scale: FloatArray, held: tuple[bool, bool, bool], tolerance: float
     ) -> Iterator[tuple[_Branch, FloatArray]]:

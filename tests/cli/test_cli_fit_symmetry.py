@@ -56,7 +56,7 @@ def with_symmetry(path: Path, symmetry: Any) -> Path:
 )
 @pytest.mark.parametrize("flags", [[], ["--shape-sigma", "0.02"]])
 def test_turned_labels_give_the_same_alignment(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], symmetry: Any, flags: list[str]
+    tmp_path: Path, symmetry: Any, flags: list[str]
 ) -> None:
     if symmetry == "bop":
         turns = [np.eye(4), np.eye(4), np.eye(4)]
@@ -67,8 +67,6 @@ def test_turned_labels_give_the_same_alignment(
     for name, points in (("a.json", CORNERS), ("b.json", CORNERS @ QUARTER.T)):
         path = with_symmetry(write_observation(tmp_path, name, points=points), symmetry)
         assert main(["fit", str(path), *flags]) == 0
-        printed = capsys.readouterr().out
-        assert "symmetry     4 alignments are equal under the model's symmetry" in printed
         fit = json.loads((tmp_path / f"{path.stem}_fit" / "fit.json").read_text())
         rotations.append(np.array(fit["alignment"]["rotation"]))
     assert angle_between(*rotations) < 0.01

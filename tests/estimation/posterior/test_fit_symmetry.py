@@ -103,7 +103,6 @@ def test_rotations_about_the_axis_count_for_nothing():
     assert any(each.kind == "rotation" for each in plain.warnings)
     assert result.std.rotation_deg < 0.5 * plain.std.rotation_deg
     assert not any(each.kind == "rotation" for each in result.warnings)
-    assert "any rotation about (0, 1, 0) is equal under the model's symmetry" in str(result)
     # The axis' own deviation stays: that of the direction of y in the camera frame.
     axis = plain.alignment.rotation @ UP
     across = np.eye(3) - np.outer(axis, axis)
@@ -121,7 +120,6 @@ def test_a_stretch_across_the_axis_leaves_half_turns():
     for result in results:
         np.testing.assert_allclose(result.alignment.scale, (1, 1.3, 1.6), rtol=0.02)
         assert angle_between(result.alignment.rotation, truth_of(0.2).rotation) < 1
-        assert "2 alignments are equal under the model's symmetry" in str(result)
 
 
 def test_with_the_height_known_a_quarter_turn_exchanges_the_other_two_lengths():

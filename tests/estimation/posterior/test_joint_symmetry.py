@@ -67,7 +67,6 @@ def test_labels_that_are_turned_give_the_same_result(options):
     for result in (first, second):
         seen = CAMERA.project(result.alignment.apply(result.points_3d))
         np.testing.assert_allclose(seen - view.points_2d, result.residuals, atol=1e-6)
-        assert "4 alignments are equal under the model's symmetry" in str(result)
         assert str(Result.from_dict(result.to_dict())) == str(result)
 
 
@@ -78,11 +77,9 @@ def test_with_its_size_known_a_quarter_turn_exchanges_stretches():
     sized = [align(model, view, size=Size(height=1.1 * 1.3, sigma=0.001)) for model in models()]
     assert_same(*sized, tolerance=5e-4)
     np.testing.assert_allclose(sized[1].stretch, (1, 1.3, 1.6), rtol=0.02)
-    assert "4 alignments" in str(sized[1])
     held = [align(model, view) for model in models()]
     np.testing.assert_allclose(held[0].stretch, (1, 1.3, 1.6), rtol=0.02)
     np.testing.assert_allclose(held[1].stretch, (1, 1.3 / 1.6, 1 / 1.6), rtol=0.02)
-    assert all("2 alignments" in str(each) for each in held)
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -114,7 +111,6 @@ def test_of_a_round_model_rotations_about_its_axis_count_for_nothing():
     plain = align(Model(points_3d=thin, **options), view)
     result = align(Model(points_3d=thin, **options, symmetry=round_model), view)
     assert plain.std.rotation_deg > 10
-    assert "any rotation about (0, 1, 0) is equal" in str(result)
     axis = result.alignment.rotation @ UP
     across = np.eye(3) - np.outer(axis, axis)
     variance = np.trace(across @ plain.covariance[:3, :3] @ across)

@@ -48,7 +48,6 @@ def test_a_view_that_determines_no_pose_is_left_out_and_named(count: int) -> Non
     assert result.alignment == expected.alignment
     assert result.poses[2] == expected.poses[1]
     assert not result.views[1].inliers.any()
-    assert np.abs(result.views[1].residuals).max() < 1e-3  # its pose is one that explains them
     assert [each.view for each in result.evidence] == [0, 2]
     written = Result.from_dict(result.to_dict())
     assert written.cameras == tuple(view.camera for view in (views[0], weak, views[1]))

@@ -5,16 +5,15 @@ Killed, it goes on where it was when it is started again with the same arguments
 
 from __future__ import annotations
 
-import shutil
 import sys
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 
 from cadalign import CadalignError
+from cadalign.cli.runs import run_progress
 from cadalign.datasets import write_sample_dataset
 from cadalign.evaluation import metrics
 from cadalign.evaluation.api import run
@@ -31,13 +30,15 @@ from cadalign.evaluation.experiments.simulation import SWEEPS, SweepOptions
 from cadalign.evaluation.methods import LIMIT
 from cadalign.evaluation.options import ExperimentOptions, RunOptions
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.summary import ALL, Summary, csv_text
-from cadalign.io.files import made_folder, write_text, writing
+from cadalign.io.files import made_folder, write_text
 
-_TITLE = "The AEPnP paper's tables and figures"
-_METRICS = (metrics.ROTATION, metrics.TRANSLATION, metrics.SCALE_Y, metrics.SCALE_Z)
+_DATASETS = {
+    "sample": "The sample dataset (parametric models, visibility by rays)",
+    "keypointnet": "The dataset given (visibility by rays where there is a mesh, else by the hull)",
+}
+_HEAD = ("category", "method", "keypoints", "R [deg]", "t", "s1 (y) [%]", "s2 (z) [%]", "R / limit")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,65 +55,54 @@ class PaperPlan(RunOptions):
     """Seed of everything random."""
 
 
-Announce = Callable[[str], Callable[[Progress], object]]
-
-
-def reproduce_paper(plan: PaperPlan, *, announce: Announce = lambda what: lambda _: None) -> Path:
-    """Run everything, or what is left of it; returns ``report.md``, beside figures and tables.
-
-    ``announce`` gets the name of the next run, and returns the function that gets its progress.
-    """
-    made_folder(plan.out / "figures")
-    sections = [f"# {_TITLE}\n", _settings(plan)]
-    sections += [_table_section(plan, announce)]
-    for name in SWEEPS:
-        sections.append(_sweep_section(plan, name, announce))
+def reproduce_paper(plan: PaperPlan) -> Path:
+    """Run everything, or what is left of it; returns ``report.md``, beside runs and tables."""
+    made_folder(plan.out)
+    quick = " This is the quick pass, with few problems: numbers are rough." if plan.quick else ""
+    sections = [
+        "# The AEPnP paper's tables and figures\n",
+        f"Seed {plan.seed}.{quick} Every run's own folder, with all rows, its configuration and "
+        "more figures, lies beside this file. Lines are medians, bands quartiles; the dashed line "
+        "is the Cramer-Rao bound, the least error that any unbiased method can have.\n",
+        _table_section(plan),
+        *(_sweep_section(plan, name) for name in SWEEPS),
+    ]
     report = plan.out / "report.md"
     write_text(report, "\n".join(sections))
     return report
 
 
-def _settings(plan: PaperPlan) -> str:
-    quick = " This is the quick pass, with few problems: numbers are rough." if plan.quick else ""
-    return (
-        f"Seed {plan.seed}.{quick} Every run's own folder, with all rows, its configuration and "
-        "more figures, lies beside this file. Lines are medians, bands quartiles; the dashed line "
-        "is the Cramer-Rao bound, the least error that any unbiased method can have.\n"
-    )
+def _run(plan: PaperPlan, options: ExperimentOptions, name: str, *, is_timed: bool = False) -> Run:
+    folder = RunFolder(plan.out / name)
+    how = {"workers": None, "dask": None} if is_timed else vars(plan)
+    with run_progress(name) as on_progress:
+        run(options, folder, workers=how["workers"], dask=how["dask"], on_progress=on_progress)
+    return Run.open(folder.path)
 
 
-def _sweep_section(plan: PaperPlan, name: str, announce: Announce) -> str:
+def _sweep_section(plan: PaperPlan, name: str) -> str:
     runs = max(SWEEPS[name].runs // 25, 20) if plan.quick else None
     options = SweepOptions(name, runs=runs, seed=plan.seed)
     kind = options.kind
-    folder = RunFolder(plan.out / f"simulate_{name}")
-    run(
-        options,
-        folder,
-        workers=None if kind.is_timed else plan.workers,
-        dask=None if kind.is_timed else plan.dask,
-        on_progress=announce(f"simulation: {name}"),
-    )
-    summaries = SIMULATION.write(Run.open(folder.path))
+    summaries = SIMULATION.write(_run(plan, options, f"simulate_{name}", is_timed=kind.is_timed))
     keys = list(dict.fromkeys(summary["metric"] for summary in summaries))
-    pictures = [f"{name}_{key}" for key in keys[: 1 if kind.is_timed else None]]
-    for picture in pictures:
-        _copy_figure(folder.figures / picture, plan.out / "figures" / picture)
     shown = [summary for summary in summaries if summary["metric"] == keys[0]]
     rows = [
         [f"{value:g}", *(f"{s['median']:.3g}" for s in shown if s["value"] == value)]
         for value in kind.values
     ]
-    table = _markdown(["", *kind.methods], rows, words=0)
-    images = "\n".join(f"![{picture}](figures/{picture}.png)" for picture in pictures)
+    images = "\n".join(
+        f"![{name}: {key}](simulate_{name}/figures/{name}_{key}.png)"
+        for key in keys[: 1 if kind.is_timed else None]
+    )
     return (
         f"## Simulation: {name}\n\n{images}\n\n"
         f"Median {keys[0]} by {kind.column}; the paper states no numbers, only the figure.\n\n"
-        f"{table}\n"
+        f"{_markdown(['', *kind.methods], rows, words=0)}\n"
     )
 
 
-def _table_section(plan: PaperPlan, announce: Announce) -> str:
+def _table_section(plan: PaperPlan) -> str:
     """Evaluate on the sample dataset, and on the dataset that is given; write Table 1."""
     sample = write_sample_dataset(plan.out / "sample_dataset", per_category=12)
     roots = {"sample": (sample, 2 if plan.quick else 40)}
@@ -121,34 +111,17 @@ def _table_section(plan: PaperPlan, announce: Announce) -> str:
     rows: list[list[str]] = []
     sections = []
     for name, (root, views) in roots.items():
-        folder = RunFolder(plan.out / f"evaluate_{name}")
-        run(
-            KeypointNetOptions(root, views_per_model=views, seed=plan.seed),
-            folder,
-            workers=plan.workers,
-            dask=plan.dask,
-            on_progress=announce(f"keypoints: {name}"),
-        )
-        summaries = KEYPOINTNET.write(Run.open(folder.path))
-        for metric in _METRICS:
-            picture = f"categories_{metric.key}"
-            _copy_figure(folder.figures / picture, plan.out / "figures" / f"{name}_{picture}")
-        table = _table_rows(summaries)
+        options = KeypointNetOptions(root, views_per_model=views, seed=plan.seed)
+        table = _table_rows(KEYPOINTNET.write(_run(plan, options, f"evaluate_{name}")))
         rows += [[name, *row] for row in table]
+        figure = f"evaluate_{name}/figures/categories_{metrics.ROTATION.key}.png"
         sections.append(
             f"### {_DATASETS[name]}\n\n{_markdown(_HEAD, table, words=2)}\n\n"
-            f"![rotation errors](figures/{name}_categories_rotation_error_deg.png)\n"
+            f"![rotation errors]({figure})\n"
         )
     write_text(plan.out / "table1.csv", csv_text([["dataset", *_HEAD], *rows]))
     body = "\n".join(sections)
     return f"## Table 1: sparse keypoints, 1 px noise\n\n{PERCENT_NOTE}\n\n{body}"
-
-
-_DATASETS = {
-    "sample": "The sample dataset (parametric models, visibility by rays)",
-    "keypointnet": "The dataset given (visibility by rays where there is a mesh, else by the hull)",
-}
-_HEAD = ("category", "method", "keypoints", "R [deg]", "t", "s1 (y) [%]", "s2 (z) [%]", "R / limit")
 
 
 def _table_rows(summaries: Sequence[Summary]) -> list[list[str]]:
@@ -156,8 +129,7 @@ def _table_rows(summaries: Sequence[Summary]) -> list[list[str]]:
     rows = []
     categories = dict.fromkeys(summary.group for summary in summaries)
     for category in sorted(categories, key=lambda name: name != ALL):
-        of_category = [summary for summary in summaries if summary.group == category]
-        for summary in of_category:
+        for summary in (each for each in summaries if each.group == category):
             ratio = metrics.OVER_BOUND.text(summary["over_limit"])
             name = "Cramer-Rao bound" if summary.method == LIMIT else summary.method
             texts = [column.text(summary[column.key]) for column in TABLE[:5]]
@@ -177,38 +149,16 @@ def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]], *, words: int)
     return "\n".join(f"| {' | '.join(line)} |" for line in (head, marks, *rows))
 
 
-def _copy_figure(source: Path, target: Path) -> None:
-    """Copy a figure, named without its ending, in both of its formats."""
-    for ending in (".png", ".pdf"):
-        copied = target.with_name(target.name + ending)
-        with writing(copied):
-            shutil.copyfile(source.with_name(source.name + ending), copied)
-
-
 def main() -> int:
     """Run it; returns the exit code."""
     plan = tyro.cli(PaperPlan, description=__doc__)
     try:
-        report = reproduce_paper(plan, announce=_announce)
+        report = reproduce_paper(plan)
     except CadalignError as error:
         print(f"reproduce_paper: {error}", file=sys.stderr)
         return 1
     print(f"Report: {report}")
     return 0
-
-
-def _announce(what: str) -> Callable[[Progress], None]:
-    start = time.monotonic()
-    shown = 0.0
-
-    def show(progress: Progress) -> None:
-        nonlocal shown
-        now = time.monotonic()
-        if progress.done == progress.total or now - shown > 5:
-            shown = now
-            print(f"{what}: {progress.done} of {progress.total}, {now - start:.0f} s", flush=True)
-
-    return show
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Make the documentation's pictures: overview, chairs, annotator, conventions, architecture.
+"""Make the documentation's pictures: overview, chairs, annotator, architecture.
 
     python scripts/make_pictures.py overview
 
@@ -18,11 +18,8 @@ from html import escape
 from pathlib import Path
 
 import cv2
-import matplotlib
-import matplotlib.pyplot as plt
 import numpy as np
 import tyro
-from matplotlib.axes import Axes
 
 from cadalign import Alignment, Box, Camera, Observation, fit
 from cadalign.annotate.lines import Wireframe
@@ -46,7 +43,6 @@ from cadalign.render.drawing.canvas import ByteImage, composite
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 MODELS = (("chair", "000"), ("car", "002"), ("bottle", "002"), ("vessel", "003"))
-COLORS = {"x": "#c62828", "y": "#2e7d32", "z": "#1565c0"}
 WIDTH, ROW, TOP = 1080, 34, 56
 CHAIR_CAMERA = Camera.from_fov(640, 720, fov_x=33.0)
 CHAIR_VIEW = Angles(azimuth=143.0, elevation=24.0)
@@ -67,20 +63,12 @@ INSTANCE = (
 )
 
 
-def overview(*, out: Path = DOCS / "overview.png", width: int = 1600) -> None:
-    """Overlays of four sample models, side by side: the README's picture.
-
-    Parameters
-    ----------
-    out : Path
-        Where to write the picture.
-    width : int
-        Width in pixels.
-    """
+def overview() -> None:
+    """Overlays of four sample models, side by side: the README's picture."""
     with tempfile.TemporaryDirectory() as folder:
         dataset = KeypointNet(write_sample_dataset(Path(folder) / "sample"))
         pictures = [_overlay(dataset, *model) for model in MODELS]
-    write_row(out, pictures, width=width)
+    write_row(DOCS / "overview.png", pictures, width=1600)
 
 
 def _overlay(dataset: KeypointNet, category: str, number: str) -> np.ndarray:
@@ -101,35 +89,21 @@ def _overlay(dataset: KeypointNet, category: str, number: str) -> np.ndarray:
     )
 
 
-def chairs(
-    *,
-    out: Path | None = None,
-    photo_of: str = "006",
-    model: str = "000",
-    files: Path | None = None,
-    width: int = 1500,
-) -> None:
+def chairs(*, files: Path | None = None) -> None:
     """Align one sample chair to a photo of another: the README's worked example.
 
     The photo is a rendering of the one chair; keypoints are joined by their semantic ids.
 
     Parameters
     ----------
-    out : Path, optional
-        Where to write the picture; by default beside the files, or docs/other_chair.png.
-    photo_of : str
-        The sample chair in the photo.
-    model : str
-        The sample chair that is aligned to it.
     files : Path, optional
-        Folder for the photo, the observation and the model's keypoints.
-    width : int
-        Width of the picture in pixels.
+        Folder for the photo, the observation, the model's keypoints and the picture, which is
+        docs/other_chair.png by default.
     """
     with tempfile.TemporaryDirectory() as folder:
         root = files or Path(folder)
         dataset = KeypointNet(write_sample_dataset(root / "sample"))
-        seen, own = (dataset["chair", f"sample_chair_{name}"] for name in (photo_of, model))
+        seen, own = (dataset["chair", f"sample_chair_{name}"] for name in ("006", "000"))
         photo = root / "photo.png"
         observation = observe(seen, own, photo)
         observation.save(root / "photo.json")
@@ -147,8 +121,8 @@ def chairs(
             reprojected=CHAIR_CAMERA.project(result.alignment.apply(observation.points_3d)),
             legend=False,
         )
-        out = out or (Path("docs") if files is None else files) / "other_chair.png"
-        write_row(out, [image, still(scene), aligned], width=width)
+        out = (files or DOCS) / "other_chair.png"
+        write_row(out, [image, still(scene), aligned], width=1500)
 
 
 def observe(seen: AnnotatedModel, model: AnnotatedModel, photo: Path) -> Observation:
@@ -192,20 +166,11 @@ def write_row(path: Path, pictures: Sequence[np.ndarray], *, width: int) -> None
     """Write pictures of one height side by side, shrunk to a width [px] in all."""
     row = np.hstack(pictures)
     height = round(row.shape[0] * width / row.shape[1])
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_image(path, cv2.resize(row, (width, height), interpolation=cv2.INTER_AREA))
 
 
-def annotator(*, out: Path = DOCS / "annotator.png", files: Path) -> None:
-    """The annotator in a headless browser.
-
-    Parameters
-    ----------
-    out : Path
-        Where to write the picture.
-    files : Path
-        Where `chairs` has written its files.
-    """
+def annotator(*, files: Path) -> None:
+    """The annotator in a headless browser, with the files that `chairs` has written."""
     sys.path.insert(0, str(ROOT / "tests"))
     from support.annotating import IDLE, opened_page, wait
     from support.chromium import chromium
@@ -219,55 +184,7 @@ def annotator(*, out: Path = DOCS / "annotator.png", files: Path) -> None:
         wait(page, f"{IDLE} && annotator.state.alignment.status === 'done'")
         page.keyboard.press("v")
         page.wait_for_timeout(1000)  # until everything is drawn
-        out.parent.mkdir(parents=True, exist_ok=True)
-        page.screenshot(path=out)
-
-
-def axes_cross(ax: Axes, origin: tuple[float, float], ends: dict[str, tuple[float, float]]) -> None:
-    """Three named arrows."""
-    for name, (dx, dy) in ends.items():
-        end = (origin[0] + dx, origin[1] + dy)
-        ax.annotate(
-            "", end, origin, arrowprops={"arrowstyle": "-|>", "color": COLORS[name], "lw": 2}
-        )
-        ax.text(origin[0] + 1.15 * dx, origin[1] + 1.15 * dy, name, color=COLORS[name],
-                ha="center", va="center", fontsize=13, fontweight="bold")  # fmt: skip
-
-
-def draw_scene(ax: Axes) -> None:
-    """A camera that looks at a box, each with its axes."""
-    axes_cross(ax, (0, 0), {"x": (0.55, -0.4), "y": (0, -0.9), "z": (1.5, 0.2)})
-    ax.text(-0.1, 0.25, "camera", ha="right", fontsize=11)
-    axes_cross(ax, (4.2, -1.1), {"x": (0.75, -0.2), "y": (0, 1.1), "z": (-0.6, -0.3)})
-    ax.text(4.35, 0.25, "model", fontsize=11)
-    ax.set(xlim=(-1, 5.5), ylim=(-1.9, 0.9), aspect="equal")
-
-
-def draw_pixels(ax: Axes) -> None:
-    """The corner of an image, with the coordinates of pixel centres."""
-    for line in range(5):
-        ax.plot([0, 4], [line, line], color="#9e9e9e", lw=1)
-        ax.plot([line, line], [0, 4], color="#9e9e9e", lw=1)
-    for column in range(4):
-        ax.plot(column + 0.5, 0.5, "o", color="#424242", ms=4)
-        ax.text(column + 0.5, 0.28, f"({column}, 0)", ha="center", va="center", fontsize=9)
-    ax.plot(0, 0, "s", color="#c62828", ms=6, clip_on=False)
-    ax.text(
-        0, -0.25, "corner: (-0.5, -0.5);\n(0, 0) in COLMAP and in JSON", color="#c62828", fontsize=9
-    )
-    ax.set(xlim=(-0.2, 4.4), ylim=(4.2, -0.9), aspect="equal")
-
-
-def conventions() -> None:
-    """Camera axes, the model's axes, and pixel centres; the same bytes every time."""
-    matplotlib.rcParams["svg.hashsalt"] = "cadalign"
-    figure, axes = plt.subplots(1, 2, figsize=(9.5, 3.4), width_ratios=(6, 4), layout="constrained")
-    draw_scene(axes[0])
-    draw_pixels(axes[1])
-    for ax in axes:
-        ax.set_axis_off()
-    figure.patch.set_facecolor("white")
-    figure.savefig(DOCS / "concepts" / "conventions.svg", metadata={"Date": None})
+        page.screenshot(path=DOCS / "annotator.png")
 
 
 def label(x: float, y: float, content: str, style: str = "") -> str:
@@ -316,5 +233,5 @@ def architecture() -> None:
 
 if __name__ == "__main__":
     tyro.extras.subcommand_cli_from_dict(
-        {each.__name__: each for each in (overview, chairs, annotator, conventions, architecture)}
+        {each.__name__: each for each in (overview, chairs, annotator, architecture)}
     )

@@ -1,25 +1,24 @@
-"""Search range and priors of an unknown focal length, from EXIF data for example."""
+"""Search range and priors of an unknown focal length."""
 
 from __future__ import annotations
 
 import logging
 import math
 import os
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 
 from cadalign.arrays import FloatArray, as_positive
-from cadalign.errors import InputError, brief
+from cadalign.errors import InputError
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
 
 logger = logging.getLogger("cadalign")
 
-SHORTEST, LONGEST = 0.1, 50.0
+_SHORTEST, _LONGEST = 0.1, 50.0
 """Over the longer side of the image: fields of view from 157 to 1 degrees."""
 _GRID = (0.15, 0.22, 0.3, 0.4, 0.55, 0.72, 0.95, 1.25, 1.65, 2.3, 3.3, 5.0, 10.0, 30.0)
 
@@ -29,33 +28,7 @@ _USUAL_FOCAL = 1.2  # over the longer side of the image
 _USUAL_SIGMA = 0.6
 _EXIF_SIGMA = 0.05  # roundings, focusing, and corrections of the lens inside the camera
 _SAME_LENS = 0.01
-_CONTRADICTION = 1.25
 _CONTRADICTING_SIGMAS = 3.0
-_FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
-# EXIF tags, and the length of their units [mm].
-_EXIF_IFD = 0x8769
-_MODEL = 0x0110
-_FOCAL_LENGTH = 0x920A
-_DIGITAL_ZOOM = 0xA404
-_FOCAL_LENGTH_35MM = 0xA405
-_PLANE_X_RESOLUTION = 0xA20E
-_PLANE_UNIT = 0xA210
-_PIXEL_X_DIMENSION = 0xA002
-_PIXEL_Y_DIMENSION = 0xA003
-_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-_SENSOR_WIDTHS_MM = (
-    (r"canon eos (5ds?r?|6d|r|rp|r[1356])( mark \w+|m\d)?$", 36.0),
-    (r"canon eos (\d{2,4}d\b|rebel|kiss|m\d*\b|r(7|10|50|100)$)", 22.3),
-    (r"nikon (d[3456][sx]?|d[678]\d\d[aes]?|z ?[56789f](_\d|ii)?)$", 35.9),
-    (r"nikon (d\d+\w?|z ?(30|50|fc)(_\d)?)$", 23.5),
-    (r"ilce-(1|7\w*|9\w*)$", 35.7),
-    (r"ilce-\d{4}|nex-\w+$", 23.5),
-    (r"x-(t|e|h|pro)\d+\w*$|x100\w*$", 23.5),
-    (r"e-(m|p|pl|pm)\d\w*$|dmc-g\w+$|dc-g\w+$", 17.3),
-    (r"dsc-rx100\w*$|fc6310\w*$|l1d-20c$", 13.2),
-    (r"hero\d", 6.17),
-)
-"""Widths of sensors by patterns of camera models' names in EXIF data, from their makers' data."""
 
 
 @dataclass(frozen=True)
@@ -152,13 +125,9 @@ class FocalPrior:
         DataError
             If the file is missing or not an image.
         """
-        from cadalign.io.images import open_photo  # only here: a known focal length needs none
+        from cadalign.io.exif import read_focal  # only here: a known focal length needs none
 
-        with open_photo(path) as image:
-            exif = image.getexif()
-            tags = {_MODEL: exif.get(_MODEL), **exif.get_ifd(_EXIF_IFD)}
-            width, height = image.size
-        focal = _focal_in_pixels(tags, width, height, str(path))
+        focal = read_focal(path)
         return None if focal is None else cls(focal, relative_sigma, "the photo's EXIF data")
 
 
@@ -200,7 +169,7 @@ def check_estimable(cameras: Sequence[Camera]) -> None:
 def focal_bounds(camera: Camera) -> tuple[float, float]:
     """The range in which the focal length is searched for [px]."""
     side = max(camera.width, camera.height)
-    return SHORTEST * side, LONGEST * side
+    return _SHORTEST * side, _LONGEST * side
 
 
 def log_focal_range(
@@ -246,68 +215,3 @@ def focal_doubt(camera: Camera, prior: PriorOption) -> EstimateWarning | None:
             "the keypoints fit best at one that no camera has",
         )
     return None
-
-
-def _focal_in_pixels(tags: Mapping[int, Any], width: int, height: int, where: str) -> float | None:
-    """The focal length that EXIF tags state, or None, with a warning where they can't be right."""
-    equivalent = _positive(tags, _FOCAL_LENGTH_35MM, "FocalLengthIn35mmFilm", where)
-    millimetres = _positive(tags, _FOCAL_LENGTH, "FocalLength", where)
-    density = _positive(tags, _PLANE_X_RESOLUTION, "FocalPlaneXResolution", where)
-    focals = []
-    if equivalent is not None:
-        focals.append(equivalent / _FULL_FRAME_DIAGONAL_MM * math.hypot(width, height))
-    original = _original_width(tags, width, height)
-    if millimetres is not None and original is not None:
-        # The 35 mm equivalent holds the digital zoom already, the lens's own focal length does not.
-        millimetres *= max(_positive(tags, _DIGITAL_ZOOM, "DigitalZoomRatio", where) or 1.0, 1.0)
-        name = str(tags.get(_MODEL) or "").strip("\0 ").lower()
-        sensors = [each for pattern, each in _SENSOR_WIDTHS_MM if re.match(pattern, name)]
-        if density is not None:
-            unit = _UNIT_MM.get(tags.get(_PLANE_UNIT, 2), 25.4)
-            focals.append(millimetres * density / unit * width / original)
-        elif equivalent is None and sensors:
-            focals.append(millimetres / sensors[0] * max(width, height))
-    side = max(width, height)
-    if any(not SHORTEST * side < focal < LONGEST * side for focal in focals):
-        named = ", ".join(f"{focal:.4g} px" for focal in focals)
-        logger.warning(
-            "%s: the EXIF data state a focal length of %s, which no camera has; ignored",
-            where,
-            named,
-        )
-        return None
-    if len(focals) == 2 and not 1 / _CONTRADICTION < focals[0] / focals[1] < _CONTRADICTION:
-        logger.warning(
-            "%s: the EXIF data contradict themselves, the focal length is %.4g px by its 35 mm "
-            "equivalent and %.4g px by the sensor's resolution; ignored",
-            where,
-            *focals,
-        )
-        return None
-    return focals[0] if focals else None
-
-
-def _positive(tags: Mapping[int, Any], tag: int, name: str, where: str) -> float | None:
-    """A tag's value; None where it is missing, or, with a warning, where it is nonsense."""
-    if tag not in tags:
-        return None
-    try:
-        value = float(tags[tag])
-    except (TypeError, ValueError, ZeroDivisionError):
-        value = math.nan
-    if 0 < value < math.inf:
-        return value
-    if tag in (_FOCAL_LENGTH_35MM, _DIGITAL_ZOOM) and value == 0:
-        return None  # EXIF's way to say that it is not known, or not used
-    logger.warning("%s: the EXIF data state %s %s; ignored", where, name, brief(tags[tag]))
-    return None
-
-
-def _original_width(tags: Mapping[int, Any], width: int, height: int) -> float | None:
-    """The width of the photo as it was taken [px]; None where it was cropped since."""
-    x, y = tags.get(_PIXEL_X_DIMENSION, width), tags.get(_PIXEL_Y_DIMENSION, height)
-    try:
-        same_shape = abs(x * height - y * width) <= 0.01 * y * width
-        return float(x) if same_shape and x > 0 else None
-    except (TypeError, ValueError):
-        return None

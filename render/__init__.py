@@ -19,10 +19,9 @@ if TYPE_CHECKING:
         normal_picture,
         pose_in_view,
     )
-    from cadalign.render.probe import Probe, make_renderer, probe_renderer
     from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry
     from cadalign.render.raycast.surface import Studio
-    from cadalign.render.scene import Frame, Geometry, Renderer, Scene
+    from cadalign.render.scene import Frame, Geometry, Scene
     from cadalign.render.viewpoints import (
         Viewpoint,
         frame_object,
@@ -37,9 +36,7 @@ __all__ = [
     "Frame",
     "Geometry",
     "OverlayStyle",
-    "Probe",
     "RaycastRenderer",
-    "Renderer",
     "Scene",
     "Studio",
     "Viewpoint",
@@ -54,11 +51,9 @@ __all__ = [
     "keypoint_picture",
     "line_picture",
     "look_at",
-    "make_renderer",
     "normal_picture",
     "overlay_model",
     "pose_in_view",
-    "probe_renderer",
     "sample_view",
     "silhouette_iou",
     "visible_keypoints",

@@ -8,9 +8,6 @@ if TYPE_CHECKING:
     from cadalign.geometry.alignment import Alignment, Box
     from cadalign.geometry.camera import Camera
     from cadalign.geometry.conventions import (
-        alignment_from_opengl,
-        opengl_from_model,
-        opengl_projection,
         up_from_gravity,
         up_from_pitch_roll,
         up_from_pose,
@@ -39,12 +36,9 @@ __all__ = [
     "Symmetry",
     "SymmetryAxis",
     "alignment_box_iou",
-    "alignment_from_opengl",
     "box_iou",
     "box_iou_up_to_scale",
     "nearest_truth",
-    "opengl_from_model",
-    "opengl_projection",
     "reprojection_error",
     "rotation_error",
     "scale_error",

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from cadalign.datasets.photos.dataset import PhotoDataset
-from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
+from cadalign.datasets.photos.pascal3d import Pascal3D
 from cadalign.datasets.photos.pix3d import Pix3D
 from cadalign.datasets.photos.scan2cad import Scan2CAD
-from cadalign.datasets.sfm import blind_pnp, colmap
+from cadalign.datasets.sfm.blind_pnp import BlindPnP
+from cadalign.datasets.sfm.colmap import Colmap
 from cadalign.datasets.sfm.correspondences import CorrespondenceSet
 from cadalign.errors import DataError, InputError
 from cadalign.io.files import as_path
 
-PHOTO_FORMATS = (Scan2CAD, Pix3D, Pascal3D, Pascal3DDetections)
+PHOTO_FORMATS = (Scan2CAD, Pix3D, Pascal3D)
 """The known formats, in the order in which they are looked for."""
 
 
@@ -26,8 +25,7 @@ def open_photos(path: str | os.PathLike[str]) -> PhotoDataset:
     Parameters
     ----------
     path : str or path-like
-        The folder; see the classes for what may lie in it: `Scan2CAD`, `Pix3D`, `Pascal3D`,
-        `Pascal3DDetections`.
+        The folder; see the classes for what may lie in it: `Scan2CAD`, `Pix3D`, `Pascal3D`.
 
     Returns
     -------
@@ -56,39 +54,7 @@ def open_photos(path: str | os.PathLike[str]) -> PhotoDataset:
     raise DataError(what, where=str(folder), fix=fix)
 
 
-@dataclass(frozen=True)
-class _Format:
-    """A format of correspondences, and the files that it is recognised by."""
-
-    load: Callable[[Path], CorrespondenceSet]  # makes the set of a folder
-    sought: str  # the files of this format, for messages
-    layouts: tuple[tuple[str, ...], ...]
-    """The files below a folder, which all belong to one of the layouts."""
-
-    def fit(self, folder: Path) -> int:
-        """2 for a folder that holds all files of a layout, 1 for some of them, 0 for none."""
-        best = 0
-        for layout in self.layouts:
-            files = [(folder / name).is_file() for name in layout]
-            if all(files):
-                return 2
-            best = max(best, int(any(files)))
-        return best
-
-
-_FORMATS = {
-    "colmap": _Format(
-        colmap.Colmap,
-        "cameras, images and points3D (.bin or .txt; also in sparse/0, sparse or 0)",
-        colmap.LAYOUTS,
-    ),
-    "blind-pnp": _Format(
-        blind_pnp.BlindPnP,
-        "matches.pkl, R.pkl and t.pkl, or p2d.pkl, p3d.pkl, R_gt.pkl and t_gt.pkl "
-        "(also in preprocessed)",
-        blind_pnp.LAYOUTS,
-    ),
-}
+_FORMATS: dict[str, type[Colmap] | type[BlindPnP]] = {"colmap": Colmap, "blind-pnp": BlindPnP}
 AUTO = "auto"
 """Recognise the format by the names of the files."""
 CORRESPONDENCE_FORMATS = (AUTO, *_FORMATS)
@@ -121,18 +87,16 @@ def open_correspondences(path: str | os.PathLike[str], *, format: str = AUTO) ->
         fix = f"known are {', '.join(CORRESPONDENCE_FORMATS)}"
         raise InputError(f"unknown format {format!r}", where="format", fix=fix)
     root = as_path(path)
-    return _FORMATS[_recognize(root) if format == AUTO else format].load(root)
+    return _FORMATS[_recognize(root) if format == AUTO else format](root)
 
 
 def _recognize(root: Path) -> str:
     if not root.is_dir():
         fix = "give the folder of the correspondences"
         raise DataError("no such folder", where=str(root), fix=fix)
-    # A layout with files missing is better named by its loader, which says which ones.
-    fits = {name: known.fit(root) for name, known in _FORMATS.items()}
-    found = [name for name, fit in fits.items() if fit and fit == max(fits.values())]
+    found = [name for name, known in _FORMATS.items() if known.is_here(root)]
     if not found:
-        sought = "; ".join(f"{name}: {known.sought}" for name, known in _FORMATS.items())
+        sought = "; ".join(f"{name}: {known.signature}" for name, known in _FORMATS.items())
         what = f"there are no correspondences of a known format. Looked for {sought}"
         raise DataError(what, where=str(root), fix="give the folder that holds such files")
     if len(found) > 1:

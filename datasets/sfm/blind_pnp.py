@@ -1,9 +1,7 @@
 """The NYU-RGBD and MegaDepth correspondences that blind PnP was trained on.
 
 Liu, Campbell, Li, Zhou, Song and Yang, "Learning 2D-3D Correspondences To Solve The Blind
-Perspective-n-Point Problem", 2020 (github.com/Liumouliu/Deep_blind_PnP); Campbell, Liu and Gould,
-"Solving the Blind Perspective-n-Point Problem End-To-End With Robust Differentiable Geometric
-Optimization", ECCV 2020 (github.com/dylan-campbell/bpnpnet).
+Perspective-n-Point Problem", 2020 (github.com/Liumouliu/Deep_blind_PnP).
 """
 
 from __future__ import annotations
@@ -14,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray, as_floats
+from cadalign.arrays import FloatArray, as_floats
 from cadalign.datasets.sfm.correspondences import (
     Correspondences,
     CorrespondenceSet,
@@ -33,37 +31,20 @@ DEFAULT_FOCAL = 800.0
 _LARGEST_IMAGE = 2**30
 # Pairs whose median distance under the true pose [normalised] is larger don't belong together.
 _PAIRED = 0.05
-
-
-LAYOUTS = tuple(
-    tuple(f"{folder}/{name}.pkl" for name in names)
-    for folder in (".", "preprocessed")
-    for names in (("matches", "R", "t"), ("p2d", "p3d", "R_gt", "t_gt"))
-)
-"""The pickles that a split needs, rotations and translations last, wherever they may lie."""
-_OPTIONAL = {
-    "matches": ("inlier_matches", "focal"),
-    "p2d": ("W_gt", "num_points_2d", "num_points_3d", "focal"),
-}
+_REQUIRED, _OPTIONAL = ("matches", "R", "t"), ("inlier_matches", "focal")
 
 
 class BlindPnP(CorrespondenceSet):
     """Samples of one split, such as ``nyu_train`` or ``megaDepth_valid``; ids are "0", "1", ...
 
-    Two layouts are understood. Each is a folder of pickles, each pickle a list with an entry per
-    sample, those in brackets optional::
+    A split is a folder of pickles, each pickle a list with an entry per sample, those in brackets
+    optional::
 
         matches.pkl  R.pkl  t.pkl  [inlier_matches.pkl  focal.pkl]
-        preprocessed/  p2d.pkl  p3d.pkl  R_gt.pkl  t_gt.pkl
-                       [W_gt.pkl  num_points_2d.pkl  num_points_3d.pkl  focal.pkl]
 
-    - ``matches`` (n, 5) has an image point and a scene point in each row. Where there is
-      ``inlier_matches`` (m, 2), its rows say which belong together: (row of the scene point, row
-      of the image point).
-    - ``p2d`` (n, 2) and ``p3d`` (m, 3) are shuffled, and padded with repetitions from
-      ``num_points_2d`` and ``num_points_3d`` on. Scene point j belongs to image point ``W_gt[j]``,
-      or to none where there is no such row. One of the sets is said to store it the other way
-      round; the true pose decides. Without ``W_gt`` the rows belong together as they are.
+    ``matches`` (n, 5) has an image point and a scene point in each row. Where there is
+    ``inlier_matches`` (m, 2), its rows say which belong together: (row of the scene point, row of
+    the image point).
 
     Image points are stored with the calibration taken out. They are given in the pixels of a
     virtual camera of the sample's focal length, whose image is just large enough for them.
@@ -93,88 +74,64 @@ class BlindPnP(CorrespondenceSet):
     >>> samples[0].cam_from_world.translation  # doctest: +SKIP
     """
 
+    layouts = (tuple(f"{name}.pkl" for name in _REQUIRED),)
+    signature = "matches.pkl, R.pkl and t.pkl"
+
     def __init__(self, path: str | os.PathLike[str], *, focal: float | None = None) -> None:
         if focal is not None and not (np.isfinite(focal) and focal > 0):
             raise InputError(f"{focal!r} is not a focal length", where="focal")
         self._focal = focal
-        fix = "give a split's folder, which holds matches.pkl, R.pkl and t.pkl, or preprocessed/"
+        folder = as_path(path)
+        fix = "give a split's folder, which holds matches.pkl, R.pkl and t.pkl"
         nothing = "there are no correspondences"
-        required = find_layout(as_path(path), LAYOUTS, nothing=nothing, fix=fix)
-        folder, first = required[0].parent, required[0].stem
-        optional = (folder / f"{name}.pkl" for name in _OPTIONAL[first])
+        required = find_layout(folder, self.layouts, nothing=nothing, fix=fix)
+        optional = (folder / f"{name}.pkl" for name in _OPTIONAL)
         self._files = {file.stem: file for file in (*required, *filter(Path.is_file, optional))}
-        self._is_matches = first == "matches"
-        *_, self._rotation, self._translation = (file.stem for file in required)
         # The smallest file is enough to count the samples.
-        translations = _load_samples(self._files[self._translation])
-        self._data: dict[str, Any] = {self._translation: translations}
-        super().__init__(folder, [str(position) for position in range(len(translations))])
+        self._data: dict[str, Any] = {"t": _load_samples(self._files["t"])}
+        super().__init__(folder, [str(position) for position in range(len(self._data["t"]))])
 
     def _prepare(self) -> None:
         for name, file in self._files.items():
             if name not in self._data:
                 samples = _load_samples(file)
                 if len(samples) != len(self):
-                    what = f"holds {len(samples)} samples, {self._translation}.pkl {len(self)}"
+                    what = f"holds {len(samples)} samples, t.pkl {len(self)}"
                     fix = "the files must be of one split; get them again"
                     raise DataError(what, where=str(file), fix=fix)
                 self._data[name] = samples
 
     def _read(self, position: int) -> Correspondences:
-        rotation = self._array(self._rotation, position, shape=(3, 3))
-        pose = rigid_pose(rotation, self._flat(self._translation, position))
-        if self._is_matches:
-            rays, points_3d = self._matched(position)
-        else:
-            rays, points_3d = self._paired(position, pose)
+        rotation = self._array("R", position, shape=(3, 3))
+        pose = rigid_pose(rotation, self._flat("t", position))
+        rays, points_3d = self._matched(position)
         if not len(rays):
-            where = "matches" if self._is_matches else "p2d"
-            raise InputError("there are no correspondences", where=where)
+            raise InputError("there are no correspondences", where="matches")
         distance = _distance(rays, points_3d, pose)
         if not distance <= _PAIRED:
             raise InputError(
                 f"under the true pose the {len(rays)} pairs of points are {distance:.2g} apart, "
                 "in normalised coordinates and the median",
                 where="true pose",
-                fix="is W_gt.pkl or inlier_matches.pkl, which says what belongs together, missing?",
+                fix="is inlier_matches.pkl, which says what belongs together, missing?",
             )
         camera = _virtual_camera(self._focal_lengths(position), rays)
         pixels = camera.pixels_from_normalized(rays)
         return Correspondences(self.ids[position], points_3d, pixels, camera, pose)
 
     def _matched(self, position: int) -> tuple[FloatArray, FloatArray]:
-        """Image points (n, 2) and scene points (n, 3) out of ``matches``."""
+        """Image points (n, 2) and scene points (n, 3) that belong together."""
         rows = self._array("matches", position, shape=(None, 5))
         rays, points_3d = rows[:, :2], rows[:, 2:]
         if "inlier_matches" not in self._data:
             return rays, points_3d
-        pairs = _rows(self._array("inlier_matches", position, shape=(None, 2)))
-        bad = pairs[(pairs < 0) | (pairs >= len(rows))]
+        numbers = self._array("inlier_matches", position, shape=(None, 2))
+        bad = numbers[(numbers < 0) | (numbers >= len(rows))]
         if len(bad):
-            what = f"names row {bad[0]} of {len(rows)} in matches"
+            what = f"names row {bad[0]:g} of {len(rows)} in matches"
             raise InputError(what, where="inlier_matches")
-        return rays[pairs[:, 1]], points_3d[pairs[:, 0]]
-
-    def _paired(self, position: int, pose: Alignment) -> tuple[FloatArray, FloatArray]:
-        """Image points (n, 2) and scene points (n, 3) of the preprocessed layout."""
-        rays = self._array("p2d", position, shape=(None, 2))[: self._count("2d", position)]
-        points_3d = self._array("p3d", position, shape=(None, 3))[: self._count("3d", position)]
-        if "W_gt" not in self._data:
-            if len(rays) != len(points_3d):
-                what = f"{len(rays)} image points but {len(points_3d)} scene points"
-                fix = "W_gt.pkl, which says which belong together, is missing"
-                raise InputError(what, where="p2d", fix=fix)
-            return rays, points_3d
-        partners = _rows(self._flat("W_gt", position))
-        scene_rows, image_rows = _pairs(partners, len(points_3d), len(rays))
-        usual = rays[image_rows], points_3d[scene_rows]
-        image_rows, scene_rows = _pairs(partners, len(rays), len(points_3d))
-        inverted = rays[image_rows], points_3d[scene_rows]
-        return min(usual, inverted, key=lambda pair: _distance(pair[0], pair[1], pose))
-
-    def _count(self, kind: str, position: int) -> int | None:
-        name = f"num_points_{kind}"
-        return int(self._flat(name, position)[0]) if name in self._data else None
+        scene_rows, image_rows = numbers.astype(np.int64).T
+        return rays[image_rows], points_3d[scene_rows]
 
     def _focal_lengths(self, position: int) -> FloatArray:
         """One focal length [px], or those along x and y."""
@@ -215,27 +172,14 @@ def _load_samples(file: Path) -> Any:
     return value
 
 
-def _rows(numbers: FloatArray) -> IntArray:
-    """Row numbers as integers; -1 where one is beyond all rows."""
-    return np.where(np.abs(numbers) < 2**53, numbers, -1.0).astype(np.int64)
-
-
-def _pairs(partners: IntArray, from_count: int, to_count: int) -> tuple[IntArray, IntArray]:
-    """The rows i with a partner, and their partners, where ``partners[i]`` is that of row i."""
-    rows = np.arange(min(from_count, len(partners)))
-    chosen = partners[rows]
-    known = (chosen >= 0) & (chosen < to_count)
-    return rows[known], chosen[known]
-
-
 def _distance(rays: FloatArray, points_3d: FloatArray, pose: Alignment) -> float:
-    """The median distance of pairs under a pose, in normalised coordinates; inf if none."""
+    """The median distance of pairs under a pose, in normalised coordinates."""
     points_cam = pose.apply(points_3d)
     in_front = points_cam[:, 2] > 0
     gaps = np.full(len(rays), np.inf)
     projected = points_cam[in_front, :2] / points_cam[in_front, 2:]
     gaps[in_front] = np.linalg.norm(projected - rays[in_front], axis=1)
-    return float(np.median(gaps)) if len(gaps) else np.inf
+    return float(np.median(gaps))
 
 
 def _virtual_camera(focal_lengths: FloatArray, rays: FloatArray) -> Camera:

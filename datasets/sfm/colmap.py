@@ -31,13 +31,6 @@ from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.io.documents import in_file
 from cadalign.io.files import as_path, damaged, read_bytes, read_text
 
-_STEMS = ("cameras", "images", "points3D")
-LAYOUTS = tuple(
-    tuple(f"{folder}/{stem}{suffix}" for stem in _STEMS)
-    for folder in (".", "sparse/0", "sparse", "0")
-    for suffix in (".bin", ".txt")  # COLMAP itself prefers the binary files where both are there
-)
-"""The files of a model below a folder, in each of the places where they may lie."""
 _INVALID_POINT = -1  # of an observation that belongs to no point
 _MOST_BYTES = 2**37  # of one file: models of cities have billions of observations
 
@@ -88,9 +81,17 @@ class Colmap(CorrespondenceSet):
     0.25
     """
 
+    layouts = tuple(
+        tuple(f"{folder}/{stem}{suffix}" for stem in ("cameras", "images", "points3D"))
+        for folder in (".", "sparse/0", "sparse", "0")
+        for suffix in (".bin", ".txt")  # COLMAP itself prefers the binary files
+    )
+    signature = "cameras, images and points3D (.bin or .txt; also in sparse/0, sparse or 0)"
+
     def __init__(self, path: str | os.PathLike[str]) -> None:
         fix = "give the folder of cameras, images and points3D, all three as .bin or as .txt"
-        files = find_layout(as_path(path), LAYOUTS, nothing="there is no COLMAP model", fix=fix)
+        nothing = "there is no COLMAP model"
+        files = find_layout(as_path(path), self.layouts, nothing=nothing, fix=fix)
         self._camera_file, image_file, self._point_file = files
         is_text = image_file.suffix == ".txt"
         read_cameras, read_points, read_images = _TEXT_READERS if is_text else _BINARY_READERS

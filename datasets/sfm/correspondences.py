@@ -127,6 +127,11 @@ class CorrespondenceSet(ABC):
         The images' names, each once.
     """
 
+    layouts: tuple[tuple[str, ...], ...] = ()
+    """The files below a folder that belong together, in each of the places where they may lie."""
+    signature: str = ""
+    """These files, for messages."""
+
     def __init__(self, source: Path, ids: Sequence[str]) -> None:
         self.source = source
         self.ids = tuple(ids)
@@ -136,6 +141,11 @@ class CorrespondenceSet(ABC):
             twice = next(name for i, name in enumerate(self.ids) if self._positions[name] != i)
             what = f"the image {twice!r} occurs twice"
             raise DataError(what, where=str(source), fix="remove one of them")
+
+    @classmethod
+    def is_here(cls, folder: Path) -> bool:
+        """True for a folder that holds files of this format."""
+        return any((folder / name).is_file() for layout in cls.layouts for name in layout)
 
     @abstractmethod
     def _read(self, position: int) -> Correspondences:

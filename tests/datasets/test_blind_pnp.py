@@ -1,4 +1,4 @@
-"""Blind PnP's pickles: both layouts arrive as correspondences, and no pickle runs code."""
+"""Blind PnP's pickles arrive as correspondences, and no pickle runs code."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def random_rotation(rng) -> np.ndarray:
 
 
 class Samples:
-    """Scenes with poses, in both layouts' terms."""
+    """Scenes with poses."""
 
     def __init__(self, dtype: type = np.float64) -> None:
         rng = np.random.default_rng(7)
@@ -72,19 +72,6 @@ class Samples:
     def matches(self) -> dict:
         rows = [np.hstack(pair) for pair in zip(self.p2d, self.p3d, strict=True)]
         return {"matches": rows, "R": self.R, "t": self.t}
-
-    def preprocessed(self, padded: int = 20) -> dict:
-        """As bpnpnet makes them: scene points permuted, everything tiled to one length."""
-        data = {"p2d": {}, "p3d": {}, "W_gt": {}, "num_points_2d": {}, "num_points_3d": {}}
-        for i, (rays, points) in enumerate(zip(self.p2d, self.p3d, strict=True)):
-            order = self.rng.permutation(len(points))
-            tiles = padded // len(points) + 1
-            data["p2d"][i] = np.tile(rays, (tiles, 1))[:padded]
-            data["p3d"][i] = np.tile(points[order], (tiles, 1))[:padded]
-            data["W_gt"][i] = np.tile(order, tiles)[:padded]
-            data["num_points_2d"][i] = np.array([len(points)])
-            data["num_points_3d"][i] = np.array([len(points)])
-        return data | {"R_gt": self.R, "t_gt": self.t}
 
     def write(self, folder: Path, data: dict | None = None) -> Path:
         for name, value in (self.matches() if data is None else data).items():
@@ -124,37 +111,6 @@ def test_inlier_matches_say_what_belongs_together(tmp_path):
     loaded = list(BlindPnP(samples.write(tmp_path, data)))
     assert [len(sample) for sample in loaded] == [8, 9, 10, 11]
     for sample in loaded:
-        np.testing.assert_allclose(sample.residuals(), 0, atol=1e-9)
-
-
-@pytest.mark.parametrize("inverted", [False, True])
-def test_preprocessed_points_are_paired_and_padding_is_dropped(tmp_path, inverted):
-    samples = Samples()
-    data = samples.preprocessed()
-    if inverted:  # image point i belongs to scene point W_gt[i]
-        for i, points in enumerate(samples.p3d):
-            data["W_gt"][i] = np.argsort(data["W_gt"][i][: len(points)])
-    folder = samples.write(tmp_path / "megadepth_test" / "preprocessed", data).parent
-    loaded = list(BlindPnP(folder))
-    assert [len(sample) for sample in loaded] == [9, 10, 11, 12]
-    for i, sample in enumerate(loaded):
-        np.testing.assert_allclose(sample.residuals(), 0, atol=1e-9)
-        assert sorted(sample.points_3d.tolist()) == sorted(samples.p3d[i].tolist())
-
-
-def test_points_without_partner_are_left_out(tmp_path):
-    samples = Samples()
-    data = samples.preprocessed()
-    data["W_gt"][1][[2, 5]] = 20  # as many as there are image points: none
-    sample = BlindPnP(samples.write(tmp_path, data))[1]
-    assert len(sample) == 8
-    np.testing.assert_allclose(sample.residuals(), 0, atol=1e-9)
-
-
-def test_preprocessed_rows_correspond_without_a_permutation(tmp_path):
-    samples = Samples()
-    data = {"p2d": samples.p2d, "p3d": samples.p3d, "R_gt": samples.R, "t_gt": samples.t}
-    for sample in BlindPnP(samples.write(tmp_path, data)):
         np.testing.assert_allclose(sample.residuals(), 0, atol=1e-9)
 
 
@@ -246,14 +202,11 @@ def test_a_bad_sample_is_named_and_spoils_no_other(tmp_path, name, value, messag
     assert caught.value.where.startswith(f"{tmp_path}, image 1")
 
 
-def test_shuffled_points_without_their_permutation_are_refused(tmp_path):
+def test_shuffled_points_are_refused(tmp_path):
     samples = Samples()
-    data = samples.preprocessed()
-    del data["W_gt"]
-    with pytest.raises(DataError, match=r"under the true pose .* apart.*W_gt.pkl"):
-        BlindPnP(samples.write(tmp_path, data))[0]
-    data["p2d"][0] = data["p2d"][0][:5]
-    with pytest.raises(DataError, match=r"5 image points but 9 scene points; W_gt.pkl"):
+    data = samples.matches()
+    data["matches"][0] = np.hstack([samples.p2d[0][::-1], samples.p3d[0]])
+    with pytest.raises(DataError, match=r"under the true pose .* apart.*inlier_matches.pkl"):
         BlindPnP(samples.write(tmp_path, data))[0]
 
 

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from fuzz.format import Format
 from PIL import Image
-from scipy.io import savemat
 from support.gltf_files import write_gltf
-from support.photo_data import read_whole, write_photo, write_text
+from support.photo_data import read_whole, write_text
 from support.photo_sets import WRITERS
 
 from cadalign import Alignment, Camera, Model, Result, ShapeModel, Size, View, align
@@ -52,23 +51,6 @@ def _photo_set(kind: str, changed: str) -> Format:
 
     depth = len(Path(changed).parts) - 1
     return Format(f"{kind} {changed}", write, lambda path: read_whole(path.parents[depth]))
-
-
-# --- data sets of which no tiny whole one is written elsewhere ---------------------------------
-
-
-def _write_detections(folder: Path) -> Path:
-    """Photos of PASCAL3D+ with detected keypoints."""
-    root = folder / "set"
-    lists = {
-        "imgname": np.array(["a", "b"], dtype=object),
-        "class": np.array(["chair", "bus"], dtype=object),
-        "cad_index": np.array([1.0, 3.0]),
-    }
-    (root / "annot").mkdir(parents=True)
-    savemat(root / "annot" / "valid.mat", {"annot": lists}, do_compression=True)
-    write_photo(root / "images" / "a.jpg")
-    return root / "annot" / "valid.mat"
 
 
 # --- shapes, results, estimates, masks, cameras ------------------------------------------------
@@ -181,7 +163,6 @@ def _write_scene(folder: Path) -> Path:
 
 FORMATS = (
     *(_photo_set(kind, changed) for kind, names in _CHANGED.items() for changed in names),
-    Format("PASCAL3D+ detections", _write_detections, lambda path: read_whole(path.parents[1])),
     Format("shape", _write_shape, ShapeModel.open),
     Format("forged shape", _write_shape, ShapeModel.open, sealed(SEAL)),
     Format(

@@ -21,7 +21,6 @@ from cadalign.datasets import (
     KeypointNet,
     ModelKeypoints,
     Pascal3D,
-    Pascal3DDetections,
     Pix3D,
     Scan2CAD,
     ShapeNet,
@@ -145,7 +144,7 @@ class Opened:
     "read",
     [
         *dict.fromkeys(each.read for each in READERS),
-        *(KeypointNet, ShapeNet, Scan2CAD, Pix3D, Pascal3D, Pascal3DDetections),
+        *(KeypointNet, ShapeNet, Scan2CAD, Pix3D, Pascal3D),
         *(Colmap, BlindPnP, open_correspondences),
         *(open_photos, ModelKeypoints.load, Result.load, Results.open),
         *(FocalPrior.from_exif, photo_size),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -136,27 +135,6 @@ def write_pascal3d(root: Path) -> Path:
         name: {"location": pixel, "status": 1.0} for name, pixel in zip(NAMES, pixels, strict=True)
     }
     _write_record(path, found)
-    return root
-
-
-def write_detections(root: Path, *, photos: int) -> Path:
-    """Photos of PASCAL3D+ with detected keypoints of the box, and without poses."""
-    write_pascal3d(root)
-    shutil.rmtree(root / "Annotations")
-    pixels = pixels_of(pose(0))
-    marks = [
-        {"name": name, "uv": uv.tolist(), "confidence": 0.9}
-        for name, uv in zip(NAMES, pixels, strict=True)
-    ]
-    names = [str(number) for number in range(photos)]
-    for name in names:
-        write_photo(root / "Images" / f"{name}.jpg", 320, 240)
-        observation = {"image": f"../Images/{name}.jpg", "keypoints": marks}
-        write_json(root / "observations" / f"{name}.json", observation)
-    lists = {"imgname": np.array(names, dtype=object), "cad_index": np.ones(photos)}
-    lists["class"] = np.array(["chair"] * photos, dtype=object)
-    (root / "annot").mkdir()
-    _write_mat(root / "annot" / "valid.mat", {"annot": lists})
     return root
 
 

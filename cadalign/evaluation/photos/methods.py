@@ -10,7 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from cadalign.arrays import BoolArray, FloatArray, instance_rng
-from cadalign.datasets.photos.photo import NamedPoints, PhotoObject
+from cadalign.datasets.photos.photo import NamedPoints, PhotoKeypoints
 from cadalign.estimation.align import align
 from cadalign.estimation.fit import fit
 from cadalign.estimation.model import Model
@@ -29,7 +29,7 @@ from cadalign.geometry.mesh import Mesh
 from cadalign.render.viewpoints import visible_keypoints
 from cadalign.shapes.model import ShapeModel
 
-ANNOTATED, DETECTED = "annotated", "detected"
+ANNOTATED = "annotated"
 _LEAST_PX = 0.5  # a standard deviation that keypoints are given at least
 # Evidence about the model's outline, which needs a mesh.
 _OUTLINED = frozenset({protocols.MASK, protocols.IMAGE})
@@ -73,8 +73,8 @@ def sight(target: PhotoTarget, protocol: Protocol, options: KeypointOptions) -> 
     model = cad.model.load_keypoints()
     marks = target.found.keypoints
     if marks is not None and model is not None:
-        source = ANNOTATED if marks.scores is None else DETECTED
-        names, pixels = _marked(target.found, model, options.min_score)
+        source = ANNOTATED
+        names, pixels = _marked(marks, model)
     else:
         source = protocols.SIMULATED
         model, names, pixels = _simulated(target, camera, cad, model, options)
@@ -97,15 +97,9 @@ def sight(target: PhotoTarget, protocol: Protocol, options: KeypointOptions) -> 
     return sighting if camera.focal_known else _calibrated(sighting)
 
 
-def _marked(
-    found: PhotoObject, model: NamedPoints, min_score: float
-) -> tuple[tuple[str, ...], FloatArray]:
+def _marked(marks: PhotoKeypoints, model: NamedPoints) -> tuple[tuple[str, ...], FloatArray]:
     """The visible keypoints that the model has, and their pixels."""
-    marks = found.keypoints
-    assert marks is not None
     good = marks.visible & np.isin(marks.names, model.names)
-    if marks.scores is not None:
-        good &= marks.scores > min_score
     return tuple(np.array(marks.names)[good].tolist()), marks.points_2d[good]
 
 

@@ -9,7 +9,7 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
+from cadalign.datasets.photos.pascal3d import Pascal3D
 from cadalign.datasets.photos.pix3d import Pix3D
 from cadalign.datasets.photos.scan2cad import Scan2CAD
 from cadalign.errors import InputError, quote
@@ -105,12 +105,10 @@ class KeypointOptions(ExperimentOptions):
     simulated_points: int = 24
     """Number of points on a model of which the visible ones are simulated keypoints."""
     sigma: float | None = None
-    """Standard deviation of annotated or detected keypoints that methods are given, in pixels; by
+    """Standard deviation of annotated keypoints that methods are given, in pixels; by
     default that of the data set."""
     min_keypoints: int = 6
     """Objects with fewer keypoints are left out."""
-    min_score: float = 0.4
-    """Detected keypoints with lower scores are not used."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -118,8 +116,6 @@ class KeypointOptions(ExperimentOptions):
         if self.sigma is not None and not 0 < self.sigma < math.inf:
             raise InputError(f"{self.sigma} is not positive", where="sigma")
         self.check_noise("simulated_noise_px")
-        if not math.isfinite(self.min_score):
-            raise InputError(f"{self.min_score} is not a score", where="min_score")
 
 
 SETS = (VIEWPOINT, NINE_DOF, SCAN2CAD)
@@ -145,7 +141,6 @@ _PROTOCOLS = {
     Scan2CAD.kind: Protocol((VIEWPOINT, SCAN2CAD, NINE_DOF), SIMILAR, sigma_of_width=1 / 60),
     Pix3D.kind: Protocol((VIEWPOINT, NINE_DOF), RIGID),
     Pascal3D.kind: Protocol((VIEWPOINT,), SIMILAR, up_axis="z"),
-    Pascal3DDetections.kind: Protocol((VIEWPOINT,), SIMILAR, up_axis="z"),
 }
 _OTHER = Protocol((VIEWPOINT, NINE_DOF), PRIOR)
 

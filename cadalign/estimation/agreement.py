@@ -11,12 +11,14 @@ import numpy as np
 
 from cadalign.errors import CadalignError
 from cadalign.estimation.model import Model, is_exact_model
-from cadalign.estimation.options import FitOptions, RansacOptions, Sigma, pixel_information
+from cadalign.estimation.options import RansacOptions, Sigma, pixel_information
 from cadalign.estimation.uncertainty.doubts import FALSE_ALARMS, is_large_sigma
-from cadalign.estimation.uncertainty.residuals import area_of, chi_square_tail, f_quantile
+from cadalign.estimation.uncertainty.residuals import area_of, chance_of, f_quantile
 from cadalign.estimation.view import View, numbered
-from cadalign.estimation.warning import EstimateWarning
+from cadalign.estimation.warning import Kind
+from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.parts import inflation_with, probability_within
 
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
@@ -25,20 +27,19 @@ AnyModel = Model | ShapeModel
 
 AS_MANY_AGREE = 12.0
 """Gain of -2 log likelihood by a mistake that is corrected, at least."""
-_DOUBTFUL = 1e-4  # probability of such residuals by chance, below which mistakes are looked for
 _MOST_CORRECTED = 1.6  # residuals of uncertain shapes without a mistake, over their deviations
 _LEAST_RATIO = 1.7  # of the residuals with and without it
+_MUCH_LESS = 5.0  # the same, where those without it are of a wrong sigma
 _MORE_AGREE = 2.0  # of -2 log likelihood, that is gained where more keypoints agree
 _AS_MANY_ARE_FOUND = 2 * math.log(100)  # the same after a robust search, where as many do
 _FEW_REJECTED = 0.1  # share of the keypoints, up to which an uncertain shape is not doubted
 _MOST_REJECTED = 1 / 3  # share of the keypoints that are outliers; more are none
 _CHANCE_OF_RATIO = 1e-3  # that residuals of an unknown noise differ by as much
 _UPRIGHT = 0.5  # cosine between the model's y axis and the photo's upwards, at least
-_EQUATIONS = {"keypoints": 2, "gravity": 2, "depth": 1, "size": 1, "camera height": 1}
 
 
 class Again(Protocol):
-    """Estimate without a diagnosis; ``changes`` are those of its `FitOptions`."""
+    """Estimate without a diagnosis; ``changes`` are those of its options, ransac and size."""
 
     def __call__(self, model: AnyModel, views: Sequence[View], /, **changes: Any) -> Result:
         """Raises CadalignError if there is none."""
@@ -47,27 +48,26 @@ class Again(Protocol):
 class Rule(NamedTuple):
     """A cause of residuals that are too large.
 
-    What is undone: ``undo_view``, ``undo_model``, and ``changes`` of the options. What the estimate
-    must explain: so much ``gain`` of -2 log likelihood. What is said: a ``clause`` that names a
-    usual mistake, or what ``says`` makes of the agreement without the cause and with it.
+    What is undone: ``undo_view``, ``undo_model``, and ``changes`` of the options; a view that is
+    None is left out. What the estimate must explain: so much ``gain`` of -2 log likelihood, and a
+    ``price`` of each equation that it lacks. What is said: the ``kind`` has a text, in which the
+    ``clause`` stands, with those of rules of the kind that are as likely.
     """
 
+    kind: Kind
     clause: str = ""
-    undo_view: Callable[[View], View] = lambda view: view
+    undo_view: Callable[[View], View | None] = lambda view: view
     undo_model: Callable[[Model], Model] = lambda model: model
     changes: Mapping[str, Any] = {}
     gain: float = AS_MANY_AGREE
-    says: Callable[[Agreement, Agreement], EstimateWarning] | None = None
-
-
-AS_GIVEN = Rule()
-"""Nothing is undone."""
+    price: float = 0.0
 
 
 class Agreement(NamedTuple):
     """Agreement of all evidence with an estimate.
 
-    The ``score`` is -2 log likelihood of all keypoints, of which outliers lie anywhere.
+    The ``score`` is -2 log likelihood of all keypoints, of which outliers lie anywhere, and
+    ``squares`` are the sums of squared residuals of every view's keypoints.
     """
 
     result: Result
@@ -77,6 +77,7 @@ class Agreement(NamedTuple):
     inliers: int
     keypoints: int
     sigma: float | None  # estimated [px]
+    squares: Sequence[float]
 
     @property
     def ratio(self) -> float:
@@ -97,27 +98,42 @@ class DiagnosisCase:
     views: Sequence[View]
     again: Again
     ransac: RansacOptions | None = None
-    options: FitOptions | None = None  # of a fit to keypoints of known noise, without a search
+    size: Size | None = None
+    has_rows: bool = False  # the ids of keypoints are their rows
 
     @property
     def inflation(self) -> float:
         """Factor on the deviations of a learned shape."""
-        return float(getattr(self.model, "inflation", 1.0))
+        if isinstance(self.model, Model):
+            return 1.0
+        count = sum(len(view.keypoint_ids) for view in self.views)
+        return inflation_with(count, self.model.inflation, self.model.few_keypoints)
 
     @property
     def is_exact(self) -> bool:
         """True for a CAD model whose object has its shape, but for the stretch."""
         return is_exact_model(self.model)
 
+    @property
+    def is_plain(self) -> bool:
+        """True where keypoints of known noise in one view and an exact model are all."""
+        first, *others = self.views
+        is_alone = not (others or first.sources or self.size or self.ransac)
+        return is_alone and self.is_exact and first.sigma is not None
+
     @np.errstate(all="ignore")  # what is not finite is refused
-    def without(self, rule: Rule) -> Agreement | None:
+    def without(self, rule: Rule | None) -> Agreement | None:
         """The agreement after a cause is undone; None where there is no estimate."""
-        model = self.model
+        model, views, changes = self.model, list(self.views), {} if rule is None else rule.changes
         try:
             if isinstance(model, Model):
-                model = rule.undo_model(replace(model, mesh=None) if model.mesh else model)
-            views = numbered([rule.undo_view(view) for view in self.views])
-            result = self.again(model, views, **rule.changes)
+                model = replace(model, mesh=None) if model.mesh else model
+                model = model if rule is None else rule.undo_model(model)
+            if rule is not None:
+                undone = map(rule.undo_view, views)
+                views = [each for each in undone if each is not None and each.has_evidence]
+            views = numbered(views)
+            result = self.again(model, views, **changes)
             return replace(self, model=model, views=views).agreement(result)
         except CadalignError:
             return None
@@ -126,7 +142,7 @@ class DiagnosisCase:
     def agreement(self, result: Result) -> Agreement:
         """The agreement of views that take part in a result."""
         views, ransac = self.views, self.ransac
-        score, squares, inliers, count = 0.0, 0.0, 0, 0
+        score, squares, inliers, count = 0.0, [], 0, 0
         for view in views:
             own = result.views[view.number]
             sigma: Sigma = result.sigma or 1.0 if view.sigma is None else view.sigma
@@ -135,39 +151,51 @@ class DiagnosisCase:
             if ransac is not None and result.options is not None:
                 kept = kept & (np.linalg.norm(own.residuals, axis=1) < threshold)
             inliers, count = inliers + int(kept.sum()), count + len(kept)
-            if len(kept):
-                seen = own.residuals[kept], information[kept]
-                squares += float(np.einsum("ni,nij,nj->", seen[0], seen[1], seen[0]))
-                score += float((math.log(4 * math.pi**2) - np.log(np.linalg.det(seen[1]))).sum())
-                if not kept.all():
-                    area = area_of(own.points_2d, own.camera, threshold)
-                    score += 2 * math.log(area) * int((~kept).sum())
-        kinds = {each.kind for each in result.evidence}
-        is_whole = inliers == int(result.inliers.sum())
-        if result.cost is not None and is_whole and not kinds & {"mask", "photo"}:
-            squares = result.cost
-        equations = sum(_EQUATIONS.get(each.kind, 0) * each.count for each in result.evidence)
-        unknowns = 6 * (1 if views[0].cam_from_rig is not None else len(views))
-        unknowns += len(result.stretched_axes) + (result.focal == "estimate")
-        equations += result.focal == "estimate" and result.focal_prior is not None
-        if isinstance(self.model, Model):
-            options, scale = self.model.fit_options(), result.alignment.scale
-            equations += options.prior_equations(np.ones(3) if self.options is None else scale)
-            score += float((np.log(scale / scale.mean()) ** 2).sum())  # outliers invite extremes
-        return Agreement(
-            result,
-            score + squares,
-            squares,
-            equations - unknowns,
-            inliers,
-            count,
-            result.sigma if any(view.sigma is None for view in views) else None,
-        )
+            residuals, information = own.residuals[kept], information[kept]
+            squares.append(float(np.einsum("ni,nij,nj->", residuals, information, residuals)))
+            score += float((math.log(4 * math.pi**2) - np.log(np.linalg.det(information))).sum())
+            if not kept.all():
+                area = area_of(own.points_2d, own.camera, threshold)
+                score += 2 * math.log(area) * int((~kept).sum())
+        chi_square, redundancy = sum(squares), result.posterior.redundancy
+        if any(view.has_outline for view in views):
+            poses = 1 if views[0].cam_from_rig is not None else len(views)
+            redundancy = 2 * inliers - 6 * poses - len(result.stretched_axes)
+        elif result.cost is not None and inliers == int(result.inliers.sum()):
+            chi_square = result.cost
+        if isinstance(self.model, Model):  # outliers invite extreme stretches
+            logs = np.log(result.alignment.scale)
+            score += float(((logs - logs.mean()) ** 2).sum())
+        noise = result.sigma if any(view.sigma is None for view in views) else None
+        agreed = inliers, count, noise, squares
+        return Agreement(result, score + chi_square, chi_square, redundancy, *agreed)
 
-    def has_chance(self, found: Agreement, probability: float) -> bool:
-        """True if noise leaves such residuals with this probability at least."""
-        squares = found.chi_square / self.inflation**2
-        return found.redundancy <= 0 or chi_square_tail(squares, found.redundancy) >= probability
+    def has_chance(self, found: Agreement) -> bool:
+        """True if noise, unless it is estimated, and the spread of shapes may leave this."""
+        if found.sigma is not None:
+            return True
+        squares, freedom = found.chi_square / self.inflation**2, found.result.degrees_of_freedom
+        return chance_of(squares, found.redundancy, freedom) >= FALSE_ALARMS
+
+    def has_contradiction(self, found: Agreement) -> bool:
+        """True if a piece of evidence, alone, has residuals beyond its noise.
+
+        Of a learned shape in one view, a keypoint is a piece: where the shape's deviations have
+        tails, the others and the prior tell its own scale.
+        """
+        pieces, posterior = found.result.evidence, found.result.posterior
+        if posterior.misses is not None and found.chi_square >= found.redundancy > 0:
+            (alone, total), freedom, others = posterior.misses, posterior.degrees_of_freedom, None
+            if freedom is not None:
+                others = freedom + found.redundancy - 2
+                alone *= (others - 2) / (freedom - 2 + total - alone)
+            chance = 1 - probability_within(alone, 2, others)
+            return bool(found.keypoints * chance < FALSE_ALARMS)
+        counts = [each.count * (1 + (each.kind in ("keypoints", "gravity"))) for each in pieces]
+        return len(pieces) > 1 and any(
+            chance_of(count * each.rms_sigmas**2, count) * len(pieces) < FALSE_ALARMS
+            for each, count in zip(pieces, counts, strict=True)
+        )
 
     def is_doubtful(self, given: Agreement) -> bool:
         """True if the residuals fail the test for mistakes.
@@ -181,23 +209,32 @@ class DiagnosisCase:
         if self.ransac is not None and (self.is_exact or given.ratio >= 1):
             return True
         if given.sigma is None:
-            return not self.has_chance(given, _DOUBTFUL)
+            return not self.has_chance(given) or self.has_contradiction(given)
         pixels = [view.pixels for view in self.views]
         return given.redundancy > 0 and is_large_sigma(given.sigma, pixels)
 
+    def gain(self, rule: Rule, found: Agreement, given: Agreement) -> float:
+        """Fall of -2 log likelihood without a cause, less the price of what was left out."""
+        if not rule.price:
+            return given.score - found.score
+        fewer = max(given.redundancy - found.redundancy, 0)
+        price = rule.price * max(found.ratio, 1.0) ** 2  # where sigma is too small
+        return given.chi_square - found.chi_square - price * fewer
+
     def explains(self, rule: Rule, found: Agreement, given: Agreement) -> bool:
         """True if the data without a cause fit, and much better than as they were ``given``."""
-        gain = given.score - found.score
-        if self.ransac is not None and (self.is_exact or given.inliers < given.keypoints):
+        gain, is_piece = self.gain(rule, found, given), rule.price > 0
+        is_robust = self.ransac is not None and not is_piece
+        if is_robust and (self.is_exact or given.inliers < given.keypoints):
             more = found.inliers > given.inliers or found.inliers == found.keypoints
             return more and gain > _MORE_AGREE
-        least = rule.gain if self.ransac is None else _AS_MANY_ARE_FOUND
-        if not gain > least * self.inflation**2:
+        if not gain > (_AS_MANY_ARE_FOUND if is_robust else rule.gain) * self.inflation**2:
             return False
         if found.sigma is not None and given.sigma is not None:
             ratio = f_quantile(found.redundancy, found.redundancy, _CHANCE_OF_RATIO)
             return found.sigma < given.sigma / math.sqrt(ratio)
-        rejected, fits = found.keypoints - found.inliers, self.has_chance(found, FALSE_ALARMS)
-        if rejected:
-            return fits and rejected <= _MOST_REJECTED * found.keypoints
-        return fits or found.ratio < min(_MOST_CORRECTED, given.ratio / _LEAST_RATIO)
+        rejected, fits = found.keypoints - found.inliers, self.has_chance(found)
+        if rejected or "ransac" in rule.changes:
+            return fits and 0 < rejected <= _MOST_REJECTED * found.keypoints
+        is_small = found.ratio < min(_MOST_CORRECTED, given.ratio / _LEAST_RATIO)
+        return fits or is_small or found.ratio < given.ratio / _MUCH_LESS

@@ -23,7 +23,7 @@ from cadalign.estimation.agreement import DiagnosisCase
 from cadalign.estimation.contours import refine
 from cadalign.estimation.diagnose import diagnose, diagnose_refusal
 from cadalign.estimation.focal import PriorOption
-from cadalign.estimation.joint import Causes, result_of_minima, with_causes
+from cadalign.estimation.joint import result_of_minima, with_cause
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.prior import Lenses
@@ -124,24 +124,30 @@ def align(
         return align_plain(exact, given[0], options=options, ransac=ransac)
     problem = compile_problem(model, given, size, inits, options, ransac)
 
-    def again(model: Model | ShapeModel, views: Sequence[View], /, **changes: Any) -> Result:
+    def again(
+        model: Model | ShapeModel,
+        views: Sequence[View],
+        /,
+        size: Size | None = size,
+        ransac: RansacOptions | None = ransac,
+        **changes: Any,
+    ) -> Result:
         some, own = [None] * len(views), replace(options, **changes)
-        problem = compile_problem(model, views, size, some, own, ransac)
-        return _estimate(problem, start)[0]
+        return _estimate(compile_problem(model, views, size, some, own, ransac), start)
 
-    case = DiagnosisCase(model, [given[number] for number in problem.numbers], again, ransac)
+    seen = [given[number] for number in problem.numbers]
+    case = DiagnosisCase(model, seen, again, ransac, size)
     try:
-        result, causes = _estimate(problem, start)
+        result = _estimate(problem, start)
     except (NoConsensusError, DegenerateError) as error:
         named = diagnose_refusal(case, with_keypoints=isinstance(error, NoConsensusError))
         error.fix = named or error.fix
         raise
-    mistake = diagnose(case, result=result) if loss == FitOptions.loss else None
-    found = causes() if mistake is None else (mistake,)
-    return with_causes(result, found, problem.views)
+    cause = diagnose(case, result=result) if loss == FitOptions.loss else None
+    return with_cause(result, cause, problem.views)
 
 
-def _estimate(problem: Problem, start: float) -> tuple[Result, Causes]:
+def _estimate(problem: Problem, start: float) -> Result:
     """All stages of an estimate that was begun at ``start`` [s]."""
     if is_single(problem):
         return align_single(problem, start)

@@ -54,6 +54,10 @@ class KeypointPosterior(Posterior):
         return keypoint_warnings(self.keypoints, self.covariance, self.diagnosis)
 
     @cached_property
+    def redundancy(self) -> int:
+        return self.keypoints.redundancy
+
+    @cached_property
     def evidence(self) -> tuple[EvidenceSummary, ...]:
         return keypoint_evidence(self.keypoints)
 

@@ -15,35 +15,33 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.estimation.agreement import AS_GIVEN, Agreement, AnyModel, DiagnosisCase, Rule
-from cadalign.estimation.assemble import KeypointPosterior, result_of_keypoints
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.errors import quote
+from cadalign.estimation.agreement import Agreement, AnyModel, DiagnosisCase, Rule
+from cadalign.estimation.assemble import result_of_keypoints
 from cadalign.estimation.fit import fit_once
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
-from cadalign.estimation.problems import Problems, pack_one
-from cadalign.estimation.result_parts import FittedKeypoints, listed, uncertainty_of
-from cadalign.estimation.uncertainty.doubts import (
-    CAMERA_GAIN,
-    FALSE_ALARMS,
-    OTHER_SIZES,
-    may_fit_other_cameras,
-    percent,
-)
-from cadalign.estimation.uncertainty.residuals import (
-    named_keypoints,
-)
+from cadalign.estimation.problems import pack_one
+from cadalign.estimation.result_parts import FittedKeypoints, listed
+from cadalign.estimation.uncertainty.doubts import FALSE_ALARMS, OTHER_SIZES, is_large_sigma
+from cadalign.estimation.uncertainty.residuals import chance_of, named_keypoints
 from cadalign.estimation.view import View
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import rescaled_pixels
+from cadalign.io.evidence import LENGTHS, Size
 
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
 
 _AS_LIKELY = 6.0  # difference of -2 log likelihoods of mistakes that are both named
 _MOST_INSIDE = 0.8  # share of the keypoints that lie in their image
-_TESTED_TO = 0.1  # relative standard deviation to which a held scale must be tested
+_CAMERA_GAIN = 19.5  # by a focal length of its own, by chance in one of 100,000
+_PER_EQUATION = 3.0  # gain that a piece of evidence must leave, without which there are fewer
+_MOST_VIEWS = 10  # those with the largest residuals, of which each is left out
+_WRONG_UNIT = 100.0  # factor between an object's size and its model's
+_MEASURES = ("depth", "camera_height", "cam_from_rig")
 
 
 @np.errstate(all="ignore")
@@ -57,55 +55,31 @@ def diagnose(case: DiagnosisCase, *, result: Result | None = None) -> EstimateWa
         return None
     given = None if result is None else case.agreement(result)
     if given is not None and not case.is_doubtful(given):
-        return None
-    shown = replace(case, views=_without_outlines(case.views))
+        return _of_another_size(case, given)
     if given is None or any(view.has_outline for view in case.views):
-        given = shown.without(AS_GIVEN)
-    return None if given is None else _likeliest(shown, given)
-
-
-def _likeliest(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
-    rules = list(_rules_for(case, given))
+        case = replace(case, views=_without_outlines(case.views))
+        given = case.without(None)
+    if given is None or not case.is_doubtful(given):
+        return None
     if case.ransac is not None and given.inliers == given.keypoints and case.is_exact:
         # Where perspective is weak, all keypoints agree with a mirrored model if with any.
         first = case.without(MIRRORED)
         if first is None or not case.explains(MIRRORED, first, given):
             return None
+    return _likeliest(case, given)
+
+
+def _likeliest(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
+    rules = list(_rules_for(case, given))
     found = [(rule, each) for rule in rules if (each := case.without(rule)) is not None]
     explaining = [each for each in found if case.explains(*each, given)]
     if not explaining:
-        return _unexplained(case, given)
-    rule, best = min(explaining, key=lambda each: each[1].score)
-    if rule.says is not None:
-        return rule.says(best, given)
-    named = _named([each for each in found if each[0].clause], best)
-    return EstimateWarning("mistake", f"{named}: corrected, {_compared(best, given)}")
-
-
-def _unexplained(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
-    """The warning about residuals that no rule explains, or a stretch that these do not test."""
-    if case.options is None:
-        return None
-    if not case.has_chance(given, FALSE_ALARMS):
-        text = (
-            "the keypoints do not fit the model together (wrong pairs, model, stretch or camera), "
-            "or sigma is too small; sigma=None suits a model that is only similar"
-        )
-        return EstimateWarning("misfit", _too_large(given) + text)
-    held = set("xyz") - {given.result.known_axis} - set(given.result.stretched_axes)
-    free = case.without(HELD) if held else None
-    covariance = None if free is None else free.result.fisher_covariance
-    if covariance is None:
-        return None
-    scale = dict(zip("xyz", uncertainty_of(covariance).scale, strict=True))
-    open_axes = [axis for axis in sorted(held) if scale[axis] > _TESTED_TO]
-    if not open_axes:
-        return None
-    known = " and ".join(f"s_{axis} to +-{percent(scale[axis])}" for axis in open_axes)
-    text = (
-        f"the scale is held at 1, which is not tested: free, the keypoints determine {known} only"
-    )
-    return EstimateWarning("scale", text)
+        return None if case.has_chance(given) else _warning(case, MISFIT, given, given)
+    rule, best = max(explaining, key=lambda each: case.gain(each[0], each[1], given))
+    least = case.gain(rule, best, given) - _AS_LIKELY
+    alike = [each for each in found if each[0].kind == rule.kind]
+    likely = [each for each in alike if case.gain(*each, given) >= least]
+    return _warning(case, rule, best, given, named=_named(likely))
 
 
 def _without_outlines(views: Sequence[View]) -> tuple[View, ...]:
@@ -117,20 +91,46 @@ def _without_outlines(views: Sequence[View]) -> tuple[View, ...]:
     return tuple(view for view in given if view.has_evidence)
 
 
+def _of_another_size(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
+    """The warning about measured lengths that make the object larger than any of its kind."""
+    size = float(np.exp(np.log(given.result.alignment.scale).mean()))
+    names = [
+        f"views[{view.number}].{name}"
+        for view in case.views
+        for name in _MEASURES
+        if getattr(view, name) is not None
+    ]
+    names += ["size"] if case.size is not None else []
+    if not names or 1 / _WRONG_UNIT < size < _WRONG_UNIT:
+        return None
+    text = f"{listed(names)}: the object is {size:.2g} times as large as the model, is it {UNIT}"
+    return EstimateWarning("unit", text)
+
+
 def diagnose_fit(fitted: FittedKeypoints) -> EstimateWarning | None:
     """As `diagnose`, of keypoints in one view; after a robust search also of its inliers."""
-    ransac = None if fitted.search is None else fitted.search.ransac
+    options, cause = fitted.options, None
     ahead = np.asarray(np.isfinite(fitted.residuals).all(axis=1))
-    if ransac is not None:
-        own = None if fitted.inliers.all() else ransac  # samples need not be drawn where all agree
-        cause = diagnose(replace(_case_of_rows(fitted, ahead, own), ransac=ransac, options=None))
-        if cause is not None or fitted.options.sigma is None:
-            return cause
-    if fitted.fisher_covariance is None:
+    if fitted.search is not None:
+        # Samples need not be drawn where all agree.
+        ransac = fitted.search.ransac
+        own = _case_of_rows(fitted, ahead, None if fitted.inliers.all() else ransac)
+        cause = diagnose(replace(own, ransac=ransac))
+    elif _fits(fitted):
         return None
-    return diagnose(
-        _case_of_rows(fitted, ahead if fitted.options.sigma is None else fitted.inliers)
-    )
+    is_last = fitted.search is not None and options.sigma is None
+    if cause is not None or is_last or fitted.fisher_covariance is None:
+        return cause
+    return diagnose(_case_of_rows(fitted, ahead if options.sigma is None else fitted.inliers))
+
+
+def _fits(fitted: FittedKeypoints) -> bool:
+    """True for residuals without a search that pass the test for mistakes."""
+    if fitted.cost is None:
+        return True
+    if fitted.options.sigma is None:
+        return not is_large_sigma(fitted.sigma or 0.0, [fitted.observed[fitted.inliers]])
+    return chance_of(fitted.cost, fitted.redundancy) >= FALSE_ALARMS
 
 
 @np.errstate(all="ignore")
@@ -151,57 +151,40 @@ def diagnose_refusal(case: DiagnosisCase, *, with_keypoints: bool = True) -> str
     if not found:
         return None
     best = min((each for _, each in found), key=lambda each: each.score)
-    return f"{_named(found, best)}: corrected, {best.inliers} of {best.keypoints} keypoints agree"
-
-
-def diagnose_refused_fit(
-    problems: Problems, options: FitOptions, ransac: RansacOptions | None
-) -> str | None:
-    """As `diagnose_refusal`, of the only problem."""
-    view = View(problems.camera(0), problems.points_2d, sigma=options.sigma)
-    return diagnose_refusal(_case_of_fit(problems.points_3d, view, options, ransac))
+    likely = [each for each in found if each[1].score <= best.score + _AS_LIKELY]
+    return f"{_named(likely)}: corrected, {best.inliers} of {best.keypoints} keypoints agree"
 
 
 def _case_of_rows(
     fitted: FittedKeypoints, kept: BoolArray, ransac: RansacOptions | None = None
 ) -> DiagnosisCase:
+    """The case of some keypoints, whose ids are their rows."""
     rows, sigma = np.flatnonzero(kept), fitted.options.sigma
     if sigma is not None and np.ndim(sigma) > 0:
         sigma = np.asarray(sigma)[rows]
     view = View(fitted.camera, fitted.observed[rows], ids=rows.tolist(), sigma=sigma)
-    return _case_of_fit(fitted.points_3d, view, fitted.options, ransac)
+    return case_of_fit(fitted.points_3d, view, fitted.options, ransac)
 
 
-def _case_of_fit(
+def case_of_fit(
     points_3d: FloatArray, view: View, options: FitOptions, ransac: RansacOptions | None
 ) -> DiagnosisCase:
     """The case of a fit of a model's keypoints (n, 3) to a view, whose ids are rows of these."""
-    model = Model(
-        points_3d=points_3d,
-        stretch=options.stretch,
-        stretch_sigma=options.stretch_sigma,
-        known_axis=options.known_axis,
-    )
+    shape = {name: getattr(options, name) for name in ("stretch", "stretch_sigma", "known_axis")}
 
     def again(model: AnyModel, views: Sequence[View], /, **changes: Any) -> Result:
         exact, (view,) = cast(Model, model), views
-        points = cast(FloatArray, exact.points_3d)[_rows_of(view)]
+        points = cast(FloatArray, exact.points_3d)[list(cast("tuple[int, ...]", view.keypoint_ids))]
         of_model = {"stretch": exact.stretch, "stretch_sigma": exact.stretch_sigma}
         search = changes.pop("ransac", ransac)
         own = replace(options, sigma=view.sigma, **(of_model | changes))
-        problems = pack_one(points, view.pixels, view.camera)
-        fitted = fit_once(problems, own, search, None, 0.0)
+        fitted = fit_once(pack_one(points, view.pixels, view.camera), own, search, None, 0.0)
         return result_of_keypoints(view.pixels, fitted, view=view)
 
-    is_tested = ransac is None and options.sigma is not None
-    return DiagnosisCase(model, (view,), again, ransac, options if is_tested else None)
+    return DiagnosisCase(Model(points_3d=points_3d, **shape), (view,), again, ransac, has_rows=True)
 
 
-def _rows_of(view: View) -> IntArray:
-    return np.array(view.keypoint_ids, dtype=np.intp)
-
-
-# Rules -------------------------------------------------------------------------------------------
+# Undone ------------------------------------------------------------------------------------------
 
 
 def _mirrored(model: Model) -> Model:
@@ -229,75 +212,70 @@ def _size(camera: Camera, factor: float) -> tuple[int, int]:
     return max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
 
 
-def _say_stretch(best: Agreement, _: Agreement) -> EstimateWarning:
-    listed = ", ".join(f"{value:.3g}" for value in best.result.alignment.scale.tolist())
-    text = (
-        "the keypoints contradict the constraint on the stretch: without it they fit better, "
-        f"with the scale ({listed})"
-    )
-    return EstimateWarning("stretch", text)
+def _measured(view: View, *, name: str, factor: float) -> View:
+    """The view whose depths, height or motion are in another unit."""
+    value = getattr(view, name)
+    if value is None:
+        return view
+    value = np.array(value, dtype=np.float64)
+    value[(slice(3), 3) if name == "cam_from_rig" else ...] *= factor
+    changed: dict[str, Any] = {name: value if value.ndim else float(value)}
+    return replace(view, **changed)
 
 
-def _say_outliers(best: Agreement, given: Agreement) -> EstimateWarning:
-    (view,) = best.result.views
-    lengths = np.linalg.norm(view.residuals, axis=1)
-    wrong = {
-        int(cast(int, view.ids[row])): lengths[row]
-        for row in np.flatnonzero(~view.inliers).tolist()
-    }
-    keypoints, do = ("keypoint", "does") if len(wrong) == 1 else ("keypoints", "do")
-    text = (
-        f"{keypoints} {named_keypoints(wrong)} {do} not fit the others (counted from 0, with the "
-        "distance from where those put it)"
-    )
-    return EstimateWarning("outlier", _too_large(given) + text, 0, tuple(sorted(wrong)))
+def _remeasured(size: Size, factor: float) -> Size:
+    """The lengths in another unit."""
+    lengths = {name: getattr(size, name) for name in LENGTHS}
+    return replace(size, **{name: each and each * factor for name, each in lengths.items()})
 
 
-def _say_camera(best: Agreement, _: Agreement) -> EstimateWarning:
-    text = (
-        "the keypoints contradict the camera: they fit one better that has a focal length of "
-        f"{best.result.camera.fx:.4g} px"
-    )
-    return EstimateWarning("camera", text, 0)
+def _left_out(view: View, *, number: int, name: str | None) -> View | None:
+    """The view without a field, or None for the whole view, if it has the number."""
+    if view.number != number:
+        return view
+    nothing: dict[str, Any] = {} if name is None else {name: None}
+    return replace(view, **nothing) if nothing else None
 
 
-MIRRORED = Rule("the model is mirrored", undo_model=_mirrored)
+# Rules -------------------------------------------------------------------------------------------
+
+MIRRORED = Rule("mistake", "the model is mirrored", undo_model=_mirrored)
 SWAPPED = Rule(
-    "u and v are swapped", lambda view: replace(view, points_2d=view.pixels[:, ::-1].copy())
+    "mistake",
+    "u and v are swapped",
+    lambda view: replace(view, points_2d=view.pixels[:, ::-1].copy()),
 )
-FLIPPED = Rule("the photo is flipped", lambda view: _flipped(view, axis=0))
-UPSIDE_DOWN = Rule("v counts from the bottom", lambda view: _flipped(view, axis=1))
+FLIPPED = Rule("mistake", "the photo is flipped", partial(_flipped, axis=0))
+UPSIDE_DOWN = Rule("mistake", "v counts from the bottom", partial(_flipped, axis=1))
 DOWNWARD = Rule(
+    "mistake",
     "`up` points down (give its opposite)",
     lambda view: view if view.up is None else replace(view, up=np.negative(view.up)),
 )
 INVERTED = Rule(
+    "mistake",
     "`cam_from_rig` is the inverse, rig_from_cam (give np.linalg.inv of each)",
     lambda view: replace(view, cam_from_rig=np.linalg.inv(np.asarray(view.cam_from_rig))),
 )
-HELD = Rule(
-    undo_model=lambda model: replace(model, stretch=None, stretch_sigma=None), says=_say_stretch
-)
-OUTLIERS = Rule(changes={"ransac": RansacOptions()}, gain=-math.inf, says=_say_outliers)
-ANOTHER_FOCAL = Rule(changes={"focal": "estimate"}, gain=CAMERA_GAIN, says=_say_camera)
+HELD = Rule("stretch", undo_model=lambda model: replace(model, stretch=None, stretch_sigma=None))
+OUTLIERS = Rule("outlier", changes={"ransac": RansacOptions()}, gain=-math.inf)
+ANOTHER_FOCAL = Rule("camera", changes={"focal": "estimate"}, gain=_CAMERA_GAIN)
+MISFIT = Rule("misfit")
 
 
 def _rules_for(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
     """The rules that may explain such residuals."""
-    options, is_doubtful = case.options, case.is_doubtful(given)
-    if is_doubtful:
-        yield from _mistakes_in(case)
-    if options is None:
-        yield from _other_sizes(case) if is_doubtful else ()
-        return
-    if options.stretch is not None or options.stretch_sigma is not None:
-        yield HELD
-    fails = not case.has_chance(given, FALSE_ALARMS)
-    if may_fit_other_cameras(cast(KeypointPosterior, given.result.posterior).keypoints, fails):
-        yield ANOTHER_FOCAL
-        yield from _other_sizes(case)
-    if fails:
-        yield OUTLIERS
+    model, fails = case.model, not case.has_chance(given)
+    yield from _mistakes_in(case)
+    yield from _other_sizes(case)
+    if case.is_plain and isinstance(model, Model) and fails:
+        if model.stretch is not None or model.stretch_sigma is not None:
+            yield HELD
+        if given.result.focal == "known":
+            yield ANOTHER_FOCAL
+    if fails or case.has_contradiction(given):
+        yield from () if case.ransac else (OUTLIERS,)
+        yield from _pieces_of(case, given)
 
 
 def _mistakes_in(case: DiagnosisCase) -> Iterator[Rule]:
@@ -311,6 +289,16 @@ def _mistakes_in(case: DiagnosisCase) -> Iterator[Rule]:
         yield INVERTED
     if any(view.up is not None for view in views):
         yield DOWNWARD
+        for axis in "xyz" if isinstance(model, Model) else "":
+            if axis != model.up_axis:
+                clause = f"the model's {axis} axis points up (give up_axis={axis!r})"
+                yield Rule("mistake", clause, undo_model=partial(replace, up_axis=axis))
+    for factor in (1e-3, 1e3):
+        for name in _MEASURES:
+            if any(getattr(view, name) is not None for view in views):
+                yield Rule("unit", f"`{name}`", partial(_measured, name=name, factor=factor))
+        if case.size is not None:
+            yield Rule("unit", "`size`", changes={"size": _remeasured(case.size, factor)})
 
 
 def _other_sizes(case: DiagnosisCase) -> Iterator[Rule]:
@@ -331,24 +319,80 @@ def _other_sizes(case: DiagnosisCase) -> Iterator[Rule]:
     own, is_inside = f"{camera.width} x {camera.height} px", holds_most(1.0)
     for factor in OTHER_SIZES:
         is_usual = (factor > 1) != is_inside and (factor > 1 or case.ransac is None)
-        if case.options is None and not (is_usual and holds_most(factor)):
+        if not case.is_plain and not (is_usual and holds_most(factor)):
             continue
         width, height = _size(camera, factor)
         clause = f"the keypoints are of images of {width} x {height} px, the camera of {own}"
         for noise in sorted({1.0, 1.0 if is_inside else max(factor, 1.0)}):
             undo = partial(_resized, factor=factor, noise=noise)
-            yield Rule(clause, undo, gain=CAMERA_GAIN)
+            yield Rule("mistake", clause, undo, gain=_CAMERA_GAIN)
+
+
+def _pieces_of(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
+    """Each piece of evidence beside others, and each of several views, is left out."""
+    is_rig = case.views[0].cam_from_rig is not None
+    piece = partial(Rule, "contradiction", price=_PER_EQUATION)
+    for place in np.argsort(-np.array(given.squares), kind="stable")[:_MOST_VIEWS].tolist():
+        view = case.views[place]
+        fields = ("up", "depth", "camera_height")
+        pieces = {name: name for name in fields if getattr(view, name) is not None}
+        whole = {("cam_from_rig" if is_rig else "points_2d"): None} if len(case.views) > 1 else {}
+        for name, field in (pieces | whole).items():
+            undo = partial(_left_out, number=view.number, name=field)
+            yield piece(f"views[{view.number}].{name}", undo_view=undo)
+    if case.size is not None:
+        yield piece("size", changes={"size": None})
 
 
 # Texts -------------------------------------------------------------------------------------------
 
+UNIT = "in another unit (millimetres for metres)?"
+_TEXTS = {
+    "mistake": "{named}: corrected, {compared}",
+    "unit": "{named}: is it " + UNIT + " Corrected, {compared}",
+    "contradiction": "{named} contradicts the other evidence: without it, {compared}",
+    "stretch": "the keypoints contradict the constraint on the stretch: without it they fit "
+    "better, with the scale ({scale})",
+    "camera": "the keypoints contradict the camera: they fit one better that has a focal length "
+    "of {best.result.camera.fx:.4g} px",
+    "outlier": "the residuals are {given.ratio:.2g} times as large as sigma explains: {wrong} not "
+    "fit the others (with the distance from where those put it)",
+    "misfit": "the residuals are {given.ratio:.2g} times as large as sigma and the spread of "
+    "shapes explain: keypoints, sigma, the camera or the model are wrong",
+}
 
-def _named(found: Sequence[tuple[Rule, Agreement]], best: Agreement) -> str:
-    """Names of the mistakes that are as likely as the best; first those of an upright object."""
-    likely = [each for each in found if each[1].score <= best.score + _AS_LIKELY]
-    upright = {mistake.clause: None for mistake, each in likely if each.is_upright}
-    others = {mistake.clause: None for mistake, each in likely if not each.is_upright}
-    named = listed(list(upright or others))
+
+def _warning(
+    case: DiagnosisCase, rule: Rule, best: Agreement, given: Agreement, *, named: str = ""
+) -> EstimateWarning:
+    scale = ", ".join(f"{value:.3g}" for value in best.result.alignment.scale.tolist())
+    wrong, view, keypoints = _outliers_of(case, best) if rule is OUTLIERS else ("", None, ())
+    words = {"named": named, "compared": _compared(best, given), "scale": scale, "wrong": wrong}
+    text = _TEXTS[rule.kind].format(best=best, given=given, **words)
+    return EstimateWarning(rule.kind, text, 0 if rule is ANOTHER_FOCAL else view, keypoints)
+
+
+def _outliers_of(case: DiagnosisCase, best: Agreement) -> tuple[str, int | None, tuple[int, ...]]:
+    """Names of the outliers with their errors, and the view and the rows of those in one view."""
+    texts, wrong = [], dict[int, tuple[int, ...]]()
+    for view, own in zip(case.views, best.result.views, strict=True):
+        rows, names = np.flatnonzero(~own.inliers).tolist(), view.keypoint_ids
+        errors = np.linalg.norm(own.residuals, axis=1)
+        if rows:
+            numbers = [names[row] for row in rows] if case.has_rows else rows
+            wrong[view.number] = tuple(cast("list[int]", numbers))
+            where = f"views[{view.number}]: " if len(case.views) > 1 else ""
+            texts.append(where + named_keypoints({quote(names[row]): errors[row] for row in rows}))
+    total = sum(map(len, wrong.values()))
+    text = f"{'keypoint' if total == 1 else 'keypoints'} {'; '.join(texts)} do{'es' * (total == 1)}"
+    return (text, None, ()) if len(wrong) > 1 else (text, *next(iter(wrong.items())))
+
+
+def _named(likely: Sequence[tuple[Rule, Agreement]]) -> str:
+    """Names of rules that are as likely; first those of an upright object."""
+    upright = {rule.clause: None for rule, each in likely if each.is_upright}
+    others = {rule.clause: None for rule, each in likely if rule.clause not in upright}
+    named = listed(list(upright or others)) if likely else ""
     if upright and others:
         named += f" (or, if y is not up in the photo, {listed(list(others))})"
     return named
@@ -365,7 +409,3 @@ def _compared(best: Agreement, given: Agreement) -> str:
         return f"sigma is {best.sigma:.2g} px; as given, {given.sigma:.2g} px"
     what = "times what their standard deviations allow"
     return f"the residuals are {best.ratio:.2g} {what}; as given, {given.ratio:.2g} times"
-
-
-def _too_large(given: Agreement) -> str:
-    return f"the residuals are {given.ratio:.2g} times as large as sigma explains: "

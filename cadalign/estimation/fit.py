@@ -18,6 +18,7 @@ from cadalign.estimation.problems import Problems, pack_one
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FittedKeypoints
 from cadalign.estimation.solve import solve_one
+from cadalign.estimation.view import View
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
@@ -166,9 +167,11 @@ def fit_one(
     try:
         fitted = fit_once(problems, options, ransac, scores, start)
     except NoConsensusError as error:
-        from cadalign.estimation.diagnose import diagnose_refused_fit  # which makes fits anew
+        from cadalign.estimation.diagnose import case_of_fit, diagnose_refusal  # makes fits anew
 
-        error.fix = diagnose_refused_fit(problems, options, ransac) or error.fix
+        view = View(problems.camera(0), problems.points_2d, sigma=options.sigma)
+        case = case_of_fit(problems.points_3d, view, options, ransac)
+        error.fix = diagnose_refusal(case) or error.fix
         raise
     return result_of_keypoints(
         problems.points_2d, fitted, diagnosis=diagnosis_of_fit, symmetry=symmetry

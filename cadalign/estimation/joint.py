@@ -6,7 +6,7 @@ stands for all.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -45,15 +45,13 @@ from cadalign.estimation.symmetry import (
     SAME_SQUARES,
     stretched_axes,
 )
-from cadalign.estimation.uncertainty.contradictions import warnings_of
 from cadalign.estimation.uncertainty.doubts import (
     another_pose,
     outside_image,
     unexplained,
     weaknesses,
 )
-from cadalign.estimation.uncertainty.evidence import summaries_of
-from cadalign.estimation.uncertainty.shape_posterior import ShapeTails
+from cadalign.estimation.uncertainty.evidence import redundancy_of, summaries_of
 from cadalign.estimation.view import View
 from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment
@@ -61,9 +59,6 @@ from cadalign.geometry.rotations import nearest_rotation
 from cadalign.shapes.parts import inflation_with
 from cadalign.solvers.joint.covariance import joint_covariance, pose_and_border
 from cadalign.solvers.joint.evidence import points_of
-
-Causes = Callable[[], Warnings]
-"""Warnings about contradictions and residuals, which take time to find."""
 
 
 def result_of(
@@ -73,6 +68,8 @@ def result_of(
     inliers: Sequence[BoolArray],
     is_curved: bool,
     evidence: tuple[EvidenceSummary, ...],
+    redundancy: int,
+    misses: tuple[float, float] | None = None,
     notes: OutlineNotes = NO_NOTES,
     **of_result: Any,
 ) -> Result:
@@ -134,6 +131,8 @@ def result_of(
         ),
         evidence=(*evidence, *notes.evidence),
         degrees_of_freedom=prior.degrees_of_freedom,
+        redundancy=redundancy,
+        misses=misses,
     )
     of_views = []
     for number, view in enumerate(views):
@@ -172,7 +171,7 @@ def result_of_minima(
     stats: FitStats,
     *,
     notes: OutlineNotes = NO_NOTES,
-) -> tuple[Result, Causes]:
+) -> Result:
     """The result of minima, of which the likely ones count, with a widened prior of the shape.
 
     Raises DegenerateError if the evidence determines none of them.
@@ -208,23 +207,16 @@ def result_of_minima(
         rotation = camera[:3, :3]
         turned = nearest_rotation(rotation.T @ pose.rotation)
         in_rig = Alignment(turned, rotation.T @ (pose.translation - camera[:3, 3]), best.scale)
-    tails = ShapeTails(inflation, prior.degrees_of_freedom)
     seen_by = minimum.lenses.cameras_at(minimum.state.log_focals)
 
-    def causes() -> Warnings:
-        found = warnings_of(minimum.evidence, minimum.state, minimum.cost, tails)
-        if not problem.lacks_sigma:
-            return found
-        pixels = [view.pixels for view in views if view.sigma is None]
-        return (*unexplained(problem.noise, pixels), *found)
-
-    result = result_of(
+    return result_of(
         problem,
         likely,
         inliers=_inliers(problem, minimum),
         is_curved=symmetry is None and not is_exact(minimum.evidence),
         notes=notes,
         evidence=summaries_of(minimum.evidence, minimum.state, seen_by),
+        redundancy=redundancy_of(minimum.evidence),
         cost=minimum.cost,
         stats=stats,
         component=minimum.component,
@@ -236,11 +228,14 @@ def result_of_minima(
         focal="estimate" if minimum.lenses.count else "known",
         focal_prior=prior_of_camera(minimum.lenses.prior, views[0].camera),
     )
-    return result, causes
 
 
-def with_causes(result: Result, causes: Warnings, views: Sequence[View]) -> Result:
-    """The result with warnings about the causes of a misfit, and keypoints off their images."""
+def with_cause(result: Result, cause: EstimateWarning | None, views: Sequence[View]) -> Result:
+    """The result with the cause of a misfit, and warnings about noise and keypoints' places."""
+    causes: Warnings = () if cause is None else (cause,)
+    lacking = [view.pixels for view in views if view.sigma is None and len(view.keypoint_ids)]
+    if lacking and result.sigma is not None and not any(c.kind == "mistake" for c in causes):
+        causes = (*unexplained(result.sigma, lacking), *causes)
     placed = (
         warning
         for view in views

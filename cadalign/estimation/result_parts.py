@@ -130,6 +130,12 @@ class FittedKeypoints:
             return np.asarray(projected - self.residuals)
 
     @property
+    def redundancy(self) -> int:
+        """Number of equations, those of priors included, beyond the unknowns."""
+        equations = 2 * int(self.inliers.sum()) + self.options.prior_equations(self.alignment.scale)
+        return equations - self.options.unknowns
+
+    @property
     def chosen_sigma(self) -> Any:
         """The keypoints' standard deviation or covariances [px]: given, or estimated."""
         return self.sigma if self.options.sigma is None else self.options.sigma
@@ -238,6 +244,8 @@ class Posterior:
     points_covariance: FloatArray | None = None
     points_cam_covariance: FloatArray | None = None
     degrees_of_freedom: float | None = None
+    redundancy: int = 0
+    misses: tuple[float, float] | None = None
     warnings: Warnings = ()
     evidence: tuple[EvidenceSummary, ...] = ()
 

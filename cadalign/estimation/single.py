@@ -16,7 +16,7 @@ from cadalign.errors import DegenerateError
 from cadalign.estimation.assemble import KeypointPosterior, result_of_keypoints
 from cadalign.estimation.estimates import Estimate, as_given, with_boxes
 from cadalign.estimation.fit import fit
-from cadalign.estimation.joint import Causes, common_sigma, result_of
+from cadalign.estimation.joint import common_sigma, result_of
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.pack import seen_keypoints
@@ -26,19 +26,14 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.uncertainty.evidence import summary_of_keypoints
-from cadalign.estimation.uncertainty.shape_posterior import (
-    SeenShape,
-    ShapeTails,
-    keypoint_misfits,
-    single_posteriors,
-)
+from cadalign.estimation.uncertainty.shape_posterior import single_posterior
 from cadalign.estimation.view import View
-from cadalign.estimation.warning import Warnings
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import turned_alignment
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import inflation_with
-from cadalign.solvers.constants import LEAST_POINTS, LINEAR
+from cadalign.solvers.constants import LEAST_POINTS
+from cadalign.solvers.marginal.equations import POSE_UNKNOWNS
 from cadalign.solvers.marginal.problem import Mixture
 from cadalign.solvers.marginal.search import search_view
 
@@ -86,7 +81,7 @@ def align_plain(
     )
 
 
-def align_single(problem: Problem, start: float) -> tuple[Result, Causes]:
+def align_single(problem: Problem, start: float) -> Result:
     """The result of `cadalign.align` where `is_single` holds, which was begun at ``start`` [s].
 
     Raises InputError if the view names a keypoint that the model lacks; DegenerateError if no pose
@@ -113,10 +108,12 @@ def align_single(problem: Problem, start: float) -> tuple[Result, Causes]:
     likelihoods = likelihoods[likelihoods >= LEAST_LIKELIHOOD]
     inflation = inflation_with(len(rows), model.inflation, model.few_keypoints)
     placed, chosen = with_boxes(mixture, seen, minima, len(likelihoods), model)
-    likely = slice(0, len(likelihoods))
-    posteriors = single_posteriors(
-        placed, chosen.label[likely], seen, chosen.states[likely], inflation
-    )
+    posteriors = [
+        single_posterior(placed, component, seen, state, inflation)
+        for component, state in zip(
+            chosen.label[: len(likelihoods)].tolist(), chosen.states, strict=False
+        )
+    ]
     estimates = [
         Estimate(
             each.points,
@@ -136,31 +133,14 @@ def align_single(problem: Problem, start: float) -> tuple[Result, Causes]:
     errors = in_camera[:, :2] / in_camera[:, 2:] - seen.rays
     component, cost = int(minima.label[0]), float(minima.costs[0])
 
-    def causes() -> Warnings:
-        if seen.loss != LINEAR:
-            return ()
-        beside = (3 * np.array(rows)[:, None] + np.arange(3)).ravel()
-        return keypoint_misfits(
-            SeenShape(
-                points,
-                means[component].reshape(-1, 3)[rows],
-                covariances[component][np.ix_(beside, beside)],
-                estimates[0].poses[0],
-                seen.rays,
-                seen.whitening,
-            ),
-            cost,
-            view.keypoint_ids,
-            tails=ShapeTails(inflation, model.degrees_of_freedom),
-            focal=view.camera.fx,
-        )
-
-    result = result_of(
+    return result_of(
         problem,
         [as_given(each, problem) for each in estimates],
         inliers=[np.ones(len(rows), dtype=bool)],
         is_curved=bool(covariances.any()),
         evidence=(summary_of_keypoints(errors, seen.rays, seen.whitening, 0, view.camera),),
+        redundancy=2 * len(rows) - POSE_UNKNOWNS,
+        misses=posteriors[0].misses,
         cost=cost,
         stats=stats,
         component=component,
@@ -168,7 +148,6 @@ def align_single(problem: Problem, start: float) -> tuple[Result, Causes]:
         known_axis=None,
         stretched_axes="",
     )
-    return result, causes
 
 
 def _given(init: Alignment | None) -> FloatArray:

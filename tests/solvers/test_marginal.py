@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.uncertainty.shape_posterior import single_posteriors
+from cadalign.estimation.uncertainty.shape_posterior import single_posterior
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR
 from cadalign.solvers.marginal.equations import (
     POSE,
@@ -160,8 +160,8 @@ def test_the_posterior_is_the_inverse_information_of_pose_and_shape() -> None:
     mixture, seen, pose = problem_of(1)
     state = state_at(pose, 7)
     refine(Posed(target_of(mixture_at(mixture, seen), 0), seen, False), 100, state)
-    (found,) = single_posteriors(mixture, np.zeros(1, dtype=int), seen, state[None], 1.0)
-    _, _, _, covariance, of_points, of_seen = found
+    found = single_posterior(mixture, 0, seen, state, 1.0)
+    _, _, _, covariance, of_points, of_seen, _ = found
     points = shape_at(mixture, 0, seen, state)
     assert found.points[:KEYPOINTS] == pytest.approx(points[:KEYPOINTS])
     size = mixture.means[0].size

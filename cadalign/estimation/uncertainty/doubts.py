@@ -9,12 +9,10 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.estimation.focal import focal_doubt
-from cadalign.estimation.options import pixel_information
 from cadalign.estimation.result_parts import Diagnosis, FittedKeypoints, uncertainty_of
-from cadalign.estimation.uncertainty.residuals import chi_square_tail
 from cadalign.estimation.warning import EstimateWarning, Kind, Warnings
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera, projection_jacobian
+from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PIXEL_CENTRE
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.shapes.parts import probability_within
@@ -26,9 +24,6 @@ OTHER_SIZES = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2.0, 3.0, 4.0)
 """Usual sizes of other images of a photo, over that of its camera."""
 FALSE_ALARMS = 0.004
 """Probability of residuals by chance, below which they fail their test."""
-CAMERA_GAIN = 19.5
-"""Decrease of the sum of squares by a focal length of its own, by chance in one of 100,000."""
-_WORTH_A_SEARCH = 4.0  # the same, linearised
 _LARGE = 0.02  # estimated sigma, over the keypoints' extent, that is large
 _LARGEST_SHARE = 0.45  # of the keypoints' spread, of an estimated sigma
 _SAME_MIDDLE = 0.02  # of an image's size, from its middle to a principal point taken for it
@@ -46,9 +41,9 @@ def keypoint_warnings(
     fitted: FittedKeypoints, covariance: FloatArray | None, diagnosis: Diagnosis | None
 ) -> Warnings:
     """Warnings about the cause of a misfit, and what the keypoints do not determine."""
-    cause = diagnosis(fitted) if diagnosis is not None and _is_doubtful(fitted) else None
+    cause = None if diagnosis is None else diagnosis(fitted)
     observed = fitted.observed[np.isfinite(fitted.residuals).all(axis=1)]
-    fits = cause is None or cause.kind == "scale"
+    fits = cause is None
     is_mistake = cause is not None and cause.kind == "mistake"
     placed = outside_image(observed, fitted.camera, agree=fits or is_mistake)
     found = [*(() if cause is None else (cause,)), *placed]
@@ -76,48 +71,6 @@ def keypoint_warnings(
         poses = [(each.alignment, each.relative_likelihood) for each in fitted.alternatives]
         found += another_pose(fitted.alignment, poses, covariance)
     return tuple(found)
-
-
-def _is_doubtful(fitted: FittedKeypoints) -> bool:
-    """True if keypoints may have a cause of misfit, which takes longer to find.
-
-    They fail their test, those that agree were searched for, the scale is constrained, or another
-    focal length promises a better fit.
-    """
-    options, inliers = fitted.options, fitted.inliers
-    if fitted.search is not None:
-        return True
-    if fitted.fisher_covariance is None or fitted.cost is None:
-        return False
-    if options.sigma is None:
-        return is_large_sigma(fitted.sigma or 0.0, [fitted.observed[inliers]])
-    redundancy = 2 * int(inliers.sum()) - options.unknowns
-    redundancy += options.prior_equations(fitted.alignment.scale)
-    fails = redundancy > 0 and chi_square_tail(fitted.cost, redundancy) < FALSE_ALARMS
-    if fails or options.stretch is not None or options.stretch_sigma is not None:
-        return True
-    return redundancy > 0 and may_fit_other_cameras(fitted, fails)
-
-
-def may_fit_other_cameras(fitted: FittedKeypoints, fails: bool) -> bool:
-    """True if other cameras may fit keypoints better than chance explains, whose test ``fails``."""
-    if fitted.options.focal == "estimate" or (fitted.cost or 0.0) < CAMERA_GAIN:
-        return False
-    return fails or _decrease_by_focal(fitted) > _WORTH_A_SEARCH
-
-
-def _decrease_by_focal(fitted: FittedKeypoints) -> float:
-    """Decrease of the sum of squares by a focal length of its own, to first order."""
-    derivatives = projection_jacobian(fitted.points_3d, fitted.camera, fitted.alignment)
-    information = pixel_information(fitted.options.sigma, len(fitted.residuals))
-    whitening = np.linalg.cholesky(information).swapaxes(1, 2)
-    free = [*fitted.options.estimated_unknowns, 9]
-    rows = (whitening @ derivatives[:, :, free])[fitted.inliers].reshape(-1, len(free))
-    errors = (whitening @ fitted.residuals[:, :, None])[fitted.inliers].ravel()
-    others, _ = np.linalg.qr(rows[:, :-1])
-    alone = rows[:, -1] - others @ (others.T @ rows[:, -1])
-    length, along = float(alone @ alone), float(alone @ errors)
-    return along * (along / length) if length > 0 else 0.0  # a power raises where it overflows
 
 
 @np.errstate(all="ignore")  # lengths that overflow are of translations known well enough

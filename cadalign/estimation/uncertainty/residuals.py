@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import NoConsensusError
 from cadalign.geometry.camera import Camera
+from cadalign.shapes.parts import probability_within
 from cadalign.solvers.constants import CAUCHY, HUBER
 from cadalign.solvers.minimal import MAX_SOLUTIONS
 
@@ -73,6 +74,18 @@ def chi_square_tail(value: float, freedom: int) -> float:
     steps[:1] = math.lgamma(1 + freedom % 2 / 2)
     terms = float(np.exp(powers * math.log(half) - half - np.cumsum(steps)).sum())
     return terms + math.erfc(math.sqrt(half)) if freedom % 2 else terms
+
+
+def chance_of(squares: float, redundancy: int, degrees_of_freedom: float | None = None) -> float:
+    """Probability that whitened residuals have a larger sum of squares by chance, up to 1.
+
+    Those of learned shapes have the tails of `probability_within`.
+    """
+    if redundancy <= 0 or squares <= redundancy:
+        return 1.0
+    if degrees_of_freedom is None:
+        return chi_square_tail(squares, redundancy)
+    return float(1 - probability_within(squares, redundancy, degrees_of_freedom))
 
 
 @lru_cache(maxsize=64)
@@ -175,7 +188,7 @@ def disagreeing(errors: FloatArray, kept: BoolArray) -> str:
     return f"keypoints that disagree: {named_keypoints(wrong)}" if wrong else ""
 
 
-def named_keypoints(errors: Mapping[int, float]) -> str:
+def named_keypoints(errors: Mapping[Any, float]) -> str:
     """Keypoints with their errors [px], the largest first; an infinite one is left out."""
     worst = sorted(errors, key=lambda row: -errors[row])
     listed = ", ".join(

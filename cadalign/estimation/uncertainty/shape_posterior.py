@@ -13,26 +13,23 @@ Nadarajah, "Multivariate t distributions and their applications", 2004).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray
-from cadalign.errors import InputError, quote
+from cadalign.arrays import FloatArray
+from cadalign.errors import InputError
 from cadalign.estimation.estimates import widened_boxes
 from cadalign.estimation.options import LOSSES
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.problems import rays_of, whitening_of
 from cadalign.estimation.uncertainty.residuals import loss_slopes, whitening_matrices
-from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import faced, turned_alignment
 from cadalign.geometry.pixels import perspective
 from cadalign.geometry.rotations import by_rotation
 from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.model import ShapeModel
-from cadalign.shapes.parts import probability_within
 from cadalign.solvers.marginal.problem import Mixture, Seen, coordinates_of, shape_at
 from cadalign.solvers.projection import ray_derivatives
 
@@ -56,24 +53,6 @@ class ShapePosterior(NamedTuple):
 
     shapes: Gaussians
     log_evidence: float
-
-
-class ShapeTails(NamedTuple):
-    """Distribution of held-out objects' errors about a learned shape."""
-
-    inflation: float = 1.0  # factor on the standard deviations of the shape
-    degrees_of_freedom: float | None = None  # tails; None for Gaussian ones
-
-
-class SeenShape(NamedTuple):
-    """Keypoints of one view, and the learned shape's Gaussian about them."""
-
-    points: FloatArray  # (n, 3) of the estimate [model units]
-    mean: FloatArray  # (n, 3)
-    covariance: FloatArray  # (3 n, 3 n) about the mean
-    pose: Alignment  # the estimate, without a stretch
-    rays: FloatArray  # (n, 2) observed, normalised
-    whitening: FloatArray  # (n, 3), as of `cadalign.solvers.marginal.problem.Seen`
 
 
 def shape_posterior(
@@ -192,85 +171,12 @@ def whitened_errors(
     return errors[:, :, 0], by_pose
 
 
-def keypoint_misfits(
-    seen: SeenShape, cost: float, names: Sequence[object], *, tails: ShapeTails, focal: float
-) -> Warnings:
-    """Warn about a keypoint that contradicts the others, or about all that do not fit together.
-
-    ``cost`` is that of the estimate; ``focal`` [px] turns distances into pixels.
-    """
-    count, freedom = len(seen.rays), tails.degrees_of_freedom
-    redundancy = 2 * count - _POSE
-    if redundancy <= 0 or cost < _WORTH_TESTING * redundancy:
-        return ()
-    errors, weight = _predicted(seen, tails.inflation)
-    forces = (weight @ errors).reshape(count, 2)
-    blocks = weight.reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count)]
-    if np.linalg.eigvalsh(blocks).min() <= 0:  # nothing predicts the keypoint
-        return ()
-    misses = np.linalg.solve(blocks, forces[:, :, None])[:, :, 0]
-    squares = (misses * forces).sum(axis=1)
-    total, worst = float(errors @ weight @ errors), int(np.argmax(squares))
-    alone, others = float(squares[worst]), None
-    inflated = ShapeTails(degrees_of_freedom=freedom)  # as the errors are
-    fits_without = not misfits(total - alone, redundancy - 2, inflated)
-    if freedom is not None:
-        others = freedom + redundancy - 2
-        # The scale of this object's shape, by the prior and by the other keypoints.
-        alone *= others / (freedom - 2 + total - alone) * (others - 2) / others
-    is_wrong = count * (1 - probability_within(alone, 2, others)) < _FALSE_ALARMS
-    if is_wrong and fits_without:
-        away = np.linalg.solve(whitening_matrices(seen.whitening)[worst], misses[worst])
-        pixels = focal * float(np.linalg.norm(away))
-        text = (
-            f"keypoint {quote(names[worst])} is {pixels:.2g} px from where the others and the "
-            "learned shapes predict it: a wrong keypoint, or a part that the shapes do not have"
-        )
-        return (EstimateWarning("outlier", text, 0, (worst,)),)
-    return misfits(total, redundancy, inflated)
-
-
-def misfits(cost: float, redundancy: int, tails: ShapeTails) -> Warnings:
-    """Report residuals that are too large for their standard deviations.
-
-    At the optimum the cost, priors included, is distributed as chi-square: every unknown with a
-    prior adds one equation, every other takes one away. For a learned shape it is distributed as
-    errors of held-out objects are, see `ShapeTails`.
-    """
-    if redundancy <= 0 or cost < redundancy:
-        return ()
-    squares = cost / tails.inflation**2
-    if 1 - probability_within(squares, redundancy, tails.degrees_of_freedom) >= _FALSE_ALARMS:
-        return ()
-    ratio = np.sqrt(squares / redundancy)
-    text = (
-        f"the residuals are {ratio:.2g} times as large as sigma and the spread of shapes allow: "
-        "a keypoint, a sigma or the model is wrong"
-    )
-    return (EstimateWarning("misfit", text),)
-
-
-def _predicted(seen: SeenShape, inflation: float) -> tuple[FloatArray, FloatArray]:
-    """Whitened errors (2 n,) of the mean shape, and their inverse covariance beside any pose."""
-    count = len(seen.rays)
-    errors, by_pose = whitened_errors(seen.points, seen.pose, seen.rays, seen.whitening)
-    by_point = by_pose[:, :, 3:] @ seen.pose.rotation
-    errors = errors - (by_point @ (seen.points - seen.mean)[:, :, None])[:, :, 0]
-    rows = _block_diagonal(by_point)
-    spread = inflation**2 * (rows @ seen.covariance @ rows.T) + np.eye(2 * count)
-    inverse = np.linalg.inv(spread)
-    pose = by_pose.reshape(2 * count, _POSE)
-    weighted = inverse @ pose
-    weight = inverse - weighted @ np.linalg.solve(pose.T @ weighted, weighted.T)
-    return errors.ravel(), np.asarray(weight)
-
-
 def _block_diagonal(blocks: FloatArray) -> FloatArray:
-    """The matrices (..., 2 n, 3 n) with blocks (..., n, 2, 3) along their diagonals."""
-    *several, count, _, _ = blocks.shape
-    rows = np.zeros((*several, count, 2, count, 3))
-    np.einsum("...iaib->...iab", rows)[:] = blocks
-    return rows.reshape(*several, 2 * count, 3 * count)
+    """The matrix (2 n, 3 n) with blocks (n, 2, 3) along its diagonal."""
+    count = len(blocks)
+    rows = np.zeros((count, 2, count, 3))
+    np.einsum("iaib->iab", rows)[:] = blocks
+    return rows.reshape(2 * count, 3 * count)
 
 
 class SinglePosterior(NamedTuple):
@@ -278,7 +184,9 @@ class SinglePosterior(NamedTuple):
 
     ``covariance`` (9, 9) is that of the pose and the log lengths of the box, whose corners are the
     last two points; ``of_points`` (m, 3, 3) are those of the points in the model's frame, and
-    ``of_seen`` (m, 3, 3) in the camera's, where they include the pose.
+    ``of_seen`` (m, 3, 3) in the camera's, where they include the pose. ``misses`` are the largest
+    squared distance of a keypoint from what the others predict, and that of all from the mean
+    shape, in standard deviations; None where nothing predicts a keypoint.
     """
 
     pose: Alignment
@@ -287,75 +195,70 @@ class SinglePosterior(NamedTuple):
     covariance: FloatArray
     of_points: FloatArray
     of_seen: FloatArray
+    misses: tuple[float, float] | None
 
 
-def single_posteriors(
-    mixture: Mixture, components: IntArray, seen: Seen, states: FloatArray, inflation: float
-) -> list[SinglePosterior]:
-    """The posterior at each state (K, D) of a component (K,), all of them at once.
+def single_posterior(
+    mixture: Mixture, component: int, seen: Seen, state: FloatArray, inflation: float
+) -> SinglePosterior:
+    """The posterior at a state (D,) of a component.
 
     The deviations of the prior are widened by the ``inflation``. The box holds the keypoints that
     are seen. Covariances are infinite where the pose is not determined.
     """
-    size, count, m = len(states), len(seen.points), mixture.means.shape[1]
-    rotations = states[:, :9].reshape(-1, 3, 3)
-    poses = [
-        Alignment(row[:9].reshape(3, 3), row[9:12], np.ones(3), is_valid=True) for row in states
-    ]
-    given = zip(components.tolist(), states, strict=True)
-    points = np.array([shape_at(mixture, component, seen, state) for component, state in given])
-    boxes = widened_boxes(points, seen.points)
-    views = [
-        whitened_errors(each[seen.points], pose, seen.rays, seen.whitening)
-        for each, pose in zip(points, poses, strict=True)
-    ]
-    errors, by_pose = np.array([own for own, _ in views]), np.array([slopes for _, slopes in views])
+    count, m = len(seen.points), mixture.means.shape[1]
+    rotation = state[:9].reshape(3, 3)
+    pose = Alignment(rotation, state[9:12], np.ones(3), is_valid=True)
+    points = shape_at(mixture, component, seen, state)
+    boxed = widened_boxes(points, seen.points)
+    lengths = boxed[-1] - boxed[-2]
+    errors, by_pose = whitened_errors(points[seen.points], pose, seen.rays, seen.whitening)
     weights, _ = loss_slopes((errors**2).sum(axis=-1), seen.loss, seen.loss_scale)
-    by_pose *= np.sqrt(weights)[..., None, None]
-    rows = _block_diagonal(by_pose[..., 3:] @ rotations[:, None])
-    jacobian = by_pose.reshape(size, 2 * count, _POSE)
-    prior = inflation**2 * mixture.covariances[components]
-    columns = coordinates_of(seen)
-    told = prior[:, :, columns] @ rows.swapaxes(1, 2)  # covariance of points with residuals
+    by_pose *= np.sqrt(weights)[:, None, None]
+    rows, jacobian = _block_diagonal(by_pose[..., 3:] @ rotation), by_pose.reshape(-1, _POSE)
     # Behind the points, the difference of the box's corners.
-    told = np.concatenate([told, told[:, -3:] - told[:, -6:-3]], axis=1)
-    blocks = prior.reshape(size, m, 3, m, 3)
-    corners = blocks[:, -2:, :, -2:]
-    across = corners[:, 1, :, 0]
-    difference = corners[:, 1, :, 1] + corners[:, 0, :, 0] - across - across.swapaxes(1, 2)
-    own = np.einsum("kiaib->kiab", blocks)
-    own = np.concatenate([own, difference[:, None]], axis=1)
-    both = np.concatenate([told.swapaxes(1, 2), jacobian], axis=2)
-    solved = np.linalg.solve(rows @ told[:, columns] + np.eye(2 * count), both).swapaxes(1, 2)
-    solved, weight = solved[:, :-_POSE], solved[:, -_POSE:]
+    prior, columns = inflation**2 * mixture.covariances[component], coordinates_of(seen)
+    prior = np.concatenate([prior, prior[-3:] - prior[-6:-3]])
+    prior = np.concatenate([prior, prior[:, -3:] - prior[:, -6:-3]], axis=1)
+    across = prior[:, columns] @ rows.T  # covariance of points with residuals
+    inverse = np.linalg.inv(rows @ across[columns] + np.eye(2 * count))
+    weight = jacobian.T @ inverse
     try:
-        inverse = np.linalg.inv(np.linalg.cholesky(weight @ jacobian))
+        root = np.linalg.inv(np.linalg.cholesky(weight @ jacobian))
     except np.linalg.LinAlgError:
-        if size > 1:
-            each = [(components[k : k + 1], seen, states[k : k + 1]) for k in range(size)]
-            return [single_posteriors(mixture, *one, inflation)[0] for one in each]
         unknown = np.full((m, 3, 3), np.inf)
-        infinite = np.full((9, 9), np.inf), unknown, unknown
-        return [SinglePosterior(poses[0], boxes[0], np.ptp(boxes[0, -2:], axis=0), *infinite)]
-    of_pose = inverse.swapaxes(1, 2) @ inverse
-    by_steps = (-solved @ jacobian).reshape(size, m + 1, 3, _POSE)
-    shape = size, m + 1, 3, 2 * count
-    left = own - solved.reshape(shape) @ told.reshape(shape).swapaxes(2, 3)
-    whole = left + by_steps @ of_pose[:, None] @ by_steps.swapaxes(2, 3)
-    turns = rotations[:, None]
-    in_camera = turns @ by_steps[:, :m]
-    in_camera[..., :3] += by_rotation(points @ rotations.swapaxes(1, 2))
+        return SinglePosterior(
+            pose, boxed, lengths, np.full((9, 9), np.inf), unknown, unknown, None
+        )
+    of_pose, solved = root.T @ root, across @ inverse
+    by_steps = (-solved @ jacobian).reshape(m + 1, 3, _POSE)
+    left = np.einsum("iaib->iab", prior.reshape(m + 1, 3, m + 1, 3))
+    blocks = m + 1, 3, 2 * count
+    left = left - solved.reshape(blocks) @ across.reshape(blocks).swapaxes(1, 2)
+    whole = left + by_steps @ of_pose @ by_steps.swapaxes(1, 2)
+    in_camera = rotation @ by_steps[:m]
+    in_camera[..., :3] += by_rotation(points @ rotation.T)
     in_camera[..., 3:] += np.eye(3)
-    of_seen = turns @ left[:, :m] @ turns.swapaxes(2, 3)
-    of_seen += in_camera @ of_pose[:, None] @ in_camera.swapaxes(2, 3)
-    extent = points[:, -1] - points[:, -2]
+    of_seen = rotation @ left[:m] @ rotation.T + in_camera @ of_pose @ in_camera.swapaxes(1, 2)
+    extent = points[-1] - points[-2]
     relative = np.where(extent > 0, 1.0 / np.where(extent > 0, extent, 1.0), 0.0)
-    logs = np.concatenate(
-        [np.broadcast_to(np.eye(_POSE), of_pose.shape), relative[..., None] * by_steps[:, m]],
-        axis=1,
-    )
-    covariances = logs @ of_pose @ logs.swapaxes(1, 2)
-    covariances[:, _POSE:, _POSE:] += relative[:, :, None] * relative[:, None] * left[:, m]
-    lengths = boxes[:, -1] - boxes[:, -2]
-    found = poses, boxes, lengths, covariances, whole[:, :m], of_seen
-    return [SinglePosterior(*each) for each in zip(*found, strict=True)]
+    logs = np.concatenate([np.eye(_POSE), relative[:, None] * by_steps[m]])
+    covariance = logs @ of_pose @ logs.T
+    covariance[_POSE:, _POSE:] += relative[:, None] * relative * left[m]
+    moved = (points - mixture.means[component])[seen.points].ravel()
+    misses = _misses(errors.ravel() - rows @ moved, inverse - weight.T @ of_pose @ weight)
+    return SinglePosterior(pose, boxed, lengths, covariance, whole[:m], of_seen, misses)
+
+
+def _misses(errors: FloatArray, weight: FloatArray) -> tuple[float, float] | None:
+    """Largest squared miss of a keypoint, and that of all, of predicted errors (2 n,).
+
+    ``weight`` (2 n, 2 n) is their inverse covariance beside any pose.
+    """
+    count = len(errors) // 2
+    forces = (weight @ errors).reshape(count, 2)
+    blocks = np.einsum("iaib->iab", weight.reshape(count, 2, count, 2))
+    if np.linalg.eigvalsh(blocks).min() <= 0:
+        return None
+    squares = forces * np.linalg.solve(blocks, forces[:, :, None])[:, :, 0]
+    return float(squares.sum(axis=1).max()), float(errors @ weight @ errors)

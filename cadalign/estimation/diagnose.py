@@ -24,8 +24,8 @@ from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.problems import pack_one
 from cadalign.estimation.result_parts import FittedKeypoints, listed
-from cadalign.estimation.uncertainty.doubts import FALSE_ALARMS, OTHER_SIZES, is_large_sigma
-from cadalign.estimation.uncertainty.residuals import chance_of, named_keypoints
+from cadalign.estimation.uncertainty.doubts import OTHER_SIZES
+from cadalign.estimation.uncertainty.residuals import named_keypoints
 from cadalign.estimation.view import View
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
@@ -116,21 +116,10 @@ def diagnose_fit(fitted: FittedKeypoints) -> EstimateWarning | None:
         ransac = fitted.search.ransac
         own = _case_of_rows(fitted, ahead, None if fitted.inliers.all() else ransac)
         cause = diagnose(replace(own, ransac=ransac))
-    elif _fits(fitted):
-        return None
     is_last = fitted.search is not None and options.sigma is None
     if cause is not None or is_last or fitted.fisher_covariance is None:
         return cause
     return diagnose(_case_of_rows(fitted, ahead if options.sigma is None else fitted.inliers))
-
-
-def _fits(fitted: FittedKeypoints) -> bool:
-    """True for residuals without a search that pass the test for mistakes."""
-    if fitted.cost is None:
-        return True
-    if fitted.options.sigma is None:
-        return not is_large_sigma(fitted.sigma or 0.0, [fitted.observed[fitted.inliers]])
-    return chance_of(fitted.cost, fitted.redundancy) >= FALSE_ALARMS
 
 
 @np.errstate(all="ignore")
@@ -159,17 +148,23 @@ def _case_of_rows(
     fitted: FittedKeypoints, kept: BoolArray, ransac: RansacOptions | None = None
 ) -> DiagnosisCase:
     """The case of some keypoints, whose ids are their rows."""
-    rows, sigma = np.flatnonzero(kept), fitted.options.sigma
+    rows, options, sigma = np.flatnonzero(kept), fitted.options, fitted.options.sigma
     if sigma is not None and np.ndim(sigma) > 0:
-        sigma = np.asarray(sigma)[rows]
-    view = View(fitted.camera, fitted.observed[rows], ids=rows.tolist(), sigma=sigma)
-    return case_of_fit(fitted.points_3d, view, fitted.options, ransac)
+        options = replace(options, sigma=np.asarray(sigma)[rows])
+    observed = fitted.observed[rows]
+    return case_of_fit(fitted.points_3d, observed, fitted.camera, options, ransac, rows.tolist())
 
 
 def case_of_fit(
-    points_3d: FloatArray, view: View, options: FitOptions, ransac: RansacOptions | None
+    points_3d: FloatArray,
+    points_2d: FloatArray,
+    camera: Camera,
+    options: FitOptions,
+    ransac: RansacOptions | None,
+    rows: list[int] | None = None,
 ) -> DiagnosisCase:
-    """The case of a fit of a model's keypoints (n, 3) to a view, whose ids are rows of these."""
+    """The case of a fit of a model's keypoints (m, 3), by their rows, to those of an image."""
+    seen = View(camera, points_2d, ids=rows, sigma=options.sigma)
     shape = {name: getattr(options, name) for name in ("stretch", "stretch_sigma", "known_axis")}
 
     def again(model: AnyModel, views: Sequence[View], /, **changes: Any) -> Result:
@@ -181,7 +176,7 @@ def case_of_fit(
         fitted = fit_once(pack_one(points, view.pixels, view.camera), own, search, None, 0.0)
         return result_of_keypoints(view.pixels, fitted, view=view)
 
-    return DiagnosisCase(Model(points_3d=points_3d, **shape), (view,), again, ransac, has_rows=True)
+    return DiagnosisCase(Model(points_3d=points_3d, **shape), (seen,), again, ransac, has_rows=True)
 
 
 # Undone ------------------------------------------------------------------------------------------

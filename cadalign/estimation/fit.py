@@ -18,7 +18,6 @@ from cadalign.estimation.problems import Problems, pack_one
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FittedKeypoints
 from cadalign.estimation.solve import solve_one
-from cadalign.estimation.view import View
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
@@ -169,8 +168,8 @@ def fit_one(
     except NoConsensusError as error:
         from cadalign.estimation.diagnose import case_of_fit, diagnose_refusal  # makes fits anew
 
-        view = View(problems.camera(0), problems.points_2d, sigma=options.sigma)
-        case = case_of_fit(problems.points_3d, view, options, ransac)
+        given = problems.points_3d, problems.points_2d, problems.camera(0)
+        case = case_of_fit(*given, options, ransac)
         error.fix = diagnose_refusal(case) or error.fix
         raise
     return result_of_keypoints(

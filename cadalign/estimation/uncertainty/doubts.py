@@ -10,6 +10,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.estimation.focal import focal_doubt
 from cadalign.estimation.result_parts import Diagnosis, FittedKeypoints, uncertainty_of
+from cadalign.estimation.uncertainty.residuals import chance_of
 from cadalign.estimation.warning import EstimateWarning, Kind, Warnings
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -41,7 +42,7 @@ def keypoint_warnings(
     fitted: FittedKeypoints, covariance: FloatArray | None, diagnosis: Diagnosis | None
 ) -> Warnings:
     """Warnings about the cause of a misfit, and what the keypoints do not determine."""
-    cause = None if diagnosis is None else diagnosis(fitted)
+    cause = None if diagnosis is None or _fit(fitted) else diagnosis(fitted)
     observed = fitted.observed[np.isfinite(fitted.residuals).all(axis=1)]
     fits = cause is None
     is_mistake = cause is not None and cause.kind == "mistake"
@@ -71,6 +72,15 @@ def keypoint_warnings(
         poses = [(each.alignment, each.relative_likelihood) for each in fitted.alternatives]
         found += another_pose(fitted.alignment, poses, covariance)
     return tuple(found)
+
+
+def _fit(fitted: FittedKeypoints) -> bool:
+    """True for keypoints without a search that pass the test for mistakes, which take longer."""
+    if fitted.search is not None or fitted.cost is None:
+        return fitted.search is None
+    if fitted.options.sigma is None:
+        return not is_large_sigma(fitted.sigma or 0.0, [fitted.observed[fitted.inliers]])
+    return chance_of(fitted.cost, fitted.redundancy) >= FALSE_ALARMS
 
 
 @np.errstate(all="ignore")  # lengths that overflow are of translations known well enough

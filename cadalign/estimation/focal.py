@@ -103,10 +103,9 @@ class FocalPrior:
         """Read a photo's focal length from its EXIF data.
 
         From the 35 mm equivalent (taken along the diagonal, as CIPA defines it), otherwise from the
-        focal length, times the digital zoom, and the pixels' size on the sensor, or else the
-        sensor's width, where the camera's model is known. A photo turned upright has the same focal
-        length. Values that cannot be right, such as a focal length of 0, are ignored with a warning
-        (logger "cadalign").
+        focal length, times the digital zoom, and the pixels' size on the sensor. A photo turned
+        upright has the same focal length. One that no camera has is ignored with a warning (logger
+        "cadalign").
 
         Parameters
         ----------

@@ -34,7 +34,8 @@ _HIGHEST_QUANTILE = 0.95  # of the residuals' lengths that a robust sigma is tak
 _EXACT_COST = 1e-6
 _TINY = 1e-100
 # Minima, iterations, hypotheses, undetermined unknown of a method that makes one guess.
-_ONE_MINIMUM = read_only(np.array([1, 0, 1, -1]))
+_ONE_MINIMUM = read_only(np.array([[1, 0, 1, -1]]))
+_NO_COST = read_only(np.array([[np.inf]]))
 
 LEAST_LIKELIHOOD = 1e-3
 """Relative likelihood above which another minimum is reported as an alternative."""
@@ -63,11 +64,12 @@ def solve(problems: Problems, options: FitOptions) -> Solutions:
     else:
         found = _baseline(options.method, points, rays)
     residuals, statuses = _residuals(problems, points, facing, found)
-    errors = {}
-    if statuses.any():
-        for b in np.flatnonzero(statuses).tolist():
-            own = problems.points_3d[problems.rows(b)]
-            errors[b] = solver_error(statuses[b], found.info[b, 3], own, options)
+    errors = {
+        b: solver_error(
+            statuses[b], found.info[b, 3], problems.points_3d[problems.rows(b)], options
+        )
+        for b in statuses.nonzero()[0].tolist()
+    }
     poses, covariances = found.poses, found.covariances
     if covariances is not None and options.known_axis == "y":  # solved as z, x
         swapped = [0, 1, 2, 3, 4, 5, 7, 6]
@@ -208,5 +210,7 @@ def _baseline(method: str, points: FloatArray, rays: FloatArray) -> Solutions:
 
 def _one_guess(poses: FloatArray, statuses: IntArray) -> Solutions:
     """The solutions of a method that supports neither noise nor alternatives."""
-    costs, info = np.full(poses.shape[:2], np.inf), np.tile(_ONE_MINIMUM, (len(poses), 1))
-    return Solutions(poses, costs, None, statuses, info)
+    count = len(poses)  # NumPy's tile takes as long as the linear solver
+    return Solutions(
+        poses, _NO_COST.repeat(count, 0), None, statuses, _ONE_MINIMUM.repeat(count, 0)
+    )

@@ -124,7 +124,7 @@ def test_exif_that_lies_is_ignored_with_a_warning(
 ) -> None:
     photo = Image.new("RGB", (640, 480))
     exif = photo.getexif()
-    exif[0x8769] = {0x920A: 0.0}
+    exif[0x8769] = {0xA405: 60000}
     photo.save(folder / "photo.jpg", exif=exif)
     observe(folder, "--image", str(folder / "photo.jpg"))
     with caplog.at_level(logging.WARNING, logger="cadalign"):
@@ -133,7 +133,8 @@ def test_exif_that_lies_is_ignored_with_a_warning(
     assert result.camera.fx == pytest.approx(620, rel=0.1)
     (record,) = caplog.records
     assert record.getMessage() == (
-        f"{folder / 'photo.jpg'}: the EXIF data state FocalLength 0.0; ignored"
+        f"{folder / 'photo.jpg'}: the EXIF data state a focal length of 1.109e+06 px, "
+        "which no camera has; ignored"
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.estimation.options import FitOptions, pixel_information
-from cadalign.estimation.problems import Problems, Solutions, full_covariance
+from cadalign.estimation.problems import Problems, Solutions
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import (
     Alternative,
@@ -101,8 +101,9 @@ def keypoints_of_solution(
         "method": options.method,
     }
     if solutions.covariances is not None:
-        of_solver = solutions.covariances[0]
-        fitted["fisher_covariance"] = full_covariance(of_solver, options.known_axis)
+        covariance, rows = np.zeros((9, 9)), options.solver_rows
+        covariance[rows[:, None], rows] = solutions.covariances[0]
+        fitted["fisher_covariance"] = covariance
         fitted["cost"] = solutions.costs.item(0)
     if minima > 1:
         poses = [Alignment.from_packed(pose) for pose in solutions.poses[0, :minima]]

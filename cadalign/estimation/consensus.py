@@ -13,7 +13,7 @@ from cadalign.arrays import BoolArray, FloatArray, as_floats
 from cadalign.errors import CadalignError, DegenerateError, InputError, NoConsensusError
 from cadalign.estimation.assemble import keypoints_of_solution
 from cadalign.estimation.options import MINIMAL_SOLVERS, FitOptions, RansacOptions
-from cadalign.estimation.problems import Problems, are_in_one_plane, rays_of, whitening_of
+from cadalign.estimation.problems import Problems, rays_of, whitening_of
 from cadalign.estimation.result_parts import FitStats, FittedKeypoints
 from cadalign.estimation.solve import solve_one
 from cadalign.estimation.uncertainty.residuals import (
@@ -26,7 +26,7 @@ from cadalign.estimation.uncertainty.residuals import (
     share_as_moderate,
 )
 from cadalign.estimation.warning import EstimateWarning
-from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.alignment import Alignment, describe_plane
 from cadalign.geometry.camera import faced, turned_poses
 from cadalign.solvers.alignment import Objective
 from cadalign.solvers.constants import LINEAR, POSE_SIZE, SAMPLE_SIZES
@@ -171,8 +171,10 @@ def _refined(search: RobustSearch, inliers: BoolArray) -> FittedKeypoints:
     Raises CadalignError if they do not determine the alignment.
     """
     problems, sigma = search.problems, search.options.sigma
+    points, pixels = problems.points_3d, problems.points_2d
     for last in range(_INLIER_ROUNDS + 1):
-        some, options = problems.chosen(inliers), search.options
+        offsets, options = np.array([0, int(inliers.sum())]), search.options
+        some = Problems(points[inliers], pixels[inliers], offsets, problems.cameras)
         if sigma is not None and np.ndim(sigma) > 0:
             options = replace(options, sigma=np.asarray(sigma, dtype=np.float64)[inliers])
         optimum = keypoints_of_solution(some, solve_one(some, options), options, 0.0)
@@ -181,7 +183,6 @@ def _refined(search: RobustSearch, inliers: BoolArray) -> FittedKeypoints:
         if (kept == inliers).all() or kept.sum() < inliers.sum() or last == _INLIER_ROUNDS:
             break
         inliers = kept
-    points = problems.points_3d
     return replace(
         optimum,
         points_3d=points,
@@ -235,9 +236,9 @@ def _best_hypothesis(search: RobustSearch) -> tuple[Alignment, BoolArray, int, i
         pose,
         inliers,
     )
-    if not hypotheses and are_in_one_plane(points):
+    if not hypotheses and (plane := describe_plane(problems.points_3d)):
         raise DegenerateError(
-            "all keypoints lie in one plane, where the samples of ransac determine nothing",
+            f"{plane}: the samples of ransac determine nothing",
             where="points_3d",
             fix="leave ransac away: use loss='cauchy', with stretch= or stretch_sigma=",
         )

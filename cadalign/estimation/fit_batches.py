@@ -16,11 +16,10 @@ from cadalign.errors import CadalignError
 from cadalign.estimation.assemble import keypoints_of_solution, result_of_keypoints
 from cadalign.estimation.fit import check_search, diagnosis_of_fit, fit_one
 from cadalign.estimation.focal import PriorOption
-from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
+from cadalign.estimation.options import FitOptions, RansacOptions, Sigma, pixel_information
 from cadalign.estimation.problems import (
     Problems,
     Solutions,
-    check_sigmas,
     each_of,
     in_threads,
     pack_many,
@@ -107,7 +106,9 @@ def fit_batch(
     each_options = [options] * count
     if per_problem:
         sigmas = list(map(copied, each_of(sigma, "sigma", count, "values")))
-        check_sigmas(sigmas, problems.counts)
+        for one, size in zip(sigmas, problems.counts.tolist(), strict=True):
+            if one is not None:
+                pixel_information(one, size)
         each_options = [replace(options, sigma=one) for one in sigmas]
     check_search(ransac, scores, symmetry)
     if scores is not None:
@@ -148,7 +149,7 @@ def _solve_at_once(problems: Problems, options: FitOptions) -> tuple[list[Entry]
     means = np.add.reduceat(squares, problems.offsets[:-1]) / np.maximum(problems.counts, 1)
     table = np.empty((len(problems), COLUMNS))
     table[:, :POSE_SIZE] = solutions.poses[:, 0]
-    table[:, POSE_SIZE], table[:, POSE_SIZE + 1] = np.sqrt(means), problems.calibrations[:, 0]
+    table[:, POSE_SIZE], table[:, POSE_SIZE + 1] = np.sqrt(means), problems.cameras[0].fx
     table[list(errors)] = np.nan
     return [
         errors.get(b) or partial(_single, problems, solutions, options, seconds, b)

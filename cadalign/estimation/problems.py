@@ -5,10 +5,8 @@ Pixels become rays, and the keypoints' uncertainties the weights of the residual
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 from itertools import pairwise
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar, cast
@@ -16,10 +14,10 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray, as_points, is_number, worker_count
+from cadalign.arrays import FloatArray, IntArray, as_points, is_number, worker_count
 from cadalign.errors import CadalignError, DegenerateError, InputError, quote, require_kind
 from cadalign.estimation.options import SIGMA_HELP, FitOptions, Sigma, pixel_information
-from cadalign.geometry.alignment import are_on_a_line, describe_plane
+from cadalign.geometry.alignment import describe_plane
 from cadalign.geometry.camera import Camera, rays_ahead
 from cadalign.geometry.pixels import check_pixels
 from cadalign.solvers.constants import NOT_FOUND, OUT_OF_RANGE, TOO_FEW
@@ -30,7 +28,6 @@ T = TypeVar("T")
 
 _NO_RESIDUALS = np.empty((0, 2))
 _NO_ERRORS: Mapping[int, CadalignError] = MappingProxyType({})
-_FLAT = 1e-6  # extent across a line or a plane over that along it
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,11 +55,6 @@ class Problems:
         return slice(int(self.offsets[problem]), int(self.offsets[problem + 1]))
 
     @property
-    def calibrations(self) -> FloatArray:
-        """Focal lengths and principal points (1 or B, 4): fx, fy, cx, cy."""
-        return np.reshape([[c.fx, c.fy, c.cx, c.cy] for c in self.cameras], (-1, 4))
-
-    @property
     def counts(self) -> IntArray:
         """Number of points of each problem, (B,) int."""
         return self.offsets[1:] - self.offsets[:-1]
@@ -77,19 +69,29 @@ class Problems:
             self.cameras[first:last] if len(self.cameras) > 1 else self.cameras,
         )
 
-    def chosen(self, rows: BoolArray) -> Problems:
-        """The only problem with some of its rows, marked (n,)."""
-        offsets = np.array([0, int(rows.sum())])
-        return replace(
-            self, points_3d=self.points_3d[rows], points_2d=self.points_2d[rows], offsets=offsets
+
+def pack_one(
+    points_3d: npt.ArrayLike, points_2d: npt.ArrayLike, camera: Camera, place: str = ""
+) -> Problems:
+    """Check one problem's arguments, which messages name with its ``place`` among others.
+
+    The arrays are writable ones (n, 3) and (n, 2) of finite numbers; the given ones if they are
+    that.
+    """
+    model, image = cast(FloatArray, points_3d), cast(FloatArray, points_2d)
+    name_2d = f"points_2d{place}"
+    if not (_is_kernel_array(model, 3) and _is_kernel_array(image, 2) and all_finite(model, image)):
+        name_3d = f"points_3d{place}"
+        model = np.require(as_points(points_3d, name=name_3d, dimension=3), requirements="W")
+        image = np.require(as_points(points_2d, name=name_2d, dimension=2), requirements="W")
+    if len(model) != len(image):
+        raise InputError(
+            f"{len(model)} model points but {len(image)} image points",
+            where=name_2d,
+            fix="row i of both must be the same keypoint",
         )
-
-
-def pack_one(points_3d: npt.ArrayLike, points_2d: npt.ArrayLike, camera: Camera) -> Problems:
-    """Check one problem's arguments."""
-    model, image = _check_pair(points_3d, points_2d, "points_3d", "points_2d")
     require_kind(camera, Camera, "camera")
-    check_pixels(image, camera.width, camera.height, where="points_2d")
+    check_pixels(image, camera.width, camera.height, where=name_2d)
     return Problems(model, image, np.array([0, len(model)]), (camera,))
 
 
@@ -102,39 +104,17 @@ def pack_many(
     points_3d = each_of(points_3d, "points_3d", None, "")
     count = len(points_3d)
     points_2d = each_of(points_2d, "points_2d", count, "sets of image points")
-    given = isinstance(camera, Camera)
-    cameras = (camera,) if given else tuple(each_of(camera, "camera", count, "cameras"))
-    for single in cameras:
-        require_kind(single, Camera, "camera")
-    if not count:
-        return Problems(np.empty((0, 3)), np.empty((0, 2)), np.zeros(1, dtype=np.int64), cameras)
-    problems = None
-    if _is_stack(points_3d, 3) and _is_stack(points_2d, 2):
-        model = np.array(points_3d, dtype=np.float64, order="C").reshape(-1, 3)
-        image = np.array(points_2d, dtype=np.float64, order="C").reshape(-1, 2)
-        if len(model) == len(image) and all_finite(model, image):
-            offsets = np.arange(count + 1) * (len(model) // count)
-            problems = Problems(model, image, offsets, cameras)
-    if problems is None:
-        pairs = [
-            _check_pair(points_3d[b], points_2d[b], f"points_3d[{b}]", f"points_2d[{b}]")
-            for b in range(count)
-        ]
-        models, images = zip(*pairs, strict=True)
-        offsets = np.cumsum([0, *map(len, models)], dtype=np.int64)
-        problems = Problems(np.concatenate(models), np.concatenate(images), offsets, cameras)
-    for b in range(count):
-        camera, image = problems.camera(b), problems.points_2d[problems.rows(b)]
-        check_pixels(image, camera.width, camera.height, where=f"points_2d[{b}]")
-    return problems
-
-
-def distinct_rows(rows: FloatArray) -> int:
-    """The number of different rows among (n, k), told apart by a fixed combination of columns."""
-    combined = np.zeros(len(rows))
-    for k in range(rows.shape[1]):
-        combined += math.sqrt(k + 2.0) * rows[:, k]
-    return len(np.unique(combined))
+    is_shared = isinstance(camera, Camera)
+    cameras = (camera,) if is_shared else tuple(each_of(camera, "camera", count, "cameras"))
+    places = [f"[{b}]" for b in range(count)]
+    given = points_3d, points_2d, cameras * count if is_shared else cameras, places
+    each = [pack_one(*arguments) for arguments in zip(*given, strict=True)]
+    return Problems(
+        np.concatenate([np.empty((0, 3)), *(problem.points_3d for problem in each)]),
+        np.concatenate([np.empty((0, 2)), *(problem.points_2d for problem in each)]),
+        np.cumsum([0, *(len(problem.points_3d) for problem in each)], dtype=np.int64),
+        cameras,
+    )
 
 
 def each_of(value: Any, name: str, count: int | None, entries: str) -> Any:
@@ -161,15 +141,6 @@ def in_threads(run: Callable[[int, int], T], count: int, workers: int) -> list[T
         return list(pool.map(run, *zip(*parts, strict=True)))
 
 
-def _is_stack(value: object, last: int) -> bool:
-    return (
-        type(value) is np.ndarray
-        and value.ndim == 3
-        and value.shape[2] == last
-        and value.dtype.kind == "f"
-    )
-
-
 def _is_kernel_array(points: npt.ArrayLike, dimension: int) -> bool:
     """True for a writable array of the right form: frozen ones would compile the kernels again."""
     return (
@@ -179,23 +150,6 @@ def _is_kernel_array(points: npt.ArrayLike, dimension: int) -> bool:
         and points.ndim == 2
         and points.shape[1] == dimension
     )
-
-
-def _check_pair(
-    points_3d: npt.ArrayLike, points_2d: npt.ArrayLike, name_3d: str, name_2d: str
-) -> tuple[FloatArray, FloatArray]:
-    """Writable arrays (n, 3) and (n, 2) of finite numbers; the given ones where they are that."""
-    model, image = cast(FloatArray, points_3d), cast(FloatArray, points_2d)
-    if not (_is_kernel_array(model, 3) and _is_kernel_array(image, 2) and all_finite(model, image)):
-        model = np.require(as_points(points_3d, name=name_3d, dimension=3), requirements="W")
-        image = np.require(as_points(points_2d, name=name_2d, dimension=2), requirements="W")
-    if len(model) != len(image):
-        raise InputError(
-            f"{len(model)} model points but {len(image)} image points",
-            where=name_2d,
-            fix="row i of both must be the same keypoint",
-        )
-    return model, image
 
 
 def rays_of(points_2d: FloatArray, camera: Camera, *, clips: bool = False) -> FloatArray:
@@ -246,24 +200,14 @@ def whitening_by(information: FloatArray) -> FloatArray:
     return np.stack([a, b, np.sqrt(information[:, 1, 1] - b * b)], axis=1)
 
 
-def check_sigmas(sigmas: Sequence[Sigma | None], counts: IntArray) -> None:
-    """Check the standard deviations of problems of so many keypoints each.
-
-    Raises InputError if one is no standard deviation, or has another shape than its keypoints.
-    """
-    for sigma, count in zip(sigmas, counts.tolist(), strict=True):
-        if sigma is not None:
-            pixel_information(sigma, count)
-
-
 class Solutions(NamedTuple):
     """Minima of every problem, the best first.
 
     ``poses`` (B, k, 15) are packed, ``costs`` (B, k) their whitened squared errors, infinite where
-    there is none; ``covariances`` (B, 8, 8) and ``residuals`` (n, 2) [px] are those of the best.
-    ``info`` (B, 4) counts minima, iterations and hypotheses, and names an undetermined unknown or
-    -1. ``errors`` are those of the problems without a solution; ``sigma`` [px] is there where it
-    was estimated, of the only problem.
+    there is none; ``covariances`` (B, 8, 8), without the known scale, and ``residuals`` (n, 2) [px]
+    are those of the best. ``info`` (B, 4) counts minima, iterations and hypotheses, and names an
+    undetermined unknown or -1. ``errors`` are those of the problems without a solution; ``sigma``
+    [px] is there where it was estimated, of the only problem.
     """
 
     poses: FloatArray
@@ -274,27 +218,6 @@ class Solutions(NamedTuple):
     residuals: FloatArray = _NO_RESIDUALS
     errors: Mapping[int, CadalignError] = _NO_ERRORS
     sigma: float | None = None
-
-
-def full_covariance(of_solver: FloatArray, known_axis: str) -> FloatArray:
-    """Covariances (..., 9, 9) of results from solvers' (..., 8, 8), which lack the known scale."""
-    problems = of_solver.shape[:-2]
-    full = np.zeros((*problems, 81))
-    full[..., _places(known_axis)] = of_solver.reshape(*problems, 64)
-    return full.reshape(*problems, 9, 9)
-
-
-@lru_cache(maxsize=3)
-def _places(known_axis: str) -> IntArray:
-    """Entries of a flattened covariance that belong to unknowns of the solvers."""
-    rows = np.delete(np.arange(9), 6 + "xyz".index(known_axis))
-    return (9 * rows[:, None] + rows).ravel()
-
-
-def are_in_one_plane(points: FloatArray) -> bool:
-    """True for points (n, 3) that do not all coincide and lie in a plane or on a line."""
-    extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(extents[0] > 0 and extents[2] <= _FLAT * extents[0])
 
 
 def solver_error(
@@ -316,16 +239,7 @@ def solver_error(
         missing = f"the translation along the camera's {'xyz'[undetermined - 3]}"
     else:
         missing = f"the scale s_{'xyz'[options.axis_order[undetermined - 5]]}"
-    if reason is None and 2 * len(points_3d) <= options.unknowns:
-        return DegenerateError(
-            f"no alignment reprojects the {len(points_3d)} keypoints exactly, and the nearest one "
-            f"leaves {missing} open",
-            where="points_3d",
-            fix="give more keypoints, or a stretch_sigma",
-        )
     fix = "add keypoints elsewhere, hold scales fixed with stretch=, or give stretch_sigma"
-    if undetermined < 3 and are_on_a_line(points_3d, _FLAT):
-        fix = "add keypoints off their line: no option, and no symmetry about it, takes their place"
     return DegenerateError(
         f"{missing} is not determined: {reason or 'seen from there, the keypoints leave it open'}",
         where="points_3d",

@@ -13,7 +13,6 @@ from cadalign.estimation.options import LOSSES, FitOptions
 from cadalign.estimation.problems import (
     Problems,
     Solutions,
-    distinct_rows,
     no_redundancy_error,
     rays_of,
     solver_error,
@@ -71,9 +70,6 @@ def solve(problems: Problems, options: FitOptions) -> Solutions:
         for b in statuses.nonzero()[0].tolist()
     }
     poses, covariances = found.poses, found.covariances
-    if covariances is not None and options.known_axis == "y":  # solved as z, x
-        swapped = [0, 1, 2, 3, 4, 5, 7, 6]
-        covariances = covariances[:, swapped][:, :, swapped]
     if options.known_axis != "x":
         poses = options.in_model_axes(poses)
     if facing is not camera:
@@ -142,7 +138,7 @@ def _solve_with_noise(problems: Problems, options: FitOptions) -> Solutions:
     converge, or go in circles: of two optima, each may be the better one at the other's noise.
     Keypoints that are given repeatedly count once for the redundancy.
     """
-    distinct = distinct_rows(np.concatenate([problems.points_3d, problems.points_2d], axis=1))
+    distinct = len({*map(bytes, np.hstack([problems.points_3d, problems.points_2d]))})
     redundancy = 2 * distinct - options.unknowns
     if redundancy <= 0:
         raise no_redundancy_error(distinct)

@@ -21,7 +21,7 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import LOSSES, FitOptions, pixel_information
-from cadalign.estimation.problems import distinct_rows, whitening_by
+from cadalign.estimation.problems import whitening_by
 from cadalign.estimation.result_parts import FittedKeypoints
 from cadalign.estimation.uncertainty.residuals import (
     bent,
@@ -128,7 +128,7 @@ def posterior_covariance(result: FittedKeypoints) -> FloatArray:
     points = result.points_3d[result.inliers]
     widening = 1.0
     if options.sigma is None:
-        pairs = distinct_rows(np.concatenate([points, result.residuals[result.inliers]], axis=1))
+        pairs = len({*map(bytes, np.hstack([points, result.residuals[result.inliers]]))})
         redundancy = max(2 * pairs - options.unknowns, 1)
         widening = widening_of(options.unknowns, redundancy * _EFFICIENCY[options.loss])
     sampled, first = None, _with_noise_times(widening, result.fisher_covariance, options)

@@ -7,7 +7,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
 from cadalign.estimation.options import Sigma, pixel_information
-from cadalign.estimation.problems import full_covariance, whitening_of
+from cadalign.estimation.problems import whitening_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import (
     Camera,
@@ -52,19 +52,19 @@ def cramer_rao_bound(
     covariance = np.zeros((UNKNOWNS, UNKNOWNS))
     if covariance_of(objective, gt.packed, covariance) >= 0:
         raise DegenerateError("the points do not determine the alignment", where="points_3d")
+    bound = np.zeros((_FOCAL + 1, _FOCAL + 1))
+    bound[np.ix_(_OF_STRETCHED[:-1], _OF_STRETCHED[:-1])] = covariance
     if focal != "estimate":
-        return full_covariance(covariance, "x")
+        return bound[:_FOCAL, :_FOCAL]
     whitening = np.linalg.cholesky(pixel_information(sigma, len(points_3d))).swapaxes(1, 2)
     rows = whitening @ projection_jacobian(points_3d, camera, gt)[:, :, _OF_STRETCHED]
     others, own = rows.reshape(-1, UNKNOWNS + 1)[:, :-1], rows[..., -1].ravel()
     gain = covariance @ (own @ others)
     alone = own - others @ gain
     gain = np.append(-gain, 1.0)
-    bound, free = np.zeros((_FOCAL + 1, _FOCAL + 1)), np.ix_(_OF_STRETCHED, _OF_STRETCHED)
-    bound[:_FOCAL, :_FOCAL] = full_covariance(covariance, "x")
     # A focal length that the others leave open is as uncertain as rounding errors let it be known.
     information = max(float(alone @ alone), UNOBSERVABLE * float(own @ own))
-    bound[free] += np.outer(gain, gain) / information
+    bound[np.ix_(_OF_STRETCHED, _OF_STRETCHED)] += np.outer(gain, gain) / information
     return bound
 
 

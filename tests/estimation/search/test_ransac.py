@@ -185,7 +185,7 @@ def test_random_correspondences_are_refused_with_the_best_score(points: int) -> 
 
 
 def test_identical_points_are_refused() -> None:
-    with pytest.raises(NoConsensusError):
+    with pytest.raises(DegenerateError, match="all points are the same"):
         fit(np.ones((20, 3)), np.full((20, 2), 100.0), CAMERA, ransac=RansacOptions())
 
 
@@ -254,7 +254,7 @@ def test_keypoints_in_one_plane_are_refused_in_those_words() -> None:
     problem, _, _ = spoiled(0, points=30, outliers=0)
     flat = problem.points_3d * [1, 1, 0]
     points_2d = CAMERA.project(problem.alignment.apply(flat))
-    with pytest.raises(DegenerateError, match=r"all keypoints lie in one plane.*loss='cauchy'"):
+    with pytest.raises(DegenerateError, match=r"plane z = 0: .*loss='cauchy'"):
         fit(flat, points_2d, CAMERA, ransac=RansacOptions(max_iterations=200))
     alone = fit(flat, points_2d, CAMERA, stretch="y", loss="cauchy")
     assert alone.rms < 1e3

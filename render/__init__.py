@@ -27,7 +27,6 @@ if TYPE_CHECKING:
         frame_object,
         look_at,
         sample_view,
-        silhouette_iou,
         visible_keypoints,
     )
 
@@ -55,7 +54,6 @@ __all__ = [
     "overlay_model",
     "pose_in_view",
     "sample_view",
-    "silhouette_iou",
     "visible_keypoints",
 ]
 

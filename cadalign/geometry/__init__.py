@@ -7,12 +7,7 @@ from cadalign.names import lazy_names
 if TYPE_CHECKING:
     from cadalign.geometry.alignment import Alignment, Box
     from cadalign.geometry.camera import Camera
-    from cadalign.geometry.conventions import (
-        up_from_gravity,
-        up_from_pitch_roll,
-        up_from_pose,
-        up_from_vertical_edges,
-    )
+    from cadalign.geometry.conventions import up_from_gravity, up_from_pose
     from cadalign.geometry.mesh import Material, Mesh
     from cadalign.geometry.metrics import (
         alignment_box_iou,
@@ -46,9 +41,7 @@ __all__ = [
     "translation_error",
     "translation_error_up_to_scale",
     "up_from_gravity",
-    "up_from_pitch_roll",
     "up_from_pose",
-    "up_from_vertical_edges",
 ]
 
 __getattr__ = lazy_names(__name__)

@@ -13,7 +13,6 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import DataError, InputError
 
 GREY = (0.7, 0.7, 0.7, 1.0)
-_LEAST_SIDE = 4  # of the part of a texture atlas that one colour takes [px]
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,22 +174,18 @@ class Mesh:
         return f"Mesh({self.source!r}, {size}{materials})"
 
     def to_trimesh(self) -> Any:
-        """The mesh as a `trimesh.Trimesh` with its colours and texture; needs trimesh.
+        """The mesh as a `trimesh.Trimesh` with its colours, without textures; needs trimesh.
 
-        Faces keep their order. A mesh of one look has its vertices as they are; textured ones, and
-        those of several materials, have three vertices for each face, so that texture coordinates
-        and colours belong to corners. Several textures are put side by side in one image.
+        Faces and vertices keep their order.
         """
         import trimesh
 
-        textured = any(material.texture is not None for material in self.materials)
-        if textured and self.corner_uv is not None:
-            return _with_texture(self, self.corner_uv)
         if self.vertex_colors is not None:
-            colors: dict[str, Any] = {"vertex_colors": _bytes(self.vertex_colors)}
+            colors: dict[str, Any] = {"vertex_colors": np.rint(255 * self.vertex_colors)}
         else:
             of_materials = np.array([material.color for material in self.materials])
-            colors = {"face_colors": _bytes(of_materials[self.face_material])}
+            colors = {"face_colors": np.rint(255 * of_materials[self.face_material])}
+        colors = {name: each.clip(0, 255).astype(np.uint8) for name, each in colors.items()}
         return trimesh.Trimesh(self.vertices, self.faces, process=False, **colors)
 
 
@@ -244,68 +239,6 @@ def spread_colors(mesh: Mesh, palette: FloatArray | None = None) -> FloatArray:
     colors = np.ones((len(mesh.vertices), 4))
     colors[mesh.faces] = palette[mesh.face_material][:, None]
     return colors
-
-
-def _with_texture(mesh: Mesh, corner_uv: FloatArray) -> Any:
-    """A mesh with three vertices for each face, and one image that holds all materials."""
-    import trimesh
-    from PIL import Image
-    from trimesh.visual.material import PBRMaterial
-    from trimesh.visual.texture import TextureVisuals
-
-    used = np.unique(mesh.face_material)
-    atlas, places = _atlas([mesh.materials[number] for number in used])
-    uv = corner_uv
-    if len(used) > 1:
-        # A part of an atlas cannot repeat: coordinates come to lie in [0, 1], once a triangle.
-        uv = corner_uv - np.floor(corner_uv.mean(axis=1, keepdims=True))
-        left, bottom, width, height = places[np.searchsorted(used, mesh.face_material)].T
-        uv = np.clip(uv, 0.0, 1.0) * np.stack([width, height], axis=1)[:, None]
-        uv = uv + np.stack([left, bottom], axis=1)[:, None]
-    material = PBRMaterial(  # type: ignore[no-untyped-call]
-        baseColorTexture=Image.fromarray(atlas),
-        metallicFactor=0.0,
-        roughnessFactor=1.0,
-        alphaMode="BLEND" if atlas[..., 3].min() < 255 else "OPAQUE",
-    )
-    visuals = TextureVisuals(uv=uv.reshape(-1, 2), material=material)  # type: ignore[no-untyped-call]
-    corners = np.arange(3 * len(mesh.faces)).reshape(-1, 3)
-    vertices = mesh.vertices[mesh.faces.ravel()]
-    return trimesh.Trimesh(vertices, corners, visual=visuals, process=False)
-
-
-def _atlas(materials: list[Material]) -> tuple[npt.NDArray[np.uint8], FloatArray]:
-    """Images of materials side by side, RGBA, and their places: left, bottom, width, height.
-
-    Places are texture coordinates, from the bottom left; half a pixel at the borders stays free.
-    """
-    images = [_image(material) for material in materials]
-    height, width = max(len(each) for each in images), sum(each.shape[1] for each in images)
-    atlas = np.zeros((height, width, 4), dtype=np.uint8)
-    places, left = [], 0
-    for image in images:
-        rows, columns = image.shape[:2]
-        atlas[height - rows :, left : left + columns] = image
-        place = (left + 0.5, 0.5, columns - 1, rows - 1)
-        places.append(np.array(place) / (width, height, width, height))
-        left += columns
-    return atlas, np.array(places)
-
-
-def _image(material: Material) -> npt.NDArray[np.uint8]:
-    """The texture times the colour, (h, w, 4)."""
-    color = np.array(material.color)
-    if material.texture is None:
-        return np.broadcast_to(_bytes(color), (_LEAST_SIDE, _LEAST_SIDE, 4)).copy()
-    texture = material.texture
-    if texture.shape[2] == 3:
-        opaque = np.full((*texture.shape[:2], 1), 255, dtype=np.uint8)
-        texture = np.concatenate([texture, opaque], axis=2)
-    return np.asarray(np.rint(np.clip(texture * np.clip(color, 0, 1), 0, 255)), dtype=np.uint8)
-
-
-def _bytes(color: FloatArray) -> npt.NDArray[np.uint8]:
-    return np.asarray(np.rint(255 * np.clip(color, 0, 1)), dtype=np.uint8)
 
 
 def face_normals(triangles: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Plain pictures, sheets and silhouettes: they show what they say."""
+"""Plain pictures and sheets: they show what they say."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ from cadalign.render import (
     look_at,
     normal_picture,
     pose_in_view,
-    silhouette_iou,
 )
 
 CAMERA = Camera.from_fov(160, 120, fov_x=50)
@@ -168,35 +167,3 @@ def test_a_contact_sheet_holds_every_picture_and_refuses_odd_ones():
         contact_sheet([images[0], images[1][1:]], ["a", "b"])
     with pytest.raises(InputError, match="labels"):
         contact_sheet(images, ["a"])
-
-
-def test_silhouette_iou_of_known_masks():
-    one, other = np.zeros((10, 10), bool), np.zeros((10, 10), bool)
-    one[:, :6], other[:, 3:] = True, True
-    assert silhouette_iou(est=one, gt=other) == pytest.approx(30 / 100)
-    assert silhouette_iou(est=one, gt=one) == 1
-    assert silhouette_iou(est=255 * one.astype(np.uint8), gt=one.astype(float)) == 1
-    assert np.isnan(silhouette_iou(est=~one & one, gt=~one & one))
-    with pytest.raises(InputError, match="gt has"):
-        silhouette_iou(est=one, gt=other[1:])
-    with pytest.raises(InputError, match="expected"):
-        silhouette_iou(est=one[None], gt=other)
-
-
-def test_silhouette_iou_falls_as_the_pose_goes_wrong():
-    scene = _box()
-    truth = look_at(azimuth=35, elevation=25, distance=3)
-    gt = cast_geometry(scene, CAMERA, truth).mask
-    values = [
-        silhouette_iou(
-            est=cast_geometry(
-                scene,
-                CAMERA,
-                Alignment(truth.rotation, truth.translation + np.array([x, 0, 0]), (1, 1, 1)),
-            ).mask,
-            gt=gt,
-        )
-        for x in (0, 0.05, 0.2, 3)
-    ]
-    assert values[0] == 1
-    assert values[0] > values[1] > values[2] > values[3] == 0

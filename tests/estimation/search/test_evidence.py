@@ -29,7 +29,6 @@ from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.uncertainty.evidence import redundancy_of
-from cadalign.geometry.conventions import up_from_vertical_edges
 from cadalign.shapes.parts import BoxMargins
 from cadalign.solvers.joint.evidence import State
 
@@ -213,18 +212,6 @@ class TestFewKeypoints:
 
 
 class TestUp:
-    def test_one_vertical_edge_sharpens_the_rotation(self) -> None:
-        points, truth, rng = keypoints(6), truth_of(), np.random.default_rng(0)
-        up = truth.rotation[:, 1]
-        base = np.array([0.3, 0.4, 4.0])
-        edge = CAMERA.project(np.stack([base, base + 0.8 * up]))
-        direction, covariance = up_from_vertical_edges(CAMERA, edge)
-        pixels = seen(points, truth, np.eye(4), rng).points_2d
-        without = align(Model(points_3d=points), View(CAMERA, pixels))
-        view = View(CAMERA, pixels, up=direction, up_sigma_deg=covariance)
-        result = align(Model(points_3d=points), view)
-        assert result.std.rotation_deg < without.std.rotation_deg
-
     def test_an_isotropic_covariance_equals_the_deviation(self) -> None:
         points, truth, rng = keypoints(6), truth_of(), np.random.default_rng(0)
         up = turned(truth.rotation[:, 1], 1.0, rng)

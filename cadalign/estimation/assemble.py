@@ -204,20 +204,17 @@ def _canonical(
 
     Alternatives are others than that one.
     """
-    from cadalign.estimation.symmetry import carried, held_axes, is_same
-    from cadalign.geometry.symmetry_group import group_of  # most models have none
+    from cadalign.estimation.symmetry import carried, distinct_ones, held_axes  # few have one
 
-    group = group_of(symmetry)
-    held = held_axes(fitted.options.stretched_axes)
-    best = group.canonical(fitted.alignment, held=held)
-    covariance = fitted.fisher_covariance
+    held, covariance = held_axes(fitted.options.stretched_axes), fitted.fisher_covariance
+    poses = [fitted.alignment, *(each.alignment for each in fitted.alternatives)]
+    (_, best), *others = distinct_ones(poses, covariance, symmetry, held)
     if covariance is not None:
         covariance = carried(covariance, fitted.alignment, best, held)
-    canonical = [(group.canonical(each.alignment, held=held), each) for each in fitted.alternatives]
     alternatives = tuple(
         replace(each, alignment=equal.alignment, points_3d=equal.relabelled(each.points_3d))
-        for equal, each in canonical
-        if group.is_trivial or not is_same(group, best.alignment, equal.alignment, covariance)
+        for k, equal in others
+        for each in [fitted.alternatives[k - 1]]
     )
     same = replace(
         fitted,

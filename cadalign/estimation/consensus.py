@@ -155,11 +155,10 @@ def _fit_to_inliers(search: RobustSearch, start: float) -> FittedKeypoints:
     found = FittedKeypoints(points, residuals, inliers, alignment, camera, options)
     if ransac.refine:
         found = _refined(search, inliers)
-    ratio, seconds = float(found.inliers.mean()), time.perf_counter() - start
     return replace(
         found,
         method=f"ransac-{found.method if ransac.refine else ransac.minimal}",
-        stats=FitStats(iterations, hypotheses, seconds, ratio, score),
+        stats=FitStats(iterations, hypotheses, time.perf_counter() - start),
         # As many samples would find the support that a corrected mistake gives, which is more.
         search=replace(search, ransac=replace(ransac, max_iterations=iterations)),
     )

@@ -16,12 +16,12 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.problem import Problem
-from cadalign.estimation.symmetry import carried, is_same, without_free_turns
+from cadalign.estimation.symmetry import carried, distinct_ones, without_free_turns
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, turned_alignment, turned_covariance
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.geometry.symmetry_group import group_of
+from cadalign.geometry.symmetry_group import Equal
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
 from cadalign.solvers.marginal.problem import Mixture, Seen, shape_at
@@ -225,54 +225,32 @@ def as_given(estimate: Estimate, problem: Problem) -> Estimate:
     )
 
 
-def moments_of_poses(estimates: Sequence[Estimate], view: int) -> tuple[FloatArray, FloatArray]:
-    """Second moments of estimates about the first, in a view's camera, and distances (L,).
+def steps_between(estimates: Sequence[Estimate], view: int) -> FloatArray:
+    """Steps (L, k) from the first estimate, in a view's camera.
 
-    These are squared distances of the rotations from the first one's, in its standard deviations;
-    infinite where it has none.
+    Rotation vector, translation, log lengths and log focal length, as covariances have them.
     """
     best, *others = estimates
-    total, distances = best.likelihood * best.covariances[view], np.zeros(len(estimates))
-    try:
-        root = np.linalg.inv(np.linalg.cholesky(best.covariances[view][:3, :3]))
-    except np.linalg.LinAlgError:
-        root = np.full((3, 3), np.nan)
-    for k, each in enumerate(others, start=1):
-        step = _step(best, each, view)
-        total += each.likelihood * (each.covariances[view] + step[:, None] * step)
-        distance = np.square(root @ step[:3]).sum()
-        distances[k] = distance if np.isfinite(distance) else np.inf
-    return total / sum(each.likelihood for each in estimates), distances
+    steps: list[list[float]] = [[0.0] * 10]
+    start, before = best.poses[view], [*best.lengths.tolist(), best.cameras[view].fx]
+    for each in others:
+        end, after = each.poses[view], [*each.lengths.tolist(), each.cameras[view].fx]
+        turn = vector_from_rotation(end.rotation @ start.rotation.T)
+        logs = [math.log(b / a) if a > 0 < b else 0.0 for a, b in zip(before, after, strict=True)]
+        steps.append([*turn, *(end.translation - start.translation), *logs])
+    return np.array(steps)[:, : len(best.covariances[view])]
 
 
-def _step(first: Estimate, second: Estimate, view: int) -> FloatArray:
-    """Rotation vector, translation, log lengths and log focal length between estimates."""
-    start, end = first.poses[view], second.poses[view]
-    before = [*first.lengths.tolist(), first.cameras[view].fx]
-    after = [*second.lengths.tolist(), second.cameras[view].fx]
-    turn = vector_from_rotation(end.rotation @ start.rotation.T)
-    logs = [math.log(b / a) if a > 0 < b else 0.0 for a, b in zip(before, after, strict=True)]
-    step = [*turn, *(end.translation - start.translation), *logs]
-    return np.array(step[: len(first.covariances[view])])
-
-
-def moments_of_points(estimates: Sequence[Estimate]) -> tuple[FloatArray, FloatArray]:
-    """Second moments (m, 3, 3) of points about the first estimate, in model and first camera."""
-    best = estimates[0]
+def second_moments(
+    estimates: Sequence[Estimate], covariances: Sequence[FloatArray], places: FloatArray
+) -> FloatArray:
+    """Second moments (..., k, k) about the first of estimates at ``places`` (L, ..., k)."""
     if len(estimates) == 1:
-        return best.of_points, best.of_seen
+        return covariances[0].copy()
     weights = np.array([each.likelihood for each in estimates])
-    weights /= weights.sum()
-
-    def total(covariances: list[FloatArray], places: list[FloatArray]) -> FloatArray:
-        gaps = np.array(places) - places[0]
-        squares = gaps[..., None] * gaps[..., None, :]
-        return np.asarray(np.tensordot(weights, np.array(covariances) + squares, axes=1))
-
-    return (
-        total([e.of_points for e in estimates], [e.points * e.scale for e in estimates]),
-        total([e.of_seen for e in estimates], [e.poses[0].apply(e.points) for e in estimates]),
-    )
+    gaps = places - places[0]
+    squares = gaps[..., None] * gaps[..., None, :]
+    return np.tensordot(weights / weights.sum(), np.array(covariances) + squares, axes=1)
 
 
 def one_of_equals(
@@ -282,20 +260,15 @@ def one_of_equals(
 
     ``held`` are the axes whose scale is.
     """
-    if symmetry is None or group_of(symmetry).is_trivial:
+    if symmetry is None or symmetry.is_trivial:
         return likely
-    group = group_of(symmetry)
-    best, *others = (_canonical(each, symmetry, held) for each in likely)
-    covariance = best.covariances[0]
-    return [
-        best,
-        *(each for each in others if not is_same(group, best.poses[0], each.poses[0], covariance)),
-    ]
+    poses, covariance = [each.poses[0] for each in likely], likely[0].covariances[0]
+    found = distinct_ones(poses, covariance, symmetry, held)
+    return [_carried(likely[k], equal) for k, equal in found]
 
 
-def _canonical(estimate: Estimate, symmetry: Symmetry, held: _Held) -> Estimate:
-    """The canonical one of all equal estimates, without standard deviations that mean nothing."""
-    best = group_of(symmetry).canonical(estimate.poses[0], held=held)
+def _carried(estimate: Estimate, best: Equal) -> Estimate:
+    """An estimate as an equal one, without standard deviations that mean nothing."""
     turn, shift, scale = best.motion[:3, :3], best.motion[:3, 3], best.alignment.scale
     poses: list[Alignment] = []
     covariances = []

@@ -18,11 +18,11 @@ from cadalign.estimation.estimates import (
     Estimate,
     as_given,
     curvature_of_rotations,
-    moments_of_points,
-    moments_of_poses,
     one_of_equals,
     pose_and_lengths,
     poses_of,
+    second_moments,
+    steps_between,
     widened_boxes,
     with_box,
 )
@@ -83,12 +83,17 @@ def result_of(
     """
     prior, views, numbers = problem.prior, problem.given, problem.numbers
     best = estimates[0]
-    moments = [moments_of_poses(estimates, place) for place in range(len(numbers))]
-    covariances = [covariance for covariance, _ in moments]
+    steps = [steps_between(estimates, place) for place in range(len(numbers))]
+    covariances = [
+        second_moments(estimates, [each.covariances[place] for each in estimates], own)
+        for place, own in enumerate(steps)
+    ]
     if is_curved:
         for covariance in covariances:
             covariance[:3, :3] += curvature_of_rotations(covariance[:3, :3])
-    is_far = moments[0][1] > SAME_SQUARES
+    turns, of_turns = steps[0][:, :3], best.covariances[0][:3, :3]
+    squares = (turns @ np.linalg.pinv(of_turns, hermitian=True) * turns).sum(axis=1)
+    is_far = squares > SAME_SQUARES
     others = [each for each, far in zip(estimates, is_far, strict=True) if far]
     alternatives = tuple(
         Alternative(
@@ -98,7 +103,10 @@ def result_of(
         if far or (each.is_optimum and each is not best)
     )
     pose, points = best.poses[0], best.points[:-2]
-    of_points, of_seen = moments_of_points(estimates)
+    places = np.array([each.points * each.scale for each in estimates])
+    seen = np.array([each.poses[0].apply(each.points) for each in estimates])
+    of_points = second_moments(estimates, [each.of_points for each in estimates], places)
+    of_seen = second_moments(estimates, [each.of_seen for each in estimates], seen)
     posterior = Posterior(
         covariances[0],
         fisher_covariance=best.covariances[0],

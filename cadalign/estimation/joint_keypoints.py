@@ -82,11 +82,8 @@ def fit_jointly(
     )
     if ransac is None:
         return fitted
-    squares = np.minimum((residuals**2).sum(axis=1), problem.threshold(ransac) ** 2)
-    share, score = float(best.inliers.mean()), float(squares.sum())
     return replace(
         fitted,
         method="ransac-optimal",
-        stats=replace(stats, inlier_ratio=share, score=score),
         search=RobustSearch(problems, options, ransac, scores),
     )

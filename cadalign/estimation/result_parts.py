@@ -73,17 +73,11 @@ class FitStats:
     hypotheses : int
         Alignments from which a refinement could start.
     seconds : float
-    inlier_ratio : float, optional
-        Share of the keypoints that were kept, where they were searched for.
-    score : float, optional
-        Sum of squared errors, each at most the threshold's square [px^2], of the robust search.
     """
 
     iterations: int
     hypotheses: int
     seconds: float
-    inlier_ratio: float | None = None
-    score: float | None = None
 
 
 NO_STATS = FitStats(0, 0, 0.0)

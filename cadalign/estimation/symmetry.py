@@ -10,6 +10,8 @@ standard deviations are stated without that step, such that points on the axis k
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from cadalign.arrays import FloatArray
@@ -17,7 +19,7 @@ from cadalign.errors import require_kind
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import angle_between, by_rotation, vector_from_rotation
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.geometry.symmetry_group import Equal, SymmetryGroup, group_of
+from cadalign.geometry.symmetry_group import Equal, group_of
 
 SAME_SQUARES = 9.0
 """Squared distance of rotations, in the best one's deviations, of equal estimates."""
@@ -60,18 +62,31 @@ def without_free_turns(covariance: FloatArray, best: Equal) -> FloatArray:
     return np.asarray(left @ covariance @ left.T)
 
 
-def is_same(
-    group: SymmetryGroup, best: Alignment, other: Alignment, covariance: FloatArray | None
-) -> bool:
-    """True for an estimate that is equal to the best one, by its rotation's standard deviations."""
-    near = group.nearest(other, best.rotation, tolerance=_SAME_SCALE).alignment
-    if angle_between(near.rotation, best.rotation) < _SAME_DEG:
-        return True
-    if covariance is None:
-        return False
-    step = vector_from_rotation(near.rotation @ best.rotation.T)
-    information = np.linalg.pinv(covariance[:3, :3], hermitian=True)
-    return bool(step @ information @ step <= SAME_SQUARES)
+def distinct_ones(
+    poses: Sequence[Alignment],
+    covariance: FloatArray | None,
+    symmetry: Symmetry,
+    held: tuple[bool, bool, bool],
+) -> list[tuple[int, Equal]]:
+    """Canonical ones of alignments with their numbers, without those that equal the first.
+
+    Those are as near to it as the ``covariance`` of its errors allows.
+    """
+    group = group_of(symmetry)
+    first, *others = enumerate(group.canonical(each, held=held) for each in poses)
+    best = first[1].alignment
+    information = None
+    if covariance is not None:
+        information = np.linalg.pinv(covariance[:3, :3], hermitian=True)
+
+    def is_same(other: Alignment) -> bool:
+        near = group.nearest(other, best.rotation, tolerance=_SAME_SCALE).alignment
+        if angle_between(near.rotation, best.rotation) < _SAME_DEG:
+            return True
+        step = vector_from_rotation(near.rotation @ best.rotation.T)
+        return information is not None and bool(step @ information @ step <= SAME_SQUARES)
+
+    return [first, *(each for each in others if not is_same(each[1].alignment))]
 
 
 def carried(

@@ -40,9 +40,6 @@ def test_outliers_are_found_and_the_rest_is_fitted(share: float) -> None:
     assert result.alignment == alone.alignment
     assert rotation_error(est=result.alignment, gt=problem.alignment) < 1.0
     assert result.rms < 2.0
-    assert result.stats.inlier_ratio == pytest.approx(result.inliers.mean())
-    assert result.stats.score is not None
-    assert result.stats.score > 0
 
 
 @pytest.mark.long

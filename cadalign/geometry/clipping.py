@@ -1,4 +1,4 @@
-"""Volume of the intersection of two boxes."""
+"""Intersection of two boxes: one box's edges, cut off at the faces of the other, and the volume."""
 
 from __future__ import annotations
 
@@ -7,8 +7,46 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.compile import kernel
 
-_CORNERS = 24  # of a side after 6 cuts: 10, and no more than these however sums are rounded
-_SHRUNKEN = 1.0 - 1e-13  # the first box, so that no two faces lie in one plane
+_PARALLEL = 1e-14  # share of an edge's length that its direction must have across a face
+_CORNERS = 42  # of a polygon after 6 cuts: 10, and no more than these however sums are rounded
+_NODE = 1.0 / np.sqrt(3.0)
+
+
+@kernel
+def clipped_edges(
+    extents: FloatArray, clip: FloatArray, axes: FloatArray, center: FloatArray, ends: FloatArray
+) -> int:
+    """Write the ends of those parts of a box's edges that lie inside another box; their number.
+
+    The boxes have the side lengths ``extents`` and ``clip``; ``axes`` (columns), ``center`` and
+    ``ends`` (24, 3) of the first are in the frame of the second.
+    """
+    count = 0
+    start = np.empty(3)
+    step = np.empty(3)
+    for along in range(3):
+        one, other = (along + 1) % 3, (along + 2) % 3
+        for corner in range(4):
+            a = extents[one] * (0.5 if corner % 2 else -0.5)
+            b = extents[other] * (0.5 if corner // 2 else -0.5)
+            enter, leave = 0.0, 1.0
+            for c in range(3):
+                step[c] = axes[c, along] * extents[along]
+                start[c] = center[c] + axes[c, one] * a + axes[c, other] * b - 0.5 * step[c]
+                half = 0.5 * clip[c]
+                if abs(step[c]) <= _PARALLEL * extents[along]:
+                    if abs(start[c]) > half * (1.0 + 1e-12):
+                        leave = -1.0
+                    continue
+                first, last = (-half - start[c]) / step[c], (half - start[c]) / step[c]
+                enter = max(enter, min(first, last))
+                leave = min(leave, max(first, last))
+            if enter <= leave:
+                for c in range(3):
+                    ends[count, c] = start[c] + enter * step[c]
+                    ends[count + 1, c] = start[c] + leave * step[c]
+                count += 2
+    return count
 
 
 @kernel
@@ -18,82 +56,93 @@ def intersection_volume(
     """Compute the volume of the intersection of two boxes.
 
     The boxes have the side lengths ``first`` and ``second``; ``axes`` (columns) and ``center`` of
-    the second are in the frame of the first. By the divergence theorem the volume is a third of the
-    sum, over the intersection's sides, of area times distance from the origin. A side is a part of
-    one box's face, cut off at the faces of the other (Sutherland and Hodgman).
+    the second are in the frame of the first. A vertex of the intersection lies on an edge of one
+    box, where that edge enters or leaves the other. Between the vertices' x coordinates the area of
+    a section at x is quadratic, so that Gauss' rule with two nodes integrates it exactly. It has no
+    special cases: boxes may share faces, edges or corners.
     """
-    back = np.ascontiguousarray(axes.T)
+    ends = np.empty((24, 3))
+    places = np.empty(48)
+    count = clipped_edges(second, first, axes, center, ends)
+    for i in range(count):
+        places[i] = ends[i, 0]
+    back = np.empty((3, 3))
     origin = np.zeros(3)
     for i in range(3):
         for j in range(3):
+            back[i, j] = axes[j, i]
             origin[i] -= axes[j, i] * center[j]
-    room = np.empty((2, _CORNERS, 3))
-    smaller = _SHRUNKEN * first
-    # All pyramids have their apex in the centre of the first box.
-    volume = _sides(smaller, second, axes, center, np.zeros(3), room)
-    return volume + _sides(second, smaller, back, origin, origin, room)
-
-
-@kernel
-def _sides(
-    own: FloatArray,
-    other: FloatArray,
-    axes: FloatArray,
-    center: FloatArray,
-    apex: FloatArray,
-    room: FloatArray,
-) -> float:
-    """Sum, over the faces of a box, the volumes of pyramids on their parts inside another box.
-
-    ``axes`` (columns), ``center`` and ``apex`` are in the box's frame.
-    """
+    more = clipped_edges(first, second, back, origin, ends)
+    for i in range(more):
+        x = center[0]
+        for j in range(3):
+            x += axes[0, j] * ends[i, j]
+        places[count + i] = x
+    count += more
+    for i in range(1, count):
+        x = places[i]
+        k = i
+        while k > 0 and places[k - 1] > x:
+            places[k] = places[k - 1]
+            k -= 1
+        places[k] = x
+    room = np.empty((2, _CORNERS, 2))
     volume = 0.0
-    for face in range(6):
-        k, sign = face // 2, 1.0 if face % 2 else -1.0
-        a, b = (k + 1) % 3, (k + 2) % 3
-        for corner in range(4):
-            room[0, corner, k] = 0.5 * sign * own[k]
-            room[0, corner, a] = 0.5 * own[a] * (1.0 if corner == 1 or corner == 2 else -1.0)
-            room[0, corner, b] = 0.5 * own[b] * (1.0 if corner >= 2 else -1.0)
-        count, now = 4, 0
-        for cut in range(6):
-            count = _cut(room, now, count, other, axes, center, cut)
-            now = 1 - now
-        area = 0.0
-        for i in range(2, count):
-            area += (room[now, i - 1, a] - room[now, 0, a]) * (room[now, i, b] - room[now, 0, b])
-            area -= (room[now, i - 1, b] - room[now, 0, b]) * (room[now, i, a] - room[now, 0, a])
-        volume += 0.5 * abs(area) * (0.5 * own[k] - sign * apex[k]) / 3.0
+    for i in range(count - 1):
+        half = 0.5 * (places[i + 1] - places[i])
+        if half > 0.0:
+            middle = 0.5 * (places[i + 1] + places[i])
+            for node in (-_NODE, _NODE):
+                x = middle + node * half
+                volume += half * _section_area(first, second, axes, center, x, room)
     return volume
 
 
 @kernel
-def _cut(
-    room: FloatArray,
-    now: int,
-    count: int,
-    other: FloatArray,
+def _section_area(
+    first: FloatArray,
+    second: FloatArray,
     axes: FloatArray,
     center: FloatArray,
-    face: int,
-) -> int:
-    """Cut a polygon off at a face of a box, from ``room[now]`` to the other half; its corners."""
-    k, sign = face // 2, 1.0 if face % 2 else -1.0
-    kept = 0
-    for i in range(count):
-        j = (i + 1) % count
-        over, next_over = -0.5 * other[k], -0.5 * other[k]
-        for c in range(3):
-            over += sign * axes[c, k] * (room[now, i, c] - center[c])
-            next_over += sign * axes[c, k] * (room[now, j, c] - center[c])
-        if over <= 0.0:
-            room[1 - now, kept] = room[now, i]
-            kept += 1
-        if (over < 0.0 and next_over > 0.0) or (over > 0.0 and next_over < 0.0):
-            share = over / (over - next_over)
-            for c in range(3):
-                room[1 - now, kept, c] = room[now, i, c] + share * (
-                    room[now, j, c] - room[now, i, c]
-                )
-            kept += 1
-    return kept
+    x: float,
+    room: FloatArray,
+) -> float:
+    """Compute the area of the section of the intersection at x in the frame of the first box.
+
+    ``room`` (2, `_CORNERS`, 2) is scratch space.
+    """
+    for corner in range(4):
+        right = corner == 1 or corner == 2
+        room[0, corner, 0] = 0.5 * first[1] if right else -0.5 * first[1]
+        room[0, corner, 1] = 0.5 * first[2] if corner >= 2 else -0.5 * first[2]
+    count = 4
+    now = 0
+    for face in range(6):
+        k = face // 2
+        sign = 1.0 if face % 2 else -1.0
+        a, b = sign * axes[1, k], sign * axes[2, k]
+        limit = (
+            0.5 * second[k] - sign * axes[0, k] * (x - center[0]) + a * center[1] + b * center[2]
+        )
+        kept = 0
+        for i in range(count):  # Sutherland and Hodgman's clipping
+            y, z = room[now, i, 0], room[now, i, 1]
+            next_y, next_z = room[now, (i + 1) % count, 0], room[now, (i + 1) % count, 1]
+            over, next_over = a * y + b * z - limit, a * next_y + b * next_z - limit
+            if over <= 0.0:
+                room[1 - now, kept, 0] = y
+                room[1 - now, kept, 1] = z
+                kept += 1
+            if (over < 0.0 and next_over > 0.0) or (over > 0.0 and next_over < 0.0):
+                share = over / (over - next_over)
+                room[1 - now, kept, 0] = y + share * (next_y - y)
+                room[1 - now, kept, 1] = z + share * (next_z - z)
+                kept += 1
+        count = kept
+        now = 1 - now
+    area = 0.0
+    for i in range(2, count):
+        y, z = room[now, 0, 0], room[now, 0, 1]
+        area += (room[now, i - 1, 0] - y) * (room[now, i, 1] - z)
+        area -= (room[now, i - 1, 1] - z) * (room[now, i, 0] - y)
+    return 0.5 * area

@@ -199,7 +199,7 @@ def octagon_iou(angle_deg: float) -> float:
 def test_box_iou_of_a_square_prism_turned_about_its_axis(angle: float, length: float) -> None:
     gt = Box([0, 0, 0], np.eye(3), [1, 1, length])
     est = Box([0, 0, 0], turned(angle), [1, 1, length])
-    assert box_iou(est=est, gt=gt) == pytest.approx(octagon_iou(angle), abs=1e-8)
+    assert box_iou(est=est, gt=gt) == pytest.approx(octagon_iou(angle), abs=1e-10)
 
 
 def overlapping_boxes(seed: int) -> tuple[Box, Box]:

@@ -23,7 +23,6 @@ MOST_FACES = 150_000  # that are displayed
 # Depth beneath the surface at which markers can still be clicked [diagonals]: keypoints sit in
 # corners, where rays to them graze other parts. The page uses the same value.
 _BENEATH = 0.02
-_EXACT = 1e-6
 _MOST_TRIED = 40  # vertices near a click, of which the first visible one is taken
 CORNER, CREASE, SMOOTH = range(3)
 _CREASE_DEG = 30.0
@@ -73,7 +72,7 @@ class ClickableModel:
         face, distance = self.scene.caster.first_hits(start, along[None])
         if face[0] < 0 or not np.isfinite(distance[0]):
             return None
-        return self._on_triangle(int(face[0]), start + distance[0] * along)
+        return _placed(start + distance[0] * along)
 
     def is_seen(self, origin: npt.ArrayLike, xyz: npt.ArrayLike) -> bool:
         """True if a point on the surface, or slightly beneath it, is visible from ``origin``."""
@@ -118,31 +117,14 @@ class ClickableModel:
         if not seen or points.kind[seen[0]] > CREASE:
             rim = find_rim(self.scene.caster, origin, direction, reach, self.diagonal)
             if rim is not None:
-                return self._on_triangle(*rim)
-        return (
-            self._on_triangle(int(points.triangle[seen[0]]), points.xyz[seen[0]]) if seen else None
-        )
+                return _placed(rim)
+        return _placed(points.xyz[seen[0]]) if seen else None
 
-    def _on_triangle(self, triangle: int, xyz: FloatArray) -> ModelKeypoint:
-        """Make a keypoint of a point on a triangle, with the file's face number and barycentrics.
 
-        Barycentrics refer to the first triangle of a polygon: on its other triangles some weights
-        are negative. They are left out if the polygon is not flat.
-        """
-        mesh = self.scene.mesh
-        face = int(mesh.polygon[triangle])
-        corners = mesh.vertices[mesh.faces[np.searchsorted(mesh.polygon, face)]]
-        edges = (corners[1:] - corners[0]).T
-        if np.linalg.matrix_rank(edges) == 2:
-            first, second = np.linalg.lstsq(edges, xyz - corners[0], rcond=None)[0]
-            weights = np.array([1 - first - second, first, second])
-        else:
-            weights = np.array([1.0, 0.0, 0.0])
-        x, y, z = xyz.tolist()
-        if np.linalg.norm(weights @ corners - xyz) > _EXACT * self.diagonal:
-            return ModelKeypoint(name="", xyz=(x, y, z))
-        a, b, c = weights.tolist()
-        return ModelKeypoint(name="", xyz=(x, y, z), face_index=face, barycentric=(a, b, c))
+def _placed(xyz: FloatArray) -> ModelKeypoint:
+    """A keypoint without a name."""
+    x, y, z = xyz.tolist()
+    return ModelKeypoint(name="", xyz=(x, y, z))
 
 
 def display_bytes(model: ClickableModel) -> bytes:
@@ -188,28 +170,27 @@ def detail_bytes(model: ClickableModel, creases: FloatArray) -> bytes:
 
 @dataclass(frozen=True, eq=False)
 class SnapPoints:
-    """Vertices of a mesh (n, 3), a triangle at each (n,), and their kinds (n,).
+    """Vertices of a mesh (n, 3), and their kinds (n,).
 
     A corner ends a crease or is where creases meet at an angle.
     """
 
     xyz: FloatArray
-    triangle: IntArray
     kind: npt.NDArray[np.int8]
 
     @classmethod
     def of_mesh(cls, mesh: Mesh, diagonal: float) -> SnapPoints:
         """Find and sort the vertices; those of very large meshes all count as smooth."""
-        used, first = np.unique(mesh.faces, return_index=True)
+        used = np.unique(mesh.faces)
         grid = np.round((mesh.vertices[used] - mesh.vertices[used[0]]) / (_WELD * diagonal))
         _, kept, place = np.unique(grid, axis=0, return_index=True, return_inverse=True)
-        xyz, triangle = mesh.vertices[used[kept]], first[kept] // 3
+        xyz = mesh.vertices[used[kept]]
         kind = np.full(len(xyz), SMOOTH, dtype=np.int8)
         if len(mesh.faces) <= _MOST_FACES:
             number = np.zeros(len(mesh.vertices), dtype=np.int64)
             number[used] = place.ravel()
             kind = _kinds(xyz, number[mesh.faces])
-        return cls(xyz, triangle, kind)
+        return cls(xyz, kind)
 
     def near(self, origin: FloatArray, direction: FloatArray, reach: float) -> IntArray:
         """Vertices in a cone about a ray, best first: by kind, then by angle.
@@ -226,8 +207,8 @@ class SnapPoints:
 
 def find_rim(
     caster: RayCaster, origin: FloatArray, direction: FloatArray, reach: float, diagonal: float
-) -> tuple[int, FloatArray] | None:
-    """The silhouette's nearest point in a cone about a ray: a triangle and the point on it.
+) -> FloatArray | None:
+    """The silhouette's nearest point (3,) in a cone about a ray.
 
     That is the border of the surface, or of a part before a farther one. None if there is none.
     """
@@ -237,18 +218,18 @@ def find_rim(
     angle = 2 * np.pi * np.arange(_SPOKES) / _SPOKES
     ring = np.cos(angle)[:, None] * right + np.sin(angle)[:, None] * up
 
-    def cast(offsets: FloatArray) -> tuple[IntArray, FloatArray]:
+    def cast(offsets: FloatArray) -> FloatArray:
         face, distance = caster.first_hits(origin, direction + offsets)
-        return np.asarray(face), np.where(face < 0, np.inf, distance)
+        return np.where(face < 0, np.inf, distance)
 
-    _, (middle,) = cast(np.zeros((1, 3)))
+    (middle,) = cast(np.zeros((1, 3)))
     is_outside = bool(np.isinf(middle))
 
     def crossed(distance: FloatArray) -> BoolArray:
         return np.isfinite(distance) if is_outside else distance > middle + _JUMP * diagonal
 
     for radius in reach * np.arange(1, _RINGS + 1) / _RINGS:
-        _, distance = cast(radius * ring)
+        distance = cast(radius * ring)
         other = crossed(distance)
         if not other.any():
             continue
@@ -257,11 +238,11 @@ def find_rim(
         best = None
         for _ in range(_BISECTIONS):
             half = (near + far) / 2
-            face, found = cast(half * spoke[None])
+            found = cast(half * spoke[None])
             beyond = bool(crossed(found)[0])
             near, far = (near, half) if beyond else (half, far)
             if beyond == is_outside:  # on the near surface
-                best = int(face[0]), origin + found[0] * (direction + half * spoke)
+                best = origin + found[0] * (direction + half * spoke)
         return best
     return None
 

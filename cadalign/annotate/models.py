@@ -311,16 +311,16 @@ def open_model(
     require_utf8(path)
     cad = ClickableModel(load_mesh(path))
     own, beside = keypoints_file(path, folder), keypoints_file(path, path.parent)
-    source, mesh = keypoints or beside, cad.scene.mesh
+    source = keypoints or beside
     given: tuple[ModelKeypoint, ...] = ()
     if source != own and (source != beside or source.exists()):
-        given = ModelKeypoints.load(source, mesh=mesh, model=path).keypoints
+        given = ModelKeypoints.load(source, model=path).keypoints
     content = LastContent()
     content.note(own)
     tolerance = _SAME_PLACE * cad.diagonal
     registry = KeypointRegistry(given, reserved=shape.reserved, tolerance=tolerance)
     if own.exists():
-        earlier = ModelKeypoints.load(own, mesh=mesh, model=path)
+        earlier = ModelKeypoints.load(own, model=path)
         refuse_other_model(earlier.model, path, where=own)
         registry.merge(earlier.keypoints)
     return OpenedModel(path, cad, registry, own, content)

@@ -11,7 +11,6 @@ from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.datasets.models.model_keypoints import ModelKeypoints
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import read_json
 from cadalign.io.images import JPEG_ENDING
 from cadalign.io.meshes.files import load_mesh
@@ -63,7 +62,7 @@ class RenderJob:
             raise InputError("no view is given", where="--view", fix="give one or more")
         path = command.keypoints
         mesh = load_mesh(command.model)
-        keypoints = None if path is None else read_keypoints(path, command.model, mesh)
+        keypoints = None if path is None else read_keypoints(path, command.model)
         return cls(command, Scene(mesh), views, camera, keypoints)
 
     def _draw(self, view: Angles) -> ByteImage:
@@ -97,11 +96,11 @@ def parse_size(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def read_keypoints(path: Path, model: Path, mesh: Mesh) -> FloatArray:
+def read_keypoints(path: Path, model: Path) -> FloatArray:
     """Read keypoints (k, 3) from a list of [x, y, z] or as `ModelKeypoints.load` does."""
     data = read_json(path)
     if isinstance(data, dict) or (isinstance(data, list) and data and isinstance(data[0], dict)):
-        return ModelKeypoints.load(path, mesh=mesh, model=model).xyz
+        return ModelKeypoints.load(path, model=model).xyz
     try:
         return as_points(data, name="keypoints", dimension=3)
     except InputError as error:

@@ -16,8 +16,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.keypointnet import AnnotatedModel
 from cadalign.datasets.models.keypoints import Keypoints, entry_id, parse_entry
-from cadalign.errors import CadalignError, DataError, InputError, quote
-from cadalign.geometry.mesh import Mesh
+from cadalign.errors import DataError, InputError, quote
 from cadalign.io.documents import (
     Document,
     Index,
@@ -32,14 +31,12 @@ from cadalign.io.documents import (
     written_path,
 )
 from cadalign.io.files import as_path, write_json
-from cadalign.io.meshes.files import load_mesh
 
 FORMAT = "cadalign model keypoints"
 VERSION = 1
 SUFFIX = ".keypoints.json"
 """What the file of ``chair.obj`` ends in: ``chair.keypoints.json``."""
 
-_SUM_TOLERANCE = 0.01
 _WANTED = "give a file of model keypoints; see cadalign.datasets.ModelKeypoints"
 
 
@@ -48,19 +45,7 @@ class _Entry(Document, kw_only=True):
 
     semantic_id: Index | None = None
     name: Text
-    xyz: Point3 | None = None
-    face_index: Index | None = None
-    barycentric: Point3 | None = None
-
-    def __post_init__(self) -> None:
-        if (self.face_index is None) != (self.barycentric is None):
-            missing = "face_index" if self.face_index is None else "barycentric"
-            raise InputError("missing", where=missing, fix="give both or neither")
-        if self.xyz is None and self.face_index is None:
-            raise InputError("missing", where="xyz", fix="or give face_index and barycentric")
-        if self.barycentric is not None and not abs(sum(self.barycentric) - 1) <= _SUM_TOLERANCE:
-            what = f"{list(self.barycentric)} sum to {sum(self.barycentric):g}, not to 1"
-            raise InputError(what, where="barycentric")
+    xyz: Point3
 
 
 class _File(Document):
@@ -82,10 +67,6 @@ class ModelKeypoint:
     """(3,), where it lies [model units]."""
     semantic_id: int | None = None
     """Its number within the model's category."""
-    face_index: int | None = None
-    """The face that it lies on, counted as in the mesh file."""
-    barycentric: tuple[float, float, float] | None = None
-    """(3,), where on that face: weights of its corners in file order, of sum 1."""
 
 
 @dataclass(frozen=True)
@@ -156,18 +137,12 @@ class ModelKeypoints:
     def _of_keypoints(
         cls, annotated: Keypoints, model: Path | None, names: Mapping[int, str]
     ) -> ModelKeypoints:
-        columns = annotated.xyz, annotated.ids, annotated.face_index, annotated.barycentric
-        rows = zip(*(column.tolist() for column in columns), strict=True)
-        keypoints = (
-            ModelKeypoint(names.get(k, f"keypoint {k}"), tuple(xyz), k, face, tuple(weights))
-            for xyz, k, face, weights in rows
-        )
+        rows = zip(annotated.xyz.tolist(), annotated.ids.tolist(), strict=True)
+        keypoints = (ModelKeypoint(names.get(k, f"keypoint {k}"), tuple(xyz), k) for xyz, k in rows)
         return cls(tuple(keypoints), model)
 
     @classmethod
-    def load(
-        cls, path: str | os.PathLike[str], *, mesh: Mesh | None = None, model: Path | None = None
-    ) -> ModelKeypoints:
+    def load(cls, path: str | os.PathLike[str], *, model: Path | None = None) -> ModelKeypoints:
         """Read a file of model keypoints, or one model's of KeypointNet's annotations.
 
         Parameters
@@ -175,9 +150,6 @@ class ModelKeypoints:
         path : str or path-like
             A file as described in docs/formats/model_keypoints.md, or KeypointNet's annotations of
             a category.
-        mesh : Mesh, optional
-            The surface that keypoints without ``xyz`` lie on; the file's ``model`` is read
-            otherwise, if it is needed.
         model : Path, optional
             The mesh file; of KeypointNet's annotations those of the model are taken whose id
             occurs in this path.
@@ -194,7 +166,7 @@ class ModelKeypoints:
         if isinstance(data, list):
             return cls._from_annotations(data, path, model)
         with in_file(path):
-            return cls._from_data(data, path.parent, mesh)
+            return cls._from_data(data, path.parent)
 
     @classmethod
     def _from_annotations(cls, data: list[Any], path: Path, model: Path | None) -> ModelKeypoints:
@@ -212,26 +184,14 @@ class ModelKeypoints:
         raise DataError(what, where=str(path), fix=f"is {model} of this category?")
 
     @classmethod
-    def _from_data(cls, data: Any, folder: Path, mesh: Mesh | None) -> ModelKeypoints:
+    def _from_data(cls, data: Any, folder: Path) -> ModelKeypoints:
         other_version = "it was written by another version of cadalign"
         for name, wanted, fix in (("format", FORMAT, _WANTED), ("version", VERSION, other_version)):
             if isinstance(data, dict) and data.get(name) != wanted:
                 raise DataError(f"{quote(data.get(name))} is not {wanted!r}", where=name, fix=fix)
         read: _File = convert(data, _File)
         model = None if read.model is None else path_from(read.model, folder)
-        keypoints = []
-        for row, entry in enumerate(read.keypoints):
-            xyz = entry.xyz
-            if xyz is None:
-                if mesh is None:
-                    if model is None:
-                        what = "neither xyz nor a model that the face belongs to"
-                        fix = "give xyz, or name the mesh file under model"
-                        raise DataError(what, where=f"keypoints[{row}]", fix=fix)
-                    mesh = load_mesh(model)
-                xyz = _on_face(mesh, entry, f"keypoints[{row}].face_index")
-            face = entry.face_index, entry.barycentric
-            keypoints.append(ModelKeypoint(entry.name, xyz, entry.semantic_id, *face))
+        keypoints = (ModelKeypoint(e.name, e.xyz, e.semantic_id) for e in read.keypoints)
         return cls(tuple(keypoints), model)
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -253,20 +213,8 @@ class ModelKeypoints:
         return data
 
 
-def _on_face(mesh: Mesh, entry: _Entry, where: str) -> tuple[float, float, float]:
-    try:
-        place = mesh.surface_points(np.array([entry.face_index]), np.array([entry.barycentric]))
-    except CadalignError as error:
-        raise DataError(error.what, where=where) from None
-    x, y, z = place[0].tolist()
-    return x, y, z
-
-
 def _written(keypoint: ModelKeypoint) -> dict[str, Any]:
     data: dict[str, Any] = {"name": keypoint.name, "xyz": list(keypoint.xyz)}
     if keypoint.semantic_id is not None:
         data["semantic_id"] = keypoint.semantic_id
-    if keypoint.face_index is not None and keypoint.barycentric is not None:
-        data["face_index"] = keypoint.face_index
-        data["barycentric"] = list(keypoint.barycentric)
     return data

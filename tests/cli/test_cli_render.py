@@ -90,9 +90,8 @@ def test_keypoints_from_a_list_and_from_annotations(model, tmp_path):
         ],
     }
     (tmp_path / "chair.json").write_text(json.dumps([{"model_id": "other"}, entry]))
-    named = {"name": "corner", "face_index": 0, "barycentric": [0.5, 0.25, 0.25]}
-    mesh = load_mesh(model)
-    xyz = mesh.surface_points([0], [[0.5, 0.25, 0.25]])[0].tolist()
+    xyz = load_mesh(model).surface_points([0], [[0.5, 0.25, 0.25]])[0].tolist()
+    named = {"name": "corner", "xyz": xyz}
     own = {"format": "cadalign model keypoints", "version": 1, "keypoints": [named]}
     (tmp_path / "parts.keypoints.json").write_text(json.dumps(own))
     (tmp_path / "same.json").write_text(json.dumps([xyz]))

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from support.files import TETRAHEDRON, write_json
 
-from cadalign import Mesh
-from cadalign.datasets import KeypointNet, ModelKeypoint, ModelKeypoints, load_mesh
+from cadalign.datasets import KeypointNet, ModelKeypoint, ModelKeypoints
 from cadalign.errors import DataError
 
 DATA: dict[str, Any] = {
@@ -21,13 +20,8 @@ DATA: dict[str, Any] = {
     "model": "tetrahedron.obj",
     "keypoints": [
         {"name": "top", "xyz": [0, 0, 1], "semantic_id": 7},
-        {
-            "name": "floor",
-            "xyz": [0.25, 0.5, 0],
-            "face_index": 0,
-            "barycentric": [0.25, 0.25, 0.5],
-        },
-        {"name": "slope", "face_index": 3, "barycentric": [0.2, 0.3, 0.5], "semantic_id": 2},
+        {"name": "floor", "xyz": [0.25, 0.5, 0]},
+        {"name": "slope", "xyz": [0.2, 0.3, 0.5], "semantic_id": 2},
     ],
 }
 
@@ -49,7 +43,7 @@ def changed(row: int, **fields: Any) -> dict[str, Any]:
     return data
 
 
-def test_fields_arrive_and_faces_become_places(tmp_path: Path) -> None:
+def test_fields_arrive(tmp_path: Path) -> None:
     keypoints = ModelKeypoints.load(write(tmp_path / "a.keypoints.json"))
     assert keypoints.names == ("top", "floor", "slope")
     assert keypoints.ids == (7, None, 2)
@@ -57,18 +51,7 @@ def test_fields_arrive_and_faces_become_places(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         keypoints.xyz, [[0, 0, 1], [0.25, 0.5, 0], [0.2, 0.3, 0.5]], atol=1e-15
     )
-    assert keypoints.keypoints[1].barycentric == (0.25, 0.25, 0.5)
     assert len(keypoints) == 3
-
-
-def test_mesh_at_hand_takes_the_place_of_the_named_one(tmp_path: Path) -> None:
-    data = {name: value for name, value in DATA.items() if name != "model"}
-    path = write(tmp_path / "a.keypoints.json", data)
-    mesh = load_mesh(tmp_path / "tetrahedron.obj")
-    doubled = Mesh(2 * mesh.vertices, mesh.faces)
-    keypoints = ModelKeypoints.load(path, mesh=doubled)
-    np.testing.assert_allclose(keypoints.xyz[2], [0.4, 0.6, 1.0])
-    np.testing.assert_allclose(keypoints.xyz[0], [0, 0, 1])  # xyz counts where it is given
 
 
 def test_load_undoes_save_exactly(tmp_path: Path) -> None:
@@ -82,7 +65,7 @@ def test_load_undoes_save_exactly(tmp_path: Path) -> None:
     assert ModelKeypoints.load(tmp_path / "below" / "c.keypoints.json").model == written.model
 
 
-def test_annotated_model_is_written_and_lies_on_its_mesh(sample_root: Path, tmp_path: Path) -> None:
+def test_annotated_model_is_written(sample_root: Path, tmp_path: Path) -> None:
     model = next(iter(KeypointNet(sample_root)["chair"]))
     ids = model.keypoints.ids.tolist()
     keypoints = ModelKeypoints.of_model(model, names={ids[1]: "back, top left"})
@@ -91,12 +74,6 @@ def test_annotated_model_is_written_and_lies_on_its_mesh(sample_root: Path, tmp_
     assert again == keypoints
     assert again.names[:2] == (f"keypoint {ids[0]}", "back, top left")
     assert again.ids == tuple(ids)
-    data = json.loads((tmp_path / "chair.keypoints.json").read_text())
-    for entry in data["keypoints"]:
-        del entry["xyz"]
-    (tmp_path / "faces.keypoints.json").write_text(json.dumps(data))
-    rebuilt = ModelKeypoints.load(tmp_path / "faces.keypoints.json").xyz
-    np.testing.assert_allclose(rebuilt, keypoints.xyz, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -138,43 +115,17 @@ def test_annotated_model_is_written_and_lies_on_its_mesh(sample_root: Path, tmp_
             changed(1, semantic_id="seven"),
             "{path}: keypoints[1].semantic_id: 'seven' is not a whole number",
         ),
-        (
-            changed(0, xyz=...),
-            "{path}: keypoints[0].xyz: missing; or give face_index and barycentric",
-        ),
+        (changed(0, xyz=...), "{path}: keypoints[0].xyz: missing"),
         (changed(0, xyz=[1, 2]), "{path}: keypoints[0].xyz: [1, 2] is not a list of 3"),
         (
             changed(0, xyz=[1, 2, None]),
             "{path}: keypoints[0].xyz[2]: None is not a finite number",
         ),
         (
-            changed(1, barycentric=...),
-            "{path}: keypoints[1].barycentric: missing; give both or neither",
-        ),
-        (
-            changed(1, face_index=...),
-            "{path}: keypoints[1].face_index: missing; give both or neither",
-        ),
-        (
-            changed(1, barycentric=[1, 1, 1]),
-            "{path}: keypoints[1].barycentric: [1.0, 1.0, 1.0] sum to 3, not to 1",
-        ),
-        (
-            changed(2, face_index=4),
-            "{path}: keypoints[2].face_index: face 4 is not in {mesh}, which has faces 0 to 3",
-        ),
-        (changed(2, face_index=0.5), "{path}: keypoints[2].face_index: 0.5 is not a whole number"),
-        (
             changed(0, colour="red"),
-            "{path}: keypoints[0]: unknown field 'colour'; "
-            "known are barycentric, face_index, name, semantic_id, xyz",
+            "{path}: keypoints[0]: unknown field 'colour'; known are name, semantic_id, xyz",
         ),
         (DATA | {"keypoints": [3]}, "{path}: keypoints[0]: 3 is not an object"),
-        (
-            {name: value for name, value in DATA.items() if name != "model"},
-            "{path}: keypoints[2]: neither xyz nor a model that the face belongs to; "
-            "give xyz, or name the mesh file under model",
-        ),
         ("{", "{path}, line 1: not valid JSON: Expecting property name enclosed in double quotes"),
         ("[" * 100_000, "{path}: not valid JSON: nested too deeply"),
     ],
@@ -185,7 +136,7 @@ def test_malformed_files_are_refused_by_file_and_field(
     path = write(tmp_path / "a.keypoints.json", data)
     with pytest.raises(DataError) as caught:
         ModelKeypoints.load(path)
-    assert str(caught.value) == text.format(path=path, mesh=tmp_path / "tetrahedron.obj")
+    assert str(caught.value) == text.format(path=path)
 
 
 def test_files_that_cannot_be_read_or_written_are_refused(tmp_path: Path) -> None:
@@ -194,6 +145,3 @@ def test_files_that_cannot_be_read_or_written_are_refused(tmp_path: Path) -> Non
     one = ModelKeypoints((ModelKeypoint("a", (0.0, 0.0, 0.0)),))
     with pytest.raises(DataError, match=r"no/such\.json: cannot be written \(No such file"):
         one.save(tmp_path / "no" / "such.json")
-    path = write(tmp_path / "a.keypoints.json", DATA | {"model": "missing.obj"})
-    with pytest.raises(DataError, match=r"missing\.obj: no such mesh file"):
-        ModelKeypoints.load(path)

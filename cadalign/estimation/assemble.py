@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.options import FitOptions, pixel_information
+from cadalign.estimation.options import FitOptions
 from cadalign.estimation.problems import Problems, Solutions
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import (
@@ -22,6 +22,7 @@ from cadalign.estimation.result_parts import (
     FittedKeypoints,
     Posterior,
     ViewResult,
+    keypoint_summary,
     quickly,
 )
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
@@ -59,24 +60,8 @@ class KeypointPosterior(Posterior):
 
     @cached_property
     def evidence(self) -> tuple[EvidenceSummary, ...]:
-        return keypoint_evidence(self.keypoints)
-
-
-def keypoint_evidence(fitted: FittedKeypoints) -> tuple[EvidenceSummary, ...]:
-    """Agreement of the keypoints that the estimate rests on."""
-    residuals = fitted.residuals[fitted.inliers]
-    count = max(len(residuals), 1)
-    rms = float(np.sqrt((residuals * residuals).sum() / count))
-    sigma = fitted.chosen_sigma
-    if np.ndim(sigma) == 0:
-        unit = 1.0 if sigma is None else float(sigma)
-        with np.errstate(over="ignore"):  # of the least positive number
-            in_sigmas = float(np.nan_to_num(np.divide(rms / np.sqrt(2.0), unit)))
-    else:
-        information = pixel_information(sigma, len(fitted.residuals))[fitted.inliers]
-        whitened = np.einsum("ni,nij,nj->", residuals, information, residuals)
-        in_sigmas = float(np.sqrt(whitened / (2 * count)))
-    return (EvidenceSummary("keypoints", 0, len(residuals), in_sigmas, rms, "px"),)
+        own = self.keypoints
+        return (keypoint_summary(0, own.residuals, own.inliers, own.chosen_sigma),)
 
 
 def keypoints_of_solution(

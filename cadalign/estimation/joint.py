@@ -38,6 +38,7 @@ from cadalign.estimation.result_parts import (
     OutlineNotes,
     Posterior,
     ViewResult,
+    keypoint_summary,
 )
 from cadalign.estimation.search import Minimum
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
@@ -67,7 +68,7 @@ def result_of(
     *,
     inliers: Sequence[BoolArray],
     is_curved: bool,
-    evidence: tuple[EvidenceSummary, ...],
+    evidence: Sequence[EvidenceSummary] = (),
     redundancy: int,
     misses: tuple[float, float] | None = None,
     notes: OutlineNotes = NO_NOTES,
@@ -107,6 +108,23 @@ def result_of(
     seen = np.array([each.poses[0].apply(each.points) for each in estimates])
     of_points = second_moments(estimates, [each.of_points for each in estimates], places)
     of_seen = second_moments(estimates, [each.of_seen for each in estimates], seen)
+    of_views, summaries = [], list(evidence)
+    for number, view in enumerate(views):
+        rows, observed = prior.rows_of(view.keypoint_ids, "ids"), view.pixels
+        camera, alignment, own = view.camera, best.poses[0], Posterior()  # a pose as good as any
+        kept = np.zeros(len(rows), dtype=bool)
+        if number in numbers:
+            place = numbers.index(number)
+            camera, alignment, kept = best.cameras[place], best.poses[place], inliers[place]
+            own = Posterior(covariances[place])
+        residuals = camera.project(alignment.apply(points[rows])) - observed
+        of_views.append(
+            ViewResult(camera, alignment, view.keypoint_ids, observed, residuals, kept, own)
+        )
+        if kept.any():
+            sigma = problem.noise if view.sigma is None else view.sigma
+            summaries.append(keypoint_summary(number, residuals, kept, sigma))
+    summaries.sort(key=lambda each: (each.view is None, each.view, each.kind != "keypoints"))
     posterior = Posterior(
         covariances[0],
         fisher_covariance=best.covariances[0],
@@ -137,25 +155,12 @@ def result_of(
             ),
             *notes.warnings,
         ),
-        evidence=(*evidence, *notes.evidence),
+        evidence=(*summaries, *notes.evidence),
         degrees_of_freedom=prior.degrees_of_freedom,
         redundancy=redundancy,
         misses=misses,
     )
-    of_views = []
-    for number, view in enumerate(views):
-        rows, observed = prior.rows_of(view.keypoint_ids, "ids"), view.pixels
-        if number in numbers:
-            place = numbers.index(number)
-            camera, alignment, kept = best.cameras[place], best.poses[place], inliers[place]
-            own = Posterior(covariances[place]) if number else posterior
-        else:  # a pose as good as any
-            camera, alignment = view.camera, best.poses[0]
-            kept, own = np.zeros(len(rows), dtype=bool), Posterior()
-        residuals = camera.project(alignment.apply(points[rows])) - observed
-        of_views.append(
-            ViewResult(camera, alignment, view.keypoint_ids, observed, residuals, kept, own)
-        )
+    of_views[0] = replace(of_views[0], posterior=posterior)
     has_length = prior.lengths > 0
     return Result(
         views=tuple(of_views),
@@ -215,7 +220,6 @@ def result_of_minima(
         rotation = camera[:3, :3]
         turned = nearest_rotation(rotation.T @ pose.rotation)
         in_rig = Alignment(turned, rotation.T @ (pose.translation - camera[:3, 3]), best.scale)
-    seen_by = minimum.lenses.cameras_at(minimum.state.log_focals)
 
     return result_of(
         problem,
@@ -223,7 +227,7 @@ def result_of_minima(
         inliers=_inliers(problem, minimum),
         is_curved=symmetry is None and not is_exact(minimum.evidence),
         notes=notes,
-        evidence=summaries_of(minimum.evidence, minimum.state, seen_by),
+        evidence=summaries_of(minimum.evidence, minimum.state),
         redundancy=redundancy_of(minimum.evidence),
         cost=minimum.cost,
         stats=stats,

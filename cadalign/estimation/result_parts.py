@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.estimation.options import FitOptions, RansacOptions
+from cadalign.estimation.options import FitOptions, RansacOptions, pixel_information
 from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment, extent
 from cadalign.geometry.camera import Camera
@@ -200,6 +200,23 @@ class EvidenceSummary:
     def __str__(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
         return f"{self.name}: rms {self.rms:.3g}{unit}, {self.rms_sigmas:.2g} sigma"
+
+
+def keypoint_summary(
+    number: int, residuals: FloatArray, inliers: BoolArray, sigma: Any
+) -> EvidenceSummary:
+    """The summary of a view's inliers (n,), with residuals (n, 2) [px] of a standard deviation."""
+    kept, unit = residuals[inliers], 1.0 if sigma is None else sigma
+    count = max(len(kept), 1)
+    rms = float(np.sqrt((kept * kept).sum() / count))
+    if np.ndim(unit) == 0:
+        with np.errstate(over="ignore"):  # of the least positive number
+            in_sigmas = float(np.nan_to_num(np.divide(rms / np.sqrt(2.0), float(unit))))
+    else:
+        information = pixel_information(unit, len(residuals))[inliers]
+        squares = np.einsum("ni,nij,nj->", kept, information, kept)
+        in_sigmas = float(np.sqrt(squares / (2 * count)))
+    return EvidenceSummary("keypoints", number, len(kept), in_sigmas, rms, "px")
 
 
 def name_of(kind: str, view: int | None) -> str:

@@ -25,7 +25,6 @@ from cadalign.estimation.problem import Problem
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
-from cadalign.estimation.uncertainty.evidence import summary_of_keypoints
 from cadalign.estimation.uncertainty.shape_posterior import single_posterior
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
@@ -128,9 +127,6 @@ def align_single(problem: Problem, start: float) -> Result:
         )
         for each, likelihood in zip(posteriors, likelihoods.tolist(), strict=True)
     ]
-    points = estimates[0].points[rows]
-    in_camera = estimates[0].poses[0].apply(points)
-    errors = in_camera[:, :2] / in_camera[:, 2:] - seen.rays
     component, cost = int(minima.label[0]), float(minima.costs[0])
 
     return result_of(
@@ -138,7 +134,6 @@ def align_single(problem: Problem, start: float) -> Result:
         [as_given(each, problem) for each in estimates],
         inliers=[np.ones(len(rows), dtype=bool)],
         is_curved=bool(covariances.any()),
-        evidence=(summary_of_keypoints(errors, seen.rays, seen.whitening, 0, view.camera),),
         redundancy=2 * len(rows) - POSE_UNKNOWNS,
         misses=posteriors[0].misses,
         cost=cost,

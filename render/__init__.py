@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
-    from cadalign.render.drawing.model_overlay import OverlayStyle, overlay_model
+    from cadalign.render.drawing.model_overlay import overlay_model
     from cadalign.render.drawing.overlay import draw_overlay
     from cadalign.render.drawing.pictures import (
         Angles,
@@ -34,7 +34,6 @@ __all__ = [
     "Angles",
     "Frame",
     "Geometry",
-    "OverlayStyle",
     "RaycastRenderer",
     "Scene",
     "Studio",

@@ -30,7 +30,7 @@ from cadalign.io.documents import parse_json
 from cadalign.io.files import keeping, listed, made_folder, write_json
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
-from cadalign.render import OverlayStyle, Scene, overlay_model
+from cadalign.render import Scene, overlay_model
 from cadalign.render.scene import LIGHT_GREY
 
 RUN_FORMATS = ("json", "overlay", "glb")
@@ -57,7 +57,6 @@ def export_run(
     format: str | None = None,
     metres: float = 1.0,
     rows: Collection[int] = (),
-    style: OverlayStyle | None = None,
 ) -> Exported:
     """Write the alignments of a finished run for another tool.
 
@@ -77,8 +76,6 @@ def export_run(
         Length of one unit of the model [m].
     rows : collection of int
         Numbers of the observations to write; by default all.
-    style : OverlayStyle, optional
-        Style of ``overlay``.
 
     Raises
     ------
@@ -113,7 +110,7 @@ def export_run(
         elif name == "glb":
             count = _write_glb(to, objects, left_out)
         else:
-            count = _write_overlays(to, objects, left_out, style)
+            count = _write_overlays(to, objects, left_out)
     if not count:
         if left_out:
             raise all_left_out(left_out)
@@ -215,7 +212,6 @@ def _write_overlays(
     folder: Path,
     objects: Iterator[_Numbered],
     left_out: list[CadalignError],
-    style: OverlayStyle | None,
 ) -> int:
     """Draw each model over its photos, grey where there is none."""
     made_folder(folder)
@@ -230,7 +226,7 @@ def _write_overlays(
                 if photo is None:
                     size = (camera.height, camera.width, 3)
                     photo = np.full(size, LIGHT_GREY, dtype=np.uint8)
-                drawn = overlay_model(photo, camera, scene, view.cam_from_model, style=style)
+                drawn = overlay_model(photo, camera, scene, view.cam_from_model)
                 name = f"{row:06d}_{number}.png" if number else f"{row:06d}.png"
                 write_image(folder / name, drawn)
         except (InputError, DataError, RenderError) as error:

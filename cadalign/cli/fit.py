@@ -42,7 +42,7 @@ from cadalign.io.observation import (
 )
 
 if TYPE_CHECKING:
-    from cadalign.render import OverlayStyle
+    pass
 
 
 @dataclass(frozen=True)
@@ -78,11 +78,6 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
     overlay: Path | None = None
     """Draw the aligned model over the photo, too, and write it to this picture; further views to
     FILE_1 and so on. The observation names the model. For many observations, a folder."""
-    overlay_mode: Literal["shaded", "translucent", "lines", "box"] = "shaded"
-    """Style of drawing: in its own colours, as a red veil, its outline and creases, or its box."""
-    overlay_opacity: float = 0.6
-    """Opacity of the shaded or translucent model, 0 to 1."""
-
     # A group's own text: without it, tyro reads the documentation of all options for every fit.
     fitting: Annotated[
         _FitOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(help=_FitOptions.__doc__)
@@ -162,12 +157,11 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
         from cadalign.batch.experiment import FitRunOptions
         from cadalign.cli.runs import inputs_of, run_command, run_folder, write_overlays
 
-        style = self._style
         with named_as_flags(self, self.fitting, self.ransac):
             options = FitRunOptions(estimate=self.estimate, **inputs_of(self, self.changes))
             code = run_command(self, options, done="aligned")
         if self.overlay is not None and code != NOTHING_WORKED:
-            write_overlays(run_folder(self, options), self.overlay, style)
+            write_overlays(run_folder(self, options), self.overlay)
         return code
 
     @property
@@ -177,27 +171,15 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
 
     def _fitted(self, observation: Observation, path: Path, sources: dict[str, Path]) -> FittedFile:
         """Fit an observation, which messages call ``path``, and draw it; see `FittedFile`."""
-        shape, style = self.shape_of(observation), self._style
+        shape = self.shape_of(observation)
         if shape is not None:
             sources = {**sources, "shape": shape}
-        if style is not None and shape is None and observation.model is None:
+        if self.overlay is not None and shape is None and observation.model is None:
             fix = "give the file's `model` a mesh, or leave out the option"
             raise InputError(f"{path} names no model to draw", where="--overlay", fix=fix)
         with named_as_flags(self, self.fitting, self.ransac):
             status = waiting("fitting")
             result, views = self.fit(observation, str(path), note=say, status=status)
         found = FittedFile(result, sources, inputs=(*observation.files, *sources.values()))
-        return found.drawn(observation, views=views, picture=self.picture, style=style)
-
-    @property
-    def _style(self) -> OverlayStyle | None:
-        """The style of overlays, where some are asked for."""
-        if self.overlay is None:
-            return None
-        from cadalign.render import OverlayStyle
-
-        try:
-            return OverlayStyle(mode=self.overlay_mode, opacity=self.overlay_opacity)
-        except InputError as error:
-            flag = f"--overlay-{error.where}"
-            raise InputError(error.what, where=flag, fix=error.fix) from None
+        has_overlay = self.overlay is not None
+        return found.drawn(observation, views=views, picture=self.picture, overlay=has_overlay)

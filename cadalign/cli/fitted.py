@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from cadalign.estimation.result import Result
     from cadalign.estimation.view import View
     from cadalign.io.observation import Observation
-    from cadalign.render import OverlayStyle
     from cadalign.render.drawing.canvas import ByteImage
 
 
@@ -68,15 +67,15 @@ class FittedFile:
         *,
         views: tuple[View, ...] | None,
         picture: bool,
-        style: OverlayStyle | None,
+        overlay: bool,
     ) -> FittedFile:
-        """The same with pictures of all views, and overlays in a style; each photo is read once.
+        """The same with pictures of all views, and overlays; each photo is read once.
 
         ``views`` are those that were aligned, None for a stretched model and keypoints alone, whose
-        mesh is drawn as a box. Raises InputError if there is a style and no mesh, DataError if a
-        photo or the model cannot be read.
+        mesh is drawn as a box. Raises InputError for overlays without a mesh, DataError if a photo
+        or the model cannot be read.
         """
-        if not picture and style is None:
+        if not picture and not overlay:
             return self
         from cadalign.io.meshes.files import load_mesh
         from cadalign.render.drawing.model_overlay import draw_result, mesh_of, photo_of
@@ -102,7 +101,7 @@ class FittedFile:
                 for number, (image, photo, mask) in of_views
             )
             found = replace(found, pictures=tuple(pictures))
-        if style is None:
+        if not overlay:
             return found
         if mesh is None:
             raise InputError("no mesh of the object is known", where="--overlay")
@@ -110,7 +109,7 @@ class FittedFile:
 
         scene = Scene(mesh)
         overlays = (
-            overlay_model(photo, view.camera, scene, view.alignment, style=style)
+            overlay_model(photo, view.camera, scene, view.alignment)
             for photo, view in zip(photos, result.views, strict=True)
         )
         return replace(found, overlays=tuple(overlays))

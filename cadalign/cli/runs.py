@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from cadalign.evaluation.runs.run import Progress as RunProgress
     from cadalign.evaluation.runs.tables import Run
     from cadalign.io.observation import ObservationChanges
-    from cadalign.render import OverlayStyle
 
 T = TypeVar("T")
 _MOST_REASONS, _MOST_OF_EVALUATIONS = 10, 3
@@ -205,10 +204,10 @@ def run_folder(command: ManyCommand, options: ManyOptions) -> RunFolder:
     return RunFolder(beside(first, f"_{kind}"))
 
 
-def write_overlays(run: RunFolder, to: Path, style: OverlayStyle | None) -> None:
+def write_overlays(run: RunFolder, to: Path) -> None:
     """Draw all aligned models of a run over their photos, in a folder."""
     from cadalign.batch.exports import export_run
 
-    found = export_run(run.path, to, format="overlay", style=style)
+    found = export_run(run.path, to, format="overlay")
     left = f", {len(found.left_out):,} left out" if found.left_out else ""
     say(f"Overlays: {found.objects:,} in {to}{left}")

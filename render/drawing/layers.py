@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_floats, as_points
-from cadalign.errors import InputError, unknown
+from cadalign.errors import InputError
 from cadalign.render.drawing.canvas import (
     CASING,
     ByteImage,
@@ -21,31 +21,18 @@ from cadalign.render.drawing.canvas import (
 from cadalign.render.drawing.pictures import feature_lines
 from cadalign.render.scene import Frame, Geometry
 
-FloatImage = npt.NDArray[np.float32]
-
-SHADED = "shaded"
-TRANSLUCENT = "translucent"
-LINES = "lines"
-STYLES = (TRANSLUCENT, LINES, SHADED)
-VEIL_OPACITY = 0.5
-
+_SHADED_OPACITY, _VEIL_OPACITY = 0.6, 0.5
 # How much of the veil's colour is the model's own, so that its parts can be told apart.
 _OWN_SHARE = 0.45
 _LINE_OPACITY = 0.9
 _CASING_OPACITY = 0.45
 
 
-def with_model(
-    image: ByteImage, geometry: Geometry, color: Color, *, style: str, opacity: float
-) -> ByteImage:
-    """Put a model over an image in a style, a veil in a colour; (h, w, 3) uint8.
+def with_model(image: ByteImage, geometry: Geometry, color: Color) -> ByteImage:
+    """Put a model over an image: a `Frame` in its own colours, mere geometry as a veil in a colour.
 
-    Refuses an unknown style, an opacity out of range, and a frame of another size.
+    Refuses a frame of another size.
     """
-    if style not in STYLES:
-        raise unknown("style", style, STYLES, where="model_style")
-    if not 0 <= opacity <= 1:
-        raise InputError(f"{opacity} is not from 0 to 1", where="model_opacity")
     if geometry.depth.shape != image.shape[:2]:
         rows, columns = geometry.depth.shape
         raise InputError(
@@ -53,42 +40,18 @@ def with_model(
             where="est_frame",
             fix="render the model with the image's camera",
         )
-    if style == SHADED:
-        return _shaded(image, geometry, opacity)
-    return _veiled(image, geometry, color, opacity) if style == TRANSLUCENT else image
-
-
-def _shaded(image: ByteImage, geometry: Geometry, opacity: float) -> ByteImage:
-    """Put a model over an image in its own colours, blended in linear light; (h, w, 3) uint8."""
-    own, cover = _colors_of(geometry)
-    front = np.dstack([own, 255 * opacity * cover]) + np.float32(0.5)
-    return composite(front.astype(np.uint8), image)
-
-
-def _veiled(image: ByteImage, geometry: Geometry, color: Color, opacity: float) -> ByteImage:
-    """Let a model shine through in a colour; (h, w, 3) uint8."""
-    own, cover = _colors_of(geometry)
-    grey = own.mean(axis=2, keepdims=True) / 255
+    if isinstance(geometry, Frame):
+        front = geometry.color.astype(np.float32)
+        front[:, :, 3] *= _SHADED_OPACITY
+        return composite((front + np.float32(0.5)).astype(np.uint8), image)
+    grey = np.float32(0.35) + np.float32(0.65) * np.abs(geometry.normal[:, :, 2:])
     # White in the light, the colour itself in the middle, dark in the shade.
     tinted = np.minimum(2 * grey, 1) * np.array(color, np.float32) + np.maximum(2 * grey - 1, 0) * (
         255 - np.array(color, np.float32)
     )
-    front = _OWN_SHARE * own + (1 - _OWN_SHARE) * tinted
-    share = opacity * cover[:, :, None]
+    front = _OWN_SHARE * 255 * grey + (1 - _OWN_SHARE) * tinted
+    share = _VEIL_OPACITY * geometry.mask.astype(np.float32)[:, :, None]
     return np.asarray(image * (1 - share) + front * share + 0.5, dtype=np.uint8)
-
-
-def _colors_of(geometry: Geometry) -> tuple[FloatImage, FloatImage]:
-    """Colours (h, w, 3) from 0 to 255, and the share (h, w) of each pixel that is covered.
-
-    A `Frame` has its own colours and shading, mere geometry shading alone.
-    """
-    if isinstance(geometry, Frame):
-        cover: FloatImage = (geometry.color[:, :, 3] / 255).astype(np.float32)
-        return geometry.color[:, :, :3].astype(np.float32), cover
-    facing = np.float32(0.35) + np.float32(0.65) * np.abs(geometry.normal[:, :, 2])
-    covered: FloatImage = geometry.mask.astype(np.float32)
-    return np.repeat(255 * facing[:, :, None], 3, axis=2), covered
 
 
 def draw_lines(canvas: Canvas, geometry: Geometry, color: Color) -> None:

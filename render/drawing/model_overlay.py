@@ -1,8 +1,7 @@
-"""A placed model over its photo: shaded or as lines, with its box and its axes."""
+"""A placed model over its photo, with its box and its axes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -10,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import InputError, unknown
 from cadalign.estimation.result import Result
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
@@ -20,42 +18,10 @@ from cadalign.io.images import read_image
 from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.canvas import ByteImage
-from cadalign.render.drawing.layers import LINES, SHADED, TRANSLUCENT, confidence_regions
+from cadalign.render.drawing.layers import confidence_regions
 from cadalign.render.drawing.overlay import draw_overlay
 from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry
-from cadalign.render.scene import LIGHT_GREY, Geometry, Scene, check_image_size
-
-BOX = "box"
-MODES = (SHADED, TRANSLUCENT, LINES, BOX)
-
-
-@dataclass(frozen=True)
-class OverlayStyle:
-    """Style of a model drawn over its photo.
-
-    Raises
-    ------
-    InputError
-        If there is no such mode, or the opacity is out of range.
-    """
-
-    mode: str = "shaded"
-    """``shaded``, the model in its own colours, lit; ``translucent``, as a red veil; ``lines``, its
-    visible outline and creases alone; or ``box``, the box alone."""
-    opacity: float = 0.6
-    """Opacity of the shaded or translucent model, 0 to 1."""
-    lines: bool = True
-    """Whether to draw outline and creases over the model."""
-    box: bool = True
-    """Whether to draw its box."""
-    axes: bool = True
-    """Whether to draw its x, y and z axes."""
-
-    def __post_init__(self) -> None:
-        if self.mode not in MODES:
-            raise unknown("mode", self.mode, MODES)
-        if not 0 <= self.opacity <= 1:
-            raise InputError(f"{self.opacity} is not from 0 to 1", where="opacity")
+from cadalign.render.scene import LIGHT_GREY, Scene, check_image_size
 
 
 def overlay_model(
@@ -63,11 +29,8 @@ def overlay_model(
     camera: Camera,
     mesh: Mesh | Scene,
     alignment: Alignment,
-    *,
-    style: OverlayStyle | None = None,
-    bounds: npt.ArrayLike | None = None,
 ) -> ByteImage:
-    """Draw an aligned model over its photo.
+    """Draw an aligned model over its photo, shaded, with its edges, its box and its axes.
 
     Parameters
     ----------
@@ -80,9 +43,6 @@ def overlay_model(
         A `Scene` is prepared once for many photos.
     alignment : Alignment
         The model's pose and stretch, of a result or the truth.
-    style : OverlayStyle, optional
-    bounds : (2, 3) float, optional
-        The model's lowest and highest coordinates; by default the mesh's.
 
     Returns
     -------
@@ -101,31 +61,17 @@ def overlay_model(
     >>> camera = Camera.from_fov(65, 49, fov_x=60.0)
     >>> photo = np.zeros((49, 65, 3), np.uint8)
     >>> pose = Alignment(np.eye(3), [0, 0, 4], [1, 1, 1])
-    >>> overlay_model(photo, camera, triangle, pose, style=OverlayStyle(opacity=0.8)).shape
+    >>> overlay_model(photo, camera, triangle, pose).shape
     (49, 65, 3)
     """
-    chosen = style or OverlayStyle()
     scene = mesh if isinstance(mesh, Scene) else Scene(mesh)
-    box = Box.from_model(scene.bounds if bounds is None else bounds, alignment)
     return draw_overlay(
         image,
         camera,
-        est_box=box if chosen.box or chosen.mode == BOX else None,
-        est_frame=_drawn(scene, camera, alignment, chosen.mode),
-        model_style=LINES if chosen.mode == BOX else chosen.mode,
-        model_opacity=chosen.opacity,
-        model_lines=chosen.lines or chosen.mode == LINES,
-        axes=box if chosen.axes else False,
+        est_box=Box.from_model(scene.bounds, alignment),
+        est_frame=RaycastRenderer().render(scene, camera, alignment),
         legend=False,
     )
-
-
-def _drawn(scene: Scene, camera: Camera, alignment: Alignment, mode: str) -> Geometry | None:
-    if mode == BOX:
-        return None
-    if mode == LINES:
-        return cast_geometry(scene, camera, alignment)
-    return RaycastRenderer().render(scene, camera, alignment)
 
 
 _SAME = 1e-9  # of the model's size

@@ -14,8 +14,6 @@ from cadalign.geometry.alignment import BOX_EDGES, Box
 from cadalign.geometry.camera import Camera
 from cadalign.render.drawing.canvas import ByteImage, Canvas, Color, LegendEntry
 from cadalign.render.drawing.layers import (
-    TRANSLUCENT,
-    VEIL_OPACITY,
     KeypointMarks,
     draw_lines,
     with_model,
@@ -56,9 +54,6 @@ def draw_overlay(
     gt_box: Box | None = None,
     est_box: Box | None = None,
     est_frame: Geometry | None = None,
-    model_style: str = TRANSLUCENT,
-    model_opacity: float = VEIL_OPACITY,
-    model_lines: bool = True,
     observed: npt.ArrayLike | None = None,
     reprojected: npt.ArrayLike | None = None,
     unseen: npt.ArrayLike | None = None,
@@ -70,8 +65,8 @@ def draw_overlay(
 
     The true box is green, the predicted one red; their far edges are dashed. Three arrows run from
     the predicted box's centre (or the true one's, without a prediction) to its faces, so that
-    their lengths show the stretch. The predicted model itself lies over the photo as a red veil
-    with its edges. Observed keypoints are white rings, reprojected ones yellow
+    their lengths show the stretch. The predicted model itself lies over the photo with its
+    edges. Observed keypoints are white rings, reprojected ones yellow
     crosses, and a thin line between the two is the residual. Keypoints that were not observed are
     small rings, and thin curves hold those that are uncertain. What lies behind the camera is cut
     off.
@@ -84,14 +79,8 @@ def draw_overlay(
     gt_box, est_box : Box, optional
         The true and the predicted box, in the camera frame.
     est_frame : Geometry, optional
-        The predicted model as a renderer or `cast_geometry` gives it for this camera.
-    model_style : str
-        How to show it: ``shaded``, in its own colours, ``translucent``, as a red veil, or
-        ``lines`` for outline and edges alone.
-    model_opacity : float
-        Opacity of the model where it is not drawn as lines, 0 to 1.
-    model_lines : bool
-        Whether to draw its outline and edges.
+        The predicted model for this camera: a `Frame` of `RaycastRenderer` is shown in its own
+        colours, what `cast_geometry` gives as a red veil.
     observed, reprojected : (k, 2) float, optional
         Keypoints [px]; if both are given they belong together, row by row. Reprojected ones that
         are not finite, behind the camera, are left out.
@@ -112,8 +101,7 @@ def draw_overlay(
     Raises
     ------
     InputError
-        If the image is of another kind or size, the keypoints don't match, or there is no such
-        style.
+        If the image is of another kind or size, or the keypoints don't match.
     RenderError
         If the image is too large.
 
@@ -127,9 +115,9 @@ def draw_overlay(
     check_image_size(camera)
     pixels = _as_rgb(image, camera)
     if est_frame is not None:
-        pixels = with_model(pixels, est_frame, EST_COLOR, style=model_style, opacity=model_opacity)
+        pixels = with_model(pixels, est_frame, EST_COLOR)
     canvas = Canvas(pixels)
-    if est_frame is not None and model_lines:
+    if est_frame is not None:
         draw_lines(canvas, est_frame, EST_COLOR)
     marks = KeypointMarks.checked(observed, reprojected, unseen, regions)
     strokes: list[_Stroke] = []

@@ -132,10 +132,9 @@ def test_documents_are_those_of_single_fits(run: Path, tmp_path: Path) -> None:
 def test_overlays_of_many_are_those_of_single_fits(run: Path, tmp_path: Path) -> None:
     folder = tmp_path / "docs"
     export_run(run, folder, format="json", rows=[0])
-    style = ["--overlay-mode", "lines"]
-    one = ["fit", str(folder / "000000.json"), "--no-picture", *style]
+    one = ["fit", str(folder / "000000.json"), "--no-picture"]
     assert main([*one, "--overlay", str(tmp_path / "one.png")]) == 0
-    many = ["fit", str(folder / "000000.json"), str(folder / "000000.json"), "--no-picture", *style]
+    many = ["fit", str(folder / "000000.json"), str(folder / "000000.json"), "--no-picture"]
     assert main([*many, "--overlay", str(tmp_path / "all"), "--out", str(tmp_path / "run")]) == 0
     names = ["000000.png", "000001.png"]
     assert sorted(path.name for path in (tmp_path / "all").iterdir()) == names

@@ -253,7 +253,7 @@ def test_mask_goes_with_an_unknown_focal_length(tmp_path: Path) -> None:
     image = ObservedImage(corners[:7], pixels, CAMERA, evidence=evidence)
     path = without_focal(write(tmp_path, image, model=tmp_path / "box.obj"))
     overlay = tmp_path / "model.png"
-    assert main(["fit", str(path), "--overlay", str(overlay), "--overlay-mode", "lines"]) == 0
+    assert main(["fit", str(path), "--overlay", str(overlay)]) == 0
     found = result_in(tmp_path)
     assert found.focal == "estimate"
     assert found.std is not None

@@ -98,8 +98,7 @@ def test_the_overlay_shows_the_model_over_the_photo(tmp_path: Path, flags: list[
     path = write_observation(tmp_path)
     target = tmp_path / "pictures" / "over.png"
     target.parent.mkdir()
-    options = ["--overlay", str(target), "--overlay-opacity", "1"]
-    assert main(["fit", str(path), *options, *flags]) == 0
+    assert main(["fit", str(path), "--overlay", str(target), *flags]) == 0
     picture = read_image(target, CAMERA)
     mesh = load_mesh(tmp_path / "box.obj")
     mask = cast_geometry(Scene(mesh), CAMERA, TRUTH).mask
@@ -119,21 +118,10 @@ def test_the_overlay_of_every_view_is_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("flags", "without_model", "message"),
-    [
-        ([], True, "--overlay: "),
-        (["--overlay-opacity", "2"], False, "--overlay-opacity: 2.0 is not from 0 to 1"),
-    ],
-)
 def test_overlays_that_cannot_be_drawn_are_refused_before_the_fit(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    flags: list[str],
-    without_model: bool,
-    message: str,
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = write_observation(tmp_path, **({"model": None} if without_model else {}))
-    line = refusal_line(capsys, "fit", path, "--overlay", tmp_path / "o.png", *flags)
-    assert message in line
+    path = write_observation(tmp_path, model=None)
+    line = refusal_line(capsys, "fit", path, "--overlay", tmp_path / "o.png")
+    assert "--overlay: " in line
     assert not (tmp_path / "box_fit").exists()

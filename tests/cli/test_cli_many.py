@@ -144,7 +144,6 @@ def test_what_is_wrong_with_the_inputs_is_one_line(
     for arguments, text in [
         (["no such*.json"], "no such*.json: no file matches"),
         ([str(folder / "a.png"), "b.json"], "a photo, not an observation"),
-        ([str(folder / "found.json"), "--overlay", "o", "--overlay-opacity", "2"], "--overlay-op"),
         ([str(folder / "gone.jsonl")], "gone.jsonl: no such file"),
     ]:
         assert main(["fit", *arguments, *out]) == 1

@@ -14,7 +14,6 @@ from cadalign.render import (
     RaycastRenderer,
     Scene,
     draw_overlay,
-    feature_lines,
     look_at,
 )
 from cadalign.render.drawing.layers import OBSERVED_COLOR, REPROJECTED_COLOR
@@ -269,48 +268,28 @@ def test_true_and_predicted_box_may_differ_in_stretch():
     assert _near_color(image, EST_COLOR).sum() > 200
 
 
-def _model_frames(style):
+def _model_frame():
     camera = Camera.from_fov(320, 240, fov_x=60)
     shape = trimesh.creation.box((1.0, 1.2, 0.8))
     scene = Scene(Mesh(np.array(shape.vertices), np.array(shape.faces)))
     frame = RaycastRenderer().render(scene, camera, look_at(azimuth=30, elevation=20, distance=3))
-    photo = np.full((240, 320, 3), 120, np.uint8)
-    drawn = draw_overlay(photo, camera, est_frame=frame, model_style=style, legend=False)
-    return frame, photo, drawn
+    return camera, frame, np.full((240, 320, 3), 120, np.uint8)
 
 
 def test_the_predicted_model_lies_over_the_photo_as_a_red_veil():
-    frame, photo, drawn = _model_frames("translucent")
+    camera, frame, photo = _model_frame()
+    geometry = Geometry(depth=frame.depth, face_id=frame.face_id, normal=frame.normal)
+    drawn = draw_overlay(photo, camera, est_frame=geometry, legend=False)
     inner = cv2.erode(frame.mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
     tint = drawn[inner].astype(int)
-    assert (tint[:, 0] - tint[:, 1]).min() > 15
+    assert np.median(tint[:, 0] - tint[:, 1]) > 10
+    assert (tint[:, 0] > tint[:, 1]).all()
     outside = cv2.dilate(frame.mask.astype(np.uint8), np.ones((7, 7), np.uint8)) == 0
     np.testing.assert_array_equal(drawn[outside], photo[outside])
 
 
-def test_lines_alone_leave_the_surfaces_as_they_are():
-    frame, photo, drawn = _model_frames("lines")
-    changed = (drawn != photo).any(axis=2)
-    lines = cv2.dilate(feature_lines(frame).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
-    assert changed.sum() > 300
-    assert not changed[~lines].any()
-    reddest = drawn.reshape(-1, 3)[drawn.reshape(-1, 3)[:, 0].argmax()].astype(int)
-    assert reddest[0] > reddest[1] + 80
-
-
-def test_geometry_alone_is_enough_for_a_veil():
-    frame, photo, _ = _model_frames("lines")
-    geometry = Geometry(depth=frame.depth, face_id=frame.face_id, normal=frame.normal)
-    camera = Camera.from_fov(320, 240, fov_x=60)
-    drawn = draw_overlay(photo, camera, est_frame=geometry, legend=False)
-    assert drawn[120, 160, 0] > int(drawn[120, 160, 1]) + 10
-
-
-def test_wrong_frames_and_styles_are_refused():
-    frame, photo, _ = _model_frames("lines")
-    camera = Camera.from_fov(320, 240, fov_x=60)
-    with pytest.raises(InputError, match="known are translucent, lines"):
-        draw_overlay(photo, camera, est_frame=frame, model_style="fog")
+def test_frames_of_another_size_are_refused():
+    camera, frame, photo = _model_frame()
     small = Geometry(frame.depth[1:], frame.face_id[1:], frame.normal[1:])
     with pytest.raises(InputError, match="est_frame: it is 320 x 239 px, the image 320 x 240"):
         draw_overlay(photo, camera, est_frame=small)

@@ -13,18 +13,14 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
+from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
-from cadalign.estimation.contours.descent import OutlineFit, first_fit, last_fit
 from cadalign.estimation.contours.mask import MaskSource, convex_hull
-from cadalign.estimation.contours.outline import OutlineSource, OutlineSupport
+from cadalign.estimation.contours.outline import MeasuredOutline, OutlineSource, OutlineSupport
 from cadalign.estimation.contours.photo import PhotoSource
 from cadalign.estimation.contours.photo_lines import photo_of
-from cadalign.estimation.contours.problem import (
-    ContourProblem,
-    Place,
-    weakest_steps,
-    with_displacement_modes,
-)
+from cadalign.estimation.contours.problem import OutlineProblem, with_displacement_modes
+from cadalign.estimation.contours.rounds import OutlineFit, first_fit, last_fit
 from cadalign.estimation.contours.surface import Surface, surface_of
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.prior import ShapePrior
@@ -33,7 +29,7 @@ from cadalign.estimation.search import Minimum
 from cadalign.estimation.uncertainty.residuals import chi_square_quantile
 from cadalign.estimation.view import View
 from cadalign.estimation.warning import EstimateWarning
-from cadalign.geometry.rotations import angle_between
+from cadalign.geometry.rotations import angle_between, rotation_from_vector
 from cadalign.io.images import ByteImage
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.covariance import information_of, scaled_information
@@ -43,6 +39,7 @@ from cadalign.solvers.joint.search import cost_of, reduced, score_state
 _MOST_STARTS = 4
 _MOST_OPEN_STARTS = 12  # where nothing but masks determines the estimate
 _MOST_FINISHED = 4
+_LEAST_EIGENVALUE = 1e-12
 _UNLIKELY = 60.0  # excess score of a minimum that is still a start
 _LEAST_INFORMATION = 1e-9  # about the worst known direction of the unknowns, relative
 # Of further starts: directions of which an estimate knows least, standard deviations along these,
@@ -63,31 +60,36 @@ class Candidate:
     """A start, what is to be refined from there, and where that led."""
 
     start: Minimum
-    problem: ContourProblem
+    problem: OutlineProblem
     fit: OutlineFit
+
+    @cached_property
+    def measured(self) -> list[MeasuredOutline | None]:
+        """The outline that each source measures."""
+        return self.fit.measured(self.problem)
 
     @cached_property
     def supports(self) -> list[OutlineSupport]:
         """The agreement of each source with the outline."""
         return [
             OutlineSupport() if each is None else source.support(each)
-            for source, each in zip(self.problem.sources, self.fit.measured, strict=True)
+            for source, each in zip(self.problem.sources, self.measured, strict=True)
         ]
 
     @cached_property
     def rank(self) -> float:
         """-2 log of its probability by the other evidence and by the outlines, up to a constant."""
-        rest = cost_of(self.problem.evidence, self.fit.place.state) + self.start.prior_score
-        for source, each in zip(self.problem.sources, self.fit.measured, strict=True):
+        rest = cost_of(self.problem.evidence, self.fit.state) + self.start.prior_score
+        for source, each in zip(self.problem.sources, self.measured, strict=True):
             rest += 0.0 if each is None else source.rank(each)
         return rest
 
-    def minimum(self, *, by_rank: bool) -> Minimum:
-        """The minimum, its score with the `rank` or with the cost of the outlines."""
-        evidence, state, *_ = self.fit.augmented
-        cost, score = cost_of(evidence, state), self.fit.score + self.start.prior_score
-        if by_rank and np.isfinite(score):
-            score = score_state(evidence, state) - cost + self.rank
+    @cached_property
+    def minimum(self) -> Minimum:
+        """The minimum, its score with the `rank` in the place of the cost."""
+        evidence, state = self.fit.with_outlines
+        cost = cost_of(evidence, state)
+        score = score_state(evidence, state) - cost + self.rank
         return self.start._replace(evidence=evidence, state=state, cost=cost, score=score)
 
 
@@ -123,12 +125,11 @@ def refine_with_outlines(
         warnings.append(source.warning(text))
         left = [each for each in left if each is not source]
     supports = dict(zip(left, best[0].supports, strict=True)) if left else {}
-    by_rank = search.by_rank(left)
-    if by_rank and not wrong:
+    if not wrong:
         doubts = {source: source.doubt(each) for source, each in supports.items()}
         warnings += [source.warning(text) for source, text in doubts.items() if text]
     summaries = [source.summary(supports.get(source, OutlineSupport())) for source in sources]
-    found = [each.minimum(by_rank=by_rank) for each in best] if left else list(minima)
+    found = [each.minimum for each in best] if left else list(minima)
     return found, OutlineNotes(tuple(summaries), tuple(warnings))
 
 
@@ -164,27 +165,26 @@ class OutlineSearch(NamedTuple):
         most = _MOST_OPEN_STARTS if is_open else _MOST_STARTS
         return cls(likely[:most], sources, surface, keypoints, is_open)
 
-    def by_rank(self, sources: Sequence[OutlineSource]) -> bool:
-        """True if ranks score the estimates: costs do not compare, or nothing is beside them."""
-        return self.is_open or not all(source.is_comparable for source in sources)
-
     def best(self, sources: Sequence[OutlineSource]) -> list[Candidate]:
         """Distinct candidates, the likeliest first."""
         starts = [(each, each.state) for each in self.minima]
-        is_comparable = all(source.is_comparable for source in sources)
-        if not self.is_open and (self.surface.is_exact or not is_comparable):
+        has_photo = not all(each.learns_sigma for each in sources)
+        if not self.is_open and (self.surface.is_exact or has_photo):
             starts += _displaced(self.minima[0], is_exact=self.surface.is_exact)
         near = []
         for start, state in starts:
-            evidence, moved = with_displacement_modes(start.evidence, state)
-            problem = ContourProblem(evidence, self.keypoints, sources, self.surface)
-            fit = first_fit(problem, moved)
+            given = start.evidence, state, self.keypoints, sources, self.surface
+            problem, begun = OutlineProblem.of(*given)
+            fit = first_fit(problem, begun)
             if fit is not None:
                 near.append(Candidate(start, problem, fit))
         likely = _distinct_candidates(near)[:_MOST_FINISHED]
-        found = _finished([each for each in likely if each.rank < likely[0].rank + _UNLIKELY])
-        by_rank = self.by_rank(sources)
-        return sorted(found, key=lambda each: each.minimum(by_rank=by_rank).score)
+        found = []
+        for each in likely:
+            if each.rank < likely[0].rank + _UNLIKELY:
+                end = last_fit(each.problem, each.fit)
+                found += [] if end is None else [replace(each, fit=end)]
+        return sorted(_distinct_candidates(found), key=lambda each: each.minimum.score)
 
 
 def _hulls_of(views: Sequence[View]) -> list[View]:
@@ -231,32 +231,35 @@ def _displaced(start: Minimum, *, is_exact: bool) -> list[tuple[Minimum, State]]
     _, information = information_of(*reduced(start.evidence, start.state))
     poses, rest = 6 * len(start.state.poses), len(start.state.log_focals) + 3
     count = poses + rest * is_exact
-    place, found = Place.of(start.state), []
-    for weak in weakest_steps(information[:count, :count], _WEAKEST):
+    matrix, sizes = scaled_information(information[:count, :count])
+    values, vectors = np.linalg.eigh(matrix)
+    roots = np.sqrt(np.maximum(values[:_WEAKEST], _LEAST_EIGENVALUE))
+    found = []
+    for weak in (vectors[:, :_WEAKEST] / roots / sizes[:, None]).T:
         step = np.append(weak, np.zeros(poses + rest - count))
         turn = np.linalg.norm(step[:poses].reshape(-1, 6)[:, :3], axis=1).max()
         stretch = np.abs(step[-3:]).max()
         if max(turn / _LEAST_TURN, stretch / _LEAST_STRETCH) > 1 and turn < _MOST_TURN:
-            found += [(start, place.moved(sign * step).state) for sign in _SIDEWAYS]
+            found += [(start, _moved(start.state, sign * step)) for sign in _SIDEWAYS]
     return found
 
 
-def _finished(near: list[Candidate]) -> list[Candidate]:
-    """The candidates brought to their ends; at the noise of the likeliest where costs compare."""
-    found, tracks = [], None
-    for each in near:
-        fit = last_fit(each.problem, each.fit, tracks)
-        if fit is not None:
-            found.append(replace(each, fit=fit))
-            tracks = fit.tracks if each.problem.is_comparable else None
-    return _distinct_candidates(found)
+def _moved(state: State, step: FloatArray) -> State:
+    """The state after a step (U,) of poses, log focals and log scales."""
+    poses, focals = state.poses.copy(), len(state.log_focals)
+    turns, by_focal, by_scale = np.split(step, 6 * len(poses) + np.array([0, focals]))
+    for pose, part in zip(poses, turns.reshape(-1, 6), strict=True):
+        pose[:9] = (rotation_from_vector(part[:3]) @ pose[:9].reshape(3, 3)).ravel()
+        pose[9:] += part[3:]
+    logs = {"log_focals": state.log_focals + by_focal, "log_scales": state.log_scales + by_scale}
+    return state._replace(poses=poses, **logs)
 
 
 def _distinct_candidates(candidates: list[Candidate]) -> list[Candidate]:
     """Candidates without those that equal a likelier one, the likeliest first."""
     kept: list[Candidate] = []
     for each in sorted(candidates, key=lambda candidate: candidate.rank):
-        if not any(_are_alike(each.fit.place.state, other.fit.place.state) for other in kept):
+        if not any(_are_alike(each.fit.state, other.fit.state) for other in kept):
             kept.append(each)
     return kept
 
@@ -285,17 +288,18 @@ def _tension(candidate: Candidate) -> str | None:
 
     A contour's registration counts with them.
     """
-    start, evidence = candidate.start, candidate.problem.evidence
+    start, problem, state = candidate.start, candidate.problem, candidate.fit.state
+    evidence = start.evidence
     equations = 2 * int((evidence.sightings.whitening[:, 2] > 0).sum())
     if not equations:
         return None
-    alone = cost_of(*with_displacement_modes(start.evidence, start.state))
-    place = candidate.fit.place
-    joint = cost_of(evidence, place.state) + float((place.own[:, 1:] ** 2).sum())
-    free = 6 * len(start.state.poses) + int(evidence.scales.free.sum())
+    still = with_displacement_modes(evidence, start.state)
+    alone, joint = cost_of(*still), cost_of(problem.evidence, state)
+    free = 6 * len(state.poses) + int(evidence.scales.free.sum())
     redundancy = equations - free
     scale = max(1.0, alone / redundancy) if redundancy > 0 else 1.0
-    unknowns = min(free + len(evidence.shape.modes), equations) + place.own[:, 1:].size
+    own = problem.own_of(state).size
+    unknowns = min(free + len(still[1].coefficients), equations) + own
     if joint - alone <= scale * chi_square_quantile(unknowns, _LEAST_PROBABILITY):
         return None
     times = np.sqrt(joint / max(alone, float(max(redundancy, 1))))

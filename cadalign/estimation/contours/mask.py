@@ -72,7 +72,7 @@ class MaskSource(OutlineSource):
 
     kind = "mask"
     field = "mask"
-    is_comparable = True
+    learns_sigma = True
     good_share = 0.94
     tolerances = 3.0, 0.02, 0.06
 
@@ -167,8 +167,10 @@ class MaskSource(OutlineSource):
 
     def doubt(self, support: OutlineSupport) -> str | None:
         """See `OutlineSource`."""
+        if not self.is_wide:
+            return None
         if support.share >= self.good_share:
-            if not self.is_wide or not _leaves_image(self.mask[0] >= _INSIDE):
+            if not _leaves_image(self.mask[0] >= _INSIDE):
                 return None
             return (
                 f"{self.where} reaches the image's border, where the object may go on: alone it "

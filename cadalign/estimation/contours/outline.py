@@ -197,13 +197,13 @@ class OutlineSource(ABC):
     """A mask or a photo: rows of evidence that depend on the state.
 
     It is that of the view in place ``image``, whose ``number`` is the user's. The ``camera`` is
-    that of the evidence's rays. The surface ``is_exact``, or only similar to the object's. Costs of
-    sources that are ``is_comparable`` compare at several states.
+    that of the evidence's rays. The surface ``is_exact``, or only similar to the object's.
     """
 
     kind: ClassVar[Literal["mask", "photo"]]
     field: ClassVar[str]
-    is_comparable: ClassVar[bool]
+    learns_sigma: ClassVar[bool]
+    """True if one unknown standard deviation is that of all samples."""
     good_share: ClassVar[float]
     """Share of the outline that agrees, below which a warning says so."""
     tolerances: ClassVar[tuple[float, float, float]]
@@ -222,7 +222,7 @@ class OutlineSource(ABC):
     @property
     def learns_offset(self) -> bool:
         """True if the deviation of the offset that all of it has in common is estimated."""
-        return self.is_comparable and self.is_exact
+        return self.learns_sigma and self.is_exact
 
     @abstractmethod
     def first(self) -> Track:
@@ -261,7 +261,7 @@ class OutlineSource(ABC):
         if not near.any() or not len(kept):
             return OutlineSupport()
         sigmas = found.outline.sigmas[found.inliers]
-        sigmas = sigmas * found.noise.sigma if self.is_comparable else sigmas
+        sigmas = sigmas * found.noise.sigma if self.learns_sigma else sigmas
         rms, rms_sigmas = (float(np.sqrt((x**2).mean())) for x in (kept, kept / sigmas))
         return OutlineSupport(float(near.mean()), len(kept), rms, rms_sigmas)
 
@@ -272,5 +272,5 @@ class OutlineSource(ABC):
     def summary(self, support: OutlineSupport) -> EvidenceSummary:
         """The line of the result's evidence."""
         figures = support.agreeing, support.rms_sigmas, support.rms
-        share = None if self.is_comparable else support.share
+        share = None if self.learns_sigma else support.share
         return EvidenceSummary(self.kind, self.number, *figures, "px", share)

@@ -48,7 +48,7 @@ class PhotoSource(OutlineSource):
 
     kind = "photo"
     field = "image"
-    is_comparable = False
+    learns_sigma = False
     good_share = 0.75
     tolerances = 2.0, 0.01, 0.04
 

@@ -20,8 +20,8 @@ from cadalign.estimation.contours.contour import (
     mask_contour,
     sampled,
 )
-from cadalign.estimation.contours.descent import likeliest_offset
 from cadalign.estimation.contours.outline import Noise, correlation_length
+from cadalign.estimation.contours.rounds import likeliest_offset
 
 WIDTH, HEIGHT = 160, 120
 

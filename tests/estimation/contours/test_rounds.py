@@ -1,4 +1,4 @@
-"""Descents on masks' contours: where they end, and what is stated of it."""
+"""Rounds of steps to masks' contours: where they end, and what is stated of it."""
 
 from __future__ import annotations
 
@@ -7,21 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from support.scenes import CAMERA, truth_of
 
 from cadalign import Alignment, Camera, Mesh, Model, Result, View, align
 from cadalign.datasets import KeypointNet
 from cadalign.estimation.contours.contour import Contour, Rims, across_rims
-from cadalign.estimation.contours.descent import descended, first_fit, fit_at, last_fit
-from cadalign.estimation.contours.mask import MaskSource
-from cadalign.estimation.contours.problem import ContourProblem, Place, shifted
-from cadalign.estimation.contours.surface import RigidSurface
-from cadalign.estimation.pack import evidence_of
-from cadalign.estimation.prior import prior_of
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.metrics import rotation_error
 from cadalign.render import Scene, cast_geometry, sample_view
-from cadalign.solvers.joint.evidence import State
 
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
 QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -120,55 +112,6 @@ def test_a_mask_of_the_other_pixel_convention_is_within_the_stated_uncertainty(
             assert not any(each.kind == "mask" for each in result.warnings)
             distances.append(squared_distance(result, truth))
     assert max(distances) < chi2.ppf(0.99, 8)
-
-
-def test_no_step_from_the_end_of_a_descent_lowers_the_cost() -> None:
-    truth = truth_of((0.6, 0.4, 0.8))
-    rng = np.random.default_rng(0)
-    mask = cast_geometry(Scene(BOX), CAMERA, truth).mask
-    pixels = CAMERA.project(truth.apply(CORNERS)) + rng.normal(0, 1, (8, 2))
-    model, view = Model(points_3d=CORNERS, mesh=BOX), View(CAMERA, pixels, mask=mask)
-    evidence = evidence_of(prior_of(model), [view])
-    pose = np.append(truth.rotation.ravel(), truth.translation)[None]
-    still = np.zeros_like(evidence.shape.mean)
-    start = State(pose, np.zeros(0), np.log(truth.scale), np.zeros(0), still)
-    start.poses[0, 9:] *= 1.03
-    problem = ContourProblem(evidence, 8, [MaskSource.of(0, view, view.camera)], RigidSurface(BOX))
-    near = first_fit(problem, start)
-    assert near is not None
-    end = last_fit(problem, near)
-    assert end is not None
-    assert descended(problem, end) is end
-    for _ in range(20):
-        step = np.zeros(6 + 3 + 3)
-        step[:9] = rng.normal(0, 1e-3, 9) * [1, 1, 1, 1, 1, 1, 0, 1, 1]
-        there = fit_at(problem, end.place.moved(step), end.tracks)
-        assert there is not None
-        assert there.cost > end.cost
-
-
-def test_places_move_by_turns_shifts_and_logarithms() -> None:
-    rng = np.random.default_rng(1)
-    pose = np.append(np.eye(3).ravel(), [0, 0, 4.0])[None]
-    still = State(pose, np.zeros(1), np.zeros(3), np.zeros(2), np.zeros((5, 3)))
-    step = rng.normal(0, 0.3, 6 + 1 + 3 + 6)
-    moved = Place(still, np.zeros((2, 3))).moved(step)
-    assert np.allclose(vector_from_rotation(moved.state.poses[0, :9].reshape(3, 3)), step[:3])
-    assert np.allclose(moved.state.log_focals, step[6:7])
-    assert np.allclose(moved.state.log_scales, step[7:10])
-    assert np.allclose(moved.own.ravel(), step[10:])
-
-
-def test_places_of_one_picture_lie_on_a_line() -> None:
-    """Distance and stretch that rise by one factor change little in the picture."""
-    pose = np.append(np.eye(3).ravel(), [1.0, -2.0, 9.0])[None]
-    still = State(pose, np.zeros(0), np.zeros(3), np.zeros(0), np.zeros((5, 3)))
-    step = np.concatenate([np.zeros(3), 0.7 * pose[0, 9:], np.full(3, 0.7)])
-    place = Place(still, np.zeros((0, 3)))
-    moved = place.moved(step)
-    factor = np.exp(moved.state.log_scales[0])
-    np.testing.assert_allclose(moved.state.poses[0, 9:], factor * pose[0, 9:])
-    np.testing.assert_allclose(shifted(np.zeros(3), step[:3] + 1), step[:3] + 1)
 
 
 def test_directions_across_rims_are_the_rims_own() -> None:

@@ -20,7 +20,6 @@ from benchmarks.accuracy import solvers, unknown_focal, wide_lenses
 from benchmarks.cars import kitti
 from benchmarks.coverage import coverage
 from benchmarks.evidence import evidence
-from benchmarks.gradients import gradient_errors
 from benchmarks.masks import mask_alone, mask_optima
 from benchmarks.mistakes import mistakes
 from benchmarks.photo import photos
@@ -46,7 +45,6 @@ USUAL: dict[str, Section] = {
     "evaluation": evaluation,
     "fits": fits,
     "ransac": ransac,
-    "gradients": gradient_errors,
 }
 ON_REQUEST: dict[str, Section] = {
     "evidence": evidence,

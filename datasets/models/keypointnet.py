@@ -124,7 +124,7 @@ class KeypointNet:
 
     ::
 
-        annotations/<category>.json     or one file for all: annotations/all.json, keypointnet.json
+        annotations/<category>.json
         splits/<name>.txt               lines <synset>-<model id>
         ShapeNetCore.v2.ply/<synset>/<model id>.ply                          meshes, either here
         models/<synset>/<model id>/models/model_normalized.obj               or here
@@ -169,8 +169,11 @@ class KeypointNet:
         self._with_mesh = False
         folder = self.root / "annotations"
         self._files = {path.stem: path for path in listed(folder, "*.json") if path.stem != _ALL}
-        self._loaded = {} if self._files else self._load_all(folder)
-        self.categories = tuple(sorted({*self._files, *self._loaded}))
+        if not self._files:
+            fix = "give the folder that holds KeypointNet's annotations/ and splits/"
+            raise DataError("no annotations/*.json below it", where=str(self.root), fix=fix)
+        self._loaded: dict[str, _Models] = {}
+        self.categories = tuple(sorted(self._files))
         """The categories' names, sorted."""
 
     @property
@@ -182,8 +185,7 @@ class KeypointNet:
     def files(self) -> tuple[Path, ...]:
         """The files of annotations and splits."""
         folders = (self.root / "annotations", "*.json"), (self.root / "splits", "*.txt")
-        own = [path for folder, ending in folders for path in folder.glob(ending)]
-        return (*own, *self.root.glob("*.json"))
+        return tuple(path for folder, ending in folders for path in folder.glob(ending))
 
     def split(self, name: str) -> frozenset[ModelKey]:
         """The (category, model id) that a split names, annotated or not.
@@ -314,25 +316,12 @@ class KeypointNet:
         """All models of a category, whose file is read once, also for subsets."""
         if category not in self._loaded:
             path = self._files[category]
-            self._loaded[category] = self._build(category, path, enumerate(read_entries(path)))
+            self._loaded[category] = self._build(category, path)
         return self._loaded[category]
 
-    def _load_all(self, folder: Path) -> dict[str, _Models]:
-        single = folder / f"{_ALL}.json", self.root / f"{_ALL}.json", self.root / "keypointnet.json"
-        path = next(filter(Path.is_file, single), None)
-        if path is None:
-            fix = "give the folder that holds KeypointNet's annotations/ and splits/"
-            raise DataError("no annotations/*.json below it", where=str(self.root), fix=fix)
-        grouped: dict[str, list[tuple[int, object]]] = {}
-        for position, entry in enumerate(read_entries(path)):
-            class_id = entry.get("class_id") if isinstance(entry, dict) else None
-            name = name_of_synset(class_id) if isinstance(class_id, str) else "unknown"
-            grouped.setdefault(name, []).append((position, entry))
-        return {name: self._build(name, path, found) for name, found in grouped.items()}
-
-    def _build(self, category: str, path: Path, entries: Iterable[tuple[int, object]]) -> _Models:
+    def _build(self, category: str, path: Path) -> _Models:
         models: _Models = {}
-        for position, entry in entries:
+        for position, entry in enumerate(read_entries(path)):
             model_id = entry_id(entry, position)
             where = f"{path.name}, model {model_id}"
             try:

@@ -15,7 +15,7 @@ from msgspec import Meta
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
 from cadalign.errors import DataError, InputError, quote
-from cadalign.geometry.mesh import GREY, Mesh
+from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.geometry.symmetry import Symmetry, SymmetryAxis
 from cadalign.geometry.symmetry_group import SymmetryGroup
@@ -33,7 +33,6 @@ from cadalign.io.files import damaged
 _FIX = "repair or remove this model's annotation"
 # Real barycentric coordinates sum to 0.999 ... 1.001.
 _SUM_TOLERANCE = 0.01
-_NO_POINT = -1
 _EQUIVALENT = 0.03  # of the keypoints' extent: how well people place equivalent keypoints
 _OF_WAY = 0.2  # the same, of how far the rotation takes a keypoint
 _STILL = 1e-12  # square of a way that is none
@@ -56,11 +55,6 @@ class Keypoints:
     """(k,), the face that each one lies on, numbered as in the mesh file."""
     barycentric: FloatArray
     """(k, 3), where on that face: weights of its corners in file order, of sum 1."""
-    point_index: IntArray
-    """(k,), its nearest point in KeypointNet's point cloud, -1 where the annotation names none."""
-    colors: FloatArray
-    """(k, 3), red, green and blue of the surface there, 0 to 1; grey where the annotation names
-    none."""
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -140,16 +134,10 @@ class _MeshInfo(ForeignDocument):
             raise InputError(what, where="face_uv")
 
 
-class _CloudInfo(ForeignDocument):
-    point_index: Count
-
-
 class _Keypoint(ForeignDocument):
     xyz: _Place
     semantic_id: Count
     mesh_info: _MeshInfo
-    pcd_info: _CloudInfo | None = None
-    rgb: Point3 | None = None  # 0 to 255
 
 
 class _Circle(ForeignDocument):
@@ -236,15 +224,11 @@ def parse_entry(entry: Any, *, where: str) -> tuple[str, str, Keypoints, Symmetr
 
 def _keypoints(entries: list[_Keypoint]) -> Keypoints:
     weights = np.array([entry.mesh_info.face_uv for entry in entries])
-    grey = tuple(255 * value for value in GREY[:3])
-    clouds = [entry.pcd_info for entry in entries]
     return Keypoints(
         xyz=_frozen([entry.xyz for entry in entries]),
         ids=_frozen([entry.semantic_id for entry in entries]),
         face_index=_frozen([entry.mesh_info.face_index for entry in entries]),
         barycentric=_frozen(weights / weights.sum(axis=1, keepdims=True)),
-        point_index=_frozen([_NO_POINT if each is None else each.point_index for each in clouds]),
-        colors=_frozen(np.clip(np.array([e.rgb or grey for e in entries]) / 255, 0.0, 1.0)),
     )
 
 

@@ -205,7 +205,6 @@ class SampleKeypoint:
     xyz: FloatArray  # (3,) [model units]
     face_index: int
     barycentric: FloatArray  # (3,) weights of the face's corners, of sum 1
-    vertex_index: int  # of the nearest vertex
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +232,6 @@ def finish(draft: Draft, category: str, model_id: str, offset: FloatArray) -> Sa
     places = (np.array([draft.places[number] for number in ids]) - center) / diagonal + offset
     face_index, weights = mesh.closest(places)
     xyz = mesh.surface_points(face_index, weights)
-    vertex = [int(np.argmin(np.linalg.norm(scaled - point, axis=1))) for point in xyz]
-    keypoints = tuple(map(SampleKeypoint, ids, xyz, face_index.tolist(), weights, vertex))
+    keypoints = tuple(map(SampleKeypoint, ids, xyz, face_index.tolist(), weights))
     symmetries = tuple(draft.mirrored), tuple(draft.turned), draft.round
     return SampleModel(category, model_id, mesh, keypoints, *symmetries)

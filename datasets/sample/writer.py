@@ -163,13 +163,10 @@ def _annotation(model: SampleModel) -> dict[str, Any]:
             radius = float(np.linalg.norm(xyz - center, axis=1).mean())
             circle = {"center": center.tolist(), "radius": radius, "normal": [0.0, 1.0, 0.0]}
         rotation.append({"kp_indexes": rows, "is_circle": model.round, "circle": circle})
-    colors = np.round(255 * np.asarray(model.mesh.vertex_colors)[:, :3]).astype(int).tolist()
     keypoints = [
         {
             "xyz": each.xyz.tolist(),
-            "rgb": colors[each.vertex_index],
             "semantic_id": each.semantic_id,
-            "pcd_info": {"point_index": each.vertex_index},
             "mesh_info": {"face_index": each.face_index, "face_uv": each.barycentric.tolist()},
         }
         for each in model.keypoints

@@ -87,9 +87,8 @@ def test_keypoints_and_symmetries_arrive(root):
     keypoints = model.keypoints
     assert len(keypoints) == 4
     assert keypoints.ids.tolist() == [0, 2, 4, 6]
-    assert keypoints.face_index.tolist() == keypoints.point_index.tolist() == [0, 1, 2, 3]
+    assert keypoints.face_index.tolist() == [0, 1, 2, 3]
     np.testing.assert_allclose(keypoints.barycentric.sum(axis=1), 1, atol=1e-15)
-    np.testing.assert_allclose(keypoints.colors[0], [1, 0, 0.2])
     assert model.symmetries.reflections == ((0, 1),)
     ring, pair = model.symmetries.rotations
     assert ring.is_circle
@@ -108,21 +107,12 @@ def test_records_are_read_only_and_picklable(root):
     np.testing.assert_array_equal(again.keypoints.xyz, model.keypoints.xyz)
 
 
-def test_colors_and_point_indices_may_be_absent(root):
+def test_symmetries_may_be_absent(root):
     plain = entry("a")
-    for keypoint in plain["keypoints"]:
-        del keypoint["rgb"], keypoint["pcd_info"]
     del plain["symmetries"]
     write_json(root / "annotations/chair.json", [plain])
     model = KeypointNet(root)["chair", "a"]
-    assert model.keypoints.point_index.tolist() == [-1] * 4
     assert model.symmetries.rotations == ()
-
-
-def test_one_file_for_all_categories(tmp_path):
-    write_json(tmp_path / "annotations/all.json", [entry("a"), entry("m", MUG), entry("b")])
-    dataset = KeypointNet(tmp_path)
-    assert dataset.ids() == (("chair", "a"), ("chair", "b"), ("mug", "m"))
 
 
 def test_categories_are_read_when_asked_for(root):
@@ -264,8 +254,6 @@ def _set(path: str, value: object):
         ("keypoints.1.semantic_id", 0, "keypoints[1].semantic_id: 0 occurs twice"),
         ("keypoints.1.semantic_id", 1.5, "keypoints[1].semantic_id"),
         ("keypoints.1.semantic_id", None, "keypoints[1].semantic_id"),
-        ("keypoints.1.rgb", "red", "keypoints[1].rgb"),
-        ("keypoints.1.pcd_info", 3, "keypoints[1].pcd_info"),
         ("keypoints.1.mesh_info", KeyError, "keypoints[1].mesh_info: missing"),
         ("keypoints.1.mesh_info.face_index", -1, "keypoints[1].mesh_info.face_index"),
         ("keypoints.1.mesh_info.face_uv", [0, 0, 0], "sum to 0, not to 1"),

@@ -66,9 +66,8 @@ def test_layout_is_that_of_keypointnet(root: Path, records: list[dict[str, Any]]
         assert set(record) == {"class_id", "model_id", "keypoints", "symmetries"}
         assert set(record["symmetries"]) == {"reflection", "rotation"}
         for keypoint in record["keypoints"]:
-            assert set(keypoint) == {"xyz", "rgb", "semantic_id", "pcd_info", "mesh_info"}
+            assert set(keypoint) == {"xyz", "semantic_id", "mesh_info"}
             assert set(keypoint["mesh_info"]) == {"face_index", "face_uv"}
-            assert set(keypoint["pcd_info"]) == {"point_index"}
 
 
 @pytest.mark.slow
@@ -94,9 +93,6 @@ def test_keypoints_rebuilt_from_the_file_are_where_they_say(
             assert weights.min() >= 0
             assert weights.sum() == pytest.approx(1.0, abs=1e-12)
             np.testing.assert_allclose(weights @ mesh.vertices[face], keypoint["xyz"], atol=1e-9)
-            distance = np.linalg.norm(mesh.vertices - keypoint["xyz"], axis=1)
-            nearest = keypoint["pcd_info"]["point_index"]
-            assert distance[nearest] == pytest.approx(distance.min(), abs=1e-12)
 
 
 @pytest.mark.long

@@ -19,9 +19,10 @@ if TYPE_CHECKING:
         normal_picture,
         pose_in_view,
     )
+    from cadalign.render.probe import Probe, make_renderer, probe_renderer
     from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry
     from cadalign.render.raycast.surface import Studio
-    from cadalign.render.scene import Frame, Geometry, Scene
+    from cadalign.render.scene import Frame, Geometry, Renderer, Scene
     from cadalign.render.viewpoints import (
         Viewpoint,
         frame_object,
@@ -34,7 +35,9 @@ __all__ = [
     "Angles",
     "Frame",
     "Geometry",
+    "Probe",
     "RaycastRenderer",
+    "Renderer",
     "Scene",
     "Studio",
     "Viewpoint",
@@ -49,9 +52,11 @@ __all__ = [
     "keypoint_picture",
     "line_picture",
     "look_at",
+    "make_renderer",
     "normal_picture",
     "overlay_model",
     "pose_in_view",
+    "probe_renderer",
     "sample_view",
     "visible_keypoints",
 ]

@@ -1,9 +1,11 @@
-"""Scenes, and the frames that are drawn of them."""
+"""Scenes, the frames that renderers make of them, and the interface of all renderers."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -13,9 +15,11 @@ from cadalign.errors import RenderError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh, face_normals
-from cadalign.geometry.raycaster import RayCaster
+from cadalign.geometry.raycaster import Open3DEngine, RayCaster
 from cadalign.render.drawing.canvas import ByteImage, composite
 from cadalign.render.raycast.surface import SurfaceColors, coincident_faces, corner_normals
+
+T = TypeVar("T")
 
 
 class Scene:
@@ -44,6 +48,7 @@ class Scene:
     def __init__(self, mesh: Mesh, *, crease_angle: float = 40.0) -> None:
         self.mesh = mesh
         self.crease_angle = float(crease_angle)
+        self._derived: dict[Callable[[Scene], Any], Any] = {}
 
     def __reduce__(self) -> tuple[object, ...]:
         # The ray hierarchy cannot be pickled; worker processes build their own.
@@ -67,6 +72,18 @@ class Scene:
     def caster(self) -> RayCaster:
         """The ray hierarchy."""
         return RayCaster(self.mesh, self.face_normals)
+
+    @cached_property
+    def open3d_caster(self) -> RayCaster:
+        """The same built by Open3D, which must be importable."""
+        return RayCaster(self.mesh, self.face_normals, engine=Open3DEngine)
+
+    def derived(self, make: Callable[[Scene], T]) -> T:
+        """Make of the scene what a renderer draws, once; ``make`` is a function of its module."""
+        if make not in self._derived:
+            self._derived[make] = make(self)
+        made: T = self._derived[make]
+        return made
 
     @cached_property
     def used_vertices(self) -> FloatArray:
@@ -186,6 +203,22 @@ class Frame(Geometry):
             If the background is neither a colour nor an image of the frame's size.
         """
         return composite(self.color, background)
+
+
+class Renderer(Protocol):
+    """Draws a scene as a camera sees it."""
+
+    @property
+    def name(self) -> str:
+        """The renderer's name on the command line."""
+
+    def render(
+        self, scene: Scene, camera: Camera, cam_from_model: Alignment, *, samples: int = 8
+    ) -> Frame:
+        """Draw one frame; see `RaycastRenderer.render`."""
+
+    def drawn_by(self, scene: Scene, *, samples: int) -> str:
+        """Name of the renderer that draws a scene's frames: another where this one cannot."""
 
 
 def check_image_size(camera: Camera) -> None:

@@ -17,14 +17,17 @@ import cadalign
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = {
+    "OpenGL",
     "PIL",
     "cv2",
     "dask",
     "embreex",
     "matplotlib",
     "numba",
+    "open3d",
     "pandas",
     "pyarrow",
+    "pyrender",
     "rich",
     "scipy",
     "starlette",

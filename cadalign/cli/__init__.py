@@ -51,7 +51,7 @@ COMMANDS = {  # the class of each in its module, and the first sentence of its d
     ),
     "doctor": (
         "doctor.Doctor",
-        "Check this machine: the speed of drawing, the cores, the cache of compiled solvers.",
+        "Check the renderers and their speed, and show how to enable missing ones.",
     ),
 }
 

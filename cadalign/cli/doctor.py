@@ -8,7 +8,6 @@ import time
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING
 
 from cadalign.cli.common import JsonOption, answer, new_console, print_json, waiting
@@ -16,17 +15,17 @@ from cadalign.errors import InputError
 
 if TYPE_CHECKING:
     from cadalign.datasets import PhotoSummary
+    from cadalign.render.probe import Probe
 
 # Problems of a data set that are printed; JSON has all.
 _SHOWN = 10
-_TIMED_FRAMES = 5
 
 
 @dataclass(frozen=True)
 class Doctor(JsonOption):
-    """Check this machine: the speed of drawing, the cores, the cache of compiled solvers.
+    """Check the renderers and their speed, and show how to enable missing ones.
 
-    With --data, lists what lies
+    Also shows the processor cores and the cache of compiled solvers. With --data, lists what lies
     in a folder of photos instead: its format, and how many photos and objects can be read. With
     --compile, compiles the solvers ahead.
     """
@@ -37,18 +36,18 @@ class Doctor(JsonOption):
     """Compile all solvers now, as for a Docker image, in place of when they are first called."""
 
     def run(self) -> int:
-        """Run the checks; returns the exit code, 0 if photos can be read."""
+        """Run the checks; returns the exit code, 0 if ray casting works or photos can be read."""
         if self.data is not None:
             return self._check_data(self.data)
         if self.compile:
             return self._compile()
-        with waiting("drawing ..."):
+        with waiting("trying the renderers, each in a process of its own ..."):
             health = examine()
         if self.json:
             print_json(asdict(health))
         else:
             _print(health)
-        return 0
+        return 0 if health.renderers[-1].works else 1
 
     def _compile(self) -> int:
         from cadalign.cli.compile_ahead import compile_ahead
@@ -78,7 +77,29 @@ class Doctor(JsonOption):
 
 
 def _print(health: Health) -> None:
-    answer(f"Ray casting: {health.milliseconds:.0f} ms for 640 x 480 px, 20,480 triangles")
+    from rich.table import Column, Table
+
+    heads = (
+        "renderer",
+        "works",
+        Column("ms", justify="right"),
+        "versions",
+        "drawn by / what is wrong",
+    )
+    caption = "ms: a frame of 640 x 480 px, 20,480 triangles"
+    table = Table(*heads, title="Renderers", caption=caption)
+    for renderer in health.renderers:
+        table.add_row(
+            renderer.name,
+            "yes" if renderer.works else "no",
+            "" if renderer.milliseconds is None else f"{renderer.milliseconds:.0f}",
+            renderer.versions,
+            renderer.detail,
+        )
+    new_console(stderr=False).print(table)
+    answer(f"--renderer auto takes: {health.best}")
+    for name, command in health.remedies.items():
+        answer(f"To enable {name}: {command}")
     answer(f"Python {health.python}, NumPy {health.numpy}, Numba {health.numba}")
     answer(f"Cores: {health.cores}, of which this process may use {health.usable_cores}")
     answer(f"Compiled solvers: {health.cache}")
@@ -107,8 +128,12 @@ def _print_data(summary: PhotoSummary) -> None:
 class Health:
     """Findings of `examine`."""
 
-    milliseconds: float
-    """The median time in which a frame is drawn."""
+    renderers: tuple[Probe, ...]
+    """All of them, ray casting last."""
+    best: str
+    """The renderer that "auto" selects."""
+    remedies: dict[str, str]
+    """For each renderer that does not work, the command that would enable it."""
     cores: int
     usable_cores: int
     """Those that this process may use."""
@@ -120,9 +145,14 @@ class Health:
 
 
 def examine() -> Health:
-    """Draw some frames and collect the rest."""
+    """Try every renderer in a process of its own and collect the rest; takes some seconds."""
+    from cadalign.render.probe import RENDERERS, best_renderer, probe_renderer, remedy
+
+    renderers = tuple(probe_renderer(name, timed=True) for name in RENDERERS)
     return Health(
-        milliseconds=_frame_milliseconds(),
+        renderers=renderers,
+        best=best_renderer(),
+        remedies={found.name: command for found in renderers if (command := remedy(found))},
         cores=os.cpu_count() or 1,
         usable_cores=_usable_cores(),
         cache=compiled_cache(),
@@ -130,25 +160,6 @@ def examine() -> Health:
         numpy=version("numpy"),
         numba=version("numba"),
     )
-
-
-def _frame_milliseconds() -> float:
-    from trimesh.creation import icosphere
-
-    from cadalign.geometry.camera import Camera
-    from cadalign.geometry.mesh import Mesh
-    from cadalign.render.raycast.renderer import RaycastRenderer
-    from cadalign.render.scene import Scene
-    from cadalign.render.viewpoints import look_at
-
-    ball = icosphere(subdivisions=5)
-    scene, camera = Scene(Mesh(ball.vertices, ball.faces)), Camera.from_fov(640, 480, fov_x=50.0)
-    pose, times = look_at(azimuth=0, elevation=0, distance=4.5), list[float]()
-    for _ in range(_TIMED_FRAMES + 1):
-        begin = time.perf_counter()
-        RaycastRenderer().render(scene, camera, pose)
-        times.append(time.perf_counter() - begin)
-    return 1000 * median(times[1:])  # the first one prepares the mesh
 
 
 def compiled_cache() -> str:

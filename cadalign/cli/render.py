@@ -42,6 +42,8 @@ class Render:
     """Horizontal field of view in degrees."""
     samples: int = 16
     """Rays per pixel at edges; 1 turns antialiasing off."""
+    renderer: Literal["auto", "raycast", "pyrender", "open3d"] = "auto"
+    """Renderer of the colour."""
 
     def run(self) -> int:
         """Draw and write; returns the exit code."""
@@ -55,5 +57,6 @@ class Render:
 
         make_folder_of(self.out)
         write_image(self.out, job.picture())
-        say(f"Written: {self.out}")
+        drawn_by = job.renderer.drawn_by(job.scene, samples=self.samples)
+        say(f"Written: {self.out} (drawn by {drawn_by})")
         return 0

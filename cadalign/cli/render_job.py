@@ -23,8 +23,8 @@ from cadalign.render.drawing.pictures import (
     keypoint_picture,
     pose_in_view,
 )
-from cadalign.render.raycast.renderer import RaycastRenderer
-from cadalign.render.scene import LIGHT_GREY, Scene, check_image_size
+from cadalign.render.probe import make_renderer
+from cadalign.render.scene import LIGHT_GREY, Renderer, Scene, check_image_size
 from cadalign.render.viewpoints import visible_keypoints
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ class RenderJob:
 
     command: Render
     scene: Scene
+    renderer: Renderer
     views: dict[str, Angles]
     camera: Camera
     keypoints: FloatArray | None
@@ -62,16 +63,16 @@ class RenderJob:
             raise InputError("no view is given", where="--view", fix="give one or more")
         path = command.keypoints
         mesh = load_mesh(command.model)
+        # Depth, normals, triangles and lines are cast in any case.
+        renderer = make_renderer(command.renderer if command.style == "color" else "raycast")
         keypoints = None if path is None else read_keypoints(path, command.model)
-        return cls(command, Scene(mesh), views, camera, keypoints)
+        return cls(command, Scene(mesh), renderer, views, camera, keypoints)
 
     def _draw(self, view: Angles) -> ByteImage:
         """One picture, (h, w, 3) uint8."""
         style, samples, camera = self.command.style, self.command.samples, self.camera
         pose = pose_in_view(self.scene, camera, view, scale=self.command.scale)
-        color = draw_still(
-            RaycastRenderer(), self.scene, camera, pose, style=style, samples=samples
-        )
+        color = draw_still(self.renderer, self.scene, camera, pose, style=style, samples=samples)
         image = composite(color, LIGHT_GREY)
         if self.keypoints is None:
             return image

@@ -7,7 +7,13 @@ from cadalign.names import lazy_names
 if TYPE_CHECKING:
     from cadalign.geometry.alignment import Alignment, Box
     from cadalign.geometry.camera import Camera
-    from cadalign.geometry.conventions import up_from_gravity, up_from_pose
+    from cadalign.geometry.conventions import (
+        alignment_from_opengl,
+        opengl_from_model,
+        opengl_projection,
+        up_from_gravity,
+        up_from_pose,
+    )
     from cadalign.geometry.mesh import Material, Mesh
     from cadalign.geometry.metrics import (
         alignment_box_iou,
@@ -31,9 +37,12 @@ __all__ = [
     "Symmetry",
     "SymmetryAxis",
     "alignment_box_iou",
+    "alignment_from_opengl",
     "box_iou",
     "box_iou_up_to_scale",
     "nearest_truth",
+    "opengl_from_model",
+    "opengl_projection",
     "reprojection_error",
     "rotation_error",
     "scale_error",

@@ -1,7 +1,8 @@
 """Axes of other programs and the up direction in a camera's frame: the only place for either.
 
 The camera's axes are OpenCV's (x right, y down, z forward) or, where said so, OpenGL's (x right,
-y up, z backward), which NeRF, ARKit and ARCore use.
+y up, z backward), which NeRF, ARKit and ARCore use. OpenGL's image begins at the border of the
+corner pixel, cadalign's at the pixel's centre, `cadalign.geometry.pixels.PIXEL_CENTRE` from there.
 Up directions are found from gravity or a pose.
 """
 
@@ -12,6 +13,9 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import InputError, quote
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.pixels import PIXEL_CENTRE
 from cadalign.geometry.rotations import nearest_rotation
 
 OPENGL_AXES = np.array([1.0, -1.0, -1.0])
@@ -19,6 +23,67 @@ OPENGL_AXES = np.array([1.0, -1.0, -1.0])
 
 OPENGL_FLIP = np.diag([*OPENGL_AXES, 1.0])
 """Motion (4, 4) between the axes of the two cameras, either way."""
+
+
+def opengl_from_model(cam_from_model: Alignment) -> FloatArray:
+    """The model-view matrix: stretched, posed, in OpenGL's camera axes; (4, 4) float.
+
+    Examples
+    --------
+    >>> from cadalign import Alignment
+    >>> opengl_from_model(Alignment(np.eye(3), [1, 2, 3], [1, 1, 1]))[:, 3].tolist()
+    [1.0, -2.0, -3.0, 1.0]
+    """
+    return np.asarray(OPENGL_FLIP @ cam_from_model.cam_from_model)
+
+
+def alignment_from_opengl(opengl_from_world: FloatArray) -> Alignment:
+    """Convert a rigid model-view matrix (4, 4) to a pose in cadalign's axes; scale 1.
+
+    Raises
+    ------
+    InputError
+        If the matrix is not a rotation and a translation.
+    """
+    matrix = OPENGL_FLIP @ opengl_from_world
+    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-9:
+        raise InputError("the last row is not (0, 0, 0, 1)", where="transform")
+    return Alignment(matrix[:3, :3], matrix[:3, 3], np.ones(3))
+
+
+def opengl_projection(
+    camera: Camera,
+    *,
+    near: float,
+    far: float,
+    window: tuple[int, int, int, int] | None = None,
+) -> FloatArray:
+    """The projection matrix (4, 4) of a camera; its lens distortion has no place in one.
+
+    It leads from OpenGL's camera axes to clip coordinates, between the depths ``near`` and ``far``.
+    The window (left, top, width, height) [px] fills the viewport; by default all of the image does.
+
+    Examples
+    --------
+    >>> from cadalign import Camera
+    >>> camera = Camera(width=4, height=2, fx=2, fy=2, cx=1.5, cy=0.5)
+    >>> clip = opengl_projection(camera, near=1, far=3) @ (0, 0, -1, 1)
+    >>> (clip / clip[3]).tolist()
+    [0.0, 0.0, -1.0, 1.0]
+    """
+    left, top, width, height = window or (0, 0, camera.width, camera.height)
+    # A pixel's x in the window, from its border, is fx X / Z + border_x.
+    border_x = camera.cx + PIXEL_CENTRE - left
+    border_y = camera.cy + PIXEL_CENTRE - top
+    return np.array(
+        [
+            [2 * camera.fx / width, 0, 1 - 2 * border_x / width, 0],
+            [0, 2 * camera.fy / height, 2 * border_y / height - 1, 0],
+            [0, 0, -(far + near) / (far - near), -2 * far * near / (far - near)],
+            [0, 0, -1, 0],
+        ],
+        dtype=float,
+    )
 
 
 _AXES = {"opencv": np.ones(3), "opengl": OPENGL_AXES}

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, Protocol
+
 import numpy as np
 import numpy.typing as npt
 from embreex.mesh_construction import TriangleMesh
@@ -24,13 +27,84 @@ _FAR_ORIGIN = 8.0
 _GRAZING = 1e-3
 
 
+class RayEngine(Protocol):
+    """A library's ray hierarchy over triangles, in single precision; safe in several threads."""
+
+    def first_faces(self, origins: SingleArray, directions: SingleArray) -> FaceArray:
+        """The first triangle on each of n rays (n, 3), (n,) int32; -1 where there is none."""
+
+    def blocked(
+        self, origins: SingleArray, directions: SingleArray, reach: float
+    ) -> npt.NDArray[np.bool_]:
+        """Rays that hit anything before ``origin + reach * direction``, (n,) bool."""
+
+
+EngineMaker = Callable[[SingleArray, FaceArray], RayEngine]
+
+
+class EmbreeEngine:
+    """Embree by way of embreex, over vertices (n, 3) and faces (m, 3)."""
+
+    def __init__(self, vertices: SingleArray, faces: FaceArray) -> None:
+        self._scene = EmbreeScene()
+        TriangleMesh(self._scene, vertices, faces)
+        # Embree builds the hierarchy on the first query; let no two threads make that one at once.
+        self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+
+    def first_faces(self, origins: SingleArray, directions: SingleArray) -> FaceArray:
+        """See `RayEngine`."""
+        found: FaceArray = self._scene.run(origins, directions)
+        return found
+
+    def blocked(
+        self, origins: SingleArray, directions: SingleArray, reach: float
+    ) -> npt.NDArray[np.bool_]:
+        """See `RayEngine`."""
+        far = np.full(len(origins), reach, dtype=np.float32)
+        return np.asarray(self._scene.run(origins, directions, far, query="OCCLUDED") >= 0)
+
+
+class Open3DEngine:
+    """Embree by way of Open3D, which casts with all cores by itself; see `EmbreeEngine`."""
+
+    def __init__(self, vertices: SingleArray, faces: FaceArray) -> None:
+        import open3d
+
+        self._tensor = open3d.core.Tensor
+        self._no_hit = np.uint32(open3d.t.geometry.RaycastingScene.INVALID_ID)
+        self._scene = open3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(
+            self._tensor(np.ascontiguousarray(vertices)),
+            self._tensor(np.ascontiguousarray(faces.astype(np.uint32))),
+        )
+        # The hierarchy is built on the first query; let no two threads make that one at once.
+        self.first_faces(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+
+    def first_faces(self, origins: SingleArray, directions: SingleArray) -> FaceArray:
+        """See `RayEngine`."""
+        found = self._scene.cast_rays(self._rays(origins, directions))["primitive_ids"].numpy()
+        return np.asarray(np.where(found == self._no_hit, -1, found.astype(np.int32)), np.int32)
+
+    def blocked(
+        self, origins: SingleArray, directions: SingleArray, reach: float
+    ) -> npt.NDArray[np.bool_]:
+        """See `RayEngine`."""
+        rays = self._rays(origins, directions)
+        return np.asarray(self._scene.test_occlusions(rays, tnear=0.0, tfar=reach).numpy(), bool)
+
+    def _rays(self, origins: SingleArray, directions: SingleArray) -> Any:
+        return self._tensor(np.concatenate([origins, directions], axis=1))
+
+
 class RayCaster:
     """A bounding volume hierarchy over a mesh, then only read; safe in several threads.
 
     ``normals`` (m, 3) are the unit normals of its faces, where they are known already.
     """
 
-    def __init__(self, mesh: Mesh, normals: FloatArray | None = None) -> None:
+    def __init__(
+        self, mesh: Mesh, normals: FloatArray | None = None, *, engine: EngineMaker = EmbreeEngine
+    ) -> None:
         low, high = mesh.bounds
         self._center = (low + high) / 2
         # A mesh of a single point has no size; any radius serves.
@@ -38,10 +112,7 @@ class RayCaster:
         self._triangles = mesh.triangles
         self._normals = face_normals(self._triangles) if normals is None else normals
         unit = (mesh.vertices - self._center) / self._radius
-        self._scene = EmbreeScene()
-        TriangleMesh(self._scene, unit.astype(np.float32), mesh.faces.astype(np.int32))
-        # Embree builds the hierarchy on the first query; let no two threads make that one at once.
-        self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+        self._engine = engine(unit.astype(np.float32), mesh.faces.astype(np.int32))
 
     def first_hits(
         self, origin: FloatArray, directions: FloatArray, *, start: FloatArray | None = None
@@ -60,7 +131,7 @@ class RayCaster:
 
     def covered(self, origin: FloatArray, directions: FloatArray) -> npt.NDArray[np.bool_]:
         """Find the rays (n, 3) from one point that hit anything, (n,) bool."""
-        return self._occluded(*self._rays(origin, directions), np.inf)
+        return self._engine.blocked(*self._rays(origin, directions), np.inf)
 
     def blocked(
         self, origins: FloatArray, directions: FloatArray, *, reach: float
@@ -70,22 +141,15 @@ class RayCaster:
         Each ray goes ``reach`` times its direction's length, in model coordinates.
         """
         unit = (origins - self._center) / self._radius
-        return self._occluded(
+        return self._engine.blocked(
             unit.astype(np.float32), (directions / self._radius).astype(np.float32), reach
         )
-
-    def _occluded(
-        self, origins: SingleArray, directions: SingleArray, reach: float
-    ) -> npt.NDArray[np.bool_]:
-        far = np.full(len(origins), reach, dtype=np.float32)
-        return np.asarray(self._scene.run(origins, directions, far, query="OCCLUDED") >= 0)
 
     def first_faces(
         self, origin: FloatArray, directions: FloatArray, *, start: FloatArray | None = None
     ) -> FaceArray:
         """Find the first triangle on each ray as `first_hits` does, without its distance."""
-        found: FaceArray = self._scene.run(*self._rays(origin, directions, start))
-        return found
+        return self._engine.first_faces(*self._rays(origin, directions, start))
 
     def _rays(
         self, origin: FloatArray, directions: FloatArray, start: FloatArray | None = None

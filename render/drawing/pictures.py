@@ -16,8 +16,8 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import OPENGL_AXES
 from cadalign.render.drawing.canvas import ByteImage, Canvas
-from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry
-from cadalign.render.scene import Geometry, Scene
+from cadalign.render.raycast.renderer import cast_geometry
+from cadalign.render.scene import Geometry, Renderer, Scene
 from cadalign.render.viewpoints import frame_object, look_at, seen_in_image
 
 VIEWS: dict[str, tuple[float, float]] = {
@@ -237,7 +237,7 @@ def pose_in_view(
 
 
 def draw_still(
-    renderer: RaycastRenderer,
+    renderer: Renderer,
     scene: Scene,
     camera: Camera,
     cam_from_model: Alignment,

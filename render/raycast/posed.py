@@ -16,7 +16,7 @@ from cadalign.arrays import FloatArray
 from cadalign.geometry.alignment import Alignment, model_rays
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import perspective
-from cadalign.geometry.raycaster import FaceArray
+from cadalign.geometry.raycaster import FaceArray, RayCaster
 from cadalign.render.drawing.canvas import LinearArray
 from cadalign.render.raycast.surface import Studio
 from cadalign.render.scene import Scene
@@ -83,10 +83,12 @@ class PosedScene:
         camera: Camera,
         cam_from_model: Alignment,
         block: Rectangle,
+        caster: RayCaster,
     ) -> None:
         self.scene = scene
         self.camera = camera
         self.block = block
+        self._caster = caster
         self._alignment = cam_from_model
         self._origin, self._model_from_ray = model_rays(cam_from_model)
         first = scene.triangles[:, 0]
@@ -111,12 +113,20 @@ class PosedScene:
         A depth is the multiple of its ray that leads to the hit.
         """
         directions = self._directions(rays)
-        face, depth = self.scene.caster.first_hits(self._origin, directions, start=start)
+        face, depth = self._caster.first_hits(self._origin, directions, start=start)
         return self._as_shown(face), depth
 
     def _as_shown(self, face: FaceArray) -> FaceArray:
         """Triangles that were hit, (n,): of coincident ones those wound to the camera."""
         return np.where(face >= 0, self._shown[face], np.int32(-1))
+
+    def seen_sides(self, face_id: npt.NDArray[np.int32]) -> tuple[bool, bool]:
+        """Tell if any triangle in an image is seen from its front, and any from its back."""
+        seen = np.zeros(len(self._side) + 1, dtype=bool)
+        # Where nothing is, -1 marks the last place, which is no triangle's.
+        seen[face_id.ravel()] = True
+        side = self._side[seen[:-1]]
+        return bool((side > 0).any()), bool((side < 0).any())
 
     @cached_property
     def diagonal(self) -> float:
@@ -132,7 +142,7 @@ class PosedScene:
         model units.
         """
         columns = self._model_from_ray.T
-        return self.scene.caster.blocked(
+        return self._caster.blocked(
             (points_cam - self._alignment.translation) @ columns, directions @ columns, reach=reach
         )
 
@@ -150,17 +160,17 @@ class PosedScene:
         ``valid`` see nothing.
         """
         directions = self._directions(rays)
-        face = self.scene.caster.first_faces(self._origin, directions)
+        face = self._caster.first_faces(self._origin, directions)
         face[~valid] = -1
         surface = self.scene.surface
         if surface.varies or not surface.opaque:
-            depth = self.scene.caster.distances(self._origin, directions, face)
+            depth = self._caster.distances(self._origin, directions, face)
             light = self.light_of_hits(rays, self._as_shown(face), depth, studio)
             return np.asarray(light.reshape(-1, samples, 4).mean(axis=1))
         # A triangle of one colour looks the same all over a pixel: one of its hits stands for all.
         chosen, share = _one_of_each(face.reshape(-1, samples))
         face = face[chosen]
-        depth = self.scene.caster.distances(self._origin, directions[chosen], face)
+        depth = self._caster.distances(self._origin, directions[chosen], face)
         light = self.light_of_hits(rays[chosen], self._as_shown(face), depth, studio)
         light *= share[:, None]
         begins = np.searchsorted(chosen // samples, np.arange(len(directions) // samples))
@@ -266,12 +276,14 @@ def _one_of_each(faces: FaceArray) -> tuple[npt.NDArray[np.int64], LinearArray]:
     return places, shares
 
 
-def pose_scene(scene: Scene, camera: Camera, cam_from_model: Alignment) -> PosedScene | None:
-    """Place a scene before a camera; None if it is unseen."""
+def pose_scene(
+    scene: Scene, camera: Camera, cam_from_model: Alignment, *, caster: RayCaster | None
+) -> PosedScene | None:
+    """Place a scene before a camera; None if it is unseen. The caster is by default its own."""
     block = _object_rectangle(scene, camera, cam_from_model)
     if block is None:
         return None
-    return PosedScene(scene, camera, cam_from_model, block)
+    return PosedScene(scene, camera, cam_from_model, block, caster or scene.caster)
 
 
 def _object_rectangle(scene: Scene, camera: Camera, cam_from_model: Alignment) -> Rectangle | None:

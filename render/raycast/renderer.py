@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from operator import attrgetter
 
 import cv2
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.errors import InputError
+from cadalign.errors import InputError, RenderError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.raycaster import FaceArray
+from cadalign.geometry.raycaster import FaceArray, RayCaster
 from cadalign.render.drawing.canvas import ByteImage, LinearArray, bytes_from_linear
 from cadalign.render.raycast.occlusion import darken_corners
 from cadalign.render.raycast.posed import PosedScene, Rectangle, in_threads, pose_scene
@@ -26,12 +27,14 @@ _MAX_SAMPLES = 256
 
 
 class RaycastRenderer:
-    """Draws with embree on the processor.
+    """Draws with embree on the processor; the renderer that works everywhere.
 
     Parameters
     ----------
     studio : Studio, optional
         The lights.
+    caster_of : callable, optional
+        Gives what casts a scene's rays; by default the scene's own caster, embree's.
 
     Examples
     --------
@@ -45,8 +48,16 @@ class RaycastRenderer:
     (4.0, 0, False)
     """
 
-    def __init__(self, *, studio: Studio | None = None) -> None:
+    name = "raycast"
+
+    def __init__(
+        self,
+        *,
+        studio: Studio | None = None,
+        caster_of: Callable[[Scene], RayCaster] = attrgetter("caster"),
+    ) -> None:
         self.studio = studio or Studio()
+        self._caster_of = caster_of
 
     def render(
         self, scene: Scene, camera: Camera, cam_from_model: Alignment, *, samples: int = 8
@@ -78,11 +89,10 @@ class RaycastRenderer:
         InputError
             If ``samples`` is not from 1 to 256.
         """
-        if not 1 <= samples <= _MAX_SAMPLES:
-            raise InputError(f"{samples} is not from 1 to {_MAX_SAMPLES}", where="samples")
+        check_samples(samples)
         check_image_size(camera)
         color: ByteImage = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
-        posed = pose_scene(scene, camera, cam_from_model)
+        posed = pose_scene(scene, camera, cam_from_model, caster=self._caster_of(scene))
 
         def shade(
             posed: PosedScene, band: Rectangle, rays: FloatArray, face: FaceArray, depth: FloatArray
@@ -92,12 +102,16 @@ class RaycastRenderer:
 
         if posed is not None:
             posed.prepare_color()
-        geometry = _geometry_of(camera, posed, shade)
+        geometry = geometry_of(camera, posed, shade)
         if posed is not None:
             if samples > 1:
                 self._antialias(color, posed, samples)
             darken_corners(color, geometry, posed, self.studio)
         return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
+
+    def drawn_by(self, scene: Scene, *, samples: int) -> str:
+        """The renderer's own name."""
+        return self.name
 
     def _antialias(self, color: ByteImage, posed: PosedScene, samples: int) -> None:
         part = color[posed.block.slices]
@@ -125,7 +139,26 @@ class RaycastRenderer:
         in_threads(draw, [pixels[begin : begin + step] for begin in range(0, len(pixels), step)])
 
 
-def cast_geometry(scene: Scene, camera: Camera, cam_from_model: Alignment) -> Geometry:
+class Open3DRenderer(RaycastRenderer):
+    """Draws as `RaycastRenderer` does; Open3D finds the hits."""
+
+    name = "open3d"
+
+    def __init__(self, *, studio: Studio | None) -> None:
+        try:
+            import open3d  # noqa: F401
+        except (ImportError, OSError) as error:  # OSError: a library of the system is missing
+            raise RenderError(
+                f"Open3D cannot be imported ({error})",
+                where="open3d",
+                fix="run `cadalign doctor` to see what is missing, or use the ray-cast renderer",
+            ) from None
+        super().__init__(studio=studio, caster_of=attrgetter("open3d_caster"))
+
+
+def cast_geometry(
+    scene: Scene, camera: Camera, cam_from_model: Alignment, *, caster: RayCaster | None = None
+) -> Geometry:
     """Depth, triangle numbers and normals without colour: one ray through each pixel's centre.
 
     Parameters
@@ -133,6 +166,8 @@ def cast_geometry(scene: Scene, camera: Camera, cam_from_model: Alignment) -> Ge
     scene : Scene
     camera : Camera
     cam_from_model : Alignment
+    caster : RayCaster, optional
+        By default the scene's own.
 
     Returns
     -------
@@ -145,13 +180,19 @@ def cast_geometry(scene: Scene, camera: Camera, cam_from_model: Alignment) -> Ge
         If the image is too large.
     """
     check_image_size(camera)
-    return _geometry_of(camera, pose_scene(scene, camera, cam_from_model))
+    return geometry_of(camera, pose_scene(scene, camera, cam_from_model, caster=caster))
+
+
+def check_samples(samples: int) -> None:
+    """Refuse a number of rays per pixel that is out of range."""
+    if not 1 <= samples <= _MAX_SAMPLES:
+        raise InputError(f"{samples} is not from 1 to {_MAX_SAMPLES}", where="samples")
 
 
 _Shade = Callable[[PosedScene, Rectangle, FloatArray, FaceArray, FloatArray], None]
 
 
-def _geometry_of(camera: Camera, posed: PosedScene | None, shade: _Shade | None = None) -> Geometry:
+def geometry_of(camera: Camera, posed: PosedScene | None, shade: _Shade | None = None) -> Geometry:
     """Hits of one ray through each pixel's centre, which ``shade`` draws; none of an unseen scene.
 
     ``shade`` takes the scene, a part of its block, and the rays, triangles and depths of the pixels

@@ -13,10 +13,11 @@ import tyro
 from PIL import Image
 from support.refusals import refusal_line
 
-from cadalign.cli.doctor import Doctor, compiled_cache
+from cadalign.cli.doctor import Doctor, Health, compiled_cache
 from cadalign.cli.render import Render
 from cadalign.datasets import load_mesh
 from cadalign.errors import DataError, InputError, RenderError
+from cadalign.render.probe import RENDERERS, Probe, probe_renderer
 
 
 @pytest.fixture
@@ -27,10 +28,26 @@ def model(tmp_path) -> Path:
     return path
 
 
-def _run(model, *arguments):
+def _run(model, *arguments, renderer="raycast"):
     """Run the command as the command line does."""
-    command = tyro.cli(Render, args=[str(model), *map(str, arguments)])
+    command = tyro.cli(Render, args=[str(model), "--renderer", renderer, *map(str, arguments)])
     return command.run()
+
+
+@pytest.mark.long
+def test_the_renderer_that_really_drew_is_named(tmp_path, capsys):
+    if not probe_renderer("pyrender").works:
+        pytest.skip("pyrender does not work here")
+    names = {}
+    for opacity in (255, 90):
+        box = trimesh.creation.box((0.4, 0.8, 0.6))
+        box.visual.vertex_colors = [180, 40, 40, opacity]
+        path = tmp_path / f"box{opacity}.ply"
+        box.export(path)
+        out = tmp_path / f"box{opacity}.png"
+        assert _run(path, "--out", out, "--size", "64x48", renderer="pyrender") == 0
+        names[opacity] = capsys.readouterr().err.split("drawn by ")[1].strip(")\n")
+    assert names == {255: "pyrender", 90: "raycast"}
 
 
 def _pixels(path):
@@ -170,13 +187,40 @@ def test_a_file_that_cannot_be_written_is_named(model, tmp_path):
 # doctor
 
 
-def test_doctor_shows_the_speed_of_drawing_and_the_cores(capsys):
+def _health(**changes):
+    good = Probe("raycast", True, "processor", "trimesh 5, embreex 4", 80.0)
+    bad = Probe("pyrender", False, "OpenGL does not start", "pyrender2 0.2")
+    values = {
+        "renderers": (bad, good),
+        "best": "raycast",
+        "remedies": {"pyrender": "sudo apt-get install libegl1 libgl1"},
+        "cores": 8,
+        "usable_cores": 2,
+        "cache": "12 functions kept in /somewhere",
+        "python": "3.11",
+        "numpy": "2.4",
+        "numba": "0.68",
+    }
+    return Health(**{**values, **changes})
+
+
+def test_doctor_tells_what_works_and_how_to_enable_the_rest(monkeypatch, capsys):
+    monkeypatch.setattr("cadalign.cli.doctor.examine", _health)
+    monkeypatch.setenv("COLUMNS", "160")
     assert Doctor().run() == 0
     text = capsys.readouterr().out
-    assert "ms for 640 x 480 px" in text
-    assert "of which this process may use" in text
+    assert "To enable pyrender: sudo apt-get install libegl1 libgl1" in text
+    assert "--renderer auto takes: raycast" in text
+    assert "OpenGL does not start" in text
+    assert "of which this process may use 2" in text
     assert Doctor(json=True).run() == 0
-    assert json.loads(capsys.readouterr().out)["milliseconds"] > 0
+    assert json.loads(capsys.readouterr().out)["renderers"][1]["milliseconds"] == 80.0
+
+
+def test_doctor_fails_where_not_even_ray_casting_works(monkeypatch, capsys):
+    broken = Probe("raycast", False, "embreex is gone", "")
+    monkeypatch.setattr("cadalign.cli.doctor.examine", lambda: _health(renderers=(broken,)))
+    assert Doctor().run() == 1
 
 
 def test_the_state_of_the_cache_is_told(tmp_path, monkeypatch):
@@ -197,6 +241,18 @@ def test_nothing_is_compiled_ahead_that_could_not_be_kept(tmp_path, monkeypatch,
     assert refusal_line(capsys, "doctor", "--compile") == (
         f"--compile: {tmp_path} cannot be written to; set NUMBA_CACHE_DIR to a folder that can be"
     )
+
+
+@pytest.mark.long
+def test_doctor_runs_for_real(monkeypatch, capsys):
+    monkeypatch.delitem(RENDERERS, "open3d")  # which takes seconds to load
+    assert Doctor(json=True).run() == 0
+    health = json.loads(capsys.readouterr().out)
+    names = [renderer["name"] for renderer in health["renderers"]]
+    assert names == ["pyrender", "raycast"]
+    for renderer in health["renderers"]:
+        assert renderer["works"] == (renderer["milliseconds"] is not None)
+        assert renderer["works"] or renderer["detail"]
 
 
 def test_textures_of_the_model_are_not_written_over(model, capsys) -> None:

@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from support.renderers import renderer_or_skip
 from trimesh.visual.material import PBRMaterial
 
 from cadalign import Camera
 from cadalign.datasets import load_mesh
 from cadalign.io.meshes.materials import _without_options
-from cadalign.render import RaycastRenderer, Scene, frame_object, look_at
+from cadalign.render import Scene, frame_object, look_at, make_renderer
 
 CAMERA = Camera.from_fov(320, 240, fov_x=45)
 
 
-@pytest.fixture
-def renderer():
-    return RaycastRenderer()
+@pytest.fixture(params=["raycast", "open3d", "pyrender"])
+def renderer(request):
+    return renderer_or_skip(request.param)
 
 
 def _moved(x, y, z, *, turn=0.0, mirror=False):
@@ -186,6 +188,24 @@ def test_what_is_behind_glass_is_seen_through_it(renderer, tmp_path):
     assert ball[0] > ball[2] + 20
     corner = _color_at(frame, pose, (0.8, -0.7, 0.8))
     assert corner[2] >= corner[0]
+
+
+@pytest.mark.long
+def test_real_models_are_recognisable_alike_by_every_renderer(renderer):
+    data = os.environ.get("CADALIGN_DATA")
+    if not data:
+        pytest.skip("set CADALIGN_DATA to the real data")
+    paths = sorted(Path(data, "keypointnet", "models").glob("*/*/models/model_normalized.obj"))
+    assert len(paths) == 10
+    truth = make_renderer("raycast")
+    for path in paths:
+        scene, pose, frame = _drawn(renderer, path)
+        expected = truth.render(scene, CAMERA, pose)
+        both = (frame.color[:, :, 3] == 255) & (expected.color[:, :, 3] == 255)
+        assert both.sum() > 500
+        difference = frame.color[both][:, :3].astype(int) - expected.color[both][:, :3]
+        # Lights without size and another filter of textures make some difference.
+        assert np.abs(difference).mean() < 20, path
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ from cadalign import Alignment, Camera, Mesh
 from cadalign.errors import InputError
 from cadalign.render import (
     Angles,
-    RaycastRenderer,
     Scene,
     cast_geometry,
     contact_sheet,
@@ -22,6 +21,7 @@ from cadalign.render import (
     keypoint_picture,
     line_picture,
     look_at,
+    make_renderer,
     normal_picture,
     pose_in_view,
 )
@@ -130,7 +130,7 @@ def test_keypoints_are_ringed_where_they_are(geometry):
 def test_every_style_draws_the_model_where_it_is(style):
     scene = _box()
     pose = pose_in_view(scene, CAMERA, Angles.parse("iso"))
-    picture = draw_still(RaycastRenderer(), scene, CAMERA, pose, style=style)
+    picture = draw_still(make_renderer("raycast"), scene, CAMERA, pose, style=style)
     assert picture.shape == (120, 160, 4)
     mask = cast_geometry(scene, CAMERA, pose).mask
     wide = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8))
@@ -140,7 +140,7 @@ def test_every_style_draws_the_model_where_it_is(style):
 
 def test_unknown_styles_and_views_are_refused():
     with pytest.raises(InputError, match="known are color, depth"):
-        draw_still(RaycastRenderer(), _box(), CAMERA, Alignment.identity(), style="oil")
+        draw_still(make_renderer("raycast"), _box(), CAMERA, Alignment.identity(), style="oil")
     for text in ("sideways", "1", "1,2,3,4", "nan,0", ""):
         with pytest.raises(InputError, match="is not a view"):
             Angles.parse(text)

@@ -1,13 +1,20 @@
-"""Frames against `Camera.project` and against exact geometry."""
+"""Every renderer against the others, against `Camera.project`, and against broken machines."""
 
 from __future__ import annotations
 
+import json
+import logging
+import pickle
+import re
+import subprocess
+import sys
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 import trimesh
+from support.renderers import renderer_or_skip
 
 from cadalign import Alignment, Camera, Material, Mesh
 from cadalign.errors import InputError, RenderError
@@ -15,18 +22,23 @@ from cadalign.render import (
     RaycastRenderer,
     Scene,
     Studio,
+    cast_geometry,
     frame_object,
     look_at,
+    make_renderer,
 )
+from cadalign.render import probe as probing
+from cadalign.render.probe import Probe, ball, probe_renderer, remedy
 
 CAMERA = Camera(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 SKEWED = Camera(width=160, height=120, fx=170.0, fy=140.0, cx=60.25, cy=71.75)
 BENT = Camera(160, 120, 170.0, 140.0, 66.0, 63.0, (-0.25, 0.06, 0.004, -0.003))
+NAMES = ("raycast", "open3d", "pyrender")
 
 
-@pytest.fixture
-def renderer():
-    return RaycastRenderer()
+@pytest.fixture(params=NAMES)
+def renderer(request):
+    return renderer_or_skip(request.param)
 
 
 def _knot() -> Mesh:
@@ -44,6 +56,29 @@ def _knot() -> Mesh:
 def _view(scene, camera, **angles):
     rotation = look_at(azimuth=35, elevation=25, distance=3, **angles).rotation
     return frame_object(scene.bounds, camera, rotation=rotation, fill=0.9)
+
+
+@pytest.mark.long
+def test_open3d_agrees_with_embreex_on_depth_and_faces():
+    renderer_or_skip("open3d")
+    camera = Camera.from_fov(640, 480, fov_x=50)
+    differing, total = 0, 0
+    for mesh in (_knot(), ball(5), Mesh(*_shape(trimesh.creation.box()))):
+        scene = Scene(mesh)
+        pose = _view(scene, camera)
+        one = cast_geometry(scene, camera, pose)
+        other = cast_geometry(scene, camera, pose, caster=scene.open3d_caster)
+        same = one.face_id == other.face_id
+        differing += (~same).sum()
+        total += same.size
+        np.testing.assert_array_equal(one.depth[same], other.depth[same])
+        near = np.abs(one.depth - other.depth) <= 1e-6 * one.depth.max()
+        assert near.mean() > 0.9999
+    assert differing < 1e-4 * total
+
+
+def _shape(shape):
+    return np.array(shape.vertices), np.array(shape.faces)
 
 
 @pytest.mark.slow
@@ -109,6 +144,27 @@ def test_depth_is_exact_whatever_draws_the_colour(renderer):
     np.testing.assert_allclose(frame.depth[rows, columns], expected, rtol=1e-9)
 
 
+def test_all_renderers_draw_about_the_same_colours(renderer):
+    texture = np.zeros((2, 2, 3), np.uint8)
+    texture[0], texture[1] = (220, 60, 40), (40, 90, 220)
+    mesh = Mesh(
+        [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]],
+        [[0, 1, 2], [0, 2, 3]],
+        corner_uv=np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])[[[0, 1, 2], [0, 2, 3]]],
+        materials=(Material("m", (1, 1, 1, 1), texture),),
+    )
+    view = look_at(azimuth=20, elevation=20, distance=4)
+    frame = renderer.render(Scene(mesh), CAMERA, view)
+    truth = RaycastRenderer().render(Scene(mesh), CAMERA, view)
+    both = (frame.color[:, :, 3] == 255) & (truth.color[:, :, 3] == 255)
+    difference = np.abs(frame.color[both].astype(int) - truth.color[both])
+    assert np.median(difference) < 25
+    upper = frame.color[45, 80].astype(int)
+    lower = frame.color[75, 80].astype(int)
+    assert upper[0] > upper[2] + 60
+    assert lower[2] > lower[0] + 60
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [1, 2, 3, 5, 7])
 def test_textures_of_odd_widths_are_read_row_by_row(renderer, width):
@@ -157,6 +213,17 @@ def test_out_of_view_and_too_large_are_the_same_everywhere(renderer):
 
 
 @pytest.mark.slow
+def test_an_image_larger_than_a_tile_has_no_seams():
+    renderer = renderer_or_skip("pyrender")
+    camera = Camera.from_fov(2300, 90, fov_x=60)
+    quad = Mesh([[-9, -1, 0], [9, -1, 0], [9, 1, 0], [-9, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    pose = Alignment(np.eye(3), [0, 0, 8], [1, 1, 1])
+    color = renderer.render(Scene(quad), camera, pose).color[45]
+    assert (color[:, 3] == 255).all()
+    assert np.abs(np.diff(color[:, :3].astype(int), axis=0)).max() <= 1
+
+
+@pytest.mark.slow
 def test_lens_that_cannot_be_inverted_everywhere_leaves_those_pixels_empty(renderer):
     camera = replace(BENT, fx=60.0, fy=60.0, distortion=(-0.4, 0.05, 0.0, 0.0))
     corners = [[0, 0], [159, 0], [0, 119], [159, 119]]
@@ -186,6 +253,34 @@ def test_what_is_prepared_of_a_mesh_is_prepared_once(renderer, monkeypatch):
     assert {name: id(vars(scene)[name]) for name in before} == before
 
 
+def test_renderers_survive_pickling(renderer):
+    again = pickle.loads(pickle.dumps(renderer))
+    assert again.name == renderer.name
+    scene = Scene(_knot())
+    view = _view(scene, CAMERA)
+    np.testing.assert_array_equal(
+        again.render(scene, CAMERA, view).color, renderer.render(scene, CAMERA, view).color
+    )
+
+
+def test_the_renderer_says_which_one_draws_a_model(renderer):
+    """OpenGL leaves transparent models, and frames without antialiasing, to ray casting."""
+    scenes = {
+        opacity: Scene(
+            Mesh(
+                [[-1, -1, 0], [1, -1, 0], [0, 2, 0]],
+                [[0, 1, 2]],
+                materials=(Material(color=(0.7, 0.2, 0.2, opacity)),),
+            )
+        )
+        for opacity in (1.0, 0.5)
+    }
+    stand_in = "raycast" if renderer.name == "pyrender" else renderer.name
+    assert renderer.drawn_by(scenes[1.0], samples=8) == renderer.name
+    assert renderer.drawn_by(scenes[0.5], samples=8) == stand_in
+    assert renderer.drawn_by(scenes[1.0], samples=1) == stand_in
+
+
 def test_ambient_occlusion_darkens_corners_alone():
     floor = [[-2, -1, -2], [2, -1, -2], [2, -1, 2], [-2, -1, 2]]
     wall = [[-2, -1, -2], [2, -1, -2], [2, 2, -2], [-2, 2, -2]]
@@ -200,3 +295,101 @@ def test_ambient_occlusion_darkens_corners_alone():
     seen = np.flatnonzero(plain.mask[:, 80])
     assert ratio[seen[2]] > 0.99
     np.testing.assert_array_equal(plain.color[:, :, 3], dark.color[:, :, 3])
+
+
+# Choosing, and machines on which graphics do not work
+
+
+@pytest.mark.parametrize(
+    ("found", "taken", "said"),
+    [
+        (Probe("pyrender", True, "NVIDIA GeForce", ""), "pyrender", r"pyrender \(NVIDIA GeForce\)"),
+        (
+            Probe("pyrender", True, "llvmpipe (LLVM 15)", ""),
+            "raycast",
+            "no graphics card .*llvmpipe",
+        ),
+        (Probe("pyrender", False, "no EGL", ""), "raycast", "pyrender does not work here: no EGL"),
+    ],
+)
+def test_auto_takes_a_graphics_card_or_casts_rays_and_says_which(
+    monkeypatch, caplog, found, taken, said
+):
+    monkeypatch.setattr("cadalign.render.probe.probe_renderer", lambda name: found)
+    monkeypatch.setattr("cadalign.render.probe.load_renderer", lambda name, studio: name)
+    with caplog.at_level(logging.INFO, logger="cadalign"):
+        assert make_renderer("auto") == taken
+    assert re.search(f"renderer: {taken} .*", caplog.text)
+    assert re.search(said, caplog.text)
+
+
+def test_a_renderer_that_does_not_work_is_refused(monkeypatch):
+    monkeypatch.setattr(
+        "cadalign.render.probe.probe_renderer", lambda name: Probe(name, False, "no EGL", "")
+    )
+    for name in ("pyrender", "open3d"):
+        with pytest.raises(RenderError, match=f"{name}: the renderer does not work here: no EGL"):
+            make_renderer(name)
+    assert make_renderer("raycast").name == "raycast"
+
+
+def test_unknown_renderers_are_refused():
+    with pytest.raises(InputError, match=r"unknown renderer 'blender'; known are auto, pyrender"):
+        make_renderer("blender")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("body", "reason"),
+    [
+        ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "killed by signal 11"),
+        ("raise ImportError('Unable to load EGL library')", "Unable to load EGL library"),
+        ("import sys; sys.exit(3)", "SystemExit|no message"),
+    ],
+)
+def test_a_broken_graphics_library_does_not_take_the_caller_down(
+    tmp_path, monkeypatch, body, reason
+):
+    (tmp_path / "pyrender").mkdir()
+    (tmp_path / "pyrender" / "__init__.py").write_text(body)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    found = probing._probe.__wrapped__("pyrender", False)
+    assert not found.works
+    assert re.search(reason, found.detail), found.detail
+
+
+@pytest.mark.long
+def test_a_missing_egl_device_is_told(monkeypatch):
+    renderer_or_skip("pyrender")
+    monkeypatch.setenv("EGL_DEVICE_ID", "77")
+    found = probing._probe.__wrapped__("pyrender", False)
+    assert not found.works
+    assert "OpenGL does not start (ValueError" in found.detail
+
+
+def test_probes_are_remembered(monkeypatch):
+    first = probe_renderer("raycast")
+    monkeypatch.setattr(subprocess, "run", None)
+    assert probe_renderer("raycast") is first
+
+
+def test_remedies_name_the_packages(monkeypatch):
+    monkeypatch.setattr("cadalign.render.probe._loads", lambda library: library not in missing)
+    monkeypatch.setattr("cadalign.render.probe.find_spec", lambda name: object())
+    missing = {"libEGL.so.1", "libGL.so.1"}
+    broken = Probe("pyrender", False, "OpenGL does not start", "")
+    assert remedy(broken) == "sudo apt-get install libegl1 libgl1"
+    missing = {"libusb-1.0.so.0"}
+    detail = "libusb-1.0.so.0: cannot open shared object file"
+    assert remedy(Probe("open3d", False, detail, "")) == "sudo apt-get install libusb-1.0-0"
+    monkeypatch.setattr("cadalign.render.probe.find_spec", lambda name: None)
+    assert remedy(Probe("open3d", False, "", "")).endswith("-m pip install 'cadalign[open3d]'")
+
+
+def test_importing_the_package_loads_no_graphics():
+    code = (
+        "import sys, json, cadalign.render; "
+        "print(json.dumps([m for m in ('pyrender', 'open3d', 'OpenGL') if m in sys.modules]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == []

@@ -1,0 +1,298 @@
+"""Renderers by name: tried in a process of their own, chosen, and remedies for broken ones."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import logging
+import re
+import subprocess
+import sys
+import time
+from dataclasses import asdict, dataclass
+from functools import cache
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+
+import numpy as np
+
+from cadalign.errors import CadalignError, RenderError, unknown
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Mesh
+from cadalign.render.raycast.surface import Studio
+from cadalign.render.scene import Renderer, Scene
+
+RENDERERS: dict[str, str] = {
+    "pyrender": "cadalign.render.opengl:PyrenderRenderer",
+    "open3d": "cadalign.render.raycast.renderer:Open3DRenderer",
+    "raycast": "cadalign.render.raycast.renderer:RaycastRenderer",
+}
+"""Module and class of each renderer."""
+
+_TIMEOUT = 120
+_TIMED_FRAMES = 5
+_PACKAGES = {
+    "pyrender": ("pyrender2", "PyOpenGL"),
+    "open3d": ("open3d",),
+    "raycast": ("trimesh", "embreex"),
+}
+# The last line of the child's output begins so; libraries write what they like before it.
+_MARK = "cadalign-probe "
+_CHILD = (
+    "import sys, json; sys.path[:] = json.loads(sys.argv[1]); "
+    "from cadalign.render.probe import report; report(sys.argv[2], timed=sys.argv[3] == 'timed')"
+)
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Result of trying a renderer."""
+
+    name: str
+    """The renderer."""
+    works: bool
+    detail: str
+    """Device that draws, or the reason of the failure."""
+    versions: str
+    """Versions of the packages that it needs."""
+    milliseconds: float | None = None
+    """The median time of a frame, 640 x 480 px with 20,480 triangles."""
+
+
+def probe_renderer(name: str, *, timed: bool = False) -> Probe:
+    """Try a renderer in a process of its own; the result is kept for the life of this one.
+
+    Parameters
+    ----------
+    name : str
+        One of `RENDERERS`.
+    timed : bool
+        Measure the time of a frame too, which takes some seconds.
+
+    Raises
+    ------
+    InputError
+        If there is no such renderer.
+    """
+    if name not in RENDERERS:
+        raise unknown("renderer", name, RENDERERS)
+    return _probe(name, timed)
+
+
+@cache
+def _probe(name: str, timed: bool) -> Probe:
+    arguments = [json.dumps(sys.path), name, "timed" if timed else "untimed"]
+    try:
+        child = subprocess.run(
+            [sys.executable, "-c", _CHILD, *arguments],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=_TIMEOUT,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return Probe(name, False, f"no frame within {_TIMEOUT} seconds", _versions(name))
+    except OSError as error:
+        return Probe(name, False, f"no process to try it in ({error})", _versions(name))
+    for line in reversed(child.stdout.splitlines()):
+        if line.startswith(_MARK):
+            return Probe(**json.loads(line.removeprefix(_MARK)))
+    if child.returncode < 0:
+        reason = f"the process was killed by signal {-child.returncode}"
+    else:
+        reason = (child.stderr.strip().splitlines() or ["no message"])[-1]
+    return Probe(name, False, reason, _versions(name))
+
+
+def report(name: str, *, timed: bool) -> None:
+    """Try a renderer in this process and write the result to standard output, for the parent."""
+    try:
+        result = _try(name, timed=timed)
+    except Exception as error:  # whatever it is, the parent wants to know
+        reason = error.what if isinstance(error, CadalignError) else str(error)
+        result = Probe(name, False, reason or type(error).__name__, _versions(name))
+    sys.stdout.write(f"\n{_MARK}{json.dumps(asdict(result))}\n")
+    sys.stdout.flush()
+
+
+def load_renderer(name: str, studio: Studio | None) -> Renderer:
+    """Make a renderer in this process, even if that takes the process down."""
+    module, _, kind = RENDERERS[name].partition(":")
+    renderer: Renderer = getattr(import_module(module), kind)(studio=studio)
+    return renderer
+
+
+def _try(name: str, *, timed: bool) -> Probe:
+    renderer = load_renderer(name, None)
+    mesh = ball(5 if timed else 1)
+    camera = Camera.from_fov(*((640, 480) if timed else (64, 48)), fov_x=50.0)
+    scene, pose = Scene(mesh), Alignment(np.eye(3), np.array([0, 0, 4.5]), np.ones(3))
+    frame = renderer.render(scene, camera, pose)
+    seen = float((frame.color[:, :, 3] > 127).mean())
+    if not (frame.mask.any() and abs(seen - frame.mask.mean()) < 0.1):
+        return Probe(name, False, "it draws a ball wrongly", _versions(name))
+    milliseconds = None
+    if timed:
+        times = []
+        for _ in range(_TIMED_FRAMES):
+            begin = time.perf_counter()
+            renderer.render(scene, camera, pose)
+            times.append(time.perf_counter() - begin)
+        milliseconds = 1000 * float(np.median(times))
+    device = str(getattr(renderer, "device", "processor"))
+    return Probe(name, True, device, _versions(name), milliseconds)
+
+
+def ball(subdivisions: int) -> Mesh:
+    """A ball of radius 1 with 20 * 4**subdivisions triangles."""
+    import trimesh
+
+    shape = trimesh.creation.icosphere(subdivisions=subdivisions)
+    return Mesh(np.array(shape.vertices), np.array(shape.faces))
+
+
+def _versions(name: str) -> str:
+    found = []
+    for package in _PACKAGES[name]:
+        try:
+            found.append(f"{package} {version(package)}")
+        except PackageNotFoundError:
+            found.append(f"{package} missing")
+    return ", ".join(found)
+
+
+logger = logging.getLogger("cadalign")
+
+AUTO = "auto"
+
+# Of OpenGL's devices, programs that run on the processor.
+_IMITATIONS = ("llvmpipe", "softpipe", "swrast", "software rasterizer", "swiftshader")
+
+
+def make_renderer(name: str = AUTO, *, studio: Studio | None = None) -> Renderer:
+    """Make a renderer.
+
+    Renderers other than ``raycast`` are tried in a process of their own first, once in the life of
+    this one, since broken graphics libraries would take this process down.
+
+    Parameters
+    ----------
+    name : str
+        ``raycast`` works everywhere; ``pyrender`` draws the colour with OpenGL; ``open3d`` casts
+        rays with Open3D. ``auto`` takes pyrender where it works on a graphics card, and raycast
+        elsewhere: OpenGL imitated on the processor takes as long and smooths edges less, and
+        Open3D casts no faster. It says which (logger "cadalign", level info; the renderer's
+        ``name``).
+    studio : Studio, optional
+        The lights.
+
+    Returns
+    -------
+    Renderer
+
+    Raises
+    ------
+    InputError
+        If there is no renderer of that name.
+    RenderError
+        If the one asked for does not work here.
+
+    Examples
+    --------
+    >>> make_renderer("raycast").name
+    'raycast'
+    """
+    if name == AUTO:
+        return load_renderer(best_renderer(), studio)
+    if name not in RENDERERS:
+        raise unknown("renderer", name, [AUTO, *RENDERERS])
+    if name != "raycast":
+        found = probe_renderer(name)
+        if not found.works:
+            raise RenderError(
+                f"the renderer does not work here: {found.detail}",
+                where=name,
+                fix="run `cadalign doctor` to see what is missing, or use the ray-cast renderer",
+            )
+    return load_renderer(name, studio)
+
+
+def best_renderer() -> str:
+    """The renderer that "auto" takes here, by name; ray casting needs no proof."""
+    found = probe_renderer("pyrender")
+    is_imitation = any(name in found.detail.lower() for name in _IMITATIONS)
+    if found.works and not is_imitation:
+        logger.info("renderer: pyrender (%s)", found.detail)
+        return "pyrender"
+    if found.works:
+        reason = f"OpenGL has no graphics card here but {found.detail}"
+    else:
+        reason = f"pyrender does not work here: {found.detail}"
+    logger.info("renderer: raycast (%s)", reason)
+    return "raycast"
+
+
+# Remedies -----------------------------------------------------------------------------------------
+
+
+# Shared libraries and the Debian packages that hold them.
+_DEBIAN_PACKAGES = {
+    "libEGL.so.1": "libegl1",
+    "libGL.so.1": "libgl1",
+    "libX11.so.6": "libx11-6",
+    "libgomp.so.1": "libgomp1",
+    "libusb-1.0.so.0": "libusb-1.0-0",
+}
+_NEEDED = {
+    "pyrender": ("libEGL.so.1", "libGL.so.1"),
+    "open3d": ("libX11.so.6", "libGL.so.1", "libgomp.so.1"),
+    "raycast": (),
+}
+_MODULES = {"pyrender": ("pyrender", "pyrender2"), "open3d": ("open3d", "'cadalign[open3d]'")}
+
+
+def remedy(probe: Probe) -> str:
+    """The command that would enable a renderer; empty where it works or none is known.
+
+    Examples
+    --------
+    >>> remedy(Probe("raycast", True, "processor", ""))
+    ''
+    """
+    if probe.works:
+        return ""
+    if probe.name in _MODULES:
+        module, package = _MODULES[probe.name]
+        if find_spec(module) is None:
+            return f"{sys.executable} -m pip install {package}"
+    named = re.findall(r"lib[\w.+-]+\.so[.\d]*", probe.detail)
+    absent = [*missing_libraries(probe.name), *(name for name in named if not _loads(name))]
+    packages = dict.fromkeys(
+        _DEBIAN_PACKAGES[library] for library in absent if library in _DEBIAN_PACKAGES
+    )
+    if packages:
+        return f"sudo apt-get install {' '.join(packages)}"
+    if probe.name == "pyrender":
+        # The libraries are there; what is missing is a driver that needs no display.
+        return "sudo apt-get install libegl-mesa0 libgl1-mesa-dri"
+    if probe.name == "raycast":
+        return f"{sys.executable} -m pip install --force-reinstall embreex trimesh"
+    return ""
+
+
+def missing_libraries(name: str) -> list[str]:
+    """The shared libraries that a renderer needs and that cannot be loaded (Linux only)."""
+    if not sys.platform.startswith("linux"):
+        return []
+    return [library for library in _NEEDED[name] if not _loads(library)]
+
+
+def _loads(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True

@@ -9,32 +9,28 @@ from contextlib import suppress
 from functools import cache, partial
 from typing import Any
 
-import cv2
 import numpy as np
 
-from cadalign.arrays import FloatArray
 from cadalign.errors import RenderError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.render.drawing.canvas import ByteImage
-from cadalign.render.probe import missing_libraries
 from cadalign.render.raycast.occlusion import darken_corners
 from cadalign.render.raycast.posed import Rectangle, pose_scene
 from cadalign.render.raycast.renderer import RaycastRenderer, check_samples, geometry_of
 from cadalign.render.raycast.surface import Studio
 from cadalign.render.scene import Frame, Scene, check_image_size
 
-# Larger images are drawn in tiles of this size: no graphics memory is too small for it.
-_TILE = 2048
+_LARGEST = 4096  # side of an image that OpenGL draws [px]; larger ones are ray cast
 # Sizes of what is drawn are rounded up, so that buffers are not made anew for every frame.
 _SIZE_STEP = 64
-_MAX_UNBENT = 8192
 
 
 class PyrenderRenderer:
     """Draws colour with OpenGL under EGL; depth, triangle numbers and normals are ray cast.
 
-    A model with transparent parts, which OpenGL would need sorted, is drawn by ray casting wholly.
+    Ray casting draws models with transparent parts, which OpenGL would need sorted, and what a lens
+    with distortion sees.
     A process has one OpenGL context, however many of these there are; a forked process must not
     use its parent's, so start pools with "spawn". Where OpenGL's libraries are broken
     the whole process may die: `make_renderer` tries it in another one first.
@@ -66,10 +62,11 @@ class PyrenderRenderer:
     ) -> Frame:
         """Draw a scene; see `RaycastRenderer.render`.
 
-        OpenGL antialiases with 4 samples whatever ``samples`` says; 1 turns antialiasing off. What
-        a wide lens sees is cast by rays: OpenGL has no picture of 180 degrees.
+        OpenGL antialiases with 4 samples whatever ``samples`` says; 1 turns antialiasing off.
         """
-        if camera.is_wide or self.drawn_by(scene, samples=samples) != self.name:
+        is_bent = camera.is_wide or bool(camera.distortion)
+        is_large = max(camera.width, camera.height) > _LARGEST
+        if is_bent or is_large or self.drawn_by(scene, samples=samples) != self.name:
             return self._fallback.render(scene, camera, cam_from_model, samples=samples)
         check_samples(samples)
         check_image_size(camera)
@@ -79,8 +76,7 @@ class PyrenderRenderer:
         if posed is not None:
             block = posed.block.slices
             self._stage.place(scene, cam_from_model, posed.seen_sides(geometry.face_id[block]))
-            draw = self._draw_bent if camera.distortion else self._draw
-            color[block] = straight_color(draw(camera, posed.block))
+            color[block] = straight_color(self._draw(camera, posed.block))
             darken_corners(color, geometry, posed, self.studio)
         return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
 
@@ -89,44 +85,11 @@ class PyrenderRenderer:
         return self.name if scene.surface.opaque and samples > 1 else self._fallback.name
 
     def _draw(self, camera: Camera, block: Rectangle) -> ByteImage:
-        """Draw a block of an image without lens distortion, premultiplied (h, w, 4)."""
-        result: ByteImage = np.empty((block.height, block.width, 4), dtype=np.uint8)
-        for tile in block.tiles(_TILE, _TILE):
-            width, height = (-(-n // _SIZE_STEP) * _SIZE_STEP for n in (tile.width, tile.height))
-            self._stage.look(camera, (tile.left, tile.top, width, height))
-            drawn = self._context.draw(self._stage.scene, width=width, height=height)
-            rows = slice(tile.top - block.top, tile.bottom - block.top)
-            columns = slice(tile.left - block.left, tile.right - block.left)
-            result[rows, columns] = drawn[: tile.height, : tile.width]
-        return result
-
-    def _draw_bent(self, camera: Camera, block: Rectangle) -> ByteImage:
-        """Draw as a pinhole camera would and bend that as the lens does, premultiplied."""
-        rays, valid = camera.normalize_where_valid(block.pixels)
-        if not valid.any():
-            return np.zeros((block.height, block.width, 4), dtype=np.uint8)
-        low, high = rays[valid].min(axis=0), rays[valid].max(axis=0)
-        pinhole = _pinhole_over(camera, low, high)
-        whole = Rectangle(0, 0, pinhole.width, pinhole.height)
-        drawn = self._draw(pinhole, whole)
-        at = pinhole.pixels_from_normalized(rays)
-        at[~valid] = -10
-        at_x, at_y = at.astype(np.float32).T.reshape(2, block.height, block.width)
-        bent = cv2.remap(drawn, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-        return np.asarray(bent, dtype=np.uint8)
-
-
-def _pinhole_over(camera: Camera, low: FloatArray, high: FloatArray) -> Camera:
-    """A camera without distortion that sees normalised coordinates from low to high."""
-    span = np.maximum(high - low, 1e-9)
-    focal = np.array([camera.fx, camera.fy])
-    size = np.ceil(span * focal) + 3
-    # A very wide lens would need a huge pinhole image; a coarser one then has to do.
-    shrink = min(1.0, float((_MAX_UNBENT / size).min()))
-    focal = focal * shrink
-    width, height = (int(value) for value in np.ceil(span * focal) + 3)
-    cx, cy = 1 - low * focal
-    return Camera(width, height, float(focal[0]), float(focal[1]), float(cx), float(cy))
+        """Draw a block of an image, premultiplied (h, w, 4)."""
+        width, height = (-(-n // _SIZE_STEP) * _SIZE_STEP for n in (block.width, block.height))
+        self._stage.look(camera, (block.left, block.top, width, height))
+        drawn = self._context.draw(self._stage.scene, width=width, height=height)
+        return drawn[: block.height, : block.width]
 
 
 class GlContext:
@@ -145,14 +108,8 @@ class GlContext:
 
             self._renderer = pyrender.OffscreenRenderer(64, 64)
         except Exception as error:  # PyOpenGL and ctypes raise what they like
-            missing = missing_libraries("pyrender")
-            reason = (
-                f"{' and '.join(missing)} cannot be loaded"
-                if missing
-                else f"{type(error).__name__}: {_beginning(error)}"
-            )
             raise RenderError(
-                f"OpenGL does not start ({reason})",
+                f"OpenGL does not start ({type(error).__name__}: {_beginning(error)})",
                 where="pyrender",
                 fix="run `cadalign doctor` to see what is missing, or use the ray-cast renderer",
             ) from None

@@ -133,7 +133,7 @@ class Health:
     best: str
     """The renderer that "auto" selects."""
     remedies: dict[str, str]
-    """For each renderer that does not work, the command that would enable it."""
+    """For each renderer that does not work, the commands that would enable it."""
     cores: int
     usable_cores: int
     """Those that this process may use."""
@@ -146,13 +146,13 @@ class Health:
 
 def examine() -> Health:
     """Try every renderer in a process of its own and collect the rest; takes some seconds."""
-    from cadalign.render.probe import RENDERERS, best_renderer, probe_renderer, remedy
+    from cadalign.render.probe import REMEDIES, RENDERERS, best_renderer, probe_renderer
 
     renderers = tuple(probe_renderer(name, timed=True) for name in RENDERERS)
     return Health(
         renderers=renderers,
         best=best_renderer(),
-        remedies={found.name: command for found in renderers if (command := remedy(found))},
+        remedies={each.name: REMEDIES[each.name] for each in renderers if not each.works},
         cores=os.cpu_count() or 1,
         usable_cores=_usable_cores(),
         cache=compiled_cache(),

@@ -28,7 +28,7 @@ from cadalign.render import (
     make_renderer,
 )
 from cadalign.render import probe as probing
-from cadalign.render.probe import Probe, ball, probe_renderer, remedy
+from cadalign.render.probe import Probe, ball, probe_renderer
 
 CAMERA = Camera(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 SKEWED = Camera(width=160, height=120, fx=170.0, fy=140.0, cx=60.25, cy=71.75)
@@ -213,16 +213,6 @@ def test_out_of_view_and_too_large_are_the_same_everywhere(renderer):
 
 
 @pytest.mark.slow
-def test_an_image_larger_than_a_tile_has_no_seams():
-    renderer = renderer_or_skip("pyrender")
-    camera = Camera.from_fov(2300, 90, fov_x=60)
-    quad = Mesh([[-9, -1, 0], [9, -1, 0], [9, 1, 0], [-9, 1, 0]], [[0, 1, 2], [0, 2, 3]])
-    pose = Alignment(np.eye(3), [0, 0, 8], [1, 1, 1])
-    color = renderer.render(Scene(quad), camera, pose).color[45]
-    assert (color[:, 3] == 255).all()
-    assert np.abs(np.diff(color[:, :3].astype(int), axis=0)).max() <= 1
-
-
 @pytest.mark.slow
 def test_lens_that_cannot_be_inverted_everywhere_leaves_those_pixels_empty(renderer):
     camera = replace(BENT, fx=60.0, fy=60.0, distortion=(-0.4, 0.05, 0.0, 0.0))
@@ -371,19 +361,6 @@ def test_probes_are_remembered(monkeypatch):
     first = probe_renderer("raycast")
     monkeypatch.setattr(subprocess, "run", None)
     assert probe_renderer("raycast") is first
-
-
-def test_remedies_name_the_packages(monkeypatch):
-    monkeypatch.setattr("cadalign.render.probe._loads", lambda library: library not in missing)
-    monkeypatch.setattr("cadalign.render.probe.find_spec", lambda name: object())
-    missing = {"libEGL.so.1", "libGL.so.1"}
-    broken = Probe("pyrender", False, "OpenGL does not start", "")
-    assert remedy(broken) == "sudo apt-get install libegl1 libgl1"
-    missing = {"libusb-1.0.so.0"}
-    detail = "libusb-1.0.so.0: cannot open shared object file"
-    assert remedy(Probe("open3d", False, detail, "")) == "sudo apt-get install libusb-1.0-0"
-    monkeypatch.setattr("cadalign.render.probe.find_spec", lambda name: None)
-    assert remedy(Probe("open3d", False, "", "")).endswith("-m pip install 'cadalign[open3d]'")
 
 
 def test_importing_the_package_loads_no_graphics():

@@ -188,7 +188,7 @@ class ReportCommand:
     out: Path | None = None
     """File to write. By default report.html, in the run's folder if it is one run; a table goes to
     standard output."""
-    format: Literal["html", "md", "csv", "latex"] = "html"
+    format: Literal["html", "md", "csv"] = "html"
     """The page, or the headline table alone."""
     assets: bool = False
     """Put pictures into a folder beside the page, which then stays small. Pages that would exceed

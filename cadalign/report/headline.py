@@ -1,4 +1,4 @@
-"""Headline tables: their rows, best values and failures, and as Markdown, CSV and LaTeX."""
+"""Headline tables: their rows, best values and failures, and as Markdown and CSV."""
 
 from __future__ import annotations
 
@@ -154,17 +154,7 @@ def _reasons(index: int, run: Run, group: Metric, wanted: str) -> list[Failure]:
 
 # As text ------------------------------------------------------------------------------------------
 
-FORMATS = ("md", "csv", "latex")
-_LATEX: dict[int, str] = str.maketrans(
-    {
-        "\\": r"\textbackslash{}",
-        "~": r"\textasciitilde{}",
-        "^": r"\textasciicircum{}",
-        "µ": r"\textmu{}",
-        "\n": " ",
-        **{character: f"\\{character}" for character in "&%$#_{}"},
-    }
-)
+FORMATS = ("md", "csv")
 # A reader of Markdown takes these for marks, or for HTML.
 _MARKDOWN: dict[int, str] = str.maketrans(
     {character: f"\\{character}" for character in "\\`*_{}[]()#+!|~$"}
@@ -179,13 +169,12 @@ def headline_text(runs: Sequence[str | os.PathLike[str]], *, format: str) -> str
     ----------
     runs : sequence of path-like
         Folders of runs; see `cadalign.report.write_report`.
-    format : {"md", "csv", "latex"}
-        Best values are bold but in CSV, whose numbers are not rounded. LaTeX needs the packages
-        booktabs and textcomp.
+    format : {"md", "csv"}
+        Best values are bold in Markdown; numbers of CSV are not rounded.
 
     Examples
     --------
-    >>> print(headline_text(["runs/keypointnet"], format="latex"))  # doctest: +SKIP
+    >>> print(headline_text(["runs/keypointnet"], format="md"))  # doctest: +SKIP
     """
     if format not in FORMATS:
         raise InputError(
@@ -197,66 +186,26 @@ def headline_text(runs: Sequence[str | os.PathLike[str]], *, format: str) -> str
 
 def table_text(headline: Headline, names: Sequence[str], *, format: str) -> str:
     """The table as text; ``names`` are those of the runs. See `headline_text`."""
-    writers = {"md": _markdown, "csv": _csv, "latex": _latex}
-    return writers[format](headline, names)
-
-
-def _csv(headline: Headline, names: Sequence[str]) -> str:
-    lines: list[list[object]] = []
-    for row, names_of_row in _rows(headline, names):
-        # A cell that is None is empty.
-        cells = (row.cells[column.key] for column in headline.columns)
-        lines.append([*names_of_row, row.method, *cells])
-    return csv_text([_head(headline, names), *lines])
-
-
-def _markdown(headline: Headline, names: Sequence[str]) -> str:
-    head, rows = _table(headline, names, _MARKDOWN, "**{}**")
-    marks = ["---"] * (len(head) - len(headline.columns)) + ["---:"] * len(headline.columns)
-    table = "\n".join(f"| {' | '.join(line)} |" for line in [head, marks, *rows])
-    return f"{table}\n\n{headline.note.translate(_MARKDOWN)}\n"
-
-
-def _latex(headline: Headline, names: Sequence[str]) -> str:
-    head, rows = _table(headline, names, _LATEX, "\\textbf{{{}}}")
-    labels = len(head) - len(headline.columns)
-    lines = []
-    for number, cells in enumerate(rows):
-        if number and cells[: labels - 1] != rows[number - 1][: labels - 1]:
-            lines.append("\\addlinespace")
-        lines.append(f"{' & '.join(cells)} \\\\")
-    return "\n".join(
-        [
-            "% needs \\usepackage{booktabs,textcomp}",
-            f"\\begin{{tabular}}{{{'l' * labels}{'r' * len(headline.columns)}}}",
-            "\\toprule",
-            f"{' & '.join(head)} \\\\",
-            "\\midrule",
-            *lines,
-            "\\bottomrule",
-            "\\end{tabular}",
-            "",
-        ]
-    )
-
-
-def _table(
-    headline: Headline, names: Sequence[str], escapes: dict[int, str], best: str
-) -> tuple[list[str], list[list[str]]]:
-    rows = []
-    for row, names_of_row in _rows(headline, names):
-        labels = [*names_of_row, look_of(row.method).label]
-        cells = [label.translate(escapes) for label in labels]
-        for column in headline.columns:
-            text = column.rounded(row.cells[column.key]).translate(escapes)
-            cells.append(best.format(text) if column.key in row.best else text)
-        rows.append(cells)
-    return [text.translate(escapes) for text in _head(headline, names)], rows
-
-
-def _head(headline: Headline, names: Sequence[str]) -> list[str]:
     headings = (column.heading for column in headline.columns)
-    return [*(["run"] if len(names) > 1 else []), headline.group, "method", *headings]
+    head = [*(["run"] if len(names) > 1 else []), headline.group, "method", *headings]
+    rows = _rows(headline, names)
+    if format == "csv":  # a cell that is None is empty
+        cells = [
+            [*labels, row.method, *(row.cells[column.key] for column in headline.columns)]
+            for row, labels in rows
+        ]
+        return csv_text([head, *cells])
+    marks = ["---"] * (len(head) - len(headline.columns)) + ["---:"] * len(headline.columns)
+    lines = [[text.translate(_MARKDOWN) for text in head], marks]
+    for row, names_of_row in rows:
+        labels = [*names_of_row, look_of(row.method).label]
+        line = [label.translate(_MARKDOWN) for label in labels]
+        for column in headline.columns:
+            text = column.rounded(row.cells[column.key]).translate(_MARKDOWN)
+            line.append(f"**{text}**" if column.key in row.best else text)
+        lines.append(line)
+    table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return f"{table}\n\n{headline.note.translate(_MARKDOWN)}\n"
 
 
 def _rows(headline: Headline, names: Sequence[str]) -> list[tuple[HeadlineRow, list[str]]]:

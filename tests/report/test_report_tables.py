@@ -61,23 +61,6 @@ def test_huge_numbers_are_written_by_their_power_of_ten() -> None:
     assert COLUMNS[1].text(-123456.7) == "-123456.700"
 
 
-def test_latex_is_a_booktabs_table_with_groups_apart() -> None:
-    assert table_text(headline(), ["run"], format="latex") == (
-        "% needs \\usepackage{booktabs,textcomp}\n"
-        "\\begin{tabular}{llrr}\n"
-        "\\toprule\n"
-        "category & method & instances & R error [deg] \\\\\n"
-        "\\midrule\n"
-        "chair & optimal (ours) & 3 & \\textbf{0.123} \\\\\n"
-        "chair & EPnP (no stretch) & 3 & 10.000 \\\\\n"
-        "chair & stated & - & 0.998 \\\\\n"
-        "\\addlinespace\n"
-        "all & Cramer-Rao bound & 3 & - \\\\\n"
-        "\\bottomrule\n"
-        "\\end{tabular}\n"
-    )
-
-
 def test_csv_has_all_digits_and_the_methods_names() -> None:
     rows = list(csv.reader(io.StringIO(table_text(headline(), ["run"], format="csv"))))
     assert rows == [
@@ -94,11 +77,6 @@ def test_names_cannot_break_a_table() -> None:
     table = markdown.split("\n\n")[0]
     assert {len(re.findall(r"(?<!\\)\|", line)) for line in table.splitlines()} == {5}
     assert "<img" not in markdown
-    latex = table_text(headline(HOSTILE), ["run"], format="latex")
-    lines = [line for line in latex.splitlines() if line.endswith("\\\\")]
-    assert {len(re.findall(r"(?<!\\)&", line)) for line in lines} == {3}
-    assert not re.search(r"(?<!\\)[#$_%]", "".join(lines))
-    assert r"\textbackslash{} \& 50 \% \#1 \{x\} \textasciitilde{}\textasciicircum{}\$" in latex
     text = table_text(headline(HOSTILE), ["run"], format="csv")
     rows = list(csv.reader(io.StringIO(text, newline="")))
     assert rows[1][0] == HOSTILE
@@ -108,11 +86,11 @@ def test_several_runs_are_told_apart_in_every_format(run: Path, tmp_path: Path) 
     other = tmp_path / "b_run"
     options = SweepOptions("noise", values=(1,), runs=4, methods=("aepnp",))
     do_run(options, RunFolder(other), workers=0, dask=None)
-    for format, names in (("md", "a\\_run"), ("csv", "a_run"), ("latex", "a\\_run")):
+    for format, names in (("md", "a\\_run"), ("csv", "a_run")):
         text = headline_text([run, other], format=format)
         assert text.count(names) == 6
         assert text.count(names.replace("a", "b", 1)) == 1
-        assert len(re.findall(r"\brun\b", text.splitlines()[0 if format != "latex" else 3])) == 1
+        assert len(re.findall(r"\brun\b", text.splitlines()[0])) == 1
 
 
 def test_the_command_prints_a_table_or_writes_it(
@@ -178,5 +156,5 @@ def test_what_makes_no_sense_is_refused(
 
 
 def test_an_unknown_format_is_named(run: Path) -> None:
-    with pytest.raises(InputError, match="unknown format 'pdf'; known are md, csv, latex"):
+    with pytest.raises(InputError, match="unknown format 'pdf'; known are md, csv"):
         headline_text([run], format="pdf")

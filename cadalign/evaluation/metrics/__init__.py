@@ -1,6 +1,6 @@
 """The table of metrics: name, label, unit and direction of every number that experiments report.
 
-Result tables, figures, pages, Markdown, CSV, LaTeX and the console all read it.
+Result tables, figures, pages, Markdown, CSV and the console all read it.
 """
 
 from __future__ import annotations

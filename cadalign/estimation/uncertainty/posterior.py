@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -24,13 +25,11 @@ from cadalign.estimation.options import LOSSES, FitOptions, pixel_information
 from cadalign.estimation.problems import whitening_by
 from cadalign.estimation.result_parts import FittedKeypoints
 from cadalign.estimation.uncertainty.residuals import (
-    bent,
     chi_square_quantile,
     f_quantile,
     loss_slopes,
     whitening_matrices,
 )
-from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import (
     faced,
     needs_facing,
@@ -42,7 +41,6 @@ from cadalign.solvers.draws import Centred, LogPriors, WhitenedPixels, weigh_dra
 
 MOST_POINTS = 100
 """Keypoints beyond which the inverse Fisher information is accurate, and sampling is slow."""
-_MOST_ASYMMETRY = 1e-3  # of a covariance, relative to its standard deviations
 _DRAWS = (500, 500, 1000, 2000, 4000)
 _ENOUGH_EFFECTIVE = 300.0  # effective draws of a round that end the sampling
 _FREEDOM = 5.0  # degrees of freedom of the Student proposals
@@ -56,50 +54,26 @@ _SEED = 0
 _EFFICIENCY = {"linear": 1.0, "huber": 0.7, "cauchy": 0.7}
 
 
-@dataclass(frozen=True, eq=False)
-class Likelihood:
-    """Negative log likelihoods, times two, of residuals in pixels."""
-
-    information: FloatArray  # (2, 2) or (n, 2, 2), inverse covariance of the keypoints [1 / px^2]
-    options: FitOptions  # loss and priors
-
-    @classmethod
-    def of(cls, result: FittedKeypoints) -> Likelihood:
-        """The likelihood of the inliers that the result maximises, at its estimated sigma."""
-        options, sigma = result.options, result.chosen_sigma
-        if np.ndim(sigma) == 0:
-            return cls(np.eye(2) / float(sigma) / float(sigma), options)
-        information = pixel_information(sigma, len(result.inliers))
-        return cls(information[result.inliers], options)
-
-    def squares(self, residuals: FloatArray) -> FloatArray:
-        """Squared whitened lengths (..., n) of residuals (..., n, 2) [px]."""
-        u, v = residuals[..., 0], residuals[..., 1]
-        (a, b), (_, c) = self.information.T
-        squares = u * u * a + v * v * c
-        if b.any():
-            squares += 2 * b * u * v
-        return np.asarray(squares)
-
-    def losses(self, residuals: FloatArray) -> FloatArray:
-        """The loss (n,) on each of the residuals (n, 2) [px], at most its whitened square."""
-        loss, bend = LOSSES[self.options.loss], self.options.loss_scale
-        return bent(self.squares(residuals), loss, bend)
-
-    def weights(self, residuals: FloatArray) -> FloatArray:
-        """Weights (n,) of the squares that stand for the loss near residuals (n, 2) [px]."""
-        loss, bend = LOSSES[self.options.loss], self.options.loss_scale
-        return loss_slopes(self.squares(residuals), loss, bend)[0]
-
-
 def keypoint_covariance(fitted: FittedKeypoints) -> FloatArray | None:
     """The covariance (9, 9) or (10, 10) by the posterior; None without a Fisher information.
 
-    Rotations about the axes of a symmetry count nothing.
+    Rotations about the axes of a symmetry count nothing. See `cadalign.Result.covariance`.
     """
     if fitted.fisher_covariance is None:
         return None
-    covariance = posterior_covariance(fitted)
+    if needs_facing([fitted.camera]):
+        kept = fitted.alignment.apply(fitted.points_3d[fitted.inliers])
+        camera = faced(fitted.camera, fitted.camera.project(kept))
+        turn = camera.lens_from_camera
+        own = replace(
+            fitted,
+            camera=camera,
+            alignment=turned_alignment(fitted.alignment, turn.T),
+            fisher_covariance=turned_covariance(fitted.fisher_covariance, turn.T),
+        )
+        covariance = turned_covariance(_posterior_covariance(own), turn)
+    else:
+        covariance = _posterior_covariance(fitted)
     if fitted.symmetry is None:
         return covariance
     from cadalign.estimation.symmetry import held_axes, without_free_turns
@@ -110,33 +84,23 @@ def keypoint_covariance(fitted: FittedKeypoints) -> FloatArray | None:
     return without_free_turns(covariance, best)
 
 
-def posterior_covariance(result: FittedKeypoints) -> FloatArray:
-    """Covariance of the errors by the posterior; see `cadalign.Result.covariance`."""
-    assert result.fisher_covariance is not None
-    if needs_facing([result.camera]):
-        kept = result.points_3d[result.inliers]
-        camera = faced(result.camera, result.camera.project(result.alignment.apply(kept)))
-        turn = camera.lens_from_camera
-        own = replace(
-            result,
-            camera=camera,
-            alignment=turned_alignment(result.alignment, turn.T),
-            fisher_covariance=turned_covariance(result.fisher_covariance, turn.T),
-        )
-        return turned_covariance(posterior_covariance(own), turn)
-    options = result.options
-    points = result.points_3d[result.inliers]
-    widening = 1.0
+def _posterior_covariance(fitted: FittedKeypoints) -> FloatArray:
+    options, points = fitted.options, fitted.points_3d[fitted.inliers]
+    widening, covariance = 1.0, cast(FloatArray, fitted.fisher_covariance)
     if options.sigma is None:
-        pairs = len({*map(bytes, np.hstack([points, result.residuals[result.inliers]]))})
+        pairs = len({*map(bytes, np.hstack([points, fitted.residuals[fitted.inliers]]))})
         redundancy = max(2 * pairs - options.unknowns, 1)
         widening = widening_of(options.unknowns, redundancy * _EFFICIENCY[options.loss])
-    sampled, first = None, _with_noise_times(widening, result.fisher_covariance, options)
+        # The noise is that of the keypoints, which leaves priors as they are.
+        excess = (widening - 1) * _prior_information(options, len(covariance))
+        more = np.eye(len(covariance)) + excess[:, None] * covariance
+        covariance = np.asarray(widening * np.linalg.solve(more.T, covariance))
     if len(points) <= MOST_POINTS:
         # Coordinates may come near the range of numbers.
         with suppress(np.linalg.LinAlgError, InputError):
-            sampled = _sample(result, first, Likelihood.of(result), widening)
-    return _within_prior(first if sampled is None else sampled, result)
+            sampled = _sample(fitted, covariance, widening)
+            covariance = covariance if sampled is None else sampled
+    return _within_prior(covariance, fitted)
 
 
 def _within_prior(covariance: FloatArray, result: FittedKeypoints) -> FloatArray:
@@ -166,8 +130,7 @@ def widening_of(unknowns: int, redundancy: float) -> float:
     return quantile / chi_square_quantile(unknowns, 1 - _COVERAGE)
 
 
-@dataclass(frozen=True, eq=False)
-class _Chart:
+class Chart(NamedTuple):
     """Coordinates (10,) about an alignment; see `cadalign.solvers.draws`."""
 
     centred: Centred
@@ -175,24 +138,36 @@ class _Chart:
     priors: LogPriors
 
     @classmethod
-    def of(cls, result: FittedKeypoints, likelihood: Likelihood, widening: float) -> _Chart:
-        """The chart of a result, at a noise of ``widening`` times its variance."""
-        camera, kept = result.camera, result.inliers
-        points, residuals = result.points_3d[kept], result.residuals[kept]
-        in_camera = result.alignment.apply(points)
+    def of(cls, fitted: FittedKeypoints, widening: float) -> Chart:
+        """The chart of a fit, at a noise of ``widening`` times its variance.
+
+        A loss counts by its weights at the residuals.
+        """
+        camera, options, alignment = fitted.camera, fitted.options, fitted.alignment
+        kept, points = fitted.inliers, fitted.points_3d[fitted.inliers]
+        residuals = fitted.residuals[kept]
+        in_camera = alignment.apply(points)
         rays = in_camera[:, :2] / in_camera[:, 2:]
         principal, focal = (camera.cx, camera.cy), np.array([[camera.fx], [camera.fy]])
         pixels = camera.pixels_from_normalized(rays) - principal
         slopes = focal * camera.distortion_jacobian(rays)
-        weights = likelihood.weights(residuals) / widening
-        information = weights[:, None, None] * likelihood.information
+        information = pixel_information(fitted.chosen_sigma, len(kept))[kept]
+        squares = np.einsum("ni,nij,nj->n", residuals, information, residuals)
+        weights, _ = loss_slopes(squares, LOSSES[options.loss], options.loss_scale)
+        information = (weights / widening)[:, None, None] * information
         whitening = whitening_matrices(whitening_by(information))
         fixed = pixels - (slopes @ rays[:, :, None])[:, :, 0]
         columns = np.stack([fixed, pixels - residuals], axis=2)
         fixed, seen = np.moveaxis(whitening @ columns, 2, 0)
         center = points.mean(axis=0)
         keypoints = WhitenedPixels(points - center, whitening @ slopes, fixed.copy(), seen.copy())
-        return cls(_centred(result.alignment, center), keypoints, _log_priors(result))
+        moved = alignment.rotation.ravel(), alignment.apply(center[None])[0], alignment.scale
+        centred = Centred(np.concatenate(moved), center, alignment.translation)
+        prior = options.focal_prior
+        of_focal = 0.0, 0.0
+        if isinstance(prior, FocalPrior):
+            of_focal = prior.relative_sigma**-2, math.log(prior.focal / camera.fx)
+        return cls(centred, keypoints, LogPriors(*options.scale_prior, *of_focal))
 
     def jacobian(self) -> FloatArray:
         """Derivatives (10, 10) of the coordinates by the unknowns of a covariance."""
@@ -213,21 +188,6 @@ class _Chart:
         return weigh_draws(self.centred, self.keypoints, self.priors, steps)
 
 
-def _centred(alignment: Alignment, center: FloatArray) -> Centred:
-    (in_camera,) = alignment.apply(center[None])
-    pose = np.concatenate([alignment.rotation.ravel(), in_camera, alignment.scale])
-    return Centred(pose, center, alignment.translation)
-
-
-def _log_priors(result: FittedKeypoints) -> LogPriors:
-    weight, width = result.options.scale_prior
-    prior = result.options.focal_prior
-    if not isinstance(prior, FocalPrior):
-        return LogPriors(weight, width, 0.0, 0.0)
-    mean = math.log(prior.focal / result.camera.fx)
-    return LogPriors(weight, width, prior.relative_sigma**-2, mean)
-
-
 def _prior_information(options: FitOptions, size: int) -> FloatArray:
     """Inverse variances (9,) or (10,) of the priors; 0 for none."""
     information = np.zeros(size)
@@ -237,40 +197,15 @@ def _prior_information(options: FitOptions, size: int) -> FloatArray:
     return information
 
 
-def _with_noise_times(widening: float, covariance: FloatArray, options: FitOptions) -> FloatArray:
-    """The covariance at a larger variance of the keypoints, which leaves priors as they are."""
-    priors = _prior_information(options, len(covariance))
-    if widening == 1.0 or not priors.any():
-        return covariance * widening
-    free = np.ix_(options.estimated_unknowns, options.estimated_unknowns)
-    prior = np.diag(priors)[free]
-    widened = np.zeros_like(covariance)
-    try:
-        of_keypoints = np.linalg.inv(covariance[free]) - prior
-        widened[free] = np.linalg.inv(of_keypoints / widening + prior)
-    except np.linalg.LinAlgError:
-        return covariance * widening
-    # Where the keypoints determine hardly anything, rounding is all that the difference leaves.
-    variances = widened[free].diagonal()
-    if not (variances > 0).all():
-        return covariance * widening
-    deviations = np.sqrt(variances)
-    asymmetry = np.abs(widened[free] - widened[free].T) / np.outer(deviations, deviations)
-    return widened if asymmetry.max() < _MOST_ASYMMETRY else covariance * widening
-
-
 @np.errstate(all="ignore")  # draws that overflow have no weight
-def _sample(
-    result: FittedKeypoints, first: FloatArray, likelihood: Likelihood, widening: float
-) -> FloatArray | None:
+def _sample(fitted: FittedKeypoints, first: FloatArray, widening: float) -> FloatArray | None:
     """A covariance (m, m) by draws from the posterior, or None where the proposals miss it.
 
     It is the inverse Fisher information, widened where the posterior is wider, and where the region
     that the likelihood ratio does not reject at 5 % reaches farther: that region covers the truth
     as often as stated with few keypoints too.
     """
-    chart = _Chart.of(result, likelihood, widening)
-    free = likelihood.options.estimated_unknowns
+    chart, free = Chart.of(fitted, widening), fitted.options.estimated_unknowns
     scales = np.flatnonzero((free >= 6) & (free < 9))
     # An order that does not follow the axes' names, of which the same draws tell the same then.
     free[scales] = free[scales][np.argsort(first.diagonal()[free[scales]], kind="stable")]
@@ -303,7 +238,7 @@ def _sample(
     limit = chi_square_quantile(len(free), 1 - _COVERAGE)
     likely = costs - at_estimate <= limit
     covariance, among = np.zeros_like(first), np.ix_(free, free)
-    prior = _prior_information(likelihood.options, size)[free]
+    prior = _prior_information(fitted.options, size)[free]
     moved = deviations[:, free]
     covariance[among] = _widened(first[among], prior, moved, weights, likely, limit)
     return covariance if np.isfinite(covariance).all() else None

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 import cadalign
 from cadalign import Alignment, Camera
 from cadalign.estimation.options import FitOptions
-from cadalign.estimation.uncertainty.posterior import FittedKeypoints, Likelihood, _Chart
+from cadalign.estimation.uncertainty.posterior import Chart, FittedKeypoints
 from cadalign.geometry.rotations import rotation_from_vector
 
 CAMERA = Camera(640, 480, 900.0, 880.0, 330.0, 250.0)
@@ -26,12 +26,12 @@ def fitted(camera: Camera, **options: object) -> cadalign.Result:
     return cadalign.fit(POINTS, pixels, camera, **{"sigma": 2.0, **options})  # type: ignore[arg-type]
 
 
-def chart_of(result: cadalign.Result, widening: float = 1.0) -> _Chart:
+def chart_of(result: cadalign.Result, widening: float = 1.0) -> Chart:
     alignment, camera, view = result.alignment, result.camera, result.views[0]
     options = result.options
     assert isinstance(options, FitOptions)
     keypoints = FittedKeypoints(POINTS, view.residuals, view.inliers, alignment, camera, options)
-    return _Chart.of(keypoints, Likelihood.of(keypoints), widening)
+    return Chart.of(keypoints, widening)
 
 
 def moved(result: cadalign.Result, deviation: np.ndarray) -> tuple[Alignment, Camera]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -151,7 +152,7 @@ def _run_results(folder: RunFolder, rows: Collection[int]) -> Iterator[_Stored]:
     """
     for where, row, seen, result in _records(folder):
         if result and (not rows or row in rows):
-            yield where, row, seen, Result.from_json(result)
+            yield where, row, seen, Result.from_dict(json.loads(result))
 
 
 def _records(folder: RunFolder) -> Iterator[tuple[Path, int, Observation, str]]:

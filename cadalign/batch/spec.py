@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -95,7 +96,7 @@ def _record(stored: Row, names: Row) -> Row:
     """The instance record of a stored result, or of the observation that has none."""
     reason, result = names.pop("reason"), None
     if stored["result"]:
-        result = Result.from_json(stored["result"])
+        result = Result.from_dict(json.loads(stored["result"]))
         view, bounds = result.views[0], result.bounds
         camera, pixels, places = view.camera, view.points_2d, result.points_3d
         row_of = {label: row for row, label in enumerate(result.ids)}

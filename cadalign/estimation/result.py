@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.errors import InputError
 from cadalign.estimation.result_data import ResultData
 from cadalign.io.files import as_path, write_json
 
@@ -164,26 +162,6 @@ class Result(ResultData):
         from cadalign.estimation.document import read_result
 
         return read_result(data, cls)
-
-    def to_json(self) -> str:
-        """The result as JSON text; see `to_dict`."""
-        return json.dumps(self.to_dict())
-
-    @classmethod
-    def from_json(cls, text: str) -> Result:
-        """Read what `to_json` wrote.
-
-        Raises
-        ------
-        InputError
-            If it is not JSON, or a field is missing or invalid.
-        """
-        try:
-            data = json.loads(text)
-        except (TypeError, ValueError, RecursionError) as error:
-            what = f"not valid JSON: {str(error)[:200]}"
-            raise InputError(what, where="result") from None
-        return cls.from_dict(data)
 
 
 def _text_of(result: ResultData) -> str:

@@ -57,7 +57,7 @@ def test_file_gives_the_same_alignment_as_the_page(
     state = place_all(case.open(), case)
     data = fitted(case, capsys)
     assert data["alignment"] == state["alignment"]["alignment"]
-    written = Result.from_json((case.folder / "photo_fit" / "fit.json").read_text())
+    written = Result.load(case.folder / "photo_fit" / "fit.json")
     assert written.alignment.to_dict() == state["alignment"]["alignment"]
     observation = Observation.load(case.observation)
     assert observation.ids is not None
@@ -139,9 +139,7 @@ def test_fit_file_waits_for_the_solvers(case: Case) -> None:
     assert file.read_bytes() == before
     unready.warm_up()
     state = page_state(unready, 0)
-    assert (
-        Result.from_json(file.read_text()).alignment.to_dict() == (state["alignment"]["alignment"])
-    )
+    assert Result.load(file).alignment.to_dict() == (state["alignment"]["alignment"])
     assert file.read_bytes() != before
 
 

@@ -160,7 +160,7 @@ def test_a_match_is_a_result(case: Case, tmp_path: Path) -> None:
     result = match.result
     assert (result.method, result.rms) == ("retrieve", pytest.approx(match.rms))
     np.testing.assert_array_equal(result.box.corners, match.box.corners)
-    again = Result.from_json(result.to_json())
+    again = Result.from_dict(result.to_dict())
     np.testing.assert_array_equal(again.alignment.packed, match.alignment.packed)
     paired = match.observation(seen)
     assert paired.model == match.mesh_path

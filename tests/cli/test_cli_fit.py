@@ -63,7 +63,7 @@ def test_prints_the_summary_and_writes_fit_and_overlay(
     assert captured.out == f"{expected}\n"
     out = tmp_path / "chair_fit"
     assert sorted(entry.name for entry in out.iterdir()) == ["fit.json", "overlay.png"]
-    written = Result.from_json((out / "fit.json").read_text())
+    written = Result.load(out / "fit.json")
     assert written.alignment == expected.alignment
     assert str(written) == str(expected)
     overlay = cv2.imread(str(out / "overlay.png"))
@@ -184,7 +184,7 @@ def test_a_rejected_keypoint_behind_the_camera_is_written_and_drawn(
     assert main(["fit", str(path), "--robust"]) == 0
     text = (tmp_path / "chair_fit" / "fit.json").read_text()
     json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
-    read = Result.from_json(text)
+    read = Result.from_dict(json.loads(text))
     assert read.inliers.tolist() == [False] + [True] * 10
     assert np.isposinf(read.residuals[0]).all()
     assert np.isfinite(read.residuals[1:]).all()

@@ -62,7 +62,7 @@ def observe(folder: Path, *options: str) -> int:
 
 def fitted(folder: Path, name: str, *options: str) -> Result:
     assert main(["fit", str(folder / f"{name}.json"), *options]) == 0
-    return Result.from_json((folder / f"{name}_fit" / "fit.json").read_text())
+    return Result.load(folder / f"{name}_fit" / "fit.json")
 
 
 def test_photo_and_detection_become_an_observation(

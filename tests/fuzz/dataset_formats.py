@@ -81,7 +81,7 @@ def _write_result(folder: Path) -> Path:
         View(CAMERA, _PIXELS + 0.5, sigma=1.0),
     ]
     result = align(Model(points_3d=POINTS), views, size=Size(width=1.0, sigma=0.1))
-    return write_text(folder / "fit.json", result.to_json())
+    return write_text(folder / "fit.json", json.dumps(result.to_dict()))
 
 
 _POLYGONS = [[1.0, 0.0, 30.0, 0.0, 30.0, 20.0, 1.0, 20.0], [40, 30, 50.5, 30, 45, 45]]
@@ -173,7 +173,7 @@ FORMATS = (
     Format(
         "result of views",
         _write_result,
-        lambda path: Result.from_json(path.read_text("utf-8", "replace")),
+        lambda path: Result.load(path),
     ),
     _mask("polygons", _POLYGONS, 64, 48),
     _mask("runs", _RUNS, 64, 48),

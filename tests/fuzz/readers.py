@@ -273,7 +273,7 @@ def _write_blind_pnp(folder: Path) -> Path:
 
 def _write_fit(folder: Path) -> Path:
     result = fit(POINTS, CAMERA.project(POSE.apply(POINTS)), CAMERA)
-    return _text("fit.json", result.to_json())(folder)
+    return _text("fit.json", json.dumps(result.to_dict()))(folder)
 
 
 def _write_library(folder: Path) -> Path:
@@ -307,7 +307,7 @@ def _read_colmap(path: Path) -> object:
 
 
 def _read_fit(path: Path) -> object:
-    return Result.from_json(path.read_text("utf-8", "replace"))
+    return Result.load(path)
 
 
 def _read_run(path: Path) -> object:

@@ -150,7 +150,7 @@ def test_the_command_fits_and_draws_an_observation_of_a_fisheye(tmp_path: Path) 
     Observation(CORNERS, pixels, FISHEYE).save(path)
     assert json.loads(path.read_text())["camera"]["model"] == "OPENCV_FISHEYE"
     assert main(["fit", str(path), "--out", str(tmp_path)]) == 0
-    found = Result.from_json((tmp_path / "fit.json").read_text())
+    found = Result.load(tmp_path / "fit.json")
     assert found.camera == FISHEYE
     np.testing.assert_allclose(found.alignment.translation, pose.translation, atol=0.3)
     assert (tmp_path / "overlay.png").is_file()

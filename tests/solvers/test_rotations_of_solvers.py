@@ -46,7 +46,7 @@ def test_start_far_from_a_rotation_does_not_reach_the_result() -> None:
     result = fit(0.25 * CORNERS, points_2d, CAMERA, stretch="none")
     assert departure(result.alignment.rotation) < 1e-9
     assert result.rms == pytest.approx(10.462, abs=1e-3)  # the best of all rotations
-    assert Result.from_json(result.to_json()).alignment == result.alignment
+    assert Result.from_dict(result.to_dict()).alignment == result.alignment
 
 
 @pytest.mark.slow

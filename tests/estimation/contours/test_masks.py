@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from functools import cache
 from itertools import cycle, islice
 from pathlib import Path
@@ -197,8 +198,8 @@ class TestOtherObjects:
         elsewhere = np.zeros_like(case.mask)
         elsewhere[:20, :20] = True
         unmet = align(case.model, case.view(mask=elsewhere))
-        read = Result.from_json(unmet.to_json())
-        assert "NaN" not in unmet.to_json()
+        read = Result.from_dict(unmet.to_dict())
+        assert "NaN" not in json.dumps(unmet.to_dict())
         assert [each.name for each in read.evidence] == ["views[0].points_2d", "views[0].mask"]
         assert np.isnan(read.evidence[1].rms)
 

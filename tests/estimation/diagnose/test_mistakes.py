@@ -141,7 +141,7 @@ def test_the_warning_tells_what_was_rejected_and_what_would_agree() -> None:
         "corrected, 12 of 12 keypoints agree; "
         f"as given, {rejected} ({100 * rejected / 12:.0f} %) are rejected"
     )
-    assert found.warnings == Result.from_json(found.to_json()).warnings
+    assert found.warnings == Result.from_dict(found.to_dict()).warnings
 
 
 def test_right_keypoints_raise_no_alarm() -> None:

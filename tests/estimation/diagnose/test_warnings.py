@@ -56,7 +56,7 @@ def test_a_warning_prints_as_its_text_and_is_stored_with_its_kind() -> None:
     assert repr(result.warnings) == repr((found.text,))
     written = {"kind": "outlier", "text": found.text, "view": 0, "keypoints": [3]}
     assert result.to_dict()["warnings"] == [written]
-    assert Result.from_json(result.to_json()).warnings == (found,)
+    assert Result.from_dict(result.to_dict()).warnings == (found,)
 
 
 def test_another_pose_is_named_where_the_deviations_conceal_it() -> None:

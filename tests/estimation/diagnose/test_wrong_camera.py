@@ -75,7 +75,7 @@ def test_few_right_keypoints_are_fitted_once(monkeypatch: pytest.MonkeyPatch) ->
 def test_named_camera_is_kept_in_json() -> None:
     found = map(_of_double_size, range(20))
     result = next(each for each in found if each.warnings[0].kind == "mistake")
-    assert Result.from_json(result.to_json()).warnings == result.warnings
+    assert Result.from_dict(result.to_dict()).warnings == result.warnings
 
 
 def _of_double_size(seed: int) -> Result:

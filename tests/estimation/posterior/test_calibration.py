@@ -136,7 +136,7 @@ def test_outlier_stands_in_the_file() -> None:
     result = fit(problem.points_3d, problem.points_2d, problem.camera, sigma=sigma)
     data = result.to_dict()
     assert data["warnings"][0]["keypoints"] == [4]
-    assert Result.from_json(result.to_json()).to_json() == result.to_json()
+    assert Result.from_dict(result.to_dict()).to_dict() == result.to_dict()
 
 
 def test_files_state_what_the_fit_stated() -> None:
@@ -144,7 +144,7 @@ def test_files_state_what_the_fit_stated() -> None:
     problem.points_2d[4] += 60
     fitted = fit(problem.points_3d, problem.points_2d, problem.camera)
     data = fitted.to_dict()
-    result = Result.from_json(json.dumps(data))
+    result = Result.from_dict(json.loads(json.dumps(data)))
     assert result.warnings == fitted.warnings
     assert result.std == fitted.std
     np.testing.assert_array_equal(result.covariance, fitted.covariance)

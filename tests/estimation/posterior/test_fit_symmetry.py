@@ -192,7 +192,7 @@ def test_with_outliers_and_an_unknown_focal_length():
 def test_results_keep_their_symmetry_in_json():
     symmetry = Symmetry.around(UP, fold=None, offset=OFFSET)
     result = fit(*observed(1.0, fold=None), CAMERA, stretch="y", symmetry=symmetry)
-    read = Result.from_json(result.to_json())
+    read = Result.from_dict(result.to_dict())
     assert str(read) == str(result)
 
 

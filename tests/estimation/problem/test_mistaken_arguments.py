@@ -74,10 +74,6 @@ GIVEN: list[tuple[Callable[..., Any], str]] = [
         "dimension: 'a' is not a positive number",
     ),
     (
-        lambda: Result.from_json(None),  # type: ignore[arg-type]
-        "result: not valid JSON: the JSON object must be str, bytes or bytearray, not NoneType",
-    ),
-    (
         lambda: ShapeModel.learn("chairs"),  # type: ignore[arg-type]
         "models[0]: expected a cadalign.Example, got str; "
         "`cadalign shape learn` takes the folder of a data set",

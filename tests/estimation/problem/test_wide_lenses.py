@@ -180,7 +180,7 @@ def test_align_exact_similar_and_learned_shapes(angle: float) -> None:
         square = errors @ np.linalg.solve(result.covariance[:6, :6], errors)
         assert square < 22.5  # 99.9 %
         assert result.rms < 2
-        again = Result.from_json(result.to_json())
+        again = Result.from_dict(result.to_dict())
         assert again.camera == FISHEYE
         np.testing.assert_allclose(again.alignment.packed, result.alignment.packed)
 

@@ -97,9 +97,9 @@ def test_text_of_a_result_without_statistics() -> None:
     ids=["made", "alternatives", "linear", "known axis", "unknown focal length"],
 )
 def test_json_brings_back_the_same_result(result: Result) -> None:
-    text = result.to_json()
-    again = Result.from_json(text)
-    assert again.to_json() == text
+    text = json.dumps(result.to_dict())
+    again = Result.from_dict(json.loads(text))
+    assert json.dumps(again.to_dict()) == text
     assert str(again) == str(result)
     assert again.alignment == result.alignment
     assert again.camera == result.camera
@@ -110,9 +110,9 @@ def test_json_brings_back_the_same_result(result: Result) -> None:
 
 def test_residuals_behind_the_camera_are_null_in_json() -> None:
     behind = made([[np.inf, np.inf], *NEAR], [False, *[True] * 5])
-    text = behind.to_json()
+    text = json.dumps(behind.to_dict())
     assert json.loads(text)["views"][0]["residuals"][0] is None
-    np.testing.assert_array_equal(Result.from_json(text).residuals, behind.residuals)
+    np.testing.assert_array_equal(Result.from_dict(json.loads(text)).residuals, behind.residuals)
 
 
 def changed(**changes: Any) -> str:
@@ -127,7 +127,6 @@ def with_view(**changes: Any) -> str:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("{", "result: not valid JSON: "),
         ("[]", "result: [] is not an object"),
         ("{}", "result: version: missing"),
         ('{"version": 1}', "result: method: missing"),
@@ -152,7 +151,7 @@ def with_view(**changes: Any) -> str:
 )
 def test_malformed_json_is_refused(text: str, expected: str) -> None:
     with pytest.raises(InputError) as caught:
-        Result.from_json(text)
+        Result.from_dict(json.loads(text))
     assert str(caught.value).startswith(expected)
 
 

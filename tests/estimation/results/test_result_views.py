@@ -164,7 +164,7 @@ def test_a_file_is_plotted_and_exported_by_itself(
     fitted: Result, aligned: Result, tmp_path: Path
 ) -> None:
     for number, result in enumerate((fitted, aligned)):
-        again = Result.from_json(result.to_json())
+        again = Result.from_dict(result.to_dict())
         again.plot(axes=Figure().add_subplot())
         path = again.export(tmp_path / f"{number}.glb", mesh=MESH)
         assert path.read_bytes() == result.export(tmp_path / "same.glb", mesh=MESH).read_bytes()

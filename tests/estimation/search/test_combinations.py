@@ -8,6 +8,7 @@ of the usual one, and a symmetry or scales that are held leave an exact model's 
 
 from __future__ import annotations
 
+import json
 from itertools import product
 from pathlib import Path
 
@@ -121,9 +122,9 @@ def assert_covers(
 
 def assert_told(result: Result) -> None:
     """The result is printed and stored, with its evidence."""
-    text = result.to_json()
-    again = Result.from_json(text)
-    assert again.to_json() == text
+    text = json.dumps(result.to_dict())
+    again = Result.from_dict(json.loads(text))
+    assert json.dumps(again.to_dict()) == text
     assert str(again) == str(result)
     assert repr(result).startswith("Result(")
     assert again.evidence == result.evidence

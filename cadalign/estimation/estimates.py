@@ -187,23 +187,32 @@ def with_boxes(
 
 
 class Estimate(NamedTuple):
-    """An estimate: points, the box's corners last, ``lengths`` of the box, covariances.
+    """An estimate: points (m, 3), the box's corners last, poses, and covariances.
 
-    Poses, covariances (9, 9) and cameras are those of every view that takes part, in the frames of
-    the cameras that were given; ``likelihood`` is relative to the best.
-    The optimum is the one of the least cost, which a shape without latent unknowns has.
+    Poses, covariances (9, 9) of pose and log lengths of the box, and cameras are those of every
+    view that takes part, in the frames of the cameras that were given; ``of_points`` (m, 3, 3) are
+    those of the points in the model's frame, and ``of_seen`` in the first camera's, where they
+    include the pose. ``likelihood`` is relative to the best. The optimum is the one of the least
+    cost, which a shape without latent unknowns has. ``misses`` are the largest squared distance of
+    a keypoint from what the others predict, and that of all from the mean shape, in standard
+    deviations; None where nothing predicts a keypoint.
     """
 
     points: FloatArray
     scale: FloatArray
     poses: tuple[Alignment, ...]
-    lengths: FloatArray
     covariances: tuple[FloatArray, ...]
     of_points: FloatArray
     of_seen: FloatArray
-    likelihood: float
-    cameras: tuple[Camera, ...]
+    likelihood: float = 1.0
+    cameras: tuple[Camera, ...] = ()
     is_optimum: bool = False
+    misses: tuple[float, float] | None = None
+
+    @property
+    def lengths(self) -> FloatArray:
+        """Lengths (3,) of the box."""
+        return np.asarray((self.points[-1] - self.points[-2]) * self.scale)
 
 
 def as_given(estimate: Estimate, problem: Problem) -> Estimate:
@@ -287,7 +296,6 @@ def _carried(estimate: Estimate, best: Equal) -> Estimate:
         points=points,
         scale=scale,
         poses=tuple(poses),
-        lengths=(points[-1] - points[-2]) * scale,
         covariances=tuple(covariances),
         of_points=turn.T @ estimate.of_points @ turn,
     )

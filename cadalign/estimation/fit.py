@@ -161,8 +161,12 @@ def fit_one(
     scores: npt.ArrayLike | None,
     symmetry: Symmetry | None,
     start: float,
+    **seen: Any,
 ) -> Result:
-    """Fit the only problem, which was begun at ``start`` [s]."""
+    """Fit the only problem, which was begun at ``start`` [s].
+
+    ``seen`` are the model and the view of `result_of_keypoints`.
+    """
     try:
         fitted = fit_once(problems, options, ransac, scores, start)
     except NoConsensusError as error:
@@ -173,7 +177,7 @@ def fit_one(
         error.fix = diagnose_refusal(case) or error.fix
         raise
     return result_of_keypoints(
-        problems.points_2d, fitted, diagnosis=diagnosis_of_fit, symmetry=symmetry
+        problems.points_2d, fitted, diagnosis=diagnosis_of_fit, symmetry=symmetry, **seen
     )
 
 

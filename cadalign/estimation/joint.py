@@ -70,7 +70,6 @@ def result_of(
     is_curved: bool,
     evidence: Sequence[EvidenceSummary] = (),
     redundancy: int,
-    misses: tuple[float, float] | None = None,
     notes: OutlineNotes = NO_NOTES,
     **of_result: Any,
 ) -> Result:
@@ -158,7 +157,7 @@ def result_of(
         evidence=(*summaries, *notes.evidence),
         degrees_of_freedom=prior.degrees_of_freedom,
         redundancy=redundancy,
-        misses=misses,
+        misses=best.misses,
     )
     of_views[0] = replace(of_views[0], posterior=posterior)
     has_length = prior.lengths > 0
@@ -292,7 +291,6 @@ def _estimate_at(minimum: Minimum, likelihood: float, problem: Problem) -> Estim
         stretched / scale,
         scale,
         tuple(poses[number] for number in problem.numbers),
-        stretched[-1] - stretched[-2],
         tuple(
             pose_and_lengths(
                 evidence, state, pose_and_border(found, int(evidence.rig.pose[number])), number

@@ -7,21 +7,22 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
-from cadalign.estimation.assemble import KeypointPosterior, result_of_keypoints
-from cadalign.estimation.estimates import Estimate, as_given, with_boxes
-from cadalign.estimation.fit import fit
+from cadalign.estimation.estimates import as_given, with_boxes
+from cadalign.estimation.fit import fit_one
 from cadalign.estimation.joint import common_sigma, result_of
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.pack import seen_keypoints
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.problem import Problem
+from cadalign.estimation.problems import pack_one
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
@@ -56,28 +57,13 @@ def align_plain(
     model: Model, view: View, *, options: FitOptions, ransac: RansacOptions | None
 ) -> Result:
     """The result of `fit`, with all keypoints of the model."""
-    prior = prior_of(model)
-    points = cast(FloatArray, model.points_3d)
-    rows = prior.rows_of(view.keypoint_ids, "views[0].ids")
-    shape = ("stretch", "stretch_sigma", "known_axis")
-    chosen = vars(options) | {name: getattr(model, name) for name in shape}
-    found = fit(
-        points[rows],
-        view.pixels,
-        view.camera,
-        **{**chosen, "sigma": view.sigma},
-        ransac=ransac,
-        scores=view.scores if ransac is not None else None,
-    )
-    posterior = cast(KeypointPosterior, found.posterior)
-    return result_of_keypoints(
-        view.pixels,
-        posterior.keypoints,
-        diagnosis=posterior.diagnosis,
-        symmetry=model.symmetry,
-        model=model,
-        view=view,
-    )
+    start, points = time.perf_counter(), cast(FloatArray, model.points_3d)
+    rows = prior_of(model).rows_of(view.keypoint_ids, "views[0].ids")
+    shape = {name: getattr(model, name) for name in ("stretch", "stretch_sigma", "known_axis")}
+    own = replace(options, sigma=view.sigma, **shape)
+    problems = pack_one(points[rows], view.pixels, view.camera)
+    scores = view.scores if ransac is not None else None
+    return fit_one(problems, own, ransac, scores, model.symmetry, start, model=model, view=view)
 
 
 def align_single(problem: Problem, start: float) -> Result:
@@ -107,25 +93,12 @@ def align_single(problem: Problem, start: float) -> Result:
     likelihoods = likelihoods[likelihoods >= LEAST_LIKELIHOOD]
     inflation = inflation_with(len(rows), model.inflation, model.few_keypoints)
     placed, chosen = with_boxes(mixture, seen, minima, len(likelihoods), model)
-    posteriors = [
-        single_posterior(placed, component, seen, state, inflation)
-        for component, state in zip(
-            chosen.label[: len(likelihoods)].tolist(), chosen.states, strict=False
-        )
-    ]
+    kept = zip(likelihoods.tolist(), chosen.label.tolist(), chosen.states, strict=False)
     estimates = [
-        Estimate(
-            each.points,
-            np.ones(3),
-            (each.pose,),
-            each.lengths,
-            (each.covariance,),
-            each.of_points,
-            each.of_seen,
-            likelihood,
-            (view.camera,),
+        single_posterior(placed, component, seen, state, inflation)._replace(
+            likelihood=likelihood, cameras=(view.camera,)
         )
-        for each, likelihood in zip(posteriors, likelihoods.tolist(), strict=True)
+        for likelihood, component, state in kept
     ]
     component, cost = int(minima.label[0]), float(minima.costs[0])
 
@@ -135,7 +108,6 @@ def align_single(problem: Problem, start: float) -> Result:
         inliers=[np.ones(len(rows), dtype=bool)],
         is_curved=bool(covariances.any()),
         redundancy=2 * len(rows) - POSE_UNKNOWNS,
-        misses=posteriors[0].misses,
         cost=cost,
         stats=stats,
         component=component,

@@ -161,7 +161,7 @@ def test_the_posterior_is_the_inverse_information_of_pose_and_shape() -> None:
     state = state_at(pose, 7)
     refine(Posed(target_of(mixture_at(mixture, seen), 0), seen, False), 100, state)
     found = single_posterior(mixture, 0, seen, state, 1.0)
-    _, _, _, covariance, of_points, of_seen, _ = found
+    (covariance,), of_points, of_seen = found.covariances, found.of_points, found.of_seen
     points = shape_at(mixture, 0, seen, state)
     assert found.points[:KEYPOINTS] == pytest.approx(points[:KEYPOINTS])
     size = mixture.means[0].size

@@ -19,7 +19,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
-from cadalign.estimation.estimates import widened_boxes
+from cadalign.estimation.estimates import Estimate, widened_boxes
 from cadalign.estimation.options import LOSSES
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.problems import rays_of, whitening_of
@@ -179,29 +179,10 @@ def _block_diagonal(blocks: FloatArray) -> FloatArray:
     return rows.reshape(2 * count, 3 * count)
 
 
-class SinglePosterior(NamedTuple):
-    """Pose, points (m, 3) and the box's ``lengths`` (3,) of an estimate, and covariances.
-
-    ``covariance`` (9, 9) is that of the pose and the log lengths of the box, whose corners are the
-    last two points; ``of_points`` (m, 3, 3) are those of the points in the model's frame, and
-    ``of_seen`` (m, 3, 3) in the camera's, where they include the pose. ``misses`` are the largest
-    squared distance of a keypoint from what the others predict, and that of all from the mean
-    shape, in standard deviations; None where nothing predicts a keypoint.
-    """
-
-    pose: Alignment
-    points: FloatArray
-    lengths: FloatArray
-    covariance: FloatArray
-    of_points: FloatArray
-    of_seen: FloatArray
-    misses: tuple[float, float] | None
-
-
 def single_posterior(
     mixture: Mixture, component: int, seen: Seen, state: FloatArray, inflation: float
-) -> SinglePosterior:
-    """The posterior at a state (D,) of a component.
+) -> Estimate:
+    """The estimate at a state (D,) of a component, with its posterior.
 
     The deviations of the prior are widened by the ``inflation``. The box holds the keypoints that
     are seen. Covariances are infinite where the pose is not determined.
@@ -210,8 +191,7 @@ def single_posterior(
     rotation = state[:9].reshape(3, 3)
     pose = Alignment(rotation, state[9:12], np.ones(3), is_valid=True)
     points = shape_at(mixture, component, seen, state)
-    boxed = widened_boxes(points, seen.points)
-    lengths = boxed[-1] - boxed[-2]
+    boxed, still = widened_boxes(points, seen.points), np.ones(3)
     errors, by_pose = whitened_errors(points[seen.points], pose, seen.rays, seen.whitening)
     weights, _ = loss_slopes((errors**2).sum(axis=-1), seen.loss, seen.loss_scale)
     by_pose *= np.sqrt(weights)[:, None, None]
@@ -227,9 +207,7 @@ def single_posterior(
         root = np.linalg.inv(np.linalg.cholesky(weight @ jacobian))
     except np.linalg.LinAlgError:
         unknown = np.full((m, 3, 3), np.inf)
-        return SinglePosterior(
-            pose, boxed, lengths, np.full((9, 9), np.inf), unknown, unknown, None
-        )
+        return Estimate(boxed, still, (pose,), (np.full((9, 9), np.inf),), unknown, unknown)
     of_pose, solved = root.T @ root, across @ inverse
     by_steps = (-solved @ jacobian).reshape(m + 1, 3, _POSE)
     left = np.einsum("iaib->iab", prior.reshape(m + 1, 3, m + 1, 3))
@@ -247,7 +225,7 @@ def single_posterior(
     covariance[_POSE:, _POSE:] += relative[:, None] * relative * left[m]
     moved = (points - mixture.means[component])[seen.points].ravel()
     misses = _misses(errors.ravel() - rows @ moved, inverse - weight.T @ of_pose @ weight)
-    return SinglePosterior(pose, boxed, lengths, covariance, whole[:m], of_seen, misses)
+    return Estimate(boxed, still, (pose,), (covariance,), whole[:m], of_seen, misses=misses)
 
 
 def _misses(errors: FloatArray, weight: FloatArray) -> tuple[float, float] | None:

@@ -34,11 +34,10 @@ from cadalign.render import (
     RaycastRenderer,
     Scene,
     draw_overlay,
-    draw_still,
     pose_in_view,
     visible_keypoints,
 )
-from cadalign.render.drawing.canvas import ByteImage, composite
+from cadalign.render.drawing.canvas import ByteImage
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -149,8 +148,8 @@ def observe(seen: AnnotatedModel, model: AnnotatedModel, photo: Path) -> Observa
 def still(scene: Scene) -> ByteImage:
     """A picture of a chair, (h, w, 3) uint8."""
     pose = pose_in_view(scene, CHAIR_CAMERA, CHAIR_VIEW)
-    color = draw_still(RaycastRenderer(), scene, CHAIR_CAMERA, pose, samples=16)
-    return composite(color, PHOTO_GROUND)
+    frame = RaycastRenderer().render(scene, CHAIR_CAMERA, pose, samples=16)
+    return frame.composite(PHOTO_GROUND)
 
 
 def with_wireframe(image: ByteImage, model: ClickableModel, alignment: Alignment) -> ByteImage:

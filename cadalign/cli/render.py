@@ -31,8 +31,6 @@ class Render:
     degrees (write --view=-30,20 if it begins with a minus), or all."""
     size: str = "640x480"
     """Image size WIDTHxHEIGHT in pixels; of a contact sheet, each picture's."""
-    style: Literal["color", "depth", "normals", "faces", "lines"] = "color"
-    """Quantity to draw."""
     keypoints: Path | None = None
     """JSON file with keypoints to draw: a list of [x, y, z], a model's .keypoints.json, or
     KeypointNet's annotations."""

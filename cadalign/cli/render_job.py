@@ -14,12 +14,11 @@ from cadalign.geometry.camera import Camera
 from cadalign.io.documents import read_json
 from cadalign.io.images import JPEG_ENDING
 from cadalign.io.meshes.files import load_mesh
-from cadalign.render.drawing.canvas import ByteImage, composite
+from cadalign.render.drawing.canvas import ByteImage
 from cadalign.render.drawing.pictures import (
     VIEWS,
     Angles,
     contact_sheet,
-    draw_still,
     keypoint_picture,
     pose_in_view,
 )
@@ -63,17 +62,15 @@ class RenderJob:
             raise InputError("no view is given", where="--view", fix="give one or more")
         path = command.keypoints
         mesh = load_mesh(command.model)
-        # Depth, normals, triangles and lines are cast in any case.
-        renderer = make_renderer(command.renderer if command.style == "color" else "raycast")
+        renderer = make_renderer(command.renderer)
         keypoints = None if path is None else read_keypoints(path, command.model)
         return cls(command, Scene(mesh), renderer, views, camera, keypoints)
 
     def _draw(self, view: Angles) -> ByteImage:
         """One picture, (h, w, 3) uint8."""
-        style, samples, camera = self.command.style, self.command.samples, self.camera
+        samples, camera = self.command.samples, self.camera
         pose = pose_in_view(self.scene, camera, view, scale=self.command.scale)
-        color = draw_still(self.renderer, self.scene, camera, pose, style=style, samples=samples)
-        image = composite(color, LIGHT_GREY)
+        image = self.renderer.render(self.scene, camera, pose, samples=samples).composite()
         if self.keypoints is None:
             return image
         visible = visible_keypoints(self.scene, self.keypoints, camera, pose)

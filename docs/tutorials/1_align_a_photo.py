@@ -27,11 +27,9 @@ from cadalign.render import (
     Angles,
     RaycastRenderer,
     Scene,
-    draw_still,
     pose_in_view,
     visible_keypoints,
 )
-from cadalign.render.drawing.canvas import composite
 
 folder = Path(tempfile.mkdtemp())
 chairs = KeypointNet(write_sample_dataset(folder, categories=("chair",)))
@@ -41,9 +39,8 @@ model = chairs["chair", "sample_chair_000"]
 camera = cadalign.Camera.from_fov(640, 720, fov_x=33.0)
 scene = Scene(seen.load_mesh())
 true_pose = pose_in_view(scene, camera, Angles(azimuth=143.0, elevation=24.0))
-photo = composite(
-    draw_still(RaycastRenderer(), scene, camera, true_pose, samples=4), (206, 208, 212)
-)
+frame = RaycastRenderer().render(scene, camera, true_pose, samples=4)
+photo = frame.composite((206, 208, 212))
 
 # %%
 # Keypoints on both

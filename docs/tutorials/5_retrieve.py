@@ -22,11 +22,9 @@ from cadalign.render import (
     Angles,
     RaycastRenderer,
     Scene,
-    draw_still,
     pose_in_view,
     visible_keypoints,
 )
-from cadalign.render.drawing.canvas import composite
 
 root = write_sample_dataset(Path(tempfile.mkdtemp()), per_category=20, categories=("chair", "car"))
 dataset = KeypointNet(root)
@@ -68,8 +66,8 @@ for match in matches[:3]:
     shown.append((f"score {match.score:.2f}", found, match.alignment))
 figure, axes = plt.subplots(1, 4, figsize=(12, 2.8), layout="constrained")
 for ax, (title, drawn, pose) in zip(axes, shown, strict=True):
-    still = draw_still(RaycastRenderer(), drawn, camera, pose, samples=4)
-    ax.imshow(composite(still, (206, 208, 212)))
+    still = RaycastRenderer().render(drawn, camera, pose, samples=4)
+    ax.imshow(still.composite((206, 208, 212)))
     ax.set_title(title)
     ax.set_axis_off()
 

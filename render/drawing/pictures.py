@@ -1,23 +1,20 @@
-"""Pictures of one model: depth, normals, faces, keypoints, lines; stills and contact sheets."""
+"""Pictures of one model: its outline and edges, keypoints, views and contact sheets."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
 from cadalign.arrays import as_points
-from cadalign.errors import InputError, unknown
+from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.conventions import OPENGL_AXES
 from cadalign.render.drawing.canvas import ByteImage, Canvas
-from cadalign.render.raycast.renderer import cast_geometry
-from cadalign.render.scene import Geometry, Renderer, Scene
+from cadalign.render.scene import Geometry, Scene
 from cadalign.render.viewpoints import frame_object, look_at, seen_in_image
 
 VIEWS: dict[str, tuple[float, float]] = {
@@ -33,79 +30,12 @@ VIEWS: dict[str, tuple[float, float]] = {
 
 _SEEN_COLOR = (255, 222, 40)
 _HIDDEN_COLOR = (150, 160, 175)
-_LINE_COLOR = (30, 34, 40)
 # Neighbouring pixels whose normals differ by more than this [degrees] lie on both sides of an edge.
 _EDGE_ANGLE = 25.0
 # And those whose depths differ by more than this share of what the slope explains.
 _DEPTH_STEP = 0.02
 _TEXT_COLOR = (70, 76, 84)
 _FILL = 0.88  # of the image, by a still's model
-
-
-def depth_picture(geometry: Geometry) -> ByteImage:
-    """Depth as colour: yellow is near, violet far, within what is seen; transparent elsewhere.
-
-    Returns
-    -------
-    (h, w, 4) uint8
-
-    Examples
-    --------
-    >>> one = np.ones((1, 1))
-    >>> flat = Geometry(one, np.zeros((1, 1), np.int32), np.zeros((1, 1, 3), np.float32))
-    >>> depth_picture(flat).shape
-    (1, 1, 4)
-    """
-    depth = geometry.depth
-    share = np.zeros(depth.shape)
-    if geometry.mask.any():
-        near, far = depth[geometry.mask].min(), depth[geometry.mask].max()
-        share = (far - depth) / (far - near if far > near else 1.0)
-    levels = (np.clip(share, 0, 1) * 255 + 0.5).astype(np.uint8)
-    colored = np.asarray(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS), dtype=np.uint8)
-    return _with_mask(colored[:, :, ::-1].reshape(*depth.shape, 3), geometry)
-
-
-def normal_picture(geometry: Geometry) -> ByteImage:
-    """Normals as colour: red to the right, green upwards, blue towards the camera.
-
-    Returns
-    -------
-    (h, w, 4) uint8
-    """
-    turned = geometry.normal * OPENGL_AXES.astype(np.float32)
-    return _with_mask((127.5 * (turned + 1) + 0.5).astype(np.uint8), geometry)
-
-
-def face_picture(geometry: Geometry) -> ByteImage:
-    """Each triangle in a colour of its own, the same in every view.
-
-    Returns
-    -------
-    (h, w, 4) uint8
-    """
-    # Multiplying by a large odd number spreads neighbouring numbers (Knuth, TAOCP 6.4).
-    mixed = (geometry.face_id.astype(np.int64) + 1) * 2654435761 % (1 << 32)
-    channels = [(mixed >> shift) % 192 + 48 for shift in (0, 9, 18)]
-    return _with_mask(np.stack(channels, axis=2).astype(np.uint8), geometry)
-
-
-def line_picture(geometry: Geometry) -> ByteImage:
-    """Outlines and edges of what is seen, dark on nothing, one pixel wide.
-
-    Drawn from what each pixel sees, so hidden lines are hidden, and meshes whose triangles share
-    no vertices show their edges as well.
-
-    Returns
-    -------
-    (h, w, 4) uint8
-        The lines' opacity is 0 or 255: draw at twice the size and shrink to smooth them.
-    """
-    lines = feature_lines(geometry)
-    result: ByteImage = np.zeros((*lines.shape, 4), dtype=np.uint8)
-    result[:, :, :3] = _LINE_COLOR
-    result[:, :, 3] = 255 * lines
-    return result
 
 
 def feature_lines(geometry: Geometry) -> npt.NDArray[np.bool_]:
@@ -177,14 +107,6 @@ def keypoint_picture(
     return canvas.finished()
 
 
-def _with_mask(rgb: npt.NDArray[np.uint8], geometry: Geometry) -> ByteImage:
-    opaque = np.full((*rgb.shape[:2], 1), 255, dtype=np.uint8)
-    return np.concatenate([rgb, opaque], axis=2) * geometry.mask[:, :, None]
-
-
-_PICTURES = {"depth": depth_picture, "normals": normal_picture, "faces": face_picture}
-
-
 @dataclass(frozen=True)
 class Angles:
     """Viewing angles of a model [degrees]; see `look_at`."""
@@ -236,33 +158,6 @@ def pose_in_view(
     return frame_object(scene.bounds, camera, rotation=rotation, fill=_FILL, scale=scale)
 
 
-def draw_still(
-    renderer: Renderer,
-    scene: Scene,
-    camera: Camera,
-    cam_from_model: Alignment,
-    *,
-    style: str = "color",
-    samples: int = 8,
-) -> ByteImage:
-    """Draw a model in one of the styles; (h, w, 4) uint8, transparent where it is not.
-
-    Raises
-    ------
-    InputError
-        If there is no such style.
-    RenderError
-        If the image is too large.
-    """
-    if style == "color":
-        return renderer.render(scene, camera, cam_from_model, samples=samples).color
-    if style == "lines":
-        return _smooth_lines(scene, camera, cam_from_model)
-    if style not in _PICTURES:
-        raise unknown("style", style, ["color", *_PICTURES, "lines"])
-    return _PICTURES[style](cast_geometry(scene, camera, cam_from_model))
-
-
 def contact_sheet(
     images: Sequence[ByteImage],
     labels: Sequence[str],
@@ -309,12 +204,3 @@ def contact_sheet(
         middle = (left + width / 2, top + height + line / 2)
         pen.text(middle, label, fill=_TEXT_COLOR, font=font, anchor="mm")
     return np.array(sheet)
-
-
-def _smooth_lines(scene: Scene, camera: Camera, cam_from_model: Alignment) -> ByteImage:
-    doubled = camera.resized(2 * camera.width, 2 * camera.height)
-    lines = line_picture(cast_geometry(scene, doubled, cam_from_model))
-    # Two pixels wide there is one pixel wide here.
-    lines[:, :, 3] = cv2.dilate(lines[:, :, 3], np.ones((2, 2), np.uint8))
-    size = (camera.width, camera.height)
-    return np.asarray(cv2.resize(lines, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)

@@ -85,7 +85,7 @@ def test_the_stretch_shows(model, tmp_path):
     extents = []
     for scale in ((1, 1, 1), (1, 0.5, 1)):
         out = tmp_path / "s.png"
-        _run(model, "--out", out, "--view", "front", "--style", "faces", "--scale", *scale)
+        _run(model, "--out", out, "--view", "front", "--scale", *scale)
         rows, columns = np.nonzero((_pixels(out) != (228, 230, 233)).any(axis=2))
         extents.append(np.ptp(rows) / np.ptp(columns))
     assert extents[0] / extents[1] == pytest.approx(2, abs=0.1)

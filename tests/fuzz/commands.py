@@ -25,7 +25,7 @@ _COMMANDS: dict[str, list[str]] = {
             "--shape", "--shape-sigma", "--no-stretch-prior"],
     "observe": ["--image", "--model", "--out", "--object", "--min-score", "--sigma"],
     "retrieve": ["--library", "--out", "--top", "--category", "--json", "--loss"],
-    "render": ["--out", "--width", "--height", "--view", "--style", "--keypoints"],
+    "render": ["--out", "--width", "--height", "--view", "--keypoints"],
     "report": ["--out", "--format", "--assets"],
     "library": ["build", "show", "--out", "--categories"],
     "evaluate": ["keypointnet", "show", "correspondences", "retrieval", "unseen", "--methods",

@@ -134,9 +134,8 @@ def _write_depth(folder: Path) -> Path:
 
 
 def _write_scene(folder: Path) -> Path:
-    """A scene with a texture, a strip, sparse positions and copies of a mesh."""
-    more = np.array([2], "<u2").tobytes() + b"\0\0" + np.array([[5, 6, 7]], "<f4").tobytes()
-    more += np.array([[0, 0], [1, 0], [1, 1], [0, 1]], "<f4").tobytes()
+    """A scene with a texture, a strip and copies of a mesh."""
+    more = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], "<f4").tobytes()
     write_picture("png")(folder)
     attributes = {"POSITION": 0, "TEXCOORD_0": 2}
     primitive = {"attributes": attributes, "indices": 1, "material": 0, "mode": 5}
@@ -152,16 +151,12 @@ def _write_scene(folder: Path) -> Path:
         bufferViews=[
             {"buffer": 0, "byteLength": 48},
             {"buffer": 0, "byteOffset": 48, "byteLength": 12},
-            {"buffer": 0, "byteOffset": 60, "byteLength": 2},
-            {"buffer": 0, "byteOffset": 64, "byteLength": 12},
-            {"buffer": 0, "byteOffset": 76, "byteLength": 32, "byteStride": 8},
+            {"buffer": 0, "byteOffset": 60, "byteLength": 32, "byteStride": 8},
         ],
         accessors=[
-            {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3", "sparse": {
-                "count": 1, "indices": {"bufferView": 2, "componentType": 5123},
-                "values": {"bufferView": 3}}},
+            {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"},
             {"bufferView": 1, "componentType": 5123, "count": 6, "type": "SCALAR"},
-            {"bufferView": 4, "componentType": 5126, "count": 4, "type": "VEC2"},
+            {"bufferView": 2, "componentType": 5126, "count": 4, "type": "VEC2"},
         ],
     )  # fmt: skip
 

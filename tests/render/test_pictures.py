@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 import trimesh
 
-from cadalign import Alignment, Camera, Mesh
+from cadalign import Camera, Mesh
 from cadalign.errors import InputError
 from cadalign.render import (
     Angles,
     Scene,
     cast_geometry,
     contact_sheet,
-    depth_picture,
-    draw_still,
-    face_picture,
     feature_lines,
     keypoint_picture,
-    line_picture,
     look_at,
-    make_renderer,
-    normal_picture,
     pose_in_view,
 )
 
@@ -39,42 +32,6 @@ def geometry():
     return cast_geometry(_box(), CAMERA, look_at(azimuth=35, elevation=25, distance=3))
 
 
-def test_depth_picture_is_yellow_where_near_and_violet_where_far(geometry):
-    picture = depth_picture(geometry)
-    near = np.unravel_index(np.where(geometry.mask, geometry.depth, 9).argmin(), (120, 160))
-    far = np.unravel_index(geometry.depth.argmax(), (120, 160))
-    assert picture[near][:2].min() > 200
-    assert picture[near][2] < 60
-    assert picture[far][2] > picture[far][1]
-    np.testing.assert_array_equal(picture[:, :, 3] == 255, geometry.mask)
-
-
-def test_depth_of_a_flat_or_an_empty_frame_is_drawn():
-    square = Scene(Mesh([[-1, -1, 0], [1, -1, 0], [1, 1, 0]], [[0, 1, 2]]))
-    for z in (4, -4):
-        pose = Alignment(np.eye(3), [0, 0, z], [1, 1, 1])
-        picture = depth_picture(cast_geometry(square, CAMERA, pose))
-        assert picture[:, :, 3].any() == (z > 0)
-
-
-def test_normal_picture_is_green_upwards_and_red_to_the_right(geometry):
-    picture = normal_picture(geometry)
-    top = geometry.normal[:, :, 1] < -0.8
-    assert (picture[top][:, 1] > 230).all()
-    right = geometry.normal[:, :, 0] > 0.7
-    assert (picture[right][:, 0] > 210).all()
-    assert (picture[geometry.mask][:, 2] >= 127).all()
-
-
-def test_face_picture_has_a_colour_for_each_triangle(geometry):
-    picture = face_picture(geometry)
-    faces = np.unique(geometry.face_id[geometry.mask])
-    colors = {tuple(picture[geometry.face_id == face][0]) for face in faces}
-    assert len(colors) == len(faces)
-    for face in faces:
-        assert (np.ptp(picture[geometry.face_id == face], axis=0) == 0).all()
-
-
 def test_lines_follow_outline_and_edges_but_not_diagonals(geometry):
     lines = feature_lines(geometry)
     rounded = geometry.normal.round(3).reshape(-1, 3)
@@ -87,7 +44,6 @@ def test_lines_follow_outline_and_edges_but_not_diagonals(geometry):
         rolled = np.roll(side, shift, (0, 1)), np.roll(geometry.mask, shift, (0, 1))
         border |= (rolled[0] != side) | (rolled[1] != geometry.mask)
     assert not lines[~border].any()
-    assert (line_picture(geometry)[:, :, 3] > 0).sum() == lines.sum()
 
 
 def test_a_step_in_depth_is_a_line_and_a_grazing_floor_has_none():
@@ -126,21 +82,7 @@ def test_keypoints_are_ringed_where_they_are(geometry):
         keypoint_picture(image, CAMERA, points, pose, visible=[True])
 
 
-@pytest.mark.parametrize("style", ["color", "depth", "normals", "faces", "lines"])
-def test_every_style_draws_the_model_where_it_is(style):
-    scene = _box()
-    pose = pose_in_view(scene, CAMERA, Angles.parse("iso"))
-    picture = draw_still(make_renderer("raycast"), scene, CAMERA, pose, style=style)
-    assert picture.shape == (120, 160, 4)
-    mask = cast_geometry(scene, CAMERA, pose).mask
-    wide = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8))
-    assert (picture[:, :, 3] > 0).any()
-    assert not picture[:, :, 3][wide == 0].any()
-
-
-def test_unknown_styles_and_views_are_refused():
-    with pytest.raises(InputError, match="known are color, depth"):
-        draw_still(make_renderer("raycast"), _box(), CAMERA, Alignment.identity(), style="oil")
+def test_unknown_views_are_refused():
     for text in ("sideways", "1", "1,2,3,4", "nan,0", ""):
         with pytest.raises(InputError, match="is not a view"):
             Angles.parse(text)

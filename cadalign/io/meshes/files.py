@@ -91,6 +91,7 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
     try:
         with np.errstate(all="ignore"):  # what is not finite, Mesh refuses
             mesh = reader(path)
+            has_area = np.linalg.norm(face_normals(mesh.triangles), axis=1).any()
     except CadalignError as error:
         where = str(path) if error.where is None else error.where
         if str(path) not in where:
@@ -100,7 +101,7 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
         reason = f"{type(error).__name__}: {brief(error)}"
         kind = path.suffix[1:].upper()
         raise damaged(f"cannot be read as a {kind} file ({reason})", path) from None
-    if not np.linalg.norm(face_normals(mesh.triangles), axis=1).any():
+    if not has_area:
         raise DataError("no face of the mesh has an area", where=str(path))
     return mesh
 

@@ -81,7 +81,7 @@ def open_correspondences(path: str | os.PathLike[str], *, format: str = AUTO) ->
     Examples
     --------
     >>> open_correspondences("reconstruction")  # doctest: +SKIP
-    Colmap('reconstruction/images.txt', 4 images)
+    Colmap('reconstruction/images.txt'): 4 images
     """
     if format not in CORRESPONDENCE_FORMATS:
         fix = f"known are {', '.join(CORRESPONDENCE_FORMATS)}"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-from abc import ABC, abstractmethod
 from codecs import BOM_UTF8
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, MutableMapping
@@ -13,21 +11,17 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
-import numpy as np
 from msgspec import Raw
 
 from cadalign.datasets.photos.photo import Photo, PhotoObject
+from cadalign.datasets.records import RecordSet
 from cadalign.errors import CadalignError, DataError, brief
 from cadalign.io.documents import convert, in_file
 from cadalign.io.files import damaged, read_bytes
 
-logger = logging.getLogger("cadalign")
-
 T = TypeVar("T")
 K = TypeVar("K", bound=Hashable)
 _Record = TypeVar("_Record")
-# Warnings of one data set that are logged; `problems` has all.
-_LOGGED = 20
 
 
 @dataclass(frozen=True)
@@ -60,22 +54,10 @@ class PhotoSummary:
     """Why records or objects could not be read."""
 
 
-class PhotoDataset(ABC):
-    """A data set of photos.
+class PhotoDataset(RecordSet[Photo]):
+    """A data set of photos; see `cadalign.datasets.records.RecordSet`.
 
-    Photos are read one at a time when they are asked for. ``len`` counts the records listed;
-    iterating gives the readable ones, with a warning (logger "cadalign") for each of the others,
-    and for objects that could not be read in a photo. `problems` holds the reasons met so far, by
-    name. Asking for one photo by its number or name raises the reason.
-
-    Parameters
-    ----------
-    root : Path
-        The folder.
-    names : iterable of str
-        The photos' names.
-    problems : dict of str to DataError, optional
-        Why parts of the annotations could not be listed; the first is raised where nothing could.
+    Objects that could not be read in a photo are among the `problems`, too.
 
     Examples
     --------
@@ -84,65 +66,16 @@ class PhotoDataset(ABC):
     ...         print(photo.name, found.category, found.truth.cam_from_model)
     """
 
-    kind: str = "photos"
-    """Name of the format."""
-    signature: str = ""
-    """What it is recognised by, for messages."""
-    marks: tuple[str, ...] = ()
-    """Patterns of files or folders of which a folder of this format has one."""
+    kind = "photos"
+    noun = "photo"
     patterns: tuple[str, ...] = ("*.json",)
     """Patterns of the annotations' files, below the folder."""
 
-    def __init__(
-        self, root: Path, names: Iterable[str], problems: dict[str, DataError] | None = None
-    ) -> None:
-        self.root = root
-        self.names = tuple(names)
-        """The photos' names, in the annotations' order."""
-        self.problems = problems or {}
-        """Why records or objects could not be read, of those read so far, by name."""
-        if self.problems and not self.names:
-            raise next(iter(self.problems.values()))
-
-    @classmethod
-    def is_here(cls, folder: Path) -> bool:
-        """True for a folder that holds this format."""
-        return any(next(folder.glob(pattern), None) is not None for pattern in cls.marks)
-
-    @abstractmethod
-    def read(self, index: int) -> Photo:
-        """Read the photo of a number from 0; raises `DataError` if its record is bad."""
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def __getitem__(self, key: int | str) -> Photo:
-        """The photo of a number or name.
-
-        Raises DataError if its record is bad or no photo has this name, IndexError if the number is
-        out of range.
-        """
-        if isinstance(key, str):
-            if key not in self.names:
-                raise DataError(f"no photo {key!r}", where=str(self.root))
-            key = self.names.index(key)
-        if not -len(self) <= key < len(self):
-            raise IndexError(f"{len(self)} photos, asked for number {key}")
-        return self._read(key % len(self))
-
     def __iter__(self) -> Iterator[Photo]:
-        for index, name in enumerate(self.names):
-            try:
-                photo = self._read(index)
-            except DataError as error:
-                self._tell(name, error)
-                continue
+        for photo in super().__iter__():
             for number, problem in enumerate(photo.problems):
-                self._tell(f"{name}, problem {number + 1}", problem)
+                self._tell(f"{photo.name}, problem {number + 1}", problem)
             yield photo
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({str(self.root)!r}): {len(self)} photos"
 
     def annotation_files(self) -> list[Path]:
         """List the files of the annotations, by which a run knows those that it began with."""
@@ -180,23 +113,6 @@ class PhotoDataset(ABC):
             **{f"with_{name}": count for name, count in having.items()},
             problems=tuple(str(problem) for problem in self.problems.values()),
         )
-
-    def _read(self, index: int) -> Photo:
-        try:
-            with np.errstate(all="ignore"):  # what is not finite in the end is refused by name
-                return self.read(index)
-        except DataError:
-            raise
-        except CadalignError as error:  # a value that a camera or a pose refuses
-            where = f"{self.root}, {self.names[index]}"
-            where += f": {error.where}" if error.where else ""
-            raise DataError(error.what, where=where, fix=error.fix) from None
-
-    def _tell(self, name: str, error: DataError) -> None:
-        if name not in self.problems and len(self.problems) <= _LOGGED:
-            more = " (further problems are counted only)" if len(self.problems) == _LOGGED else ""
-            logger.warning("%s: left out: %s%s", self.kind, error, more)
-        self.problems[name] = error
 
 
 @contextmanager

@@ -35,7 +35,7 @@ _REQUIRED, _OPTIONAL = ("matches", "R", "t"), ("inlier_matches", "focal")
 
 
 class BlindPnP(CorrespondenceSet):
-    """Samples of one split, such as ``nyu_train`` or ``megaDepth_valid``; ids are "0", "1", ...
+    """Samples of one split, such as ``nyu_train`` or ``megaDepth_valid``, named "0", "1", ...
 
     A split is a folder of pickles, each pickle a list with an entry per sample, those in brackets
     optional::
@@ -49,8 +49,7 @@ class BlindPnP(CorrespondenceSet):
     Image points are stored with the calibration taken out. They are given in the pixels of a
     virtual camera of the sample's focal length, whose image is just large enough for them.
 
-    The true pose's file is read at once, the others when the first sample is asked for. None can
-    run code; see `cadalign.datasets.sfm.unpickling`.
+    No pickle can run code; see `cadalign.datasets.sfm.unpickling`.
 
     Parameters
     ----------
@@ -74,7 +73,8 @@ class BlindPnP(CorrespondenceSet):
     >>> samples[0].cam_from_world.translation  # doctest: +SKIP
     """
 
-    layouts = (tuple(f"{name}.pkl" for name in _REQUIRED),)
+    kind = "blind PnP"
+    marks = tuple(f"{name}.pkl" for name in _REQUIRED)
     signature = "matches.pkl, R.pkl and t.pkl"
 
     def __init__(self, path: str | os.PathLike[str], *, focal: float | None = None) -> None:
@@ -84,24 +84,20 @@ class BlindPnP(CorrespondenceSet):
         folder = as_path(path)
         fix = "give a split's folder, which holds matches.pkl, R.pkl and t.pkl"
         nothing = "there are no correspondences"
-        required = find_layout(folder, self.layouts, nothing=nothing, fix=fix)
+        required = find_layout(folder, [self.marks], nothing=nothing, fix=fix)
         optional = (folder / f"{name}.pkl" for name in _OPTIONAL)
-        self._files = {file.stem: file for file in (*required, *filter(Path.is_file, optional))}
-        # The smallest file is enough to count the samples.
-        self._data: dict[str, Any] = {"t": _load_samples(self._files["t"])}
-        super().__init__(folder, [str(position) for position in range(len(self._data["t"]))])
+        files = [*required, *filter(Path.is_file, optional)]
+        self._data = {file.stem: _load_samples(file) for file in files}
+        count = len(self._data["t"])
+        for file in files:
+            if len(self._data[file.stem]) != count:
+                what = f"holds {len(self._data[file.stem])} samples, t.pkl {count}"
+                fix = "the files must be of one split; get them again"
+                raise DataError(what, where=str(file), fix=fix)
+        super().__init__(folder, [str(position) for position in range(count)])
 
-    def _prepare(self) -> None:
-        for name, file in self._files.items():
-            if name not in self._data:
-                samples = _load_samples(file)
-                if len(samples) != len(self):
-                    what = f"holds {len(samples)} samples, t.pkl {len(self)}"
-                    fix = "the files must be of one split; get them again"
-                    raise DataError(what, where=str(file), fix=fix)
-                self._data[name] = samples
-
-    def _read(self, position: int) -> Correspondences:
+    def read(self, position: int) -> Correspondences:
+        """Read the sample of a number from 0."""
         rotation = self._array("R", position, shape=(3, 3))
         pose = rigid_pose(rotation, self._flat("t", position))
         rays, points_3d = self._matched(position)
@@ -117,7 +113,7 @@ class BlindPnP(CorrespondenceSet):
             )
         camera = _virtual_camera(self._focal_lengths(position), rays)
         pixels = camera.pixels_from_normalized(rays)
-        return Correspondences(self.ids[position], points_3d, pixels, camera, pose)
+        return Correspondences(self.names[position], points_3d, pixels, camera, pose)
 
     def _matched(self, position: int) -> tuple[FloatArray, FloatArray]:
         """Image points (n, 2) and scene points (n, 3) that belong together."""

@@ -31,6 +31,11 @@ from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.io.documents import in_file
 from cadalign.io.files import as_path, damaged, read_bytes, read_text
 
+_LAYOUTS = tuple(
+    tuple(f"{folder}/{stem}{suffix}" for stem in ("cameras", "images", "points3D"))
+    for folder in (".", "sparse/0", "sparse", "0")
+    for suffix in (".bin", ".txt")  # COLMAP itself prefers the binary files
+)
 _INVALID_POINT = -1  # of an observation that belongs to no point
 _MOST_BYTES = 2**37  # of one file: models of cities have billions of observations
 
@@ -74,24 +79,21 @@ class Colmap(CorrespondenceSet):
     Examples
     --------
     >>> images = Colmap("reconstruction")  # doctest: +SKIP
-    >>> images.ids  # doctest: +SKIP
+    >>> images.names  # doctest: +SKIP
     ('00.jpg', '01.jpg')
     >>> seen = images["00.jpg"]  # doctest: +SKIP
     >>> float(np.median(np.linalg.norm(seen.residuals(), axis=1)))  # doctest: +SKIP
     0.25
     """
 
-    layouts = tuple(
-        tuple(f"{folder}/{stem}{suffix}" for stem in ("cameras", "images", "points3D"))
-        for folder in (".", "sparse/0", "sparse", "0")
-        for suffix in (".bin", ".txt")  # COLMAP itself prefers the binary files
-    )
+    kind = "COLMAP"
+    marks = tuple(name for layout in _LAYOUTS for name in layout)
     signature = "cameras, images and points3D (.bin or .txt; also in sparse/0, sparse or 0)"
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         fix = "give the folder of cameras, images and points3D, all three as .bin or as .txt"
         nothing = "there is no COLMAP model"
-        files = find_layout(as_path(path), self.layouts, nothing=nothing, fix=fix)
+        files = find_layout(as_path(path), _LAYOUTS, nothing=nothing, fix=fix)
         self._camera_file, image_file, self._point_file = files
         is_text = image_file.suffix == ".txt"
         read_cameras, read_points, read_images = _TEXT_READERS if is_text else _BINARY_READERS
@@ -105,7 +107,8 @@ class Colmap(CorrespondenceSet):
             raise DataError(f"point {twice[0]} occurs twice", where=str(self._point_file))
         super().__init__(image_file, [name for name, _ in self._images])
 
-    def _read(self, position: int) -> Correspondences:
+    def read(self, position: int) -> Correspondences:
+        """Read the image of a number from 0."""
         name, read_view = self._images[position]
         view = read_view()
         rows = view.point_ids != _INVALID_POINT
@@ -136,7 +139,7 @@ class Colmap(CorrespondenceSet):
             return Camera.from_dict(self._cameras[camera_id])
 
     def _of_another_model(self, what: str, file: Path, name: str) -> DataError:
-        where = f"{self.source}, image {brief(name)}"
+        where = f"{self.root}, {brief(name)}"
         return DataError(what, where=where, fix=f"does {file.name} belong to the same model?")
 
 

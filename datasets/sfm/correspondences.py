@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import logging
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import overload
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_only
+from cadalign.datasets.records import RecordSet
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-
-logger = logging.getLogger("cadalign")
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,112 +106,22 @@ class Correspondences:
         )
 
 
-class CorrespondenceSet(ABC):
+class CorrespondenceSet(RecordSet[Correspondences]):
     """The images of a file, each with its correspondences, read one by one.
 
-    ``images["00.jpg"]`` and ``images[0]`` give one image's `Correspondences`, ``images[:3]`` a
-    tuple, ``len(images)`` counts all images, and ``images.ids`` names them in order.
-
-    An image that the file describes wrongly does not stop the others: asking for it raises a
-    `DataError`, iterating leaves it out with a warning (logger "cadalign"), and `problems` holds
-    the reasons.
-
-    Parameters
-    ----------
-    source : Path
-        The file that describes the images, for messages.
-    ids : sequence of str
-        The images' names, each once.
+    ``images["00.jpg"]`` and ``images[0]`` give one image's `Correspondences`, and ``images.names``
+    names them in order; see `cadalign.datasets.records.RecordSet`. Raises DataError if a name
+    occurs twice.
     """
 
-    layouts: tuple[tuple[str, ...], ...] = ()
-    """The files below a folder that belong together, in each of the places where they may lie."""
-    signature: str = ""
-    """These files, for messages."""
+    noun = "image"
 
-    def __init__(self, source: Path, ids: Sequence[str]) -> None:
-        self.source = source
-        self.ids = tuple(ids)
-        self._positions = {name: position for position, name in enumerate(self.ids)}
-        self._warned: set[str] = set()
-        if len(self._positions) < len(self.ids):
-            twice = next(name for i, name in enumerate(self.ids) if self._positions[name] != i)
-            what = f"the image {twice!r} occurs twice"
-            raise DataError(what, where=str(source), fix="remove one of them")
-
-    @classmethod
-    def is_here(cls, folder: Path) -> bool:
-        """True for a folder that holds files of this format."""
-        return any((folder / name).is_file() for layout in cls.layouts for name in layout)
-
-    @abstractmethod
-    def _read(self, position: int) -> Correspondences:
-        """Read one image; an `InputError` or `DataError` from here concerns that image alone."""
-
-    def _prepare(self) -> None:  # noqa: B027 (most sets have nothing to prepare)
-        """Read what all images share; an error from here concerns the whole file."""
-
-    @property
-    def problems(self) -> dict[str, DataError]:
-        """Errors of the images that could not be read, by id; reads them all."""
-        self._prepare()
-        problems = {}
-        for position, name in enumerate(self.ids):
-            try:
-                self._read_checked(position)
-            except DataError as error:
-                problems[name] = error.with_traceback(None)
-        return problems
-
-    @overload
-    def __getitem__(self, key: int | str) -> Correspondences: ...
-    @overload
-    def __getitem__(self, key: slice) -> tuple[Correspondences, ...]: ...
-    def __getitem__(self, key: int | str | slice) -> Correspondences | tuple[Correspondences, ...]:
-        """One image by position or id, or a slice of them.
-
-        Raises InputError if there is no such image, DataError if the file describes it wrongly.
-        """
-        if isinstance(key, slice):
-            return tuple(self[position] for position in range(*key.indices(len(self))))
-        position = key if not isinstance(key, str) else self._positions.get(key, key)
-        if isinstance(position, str):
-            known = ", ".join(self.ids[:5]) + (", ..." if len(self) > 5 else "")
-            where, fix = str(self.source), f"known are {known}"
-            raise InputError(f"no image {key!r}", where=where, fix=fix)
-        if not isinstance(key, str | int | np.integer) or not -len(self) <= position < len(self):
-            what, fix = f"no image {key!r} among {len(self)}", "give a position from 0, or an id"
-            raise InputError(what, where=str(self.source), fix=fix)
-        self._prepare()
-        return self._read_checked(int(position) % len(self))
-
-    def __iter__(self) -> Iterator[Correspondences]:
-        self._prepare()
-        for position, name in enumerate(self.ids):
-            try:
-                image = self._read_checked(position)
-            except DataError as error:
-                if name not in self._warned:
-                    self._warned.add(name)
-                    logger.warning("left out: %s", error)
-                continue
-            yield image
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({str(self.source)!r}, {len(self)} images)"
-
-    def _read_checked(self, position: int) -> Correspondences:
-        try:
-            # Numbers that overflow are refused by what they are given to.
-            with np.errstate(over="ignore", invalid="ignore"):
-                return self._read(position)
-        except InputError as error:
-            where = f"{self.source}, image {self.ids[position][:200]}"
-            where += "" if error.where is None else f", {error.where}"
-            raise DataError(error.what, where=where, fix=error.fix) from None
+    def __init__(self, root: Path, names: Sequence[str]) -> None:
+        super().__init__(root, names)
+        twice = [name for name, count in Counter(self.names).items() if count > 1]
+        if twice:
+            what = f"the image {twice[0]!r} occurs twice"
+            raise DataError(what, where=str(root), fix="remove one of them")
 
 
 def find_layout(

@@ -86,7 +86,7 @@ class Samples:
 def test_matches_arrive(tmp_path, dtype):
     samples = Samples(dtype)
     loaded = BlindPnP(samples.write(tmp_path / "nyu_train"))
-    assert loaded.ids == ("0", "1", "2", "3")
+    assert loaded.names == ("0", "1", "2", "3")
     for i, sample in enumerate(loaded):
         assert sample.id == str(i)
         np.testing.assert_array_equal(sample.points_3d, samples.p3d[i])
@@ -161,16 +161,6 @@ def test_the_virtual_image_just_holds_the_points(tmp_path):
 # --- bad input
 
 
-def test_points_are_read_when_a_sample_is_asked_for(tmp_path):
-    folder = Samples().write(tmp_path)
-    (folder / "matches.pkl").write_bytes(b"no pickle")
-    loaded = BlindPnP(folder)
-    assert len(loaded) == SAMPLES
-    for access in (lambda: loaded[0], lambda: list(loaded), lambda: loaded.problems):
-        with pytest.raises(DataError, match=r"matches.pkl: not a whole pickle"):
-            access()
-
-
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
@@ -199,7 +189,7 @@ def test_a_bad_sample_is_named_and_spoils_no_other(tmp_path, name, value, messag
     assert list(loaded.problems) == ["1"]
     with pytest.raises(DataError, match=message) as caught:
         loaded[1]
-    assert caught.value.where.startswith(f"{tmp_path}, image 1")
+    assert caught.value.where.startswith(f"{tmp_path}, 1: ")
 
 
 def test_shuffled_points_are_refused(tmp_path):
@@ -212,9 +202,9 @@ def test_shuffled_points_are_refused(tmp_path):
 
 def test_files_of_different_length_are_refused(tmp_path):
     samples = Samples()
-    loaded = BlindPnP(samples.write(tmp_path, samples.matches() | {"R": samples.R[:3]}))
+    folder = samples.write(tmp_path, samples.matches() | {"R": samples.R[:3]})
     with pytest.raises(DataError, match=r"R.pkl: holds 3 samples, t.pkl 4"):
-        loaded[0]
+        BlindPnP(folder)
 
 
 def test_missing_files_are_named(tmp_path):
@@ -298,7 +288,7 @@ def test_a_pickle_that_would_run_a_command_is_refused_and_does_not(tmp_path, pro
     trap = pickle.dumps([Call(os.system, f"touch '{proof}'")] * SAMPLES, protocol=protocol)
     (folder / "matches.pkl").write_bytes(trap)
     with pytest.raises(DataError) as caught:
-        BlindPnP(folder)[0]
+        BlindPnP(folder)
     assert not proof.exists()
     assert "the pickle asks for posix.system, which is refused" in str(caught.value)
     assert caught.value.where == str(folder / "matches.pkl")

@@ -121,7 +121,7 @@ class TestFormats:
 
     @pytest.mark.parametrize("format", ["auto", "colmap"])
     def test_a_format_can_be_named(self, colmap, format):
-        assert open_correspondences(colmap, format=format).ids == ("0.jpg", "1.jpg")
+        assert open_correspondences(colmap, format=format).names == ("0.jpg", "1.jpg")
 
     def test_an_empty_folder_is_refused_and_says_what_was_sought(self, tmp_path):
         with pytest.raises(DataError, match=r"known format.*points3D.*matches\.pkl"):

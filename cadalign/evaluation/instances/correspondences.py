@@ -53,16 +53,18 @@ class CorrespondenceTasks(Tasks[CorrespondenceTask]):
     def __init__(self, images: CorrespondenceSet, options: CorrespondenceOptions) -> None:
         self._outliers = options.outliers
         self._draws = options.draws
-        self._ids = images.ids[: options.max_images]
+        self._ids = images.names[: options.max_images]
         if not self._ids:
-            raise DataError("there are no images", where=str(images.source))
-        problems = images.problems
-        self._problems = {name: problems[name] for name in self._ids if name in problems}
+            raise DataError("there are no images", where=str(images.root))
+        for _ in images:  # finds what cannot be read
+            pass
+        found = images.problems
+        self._problems = {name: found[name] for name in self._ids if name in found}
         if len(self._problems) == len(self._ids):
             first = self._problems[self._ids[0]]
             raise DataError(
                 f"none of {len(self._ids)} images can be read; the first: {first}",
-                where=str(images.source),
+                where=str(images.root),
             )
         self._read = lru_cache(maxsize=2)(images.__getitem__)
 

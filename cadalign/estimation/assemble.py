@@ -2,33 +2,22 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, cast
 
-import numpy as np
-
 from cadalign.arrays import FloatArray
-from cadalign.estimation.options import FitOptions
-from cadalign.estimation.problems import Problems, Solutions
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import (
-    Alternative,
     Diagnosis,
     EvidenceSummary,
-    FitStats,
     FittedKeypoints,
     Posterior,
     ViewResult,
     keypoint_summary,
     quickly,
 )
-from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.warning import Warnings
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 
 if TYPE_CHECKING:
@@ -62,41 +51,6 @@ class KeypointPosterior(Posterior):
     def evidence(self) -> tuple[EvidenceSummary, ...]:
         own = self.keypoints
         return (keypoint_summary(0, own.residuals, own.inliers, own.chosen_sigma),)
-
-
-def keypoints_of_solution(
-    problems: Problems, solutions: Solutions, options: FitOptions, seconds: float
-) -> FittedKeypoints:
-    """The fitted keypoints of the only problem, which has a solution."""
-    minima, iterations, hypotheses, _ = solutions.info[0].tolist()
-    points = problems.points_3d.copy()  # the caller may go on to change theirs
-    sigma = solutions.sigma
-    if options.method == "optimal" and isinstance(options.sigma, int | float):
-        sigma = float(options.sigma)
-    inliers = np.empty(len(points), dtype=bool)
-    inliers.fill(True)
-    fitted = {
-        "points_3d": points,
-        "residuals": solutions.residuals,
-        "inliers": inliers,
-        "alignment": Alignment.from_packed(solutions.poses[0, 0]),
-        "camera": problems.cameras[0],
-        "options": options,
-        "sigma": sigma,
-        "method": options.method,
-    }
-    if solutions.covariances is not None:
-        covariance, rows = np.zeros((9, 9)), options.solver_rows
-        covariance[rows[:, None], rows] = solutions.covariances[0]
-        fitted["fisher_covariance"] = covariance
-        fitted["cost"] = solutions.costs.item(0)
-    if minima > 1:
-        poses = [Alignment.from_packed(pose) for pose in solutions.poses[0, :minima]]
-        cameras, costs = problems.cameras * minima, solutions.costs[0, :minima].tolist()
-        fitted["alternatives"] = alternatives_of(points, poses, cameras, costs, options)
-    effort = {"iterations": iterations, "hypotheses": hypotheses, "seconds": seconds}
-    fitted["stats"] = quickly(FitStats, effort)
-    return quickly(FittedKeypoints, fitted)
 
 
 def result_of_keypoints(
@@ -159,27 +113,6 @@ def result_of_keypoints(
         "own_bounds": bounds,
     }
     return quickly(Result, of_result)
-
-
-def alternatives_of(
-    points: FloatArray,
-    poses: Sequence[Alignment],
-    cameras: Sequence[Camera],
-    costs: Sequence[float],
-    options: FitOptions,
-) -> tuple[Alternative, ...]:
-    """The minima beside the first, of points (n, 3), that are likely enough."""
-    if options.sigma is None:  # the likelihood at the sigma that is best for each minimum
-        # Costs are in units of sigma^2; below 1 they are those of exact fits.
-        least = max(costs[0], 1.0)
-        ratios = [(least / max(cost, least)) ** len(points) for cost in costs]
-    else:
-        ratios = [math.exp(min(0.0, costs[0] - cost) / 2) for cost in costs]
-    return tuple(
-        Alternative(pose, ratio, camera, points)
-        for pose, ratio, camera in list(zip(poses, ratios, cameras, strict=True))[1:]
-        if ratio >= LEAST_LIKELIHOOD and np.isfinite(pose.packed).all()
-    )
 
 
 def _canonical(

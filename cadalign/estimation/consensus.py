@@ -11,11 +11,10 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats
 from cadalign.errors import CadalignError, DegenerateError, InputError, NoConsensusError
-from cadalign.estimation.assemble import keypoints_of_solution
 from cadalign.estimation.options import MINIMAL_SOLVERS, FitOptions, RansacOptions
 from cadalign.estimation.problems import Problems, rays_of, whitening_of
 from cadalign.estimation.result_parts import FitStats, FittedKeypoints
-from cadalign.estimation.solve import solve_one
+from cadalign.estimation.solve import fit_keypoints
 from cadalign.estimation.uncertainty.residuals import (
     SOLUTIONS_OF_FOUR,
     Support,
@@ -135,6 +134,12 @@ def fit_robustly(
 def _fit_to_inliers(search: RobustSearch, start: float) -> FittedKeypoints:
     """Fit the keypoints within the threshold of the best hypothesis, until these don't change."""
     options, ransac, problems = search.options, search.ransac, search.problems
+    if options.focal == "estimate":
+        # Only here: most cameras are calibrated, and its kernels take time to import.
+        from cadalign.estimation.joint_keypoints import fit_jointly
+
+        found = fit_jointly(problems, options, ransac, search.scores, start)
+        return replace(found, search=search)
     alignment, inliers, iterations, hypotheses, score = _best_hypothesis(search)
     residuals = search.residuals_of(alignment)
     share = 1.0  # of alignments by chance that are stretched as little
@@ -176,7 +181,7 @@ def _refined(search: RobustSearch, inliers: BoolArray) -> FittedKeypoints:
         some = Problems(points[inliers], pixels[inliers], offsets, problems.cameras)
         if sigma is not None and np.ndim(sigma) > 0:
             options = replace(options, sigma=np.asarray(sigma, dtype=np.float64)[inliers])
-        optimum = keypoints_of_solution(some, solve_one(some, options), options, 0.0)
+        optimum = fit_keypoints(some, options, 0.0)
         residuals = search.residuals_of(optimum.alignment)
         kept = np.linalg.norm(residuals, axis=1) < search.threshold
         if (kept == inliers).all() or kept.sum() < inliers.sum() or last == _INLIER_ROUNDS:

@@ -11,13 +11,13 @@ import numpy.typing as npt
 
 from cadalign.arrays import copied
 from cadalign.errors import InputError, NoConsensusError, require_kind
-from cadalign.estimation.assemble import keypoints_of_solution, result_of_keypoints
+from cadalign.estimation.assemble import result_of_keypoints
 from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.estimation.problems import Problems, pack_one
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FittedKeypoints
-from cadalign.estimation.solve import solve_one
+from cadalign.estimation.solve import fit_keypoints
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
@@ -197,15 +197,8 @@ def fit_once(
 ) -> FittedKeypoints:
     """Fit the only problem, without a diagnosis of keypoints that no alignment explains."""
     options = options.for_camera(problems.camera(0))
-    if options.focal == "estimate":
-        # Only here: most cameras are calibrated, and its kernels take time to import.
-        from cadalign.estimation.joint_keypoints import fit_jointly
-
-        return fit_jointly(problems, options, ransac, scores, start)
     if ransac is None:
-        solutions = solve_one(problems, options)
-        seconds = time.perf_counter() - start
-        return keypoints_of_solution(problems, solutions, options, seconds)
+        return fit_keypoints(problems, options, start)
     # Only here: most programs never search for outliers, and its kernels take time to import.
     from cadalign.estimation.consensus import fit_robustly
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, copied
 from cadalign.errors import CadalignError
-from cadalign.estimation.assemble import keypoints_of_solution, result_of_keypoints
+from cadalign.estimation.assemble import result_of_keypoints
 from cadalign.estimation.fit import check_search, diagnosis_of_fit, fit_one
 from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma, pixel_information
@@ -26,7 +26,7 @@ from cadalign.estimation.problems import (
 )
 from cadalign.estimation.result import Result
 from cadalign.estimation.results import COLUMNS, Entry, Results
-from cadalign.estimation.solve import are_solved_at_once, solve
+from cadalign.estimation.solve import are_solved_at_once, keypoints_of_solution, solve
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.solvers.constants import POSE_SIZE

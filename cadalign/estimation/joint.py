@@ -31,6 +31,7 @@ from cadalign.estimation.prior import is_exact, widened
 from cadalign.estimation.problem import Problem
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import (
+    LEAST_LIKELIHOOD,
     NO_NOTES,
     Alternative,
     EvidenceSummary,
@@ -41,7 +42,6 @@ from cadalign.estimation.result_parts import (
     keypoint_summary,
 )
 from cadalign.estimation.search import Minimum
-from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.symmetry import (
     SAME_SQUARES,
     stretched_axes,

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.errors import DegenerateError
-from cadalign.estimation.assemble import alternatives_of
-from cadalign.estimation.consensus import RobustSearch
 from cadalign.estimation.estimates import pose_and_lengths, poses_of
 from cadalign.estimation.joint import common_sigma
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.problem import compile_problem
 from cadalign.estimation.problems import Problems, no_alignment_error, too_few_error
-from cadalign.estimation.result_parts import FitStats, FittedKeypoints
+from cadalign.estimation.result_parts import FitStats, FittedKeypoints, alternatives_of
 from cadalign.estimation.search import search
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import describe_plane
@@ -31,7 +28,7 @@ def fit_jointly(
     scores: npt.ArrayLike | None,
     start: float,
 ) -> FittedKeypoints:
-    """Fit the only problem, which was begun at ``start`` [s].
+    """Fit the only problem, with ``ransac`` its inliers, which was begun at ``start`` [s].
 
     Raises DegenerateError if there is no minimum, or the keypoints leave the best one open;
     NoConsensusError as `search`.
@@ -67,7 +64,7 @@ def fit_jointly(
         )
     residuals = cameras[0].project_where_ahead(poses[0].apply(points)) - pixels
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
-    fitted = FittedKeypoints(
+    return FittedKeypoints(
         points,
         residuals,
         best.inliers,
@@ -77,13 +74,7 @@ def fit_jointly(
         sigma=problem.noise if problem.lacks_sigma else common_sigma([view]),
         fisher_covariance=covariance,
         cost=best.cost,
-        alternatives=alternatives_of(points, poses, cameras, costs, options),
+        alternatives=alternatives_of(points, poses, cameras, costs),
+        method="optimal" if ransac is None else "ransac-optimal",
         stats=stats,
-    )
-    if ransac is None:
-        return fitted
-    return replace(
-        fitted,
-        method="ransac-optimal",
-        search=RobustSearch(problems, options, ransac, scores),
     )

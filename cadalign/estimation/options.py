@@ -174,15 +174,6 @@ class FitOptions(AlignmentOptions):
         return ScalePrior(self.prior_weight, 0.0)
 
     @property
-    def estimates_in_rounds(self) -> bool:
-        """True if sigma is estimated and the optimum depends on it."""
-        return (
-            self.method == "optimal"
-            and self.sigma is None
-            and (self.loss != "linear" or self.prior_weight > 0 or self.focal == "estimate")
-        )
-
-    @property
     def unknowns(self) -> int:
         """The number of unknowns that are estimated."""
         return 6 + len(self.stretched_axes) + (self.focal == "estimate")

@@ -206,8 +206,7 @@ class Solutions(NamedTuple):
     ``poses`` (B, k, 15) are packed, ``costs`` (B, k) their whitened squared errors, infinite where
     there is none; ``covariances`` (B, 8, 8), without the known scale, and ``residuals`` (n, 2) [px]
     are those of the best. ``info`` (B, 4) counts minima, iterations and hypotheses, and names an
-    undetermined unknown or -1. ``errors`` are those of the problems without a solution; ``sigma``
-    [px] is there where it was estimated, of the only problem.
+    undetermined unknown or -1. ``errors`` are those of the problems without a solution.
     """
 
     poses: FloatArray
@@ -217,7 +216,6 @@ class Solutions(NamedTuple):
     info: IntArray
     residuals: FloatArray = _NO_RESIDUALS
     errors: Mapping[int, CadalignError] = _NO_ERRORS
-    sigma: float | None = None
 
 
 def solver_error(

@@ -6,6 +6,7 @@ logarithms of the lengths along x, y, z, and, where it was estimated, of the foc
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, TypeVar
@@ -22,6 +23,8 @@ from cadalign.geometry.symmetry import Symmetry
 
 T = TypeVar("T")
 
+LEAST_LIKELIHOOD = 1e-3
+"""Relative likelihood above which another minimum is reported as an alternative."""
 _ROUNDING = 1e-12  # relative standard deviation below which a length is known
 _FIELDS = {
     "keypoints": "points_2d",
@@ -60,6 +63,21 @@ class Alternative:
     def bounds(self) -> FloatArray:
         """Its box (2, 3) in the model's frame."""
         return extent(self.points_3d) if self.own_bounds is None else self.own_bounds
+
+
+def alternatives_of(
+    points: FloatArray,
+    poses: Sequence[Alignment],
+    cameras: Sequence[Camera],
+    costs: Sequence[float],
+) -> tuple[Alternative, ...]:
+    """The minima beside the first, of points (n, 3), that are likely enough."""
+    ratios = [math.exp(min(0.0, costs[0] - cost) / 2) for cost in costs]
+    return tuple(
+        Alternative(pose, ratio, camera, points)
+        for pose, ratio, camera in list(zip(poses, ratios, cameras, strict=True))[1:]
+        if ratio >= LEAST_LIKELIHOOD and np.isfinite(pose.packed).all()
+    )
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,7 @@ from cadalign.estimation.prior import prior_of
 from cadalign.estimation.problem import Problem
 from cadalign.estimation.problems import pack_one
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import FitStats
-from cadalign.estimation.solve import LEAST_LIKELIHOOD
+from cadalign.estimation.result_parts import LEAST_LIKELIHOOD, FitStats
 from cadalign.estimation.uncertainty.shape_posterior import single_posterior
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment

@@ -1,8 +1,12 @@
-"""The fast lane: packed keypoints of one calibrated camera straight into the solvers' kernels."""
+"""The fast lane: packed keypoints of one calibrated camera straight into the solvers' kernels.
+
+The noise is the one that is given, or that the residuals tell.
+"""
 
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import replace
 from typing import cast
 
@@ -18,36 +22,33 @@ from cadalign.estimation.problems import (
     solver_error,
     whitening_of,
 )
+from cadalign.estimation.result_parts import FitStats, FittedKeypoints, alternatives_of, quickly
+from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, faced, turned_covariance, turned_poses
 from cadalign.solvers.constants import OK, OUT_OF_RANGE
 from cadalign.solvers.linear import aepnp_batch
 from cadalign.solvers.optimal import optimal_batch, rigid_flag
 from cadalign.solvers.projection import reproject_batch
 
-_NOISE_ROUNDS = 20
-_NOISE_TOLERANCE = 1e-3
+_ROUNDS = 20
+_TOLERANCE = 1e-3
 # No keypoint is known better, over the keypoints' spread in the image: keeps a perfect fit from
 # claiming to be certain of everything.
 _LEAST_SIGMA = 1e-6
 _HIGHEST_QUANTILE = 0.95  # of the residuals' lengths that a robust sigma is taken from
-_EXACT_COST = 1e-6
 _TINY = 1e-100
+_EXACT_COST = 1e-6
 # Minima, iterations, hypotheses, undetermined unknown of a method that makes one guess.
 _ONE_MINIMUM = read_only(np.array([[1, 0, 1, -1]]))
 _NO_COST = read_only(np.array([[np.inf]]))
-
-LEAST_LIKELIHOOD = 1e-3
-"""Relative likelihood above which another minimum is reported as an alternative."""
 
 
 def solve(problems: Problems, options: FitOptions) -> Solutions:
     """Solve every problem with the method of the options; all have one camera.
 
-    A problem whose sigma is unknown, or whose lens is wide, is the only one. Raises CadalignError
-    if a lens cannot be undone, sigma is none, or the only problem leaves its noise open.
+    A problem whose lens is wide is the only one. Raises CadalignError if a lens cannot be undone,
+    or sigma is none.
     """
-    if options.sigma is None and options.method == "optimal":
-        return _solve_with_noise(problems, options)
     camera = problems.cameras[0]
     camera.require_focal()
     facing = faced(camera, problems.points_2d) if camera.is_wide else camera
@@ -131,52 +132,6 @@ def _optima(
     return found
 
 
-def _solve_with_noise(problems: Problems, options: FitOptions) -> Solutions:
-    """Solve the only problem at the standard deviation that its residuals have.
-
-    It matters to the optimum where there is something beside the keypoints. Rounds end where they
-    converge, or go in circles: of two optima, each may be the better one at the other's noise.
-    Keypoints that are given repeatedly count once for the redundancy.
-    """
-    distinct = len({*map(bytes, np.hstack([problems.points_3d, problems.points_2d]))})
-    redundancy = 2 * distinct - options.unknowns
-    if redundancy <= 0:
-        raise no_redundancy_error(distinct)
-    least = _LEAST_SIGMA * math.sqrt(problems.points_2d.var(axis=0).sum())
-    sigma, tried = 1.0, list[float]()
-    for _ in range(_NOISE_ROUNDS):
-        found = solve(problems, replace(options, sigma=sigma))
-        if found.errors:
-            return found
-        tried.append(sigma)
-        squares = (found.residuals**2).sum(axis=1)
-        if options.loss == "linear":
-            sigma = math.sqrt(squares.sum() / redundancy)
-        else:
-            sigma = _robust_sigma(squares, redundancy)
-        sigma = max(sigma, least, _TINY)
-        log_scales = np.abs(np.log(found.poses[0, 0, 12:]))
-        depends = options.estimates_in_rounds or log_scales.max() > options.scale_prior.width
-        if not depends or any(abs(sigma / one - 1) < _NOISE_TOLERANCE for one in tried):
-            break
-    variance = (sigma / tried[-1]) ** 2
-    covariances = cast(FloatArray, found.covariances) * variance
-    return found._replace(costs=found.costs / variance, covariances=covariances, sigma=sigma)
-
-
-def _robust_sigma(squares: FloatArray, redundancy: int) -> float:
-    """Standard deviation [px] from a quantile of the squared lengths (n,) of residuals.
-
-    The unknowns can make as many keypoints fit exactly as they have equations. The quantile is the
-    median of the others' lengths: that of all would be zero with few keypoints.
-    """
-    count = len(squares)
-    place = math.ceil(count - redundancy / 4)
-    quantile = min((place - 0.5) / count, _HIGHEST_QUANTILE)
-    expected = -2 * math.log(1 - quantile) * redundancy / (2 * count)
-    return math.sqrt(float(np.partition(squares, place - 1)[place - 1]) / expected)
-
-
 def _residuals(
     problems: Problems, points: FloatArray, camera: Camera, found: Solutions
 ) -> tuple[FloatArray, IntArray]:
@@ -210,3 +165,91 @@ def _one_guess(poses: FloatArray, statuses: IntArray) -> Solutions:
     return Solutions(
         poses, _NO_COST.repeat(count, 0), None, statuses, _ONE_MINIMUM.repeat(count, 0)
     )
+
+
+def keypoints_of_solution(
+    problems: Problems, solutions: Solutions, options: FitOptions, seconds: float
+) -> FittedKeypoints:
+    """The fitted keypoints of the only problem, which has a solution."""
+    minima, iterations, hypotheses, _ = solutions.info[0].tolist()
+    points = problems.points_3d.copy()  # the caller may go on to change theirs
+    is_one = options.method == "optimal" and isinstance(options.sigma, int | float)
+    inliers = np.empty(len(points), dtype=bool)
+    inliers.fill(True)
+    fitted = {
+        "points_3d": points,
+        "residuals": solutions.residuals,
+        "inliers": inliers,
+        "alignment": Alignment.from_packed(solutions.poses[0, 0]),
+        "camera": problems.cameras[0],
+        "options": options,
+        "sigma": float(cast(float, options.sigma)) if is_one else None,
+        "method": options.method,
+    }
+    if solutions.covariances is not None:
+        covariance, rows = np.zeros((9, 9)), options.solver_rows
+        covariance[rows[:, None], rows] = solutions.covariances[0]
+        fitted["fisher_covariance"] = covariance
+        fitted["cost"] = solutions.costs.item(0)
+    if minima > 1:
+        poses = [Alignment.from_packed(pose) for pose in solutions.poses[0, :minima]]
+        cameras, costs = problems.cameras * minima, solutions.costs[0, :minima].tolist()
+        fitted["alternatives"] = alternatives_of(points, poses, cameras, costs)
+    effort = {"iterations": iterations, "hypotheses": hypotheses, "seconds": seconds}
+    fitted["stats"] = quickly(FitStats, effort)
+    return quickly(FittedKeypoints, fitted)
+
+
+def fit_keypoints(problems: Problems, options: FitOptions, start: float) -> FittedKeypoints:
+    """Fit all keypoints of the only problem, which was begun at ``start`` [s].
+
+    An unknown sigma is the one that the residuals have. It matters to the optimum where there is
+    something beside the keypoints: rounds end where they converge, or go in circles, for of two
+    optima each may be the better one at the other's noise. Keypoints that are given repeatedly
+    count once for the redundancy.
+
+    Raises DegenerateError if they always fit, so that the noise is open.
+    """
+    if options.sigma is not None or options.method != "optimal":
+        return _fit_at_noise(problems, options, start)
+    distinct = len({*map(bytes, np.hstack([problems.points_3d, problems.points_2d]))})
+    redundancy = 2 * distinct - options.unknowns
+    if redundancy <= 0:
+        raise no_redundancy_error(distinct)
+    least = _LEAST_SIGMA * math.sqrt(problems.points_2d.var(axis=0).sum())
+    sigma, tried = 1.0, list[float]()
+    for _ in range(_ROUNDS):
+        tried.append(sigma)
+        found = _fit_at_noise(problems, replace(options, sigma=sigma), start)
+        squares = (found.residuals**2).sum(axis=1)
+        if options.loss == "linear":
+            sigma = math.sqrt(squares.sum() / redundancy)
+        else:
+            sigma = _robust_sigma(squares, redundancy)
+        sigma = max(sigma, least, _TINY)
+        if any(abs(sigma / one - 1) < _TOLERANCE for one in tried):
+            break
+    return replace(found, options=options)
+
+
+def _fit_at_noise(problems: Problems, options: FitOptions, start: float) -> FittedKeypoints:
+    if options.focal == "known":
+        solutions = solve_one(problems, options)
+        return keypoints_of_solution(problems, solutions, options, time.perf_counter() - start)
+    # Only here: most cameras are calibrated, and its kernels take time to import.
+    from cadalign.estimation.joint_keypoints import fit_jointly
+
+    return fit_jointly(problems, options, None, None, start)
+
+
+def _robust_sigma(squares: FloatArray, redundancy: int) -> float:
+    """Standard deviation [px] from a quantile of the squared lengths (n,) of residuals.
+
+    The unknowns can make as many keypoints fit exactly as they have equations. The quantile is the
+    median of the others' lengths: that of all would be zero with few keypoints.
+    """
+    count = len(squares)
+    place = math.ceil(count - redundancy / 4)
+    quantile = min((place - 0.5) / count, _HIGHEST_QUANTILE)
+    expected = -2 * math.log(1 - quantile) * redundancy / (2 * count)
+    return math.sqrt(float(np.partition(squares, place - 1)[place - 1]) / expected)

@@ -217,7 +217,6 @@ def test_keypoints_on_the_axis_alone_are_refused(count, options):
         align(Model(points_3d=points, symmetry=symmetry, **options), View(CAMERA, seen))
     for refused in (single, joint):
         assert str(refused.value).startswith(expected)
-        assert "no symmetry about it" in str(refused.value)
 
 
 def test_keypoints_off_the_axis_beside_those_on_it_are_enough():

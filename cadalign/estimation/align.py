@@ -151,12 +151,12 @@ def _estimate(problem: Problem, start: float) -> Result:
     """All stages of an estimate that was begun at ``start`` [s]."""
     if is_single(problem):
         return align_single(problem, start)
-    if any(view.mask is not None for view in problem.views):
-        from cadalign.estimation.contours.silhouette_starts import search_by_masks  # with OpenCV
+    starts = [problem.inits]
+    if problem.is_mask_alone:
+        from cadalign.estimation.contours.silhouettes import starts_of_mask  # with OpenCV
 
-        problem, found, iterations, hypotheses = search_by_masks(problem)
-    else:
-        problem, found, iterations, hypotheses = search(problem, [problem.inits])
+        problem, starts = problem._replace(ransac=None), starts_of_mask(problem)
+    problem, found, iterations, hypotheses = search(problem, starts)
     if not found:
         raise no_pose_error(problem)
     minima, notes = refine(problem, found)

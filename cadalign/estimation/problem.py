@@ -99,14 +99,11 @@ class Problem(NamedTuple):
         return 1 if self.is_rig else len(self.numbers)
 
     @property
-    def has_own_mesh(self) -> bool:
-        """True for an exact model with a mesh, whose silhouettes can be compared with masks."""
-        return is_exact_model(self.model) and getattr(self.model, "mesh", None) is not None
-
-    @property
     def is_mask_alone(self) -> bool:
-        """True if the first view's mask is all evidence of the pose of an exact model."""
-        return self.has_own_mesh and self.views[0].has_mask_alone
+        """True if the mask of the only view is all evidence of the pose of a model with a mesh."""
+        if len(self.views) > 1 or any(self.inits) or not is_exact_model(self.model):
+            return False
+        return self.views[0].has_mask_alone and getattr(self.model, "mesh", None) is not None
 
     def threshold(self, ransac: RansacOptions) -> float:
         """Largest reprojection error of an inlier [px], by the noise alone."""
@@ -146,19 +143,6 @@ class Problem(NamedTuple):
             views[number] = without_evidence(views[number])
         lenses = Lenses.of(views, self.options.focal, self.options.focal_prior)
         return self._replace(views=tuple(views), lenses=lenses)
-
-    def alone(self, number: int) -> Problem:
-        """The problem of one view alone, without the known motion of its camera."""
-        view = replace(self.views[number], cam_from_rig=None)
-        lenses = Lenses.of([view], self.options.focal, self.options.focal_prior)
-        return self._replace(
-            given=(self.given[number],),
-            views=(view,),
-            size=None,
-            inits=[None],
-            lenses=lenses,
-            turns=(self.turns[number],),
-        )
 
 
 def compile_problem(
@@ -231,15 +215,15 @@ def no_pose_error(problem: Problem) -> DegenerateError:
             )
         if not seen:
             return DegenerateError(
-                "photos of several views tell no pose without keypoints",
+                "masks and photos of several views tell no pose without keypoints",
                 where="views",
-                fix="give at least 3 keypoints in one view, masks of two, or `init`",
+                fix="give at least 3 keypoints in one view, or `init`",
             )
         if is_rig and seen == 1 and problem.size is None:
             return DegenerateError(
                 "keypoints of one view alone leave open the size that the known motion gives",
                 where="views",
-                fix="give a keypoint or a mask in another view, `size`, or `init`",
+                fix="give a keypoint in another view, `size`, or `init`",
             )
     return DegenerateError(
         "no pose has the keypoints in front of the camera",
@@ -251,8 +235,8 @@ def no_pose_error(problem: Problem) -> DegenerateError:
 def _views_without_pose(problem: Problem) -> list[int]:
     """Numbers of the views of unknown motion whose keypoints determine no pose.
 
-    Those are fewer than three keypoints, or keypoints on one line. Masks alone determine the pose
-    of an exact model. A single view, and views with a given start, are never among them.
+    Those are fewer than three keypoints, or keypoints on one line. A single view, and views with a
+    given start, are never among them.
     """
     views, prior = problem.views, problem.prior
     if len(views) < 2 or any(view.cam_from_rig is not None for view in views):
@@ -262,7 +246,6 @@ def _views_without_pose(problem: Problem) -> list[int]:
         number
         for number, view in enumerate(views)
         if problem.inits[number] is None
-        and not (problem.has_own_mesh and view.has_mask_alone)
         and _lie_on_a_line(mean[prior.rows_of(view.keypoint_ids, f"views[{number}].ids")])
     ]
 

@@ -49,7 +49,6 @@ EVIDENCE = {
     "size": "known length (`Size`)",
     "rig": "two views, camera motion known",
     "rig, mask": "two views, camera motion known, one mask",
-    "rig, outline": "keypoints in one view and a mask alone in another, camera motion known",
     "motion": "two views, camera motion unknown",
     "motion, mask": "two views, camera motion unknown, one mask",
     "weak view": "two views and one of two keypoints, camera motion unknown",
@@ -260,9 +259,6 @@ def problem_of(cell: Cell, folder: Path) -> Problem:
             fields["cam_from_rig"] = motion
         if number == 0:
             fields |= _evidence(cell, rng, truth, points[rows])
-        elif cell.evidence == "rig, outline":
-            seen = cast_geometry(Scene(box_mesh()), CAMERA, pose)
-            rows, fields = [], {"cam_from_rig": motion, "mask": seen.mask}
         camera = CAMERA if cell.focal == "known" else Camera.without_focal(480, 360)
         views.append(View(camera, ids=rows, **fields))
     options: dict[str, Any] = _robust(cell)

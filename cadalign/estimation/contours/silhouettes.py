@@ -16,15 +16,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import cache, lru_cache
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar, cast
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray
+from cadalign.errors import InputError
 from cadalign.estimation.contours.contour import Image, sampled
 from cadalign.estimation.contours.surface import rigid_surface
+from cadalign.estimation.focal import prior_of_camera
+from cadalign.estimation.model import Model
+from cadalign.estimation.problem import Inits, Problem
 from cadalign.geometry.alignment import Alignment, model_rays
 from cadalign.geometry.camera import Camera, turned_alignment
 from cadalign.geometry.mesh import Mesh
@@ -50,6 +54,8 @@ _PRIOR = 0.05  # weight of the logarithms of scales
 _MOST_LOG = 1.3
 _DISTINCT_DEG = 10.0
 _DISTINCT_STRETCH = 0.2
+_RESEMBLING = 12  # silhouettes from which a mask alone starts
+_LARGEST_FOCAL_SIGMA = 0.25  # relative: poses are sought at the focal length of the prior
 
 T = TypeVar("T")
 
@@ -74,6 +80,31 @@ class Atlas(NamedTuple):
     corners: FloatArray
     bases: FloatArray
     views: Whitened
+
+
+def starts_of_mask(problem: Problem) -> list[Inits]:
+    """Alignments of the own model whose silhouettes resemble the mask of the only view.
+
+    Raises InputError if no prior says roughly what the focal length is.
+    """
+    (view,), camera, model = problem.views, problem.lenses.cameras[0], cast(Model, problem.model)
+    known = prior_of_camera(problem.lenses.prior, camera)
+    if problem.lenses.count and (known is None or known.relative_sigma > _LARGEST_FOCAL_SIGMA):
+        raise InputError(
+            "a mask alone does not tell the focal length",
+            where=f"views[{view.number}].camera",
+            fix="give a calibrated camera, a focal_prior whose relative_sigma is at most "
+            f"{_LARGEST_FOCAL_SIGMA}, or keypoints",
+        )
+    poses = resembling_poses(
+        cast(Mesh, model.mesh),
+        cast(FloatArray, view.mask_image),
+        camera,
+        free=np.asarray(problem.prior.scales.free > 0),
+        count=_RESEMBLING,
+        symmetry=model.symmetry,
+    )
+    return [[turned_alignment(pose, problem.turns[0])] for pose, _ in poses]
 
 
 def resembling_poses(

@@ -77,65 +77,26 @@ def test_a_prior_on_the_focal_length_is_enough() -> None:
         align(model, view, focal="estimate")
 
 
-class TestSeveralViews:
-    """Views of which some, or all, have a mask alone."""
-
-    SCALE = (1.0, 1.4, 0.7)
-
-    def seen(self, seed: int, *, keypoints: bool) -> tuple[Model, list[View], list[Alignment]]:
-        first, second = posed(seed, self.SCALE), posed(seed + 20, self.SCALE)
-        points = body().vertices[[0, 1, 2, 3, 4, 5, 9, 14, 20]]
-        views = [View(CAMERA, mask=mask_of(body(), pose)) for pose in (first, second)]
-        if keypoints:
-            noise = np.random.default_rng(seed).normal(0, 1, (len(points), 2))
-            views[0] = View(CAMERA, CAMERA.project(first.apply(points)) + noise)
-        return Model(points_3d=points, mesh=body()), views, [first, second]
-
-    def in_a_rig(self, views: list[View], truths: list[Alignment]) -> list[View]:
-        first, second = truths
-        motion = np.eye(4)
-        motion[:3, :3] = second.rotation @ first.rotation.T
-        motion[:3, 3] = second.translation - motion[:3, :3] @ first.translation
-        poses = (np.eye(4), motion)
-        return [replace(v, cam_from_rig=pose) for v, pose in zip(views, poses, strict=True)]
-
-    @pytest.mark.parametrize("keypoints", [False, True])
-    def test_a_mask_beside_another_view_counts(self, keypoints: bool) -> None:
-        model, views, truths = self.seen(0, keypoints=keypoints)
-        found = align(model, views)
-        assert not any("left out" in text for text in map(str, found.warnings))
-        assert rotation_error(est=found.poses[0], gt=truths[0]) < 2.0
-        assert rotation_error(est=found.poses[1], gt=truths[1]) < 0.5
-        assert found.alignment.scale == pytest.approx(self.SCALE, rel=0.02)
-
-    @pytest.mark.parametrize("keypoints", [False, True])
-    @pytest.mark.parametrize("order", [1, -1])
-    def test_masks_of_a_rig_give_the_size(self, keypoints: bool, order: int) -> None:
-        model, views, truths = self.seen(1, keypoints=keypoints)
-        larger = [Alignment(t.rotation, 2.5 * t.translation, 2.5 * t.scale) for t in truths]
-        found = align(model, self.in_a_rig(views, larger)[::order])
-        for pose, truth in zip(found.poses[::order], larger, strict=True):
-            assert rotation_error(est=pose, gt=truth) < 0.5
-            assert pose.translation == pytest.approx(truth.translation, rel=0.02, abs=0.05)
-        assert found.alignment.scale == pytest.approx(2.5 * np.array(self.SCALE), rel=0.02)
-
-    def test_masks_of_a_rig_beside_a_known_length(self) -> None:
-        model, views, truths = self.seen(2, keypoints=False)
-        height = float(np.ptp(body().vertices[:, 1]) * 1.4)
-        found = align(model, self.in_a_rig(views, truths), size=Size(height=height))
-        assert rotation_error(est=found.alignment, gt=truths[0]) < 0.5
-        assert found.alignment.scale == pytest.approx(self.SCALE, rel=0.02)
-
-    def test_a_similar_model_begins_at_keypoints(self) -> None:
-        model, views, _ = self.seen(0, keypoints=True)
-        found = align(replace(model, shape_sigma=0.01), views)
-        assert any(text.startswith("views[1] is left out") for text in map(str, found.warnings))
-
-    def test_the_view_that_is_refused_has_its_own_number(self) -> None:
-        model, views, truths = self.seen(0, keypoints=True)
-        few = replace(views[0], points_2d=views[0].points_2d[:2], ids=[0, 1])
-        with pytest.raises(DegenerateError, match="its keypoints determine no pose"):
-            align(model, self.in_a_rig([few, views[1]], truths))
+def test_a_mask_alone_of_another_view_counts_where_known_motion_gives_the_pose() -> None:
+    scale = (1.0, 1.4, 0.7)
+    first, second = posed(2, scale), posed(22, scale)
+    points = body().vertices[[0, 1, 2, 3, 4, 5, 9, 14, 20]]
+    noise = np.random.default_rng(2).normal(0, 1, (len(points), 2))
+    views = [
+        View(CAMERA, CAMERA.project(first.apply(points)) + noise),
+        View(CAMERA, mask=mask_of(body(), second)),
+    ]
+    model = Model(points_3d=points, mesh=body())
+    alone = align(model, views)
+    assert any(text.startswith("views[1] is left out") for text in map(str, alone.warnings))
+    motion = np.eye(4)
+    motion[:3, :3] = second.rotation @ first.rotation.T
+    motion[:3, 3] = second.translation - motion[:3, :3] @ first.translation
+    poses = (np.eye(4), motion)
+    rig = [replace(v, cam_from_rig=pose) for v, pose in zip(views, poses, strict=True)]
+    found = align(model, rig, size=Size(height=float(np.ptp(body().vertices[:, 1]) * 1.4)))
+    assert rotation_error(est=found.alignment, gt=first) < 0.5
+    assert found.alignment.scale == pytest.approx(scale, rel=0.02)
 
 
 class TestOwnModel:

@@ -97,8 +97,8 @@ def changed(pose: np.ndarray, rows: slice | int, columns: slice | int, factor: f
             lambda: align(
                 MODEL, [View(CAMERA, image=PHOTO, cam_from_rig=around(a)) for a in (0, 30)]
             ),
-            "views: photos of several views tell no pose without keypoints; "
-            "give at least 3 keypoints in one view, masks of two, or `init`",
+            "views: masks and photos of several views tell no pose without keypoints; "
+            "give at least 3 keypoints in one view, or `init`",
         ),
         (
             lambda: align(MODEL, View(CAMERA, mask=BODY)),  # a face of the box, seen head-on
@@ -107,7 +107,7 @@ def changed(pose: np.ndarray, rows: slice | int, columns: slice | int, factor: f
         (
             lambda: align(MODEL, [SEEN, View(CAMERA, image=PHOTO, cam_from_rig=around(30))]),
             "views: keypoints of one view alone leave open the size that the known motion gives; "
-            "give a keypoint or a mask in another view, `size`, or `init`",
+            "give a keypoint in another view, `size`, or `init`",
         ),
         (
             lambda: align(PLAIN, [seen(POINTS, truth_of(), around(0)), View(CAMERA)]),

@@ -206,7 +206,7 @@ def test_images_are_found_by_position_and_name(tmp_path):
     for key in (3, -4):
         with pytest.raises(IndexError, match=f"3 images, asked for number {key}"):
             images[key]
-    with pytest.raises(DataError, match="no image 'nothing.jpg'"):
+    with pytest.raises(DataError, match=r"no image 'nothing\.jpg'"):
         images["nothing.jpg"]
 
 

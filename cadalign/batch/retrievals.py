@@ -7,8 +7,8 @@ match_category, match_id, match_score
     The model of the library, and its probability; see `cadalign.Match.score`.
 match_log_likelihood, none_probability
     As of `cadalign.Match`.
-mirrored, missing
-    True if the labels are mirrored, and the number of keypoints that the model lacks.
+missing
+    Number of keypoints that the model lacks.
 top_categories, top_ids, top_scores
     All matches, the best first.
 
@@ -48,7 +48,7 @@ class RetrieveRunOptions(ManyOptions):
     columns: ClassVar[Columns] = (
         *(("match_category", str), ("match_id", str), ("match_score", float)),
         *(("match_log_likelihood", float), ("none_probability", float)),
-        *(("mirrored", bool), ("missing", int)),
+        ("missing", int),
         *(("top_categories", list[str]), ("top_ids", list[str]), ("top_scores", list[float])),
     )
     record_columns: ClassVar[Columns] = (("matches", str),)
@@ -78,7 +78,6 @@ class RetrieveRunOptions(ManyOptions):
             "match_score": best.score,
             "match_log_likelihood": best.log_likelihood,
             "none_probability": best.none_probability,
-            "mirrored": best.mirrored,
             "missing": len(best.missing_ids),
             "top_categories": [match.category for match in matches],
             "top_ids": [match.model_id for match in matches],

@@ -130,7 +130,7 @@ def _print_table(matches: Sequence[Match]) -> None:
         (
             str(rank).rjust(len(str(len(matches)))),
             match.category,
-            match.model_id + (" (mirrored)" if match.mirrored else ""),
+            match.model_id,
             score_text(match.score),
             f"{match.log_likelihood:.1f}",
             f"{match.rms:.2f}",

@@ -58,7 +58,6 @@ _FLAT = 1e-9  # share of a model's variance along an axis without extent
 _MOST_NEIGHBOURS = 2000  # models among which the nearest ones are looked for
 _INAPPLICABLE = {
     "method": "optimal",
-    "symmetries": False,
     **{name: getattr(RetrievalOptions, name) for name in ("stretch_sigma", "none_prior")},
 }
 

@@ -1,7 +1,6 @@
 """Compiled kernels of retrieval: lower bounds of candidates' costs, and the search for poses.
 
-A candidate is a model of the library with its own or mirrored keypoint labels. The library's
-keypoints are concatenated, each model's in the order of their semantic ids.
+The library's keypoints are concatenated, each model's in the order of their semantic ids.
 """
 
 from __future__ import annotations
@@ -61,15 +60,11 @@ class Query(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """Keypoints of the candidates.
-
-    A candidate's ``rows`` of ``xyz`` are in the order of its labels: ascending unless mirrored.
-    """
+    """Keypoints of the candidates, each candidate's in the order of their ids."""
 
     xyz: FloatArray  # (k, 3), of the whole library
     ids: IntArray  # (k,), semantic ids
-    rows: IntArray  # (r,)
-    spans: IntArray  # (c, 3): start and end of its labels in ``ids``, and start of its ``rows``
+    spans: IntArray  # (c, 2): start and end of a candidate's keypoints
 
 
 @kernel
@@ -138,7 +133,7 @@ def _gather(
     query: Query, candidates: Candidates, c: int, points: FloatArray, seen: IntArray
 ) -> int:
     """Write the shared model points, in the rows of the image, and these; returns their number."""
-    first, last, row = candidates.spans[c, 0], candidates.spans[c, 1], candidates.spans[c, 2]
+    first, last = candidates.spans[c, 0], candidates.spans[c, 1]
     n = 0
     i = 0
     k = first
@@ -148,9 +143,8 @@ def _gather(
         elif query.ids[i] > candidates.ids[k]:
             k += 1
         else:
-            place = candidates.rows[row + k - first]
             for j in range(3):
-                points[i, j] = candidates.xyz[place, j]
+                points[i, j] = candidates.xyz[k, j]
             seen[n] = i
             n += 1
             i += 1

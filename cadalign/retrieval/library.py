@@ -35,7 +35,7 @@ logger = logging.getLogger("cadalign")
 
 
 class Library:
-    """Annotated CAD models to retrieve from: keypoints, symmetries, bounds and mesh paths.
+    """Annotated CAD models to retrieve from: keypoints, bounds and mesh paths.
 
     The models are sorted by category and id, so that results do not depend on their order.
     `Library.from_dataset` and `Library.from_models` make a library, `Library.open` maps a saved one
@@ -220,7 +220,7 @@ class Library:
         **options
             Fields of `cadalign.retrieval.options.RetrievalOptions`, which describes them: top,
             category, method, sigma, shape_sigma, loss, loss_scale, stretch, stretch_sigma,
-            max_stretch, symmetries, missing_prob, spurious, none_prior, exhaustive.
+            max_stretch, missing_prob, spurious, none_prior, exhaustive.
 
         Returns
         -------

@@ -59,8 +59,6 @@ class Match:
     """Projected minus observed (n, 2) [px]."""
     missing_ids: tuple[int, ...]
     """Ids of the image's keypoints that the model lacks."""
-    mirrored: bool
-    """True if the labels fit better with left and right exchanged."""
     mesh_path: Path | None
     none_probability: float | None = None
     """Probability that the object is none of the library's models, not even stretched: the same in
@@ -173,7 +171,6 @@ class Match:
             "semantic_ids": self.ids.tolist(),
             "residuals": self.residuals.tolist(),
             "missing_ids": list(self.missing_ids),
-            "mirrored": self.mirrored,
             "mesh": None if self.mesh_path is None else str(self.mesh_path),
             "camera": None if self.camera is None else self.camera.to_dict(),
             "none_probability": self.none_probability,

@@ -7,12 +7,11 @@ Opening maps it into memory and compares the checksum, which reads the file once
 
 from __future__ import annotations
 
-import json
 import os
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from operator import itemgetter
 from pathlib import Path
@@ -24,7 +23,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_only
-from cadalign.datasets import AnnotatedModel, Circle, RotationalSymmetry, Symmetries, load_mesh
+from cadalign.datasets import AnnotatedModel, load_mesh
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.alignment import extent
 from cadalign.geometry.mesh import Mesh
@@ -33,9 +32,7 @@ from cadalign.io.files import Seal, as_path
 ModelKey = tuple[str, str]
 """Category name and model id."""
 
-_ALONG = 0.9  # share of a mirrored pair's distance that must lie along one axis
 _LARGEST = 1e50  # coordinate
-_MOST_SYMMETRIES = 4096
 _AGAIN = "build it with: cadalign library build"
 SEAL = Seal(magic=b"cadalign library", version=1, noun="library file", fix=_AGAIN)
 SCHEMA = pa.schema(
@@ -46,9 +43,6 @@ SCHEMA = pa.schema(
         ("bounds", pa.list_(pa.float64(), 6)),
         ("keypoints", pa.list_(pa.list_(pa.float64(), 3))),
         ("semantic_ids", pa.list_(pa.int64())),
-        # Concatenated permutations of the rows, one for each mirrored labelling.
-        ("labelings", pa.list_(pa.int64())),
-        ("symmetries", pa.string()),
     ]
 )
 
@@ -72,8 +66,6 @@ class LibraryModel:
     """Semantic ids (k,), valid for all models of the category."""
     bounds: FloatArray
     """Lowest and highest coordinates of the mesh (2, 3); of the keypoints without a mesh."""
-    symmetries: Symmetries = field(default_factory=Symmetries)
-    """Reflections and rotations, as rows of ``xyz`` that exchange places."""
     mesh_path: Path | None = None
 
     def __post_init__(self) -> None:
@@ -98,7 +90,7 @@ class LibraryModel:
         else:
             bounds, path = load_mesh(path).bounds, path.absolute()
         own = model.category, model.model_id, xyz, model.keypoints.ids, bounds
-        return cls(*own, model.symmetries, path)
+        return cls(*own, path)
 
     @property
     def key(self) -> ModelKey:
@@ -195,18 +187,6 @@ class ModelTable:
         return _numbers(self._column("bounds").flatten()).reshape(-1, 2, 3)
 
     @cached_property
-    def labeling_offsets(self) -> IntArray:
-        """Start of each model's mirrored labelings, and the end of the last, (n + 1,) int."""
-        return _offsets(self._column("labelings"))
-
-    @cached_property
-    def places(self) -> IntArray:
-        """Rows of `xyz`: the identity, then at `labeling_offsets` those of mirrored labels."""
-        first = np.repeat(self.offsets[:-1], np.diff(self.labeling_offsets))
-        mirrored = _numbers(self._column("labelings").flatten()) + first
-        return read_only(np.concatenate([np.arange(len(self.xyz)), mirrored]))
-
-    @cached_property
     def all_ids(self) -> IntArray:
         """Semantic ids of all models, ascending."""
         return np.unique(self.ids)
@@ -237,11 +217,10 @@ class ModelTable:
     def model(self, row: int) -> LibraryModel:
         """Make the model of a row."""
         own = slice(int(self.offsets[row]), int(self.offsets[row + 1]))
-        path, text = (self.table[name][row].as_py() for name in ("mesh", "symmetries"))
-        symmetries = _symmetries_from(text, own.stop - own.start)
+        path = self.table["mesh"][row].as_py()
         category, model_id = self.keys[row]
         xyz, ids, bounds = self.xyz[own], self.ids[own], self.bounds[row]
-        return LibraryModel(category, model_id, xyz, ids, bounds, symmetries, path and Path(path))
+        return LibraryModel(category, model_id, xyz, ids, bounds, path and Path(path))
 
     def payload(self) -> pa.Buffer:
         """All content, as the file of a library has it."""
@@ -266,45 +245,14 @@ def read_annotated(model: AnnotatedModel) -> tuple[LibraryModel, str]:
 def row_of(model: LibraryModel) -> dict[str, Any]:
     """Convert a model to a row of the table, its keypoints in the order of their ids."""
     order = np.argsort(model.ids)
-    place, xyz = np.argsort(order).tolist(), model.xyz[order]
-    reflections = [(place[a], place[b]) for a, b in model.symmetries.reflections]
-    rotations = []
-    for each in model.symmetries.rotations:
-        at = each.circle
-        circle = at and [at.center.tolist(), at.radius, at.normal.tolist()]
-        rotations.append({"keypoints": [place[row] for row in each.keypoints], "circle": circle})
-    labelings = mirrored_labelings(xyz, reflections)
     return {
         "category": model.category,
         "model_id": model.model_id,
         "mesh": None if model.mesh_path is None else str(model.mesh_path),
         "bounds": model.bounds.ravel().tolist(),
-        "keypoints": xyz.tolist(),
+        "keypoints": model.xyz[order].tolist(),
         "semantic_ids": model.ids[order].tolist(),
-        "labelings": [row for labeling in labelings for row in labeling.tolist()],
-        "symmetries": json.dumps({"reflections": reflections, "rotations": rotations}),
     }
-
-
-@lru_cache(_MOST_SYMMETRIES)
-def _symmetries_from(text: str, count: int) -> Symmetries:
-    try:
-        data, rotations = json.loads(text), []
-        for each in data["rotations"]:
-            circle = None
-            if each["circle"] is not None:
-                center, radius, normal = each["circle"]
-                middle, axis = read_only(np.array(center)), read_only(np.array(normal))
-                circle = Circle(middle, radius, axis)
-            rotations.append(RotationalSymmetry(tuple(each["keypoints"]), circle))
-        reflections = tuple((first, second) for first, second in data["reflections"])
-    except (ValueError, TypeError, KeyError, IndexError, RecursionError) as error:
-        raise DataError(f"malformed ({str(error)[:200]})", where="symmetries") from None
-    rows = [row for pair in reflections for row in pair]
-    rows += [row for rotation in rotations for row in rotation.keypoints]
-    if not all(isinstance(row, int) and 0 <= row < count for row in rows):
-        raise DataError("names a keypoint that does not exist", where="symmetries")
-    return Symmetries(reflections, tuple(rotations))
 
 
 def _numbers(array: Any) -> npt.NDArray[Any]:
@@ -319,39 +267,6 @@ def _offsets(array: Any) -> IntArray:
     offsets -= offsets[0] if len(offsets) else 0
     offsets.flags.writeable = False
     return np.asarray(offsets)
-
-
-def mirrored_labelings(xyz: FloatArray, reflections: Iterable[tuple[int, int]]) -> list[IntArray]:
-    """List the permutations of a model's keypoint labels under its reflections.
-
-    All pairs that mirror each other across a plane x = const swap labels together; so do those
-    across y = const and z = const, and any combination of these. Pairs along no axis, and planes
-    that give a keypoint two labels, are left out; so is the identity. A permutation names, for
-    each row of ``xyz``, the row that takes its label.
-
-    Examples
-    --------
-    >>> xyz = np.array([[-1.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0]])
-    >>> mirrored_labelings(xyz, [(0, 1)])
-    [array([1, 0, 2])]
-    """
-    planes: dict[int, list[tuple[int, int]]] = {}
-    for first, second in reflections:
-        apart = np.abs(xyz[first] - xyz[second])
-        axis = int(np.argmax(apart))
-        if apart[axis] > _ALONG * np.linalg.norm(apart):
-            planes.setdefault(axis, []).append((first, second))
-    found: list[IntArray] = [np.arange(len(xyz))]
-    for axis in sorted(planes):
-        rows = [row for pair in planes[axis] for row in pair]
-        if len(set(rows)) < len(rows):
-            continue
-        swap = np.arange(len(xyz))
-        for first, second in planes[axis]:
-            swap[[first, second]] = second, first
-        found += [swap[known] for known in found]
-    unique = {labeling.tobytes(): labeling for labeling in found}
-    return list(unique.values())[1:]
 
 
 def read_library(path: str | os.PathLike[str]) -> ModelTable:
@@ -394,12 +309,6 @@ def _check_table(table: pa.Table) -> None:
     counts = pc.list_value_length(table["semantic_ids"]).to_numpy()
     if (pc.list_value_length(table["keypoints"]).to_numpy() != counts).any():
         raise ValueError("keypoints and semantic_ids differ in length")
-    labels = pc.list_value_length(table["labelings"]).to_numpy()
-    if (labels % np.maximum(counts, 1)).any():
-        raise ValueError("labelings are not rows of all keypoints")
-    rows = pc.list_flatten(table["labelings"]).to_numpy()
-    if ((rows < 0) | (rows >= np.repeat(counts, labels))).any():
-        raise ValueError("a labeling names a keypoint that does not exist")
     for numbers in (pc.list_flatten(pc.list_flatten(table["keypoints"])), table["bounds"]):
         values = numbers if pa.types.is_floating(numbers.type) else pc.list_flatten(numbers)
         if not (np.abs(values.to_numpy()) < _LARGEST).all():

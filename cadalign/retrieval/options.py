@@ -53,9 +53,6 @@ class RetrievalOptions(AlignmentOptions):
     no prior."""
     max_stretch: float = 4.0
     """Largest stretch of a model; its inverse is the smallest."""
-    symmetries: bool = False
-    """Also try labels with left and right (front and back) exchanged, by the models'
-    reflections."""
     missing_prob: float = 0.5
     """Probability that a keypoint of the object is not marked in the image."""
     spurious: float = 0.01

@@ -118,8 +118,6 @@ def _card(rank: int, match: Match) -> str:
         "shared keypoints": f"{match.shared} of {match.observed}",
         "log-likelihood": f"{match.log_likelihood:.1f}",
     }
-    if match.mirrored:
-        values["labels"] = "left and right exchanged"
     rows = [fill("retrieval_value.html", label=key, value=value) for key, value in values.items()]
     return fill(
         "retrieval_match.html",

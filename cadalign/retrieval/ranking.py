@@ -1,6 +1,6 @@
 """Candidates of a query, and their ranking by a best-first search with bounds.
 
-A candidate is a model with its own or mirrored keypoint labels. The lower bound of its errors
+A candidate is a model that shares enough keypoints with the image. The lower bound of its errors
 (`kernels.bound_all`) gives an upper bound of its log-likelihood. Candidates are searched in growing
 batches, in the order of their bounds, until the bounds of all others lie 20 below the best
 log-likelihood found. So every match with a score above 1e-8 has the rank of an exhaustive search.
@@ -23,7 +23,7 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats, as_points, worker_count
+from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, worker_count
 from cadalign.datasets.models.shapenet import require_category
 from cadalign.errors import DegenerateError, InputError, quote, require_kind
 from cadalign.estimation.fit_batches import fit_batch
@@ -82,7 +82,6 @@ class CandidateSet:
 
     keypoints: Candidates  # for the kernels
     models: IntArray  # (c,), rows of the models in the table
-    mirrored: BoolArray  # (c,)
     base: FloatArray  # (c,), log-likelihood of a candidate that fits without error
     bounds: FloatArray  # (c,), lower bounds of the costs, twice the loss of log-likelihood
 
@@ -190,14 +189,15 @@ def gather_candidates(
         where = "the library" if options.category is None else f"the category {options.category!r}"
         what = f"no model of {where} has a keypoint with the semantic id {unknown[0]}"
         raise InputError(what, where="ids", fix=f"known are {_ranges(known)}")
-    models, candidates, labelings = _candidates(table, chosen, options.symmetries)
+    spans = np.stack([table.offsets[chosen], table.offsets[chosen + 1]], axis=1)
+    candidates = Candidates(table.xyz, table.ids, spans)
 
     def bound(start: int) -> tuple[FloatArray, FloatArray, IntArray]:
-        spans = candidates.spans[start : start + _BOUNDED_AT_ONCE]
-        return bound_all(query, candidates._replace(spans=spans))
+        some = candidates._replace(spans=spans[start : start + _BOUNDED_AT_ONCE])
+        return bound_all(query, some)
 
     with ThreadPoolExecutor(threads) as pool:
-        parts = list(pool.map(bound, range(0, len(candidates.spans), _BOUNDED_AT_ONCE)))
+        parts = list(pool.map(bound, range(0, len(spans), _BOUNDED_AT_ONCE)))
     bounds, gains, shared = map(np.concatenate, zip(*parts, strict=True))
     kept = shared >= LEAST_SHARED
     if not kept.any():
@@ -206,31 +206,11 @@ def gather_candidates(
         raise DegenerateError(what, where="ids", fix=fix)
     # The losses are concave in the squares and 0 at 0, so that of their sum is at most their sum.
     bounds = bent(bounds, query.loss, query.loss_scale)
-    counts = candidates.spans[:, 1] - candidates.spans[:, 0]
+    counts = spans[:, 1] - spans[:, 0]
     base = gains + observed.spurious + (counts - shared) * np.log(options.missing_prob)
-    base = base + options.log_scale_constant - np.log(labelings)
-    spans = np.ascontiguousarray(candidates.spans[kept])
-    mirrored = spans[:, 0] != spans[:, 2]
-    kept_keypoints = candidates._replace(spans=spans)
-    return CandidateSet(kept_keypoints, models[kept], mirrored, base[kept], bounds[kept])
-
-
-def _candidates(
-    table: ModelTable, chosen: IntArray, symmetries: bool
-) -> tuple[IntArray, Candidates, IntArray]:
-    """List the candidates: models (c,), keypoints, and numbers of labelings of each model (c,)."""
-    first, last = table.offsets[chosen], table.offsets[chosen + 1]
-    labelings = np.ones_like(chosen)
-    if symmetries:
-        starts, ends = table.labeling_offsets[chosen], table.labeling_offsets[chosen + 1]
-        labelings += (ends - starts) // (last - first)
-    models = np.repeat(chosen, labelings)
-    number = np.arange(len(models)) - np.repeat(np.cumsum(labelings) - labelings, labelings)
-    spans = np.repeat(np.stack([first, last, first], axis=1), labelings, axis=0)
-    mirrored = table.labeling_offsets[models] + (number - 1) * (spans[:, 1] - spans[:, 0])
-    spans[:, 2] = np.where(number > 0, len(table.xyz) + mirrored, spans[:, 0])
-    candidates = Candidates(table.xyz, table.ids, table.places, spans)
-    return models, candidates, np.repeat(labelings, labelings)
+    base = base + options.log_scale_constant
+    kept_keypoints = candidates._replace(spans=spans[kept])
+    return CandidateSet(kept_keypoints, chosen[kept], base[kept], bounds[kept])
 
 
 def _ranges(ids: IntArray) -> str:
@@ -296,22 +276,17 @@ class _SearchState:
 
     def last_of(self, top: int) -> float:
         """Log-likelihood of the last model of the top list; minus infinity if it is not full."""
-        models = self._candidates.models[self._searched]
-        best = np.full(int(self._candidates.models[-1]) + 1, -np.inf)
-        np.maximum.at(best, models, self._reached[self._searched])
-        best = best[np.isfinite(best)]
+        best = self._reached[np.isfinite(self._reached)]
         return float(np.partition(best, -top)[-top]) if len(best) >= top else -np.inf
 
     def ranking(self) -> Ranking:
-        """Rank the models, each with its best labels; ties in the library's order."""
+        """Rank the models; ties in the library's order."""
         order = np.argsort(-self._reached, kind="stable")
         order = order[np.isfinite(self._reached[order])]
         if not len(order):
             fix = "check the keypoints, their semantic ids and the camera"
             what = "no model can be aligned with the keypoints"
             raise DegenerateError(what, where="points_2d", fix=fix)
-        _, first = np.unique(self._candidates.models[order], return_index=True)
-        order = order[np.sort(first)]
         reached = self._reached[order]
         weights = np.exp(reached - reached[0])
         searched = int(self._searched.sum())
@@ -366,13 +341,13 @@ def shared_keypoints(
 ) -> tuple[FloatArray, IntArray]:
     """Select a candidate's keypoints in the image, (n, 3), and their rows there, (n,)."""
     keypoints = candidates.keypoints
-    first, last, row = keypoints.spans[candidate].tolist()
+    first, last = keypoints.spans[candidate].tolist()
     ids = keypoints.ids[first:last]
     # Three times as fast as np.intersect1d.
     on_model, in_image = np.nonzero(ids[:, None] == observed.query.ids)
     order = np.argsort(ids[on_model])
     on_model, in_image = on_model[order], in_image[order]
-    return keypoints.xyz[keypoints.rows[row + on_model]], in_image
+    return keypoints.xyz[first + on_model], in_image
 
 
 def make_matches(
@@ -402,7 +377,6 @@ def make_matches(
             points_2d=observed.points_2d[rows],
             residuals=residuals,
             missing_ids=tuple(np.delete(observed.query.ids, rows).tolist()),
-            mirrored=bool(candidates.mirrored[candidate]),
             none_probability=none_probability,
             camera=observed.camera,
         )

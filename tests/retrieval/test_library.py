@@ -17,7 +17,7 @@ from cadalign import Library
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.errors import DataError, InputError
 from cadalign.retrieval import LibraryModel
-from cadalign.retrieval.models import SCHEMA, SEAL, ModelTable, mirrored_labelings
+from cadalign.retrieval.models import SCHEMA, SEAL, ModelTable
 
 HEADER = 64
 
@@ -46,19 +46,12 @@ def assert_same(one: LibraryModel, other: LibraryModel) -> None:
     np.testing.assert_array_equal(one.xyz, other.xyz)
     np.testing.assert_array_equal(one.ids, other.ids)
     np.testing.assert_array_equal(one.bounds, other.bounds)
-    assert one.symmetries.reflections == other.symmetries.reflections
-    assert len(one.symmetries.rotations) == len(other.symmetries.rotations)
-    for mine, theirs in zip(one.symmetries.rotations, other.symmetries.rotations, strict=True):
-        assert mine.keypoints == theirs.keypoints
-        assert mine.is_circle == theirs.is_circle
-        if mine.circle is not None and theirs.circle is not None:
-            np.testing.assert_array_equal(mine.circle.normal, theirs.circle.normal)
 
 
 # --- what it holds ---------------------------------------------------------------------------
 
 
-def test_a_dataset_s_models_are_in_it_with_symmetries_bounds_and_meshes(sample_root: Path) -> None:
+def test_a_dataset_s_models_are_in_it_with_bounds_and_meshes(sample_root: Path) -> None:
     dataset = KeypointNet(sample_root)
     library = Library.from_dataset(dataset)
     assert library.keys == tuple(sorted(dataset.ids()))
@@ -69,11 +62,6 @@ def test_a_dataset_s_models_are_in_it_with_symmetries_bounds_and_meshes(sample_r
         np.testing.assert_array_equal(held.xyz, model.keypoints.xyz[order])
         np.testing.assert_array_equal(held.bounds, model.load_mesh().bounds)
         np.testing.assert_array_equal(held.load_mesh().faces, model.load_mesh().faces)
-        # The same pairs of keypoints, wherever they stand now.
-        ids = model.keypoints.ids
-        assert [{int(ids[a]), int(ids[b])} for a, b in model.symmetries.reflections] == [
-            {int(held.ids[a]), int(held.ids[b])} for a, b in held.symmetries.reflections
-        ]
 
 
 def test_categories_can_be_chosen_and_unknown_ones_are_refused(sample_root: Path) -> None:
@@ -138,24 +126,6 @@ def test_malformed_models_are_refused() -> None:
         replace(model, ids=np.arange(7))
 
 
-class TestMirroredLabelings:
-    XYZ = np.array([[x, y, z] for z in (-1, 1) for y in (0,) for x in (-1, 1)], dtype=float)
-
-    def test_pairs_across_one_plane_trade_labels_together(self) -> None:
-        (swapped,) = mirrored_labelings(self.XYZ, [(0, 1), (2, 3)])
-        assert swapped.tolist() == [1, 0, 3, 2]
-
-    def test_two_planes_make_three_labelings(self) -> None:
-        found = mirrored_labelings(self.XYZ, [(0, 1), (2, 3), (0, 2), (1, 3)])
-        assert [labels.tolist() for labels in found] == [[1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]]
-
-    def test_oblique_and_contradicting_pairs_are_left_out(self) -> None:
-        assert mirrored_labelings(self.XYZ, [(0, 3)]) == []
-        row = np.array([[float(x), 0, 0] for x in range(3)])
-        assert mirrored_labelings(row, [(0, 1), (1, 2)]) == []
-        assert mirrored_labelings(self.XYZ, []) == []
-
-
 # --- its file --------------------------------------------------------------------------------
 
 
@@ -172,7 +142,7 @@ def test_a_saved_library_is_the_same_when_opened(sample_root: Path, tmp_path: Pa
 def test_an_opened_library_is_mapped_and_cannot_be_changed(file: Path) -> None:
     table = Library.open(file)._table
     assert not table.xyz.flags.owndata
-    for array in (table.xyz, table.ids, table.bounds, table.places, table.offsets):
+    for array in (table.xyz, table.ids, table.bounds, table.offsets):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0
 
@@ -246,9 +216,6 @@ def test_forged_tables_are_refused_when_opened(library: Library, tmp_path: Path)
     models = {name: library._table.table[name].to_pylist() for name in SCHEMA.names}
     # Row 3 of a column gets an entry that no builder writes.
     forged = [
-        ("labelings", [10**9] * 8),
-        ("labelings", [-1] * 8),
-        ("labelings", [0, 1, 2]),
         ("semantic_ids", [0, 1]),
         ("semantic_ids", [None] * 8),
         ("keypoints", [[float("nan")] * 3] * 8),
@@ -276,19 +243,3 @@ def test_forged_offsets_are_refused_when_opened(file: Path) -> None:
     SEAL.write(file, payload)
     with pytest.raises(DataError, match="the library file is invalid: "):
         Library.open(file)
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["{", "[]", "{}", '{"reflections": [[0, 99]], "rotations": []}',
-     '{"reflections": [[0]], "rotations": []}',
-     '{"reflections": [], "rotations": [{"keypoints": [-1], "circle": null}]}'],
-)  # fmt: skip
-def test_forged_symmetries_are_refused_when_the_model_is_asked_for(
-    library: Library, tmp_path: Path, text: str
-) -> None:
-    columns = {name: library._table.table[name].to_pylist() for name in SCHEMA.names}
-    table = pa.table(columns | {"symmetries": [text] * len(library)}, schema=SCHEMA)
-    Library(ModelTable(table)).save(tmp_path / "forged")
-    with pytest.raises(DataError, match="symmetries: "):
-        next(iter(Library.open(tmp_path / "forged")))

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from scipy.linalg import eigh
 
 from cadalign import Alignment, Box, Camera, Library, Match, fit
-from cadalign.datasets import KeypointNet, Symmetries
+from cadalign.datasets import KeypointNet
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.options import LOSSES
 from cadalign.estimation.uncertainty.residuals import bent
@@ -283,45 +283,6 @@ class TestStretch:
         best = Library.from_models(models).retrieve(pixels, IDS, CAMERA)[0]
         assert best.model_id == "005"
         assert best.alignment.scale[1] == pytest.approx(1.2, rel=0.05)
-
-
-class TestMirroredLabels:
-    PAIRS = ((0, 1), (2, 3), (4, 5))
-
-    def models(self) -> list[LibraryModel]:
-        models = []
-        for number in range(12):
-            model = make_model(number)
-            xyz = model.xyz.copy()
-            for left, right in self.PAIRS:
-                xyz[right] = xyz[left] * [-1, 1, 1]
-            symmetries = Symmetries(reflections=self.PAIRS)
-            models.append(replace(model, xyz=xyz, symmetries=symmetries))
-        return models
-
-    def test_exchanged_labels_are_found_out(self) -> None:
-        models = self.models()
-        library = Library.from_models(models)
-        pixels = view(models[3], pose_of(3), noise_px=0.5)
-        wrong = np.array([1, 0, 3, 2, 5, 4, 6, 7, 8, 9])
-        tried = library.retrieve(pixels, wrong, CAMERA, symmetries=True)
-        assert tried[0].model_id == "003"
-        assert tried[0].mirrored
-        assert tried[0].rms < 1
-        # Matches are in the order of the labels, with the points that these mean on this model.
-        np.testing.assert_array_equal(tried[0].points_3d, models[3].xyz[wrong])
-        assert len(set(names(tried))) == len(tried) == 10
-        assert library.retrieve(pixels, wrong, CAMERA)[0].rms > 5
-
-    def test_right_labels_stay_as_they_are(self) -> None:
-        models = self.models()
-        library = Library.from_models(models)
-        pixels = view(models[3], pose_of(3), noise_px=0.5)
-        best = library.retrieve(pixels, IDS, CAMERA, symmetries=True)[0]
-        plain = library.retrieve(pixels, IDS, CAMERA)[0]
-        assert (best.model_id, best.mirrored) == ("003", False)
-        # Two labelings, equally likely beforehand.
-        assert plain.log_likelihood - best.log_likelihood == pytest.approx(np.log(2))
 
 
 class TestCategories:

@@ -239,11 +239,6 @@ NAMED = ShapeModel.from_basis(MODELS[0].xyz, [MODELS[0].xyz], [0.1], names=list(
             "shape['table']: its keypoints have names; learn it from models with semantic ids",
         ),
         (
-            {"symmetries": True},
-            "symmetries: True does not apply to a ranking by shape; "
-            "leave it at False, or rank without shape",
-        ),
-        (
             {"method": "epnp"},
             "method: 'epnp' does not apply to a ranking by shape; "
             "leave it at 'optimal', or rank without shape",

@@ -157,9 +157,9 @@ def test_table_and_page_say_that_it_is_none_of_these(
 def test_matches_as_json_are_those_of_the_library(
     case: Case, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options = ["--sigma", "2", "--category", "chair", "--symmetries", "--loss", "cauchy", "--json"]
+    options = ["--sigma", "2", "--category", "chair", "--loss", "cauchy", "--json"]
     assert main(["retrieve", *case.arguments, *options]) == 0
-    expected = case.retrieve(sigma=2.0, category="chair", symmetries=True, loss="cauchy")
+    expected = case.retrieve(sigma=2.0, category="chair", loss="cauchy")
     found = json.loads(capsys.readouterr().out)
     assert found == [match.to_dict() for match in expected]
     assert found[0]["camera"] == CAMERA.to_dict()

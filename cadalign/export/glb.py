@@ -12,7 +12,8 @@ camera, whose aspect ratio is that of angles, no unlit materials, and colours of
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +24,16 @@ from trimesh.visual.color import srgb_to_linear
 
 from cadalign.arrays import FloatArray
 from cadalign.export.aligned_object import AlignedObject, Frame
-from cadalign.export.scene_parts import OPAQUE, MeshPart, PlacedPhoto, parts_of, placed_parts
-from cadalign.geometry.mesh import Material
+from cadalign.export.scene_parts import PlacedPhoto, placed_parts
+from cadalign.geometry.mesh import Material, Mesh
 from cadalign.io.files import write_whole
 
 _gltf: Any = trimesh.exchange.gltf  # which has no types
 _visual: Any = trimesh.visual
 _UNLIT = "KHR_materials_unlit"
 _CLAMP_TO_EDGE = 33071  # as OpenGL numbers it
+_OPAQUE = 0.999  # least opacity of what is drawn as opaque
+_WHITE = (1.0, 1.0, 1.0, 1.0)
 
 
 _Node = tuple[str, trimesh.Trimesh, dict[str, Any], FloatArray]
@@ -48,9 +51,9 @@ def write_glb(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -
         If a photo cannot be read.
     """
     mesh, placing, photos = placed_parts(exported, frame)
-    nodes: list[_Node] = [
-        (f"{exported.name}_{number}", part_mesh(part), part_material(part), placing)
-        for number, part in enumerate(parts_of(mesh))
+    nodes = [
+        (f"{exported.name}_{number}", surface, material, placing)
+        for number, (surface, material) in enumerate(_parts(mesh))
     ]
     nodes += [
         _photo_node(f"photo_{number}", photo)
@@ -63,11 +66,12 @@ def write_glb(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -
         scene.add_geometry(surface, geom_name=own, node_name=own, transform=place)
 
     def complete(tree: dict[str, Any]) -> None:
-        set_materials(tree, {str(row): material for row, (_, _, material, _) in enumerate(nodes)})
+        _set_materials(tree, {str(row): material for row, (_, _, material, _) in enumerate(nodes)})
         _set_names(tree, {str(row): name for row, (name, *_) in enumerate(nodes)})
         _add_cameras(tree, photos)
 
-    _write(path, scene, complete)
+    data = _gltf.export_glb(scene, include_normals=False, tree_postprocessor=complete)
+    write_whole(path, lambda unfinished: unfinished.write_bytes(data))
 
 
 def _set_names(tree: dict[str, Any], names: dict[str, str]) -> None:
@@ -76,20 +80,33 @@ def _set_names(tree: dict[str, Any], names: dict[str, str]) -> None:
         each["name"] = names.get(each["name"], each["name"])
 
 
-def _write(path: Path, scene: Any, complete: Callable[[dict[str, Any]], None]) -> None:
-    data = _gltf.export_glb(scene, include_normals=False, tree_postprocessor=complete)
-    write_whole(path, lambda unfinished: unfinished.write_bytes(data))
+def _parts(mesh: Mesh) -> Iterator[tuple[trimesh.Trimesh, dict[str, Any]]]:
+    """Parts of one material as trimesh writes them, and their materials as glTF has them.
 
-
-def part_mesh(part: MeshPart) -> trimesh.Trimesh:
-    """The triangles of one material as trimesh writes them."""
-    if part.uv is not None:
-        return _textured(part.vertices, part.faces, part.uv, part.material.texture)
-    colors = None
-    if part.colors is not None:
-        linear = np.column_stack([srgb_to_linear(part.colors[:, :3]), part.colors[:, 3]])
-        colors = np.round(255 * linear).astype(np.uint8)
-    return trimesh.Trimesh(part.vertices, part.faces, vertex_colors=colors, process=False)
+    Vertices with several texture coordinates are repeated.
+    """
+    for number in np.unique(mesh.face_material):
+        material, rows = mesh.materials[number], mesh.face_material == number
+        corners, texture = mesh.faces[rows].ravel(), material.texture
+        keys = corners[:, None]
+        if texture is not None and mesh.corner_uv is not None:
+            keys = np.column_stack([corners, mesh.corner_uv[rows].reshape(-1, 2)])
+        kept, inverse = np.unique(keys, axis=0, return_inverse=True)
+        used, faces, colors = kept[:, 0].astype(np.int64), inverse.reshape(-1, 3), None
+        if mesh.vertex_colors is not None:  # which take the place of the material's
+            own, material = mesh.vertex_colors[used], replace(material, color=_WHITE)
+            linear = np.column_stack([srgb_to_linear(own[:, :3]), own[:, 3]])
+            colors = np.round(255 * linear).astype(np.uint8)
+        look = _look(material)
+        if texture is not None and mesh.corner_uv is not None:
+            surface = _textured(mesh.vertices[used], faces, kept[:, 1:], texture)
+            if texture.shape[2] == 4 and (texture[..., 3] < 255).any() and "alphaMode" not in look:
+                look["alphaMode"] = "MASK"
+        else:
+            surface = trimesh.Trimesh(
+                mesh.vertices[used], faces, vertex_colors=colors, process=False
+            )
+        yield surface, look
 
 
 def _textured(vertices: FloatArray, faces: Any, uv: FloatArray, texture: Any) -> trimesh.Trimesh:
@@ -99,7 +116,8 @@ def _textured(vertices: FloatArray, faces: Any, uv: FloatArray, texture: Any) ->
 
 
 def _photo_node(name: str, photo: PlacedPhoto) -> _Node:
-    mesh = _textured(*photo.plane.rectangle(photo.depth), photo.plane.image)
+    uv = np.array([[0.0, 1.0], [0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+    mesh = _textured(photo.corners, np.array([[0, 1, 2], [0, 2, 3]]), uv, photo.plane.image)
     material = {
         "name": name,
         "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
@@ -108,28 +126,22 @@ def _photo_node(name: str, photo: PlacedPhoto) -> _Node:
     return name, mesh, material, photo.pose
 
 
-def part_material(part: MeshPart) -> dict[str, Any]:
-    """The material of a part as glTF has it."""
-    material: Material = part.material
+def _look(material: Material) -> dict[str, Any]:
+    """A material as glTF has it."""
     red, green, blue, alpha = material.color
-    linear = srgb_to_linear(np.array([red, green, blue])).tolist()
     look: dict[str, Any] = {
         "name": material.name or "surface",
         "pbrMetallicRoughness": {
-            "baseColorFactor": [*linear, alpha],
+            "baseColorFactor": [*srgb_to_linear(np.array([red, green, blue])).tolist(), alpha],
             "metallicFactor": 0.0,
             "roughnessFactor": 1.0,
         },
         "doubleSided": True,  # faces of CAD models point either way
     }
-    if alpha < OPAQUE:
-        look["alphaMode"] = "BLEND"
-    elif part.is_cut_out:
-        look["alphaMode"] = "MASK"
-    return look
+    return look | ({"alphaMode": "BLEND"} if alpha < _OPAQUE else {})
 
 
-def set_materials(tree: dict[str, Any], looks: dict[str, dict[str, Any]]) -> None:
+def _set_materials(tree: dict[str, Any], looks: dict[str, dict[str, Any]]) -> None:
     """Replace trimesh's materials, which only bring the textures along."""
     brought = tree.get("materials", [])
     tree["materials"] = []
@@ -156,10 +168,7 @@ def _add_cameras(tree: dict[str, Any], photos: Sequence[PlacedPhoto]) -> None:
     roots = tree["scenes"][tree["scene"]]["nodes"]
     for number, photo in enumerate(photos):
         name = f"camera_{number}"
-        near, far = photo.clipping
-        plane = photo.plane
-        look = {"aspectRatio": plane.aspect, "yfov": plane.yfov, "znear": near, "zfar": far}
-        tree["cameras"].append({"name": name, "type": "perspective", "perspective": look})
+        tree["cameras"].append({"name": name, "type": "perspective", "perspective": photo.look})
         roots.append(len(tree["nodes"]))
         matrix = photo.pose.T.ravel().tolist()
         tree["nodes"].append({"name": name, "camera": number, "matrix": matrix})

@@ -1,4 +1,4 @@
-"""Parts of a scene for viewers: photos as rectangles, meshes of one material.
+"""Photos as rectangles in a scene for viewers, and the model's place in it.
 
 glTF's cameras have their principal point in the image's centre and no lens distortion. So the photo
 becomes a textured rectangle at the place where the camera sees it, and the camera's field of view
@@ -8,71 +8,36 @@ photo with a margin at one side. A distorted photo is resampled to a pinhole cam
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.export.aligned_object import AlignedObject, Frame
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import OPENGL_AXES, OPENGL_FLIP
-from cadalign.geometry.mesh import Material, Mesh
+from cadalign.geometry.mesh import Mesh
 from cadalign.io.images import ByteImage
 
 _BORDER = 0.5  # from the corner pixel's centre to the image's border [px]
-_WHITE = (1.0, 1.0, 1.0, 1.0)
 _GROWTH = 2.0  # how much larger than the photo an undistorted one may become, each way
 _AGREES = 1e-6
 _RIM = 1.5  # how far the border's colours go on beyond the photo [px]
 _BEHIND = 1.5  # depth of the photo over that of the object's farthest corner
 _FAR_OFF = 100.0  # coordinates over the extent
-OPAQUE = 0.999
-"""Least opacity of what is drawn as opaque."""
 _NEAR, _FAR = 1e-3, 10.0  # depths between which a viewer draws, over that of the photo
 
 
-@dataclass(frozen=True, eq=False)
-class PhotoPlane:
-    """The rectangle of a photo at depth 1, in the camera's axes (x right, y down).
-
-    Parameters
-    ----------
-    image : (h, w, 3) uint8 or None
-        The photo, without lens distortion.
-    low, high : (2,) float
-        Its top left and bottom right corner in normalised image coordinates.
-    """
+class PhotoPlane(NamedTuple):
+    """The rectangle of a photo at depth 1, in the camera's axes (x right, y down)."""
 
     image: ByteImage | None
+    """The photo (h, w, 3), without lens distortion."""
     low: FloatArray
+    """Its top left corner (2,) in normalised image coordinates."""
     high: FloatArray
-
-    @property
-    def half_field(self) -> FloatArray:
-        """Tangents (2,) of half the horizontal and vertical field of view that hold the photo."""
-        return np.asarray(np.maximum(np.abs(self.low), np.abs(self.high)))
-
-    @property
-    def yfov(self) -> float:
-        """Vertical field of view [rad]."""
-        return 2 * float(np.arctan(self.half_field[1]))
-
-    @property
-    def aspect(self) -> float:
-        """Width over height of the field of view."""
-        return float(self.half_field[0] / self.half_field[1])
-
-    @property
-    def corners(self) -> FloatArray:
-        """Corners at depth 1: top left, bottom left, bottom right, top right; (4, 3) float."""
-        (left, top), (right, bottom) = self.low, self.high
-        return np.array([[left, top, 1], [left, bottom, 1], [right, bottom, 1], [right, top, 1]])
-
-    def rectangle(self, depth: float) -> tuple[FloatArray, IntArray, FloatArray]:
-        """Vertices at a depth, in glTF's axes, faces and texture coordinates."""
-        uv = np.array([[0.0, 1.0], [0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
-        return self.corners * depth * OPENGL_AXES, np.array([[0, 1, 2], [0, 2, 3]]), uv
+    """Its bottom right corner (2,)."""
 
 
 def photo_plane(camera: Camera, image: ByteImage | None) -> PhotoPlane:
@@ -86,8 +51,7 @@ def photo_plane(camera: Camera, image: ByteImage | None) -> PhotoPlane:
     return PhotoPlane(image, (-_BORDER - centre) / focal, (size - _BORDER - centre) / focal)
 
 
-@dataclass(frozen=True, eq=False)
-class PlacedPhoto:
+class PlacedPhoto(NamedTuple):
     """A photo in a scene, behind the object."""
 
     plane: PhotoPlane
@@ -98,9 +62,18 @@ class PlacedPhoto:
     """Pose (4, 4) of its camera, which has glTF's axes [m]."""
 
     @property
-    def clipping(self) -> tuple[float, float]:
-        """Depths between which a viewer draws [m]."""
-        return _NEAR * self.depth, _FAR * self.depth
+    def look(self) -> dict[str, float]:
+        """The camera of glTF that holds the photo about its principal point."""
+        across, down = np.maximum(np.abs(self.plane.low), np.abs(self.plane.high)).tolist()
+        field = {"aspectRatio": across / down, "yfov": 2 * float(np.arctan(down))}
+        return field | {"znear": _NEAR * self.depth, "zfar": _FAR * self.depth}
+
+    @property
+    def corners(self) -> FloatArray:
+        """Top left, bottom left, bottom right, top right, in glTF's axes; (4, 3) float."""
+        (left, top), (right, bottom) = self.plane.low, self.plane.high
+        rows = [[left, top, 1], [left, bottom, 1], [right, bottom, 1], [right, top, 1]]
+        return np.asarray(np.array(rows) * self.depth * OPENGL_AXES)
 
 
 def placed_parts(
@@ -177,52 +150,3 @@ def _undistorted(image: ByteImage, camera: Camera, pinhole: Camera) -> ByteImage
     )
     drawn[~inside.reshape(drawn.shape[:2])] = 0
     return np.asarray(drawn, dtype=np.uint8)
-
-
-@dataclass(frozen=True, eq=False)
-class MeshPart:
-    """Triangles of one material.
-
-    Parameters
-    ----------
-    material : Material
-    vertices : (n, 3) float
-    faces : (m, 3) int
-    uv : (n, 2) float or None
-        Texture coordinates from the bottom left, where the material has a texture.
-    colors : (n, 4) float or None
-        Vertex colours; the material's is white then.
-    """
-
-    material: Material
-    vertices: FloatArray
-    faces: IntArray
-    uv: FloatArray | None
-    colors: FloatArray | None
-
-    @property
-    def is_cut_out(self) -> bool:
-        """True if the texture has transparent pixels."""
-        texture = self.material.texture
-        is_open = texture is not None and texture.shape[2] == 4 and (texture[..., 3] < 255).any()
-        return bool(is_open) and self.uv is not None
-
-
-def parts_of(mesh: Mesh) -> Iterator[MeshPart]:
-    """List the parts of a mesh; vertices with several texture coordinates are repeated."""
-    for number in np.unique(mesh.face_material):
-        material = mesh.materials[number]
-        rows = mesh.face_material == number
-        corners = mesh.faces[rows].ravel()
-        uv = None
-        if material.texture is not None and mesh.corner_uv is not None:
-            keys = np.column_stack([corners, mesh.corner_uv[rows].reshape(-1, 2)])
-            kept, inverse = np.unique(keys, axis=0, return_inverse=True)
-            used, uv = kept[:, 0].astype(np.int64), kept[:, 1:]
-        else:
-            used, inverse = np.unique(corners, return_inverse=True)
-        colors = None
-        if mesh.vertex_colors is not None:  # which take the place of the material's
-            colors, material = mesh.vertex_colors[used], replace(material, color=_WHITE)
-        faces = inverse.reshape(-1, 3).astype(np.int64)
-        yield MeshPart(material, mesh.vertices[used], faces, uv, colors)

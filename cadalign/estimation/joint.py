@@ -27,7 +27,7 @@ from cadalign.estimation.estimates import (
     with_box,
 )
 from cadalign.estimation.focal import prior_of_camera
-from cadalign.estimation.prior import is_exact, widened
+from cadalign.estimation.prior import camera_like, is_exact, widened
 from cadalign.estimation.problem import Problem
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import (
@@ -108,9 +108,11 @@ def result_of(
     of_points = second_moments(estimates, [each.of_points for each in estimates], places)
     of_seen = second_moments(estimates, [each.of_seen for each in estimates], seen)
     of_views, summaries = [], list(evidence)
+    known = dict(zip((views[k].camera for k in numbers), best.cameras, strict=True))
     for number, view in enumerate(views):
         rows, observed = prior.rows_of(view.keypoint_ids, "ids"), view.pixels
-        camera, alignment, own = view.camera, best.poses[0], Posterior()  # a pose as good as any
+        # Of a view without evidence a pose as good as any.
+        camera, alignment, own = camera_like(view.camera, known), best.poses[0], Posterior()
         kept = np.zeros(len(rows), dtype=bool)
         if number in numbers:
             place = numbers.index(number)

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import is_dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from msgspec.structs import asdict
@@ -39,9 +39,6 @@ from cadalign.io.documents import (
     convert,
     within,
 )
-
-if TYPE_CHECKING:
-    from cadalign.estimation.result import Result
 
 Matrix = list[list[Finite]]
 Matrix3 = tuple[Point3, Point3, Point3]
@@ -147,7 +144,7 @@ _FORMS: Mapping[type, type[ForeignDocument]] = {
 }
 
 
-def write_result(result: Result) -> dict[str, Any]:
+def write_result(result: Any) -> dict[str, Any]:
     """A result as plain lists and numbers; its model is not part of it."""
     posterior = {name: getattr(result.posterior, name) for name in _OF_POSTERIOR}
     others = {"version": 1, **posterior, "own_stretch": result.stretch}
@@ -206,14 +203,14 @@ _VALUES: Mapping[str, Callable[[Any], Any]] = {
 """What makes a field's value of its form in a file, where that is another one."""
 
 
-def read_result(data: Mapping[str, Any], kind: type[Result]) -> Result:
-    """Read the parsed form of a result; see `cadalign.Result.from_dict`.
+def read_result(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Read the fields of a result from its parsed form; see `cadalign.Result.from_dict`.
 
     Raises InputError if a field is missing or invalid.
     """
     try:
         with np.errstate(over="ignore", invalid="ignore"):
-            return _result(convert(data, _Result), kind)
+            return _result(convert(data, _Result))
     except CadalignError as error:
         place = f"result: {error.where}" if error.where else "result"
         raise InputError(error.what, where=place, fix=error.fix) from None
@@ -227,7 +224,7 @@ def _values(read: ForeignDocument) -> dict[str, Any]:
     }
 
 
-def _result(read: _Result, kind: type[Result]) -> Result:
+def _result(read: _Result) -> dict[str, Any]:
     unknowns = 10 if read.focal == "estimate" else 9
     views, alternatives = [], []
     for number, view in enumerate(read.views):
@@ -244,11 +241,8 @@ def _result(read: _Result, kind: type[Result]) -> Result:
     }
     posterior = Posterior(views[0].covariance, **of_posterior)
     views[0] = replace(views[0], posterior=posterior)
-    fields |= {
-        "views": tuple(views),
-        "alternatives": tuple(alternatives),
-    }
-    return kind(**fields, posterior=posterior)
+    several = {"views": tuple(views), "alternatives": tuple(alternatives)}
+    return fields | several | {"posterior": posterior}
 
 
 def _view(read: _View, unknowns: int) -> ViewResult:

@@ -1,4 +1,4 @@
-"""Outputs of results: pictures on axes, and aligned objects for export."""
+"""Outputs of results: text, pictures on axes, and aligned objects for export."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from cadalign.io.images import ByteImage, read_photo
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from cadalign.estimation.result_data import ResultData
+    from cadalign.estimation.result import Result
 
 Photo = Path | str | ByteImage | None
 _LONGEST_SIDE = 480  # of the grid of rays through a drawn model
@@ -33,8 +33,47 @@ _GREY = 0.9
 _LINE_POINTS = 17  # lens distortion bends the edges of a box
 
 
+def text_of(result: Result) -> str:
+    """Keypoints, rotation, translation, stretch, focal length, alternatives, warnings."""
+    count, of = int(result.inliers.sum()), len(result.inliers)
+    some = f"{count}" if count == of else f"{count} of {of}"
+    views = "" if len(result.views) == 1 else f" in {len(result.views)} views"
+    std, pose = result.std, result.alignment
+    angle = np.degrees(np.arccos(np.clip((np.trace(pose.rotation) - 1) / 2, -1, 1)))
+    rotation = f"{angle:.4g} deg from the camera's axes"
+    translation = f"({', '.join(f'{value:.4g}' for value in pose.translation)})"
+    stretch = [f"{value:.4g}" for value in result.stretch]
+    known_to = ""
+    if std is not None:
+        rotation += f", +- {std.rotation_deg:.2g} deg"
+        translation += f" +- ({', '.join(f'{value:.2g}' for value in std.translation)})"
+        stretch = [
+            text if deviation == 0 else f"{text} +- {100 * deviation:.2g} %"
+            for text, deviation in zip(stretch, std.scale, strict=True)
+        ]
+        known_to = f" +- {100 * std.focal:.2g} %"
+    lines = [
+        f"{result.method}: {some} keypoints{views}, rms {result.rms:.3g} px",
+        f"  rotation     {rotation}",
+        f"  translation  {translation}",
+        f"  stretch      ({', '.join(stretch)})",
+    ]
+    if result.focal == "estimate":
+        prior = "" if result.focal_prior is None else f" (prior: {result.focal_prior})"
+        lines.append(f"  focal length {result.camera.fx:.4g} px{known_to}{prior}")
+    lines.extend(
+        f"  also likely  ({other.relative_likelihood:.2g} x): scale "
+        f"({', '.join(f'{value:.4g}' for value in other.alignment.scale)})"
+        for other in result.alternatives
+    )
+    if len(result.evidence) > 1:
+        lines.extend(f"  evidence     {each}" for each in result.evidence)
+    lines.extend(f"  warning      {text}" for text in result.warnings)
+    return "\n".join(lines)
+
+
 def plot_result(
-    result: ResultData,
+    result: Result,
     image: npt.ArrayLike | str | os.PathLike[str] | None = None,
     mesh: Mesh | None = None,
     *,
@@ -158,7 +197,7 @@ def _shade(camera: Camera, alignment: Alignment, mesh: Mesh) -> FloatArray:
 
 
 def object_of(
-    result: ResultData,
+    result: Result,
     *,
     mesh: Mesh | str | os.PathLike[str] | None = None,
     image: Photo = None,

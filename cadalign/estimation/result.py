@@ -1,36 +1,129 @@
-"""The result of every estimate: its values, its text, pictures, files and exports."""
+"""The result of every estimate: its values, pictures, files and exports."""
 
 from __future__ import annotations
 
+import logging
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.estimation.result_data import ResultData
+from cadalign.arrays import BoolArray, FloatArray, is_number
+from cadalign.errors import DataError, InputError, quote
+from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.options import FitOptions
+from cadalign.estimation.result_parts import (
+    NO_STATS,
+    Alternative,
+    FitStats,
+    Posterior,
+    Uncertainty,
+    ViewResult,
+    points_covariances,
+    rms_of,
+    uncertainty_of,
+)
+from cadalign.geometry.alignment import Alignment, Box, extent
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.files import as_path, write_json
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from cadalign.estimation.model import Model
+    from cadalign.estimation.result_parts import EvidenceSummary
+    from cadalign.estimation.warning import EstimateWarning
     from cadalign.export.aligned_object import Frame
     from cadalign.geometry.mesh import Mesh
+    from cadalign.shapes.model import ShapeModel
+
+logger = logging.getLogger("cadalign")
 
 
 @dataclass(frozen=True, eq=False)
-class Result(ResultData):
+class Result:
     """Pose, stretch and shape of an object, with their uncertainty.
 
-    What `cadalign.fit`, `cadalign.align`, batches, retrieval and the annotator return. Its values
-    are those of `cadalign.estimation.result_data.ResultData`.
+    What `cadalign.fit`, `cadalign.align`, batches, retrieval and the annotator return.
+
+    Parameters
+    ----------
+    views : tuple of ViewResult
+        Camera, pose, residuals and inliers of every view.
+    ids : tuple of int or str
+        Ids or names of the m keypoints; of `cadalign.fit`, their rows.
+    points_3d : (m, 3) float
+        All keypoints of the model as they are on the object, also those that no view shows, in the
+        model's frame and before its stretch: of an exact model, as given; with a symmetry, turned
+        by the one that leads to this alignment.
+    method : str
+        The method that found it: that of `cadalign.fit`, "align" where all evidence was estimated
+        together.
+    posterior : Posterior
+        The uncertainty, and warnings about it.
+    known_axis : {"x", "y", "z"}, optional
+        The model's axis whose scale was taken as 1; None where all of them are estimated, or none.
+    stretched_axes : str
+        The axes whose scale was estimated.
+    focal : {"known", "estimate"}
+        The cameras' focal length was taken as right, or estimated.
+    focal_prior : FocalPrior, optional
+        Prior on the estimated focal length.
+    sigma : float, optional
+        Standard deviation of the keypoints [px], given or estimated; None where each keypoint has
+        its own.
+    cost : float, optional
+        -2 log likelihood of the evidence, with its priors, but for constants: the sum of whitened
+        squares, or of losses. None for methods that are not statistical.
+    alternatives : tuple of Alternative
+        Other estimates that explain the evidence as well: with 4 points all other exact solutions,
+        otherwise minima whose likelihood is at least 1/1000 of the best one's.
+    stats : FitStats
+    options : FitOptions, optional
+        As for `cadalign.fit`.
+    symmetry : Symmetry, optional
+        The model's, as given: of all equal alignments this is the canonical one.
+    model : Model or ShapeModel, optional
+        The model of `cadalign.align`; None for a result that was read from a file.
+    component : int
+        Number of the mixture's component that the object belongs to.
+    rig_from_model : Alignment, optional
+        The alignment in the frame that views with ``cam_from_rig`` share; None without them.
+    own_bounds, own_stretch : optional
+        ``bounds`` and ``stretch`` where they do not follow.
     """
 
+    views: tuple[ViewResult, ...]
+    ids: tuple[Hashable, ...]
+    points_3d: FloatArray
+    method: str
+    posterior: Posterior = field(repr=False)
+    known_axis: str | None = "x"
+    stretched_axes: str = "yz"
+    focal: str = "known"
+    focal_prior: FocalPrior | None = None
+    sigma: float | None = None
+    cost: float | None = None
+    alternatives: tuple[Alternative, ...] = ()
+    stats: FitStats = NO_STATS
+    options: FitOptions | None = None
+    symmetry: Symmetry | None = None
+    model: Model | ShapeModel | None = None
+    component: int = 0
+    rig_from_model: Alignment | None = None
+    own_bounds: FloatArray | None = None
+    own_stretch: FloatArray | None = None
+
     def __str__(self) -> str:
-        return _text_of(self)
+        from cadalign.estimation.outputs import text_of
+
+        return text_of(self)
 
     def __repr__(self) -> str:
         stretch = ", ".join(f"{value:.3g}" for value in self.stretch)
@@ -40,6 +133,219 @@ class Result(ResultData):
             f"{len(self.inliers)}, rms={self.rms:.3g} px, stretch=({stretch}), "
             f"warnings={len(self.warnings)})"
         )
+
+    @property
+    def alignment(self) -> Alignment:
+        """Pose in the first view's camera, and scale.
+
+        ``alignment.apply(points_3d)`` are the object's keypoints in that camera's frame.
+        """
+        return self.views[0].alignment
+
+    @property
+    def camera(self) -> Camera:
+        """The first view's camera; with the estimated focal length, where that was unknown."""
+        return self.views[0].camera
+
+    @property
+    def poses(self) -> tuple[Alignment, ...]:
+        """The alignment in every view's camera."""
+        return tuple(view.alignment for view in self.views)
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The camera of every view."""
+        return tuple(view.camera for view in self.views)
+
+    @property
+    def residuals(self) -> FloatArray:
+        """Projected minus observed keypoints (n, 2) of all views, one after the other [px].
+
+        Infinite for keypoints that were rejected and lie behind the camera.
+        """
+        return np.concatenate([view.residuals for view in self.views])
+
+    @property
+    def inliers(self) -> BoolArray:
+        """Marks the keypoints (n,) of all views that the estimate rests on."""
+        return np.concatenate([view.inliers for view in self.views])
+
+    @property
+    def rms(self) -> float:
+        """Root mean square length of the inliers' residuals [px]."""
+        return rms_of(self.residuals, self.inliers)
+
+    @property
+    def covariance(self) -> FloatArray | None:
+        """Covariance (9, 9) or (10, 10) of the errors, calibrated.
+
+        The unknowns are the rotation vector in the first camera's frame [rad], the translation
+        [model units], the logarithms of the object's lengths along x, y, z and, where it was
+        estimated, of the focal length; zero for what is held. None for methods that are not
+        statistical.
+
+        For keypoints of an exact model in one view it is the second moments of the posterior
+        about the alignment, from some thousand draws (always the same), scaled such that the 95 %
+        ellipsoid holds what the likelihood ratio does not reject at 5 %. Where sigma was estimated,
+        it is widened for the few degrees of freedom of that estimate. It does not reach to the
+        ``alternatives``. Beyond 100 keypoints it is ``fisher_covariance`` but for that widening.
+
+        For other evidence it is the inverse information of all evidence and priors, calibrated for
+        learned shapes, and where other estimates are likely too, it holds their distance.
+
+        With a symmetry, rotations about its axes count nothing.
+        """
+        return self.posterior.covariance
+
+    @property
+    def fisher_covariance(self) -> FloatArray | None:
+        """Inverse of the Fisher information at the optimum, in the form of ``covariance``.
+
+        The Cramer-Rao bound there: with few keypoints errors are larger. None for methods that are
+        not statistical, and where a file does not hold it.
+        """
+        return self.posterior.fisher_covariance
+
+    @property
+    def std(self) -> Uncertainty | None:
+        """Standard deviations from ``covariance``; None for methods that have none."""
+        return None if self.covariance is None else uncertainty_of(self.covariance)
+
+    @property
+    def degrees_of_freedom(self) -> float | None:
+        """Tails of the t distribution of the errors, whose covariance the stated ones are.
+
+        None if they are Gaussian. `radius` depends on it.
+        """
+        return self.posterior.degrees_of_freedom
+
+    @cached_property
+    def _of_points(self) -> tuple[FloatArray, FloatArray] | None:
+        if self.covariance is None:
+            return None
+        return points_covariances(self.points_3d, self.alignment, self.covariance)
+
+    @property
+    def points_covariance(self) -> FloatArray | None:
+        """Covariance (m, 3, 3) of each keypoint in the model's frame, with its stretch."""
+        stated = self.posterior.points_covariance
+        return stated if stated is not None or self._of_points is None else self._of_points[0]
+
+    @property
+    def points_cam_covariance(self) -> FloatArray | None:
+        """Covariance (m, 3, 3) of each keypoint in the first camera's frame."""
+        stated = self.posterior.points_cam_covariance
+        return stated if stated is not None or self._of_points is None else self._of_points[1]
+
+    @property
+    def warnings(self) -> tuple[EstimateWarning, ...]:
+        """Warnings about what `std` does not say: contradictions, other poses, nothing to test.
+
+        Each has a ``kind``, a ``text``, and the ``view`` and ``keypoints`` that it is about.
+        """
+        return self.posterior.warnings
+
+    @property
+    def evidence(self) -> tuple[EvidenceSummary, ...]:
+        """Agreement of every piece of evidence with the estimate."""
+        return self.posterior.evidence
+
+    @property
+    def bounds(self) -> FloatArray:
+        """Least and greatest coordinates (2, 3) of the object in the model's frame.
+
+        The keypoints' bounds where the model has no others.
+        """
+        return extent(self.points_3d) if self.own_bounds is None else self.own_bounds
+
+    @property
+    def box(self) -> Box:
+        """The object's box in the first camera's frame."""
+        return Box.from_model(self.bounds, self.alignment)
+
+    @property
+    def stretch(self) -> FloatArray:
+        """Lengths (3,) of the object over the model's or, for a learned shape, the mean's."""
+        return self.alignment.scale if self.own_stretch is None else self.own_stretch
+
+    def radius(self, probability: float, *, dimension: int = 1) -> float:
+        """Radius, in standard deviations, of the region that holds the truth with a probability.
+
+        Parameters
+        ----------
+        probability : float
+            Between 0 and 1.
+        dimension : int
+            Number of coordinates that the region has: 1 for the interval of one number, 3 for the
+            ellipsoid of a rotation, translation or keypoint, along the principal axes of its
+            covariance. ``std.rotation_deg`` is a total over three axes and takes neither.
+
+        Raises
+        ------
+        InputError
+            If the probability is not between 0 and 1, or the dimension is not positive.
+        """
+        from cadalign.shapes.parts import radius_of
+
+        if not is_number(probability) or not 0 < probability < 1:
+            raise InputError(f"{quote(probability)} is not between 0 and 1", where="probability")
+        if not is_number(dimension) or dimension < 1:
+            raise InputError(f"{quote(dimension)} is not a positive number", where="dimension")
+        return radius_of(probability, dimension, self.degrees_of_freedom)
+
+    def mesh(self, mesh: Mesh | str | os.PathLike[str] | None = None) -> Mesh:
+        """A model's mesh, warped so that its keypoints are the object's.
+
+        Parameters
+        ----------
+        mesh : Mesh or path, optional
+            By default that of the `Model` or, for a learned shape, of the nearest training model.
+            Where the model is not known, it is taken for the object's own.
+
+        Returns
+        -------
+        Mesh
+            In the model's frame, before the stretch; ``alignment`` places it.
+
+        Raises
+        ------
+        InputError
+            If there is no mesh to warp.
+        """
+        from cadalign.io.meshes.files import as_mesh
+        from cadalign.shapes.model import ShapeModel
+        from cadalign.shapes.warp import warp_mesh
+
+        model, source = self.model, cast(FloatArray | None, None)
+        if isinstance(model, ShapeModel):
+            nearest = model.nearest(self.points_3d)
+            source, mesh = nearest.points_3d, nearest.mesh_path if mesh is None else mesh
+        elif model is not None:
+            source = None if model.shape_sigma is None else cast(FloatArray, model.points_3d)
+            mesh = model.mesh if mesh is None else mesh
+        if mesh is None:
+            raise InputError("the model has no mesh", where="mesh", fix="give one")
+        own = as_mesh(mesh, where="mesh")
+        if source is None:
+            return own
+        known = np.isfinite(source).all(axis=1)
+        return warp_mesh(own, source[known], self.points_3d[known], bounds=self.bounds)
+
+    def known_mesh(self, mesh: Mesh | str | os.PathLike[str] | None) -> Mesh | None:
+        """As `mesh`; None where there is no mesh to warp.
+
+        A mesh of the model that cannot be read is warned of (logger "cadalign").
+        """
+        try:
+            return self.mesh(mesh)
+        except InputError:
+            if mesh is not None:
+                raise
+        except DataError as error:
+            if mesh is not None:
+                raise
+            logger.warning("the nearest training model is not drawn: %s", error)
+        return None
 
     def plot(
         self,
@@ -161,43 +467,4 @@ class Result(ResultData):
         """
         from cadalign.estimation.document import read_result
 
-        return read_result(data, cls)
-
-
-def _text_of(result: ResultData) -> str:
-    """Keypoints, rotation, translation, stretch, focal length, alternatives, warnings."""
-    count, of = int(result.inliers.sum()), len(result.inliers)
-    some = f"{count}" if count == of else f"{count} of {of}"
-    views = "" if len(result.views) == 1 else f" in {len(result.views)} views"
-    std, pose = result.std, result.alignment
-    angle = np.degrees(np.arccos(np.clip((np.trace(pose.rotation) - 1) / 2, -1, 1)))
-    rotation = f"{angle:.4g} deg from the camera's axes"
-    translation = f"({', '.join(f'{value:.4g}' for value in pose.translation)})"
-    stretch = [f"{value:.4g}" for value in result.stretch]
-    known_to = ""
-    if std is not None:
-        rotation += f", +- {std.rotation_deg:.2g} deg"
-        translation += f" +- ({', '.join(f'{value:.2g}' for value in std.translation)})"
-        stretch = [
-            text if deviation == 0 else f"{text} +- {100 * deviation:.2g} %"
-            for text, deviation in zip(stretch, std.scale, strict=True)
-        ]
-        known_to = f" +- {100 * std.focal:.2g} %"
-    lines = [
-        f"{result.method}: {some} keypoints{views}, rms {result.rms:.3g} px",
-        f"  rotation     {rotation}",
-        f"  translation  {translation}",
-        f"  stretch      ({', '.join(stretch)})",
-    ]
-    if result.focal == "estimate":
-        prior = "" if result.focal_prior is None else f" (prior: {result.focal_prior})"
-        lines.append(f"  focal length {result.camera.fx:.4g} px{known_to}{prior}")
-    lines.extend(
-        f"  also likely  ({other.relative_likelihood:.2g} x): scale "
-        f"({', '.join(f'{value:.4g}' for value in other.alignment.scale)})"
-        for other in result.alternatives
-    )
-    if len(result.evidence) > 1:
-        lines.extend(f"  evidence     {each}" for each in result.evidence)
-    lines.extend(f"  warning      {text}" for text in result.warnings)
-    return "\n".join(lines)
+        return cls(**read_result(data))

@@ -1,4 +1,4 @@
-"""Make the documentation's pictures: overview, chairs, annotator, architecture.
+"""Make the documentation's pictures: overview, chairs, annotator.
 
     python scripts/make_pictures.py overview
 
@@ -10,11 +10,9 @@ The annotator's photo and model are those of `chairs`, whose files are needed:
 
 from __future__ import annotations
 
-import re
 import sys
 import tempfile
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 
 import cv2
@@ -42,24 +40,10 @@ from cadalign.render.drawing.canvas import ByteImage
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 MODELS = (("chair", "000"), ("car", "002"), ("bottle", "002"), ("vessel", "003"))
-WIDTH, ROW, TOP = 1080, 34, 56
 CHAIR_CAMERA = Camera.from_fov(640, 720, fov_x=33.0)
 CHAIR_VIEW = Angles(azimuth=143.0, elevation=24.0)
 PHOTO_GROUND = (206, 208, 212)
 LINE = (35, 208, 255)
-# Layers by kind, and the kind's colour.
-KINDS = {
-    "#e8e8ec": "errors names arrays compile",
-    "#d9e8f7": "geometry metrics io solvers shapes export estimation torch",
-    "#dcf0dc": "datasets render web",
-    "#fbe9d0": "retrieval evaluation batch report annotate cli scripts",
-}
-# The layers that a journey passes, in order, and what happens there.
-FIT = "cli options, io observation, estimation checks, solvers search, render overlay"
-INSTANCE = (
-    "cli options, evaluation task, datasets model, render visible keypoints, estimation fit, "
-    "solvers search, geometry errors, report page"
-)
 
 
 def overview() -> None:
@@ -186,51 +170,7 @@ def annotator(*, files: Path) -> None:
         page.screenshot(path=DOCS / "annotator.png")
 
 
-def label(x: float, y: float, content: str, style: str = "") -> str:
-    """One line of text."""
-    return f'<text x="{x}" y="{y}" {style}>{escape(content)}</text>'
-
-
-def journey(title: str, x: float, color: str, stops: str, rows: dict[str, float]) -> list[str]:
-    """A vertical line with a dot in every layer that a journey passes, numbered in order."""
-    heights = []
-    parts = [label(x - 6, 26, title, f'font-weight="bold" fill="{color}"')]
-    for number, stop in enumerate(stops.split(", "), start=1):
-        name, note = stop.split(maxsplit=1)
-        y = rows[name]
-        heights.append(y)
-        parts.append(f'<circle cx="{x}" cy="{y}" r="6" fill="{color}"/>')
-        parts.append(label(x + 12, y + 4, f"{number} {note}"))
-    line = f'<path d="M{x} {min(heights)}V{max(heights)}" stroke="{color}" stroke-width="3"/>'
-    return [line, *parts]
-
-
-def architecture() -> None:
-    """The README's list of layers, the lowest at the bottom, and two journeys through them."""
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    listed = readme.split("## How it is built\n\n```\n")[1].split("```")[0]
-    layers = re.findall(r"^ *([a-z]+)(?:\.py|/) +(.+)$", listed, re.MULTILINE)[::-1]
-    rows = {name: TOP + ROW * k for k, (name, _) in enumerate(layers)}
-    height = TOP + ROW * len(layers)
-    parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}" '
-        'font-family="Helvetica, Arial, sans-serif" font-size="13" fill="#222">',
-        f'<rect width="{WIDTH}" height="{height}" fill="#fff"/>',
-        label(20, 26, "A layer imports only what stands below it", 'font-weight="bold"'),
-    ]
-    for name, about in layers:
-        color = next(color for color, names in KINDS.items() if name in names.split())
-        box = f'x="20" y="{rows[name] - 14}" width="{WIDTH - 40}" height="28" rx="5"'
-        parts.append(f'<rect {box} fill="{color}"/>')
-        parts.append(label(32, rows[name] + 4, name, 'font-weight="bold" font-family="monospace"'))
-        parts.append(label(132, rows[name] + 4, about))
-    parts += journey("one fit", 760, "#0b63b5", FIT, rows)
-    parts += journey("one evaluated instance", 910, "#b54708", INSTANCE, rows)
-    picture = "\n".join([*parts, "</svg>\n"])
-    (DOCS / "architecture.svg").write_text(picture, encoding="utf-8")
-
-
 if __name__ == "__main__":
     tyro.extras.subcommand_cli_from_dict(
-        {each.__name__: each for each in (overview, chairs, annotator, architecture)}
+        {each.__name__: each for each in (overview, chairs, annotator)}
     )

@@ -121,37 +121,18 @@ class ShapeNet:
         synsets = [name for name in folders if name.isdigit() and len(name) == _SYNSET_DIGITS]
         return tuple(sorted(map(name_of_synset, synsets)))
 
-    def ids(self, category: str | None = None) -> tuple[tuple[str, str], ...]:
-        """All (category, model id) with a mesh, sorted; of one category or of all."""
-        names = self.categories if category is None else (self._require(category),)
-        return tuple((name, model_id) for name in names for model_id in self._list(name))
-
-    def path(self, category: str, model_id: str) -> Path:
-        """The mesh file of a model, found without listing its category.
-
-        Raises InputError if there is no such category or model, DataError if the model's folder
-        holds no mesh.
-        """
-        name = self._require(category)
-        folder = self.root / synset_of_name(name) / model_id
-        if not folder.is_dir():
-            raise InputError(f"no model {model_id!r} of {name!r}", where=str(self.root))
-        found = _mesh_file(folder)
-        if found is None:
-            wanted = " nor ".join(file.as_posix() for file in MESH_FILES)
-            raise DataError(f"neither {wanted} is there", where=str(folder))
-        return found
-
     @overload
     def __getitem__(self, key: str) -> tuple[ShapeNetModel, ...]: ...
     @overload
     def __getitem__(self, key: tuple[str, str]) -> ShapeNetModel: ...
     def __getitem__(self, key: str | tuple[str, str]) -> ShapeNetModel | tuple[ShapeNetModel, ...]:
         """``shapenet["chair"]``: a category's models; ``shapenet["chair", model_id]``: one."""
-        if isinstance(key, tuple):
-            name, model_id = self._require(key[0]), key[1]
-            return ShapeNetModel(name, synset_of_name(name), model_id, self.path(*key))
-        return tuple(self._list(self._require(key)).values())
+        if not isinstance(key, tuple):
+            return tuple(self._list(key).values())
+        models = self._list(key[0])
+        if key[1] not in models:
+            raise InputError(f"no model {key[1]!r} of {key[0]!r}", where=str(self.root))
+        return models[key[1]]
 
     def __iter__(self) -> Iterator[ShapeNetModel]:
         for category in self.categories:
@@ -163,23 +144,18 @@ class ShapeNet:
     def __repr__(self) -> str:
         return f"ShapeNet({str(self.root)!r})"
 
-    def _require(self, category: str) -> str:
-        return require_category(category, self.categories, where=str(self.root))
-
     def _list(self, category: str) -> dict[str, ShapeNetModel]:
-        if category not in self._models:
-            synset = synset_of_name(category)
+        name = require_category(category, self.categories, where=str(self.root))
+        if name not in self._models:
+            synset = synset_of_name(name)
             folder = self.root / synset
-            self._models[category] = {
-                model_id: ShapeNetModel(category, synset, model_id, path)
+            self._models[name] = {
+                model_id: ShapeNetModel(name, synset, model_id, folder / model_id / file)
                 for model_id in sorted(os.listdir(folder))
-                if (path := _mesh_file(folder / model_id)) is not None
+                for file in MESH_FILES[::-1]  # version 2 counts where there are both
+                if (folder / model_id / file).is_file()
             }
-        return self._models[category]
-
-
-def _mesh_file(folder: Path) -> Path | None:
-    return next((folder / file for file in MESH_FILES if (folder / file).is_file()), None)
+        return self._models[name]
 
 
 class MeshLocator:

@@ -32,9 +32,9 @@ def root(tmp_path):
 def test_both_layouts_are_found(root):
     shapenet = ShapeNet(root)
     assert shapenet.categories == ("99999999", "chair", "mug")
-    assert shapenet.ids("chair") == (("chair", "a"), ("chair", "b"))
-    assert shapenet.path("chair", "a") == root / "03001627/a/model.obj"
-    assert shapenet.path("03001627", "b") == root / "03001627/b/models/model_normalized.obj"
+    assert shapenet["chair", "a"].mesh_path == root / "03001627/a/model.obj"
+    version_2 = root / "03001627/b/models/model_normalized.obj"
+    assert shapenet["03001627", "b"].mesh_path == version_2
     assert [model.model_id for model in shapenet["chair"]] == ["a", "b"]
     assert shapenet["chair", "b"] == shapenet["chair"][1]
     assert len(shapenet) == len(list(shapenet)) == 4
@@ -42,7 +42,7 @@ def test_both_layouts_are_found(root):
 
 def test_version_2_comes_first_where_a_model_has_both(root):
     (root / "03001627/b/model.obj").write_text(TRIANGLE)
-    assert ShapeNet(root).path("chair", "b").name == "model_normalized.obj"
+    assert ShapeNet(root)["chair", "b"].mesh_path.name == "model_normalized.obj"
 
 
 def test_meshes_are_read_only_when_asked_for(root):
@@ -67,8 +67,8 @@ def test_what_is_not_there_is_told(root):
         shapenet["chiar"]
     with pytest.raises(InputError, match="no model 'z' of 'chair'"):
         shapenet["chair", "z"]
-    with pytest.raises(DataError, match=r"neither models/model_normalized\.obj nor model\.obj"):
-        shapenet.path("chair", "empty")
+    with pytest.raises(InputError, match="no model 'empty' of 'chair'"):
+        shapenet["chair", "empty"]
     with pytest.raises(DataError, match="no such folder"):
         ShapeNet(root / "gone")
 

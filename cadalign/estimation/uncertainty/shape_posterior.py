@@ -1,18 +1,14 @@
-"""Learned shapes in one view: the posterior of the whole shape, and the test of each keypoint.
+"""Learned shapes in one view: the posterior of the whole shape, and how it predicts keypoints.
 
 The reprojection errors are linear in shape and pose about the estimate of `align`. Whitened and
 projected to what no change of the pose explains, they read ``A x = b + noise`` of unit covariance,
 with the stacked rows x of the shape: each Gaussian of the category is conditioned on that in closed
 form, and its weight grows with the probability that it gave to b.
-
-Each keypoint is tested against what the others predict. The errors of held-out objects are
-distributed as a multivariate t: one unknown scale widens all of an object's shape. The other
-keypoints determine the scale, so that a keypoint is tested by an F distribution (Kotz and
-Nadarajah, "Multivariate t distributions and their applications", 2004).
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -20,9 +16,9 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.estimates import Estimate, widened_boxes
-from cadalign.estimation.options import LOSSES
+from cadalign.estimation.options import FitOptions
+from cadalign.estimation.pack import seen_keypoints
 from cadalign.estimation.prior import prior_of
-from cadalign.estimation.problems import rays_of, whitening_of
 from cadalign.estimation.uncertainty.residuals import loss_slopes, whitening_matrices
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import faced, turned_alignment
@@ -38,8 +34,6 @@ if TYPE_CHECKING:
     from cadalign.estimation.view import View
 
 _POSE = 6
-_FALSE_ALARMS = 0.005  # of all tests of a view together
-_WORTH_TESTING = 1.0  # reduced chi-square
 
 
 class ShapePosterior(NamedTuple):
@@ -91,92 +85,65 @@ def shape_posterior(
     if not isinstance(result.model, ShapeModel) or len(result.poses) != 1:
         what = "expected the alignment of a shape model with one view"
         raise InputError(what, where="result")
-    by_shape, by_pose, residuals = _linearised(result, view, LOSSES[loss], loss_scale)
+    camera, rows_of = faced(view.camera, view.pixels), prior_of(result.model).rows_of
+    options = FitOptions(loss=loss, loss_scale=loss_scale)
+    names = rows_of(view.keypoint_ids, "view.ids")
+    seen = seen_keypoints(replace(view, camera=camera), view.pixels, names, options)
+    kept = result.inliers
+    seen = Seen(seen.points[kept], seen.rays[kept], seen.whitening[kept], *seen[3:])
+    pose = turned_alignment(result.alignment, camera.lens_from_camera.T)
+    estimate, columns = np.concatenate([result.points_3d, result.bounds]), coordinates_of(seen)
+    errors, rows, by_pose = _linearised(estimate[seen.points], pose, seen)
     full, triangle = np.linalg.qr(by_pose, mode="complete")
     rest = full[:, _POSE:].T
-    estimate = np.concatenate([result.points_3d, result.bounds]).ravel()
-    rows = rest @ by_shape
-    right = rows @ estimate - rest @ residuals
-    pose_volume = float(np.log(np.abs(triangle.diagonal())).sum())
-    shapes, log_evidence = _conditioned(gaussians_of(result.model), rows, right)
+    rows, right = rest @ rows, rest @ (rows @ estimate[seen.points].ravel() - errors)
+    logs, means, covariances = [], [], []
+    for weight, mean, covariance in zip(*gaussians_of(result.model), strict=True):
+        across = rows @ covariance[columns]
+        spread = across[:, columns] @ rows.T + np.eye(len(right))
+        gap = right - rows @ mean[columns]
+        gain = np.linalg.solve(spread, across).T
+        square = float(gap @ np.linalg.solve(spread, gap))
+        logs.append(np.log(weight) - 0.5 * (square + np.linalg.slogdet(spread)[1]))
+        means.append(mean + gain @ gap)
+        covariances.append(covariance - gain @ across)
+    total = float(np.logaddexp.reduce(logs))
+    shapes = Gaussians(np.exp(np.array(logs) - total), np.array(means), np.array(covariances))
     # The estimate's objective has the log determinant of the shape, linear here: a slope by the
     # keypoints, which moves the means. The box of an estimate is widened to hold what is seen.
     keypoints = result.points_3d.size
-    gap = (estimate - shapes.means[result.component])[:keypoints]
+    gap = (estimate.ravel() - shapes.means[result.component])[:keypoints]
     own = shapes.covariances[result.component][:keypoints, :keypoints]
     slope = np.linalg.pinv(own, hermitian=True) @ gap
     shifts = shapes.covariances[:, :, :keypoints] @ slope
     moved = Gaussians(shapes.weights, shapes.means + shifts, shapes.covariances)
-    return ShapePosterior(moved, log_evidence - pose_volume)
+    pose_volume = float(np.log(np.abs(triangle.diagonal())).sum())
+    return ShapePosterior(moved, total - pose_volume)
 
 
 def gaussians_of(model: ShapeModel) -> Gaussians:
     """The mixture of the stacked rows of a shape model."""
-    parts = model.components
-    return Gaussians(
-        np.array([part.weight for part in parts]),
-        np.array([part.mean.ravel() for part in parts]),
-        np.array([part.covariance for part in parts]),
-    )
+    weights, means, covariances = model.gaussians
+    return Gaussians(weights, means.reshape(len(means), -1), covariances)
 
 
 def _linearised(
-    result: Result, view: View, loss: int, loss_scale: float
+    points: FloatArray, pose: Alignment, seen: Seen
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Whitened and weighted: derivatives by shape (2 n, d) and pose (2 n, 6), residuals (2 n,)."""
-    kept = result.inliers
-    ids = tuple(name for name, inlier in zip(view.keypoint_ids, kept, strict=True) if inlier)
-    names = prior_of(result.model).rows_of(ids, "view.ids")
-    pixels = np.require(view.pixels, requirements="W")
-    camera = faced(view.camera, pixels)
-    rays = rays_of(pixels, camera)
-    weights = np.broadcast_to(whitening_of(view.sigma, rays, camera), (len(rays), 3))[kept]
-    pose = turned_alignment(result.alignment, camera.lens_from_camera.T)
-    points = result.points_3d[names]
-    residuals, derivatives = whitened_errors(points, pose, rays[kept], weights)
-    roots = np.sqrt(loss_slopes((residuals**2).sum(axis=1), loss, loss_scale)[0])
-    by_pose = roots[:, None, None] * derivatives
-    by_point = by_pose[:, :, 3:]  # a translation moves every point alike
-    by_shape = np.zeros((len(names), 2, len(result.points_3d) + len(result.bounds), 3))
-    by_shape[np.arange(len(names)), :, names] = by_point @ (pose.rotation * pose.scale)
-    count = 2 * len(names)
-    weighted = roots[:, None] * residuals
-    return by_shape.reshape(count, -1), by_pose.reshape(count, -1), weighted.ravel()
+    """Whitened errors (2 n,) of points in a view, weighted for their loss.
 
-
-def _conditioned(prior: Gaussians, rows: FloatArray, right: FloatArray) -> ShapePosterior:
-    """A mixture given ``rows @ x = right`` with noise of unit covariance."""
-    logs, means, covariances = [], [], []
-    for weight, mean, covariance in zip(prior.weights, prior.means, prior.covariances, strict=True):
-        across = rows @ covariance
-        seen = across @ rows.T + np.eye(len(right))
-        gap = right - rows @ mean
-        gain = np.linalg.solve(seen, across).T
-        square = float(gap @ np.linalg.solve(seen, gap))
-        logs.append(np.log(weight) - 0.5 * (square + np.linalg.slogdet(seen)[1]))
-        means.append(mean + gain @ gap)
-        covariances.append(covariance - gain @ across)
-    total = float(np.logaddexp.reduce(logs))
-    weights = np.exp(np.array(logs) - total)
-    return ShapePosterior(Gaussians(weights, np.array(means), np.array(covariances)), total)
-
-
-def whitened_errors(
-    points: FloatArray, pose: Alignment, rays: FloatArray, whitening: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Whitened errors (n, 2) of points in a view, and their derivatives (n, 2, 6) by the pose."""
-    matrices = whitening_matrices(whitening)
-    errors = matrices @ (perspective(pose.apply(points)) - rays)[:, :, None]
+    Also their derivatives by the points (2 n, 3 n) in the model's frame and by the pose (2 n, 6).
+    """
+    count, matrices = len(points), whitening_matrices(seen.whitening)
+    errors = (matrices @ (perspective(pose.apply(points)) - seen.rays)[:, :, None])[:, :, 0]
     by_pose = matrices @ ray_derivatives(points, pose.packed)[:, :, :_POSE]
-    return errors[:, :, 0], by_pose
-
-
-def _block_diagonal(blocks: FloatArray) -> FloatArray:
-    """The matrix (2 n, 3 n) with blocks (n, 2, 3) along its diagonal."""
-    count = len(blocks)
-    rows = np.zeros((count, 2, count, 3))
-    np.einsum("iaib->iab", rows)[:] = blocks
-    return rows.reshape(2 * count, 3 * count)
+    weights, _ = loss_slopes((errors**2).sum(axis=1), seen.loss, seen.loss_scale)
+    roots = np.sqrt(weights)[:, None]
+    by_pose *= roots[..., None]
+    blocks = np.zeros((count, 2, count, 3))  # a translation moves every point alike
+    np.einsum("iaib->iab", blocks)[:] = by_pose[..., 3:] @ (pose.rotation * pose.scale)
+    rows = blocks.reshape(2 * count, 3 * count)
+    return (roots * errors).ravel(), rows, by_pose.reshape(2 * count, _POSE)
 
 
 def single_posterior(
@@ -192,10 +159,7 @@ def single_posterior(
     pose = Alignment(rotation, state[9:12], np.ones(3), is_valid=True)
     points = shape_at(mixture, component, seen, state)
     boxed, still = widened_boxes(points, seen.points), np.ones(3)
-    errors, by_pose = whitened_errors(points[seen.points], pose, seen.rays, seen.whitening)
-    weights, _ = loss_slopes((errors**2).sum(axis=-1), seen.loss, seen.loss_scale)
-    by_pose *= np.sqrt(weights)[:, None, None]
-    rows, jacobian = _block_diagonal(by_pose[..., 3:] @ rotation), by_pose.reshape(-1, _POSE)
+    errors, rows, jacobian = _linearised(points[seen.points], pose, seen)
     # Behind the points, the difference of the box's corners.
     prior, columns = inflation**2 * mixture.covariances[component], coordinates_of(seen)
     prior = np.concatenate([prior, prior[-3:] - prior[-6:-3]])
@@ -224,7 +188,7 @@ def single_posterior(
     covariance = logs @ of_pose @ logs.T
     covariance[_POSE:, _POSE:] += relative[:, None] * relative * left[m]
     moved = (points - mixture.means[component])[seen.points].ravel()
-    misses = _misses(errors.ravel() - rows @ moved, inverse - weight.T @ of_pose @ weight)
+    misses = _misses(errors - rows @ moved, inverse - weight.T @ of_pose @ weight)
     return Estimate(boxed, still, (pose,), (covariance,), whole[:m], of_seen, misses=misses)
 
 

@@ -62,11 +62,11 @@ class RobustSearch:
     def residuals_of(self, alignment: Alignment) -> FloatArray:
         """Projected minus observed keypoints (n, 2) [px]; infinite behind the camera."""
         in_camera = alignment.apply(self.problems.points_3d)
-        return self.problems.cameras[0].project_where_ahead(in_camera) - self.problems.points_2d
+        return self.problems.camera.project_where_ahead(in_camera) - self.problems.points_2d
 
     def support(self, residuals: FloatArray, inliers: BoolArray) -> Support:
         """The inliers (n,) that support an estimate with residuals (n, 2) [px]."""
-        area = area_of(self.problems.points_2d, self.problems.cameras[0], self.threshold)
+        area = area_of(self.problems.points_2d, self.problems.camera, self.threshold)
         return Support(np.linalg.norm(residuals[inliers], axis=1), len(inliers), area)
 
     def log_chance(self, residuals: FloatArray, inliers: BoolArray) -> float:
@@ -156,7 +156,7 @@ def _fit_to_inliers(search: RobustSearch, start: float) -> FittedKeypoints:
         share=share,
         disagreeing=disagreeing(np.linalg.norm(residuals, axis=1), inliers),
     )
-    points, camera = problems.points_3d, problems.cameras[0]
+    points, camera = problems.points_3d, problems.camera
     found = FittedKeypoints(points, residuals, inliers, alignment, camera, options)
     if ransac.refine:
         found = _refined(search, inliers)
@@ -178,7 +178,7 @@ def _refined(search: RobustSearch, inliers: BoolArray) -> FittedKeypoints:
     points, pixels = problems.points_3d, problems.points_2d
     for last in range(_INLIER_ROUNDS + 1):
         offsets, options = np.array([0, int(inliers.sum())]), search.options
-        some = Problems(points[inliers], pixels[inliers], offsets, problems.cameras)
+        some = Problems(points[inliers], pixels[inliers], offsets, problems.camera)
         if sigma is not None and np.ndim(sigma) > 0:
             options = replace(options, sigma=np.asarray(sigma, dtype=np.float64)[inliers])
         optimum = fit_keypoints(some, options, 0.0)
@@ -203,7 +203,7 @@ def _best_hypothesis(search: RobustSearch) -> tuple[Alignment, BoolArray, int, i
     With its inliers (n,), numbers of samples and of hypotheses, and the score [px^2].
     """
     problems, options, ransac = search.problems, search.options, search.ransac
-    camera, points = problems.cameras[0], problems.points_3d[:, options.axis_order]
+    camera, points = problems.camera, problems.points_3d[:, options.axis_order]
     count, minimal = len(points), MINIMAL_SOLVERS[ransac.minimal]
     size = SAMPLE_SIZES[minimal]
     if count < size:

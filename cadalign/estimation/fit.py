@@ -172,7 +172,7 @@ def fit_one(
     except NoConsensusError as error:
         from cadalign.estimation.diagnose import case_of_fit, diagnose_refusal  # makes fits anew
 
-        given = problems.points_3d, problems.points_2d, problems.camera(0)
+        given = problems.points_3d, problems.points_2d, problems.camera
         case = case_of_fit(*given, options, ransac)
         error.fix = diagnose_refusal(case) or error.fix
         raise
@@ -196,7 +196,7 @@ def fit_once(
     start: float,
 ) -> FittedKeypoints:
     """Fit the only problem, without a diagnosis of keypoints that no alignment explains."""
-    options = options.for_camera(problems.camera(0))
+    options = options.for_camera(problems.camera)
     if ransac is None:
         return fit_keypoints(problems, options, start)
     # Only here: most programs never search for outliers, and its kernels take time to import.

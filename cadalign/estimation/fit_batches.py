@@ -22,6 +22,7 @@ from cadalign.estimation.problems import (
     Solutions,
     each_of,
     in_threads,
+    joined,
     pack_many,
 )
 from cadalign.estimation.result import Result
@@ -106,9 +107,9 @@ def fit_batch(
     each_options = [options] * count
     if per_problem:
         sigmas = list(map(copied, each_of(sigma, "sigma", count, "values")))
-        for one, size in zip(sigmas, problems.counts.tolist(), strict=True):
+        for one, problem in zip(sigmas, problems, strict=True):
             if one is not None:
-                pixel_information(one, size)
+                pixel_information(one, len(problem.points_3d))
         each_options = [replace(options, sigma=one) for one in sigmas]
     check_search(ransac, scores, symmetry)
     if scores is not None:
@@ -120,9 +121,8 @@ def fit_batch(
 
     def fit_alone(b: int) -> Result | CadalignError:
         start, trusted = time.perf_counter(), None if scores is None else scores[b]
-        one = problems.part(b, b + 1)
         try:
-            return fit_one(one, each_options[b], ransac, trusted, symmetry, start)
+            return fit_one(problems[b], each_options[b], ransac, trusted, symmetry, start)
         except CadalignError as error:
             return error
 
@@ -131,16 +131,15 @@ def fit_batch(
         if is_alone:
             entries[first:last] = map(fit_alone, range(first, last))
         else:
-            some = problems.part(first, last)
-            entries[first:last], table[first:last] = _solve_at_once(some, options)
+            entries[first:last], table[first:last] = _solve_at_once(problems[first:last], options)
 
     in_threads(run, count, workers)
     return Results(entries, None if is_alone else table)
 
 
-def _solve_at_once(problems: Problems, options: FitOptions) -> tuple[list[Entry], FloatArray]:
+def _solve_at_once(each: Sequence[Problems], options: FitOptions) -> tuple[list[Entry], FloatArray]:
     """The entries of `Results`, each made when it is asked for, and their table (B, 17)."""
-    start = time.perf_counter()
+    start, problems = time.perf_counter(), joined(each)
     solutions = solve(problems, options)
     errors = dict(solutions.errors)
     solutions = solutions._replace(errors=errors)  # which can be pickled
@@ -149,24 +148,28 @@ def _solve_at_once(problems: Problems, options: FitOptions) -> tuple[list[Entry]
     means = np.add.reduceat(squares, problems.offsets[:-1]) / np.maximum(problems.counts, 1)
     table = np.empty((len(problems), COLUMNS))
     table[:, :POSE_SIZE] = solutions.poses[:, 0]
-    table[:, POSE_SIZE], table[:, POSE_SIZE + 1] = np.sqrt(means), problems.cameras[0].fx
+    table[:, POSE_SIZE], table[:, POSE_SIZE + 1] = np.sqrt(means), problems.camera.fx
     table[list(errors)] = np.nan
     return [
-        errors.get(b) or partial(_single, problems, solutions, options, seconds, b)
-        for b in range(len(problems))
+        errors.get(b) or partial(_single, one, solutions, options, seconds, b, problems.rows(b))
+        for b, one in enumerate(each)
     ], table
 
 
 def _single(
-    problems: Problems, solutions: Solutions, options: FitOptions, seconds: float, b: int
+    problem: Problems,
+    solutions: Solutions,
+    options: FitOptions,
+    seconds: float,
+    b: int,
+    rows: slice,
 ) -> Result:
-    """The result of one problem that has a solution, as `cadalign.fit` gives it."""
+    """The result of problem ``b``, which has a solution, as `cadalign.fit` gives it."""
     own: dict[str, Any] = {
         name: None if value is None else value[b : b + 1].copy()
         for name, value in solutions._asdict().items()
         if name not in ("residuals", "errors")
     }
-    own["residuals"] = solutions.residuals[problems.rows(b)].copy()
-    some = problems.part(b, b + 1)
-    fitted = keypoints_of_solution(some, Solutions(**own), options, seconds)
-    return result_of_keypoints(some.points_2d, fitted, diagnosis=diagnosis_of_fit)
+    own["residuals"] = solutions.residuals[rows].copy()
+    fitted = keypoints_of_solution(problem, Solutions(**own), options, seconds)
+    return result_of_keypoints(problem.points_2d, fitted, diagnosis=diagnosis_of_fit)

@@ -42,7 +42,7 @@ def fit_jointly(
         stretch_sigma=options.stretch_sigma,
         known_axis=options.known_axis,
     )
-    view = View(problems.camera(0), pixels, sigma=options.sigma, scores=scores)
+    view = View(problems.camera, pixels, sigma=options.sigma, scores=scores)
     compiled = compile_problem(model, [view], None, [None], options, ransac)
     problem, minima, iterations, hypotheses = search(compiled, [[None]])
     if ransac is None:  # the optimum comes first, whatever its volume

@@ -32,23 +32,19 @@ _NO_ERRORS: Mapping[int, CadalignError] = MappingProxyType({})
 
 @dataclass(frozen=True, eq=False)
 class Problems:
-    """The correspondences of one or many problems, one after the other.
+    """The correspondences of one or many problems of one camera, one after the other.
 
     Problem b has the rows ``offsets[b]`` to ``offsets[b + 1]`` of ``points_3d`` (n, 3) and
-    ``points_2d`` (n, 2) [px]; there is one camera for all, or one each.
+    ``points_2d`` (n, 2) [px].
     """
 
     points_3d: FloatArray
     points_2d: FloatArray
     offsets: IntArray
-    cameras: tuple[Camera, ...]
+    camera: Camera
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
-
-    def camera(self, problem: int) -> Camera:
-        """The camera of a problem."""
-        return self.cameras[problem if len(self.cameras) > 1 else 0]
 
     def rows(self, problem: int) -> slice:
         """The rows of a problem."""
@@ -59,15 +55,15 @@ class Problems:
         """Number of points of each problem, (B,) int."""
         return self.offsets[1:] - self.offsets[:-1]
 
-    def part(self, first: int, last: int) -> Problems:
-        """Problems ``first`` to ``last``, that one left out."""
-        start, end = self.offsets[first], self.offsets[last]
-        return Problems(
-            self.points_3d[start:end],
-            self.points_2d[start:end],
-            self.offsets[first : last + 1] - start,
-            self.cameras[first:last] if len(self.cameras) > 1 else self.cameras,
-        )
+
+def joined(problems: Sequence[Problems]) -> Problems:
+    """Problems of one camera as one."""
+    return Problems(
+        np.concatenate([each.points_3d for each in problems]),
+        np.concatenate([each.points_2d for each in problems]),
+        np.cumsum([0, *(len(each.points_3d) for each in problems)], dtype=np.int64),
+        problems[0].camera,
+    )
 
 
 def pack_one(
@@ -92,29 +88,23 @@ def pack_one(
         )
     require_kind(camera, Camera, "camera")
     check_pixels(image, camera.width, camera.height, where=name_2d)
-    return Problems(model, image, np.array([0, len(model)]), (camera,))
+    return Problems(model, image, np.array([0, len(model)]), camera)
 
 
 def pack_many(
     points_3d: Sequence[npt.ArrayLike] | FloatArray,
     points_2d: Sequence[npt.ArrayLike] | FloatArray,
     camera: Camera | Sequence[Camera],
-) -> Problems:
+) -> list[Problems]:
     """Check the arguments of many problems, of the same or of different sizes."""
     points_3d = each_of(points_3d, "points_3d", None, "")
     count = len(points_3d)
     points_2d = each_of(points_2d, "points_2d", count, "sets of image points")
     is_shared = isinstance(camera, Camera)
-    cameras = (camera,) if is_shared else tuple(each_of(camera, "camera", count, "cameras"))
+    cameras = [camera] * count if is_shared else each_of(camera, "camera", count, "cameras")
     places = [f"[{b}]" for b in range(count)]
-    given = points_3d, points_2d, cameras * count if is_shared else cameras, places
-    each = [pack_one(*arguments) for arguments in zip(*given, strict=True)]
-    return Problems(
-        np.concatenate([np.empty((0, 3)), *(problem.points_3d for problem in each)]),
-        np.concatenate([np.empty((0, 2)), *(problem.points_2d for problem in each)]),
-        np.cumsum([0, *(len(problem.points_3d) for problem in each)], dtype=np.int64),
-        cameras,
-    )
+    given = zip(points_3d, points_2d, cameras, places, strict=True)
+    return [pack_one(*arguments) for arguments in given]
 
 
 def each_of(value: Any, name: str, count: int | None, entries: str) -> Any:

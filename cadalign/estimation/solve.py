@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import cast
 
@@ -44,12 +45,12 @@ _NO_COST = read_only(np.array([[np.inf]]))
 
 
 def solve(problems: Problems, options: FitOptions) -> Solutions:
-    """Solve every problem with the method of the options; all have one camera.
+    """Solve every problem with the method of the options.
 
-    A problem whose lens is wide is the only one. Raises CadalignError if a lens cannot be undone,
+    One through a lens is the only one. Raises CadalignError if a lens cannot be undone,
     or sigma is none.
     """
-    camera = problems.cameras[0]
+    camera = problems.camera
     camera.require_focal()
     facing = faced(camera, problems.points_2d) if camera.is_wide else camera
     points = problems.points_3d
@@ -82,11 +83,12 @@ def solve(problems: Problems, options: FitOptions) -> Solutions:
     )
 
 
-def are_solved_at_once(problems: Problems, options: FitOptions) -> bool:
+def are_solved_at_once(problems: Sequence[Problems], options: FitOptions) -> bool:
     """True for problems that `solve` takes at once, whose camera and noise are the same."""
     is_quick = options.focal == "known" and options.method in ("optimal", "aepnp")
-    lenses = [camera.is_wide or camera.distortion for camera in problems.cameras]
-    return is_quick and options.sigma is not None and len(lenses) == 1 and not lenses[0]
+    cameras = {each.camera for each in problems}
+    has_lens = any(camera.is_wide or camera.distortion for camera in cameras)
+    return is_quick and options.sigma is not None and len(cameras) == 1 and not has_lens
 
 
 def solve_one(problems: Problems, options: FitOptions) -> Solutions:
@@ -140,13 +142,11 @@ def _residuals(
     pinhole = np.array([[camera.fx, camera.fy, camera.cx, camera.cy]])
     given = points, pixels, offsets, found.poses, pinhole
     residuals, statuses = reproject_batch(*given, found.statuses)
-    if camera.distortion:
+    if camera.distortion:  # of the only problem
         rays = (pixels + residuals - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
         residuals = camera.pixels_from_normalized(rays) - pixels
-        wrong = np.flatnonzero(~np.isfinite(residuals).all(axis=1))
-        failed = np.zeros(len(statuses), dtype=bool)
-        failed[np.searchsorted(offsets, wrong, side="right") - 1] = True
-        statuses[failed & (statuses == OK)] = OUT_OF_RANGE
+        if statuses[0] == OK and not np.isfinite(residuals).all():
+            statuses[0] = OUT_OF_RANGE
     return residuals, statuses
 
 
@@ -181,7 +181,7 @@ def keypoints_of_solution(
         "residuals": solutions.residuals,
         "inliers": inliers,
         "alignment": Alignment.from_packed(solutions.poses[0, 0]),
-        "camera": problems.cameras[0],
+        "camera": problems.camera,
         "options": options,
         "sigma": float(cast(float, options.sigma)) if is_one else None,
         "method": options.method,
@@ -193,7 +193,7 @@ def keypoints_of_solution(
         fitted["cost"] = solutions.costs.item(0)
     if minima > 1:
         poses = [Alignment.from_packed(pose) for pose in solutions.poses[0, :minima]]
-        cameras, costs = problems.cameras * minima, solutions.costs[0, :minima].tolist()
+        cameras, costs = [problems.camera] * minima, solutions.costs[0, :minima].tolist()
         fitted["alternatives"] = alternatives_of(points, poses, cameras, costs)
     effort = {"iterations": iterations, "hypotheses": hypotheses, "seconds": seconds}
     fitted["stats"] = quickly(FitStats, effort)

@@ -17,7 +17,7 @@ from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.fit import fit_once
 from cadalign.estimation.focal import log_focal_range
 from cadalign.estimation.options import LOSSES, FitOptions
-from cadalign.estimation.problems import Problems, in_threads, rays_of
+from cadalign.estimation.problems import Problems, in_threads, joined, rays_of
 from cadalign.estimation.solve import are_solved_at_once, solve
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import rotations_from_vectors
@@ -199,16 +199,18 @@ def _searched(
     present: BoolArray,
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Poses (B, 15) and focal lengths (B,) of the best minima, and for which problems (B,)."""
-    offsets = np.concatenate([[0], np.cumsum(present.sum(axis=1))]).astype(np.int64)
-    problems = Problems(points[present], pixels[present], offsets, task.cameras)
-    known = sigmas[present]
+    cameras = task.cameras * (len(points) if len(task.cameras) == 1 else 1)
+    problems = [
+        Problems(points[b, kept], pixels[b, kept], np.array([0, kept.sum()]), cameras[b])
+        for b, kept in enumerate(present)
+    ]
     focals = np.array([camera.fx for camera in task.cameras]) * np.ones(len(points))
     poses, valid = np.tile(_NO_POSE, (len(points), 1)), np.zeros(len(points), dtype=bool)
 
     def fit_alone(b: int) -> None:
-        part = replace(options, sigma=known[problems.rows(b)])
+        part = replace(options, sigma=sigmas[b, present[b]])
         with suppress(CadalignError):
-            found = fit_once(problems.part(b, b + 1), part, None, None, 0.0)
+            found = fit_once(problems[b], part, None, None, 0.0)
             poses[b], focals[b], valid[b] = found.alignment.packed, found.camera.fx, True
 
     @np.errstate(all="ignore")  # holds for one thread only
@@ -217,8 +219,8 @@ def _searched(
             for b in range(first, last):
                 fit_alone(b)
             return
-        part = replace(options, sigma=known[offsets[first] : offsets[last]])
-        found = solve(problems.part(first, last), part)
+        part = replace(options, sigma=sigmas[first:last][present[first:last]])
+        found = solve(joined(problems[first:last]), part)
         solved = first + np.flatnonzero(found.statuses == OK)
         poses[solved], valid[solved] = found.poses[solved - first, 0], True
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
@@ -157,20 +156,6 @@ def check_prior(prior: object, *, focal: str) -> None:
         )
 
 
-def check_estimable(cameras: Sequence[Camera]) -> None:
-    """Refuse to estimate the focal length of a wide lens."""
-    for camera in cameras:
-        if camera.is_wide:
-            what = f"the focal length of a {camera.lens} lens is not estimated"
-            raise InputError(what, where="focal", fix='calibrate it, and give focal="known"')
-
-
-def focal_bounds(camera: Camera) -> tuple[float, float]:
-    """The range in which the focal length is searched for [px]."""
-    side = max(camera.width, camera.height)
-    return _SHORTEST * side, _LONGEST * side
-
-
 def log_focal_range(
     camera: Camera, prior: PriorOption, unit: float = 1.0
 ) -> tuple[float, float, float, float]:
@@ -179,7 +164,8 @@ def log_focal_range(
     Focal lengths are in ``unit`` [px].
     """
     prior = prior_of_camera(prior, camera)
-    low, high = (math.log(bound / unit) for bound in focal_bounds(camera))
+    side = max(camera.width, camera.height) / unit
+    low, high = math.log(_SHORTEST * side), math.log(_LONGEST * side)
     if prior is None:
         return low, high, 0.0, 0.0
     mean = math.log(prior.focal / unit)
@@ -197,20 +183,13 @@ def focal_grid(camera: Camera, prior: PriorOption) -> FloatArray:
 
 
 def focal_doubt(camera: Camera, prior: PriorOption) -> EstimateWarning | None:
-    """Warning about a camera whose estimated focal length is doubtful, or None."""
+    """Warning about a camera whose estimated focal length contradicts its prior, or None."""
     prior = prior_of_camera(prior, camera)
-    if prior is not None:
-        off = math.log(camera.fx / prior.focal)
-        if abs(off) > _CONTRADICTING_SIGMAS * prior.relative_sigma:
-            return EstimateWarning(
-                "focal",
-                f"the keypoints contradict the focal length's prior: {camera.fx:.4g} px "
-                f"instead of {prior}",
-            )
-    if np.isclose(camera.fx, focal_bounds(camera), rtol=1e-6).any():
-        return EstimateWarning(
-            "focal",
-            f"the focal length is the end of the searched range ({camera.fx:.4g} px): "
-            "the keypoints fit best at one that no camera has",
-        )
-    return None
+    if prior is None:
+        return None
+    if abs(math.log(camera.fx / prior.focal)) <= _CONTRADICTING_SIGMAS * prior.relative_sigma:
+        return None
+    return EstimateWarning(
+        "focal",
+        f"the keypoints contradict the focal length's prior: {camera.fx:.4g} px instead of {prior}",
+    )

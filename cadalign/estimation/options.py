@@ -104,22 +104,18 @@ class FitOptions(AlignmentOptions):
                     where="stretch",
                     fix=f"give one of {', '.join(allowed)}",
                 )
-        if self.focal == "estimate" and self.method != "optimal":
-            raise InputError(
-                f"the method {self.method!r} needs a known focal length",
-                where="focal",
-                fix="use the method 'optimal'",
-            )
         check_prior(self.focal_prior, focal=self.focal)
         if self.focal == "known":
             object.__setattr__(self, "focal_prior", None)
         if self.method != "optimal" and (
             self.loss != "linear"
+            or self.focal != "known"
             or self.stretch_sigma is not None
             or (self.stretch is not None and len(self.stretched_axes) < 2)
         ):
             raise InputError(
-                f"the method {self.method!r} supports neither loss, stretch nor scale prior",
+                f"the method {self.method!r} supports neither loss, stretch, scale prior nor "
+                "an unknown focal length",
                 where="method",
                 fix="use the method 'optimal', or leave these options at their defaults",
             )

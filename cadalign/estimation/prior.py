@@ -14,7 +14,6 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import InputError, quote
 from cadalign.estimation.focal import (
     PriorOption,
-    check_estimable,
     focal_grid,
     log_focal_range,
     prior_of_camera,
@@ -187,7 +186,10 @@ class Lenses:
             for camera in cameras:
                 camera.require_focal()
             return cls(cameras, (-1,) * len(cameras))
-        check_estimable(cameras)
+        for camera in cameras:
+            if camera.is_wide:
+                what = f"the focal length of a {camera.lens} lens is not estimated"
+                raise InputError(what, where="focal", fix='calibrate it, and give focal="known"')
         distinct = list(dict.fromkeys(view.camera for view in views if view.has_evidence))
         reference = []
         for camera in cameras:

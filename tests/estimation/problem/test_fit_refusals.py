@@ -307,12 +307,14 @@ def test_pixels_beyond_the_lens_are_refused() -> None:
         ),
         (
             {"method": "aepnp", "loss": "huber"},
-            "method: the method 'aepnp' supports neither loss, stretch nor scale prior; "
+            "method: the method 'aepnp' supports neither loss, stretch, scale prior nor an unknown "
+            "focal length; "
             "use the method 'optimal', or leave these options at their defaults",
         ),
         (
             {"method": "epnp", "stretch": "none"},
-            "method: the method 'epnp' supports neither loss, stretch nor scale prior; "
+            "method: the method 'epnp' supports neither loss, stretch, scale prior nor an unknown "
+            "focal length; "
             "use the method 'optimal', or leave these options at their defaults",
         ),
     ],

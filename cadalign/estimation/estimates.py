@@ -24,8 +24,6 @@ from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import Equal
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
-from cadalign.solvers.marginal.problem import Mixture, Seen, shape_at
-from cadalign.solvers.search import Minima
 
 _Held = tuple[bool, bool, bool]
 _ALONG_AXES = 1e-6  # of a rotation's entries, that are 0 or 1 where it takes axes to axes
@@ -109,11 +107,6 @@ def curvature_of_rotations(covariance: FloatArray) -> FloatArray:
     return np.asarray((axes * [y * z, x * z, x * y]) @ axes.T / 2)
 
 
-def has_linear_box(model: ShapePrior | ShapeModel) -> bool:
-    """True if the box is always that of the shape's own last two points."""
-    return model.has_box and model.box_margins is None
-
-
 def with_box(evidence: Evidence, state: State, prior: ShapePrior) -> tuple[Evidence, State]:
     """Evidence and state whose box has those faces that outermost keypoints determine at these.
 
@@ -123,11 +116,10 @@ def with_box(evidence: Evidence, state: State, prior: ShapePrior) -> tuple[Evide
     shape, keypoints = evidence.shape, len(prior.ids)
     seen = np.unique(evidence.sightings.point)
     seen = seen[seen < keypoints]
-    is_kept = has_linear_box(prior) or len(evidence.offsets.value)
-    if is_kept or not len(shape.modes) or not len(seen):
+    if len(evidence.offsets.value) or not len(shape.modes) or not len(seen):
         return evidence, state
     points = points_of(shape, state) / np.exp(state.log_scales)
-    bounds, own = _placed_box(points, keypoints, seen, prior)
+    bounds, own = placed_box(points, keypoints, seen, prior)
     axes = np.arange(3)
     mean, modes = shape.mean.copy(), shape.modes.copy()
     displacements = state.displacements.copy()
@@ -138,7 +130,7 @@ def with_box(evidence: Evidence, state: State, prior: ShapePrior) -> tuple[Evide
     return placed, state._replace(displacements=displacements)
 
 
-def _placed_box(
+def placed_box(
     points: FloatArray, keypoints: int, seen: IntArray, model: ShapePrior | ShapeModel
 ) -> tuple[FloatArray, IntArray]:
     """Corners (2, 3) of the box of points (m, 3), and the points (2, 3) that its faces vary with.
@@ -164,26 +156,6 @@ def widened_boxes(points: FloatArray, rows: IntArray) -> FloatArray:
     widened[..., -2, :] = np.minimum(points[..., -2, :], seen.min(axis=-2, initial=np.inf))
     widened[..., -1, :] = np.maximum(points[..., -1, :], seen.max(axis=-2, initial=-np.inf))
     return widened
-
-
-def with_boxes(
-    mixture: Mixture, seen: Seen, minima: Minima, count: int, model: ShapeModel
-) -> tuple[Mixture, Minima]:
-    """A component for each of the first minima, with the box that `with_box` gives."""
-    if has_linear_box(model) or not mixture.covariances.any():
-        return mixture, minima
-    component, axes = minima.label[:count], np.arange(3)
-    means, covariances = mixture.means[component], mixture.covariances[component]
-    for k in range(count):
-        points = shape_at(mixture, component[k], seen, minima.states[k])
-        bounds, rows = _placed_box(points, len(model.ids), seen.points, model)
-        means[k, -2:] = means[k, rows, axes] + (bounds - points[rows, axes])
-        own = (3 * rows + axes).ravel()
-        covariances[k, -6:] = covariances[k, own]
-        covariances[k, :, -6:] = covariances[k, :, own].T
-    numbers = np.arange(count, dtype=minima.label.dtype)
-    placed = Mixture(means, covariances, mixture.penalties[component])
-    return placed, minima._replace(label=numbers)
 
 
 class Estimate(NamedTuple):

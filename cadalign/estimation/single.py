@@ -14,7 +14,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
-from cadalign.estimation.estimates import as_given, with_boxes
+from cadalign.estimation.estimates import as_given
 from cadalign.estimation.fit import fit_one
 from cadalign.estimation.joint import common_sigma, result_of
 from cadalign.estimation.model import Model, is_exact_model
@@ -91,10 +91,10 @@ def align_single(problem: Problem, start: float) -> Result:
     likelihoods = np.exp((minima.scores[0] - minima.scores[:count]) / 2)
     likelihoods = likelihoods[likelihoods >= LEAST_LIKELIHOOD]
     inflation = inflation_with(len(rows), model.inflation, model.few_keypoints)
-    placed, chosen = with_boxes(mixture, seen, minima, len(likelihoods), model)
-    kept = zip(likelihoods.tolist(), chosen.label.tolist(), chosen.states, strict=False)
+    kept = zip(likelihoods.tolist(), minima.label.tolist(), minima.states, strict=False)
+    boxes = model if covariances.any() else None
     estimates = [
-        single_posterior(placed, component, seen, state, inflation)._replace(
+        single_posterior(mixture, component, seen, state, inflation, boxes)._replace(
             likelihood=likelihood, cameras=(view.camera,)
         )
         for likelihood, component, state in kept

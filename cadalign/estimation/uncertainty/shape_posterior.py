@@ -15,7 +15,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
-from cadalign.estimation.estimates import Estimate, widened_boxes
+from cadalign.estimation.estimates import Estimate, placed_box, widened_boxes
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.pack import seen_keypoints
 from cadalign.estimation.prior import prior_of
@@ -147,21 +147,31 @@ def _linearised(
 
 
 def single_posterior(
-    mixture: Mixture, component: int, seen: Seen, state: FloatArray, inflation: float
+    mixture: Mixture,
+    component: int,
+    seen: Seen,
+    state: FloatArray,
+    inflation: float,
+    model: ShapeModel | None = None,
 ) -> Estimate:
     """The estimate at a state (D,) of a component, with its posterior.
 
     The deviations of the prior are widened by the ``inflation``. The box holds the keypoints that
-    are seen. Covariances are infinite where the pose is not determined.
+    are seen, and has the faces that outermost ones determine by the ``model``. Covariances are
+    infinite where the pose is not determined.
     """
     count, m = len(seen.points), mixture.means.shape[1]
     rotation = state[:9].reshape(3, 3)
     pose = Alignment(rotation, state[9:12], np.ones(3), is_valid=True)
     points = shape_at(mixture, component, seen, state)
+    prior, columns = inflation**2 * mixture.covariances[component], coordinates_of(seen)
+    if model is not None:
+        points[-2:], faces = placed_box(points, len(model.ids), seen.points, model)
+        own = np.append(np.arange(3 * m - 6), 3 * faces + np.arange(3))
+        prior = prior[np.ix_(own, own)]
     boxed, still = widened_boxes(points, seen.points), np.ones(3)
     errors, rows, jacobian = _linearised(points[seen.points], pose, seen)
     # Behind the points, the difference of the box's corners.
-    prior, columns = inflation**2 * mixture.covariances[component], coordinates_of(seen)
     prior = np.concatenate([prior, prior[-3:] - prior[-6:-3]])
     prior = np.concatenate([prior, prior[:, -3:] - prior[:, -6:-3]], axis=1)
     across = prior[:, columns] @ rows.T  # covariance of points with residuals

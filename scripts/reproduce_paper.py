@@ -25,8 +25,8 @@ from cadalign.evaluation.experiments.keypointnet import (
     KeypointNetOptions,
 )
 from cadalign.evaluation.experiments.keypointnet import SPEC as KEYPOINTNET
+from cadalign.evaluation.experiments.simulation import ERRORS, SWEEPS, SweepOptions
 from cadalign.evaluation.experiments.simulation import SPEC as SIMULATION
-from cadalign.evaluation.experiments.simulation import SWEEPS, SweepOptions
 from cadalign.evaluation.methods import LIMIT
 from cadalign.evaluation.options import ExperimentOptions, RunOptions
 from cadalign.evaluation.runs.folder import RunFolder
@@ -85,16 +85,12 @@ def _sweep_section(plan: PaperPlan, name: str) -> str:
     options = SweepOptions(name, runs=runs, seed=plan.seed)
     kind = options.kind
     summaries = SIMULATION.write(_run(plan, options, f"simulate_{name}", is_timed=kind.is_timed))
-    keys = list(dict.fromkeys(summary["metric"] for summary in summaries))
-    shown = [summary for summary in summaries if summary["metric"] == keys[0]]
+    keys = [metric.key for metric in ((metrics.MICROSECONDS,) if kind.is_timed else ERRORS)]
     rows = [
-        [f"{value:g}", *(f"{s['median']:.3g}" for s in shown if s["value"] == value)]
+        [f"{value:g}", *(f"{s[keys[0]].median:.3g}" for s in summaries if s[kind.column] == value)]
         for value in kind.values
     ]
-    images = "\n".join(
-        f"![{name}: {key}](simulate_{name}/figures/{name}_{key}.png)"
-        for key in keys[: 1 if kind.is_timed else None]
-    )
+    images = "\n".join(f"![{name}: {key}](simulate_{name}/figures/{key}.png)" for key in keys)
     return (
         f"## Simulation: {name}\n\n{images}\n\n"
         f"Median {keys[0]} by {kind.column}; the paper states no numbers, only the figure.\n\n"
@@ -114,7 +110,7 @@ def _table_section(plan: PaperPlan) -> str:
         options = KeypointNetOptions(root, views_per_model=views, seed=plan.seed)
         table = _table_rows(KEYPOINTNET.write(_run(plan, options, f"evaluate_{name}")))
         rows += [[name, *row] for row in table]
-        figure = f"evaluate_{name}/figures/categories_{metrics.ROTATION.key}.png"
+        figure = f"evaluate_{name}/figures/within_{metrics.SYM_ROTATION.key}.png"
         sections.append(
             f"### {_DATASETS[name]}\n\n{_markdown(_HEAD, table, words=2)}\n\n"
             f"![rotation errors]({figure})\n"

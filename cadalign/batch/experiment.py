@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -13,7 +14,7 @@ import msgspec
 import numpy as np
 
 from cadalign.batch.observation_fit import ObservationFit
-from cadalign.batch.outputs import COLUMNS, RECORD_COLUMNS, TIMING_COLUMNS, naming_row, result_row
+from cadalign.batch.outputs import COLUMNS, RECORD_COLUMNS, naming_row, result_row
 from cadalign.batch.sources import ObservationTask, read_sources
 from cadalign.datasets.detections.image_keypoints import (
     ImageKeypoints,
@@ -24,14 +25,13 @@ from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoin
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.estimation.result import Result
 from cadalign.estimation.warning import EstimateWarning
-from cadalign.evaluation.options import ExperimentOptions, absolute_paths, plain_value
+from cadalign.evaluation.options import ExperimentOptions, absolute_paths
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import (
     FAILED,
     Columns,
     Plan,
     Row,
-    Rows,
     fingerprint,
     fingerprint_of_files,
 )
@@ -100,20 +100,9 @@ class ManyOptions(ExperimentOptions):
 
     def contents(self) -> dict[str, Any]:
         """Entries of a run's configuration that change with the contents of the options' files."""
-        paths = (path for path in _paths({**self._given(), "inputs": ()}) if path.is_file())
-        found = {str(path.absolute()): fingerprint(read_bytes(path)) for path in paths}
+        paths = (path for path in _paths(asdict(replace(self, inputs=()))) if path.is_file())
+        found = {os.path.abspath(path): fingerprint(read_bytes(path)) for path in paths}
         return {"files": found} if found else {}
-
-    def as_config(self) -> dict[str, Any]:
-        """The options in a run's configuration, without those that are at their defaults."""
-        return {name: plain_value(value) for name, value in self._given().items()}
-
-    def _given(self) -> dict[str, Any]:
-        given: dict[str, Any] = {}
-        for each in fields(self):
-            value = getattr(self, each.name)
-            given |= _changed(value) if is_dataclass(value) else {each.name: value}
-        return given
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,17 +153,6 @@ def _photo_doubt(view: ObservedImage) -> str:
     )
 
 
-def _changed(part: Any) -> dict[str, Any]:
-    """The fields of some of the options that are not at their defaults."""
-    found, values = {}, asdict(part)
-    for each in fields(part):
-        default: Any = each.default if each.default_factory is MISSING else each.default_factory()
-        plain = asdict(default) if hasattr(default, "__dataclass_fields__") else default
-        if values[each.name] != plain:
-            found[each.name] = values[each.name]
-    return found
-
-
 def _paths(value: Any) -> Iterator[Path]:
     """All paths in mappings and lists."""
     if isinstance(value, Path):
@@ -194,8 +172,6 @@ class ManyEstimates:
     folder: RunFolder | None = field(default=None, repr=False)
     """The folder that pictures go to; none are drawn without."""
 
-    timing_columns = TIMING_COLUMNS
-
     @property
     def columns(self) -> Columns:
         """The columns of the table."""
@@ -204,17 +180,17 @@ class ManyEstimates:
     @property
     def record_columns(self) -> Columns:
         """The columns of the table of observations and results."""
-        return RECORD_COLUMNS + self.options.record_columns
+        return (RECORD_COLUMNS[0], *self.options.record_columns, *RECORD_COLUMNS[1:])
 
-    def evaluate(self, tasks: Sequence[ObservationTask]) -> Rows:
+    def evaluate(self, tasks: Sequence[ObservationTask]) -> list[Row]:
         """The rows of some observations."""
-        return Rows.joined([self._evaluate(task) for task in tasks])
+        return [self._evaluate(task) for task in tasks]
 
-    def failure(self, task: ObservationTask, reason: str) -> Rows:
-        """The rows of an observation whose worker died, or that raised what nobody foresaw."""
-        return _failed(task, reason, None)
+    def failure(self, task: ObservationTask, reason: str) -> list[Row]:
+        """The row of an observation whose worker died, or that raised what nobody foresaw."""
+        return [_failed(task, reason, None)]
 
-    def _evaluate(self, task: ObservationTask) -> Rows:
+    def _evaluate(self, task: ObservationTask) -> Row:
         start, seen = time.perf_counter(), None
         try:
             seen = self._observation(task)
@@ -229,8 +205,7 @@ class ManyEstimates:
         row["warning_count"] += len(troubles)
         for name, more in (("warning_kinds", ["picture"] * len(troubles)), ("warnings", troubles)):
             row[name] = "; ".join(filter(None, (row[name], *more)))
-        timing = {"row": task.row, "seconds": time.perf_counter() - start}
-        return Rows([row], [timing], [_record(task.row, seen, found)])
+        return row | _record(seen, found) | {"seconds": time.perf_counter() - start}
 
     def _draw(
         self, task: ObservationTask, row: Row, seen: Observation, result: Result | None
@@ -292,7 +267,6 @@ def plan_run(options: ManyOptions, folder: RunFolder) -> Plan[ObservationTask]:
     model = _model_keypoints(options) if tasks.has_detections else None
     config = {
         **options.as_config(),
-        "experiment": options.experiment,
         "contents": tasks.fingerprint(),
         **options.contents(),
     }
@@ -341,15 +315,14 @@ def _parsed(content: bytes, name: str) -> Any:
         raise DataError(f"not valid JSON: {error}", where=name) from None
 
 
-def _failed(task: ObservationTask, reason: str, seen: Observation | None) -> Rows:
-    row = naming_row(task.row, task.name, seen)
-    row |= {"status": FAILED, "reason": reason, "method": "", "warning_kinds": "", "warnings": ""}
-    return Rows([row], [{"row": task.row}], [_record(task.row, seen, None)])
+def _failed(task: ObservationTask, reason: str, seen: Observation | None) -> Row:
+    row = naming_row(task.row, task.name, seen) | {"status": FAILED, "reason": reason}
+    return {**row, "method": "", "warning_kinds": "", "warnings": "", **_record(seen, None)}
 
 
-def _record(row: int, seen: Observation | None, found: Estimated | None) -> Row:
+def _record(seen: Observation | None, found: Estimated | None) -> Row:
     """Observation and result as JSON, but for its time, on which no two runs agree."""
-    record: Row = {"row": row, "observation": "", "result": ""}
+    record: Row = {"observation": "", "result": ""}
     if seen is not None:
         record["observation"] = _ENCODER.encode(seen.to_dict(states_origins=True)).decode()
     if found is not None:

@@ -104,7 +104,7 @@ def export_run(
     left_out: list[CadalignError] = []
     results = _run_results(folder, rows)
     made_folder(to.parent)
-    with keeping(_inputs(folder)):
+    with keeping(folder.path.iterdir()):
         objects = _run_objects(results, metres, left_out)
         if name == "json":
             count = _write_documents(to, results)
@@ -132,17 +132,6 @@ def require_run(folder: RunFolder) -> None:
     if fits:
         fix = f"give the folder of one of the fits in it: {brief(', '.join(fits))}"
     raise DataError("neither a fit nor a run of fits", where=where, fix=fix)
-
-
-def _inputs(folder: RunFolder) -> Iterator[Path]:
-    """The files of a run, and those that its observations lie in and name."""
-    yield from folder.path.glob("*.*")
-    for _, _, seen, _ in _records(folder):
-        yield from seen.files
-    for table in read_groups(folder.results, fix=_FIX):
-        for source in table["source"].to_pylist():
-            # The file, or "<file>, line 3" and "<file>: annotations[3]"
-            yield from map(Path, (source, source.partition(", ")[0], source.partition(": ")[0]))
 
 
 def _run_results(folder: RunFolder, rows: Collection[int]) -> Iterator[_Stored]:

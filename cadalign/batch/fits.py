@@ -5,17 +5,15 @@ from __future__ import annotations
 import filecmp
 import os
 import tempfile
-from collections import Counter
 from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import fields, replace
 from itertools import chain, starmap
 from pathlib import Path
-from typing import Any, NamedTuple, get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import msgspec
 import numpy as np
-import pyarrow.compute as pc
 
 from cadalign.arrays import is_number
 from cadalign.batch.experiment import FitRunOptions, ManyOptions, plan_run
@@ -28,8 +26,6 @@ from cadalign.estimation.results import Results
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.parallel import Workers
 from cadalign.evaluation.runs.run import OnProgress, execute, workers_of
-from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
-from cadalign.evaluation.runs.work import OK
 from cadalign.io.documents import convert
 from cadalign.io.evidence import Size
 from cadalign.io.files import as_path, write_whole
@@ -39,14 +35,6 @@ _FEW = 200  # observations, which are aligned sooner than processes start
 _SPOOL = "observations.jsonl"
 
 Observed = str | os.PathLike[str] | Iterable[str | os.PathLike[str]] | Iterable[Observation]
-
-
-class Tally(NamedTuple):
-    """Numbers of observations of a finished run and of failures, these by reason."""
-
-    total: int
-    failed: int
-    reasons: tuple[tuple[str, int], ...]
 
 
 def fit_many(
@@ -68,9 +56,9 @@ def fit_many(
         JSON or CSV); or observations, for example of a generator, which are first written to
         ``observations.jsonl`` in the run's folder.
     out : path-like, optional
-        The run's folder: ``results.parquet`` and ``results.csv`` (`cadalign.batch.outputs` names
-        the columns), and what `Results.open` needs. Started again with the same arguments, a run
-        that was killed goes on, and a finished one is read. Without it nothing is kept.
+        The run's folder: ``results.parquet`` and ``results.csv``, and what `Results.open` needs.
+        Started again with the same arguments, a run that was killed goes on, and a finished one is
+        read. Without it nothing is kept.
     workers : int, optional
         Processes; -1 for one for each core, 0 for none. By default -1, for few observations 0.
     dask : str, optional
@@ -136,13 +124,12 @@ def run_many(
     workers: int | None,
     dask: str | None,
     on_progress: OnProgress = lambda progress: None,
-) -> Tally:
+) -> None:
     """Do the run that the options describe, or what is left of it; see `fit_many`."""
     plan = plan_run(options, folder)
     pool = pool_of(len(plan.tasks), workers, dask, threads=options.threads)
     execute(plan, folder, workers=pool, on_progress=on_progress)
     write_csv(folder)
-    return _tally(folder)
 
 
 def pool_of(count: int, workers: int | None, dask: str | None, *, threads: int = 1) -> Workers:
@@ -231,18 +218,3 @@ def _line(number: int, observation: Any) -> bytes:
     require_kind(observation, Observation, f"observations[{number}]")
     data = observation.to_dict(states_origins=True)
     return msgspec.json.encode(data, enc_hook=np.generic.item) + b"\n"  # names may be NumPy's
-
-
-def _tally(folder: RunFolder) -> Tally:
-    counts: Counter[str] = Counter()
-    whole: dict[str, str] = {}  # with the source, which tells what the only failure is of
-    total = 0
-    for table in read_groups(folder.results, fix=DONE_ANEW):
-        total += len(table)
-        failed = table.filter(pc.not_equal(table["status"], OK))
-        for row in failed.select(["source", "reason"]).to_pylist():
-            reason = row["reason"].removeprefix(row["source"]).lstrip(": ,.")
-            counts[reason] += 1
-            whole[reason] = row["reason"]
-    reasons = [(whole[each] if count == 1 else each, count) for each, count in counts.most_common()]
-    return Tally(total, counts.total(), tuple(reasons))

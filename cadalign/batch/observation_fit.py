@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NoReturn
+from typing import TYPE_CHECKING, Any, Literal
 
 from cadalign.errors import InputError
 from cadalign.estimation.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
@@ -41,9 +41,6 @@ class ObservationFit:
     """Estimate sigma from the residuals: for a model that is only similar to the object. Its
     proportions are similar, too: --stretch-sigma is 0.2, unless the file or a flag says
     otherwise."""
-    stretch_prior: bool = True
-    """Take a prior on the stretch: the flag's, the file's, or with --similar the default one; with
-    --no-stretch-prior none."""
     robust: bool = False
     """Search for outliers among the keypoints (RANSAC) and fit to the inliers."""
     shape: Path | None = None
@@ -64,11 +61,6 @@ class ObservationFit:
     default the file's, or that of the photo's EXIF data, or else usual."""
     focal_prior_sigma: float = FocalPrior.relative_sigma
     """Relative standard deviation of --focal-prior."""
-    exif: bool = True
-    """Use the photo's EXIF data as a prior on an estimated focal length."""
-    stored: bool = True
-    """Take the options that the file stores, except for those that flags set to another value than
-    their defaults; with --no-stored flags alone count."""
     up_axis: Literal["x", "y", "z"] | None = None
     """The model's axis that points up, for evidence of gravity and heights; y, unless the file says
     otherwise."""
@@ -84,14 +76,14 @@ class ObservationFit:
 
     def stored_in(self, observation: Observation) -> Mapping[str, Any]:
         """Options of the file that hold unless a flag says otherwise."""
-        stored = dict(observation.fit_options) if self.stored else {}
+        stored = dict(observation.fit_options)
         if self.shape is not None or self.shape_sigma is not None:
             stored.pop("shape_sigma", None)
         return stored
 
     def shape_of(self, observation: Observation) -> Path | None:
         """File of the learned shape to fit: the flag's, or else the file's."""
-        takes_own = self.stored and self.shape is None and self.shape_sigma is None
+        takes_own = self.shape is None and self.shape_sigma is None
         return observation.shape if takes_own else self.shape
 
     def shape_sigma_of(self, observation: Observation) -> float | None:
@@ -111,14 +103,11 @@ class ObservationFit:
         if self.similar and self.sigma is not None:
             similar, sigma = self.named("similar"), self.named("sigma")
             what = f"{similar} estimates the standard deviation, which {sigma} gives"
-            self._refuse_both(what, "sigma")
+            raise InputError(what, where=sigma, fix="give one of the two options")
         if self.similar or self.sigma is not None:
             return {"sigma": self.sigma}
         stored = self.stored_in(observation)
         return {"sigma": stored["sigma"]} if "sigma" in stored else {}
-
-    def _refuse_both(self, what: str, name: str) -> NoReturn:
-        raise InputError(what, where=self.named(name), fix="give one of the two options")
 
     def options_for(self, observation: Observation, where: str, note: Note) -> FitOptions:
         """Options of the fit: those that are given, otherwise those of the file."""
@@ -149,12 +138,6 @@ class ObservationFit:
         sigma = self.stated_sigma(observation).get("sigma", own)
         changes = {**self._set_by_flags, "sigma": sigma, "focal": focal, "focal_prior": prior}
         options = replace(stored, **changes)
-        if not self.stretch_prior:
-            if self.fitting.stretch_sigma is not None:
-                left_out, stretch = map(self.named, ("no_stretch_prior", "stretch_sigma"))
-                what = f"{left_out} leaves out the prior, which {stretch} gives"
-                self._refuse_both(what, "no_stretch_prior")
-            return replace(options, stretch_sigma=None)
         is_chosen = "stretch_sigma" in given or options.stretch_sigma is not None
         has_prior = options.method == "optimal" and bool(options.stretched_axes)
         if self.similar and has_prior and not is_chosen:
@@ -179,22 +162,22 @@ class ObservationFit:
         if "focal_prior" in stored:
             prior = stored["focal_prior"]
             return FocalPrior(**prior) if isinstance(prior, dict) else prior
-        return (_prior_of_photos(observation, note) if self.exif else None) or USUAL
+        return _prior_of_photos(observation, note) or USUAL
 
     def check_for(self, observation: Observation) -> None:
         """Refuse options that have no effect together with a shape or further evidence."""
         if self.shape is not None and self.shape_sigma is not None:
             what = f"{self.named('shape')} has learned how far objects of the category differ"
-            self._refuse_both(what, "shape_sigma")
+            where, fix = self.named("shape_sigma"), "give one of the two options"
+            raise InputError(what, where=where, fix=fix)
         is_learned = self.shape_of(observation) is not None
         is_similar = self.shape_sigma_of(observation) is not None
         given, refused = {*self._set_by_flags}, {"method"}
         cause = "evidence beyond the keypoints of one image"
         if is_learned or is_similar:
             cause = "a learned shape" if is_learned else "a similar shape"
-            refused |= {"similar", "no_stretch_prior", *(_OF_THE_MODEL if is_learned else ())}
+            refused |= {"similar", *(_OF_THE_MODEL if is_learned else ())}
             given |= {"similar"} if self.similar else set()
-            given |= set() if self.stretch_prior else {"no_stretch_prior"}
         for name in sorted(given & refused):
             what, fix = f"has no effect together with {cause}", "leave out one of the two"
             raise InputError(what, where=self.named(name), fix=fix)
@@ -206,7 +189,7 @@ class ObservationFit:
 
         Keypoints need no ``xyz`` where a learned shape is fitted.
         """
-        own = data.get("shape") if isinstance(data, dict) and self.stored else None
+        own = data.get("shape") if isinstance(data, dict) else None
         if self.shape is not None or (own is not None and self.shape_sigma is None):
             data = fill_xyz(data)
         with in_file(where):

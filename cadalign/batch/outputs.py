@@ -1,44 +1,8 @@
 """Outputs of runs over many observations: their table, and pictures for the page.
 
-The table is ``results.parquet``, and ``results.csv`` without the columns that are lists. Pictures
-are the photo, the object in it, and its mesh.
-
-Rows are in the order of the observations. Pose and camera of several views are the first's.
-
-row, source
-    Number of the observation in the run, and its file, with the line or the object in it.
-image, object, model
-    The photo, the object's name, and the file of the CAD model or of the learned shape; empty where
-    they are not known.
-status, reason
-    ``ok``, or ``failed`` and why; a failed row has no numbers.
-method, views, keypoints, inliers
-    The method, and the numbers of views, of keypoints and of those that the alignment rests on.
-qw, qx, qy, qz
-    Rotation from the model's axes to the camera's (OpenCV's: x right, y down, z forward) as a unit
-    quaternion, qw not negative.
-tx, ty, tz
-    Translation, the place of the model's origin in the camera's frame [model units].
-scale_x, scale_y, scale_z
-    Scale along the model's axes: ``R diag(scale) x + t`` is a model point in the camera's frame.
-focal_length, sigma
-    Horizontal focal length, and standard deviation of the keypoints, given or estimated [px]; no
-    sigma where each keypoint has its own.
-rotation_std_deg, tx_std, ty_std, tz_std, scale_x_std, scale_y_std, scale_z_std, focal_length_std
-    Standard deviations: of the rotation about all axes together [degrees], of the translation
-    [model units], relative ones of the scales and of the focal length (0.02 is 2 %); 0 where it
-    is known.
-rms_px, cost
-    Root mean square length of the inliers' residuals [px], and the minimised cost.
-alternatives, warning_count, warning_kinds, warnings
-    Number of other alignments that explain the keypoints, number of warnings, the kind of each (see
-    `cadalign.estimation.EstimateWarning`; "picture" for one that is not drawn), and their texts.
-covariance
-    Covariance (9, 9), or (10, 10) with an estimated focal length, by rows; see
-    `cadalign.Result.covariance`.
-residuals, is_inlier
-    Projected minus observed keypoints, u and v in turn [px], infinite for rejected ones behind the
-    camera; and for each keypoint whether the alignment rests on it.
+The table is ``results.parquet``, and ``results.csv`` without the columns that are lists;
+docs/how_to/many_photos.md describes the columns. Rows are in the order of the observations. Pose
+and camera of several views are the first's.
 """
 
 from __future__ import annotations
@@ -55,22 +19,19 @@ import pyarrow.parquet as pq
 from cadalign.datasets.models.shapenet import name_of_synset
 from cadalign.errors import CadalignError, DataError, RenderError
 from cadalign.estimation.result import Result
-from cadalign.evaluation.instances.pictures import cut_out, shown_photo, write_preview, write_webp
+from cadalign.evaluation.instances.pictures import write_pictures, write_preview
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
 from cadalign.evaluation.runs.work import OK, AbortError, Columns, Row
 from cadalign.geometry.alignment import Box
-from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.geometry.pixels import rescaled_pixels
 from cadalign.geometry.rotations import quat_wxyz_from_rotation
 from cadalign.io.files import write_whole
-from cadalign.io.images import ByteImage, read_image
+from cadalign.io.images import read_image
 from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.model_overlay import mesh_of
-from cadalign.render.drawing.overlay import draw_overlay
 
 _AXES = "xyz"
 _LISTS: Columns = (
@@ -90,7 +51,6 @@ COLUMNS: Columns = (
     *(("alternatives", int), ("warning_count", int), ("warning_kinds", str), ("warnings", str)),
     *_LISTS,
 )
-TIMING_COLUMNS: Columns = (("row", int), ("seconds", float))
 RECORD_COLUMNS: Columns = (("row", int), ("observation", str), ("result", str))
 """Observation and result as JSON: all that pages, exports and `cadalign.Results.open` need."""
 
@@ -196,9 +156,7 @@ def draw_fit(
 ) -> tuple[str, ...]:
     """Write the pictures of an observation, aligned or not; says what could not be drawn.
 
-    ``pictures`` gets the photo, ``thumbs`` the part around the object with its box, ``previews`` a
-    preview of the model's mesh, warped to the estimated shape. Raises AbortError if a picture
-    cannot be written, as on a full disk.
+    Raises AbortError if a picture cannot be written, as on a full disk.
     """
     camera = seen.camera if result is None else result.camera
     names = page_names(row)
@@ -213,11 +171,11 @@ def draw_fit(
         mesh = None if result is None else _mesh(seen, result)
     except CadalignError as error:
         troubles.append(f"the model is shown as a box: {error}")
+    box = None if result is None else Box.from_model(result.bounds, result.alignment)
     try:
         if photo is not None:
-            small, shrunk = shown_photo(photo, camera)
-            write_webp(folder.pictures / f"{stem}.webp", small)
-            write_webp(folder.thumbs / f"{stem}.webp", _thumb(small, shrunk, seen, result))
+            how: dict[str, Any] = {"observed": seen.points_2d, "est_box": box}
+            write_pictures(folder, stem, photo, camera, with_overlay=False, **how)
         if mesh is not None:
             write_preview(folder.previews / f"{stem}.json", mesh)
     except (DataError, OSError) as error:
@@ -234,15 +192,3 @@ def _mesh(seen: Observation, result: Result) -> Mesh | None:
     if result.model is not None:
         return mesh_of(seen, result)
     return None if seen.model is None else load_mesh(seen.model)
-
-
-def _thumb(photo: ByteImage, camera: Camera, seen: Observation, result: Result | None) -> ByteImage:
-    box = None if result is None else Box.from_model(result.bounds, result.alignment)
-    observed = rescaled_pixels(seen.points_2d, camera.width / seen.camera.width)
-    drawn = draw_overlay(photo, camera, est_box=box, observed=observed, axes=False, legend=False)
-    ends = np.empty((0, 2)) if box is None else camera.project_where_ahead(box.corners)
-    points = np.concatenate([observed, ends])
-    points = points[np.isfinite(points).all(axis=1)]
-    if not len(points):
-        points = np.array([[0, 0], [camera.width, camera.height]], dtype=float)
-    return cut_out(drawn, camera, points)[0]

@@ -1,18 +1,7 @@
-"""Retrieval for many observations as a run.
+"""Retrieval for many observations as a run: the tables are those of each one's best match.
 
-Table, records and exports are those of the best match of each observation, whose model has these
-columns besides:
-
-match_category, match_id, match_score
-    The model of the library, and its probability; see `cadalign.Match.score`.
-match_log_likelihood, none_probability
-    As of `cadalign.Match`.
-missing
-    Number of keypoints that the model lacks.
-top_categories, top_ids, top_scores
-    All matches, the best first.
-
-The records hold all matches as JSON (`cadalign.Match.to_dict`) in the column ``matches``.
+docs/how_to/many_photos.md describes the further columns. The records hold all matches as JSON
+(`cadalign.Match.to_dict`) in the column ``matches``.
 """
 
 from __future__ import annotations

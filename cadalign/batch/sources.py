@@ -16,7 +16,7 @@ from contextlib import suppress
 from glob import glob
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -54,26 +54,11 @@ class ObservationTask(NamedTuple):
     """The folder that paths in it are relative to."""
 
 
-class Source(Protocol):
-    """Observations of one input."""
-
-    def __len__(self) -> int:
-        """Their number."""
-
-    def tasks(self, first: int, last: int) -> list[ObservationTask]:
-        """Those from ``first`` on, ``last`` left out; their rows count within the source."""
-
-    def fingerprint(self) -> str:
-        """A text that changes with the content."""
-
-    def named_files(self) -> Iterable[Path]:
-        """Photos, masks and meshes that the observations name."""
-
-
 class Files(list[Path]):
     """Observation files, one each."""
 
     def tasks(self, first: int, last: int) -> list[ObservationTask]:
+        """Those from ``first`` on, ``last`` left out; their rows count within the source."""
         chosen = enumerate(self[first:last], start=first)
         return [ObservationTask(row, str(path), None, _folder(path)) for row, path in chosen]
 
@@ -155,6 +140,9 @@ class Detections:
 
     def named_files(self) -> Iterable[Path]:
         return ()
+
+
+Source = Files | Lines | Detections
 
 
 class ObservationTasks(Sequence[ObservationTask]):

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import msgspec
 import numpy as np
@@ -23,20 +24,21 @@ from cadalign.evaluation.instances.record import record_of
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.plots import Plot, cumulative_curves
 from cadalign.evaluation.registry import Spec
-from cadalign.evaluation.runs.tables import Cells, Run
-from cadalign.evaluation.runs.work import Columns, Outcome, Row
+from cadalign.evaluation.runs.tables import Run
+from cadalign.evaluation.runs.work import FAILED, Columns, Outcome, Row
 from cadalign.evaluation.summary import (
-    ALL,
     Summary,
-    by_category_and_method,
     mean,
-    median,
-    median_of,
+    medians,
+    milliseconds,
+    summarize,
 )
 from cadalign.geometry.alignment import extent
 from cadalign.io.observation import Observation
 
-Statistics = Mapping[str, Callable[[Cells], float]]
+if TYPE_CHECKING:
+    from cadalign.evaluation.summary import Statistics
+
 METHOD = "alignment"
 """Name of the estimate on the page, the same in all runs, such that they can be compared."""
 ROTATION_STD = Metric("rotation_std_deg", "rotation uncertainty", "deg", head="R std. dev.")
@@ -52,7 +54,6 @@ _HEADLINE = (
     *_GALLERY,
     metrics.QUERY_MILLISECONDS,
 )
-_MOST_MODELS = 20  # in the table, the most frequent ones
 _PLACES = np.array([0.1, 0.2, 0.5, 1, 2, 3, 5, 7.5, 10, 15, 20, 30, 50])
 
 
@@ -106,10 +107,10 @@ def _record(stored: Row, names: Row) -> Row:
         seen = Observation.from_dict(msgspec.json.decode(stored["observation"]))
         camera, pixels, points = seen.camera, seen.points_2d, seen.points_3d
         bounds = extent(points if len(points) else np.zeros((1, 3)))
-        outcome = Outcome.failure(reason, names)
+        outcome = Outcome(names, status=FAILED, reason=reason)
     shown = np.isfinite(pixels).all(axis=1)
     estimate = DataError(reason) if result is None else result
-    return record_of(
+    record = record_of(
         [outcome],
         [estimate],
         camera=camera,
@@ -119,44 +120,20 @@ def _record(stored: Row, names: Row) -> Row:
         points_2d=pixels[shown],
         ids=np.flatnonzero(shown),
     )
+    return {**{name: names[name] for name in ("category", "model_id", "view")}, "exhibit": record}
 
 
 _STATISTICS = {
     metrics.KEYPOINTS.key: mean(metrics.KEYPOINTS.key),
-    **{metric.key: median(metric.key) for metric in _GALLERY},
+    **medians(*_GALLERY),
     WARNINGS.key: mean(WARNINGS.key),
-    "milliseconds": lambda cells: 1e3 * median_of(cells["seconds"]),
+    "milliseconds": milliseconds,
 }
 
 
 def summarize_by(further: Statistics) -> Callable[[Run], list[Summary]]:
-    """Medians for every category, for its models, and for all, with further statistics."""
-    statistics = {**_STATISTICS, **further}
-
-    def summarize(run: Run) -> list[Summary]:
-        found, models = by_category_and_method(run, statistics), _by_model(run)
-        if models is not None:
-            lines = by_category_and_method(models, statistics)
-            found += [line for line in lines if line.group != ALL]
-        return found
-
-    return summarize
-
-
-def _by_model(run: Run) -> Run | None:
-    """The run with its most frequent models for categories; None where each category has one."""
-    names = run.column("category"), run.column("model_name")
-    labels = np.array([f"{each}, {model}" for each, model in zip(*names, strict=True)])
-    models, counts = np.unique(labels, return_counts=True)
-    if len(models) == len(set(names[0].tolist())):
-        return None
-    most = models[np.argsort(-counts, kind="stable")[:_MOST_MODELS]]
-    rows = np.flatnonzero(np.isin(labels, most))
-    results = run.results.take(rows)
-    place = results.schema.get_field_index("category")
-    results = results.set_column(place, "category", pa.array(labels[rows], pa.string()))
-    timings = run.timings.take(rows) if len(run.timings) else run.timings
-    return replace(run, results=results, timings=timings)
+    """Medians for every category, and for all, with further statistics."""
+    return partial(summarize, statistics={**_STATISTICS, **further})
 
 
 def _plots(runs: Sequence[Run]) -> list[Plot]:

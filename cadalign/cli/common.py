@@ -126,14 +126,11 @@ def print_table(table: ConsoleTable) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    style: dict[str, Any] = {}
-    if table.narrow:
-        style = {"box": box.SIMPLE_HEAD, "show_edge": False, "padding": (0, 1, 0, 0)}
-    shown = Table(title=table.title, **style)
+    shown = Table(title=table.title, box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
     for name in table.labels:
         shown.add_column(escape(name), no_wrap=True)
     for name in table.heads:
-        shown.add_column(escape(name), justify="right", no_wrap=not table.wraps)
+        shown.add_column(escape(name), justify="right", no_wrap=False)
     previous = None
     for first, *rest in table.rows:
         if table.grouped and previous not in (None, first):

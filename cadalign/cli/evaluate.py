@@ -17,10 +17,10 @@ import tyro
 from cadalign.cli.common import NOTHING_WORKED, SUCCESS, JsonOption, group_of, say
 from cadalign.cli.options import named_as_flags
 from cadalign.cli.runs import conclude, run_progress, write_run_report
-from cadalign.errors import DataError, InputError
+from cadalign.errors import InputError
 from cadalign.evaluation.experiments.demo import DemoOptions
 from cadalign.evaluation.options import ExperimentOptions, RunOptions
-from cadalign.evaluation.registry import Spec, known_options, spec_named, spec_of_config
+from cadalign.evaluation.registry import Spec, known_options, spec_named
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.io.files import keeping, write_text
 
@@ -100,39 +100,13 @@ def command_of(
     )
 
 
-@dataclass(frozen=True)
-class EvaluateShow(JsonOption):
-    """Show a finished run again: its summary, and its figures drawn anew."""
-
-    run_folder: Annotated[Path, tyro.conf.Positional]
-    """The run's folder."""
-
-    def run(self) -> int:
-        """Show the run; returns the exit code, that of the run."""
-        from cadalign.evaluation.runs.folder import RunFolder
-
-        folder = RunFolder(self.run_folder)
-        config = folder.read_config()
-        spec = None if config is None else spec_of_config(config, self.run_folder)
-        if spec is None or spec.options.command != _COMMAND:
-            raise DataError("not the folder of an evaluation's run", where=str(self.run_folder))
-        if not folder.is_finished:
-            raise DataError(
-                "the run is not finished",
-                where=str(self.run_folder),
-                fix="start the command that made it again: it goes on",
-            )
-        return conclude(spec, spec.open(self.run_folder), json=self.json)
-
-
 def _evaluations() -> dict[str, Any]:
-    """The command of every experiment that `cadalign evaluate` runs, and `show`."""
-    commands = {
+    """The command of every experiment that `cadalign evaluate` runs."""
+    return {
         options.experiment: command_of(options, about=f"{getdoc(options)}\n\n{_EXIT_CODES}")
         for options in known_options()
         if options.command == _COMMAND
     }
-    return {**commands, "show": EvaluateShow}
 
 
 def _sweeps() -> dict[str, Any]:

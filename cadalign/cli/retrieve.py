@@ -140,4 +140,4 @@ def _print_table(matches: Sequence[Match]) -> None:
         )
         for rank, match in enumerate(matches, start=1)
     ]
-    print_table(ConsoleTable("", labels, heads, rows, "", narrow=True, grouped=False))
+    print_table(ConsoleTable("", labels, heads, rows, grouped=False))

@@ -54,24 +54,28 @@ def conclude(spec: Spec, run: Run, *, json: bool) -> int:
         what += f": no object is of the categories {', '.join(given)}" if given else ""
         fix = "give other categories or data, and another folder (--out), or remove this one"
         raise DataError(what, where=str(run.folder.path), fix=fix)
+    from cadalign.evaluation.runs.work import FAILED
+
     summaries = spec.write(run)
-    found = spec.conclude(run, summaries)
+    statuses = run.results["status"].to_pylist()
+    apart, failed = statuses.count(spec.apart), statuses.count(FAILED)
+    rows = len(statuses) - apart
     if json:
         print_json(
             {
                 "run": str(run.folder.path),
-                "rows": found.rows,
-                "failed": found.failed,
-                **found.counts,
+                "rows": rows,
+                "failed": failed,
+                spec.apart.replace(" ", "_"): apart,
                 "summary": [summary.to_dict() for summary in summaries],
             }
         )
     else:
         print_table(spec.console_table(run, summaries))
-        _say_reasons(_reasons(run), most=_MOST_OF_EVALUATIONS)
-        note = f", {found.note}" if found.note else ""
-        say(f"Run: {run.folder.path} ({found.failed} of {found.rows} rows failed{note})")
-    return exit_code(found.failed, found.rows)
+        _say_reasons(_reasons(run.folder)[1], most=_MOST_OF_EVALUATIONS)
+        note = f", {apart} more were {spec.apart}" if apart else ""
+        say(f"Run: {run.folder.path} ({failed} of {rows} rows failed{note})")
+    return exit_code(failed, rows)
 
 
 def write_run_report(folder: RunFolder) -> None:
@@ -147,7 +151,7 @@ def run_command(command: ManyCommand, options: ManyOptions, *, done: str) -> int
 
     folder = run_folder(command, options)
     with run_progress(options.experiment) as on_progress:
-        tally = run_many(
+        run_many(
             options,
             folder,
             workers=command.workers,
@@ -156,12 +160,14 @@ def run_command(command: ManyCommand, options: ManyOptions, *, done: str) -> int
         )
     if command.json:
         print_json(read_rows(folder))
-    _say_reasons([(_as_typed(reason, command), count) for reason, count in tally.reasons])
-    made, table = tally.total - tally.failed, folder.path / "results.csv"
-    say(f"{made:,} of {tally.total:,} {done}, {tally.failed:,} failed: {table}")
-    if command.picture and tally.total <= _ON_PAGE:
+    total, reasons = _reasons(folder)
+    failed = sum(count for _, count in reasons)
+    _say_reasons([(_as_typed(reason, command), count) for reason, count in reasons])
+    table = folder.path / "results.csv"
+    say(f"{total - failed:,} of {total:,} {done}, {failed:,} failed: {table}")
+    if command.picture and total <= _ON_PAGE:
         write_run_report(folder)
-    return exit_code(tally.failed, tally.total)
+    return exit_code(failed, total)
 
 
 def _as_typed(reason: str, command: ManyCommand) -> str:
@@ -172,14 +178,25 @@ def _as_typed(reason: str, command: ManyCommand) -> str:
     return f"{what}{mark}{with_flags(fix, flags_of(command)) if mark else fix}"
 
 
-def _reasons(run: Run) -> list[tuple[str, int]]:
-    """Reasons of failed rows of a run, and their numbers, the commonest first."""
-    import pyarrow.compute as pc  # loaded with the run
-
+def _reasons(folder: RunFolder) -> tuple[int, list[tuple[str, int]]]:
+    """Number of rows of a run, and reasons of failures with their numbers, the commonest first."""
+    from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
     from cadalign.evaluation.runs.work import FAILED
 
-    failed = run.results.filter(pc.equal(run.results["status"], FAILED))
-    return Counter(failed["reason"].to_pylist()).most_common()
+    counts: Counter[str] = Counter()
+    whole: dict[str, str] = {}  # with the source, which tells what the only failure is of
+    total = 0
+    for table in read_groups(folder.results, fix=DONE_ANEW):
+        total += len(table)
+        names = [name for name in ("status", "source", "reason") if name in table.column_names]
+        for row in table.select(names).to_pylist():
+            if row["status"] == FAILED:
+                reason = row["reason"].removeprefix(row.get("source", "")).lstrip(": ,.")
+                counts[reason] += 1
+                whole[reason] = row["reason"]
+    return total, [
+        (whole[each] if count == 1 else each, count) for each, count in counts.most_common()
+    ]
 
 
 def _say_reasons(reasons: Sequence[tuple[str, int]], *, most: int = _MOST_REASONS) -> None:

@@ -14,7 +14,6 @@ from typing import Any, ClassVar, TypeVar
 
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.functions import (
-    Compared,
     FunctionMetric,
     choose_methods,
     choose_metrics,
@@ -28,7 +27,6 @@ from cadalign.evaluation.runs.work import (
     Outcome,
     Plan,
     Row,
-    Rows,
     reason_of,
     status_of,
 )
@@ -63,23 +61,16 @@ class Case:
     error: Exception | None = None  # why there is no instance
     status: str = ""
     """The rows' status where there is no instance; by default the error's, see `status_of`."""
-    without: tuple[str, ...] = ()  # methods that are not run on it
-    seconds: float | None = None  # spent on it where there is no instance
 
 
 class Setting:
     """Instances and metrics of a benchmark; picklable.
 
-    A setting has ``names``, ``columns``, ``case`` or ``cases``, and ``row`` or ``measure``.
+    A setting has ``columns``, ``case`` or ``cases``, and ``row`` or ``measure``.
     """
 
-    record_columns: ClassVar[Columns | None] = None
-    """The columns of the table of instance records; None of a setting without."""
-
-    @property
-    def names(self) -> Columns:
-        """The columns that name a row, the method's last."""
-        raise NotImplementedError
+    record_columns: ClassVar[Columns] = ()
+    """The columns of the table of instance records; none of a setting without."""
 
     @property
     def columns(self) -> Columns:
@@ -120,11 +111,9 @@ class Setting:
         """Cells of the result table for each estimate, or why there are none."""
         return [attempt(self.row, method, *pair) for pair in pairs]
 
-    def finish(
-        self, case: Case, outcomes: list[Outcome], estimates: list[Any]
-    ) -> tuple[list[Outcome], Row | None]:
-        """The outcomes of an instance and its record, once all methods were run; pictures."""
-        return outcomes, None
+    def finish(self, case: Case, outcomes: list[Outcome], estimates: list[Any]) -> str | None:
+        """The record of an instance, and its pictures, once all methods were run."""
+        return None
 
 
 @dataclass(frozen=True)
@@ -158,12 +147,7 @@ class Benchmark:
         return (*self.setting.columns, *((each.metric.key, float) for each in self.metrics))
 
     @property
-    def timing_columns(self) -> Columns:
-        """The columns of the table of timings."""
-        return (*self.setting.names, ("seconds", float))
-
-    @property
-    def record_columns(self) -> Columns | None:
+    def record_columns(self) -> Columns:
         """The columns of the table of instance records."""
         return self.setting.record_columns
 
@@ -179,34 +163,28 @@ class Benchmark:
         functions = [text_of(each.function) for each in self.metrics]
         return {"metrics": functions} if functions else {}
 
-    def evaluate(self, tasks: Sequence[Any]) -> Rows:
-        """A row for every instance and method, and a record for every instance."""
+    def evaluate(self, tasks: Sequence[Any]) -> list[Row]:
+        """A row for every instance and method; the first of an instance has its record."""
         cases = self.setting.cases(tasks)
-        found: list[list[tuple[Outcome, Any]]] = [[] for _ in cases]
-        for method in self.methods:
-            places = [k for k, case in enumerate(cases) if method.name not in case.without]
-            answers = self._answers(method, [cases[k] for k in places])
-            for k, answer in zip(places, answers, strict=True):
-                found[k].append(answer)
-        all_outcomes: list[Outcome] = []
-        records: list[Row] = []
-        for case, each in zip(cases, found, strict=True):
+        answers = zip(*(self._answers(method, cases) for method in self.methods), strict=True)
+        rows: list[Row] = []
+        for case, each in zip(cases, answers, strict=True):
             outcomes = [outcome for outcome, _ in each]
-            if case.instance is not None and outcomes:
-                estimates = [estimate for _, estimate in each]
-                outcomes, record = self.setting.finish(case, outcomes, estimates)
-                records += [] if record is None else [record]
-            all_outcomes += outcomes
-        return Rows.of(all_outcomes, records)
+            own = [outcome.row() for outcome in outcomes]
+            if case.instance is not None:
+                record = self.setting.finish(case, outcomes, [estimate for _, estimate in each])
+                if record is not None:
+                    own[0][self.record_columns[-1][0]] = record
+            rows += own
+        return rows
 
-    def failure(self, task: Any, reason: str) -> Rows:
+    def failure(self, task: Any, reason: str) -> list[Row]:
         """A failed row for every method."""
-        return Rows.of(
-            Outcome({**case.names, "method": method.name}, case.facts, FAILED, reason)
+        return [
+            Outcome({**case.names, "method": method.name}, case.facts, FAILED, reason).row()
             for case in self.setting.failed(task)
             for method in self.methods
-            if method.name not in case.without
-        )
+        ]
 
     def _answers(self, method: Method, cases: Sequence[Case]) -> list[tuple[Outcome, Any]]:
         instances = [case.instance for case in cases if case.instance is not None]
@@ -224,7 +202,7 @@ class Benchmark:
             if case.instance is None:
                 error = case.error or ValueError("there is no instance")
                 status = case.status or status_of(error)
-                outcome = Outcome(names, case.facts, status, reason_of(error), case.seconds)
+                outcome = Outcome(names, case.facts, status, reason_of(error))
                 answers.append((outcome, error))
                 continue
             estimate, seconds = next(estimates)
@@ -255,9 +233,8 @@ class Benchmark:
             return row
         instance, estimate = pair
         given = self.setting.given(instance)
-        found = Compared.of(estimate, given.gt)
         for each in self.metrics:
-            value = attempt(each.measure, found, given)
+            value = attempt(each.measure, estimate, given)
             if isinstance(value, Exception):
                 return value
             row[each.metric.key] = value

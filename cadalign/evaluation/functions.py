@@ -32,8 +32,7 @@ from cadalign.geometry.alignment import Alignment
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
 
-_OF_ESTIMATES = ("est", "gt", "result")
-_ARGUMENTS = (*_OF_ESTIMATES, "points_3d", "points_2d", "camera", "sigma", "bounds")
+_ARGUMENTS = ("est", "gt", "result", "points_3d", "points_2d", "camera", "sigma", "bounds")
 _FIX = "give module:function"
 
 
@@ -84,41 +83,28 @@ def _check_names(functions: Iterable[Function], taken: Container[str], where: st
 
 @dataclass(frozen=True)
 class FunctionMethod:
-    """A function as the estimate of a general method.
-
-    It takes points or views; the standard deviation of the keypoints is passed on where the
-    function ``takes_sigma``.
-    """
+    """A function as the estimate of a general method; one of two required arguments takes views."""
 
     function: Function
-    takes_views: bool
-    takes_sigma: bool
-
-    @classmethod
-    def of(cls, function: Function) -> FunctionMethod:
-        """A function of two required arguments takes views."""
-        required, takes_sigma = _positional(_loaded(function, "methods"))
-        return cls(function, required == 2, takes_sigma)
 
     def __call__(self, given: MethodInput) -> Alignment | Result:
         """The function's answer, checked."""
-        told = {"sigma": given.sigma} if self.takes_sigma else {}
+        function = _loaded(self.function, "methods")
+        required, takes_sigma = _positional(function)
+        told = {"sigma": given.sigma} if takes_sigma else {}
         arguments: tuple[Any, ...]
-        if self.takes_views:
+        if required == 2:
             arguments = given.model_and_views()
         else:  # copies: what the function does to them must not reach other methods
             arguments = given.points_3d.copy(), given.points_2d.copy(), given.camera
         try:
-            return checked_answer(_loaded(self.function, "methods")(*arguments, **told))
+            return _checked_answer(function(*arguments, **told))
         except SystemExit as error:
             raise CadalignError(f"it called for an exit ({error})") from None
 
 
-def checked_answer(answer: object) -> Alignment | Result:
-    """The answer of a function, if it is a valid alignment or a result.
-
-    Raises InputError if it is something else, or its alignment is none.
-    """
+def _checked_answer(answer: object) -> Alignment | Result:
+    """The answer of a function; raises InputError if it is no valid alignment and no result."""
     from cadalign.estimation.result import Result
 
     if not isinstance(answer, Alignment | Result):
@@ -126,11 +112,11 @@ def checked_answer(answer: object) -> Alignment | Result:
         fix = "return a cadalign.Alignment, or the result of cadalign.fit or cadalign.align"
         raise InputError(f"it returned {kind}, no alignment", where="method", fix=fix)
     found = answer if isinstance(answer, Alignment) else answer.alignment
-    parts = (found.rotation, found.translation, found.scale)  # which may not have been checked
-    checked = Alignment(*parts)
+    checked = Alignment(found.rotation, found.translation, found.scale)
     return checked if isinstance(answer, Alignment) else answer
 
 
+@lru_cache(maxsize=64)
 def _positional(function: Callable[..., Any]) -> tuple[int, bool]:
     """Number of required arguments besides ``sigma``, and whether there is such a parameter."""
     try:
@@ -157,7 +143,7 @@ def choose_methods(
     """
     table = PNP_METHODS | dict(fit_methods() if own is None else own)
     return tuple(
-        Method(name_of(each), FunctionMethod.of(each), is_general=True)
+        Method(name_of(each), FunctionMethod(each), is_general=True)
         if is_function(each)
         else table[each]
         for each in checked_methods(chosen, own)
@@ -177,30 +163,11 @@ def checked_methods(chosen: Iterable[Any], own: Collection[str] | None = None) -
             raise unknown("method", each, known, where="methods")
     _check_names(functions, known, "methods")
     for function in functions:
-        FunctionMethod.of(function)  # which imports it
+        _loaded(function, "methods")
     return found
 
 
 # Metrics ------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Compared:
-    """An estimated alignment, the true one if it is known, and the result it is of, if any."""
-
-    est: Alignment
-    gt: Alignment | None
-    result: Result | None = None
-
-    @classmethod
-    def of(cls, estimate: Any, gt: Alignment | None) -> Compared:
-        """An alignment, a result, or another estimate with an ``alignment`` and perhaps one."""
-        from cadalign.estimation.result import Result
-
-        if isinstance(estimate, Alignment):
-            return cls(estimate, gt)
-        result = estimate if isinstance(estimate, Result) else getattr(estimate, "result", None)
-        return cls(estimate.alignment, gt, result)
 
 
 @dataclass(frozen=True)
@@ -225,17 +192,25 @@ class FunctionMetric:
         taken = tuple(each.name for each in parameters if each.name in _ARGUMENTS)
         return cls(metric_named(name_of(function)), function, taken)
 
-    def measure(self, found: Compared, given: MethodInput) -> float | None:
+    def measure(self, estimate: Any, given: MethodInput) -> float | None:
         """The number of an estimate; None for NaN, and where the truth is not known.
 
-        Raises InputError if the function raises, or returns no number.
+        ``estimate`` is an alignment, or has one as its ``alignment``. Raises InputError if the
+        function raises, or returns no number.
         """
-        if "gt" in self.parameters and found.gt is None:
+        from cadalign.estimation.result import Result
+
+        if "gt" in self.parameters and given.gt is None:
             return None
         where = f"metric {self.metric.key}"
+        found = {
+            "est": estimate if isinstance(estimate, Alignment) else estimate.alignment,
+            "result": estimate
+            if isinstance(estimate, Result)
+            else getattr(estimate, "result", None),
+        }
         arguments = {
-            name: getattr(found if name in _OF_ESTIMATES else given, name)
-            for name in self.parameters
+            name: found[name] if name in found else getattr(given, name) for name in self.parameters
         }
         try:
             value = _loaded(self.function, "metrics")(**arguments)

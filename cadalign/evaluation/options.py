@@ -7,6 +7,7 @@ it. These modules load quickly: `cadalign evaluate --help` imports them.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from copy import copy
 from dataclasses import KW_ONLY, dataclass, fields, is_dataclass
@@ -33,7 +34,7 @@ class ExperimentOptions:
     """Command that runs it."""
     not_stored: ClassVar[tuple[str, ...]] = ("metrics", "format")
     """Options that the run's configuration describes otherwise."""
-    if_given: ClassVar[tuple[str, ...]] = ("shapenet", "shape")
+    if_given: ClassVar[tuple[str, ...]] = ("shapenet",)
     """Options that the run's configuration has only if they are not None."""
 
     seed: int = 0
@@ -119,7 +120,7 @@ def _innermost(function: Any) -> Any:
 
 
 def plain_value(value: Any) -> Any:
-    """The value as JSON has it, the paths in it absolute, functions by their names."""
+    """The value as JSON has it, paths absolute and normalised, functions by their names."""
     if is_dataclass(value):
         return {each.name: plain_value(getattr(value, each.name)) for each in fields(value)}
     if callable(value):
@@ -130,7 +131,7 @@ def plain_value(value: Any) -> Any:
         return [plain_value(each) for each in value]
     if hasattr(value, "tolist"):  # an array
         return value.tolist()
-    return str(value.absolute()) if isinstance(value, Path) else value
+    return os.path.abspath(value) if isinstance(value, Path) else value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,73 +170,25 @@ class ModelOptions(ExperimentOptions):
         self.check_least(max_models=1)
 
 
-@dataclass(frozen=True, kw_only=True)
-class NoiseOption(ExperimentOptions):
-    """Noise of the keypoints."""
-
-    noise_px: float = 1.0
-    """Standard deviation of the keypoints' noise, in pixels."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_noise("noise_px")
-
-    @property
-    def sigma(self) -> float:
-        """Standard deviation of the keypoints that methods are given [px]."""
-        return self.noise_px or 1.0
-
-
 @dataclass(frozen=True)
-class ViewOptions(ModelOptions, NoiseOption, FunctionOptions):
-    """Views of a dataset's models, in which enough keypoints are seen."""
+class ViewOptions(ModelOptions, FunctionOptions):
+    """Views of a dataset's models, with noisy keypoints."""
 
     _: KW_ONLY
-    split: str | None = None
-    """The dataset's split to take, such as test; all models by default."""
-    min_visible: int = 6
-    """Least number of keypoints that a view must show; of several views, the first."""
+    noise_px: float = 1.0
+    """Standard deviation of the keypoints' noise, in pixels."""
     views_per_model: int = 1
     """Number of views of each model, an instance each."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self.check_noise("noise_px")
         self.check_least(views_per_model=1)
 
     @property
-    def drawn(self) -> dict[str, Any]:
-        """Noise, least visible keypoints and seed of random views, for `make_instance`."""
-        return {name: getattr(self, name) for name in ("noise_px", "min_visible", "seed")}
-
-
-@dataclass(frozen=True, kw_only=True)
-class SplitOptions(ExperimentOptions):
-    """Splits of a dataset: objects of one are aligned by what is learned from the other."""
-
-    split: str = "val"
-    """Split of the objects."""
-    train: str = "train"
-    """Split of the models to learn from."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.split == self.train:
-            what, fix = f"both are {self.split!r}", "objects must not be among the models"
-            raise InputError(what, where="split, train", fix=fix)
-
-
-@dataclass(frozen=True, kw_only=True)
-class PhotoOptions(ExperimentOptions):
-    """Choice of the photos of a data set."""
-
-    max_photos: int | None = None
-    """Number of photos to take, the first ones; all by default."""
-    pictures: int = 100
-    """Number of photos whose pictures the report shows, the first ones."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_least(max_photos=1, pictures=0)
+    def sigma(self) -> float:
+        """Standard deviation of the keypoints that methods are given [px]."""
+        return self.noise_px or 1.0
 
 
 @dataclass(frozen=True, kw_only=True)

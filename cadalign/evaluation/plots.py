@@ -20,7 +20,7 @@ from cadalign.evaluation import metrics
 from cadalign.evaluation.methods import LIMIT, fit_methods
 from cadalign.evaluation.metrics import HIGH, Metric
 from cadalign.evaluation.runs.work import FAILED, OK
-from cadalign.evaluation.summary import Quartiles, known
+from cadalign.evaluation.summary import Quartiles, Summary, known
 from cadalign.io.files import write_whole
 
 if TYPE_CHECKING:
@@ -47,37 +47,13 @@ COLORS = (
 )
 """Colours of lines, in their order."""
 _MARKERS = "os^DvP<X>phd"
-_LABELS = {
-    "optimal": "optimal (ours)",
-    "aepnp": "AEPnP, 4 x 4 (ours)",
-    "aepnp-paper": "AEPnP, as published",
-    "epnp": "EPnP (no stretch)",
-    "optimal-unstretched": "optimal, without stretch",
-    "optimal-huber": "optimal, Huber loss",
-    "optimal-cauchy": "optimal, Cauchy loss",
-    "ransac-optimal": "LO-RANSAC + optimal (ours)",
-    "ransac-ap4p": "RANSAC, 4 points",
-    "ransac-aepnp": "RANSAC, 6 points (AEPnP)",
-    "ransac-aepnp-refined": "RANSAC, 6 points + refinement",
-    "shape": "shape model of the category (ours)",
-    "random-rigid": "another model, rigid",
-    "random-stretched": "another model, stretched",
-    "nearest": "nearest of the library",
-    "mean-rigid": "mean shape, rigid",
-    "mean-stretched": "mean shape, stretched",
-    "exact": "the object's own model",
-    "rigid": "the given model, rigid",
-    "stretched": "stretched",
-    "prior": "stretched, with a prior",
-    "similar": "stretched, similar keypoints",
-    "rigid+mask": "rigid + mask",
-    "rigid+gravity": "rigid + gravity",
-    "similar+gravity": "similar + gravity",
-    "stretched+gravity": "stretched + gravity",
-    "shape+gravity": "shape model + gravity",
-    "truth": "the truth itself",
-    LIMIT: "Cramer-Rao bound",
-}
+_NAMES = (
+    *("optimal-unstretched", "shape", "random-rigid", "random-stretched", "nearest"),
+    *("mean-rigid", "mean-stretched", "exact", "rigid", "stretched", "prior", "similar"),
+    *("rigid+mask", "rigid+gravity", "similar+gravity", "stretched+gravity", "shape+gravity"),
+    "truth",
+)
+"""Methods beside those of `cadalign.fit`, whose looks differ."""
 
 
 @dataclass(frozen=True)
@@ -92,17 +68,15 @@ class Look:
 
 def look_of(method: str) -> Look:
     """The look of a method; that of the Cramer-Rao bound is a dashed line without markers."""
-    label = _LABELS.get(method, method)
     if method == LIMIT:
-        return Look(label, "black", "", "--")
-    # Those of `cadalign.fit` first.
-    names = [name for name in dict.fromkeys([*fit_methods(), *_LABELS]) if name != LIMIT]
+        return Look("Cramer-Rao bound", "black", "", "--")
+    names = [name for name in (*fit_methods(), *_NAMES) if name != LIMIT]
     if method in names:
         place = mark = names.index(method)
     else:  # of a function by its name, wherever it is drawn
         place = crc32(method.encode())
         mark = place // len(COLORS)
-    return Look(label, COLORS[place % len(COLORS)], _MARKERS[mark % len(_MARKERS)], "-")
+    return Look(method, COLORS[place % len(COLORS)], _MARKERS[mark % len(_MARKERS)], "-")
 
 
 STYLE: dict[Any, Any] = {
@@ -160,10 +134,10 @@ def save_figure(figure: Figure, path: Path) -> list[Path]:
 
 QUARTILES_NOTE = "line: median, band: quartiles"
 _DIGITS = 6
-_DASHES = ("-", "--", ":", "-.")
 # Of lines and markers [points].
 _THINNEST, _SMALLEST, _STEP = 1.5, 4.5, 0.35
 _MOST_STEPS = 7
+_MOST_TICKS = 30
 
 
 @dataclass(frozen=True)
@@ -202,21 +176,13 @@ class Trace:
 
 @dataclass(frozen=True)
 class Plot:
-    """A plot of lines.
-
-    Plots with the same ``figure`` are drawn into one, in which ``variant`` sets them apart, under a
-    ``caption`` of the quantities that are held and the number of problems. The title is by default
-    made of the axes' labels.
-    """
+    """A plot of lines, by default titled after its axes, with a note on its numbers."""
 
     id: str
     x: Metric
     y: Metric
     traces: list[Trace]
     note: str = ""
-    caption: str = ""
-    figure: str = ""
-    variant: str = ""
     title: str = ""
 
     def to_dict(self) -> dict[str, Any]:
@@ -236,42 +202,37 @@ class Plot:
         }
 
 
-def compact(values: npt.ArrayLike | Sequence[float | None]) -> list[float | None]:
-    """Numbers with 6 digits; None for what is not finite.
+def plot_against(
+    found: Sequence[Sequence[Summary]], x: Metric, y: Metric, *, place: str, **words: str
+) -> Plot:
+    """Lines of a number against what runs vary, the cell ``place`` of their summaries, by method.
 
-    Examples
-    --------
-    >>> compact([1 / 3, float("nan"), 2.0])
-    [0.333333, None, 2.0]
+    ``words`` are further fields of the plot.
     """
+    traces = []
+    for index, summaries in enumerate(found):
+        for method in dict.fromkeys(each.method for each in summaries):
+            rows = [each for each in summaries if each.method == method]
+            places = [x.factor * each[place] for each in rows]
+            traces.append(Trace.of(index, method, places, [each[y.key] for each in rows], y))
+    return Plot(**{"id": y.key, **words}, x=x, y=y, traces=traces)
+
+
+def compact(values: npt.ArrayLike | Sequence[float | None]) -> list[float | None]:
+    """Numbers with 6 digits; None for what is not finite."""
     numbers = np.asarray(values, dtype=float).tolist()
     return [float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None for value in numbers]
 
 
-def draw_plots(folder: Path, plots: Sequence[Plot]) -> list[Path]:
-    """Draw plots of one run into a folder, PNG and PDF; those with the same figure into one."""
-    files = []
-    for name in dict.fromkeys(plot.figure or plot.id for plot in plots):
-        files += draw_plot(
-            folder / name, [plot for plot in plots if (plot.figure or plot.id) == name]
-        )
-    return files
-
-
-def draw_plot(path: Path, plots: Sequence[Plot]) -> list[Path]:
-    """Draw plots with the same axes into one figure, PNG and PDF; ``path`` has no ending.
+def draw_plot(path: Path, plot: Plot) -> list[Path]:
+    """Draw a plot into a file, PNG and PDF; ``path`` has no ending.
 
     A line ends where there is no value, and a band without an upper end goes to the top.
     """
-    x, y = plots[0].x, plots[0].y
-    rows_below = sum(len(plot.traces) for plot in plots) / 2  # of the legend
-    with new_figure(figsize=(6.4, 4.2 + 0.24 * max(0, rows_below - 3))) as figure:
+    x, y = plot.x, plot.y
+    with new_figure(figsize=(6.4, 4.2 + 0.12 * max(0, len(plot.traces) - 6))) as figure:
         axes = figure.add_subplot()
-        bands = [
-            band
-            for plot, dash in zip(plots, _DASHES * len(plots), strict=False)
-            for band in _draw_lines(axes, plot, dash)
-        ]
+        bands = _draw_lines(axes, plot)
         if y.log:
             axes.set_yscale("log")
         elif y.unit == "%":
@@ -281,18 +242,18 @@ def draw_plot(path: Path, plots: Sequence[Plot]) -> list[Path]:
             above = np.where(np.isnan(high) & ~np.isnan(low), top, high)
             axes.fill_between(places, low, above, color=color, alpha=0.14, linewidth=0)
         axes.set_ylim(bottom, top)
-        ticks = sorted({round(value, 6) for plot in plots for t in plot.traces for value in t.x})
+        ticks = sorted({round(value, 6) for trace in plot.traces for value in trace.x})
         if x.log:
             axes.set_xscale("log")
-        axes.set_xticks(ticks, [f"{value:g}" for value in ticks])
-        axes.minorticks_off()
-        axes.tick_params(axis="x", labelrotation=45 if len(ticks) > 9 else 0)
+        if len(ticks) <= _MOST_TICKS:
+            axes.set_xticks(ticks, [f"{value:g}" for value in ticks])
+            axes.minorticks_off()
+            axes.tick_params(axis="x", labelrotation=45 if len(ticks) > 9 else 0)
         if y.log:
             label_log_axis(axes)
         axes.set_xlabel(in_math(x.axis))
         axes.set_ylabel(in_math(y.axis))
-        caption = plots[0].caption or plots[0].note
-        axes.set_title(caption, fontsize=9, color="0.35", loc="left")
+        axes.set_title(plot.note, fontsize=9, color="0.35", loc="left")
         figure.legend(loc="outside lower center", ncols=2, handlelength=3.6)
         return save_figure(figure, path)
 
@@ -302,7 +263,7 @@ def in_math(label: str) -> str:
     return re.sub(r"\bs_([yz])\b", r"$s_\1$", label)
 
 
-def _draw_lines(axes: Axes, plot: Plot, dash: str) -> list[tuple[Any, Any, Any, str]]:
+def _draw_lines(axes: Axes, plot: Plot) -> list[tuple[Any, Any, Any, str]]:
     """Draw lines, thinner ones last, since they often coincide; returns their bands."""
     bands = []
     for place, trace in enumerate(plot.traces):
@@ -310,16 +271,16 @@ def _draw_lines(axes: Axes, plot: Plot, dash: str) -> list[tuple[Any, Any, Any, 
         middle = np.array(trace.y, dtype=float)
         if not np.isfinite(middle).any():
             continue
-        below = min(len(plot.traces) - 1 - place, _MOST_STEPS)
+        below = _STEP * min(len(plot.traces) - 1 - place, _MOST_STEPS)
         axes.plot(
             trace.x,
             middle,
             color=look.color,
-            linestyle=dash if plot.variant else look.dash,
-            marker=look.marker,
-            label=f"{look.label}, {plot.variant}" if plot.variant else look.label,
-            linewidth=_THINNEST + _STEP * below,
-            markersize=_SMALLEST + 2 * _STEP * below,
+            linestyle=look.dash,
+            marker=look.marker if len(trace.x) <= _MOST_TICKS else "",
+            label=look.label,
+            linewidth=_THINNEST + below,
+            markersize=_SMALLEST + 2 * below,
         )
         # The Cramer-Rao bound, without markers, is a floor whose band would hide the others.
         if trace.low is not None and trace.high is not None and look.marker:

@@ -1,8 +1,8 @@
-"""Specifications of experiments, all that command line, report and `evaluate show` know of them.
+"""Specifications of experiments, all that command line and report know of them.
 
 An experiment is a module of `cadalign.evaluation.experiments`: options
 (`cadalign.evaluation.options`), tasks and an experiment (`cadalign.evaluation.runs.work`), and a
-specification. Its runs, tables, page and `evaluate show` follow.
+specification. Its runs, tables and page follow.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 from cadalign.errors import DataError, InputError, quote, unknown
 from cadalign.evaluation.metrics import CATEGORY, Metric, told
 from cadalign.evaluation.options import ExperimentOptions
-from cadalign.evaluation.plots import Plot, draw_plots
-from cadalign.evaluation.runs.work import COLUMNS, FAILED, SKIPPED, Columns, Plan
-from cadalign.evaluation.summary import Conclusion, ConsoleTable, Summary, summary_csv
+from cadalign.evaluation.plots import Plot, draw_plot
+from cadalign.evaluation.runs.work import COLUMNS, SKIPPED, Columns, Plan
+from cadalign.evaluation.summary import ConsoleTable, Summary, summary_csv
 from cadalign.io.files import write_text
 
 if TYPE_CHECKING:
@@ -29,15 +29,6 @@ if TYPE_CHECKING:
 
 Reference = tuple[tuple[Summary, ...], str]
 """Published numbers beside a headline table, and a note on them."""
-
-
-def count_failures(run: Run, summaries: Summaries, *, apart: str = SKIPPED) -> Conclusion:
-    """Count rows and failures; rows of the status ``apart`` are neither."""
-    statuses = run.results["status"].to_pylist()
-    others = statuses.count(apart)
-    note = f"{others} more were {apart}" if others else ""
-    rows = len(statuses) - others
-    return Conclusion(rows, statuses.count(FAILED), {apart.replace(" ", "_"): others}, note)
 
 
 @dataclass(frozen=True)
@@ -57,18 +48,15 @@ class Spec:
     """Columns that the result table of a run must have to be summarized."""
     run: type[Run] | None = None
     """The class of its runs; by default `cadalign.evaluation.runs.tables.Run`."""
-    lines: Callable[[Summaries], Summaries] = list
-    """Makes lines of the headline table from summaries; by default a line of each."""
-    table: Callable[[Run, Summaries], ConsoleTable] | None = None
-    """Makes the table for the console of a run and its summaries; by default the headline table."""
+    console: tuple[Metric, ...] = ()
+    """Columns of the table for the console; by default those of the headline table."""
+    console_note: str = ""
     group: Callable[[Run], Metric] = lambda run: CATEGORY
     """The column that a run's tasks are grouped by."""
     plots: Callable[[Sequence[Run]], list[Plot]] = lambda runs: []
     """Makes the plots of a page of runs to be compared."""
-    write_more: Callable[[Run, Summaries], object] = lambda run, summaries: None
-    """Writes more files of a run and its summaries."""
-    conclude: Callable[[Run, Summaries], Conclusion] = count_failures
-    """Counts rows and failures of a run."""
+    apart: str = SKIPPED
+    """Status of rows that are counted neither as failed nor as ok."""
     metrics: tuple[Metric, ...] = ()
     """Columns of the result table that a page's gallery shows, for experiments on instances."""
     kind: Callable[[Run], str] = lambda run: run.experiment
@@ -76,8 +64,9 @@ class Spec:
     """Runs of one kind, whose name this gives, can be compared."""
     title: Callable[[Sequence[Run]], str] | None = None  # names runs of one kind in a few words
     topic: str = ""  # what is evaluated, in place of a title: ``topic on dataset``
-    describe: Callable[[Run], str] = lambda run: f"on {run.total:,} tasks of {run.experiment}"
-    """Says what the methods were run on."""
+    subject: str = "tasks"  # what the tasks are, in the plural
+    describe: Callable[[Run], str] | None = None
+    """Says what the methods were run on, in place of the subject and the dataset."""
     about: str = ""  # explains the pictures
     note: str = ""  # explains the numbers of the headline table
     reference: Callable[[Sequence[Run], set[str]], Reference] = lambda *_: ((), "")
@@ -101,30 +90,45 @@ class Spec:
         datasets = dict.fromkeys(run.dataset for run in runs)
         return f"{self.topic or runs[0].experiment} on {', '.join(datasets)}"
 
+    def description_of(self, run: Run) -> str:
+        """Says what the methods were run on."""
+        if self.describe is not None:
+            return self.describe(run)
+        return f"on {self.subject} of {run.dataset} ({run.total:,})"
+
     def console_table(self, run: Run, summaries: Summaries) -> ConsoleTable:
         """The table for the console."""
-        if self.table is not None:
-            return self.table(run, summaries)
-        lines = self.lines(summaries)
-        columns = self.shown_columns(lines, [run])
-        labels = (self.group(run).heading, "method")
-        return ConsoleTable.of("Medians per group and method", lines, columns, labels=labels)
+        shown = self.shown_columns(summaries, [run], self.console or self.columns)
+        heading = self.group(run).heading
+        return ConsoleTable(
+            title=f"Medians and rates by {heading} and method",
+            labels=(heading, "method"),
+            heads=tuple(column.symbol for column in shown),
+            rows=[
+                (s.group, s.method, *(column.text(s.number(column.key)) for column in shown))
+                for s in summaries
+            ],
+            note=self.console_note,
+        )
 
-    def shown_columns(self, lines: Summaries, runs: Sequence[Run]) -> list[Metric]:
-        """The columns that some line has a value of, those of further metrics last."""
+    def shown_columns(
+        self, lines: Summaries, runs: Sequence[Run], columns: Sequence[Metric] | None = None
+    ) -> list[Metric]:
+        """The columns, by default the headline's, that some line has a value of.
+
+        Those of further metrics are the last.
+        """
         further = {metric.key: metric for run in runs for metric in run.metrics}
-        columns = (*self.columns, *further.values())
-        return [c for c in columns if told(c, [line.number(c.key) for line in lines])]
+        chosen = (*(self.columns if columns is None else columns), *further.values())
+        return [c for c in chosen if told(c, [line.number(c.key) for line in lines])]
 
     def write(self, run: Run) -> Summaries:
         """Write ``summary.csv`` and ``figures`` of a finished run."""
         summaries = self.summarize(run)
         names = {"value": self.group(run).key}
         write_text(run.folder.summary, summary_csv(summaries, rename=names))
-        plots = self.plots([run])
-        if plots:
-            draw_plots(run.folder.made_figures(), plots)
-        self.write_more(run, summaries)
+        for plot in self.plots([run]):
+            draw_plot(run.folder.made_figures() / plot.id, plot)
         return summaries
 
 

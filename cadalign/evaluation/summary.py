@@ -1,24 +1,25 @@
-"""Summaries of results: lines of tables, quartiles, medians, and their CSV file."""
+"""Summaries of results: statistics of groups of rows, their table and their CSV file."""
 
 from __future__ import annotations
 
 import csv
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray
-from cadalign.evaluation.metrics import CATEGORY, INSTANCES, Metric
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.evaluation.metrics import CATEGORY, Metric
 from cadalign.evaluation.runs.work import OK, SKIPPED, Row
 
 if TYPE_CHECKING:
     from cadalign.evaluation.runs.tables import Cells, Run
 
-    Statistics = Mapping[str, Callable[[Cells], float]]
+    Statistics = Mapping[str, Callable[["Group"], Any]]
 
 ALL = "all"
 """Name of the summary over all categories."""
@@ -31,14 +32,12 @@ class Summary:
     """Numbers of one method on one group of tasks: a row of ``summary.csv``, a line of a headline.
 
     ``names`` are the columns that name the row, the method among them; ``values`` numbers and
-    `Quartiles` by column, in the metrics' own units, NaN for what is unknown. ``tasks`` is for the
-    headline's column of that name, by default ``instances``.
+    `Quartiles` by column, in the metrics' own units, NaN for what is unknown.
     """
 
     group: str
     names: Row
     values: Row
-    tasks: int | None = None
 
     @property
     def method(self) -> str:
@@ -51,8 +50,6 @@ class Summary:
 
     def number(self, key: str) -> float | None:
         """The number of a metric, the median where there are quartiles; None if there is none."""
-        if key == INSTANCES.key and self.tasks is not None:
-            return self.tasks
         value = self.values.get(key)
         return value.median if isinstance(value, Quartiles) else value
 
@@ -78,49 +75,16 @@ class Summary:
 class ConsoleTable:
     """A table for the console, with a note beneath.
 
-    ``labels`` head the columns of texts, which come first, ``heads`` those of numbers. A narrow
-    table has no frame and little room between columns; a grouped one sets apart the rows that
-    differ in the first column, which is not repeated; the heads of one that wraps may take several
-    lines.
+    ``labels`` head the columns of texts, which come first, ``heads`` those of numbers. Rows that
+    differ in the first column are set apart in a grouped table, which does not repeat it.
     """
 
     title: str
     labels: tuple[str, ...]
     heads: tuple[str, ...]
     rows: list[tuple[str, ...]]
-    note: str
-    narrow: bool = False
+    note: str = ""
     grouped: bool = True
-    wraps: bool = False
-
-    @classmethod
-    def of(
-        cls,
-        title: str,
-        summaries: Sequence[Summary],
-        shown: Sequence[Metric],
-        *,
-        labels: tuple[str, str] = ("category", "method"),
-        note: str = "",
-        **look: bool,
-    ) -> ConsoleTable:
-        """The table of the shown cells of summaries, each with its group and method."""
-        heads = tuple(column.symbol for column in shown)
-        rows = [
-            (s.group, s.method, *(column.text(s.number(column.key)) for column in shown))
-            for s in summaries
-        ]
-        return cls(title, labels, heads, rows, note, **look)
-
-
-@dataclass(frozen=True)
-class Conclusion:
-    """Numbers of rows and of failed ones, and a note on these, that a finished run ends with."""
-
-    rows: int
-    failed: int
-    counts: dict[str, int]
-    note: str
 
 
 @dataclass(frozen=True)
@@ -137,13 +101,6 @@ class Quartiles:
 
         A quartile is NaN where so many failed that it is a failure: giving up on the hard inputs
         does not improve it.
-
-        Examples
-        --------
-        >>> Quartiles.of(np.array([3.0, 1.0, 2.0, np.inf]))
-        Quartiles(lower=1.0, median=2.0, upper=3.0)
-        >>> Quartiles.of(np.array([1.0, np.inf, np.inf]))
-        Quartiles(lower=1.0, median=nan, upper=nan)
         """
         if not len(values):
             return cls(np.nan, np.nan, np.nan)
@@ -175,107 +132,92 @@ def csv_text(rows: Iterable[Iterable[object]]) -> str:
     return text.getvalue()
 
 
-def medians(run: Run, columns: Sequence[Metric], *, group: Metric = CATEGORY) -> list[Summary]:
-    """Numbers of rows, of failures, and medians of the others, for every group and method.
+class Group(NamedTuple):
+    """Rows of a method on a group of tasks: all that count, and those of them that are ok."""
 
-    Columns that the run's results lack are left out.
+    rows: Cells
+    solved: Cells
+
+
+def summarize(
+    run: Run,
+    statistics: Statistics,
+    *,
+    by: Sequence[str] = (CATEGORY.key,),
+    name: Callable[..., str] = str,
+    apart: str = SKIPPED,
+    cells: Cells | None = None,
+) -> list[Summary]:
+    """Statistics of every method on every group of tasks, and on all categories together.
+
+    Tasks of a group share the cells of the columns ``by``, of which ``name`` makes its name. Rows
+    of the status ``apart`` do not count. Medians of the run's further metrics are added. ``cells``
+    take the place of the run's.
     """
-    statistics = {metric.key: median(metric.key) for metric in columns if metric.key in run.cells}
-    summaries = []
-    for value in sorted(set(run.cells[group.key].tolist())):
-        cells = where(run.cells, run.cells[group.key] == value)
+    cells = run.cells if cells is None else cells
+    statistics = {**statistics, **{each.key: median(each.key) for each in run.metrics}}
+    choices: list[list[Any]] = [sorted(set(cells[key].tolist())) for key in by]
+    if by[0] == CATEGORY.key and len(choices[0]) > 1:
+        choices[0].append(None)
+    found = []
+    for values in product(*choices):
+        chosen = np.ones(len(cells["method"]), dtype=bool)
+        for key, value in zip(by, values, strict=True):
+            chosen &= (cells[key] == value) | (value is None)
+        labels = [f"category {each}" if each in (ALL, MEAN) else each for each in values]
+        labels = [ALL if each is None else each for each in labels]
         for method in run.methods:
-            names = {group.key: value, "method": method}
-            values = _values(cells, method, statistics)
-            summaries.append(Summary(group_name(group, value), names, values))
-    return summaries
+            rows = where(cells, chosen & (cells["method"] == method))
+            rated = where(rows, rows["status"] != apart)
+            group = Group(rated, where(rated, rated["status"] == OK))
+            counts = [len(each["method"]) for each in (rows, *group)]
+            if not counts[0]:
+                continue
+            names = {**dict(zip(by, labels, strict=True)), "method": method}
+            numbers = {"instances": counts[1], "failed": counts[1] - counts[2]}
+            numbers |= {key: statistic(group) for key, statistic in statistics.items()}
+            numbers[apart.replace(" ", "_")] = counts[0] - counts[1]
+            found.append(Summary(name(*labels), names, numbers))
+    return found
 
 
-def by_category_and_method(run: Run, statistics: Statistics) -> list[Summary]:
-    """A summary of each category's cells for every method, and of all where there are several.
-
-    Statistics are of the rows that are ok. Medians of further metrics are added.
-    """
-
-    def summarize(category: str, method: str, cells: Cells) -> Summary:
-        values = _values(cells, method, statistics)
-        return Summary(category, {"category": category, "method": method}, values)
-
-    return summaries_of(run.cells, run.methods, summarize, further=run.metrics)
+def medians(*columns: Metric) -> Statistics:
+    """The medians of columns, by their names."""
+    return {column.key: median(column.key) for column in columns}
 
 
-def _values(cells: Cells, method: str, statistics: Statistics) -> Row:
-    counts, _, solved = counted(cells, method)
-    return {**counts, **{name: made(solved) for name, made in statistics.items()}}
+def median(key: str, factor: float = 1.0) -> Callable[[Group], float]:
+    """The median of a column, times a factor; NaN where a run lacks it."""
+    return lambda group: median_of(factor * group.solved.get(key, np.empty(0)).astype(float))
 
 
-def median(key: str) -> Callable[[Cells], float]:
-    """The median of a column."""
-    return lambda cells: median_of(cells[key])
-
-
-def mean(key: str) -> Callable[[Cells], float]:
+def mean(key: str) -> Callable[[Group], float]:
     """The mean of a column."""
-    return lambda cells: mean_of(cells[key])
+    return lambda group: mean_of(group.solved[key])
 
 
-def percentile(key: str, percent: float) -> Callable[[Cells], float]:
+def percentile(key: str, percent: float) -> Callable[[Group], float]:
     """A percentile of a column, NaN where all cells are missing."""
 
-    def made(cells: Cells) -> float:
-        values = known(cells[key])
+    def made(group: Group) -> float:
+        values = known(group.solved[key])
         return float(np.percentile(values, percent)) if len(values) else np.nan
 
     return made
 
 
-def milliseconds(cells: Cells) -> float:
-    """The median time."""
-    return median_of(1e3 * cells["seconds"].astype(float))
+def share(is_within: Callable[[Cells], BoolArray]) -> Callable[[Group], float]:
+    """The share of rows that are ok and for which a condition holds; NaN of no row."""
+
+    def made(group: Group) -> float:
+        count = len(group.rows["method"])
+        return int(is_within(group.solved).sum()) / count if count else np.nan
+
+    return made
 
 
-def summaries_of(
-    cells: Cells,
-    methods: Sequence[str],
-    summarize: Callable[[str, str, Cells], Summary],
-    *,
-    further: Sequence[Metric] = (),
-    single: bool = False,
-) -> list[Summary]:
-    """Summaries of cells by category for some methods; see `by_category_and_method`.
-
-    ``single``: also of all cells where there is a single category.
-    """
-    categories = sorted(set(cells["category"].tolist()))
-    groups = [f"category {name}" if name in (ALL, MEAN) else name for name in categories]
-    chosen = (where(cells, cells["category"] == name) for name in categories)
-    parts = list(zip(groups, chosen, strict=True))
-    if single or len(parts) > 1:
-        parts.append((ALL, cells))
-    return [
-        with_medians(summarize(category, method, found), found, further)
-        for category, found in parts
-        for method in methods
-        if method in found["method"]
-    ]
-
-
-def with_medians(summary: Summary, cells: Cells, metrics: Sequence[Metric]) -> Summary:
-    """The summary with medians of the rows of its method that are no failures."""
-    if not metrics:
-        return summary
-    solved = (cells["method"] == summary.method) & (cells["status"] == OK)
-    medians = {metric.key: median_of(cells[metric.key][solved]) for metric in metrics}
-    return replace(summary, values={**summary.values, **medians})
-
-
-def counted(cells: Cells, method: str) -> tuple[Row, int, Cells]:
-    """Numbers of instances and of failures of a method, of skipped ones, and the rows without."""
-    chosen = cells["method"] == method
-    solved = where(cells, chosen & (cells["status"] == OK))
-    skipped = int((chosen & (cells["status"] == SKIPPED)).sum())
-    count = int(chosen.sum()) - skipped
-    return {"instances": count, "failed": count - len(solved["method"])}, skipped, solved
+milliseconds = median("seconds", 1e3)
+"""The median time."""
 
 
 def group_name(group: Metric, value: Any) -> str:

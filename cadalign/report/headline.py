@@ -81,7 +81,7 @@ def headline_of(runs: Sequence[Run]) -> Headline:
     """The headline table of runs of one kind."""
     lines = []
     for run in runs:
-        found = spec_of(run).lines(spec_of(run).summarize(run))
+        found = spec_of(run).summarize(run)
         # Those of all groups together come first.
         lines.append(sorted(found, key=lambda line: line.group.split(", ")[0] != ALL))
     columns, notes, stated = dict[str, Metric](), list[str](), list[Summary]()

@@ -137,7 +137,7 @@ def summary_of(runs: Sequence[Run]) -> str:
         names = [name for name in run.methods if name != LIMIT]
         methods = "One method" if len(names) == 1 else f"{len(names)} methods"
         methods += " and the Cramer-Rao bound" if LIMIT in run.methods else ""
-        what = spec_of(run).describe(run)
+        what = spec_of(run).description_of(run)
         sentences.append(f"{before}{methods} {what}, with cadalign {version} on {run.day}.")
         if not run.is_finished:
             sentences.append(

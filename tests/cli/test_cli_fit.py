@@ -94,7 +94,6 @@ def test_method_is_chosen_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[
     [
         (STORED, [], STORED),
         (STORED, ["--sigma", "2", "--stretch", "z"], STORED | {"sigma": 2.0, "stretch": "z"}),
-        (STORED, ["--no-stored"], {"sigma": SIGMA}),
         ({"sigma": None}, [], {"sigma": None}),  # which has no prior of its own
         ({}, [], {"sigma": SIGMA}),
         (
@@ -123,11 +122,8 @@ def test_options_are_those_of_the_command_or_of_the_file(
     [
         ([], {}, 0.2),
         (["--stretch-sigma", "0.4"], {}, 0.4),
-        (["--no-stretch-prior"], {}, None),
         ([], {"stretch_sigma": 0.1}, 0.1),
         ([], {"stretch_sigma": None}, None),
-        (["--no-stretch-prior"], {"stretch_sigma": 0.1}, None),
-        (["--no-stored"], {"stretch_sigma": 0.1}, 0.2),
         (["--stretch", "none"], {}, None),
         (["--method", "aepnp"], {}, None),
     ],
@@ -247,11 +243,6 @@ def test_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     ("flags", "text"),
     [
         (
-            ["--stretch-sigma", "0.1", "--no-stretch-prior"],
-            "--no-stretch-prior: --no-stretch-prior leaves out the prior, which --stretch-sigma "
-            "gives; give one of the two options",
-        ),
-        (
             ["--sigma", "2", "--similar"],
             "--sigma: --similar estimates the standard deviation, which --sigma gives; "
             "give one of the two options",
@@ -306,7 +297,6 @@ def test_photo_sizes_that_cannot_be_drawn(
         (("fit", "{file}", "--out", "a\0b"), r"'a\x00b': the path holds a NUL character"),
         (("report", "a\0b"), r"'a\x00b': the path holds a NUL character"),
         (("report", "a\0b", "--format", "md"), r"'a\x00b': the path holds a NUL character"),
-        (("evaluate", "show", "a\0b"), r"'a\x00b/run.json': the path holds a NUL character"),
     ],
 )
 def test_paths_with_a_nul(

@@ -200,7 +200,7 @@ def test_prior_of_the_photos_is_used_where_they_agree(
     said = capsys.readouterr().err
     assert ("+- 5 %, the photo's EXIF data" in said) == used
     assert ("The photos' EXIF data differ" in said) != used
-    assert main(["fit", str(path), "--no-picture", "--no-exif"]) == 0
+    assert main(["fit", str(path), "--no-picture", "--focal-prior", "usual"]) == 0
     assert "EXIF" not in capsys.readouterr().err
 
 
@@ -381,8 +381,6 @@ class TestPhotoAndMaskAlone:
         path = write(tmp_path, seen, model=mesh, fit_options={"image": True})
         assert main(["fit", str(path), "--no-picture"]) == 0
         assert self.kinds(tmp_path) == ["keypoints", "photo"]
-        assert main(["fit", str(path), "--no-picture", "--no-stored"]) == 0
-        assert self.kinds(tmp_path) == ["keypoints"]
 
     def test_photo_that_is_not_named_is_asked_for(
         self, mesh: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

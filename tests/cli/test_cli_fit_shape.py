@@ -33,7 +33,7 @@ from cadalign.shapes.examples import Example
 CAMERA = Camera(640, 480, 900.0, 900.0, 319.5, 239.5)
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
 NAMES = tuple("abcdefgh")
-FIT_ALONE = ("--similar", "--no-stretch-prior", "--method aepnp")
+FIT_ALONE = ("--similar", "--method aepnp")
 STRETCH = ("--stretch y", "--known-axis z", "--stretch-sigma 0.1")
 FIX = "leave out one of the two"
 RIGHT = np.array([1.1, 0.9, 1.2])  # lengths of the object's box
@@ -129,9 +129,8 @@ def test_shape_of_the_file_is_fitted(
     assert main(["fit", str(path)]) == 0
     expected = align(numbered, View(CAMERA, [each["uv"] for each in keypoints], ids=range(6)))
     assert capsys.readouterr().out == f"{expected}\n"
-    for flags in (["--no-stored"], ["--shape-sigma", "0.1"]):
-        line = refusal_line(capsys, "fit", path, *flags)
-        assert line == f"{path}: keypoints[0].xyz: missing"
+    line = refusal_line(capsys, "fit", path, "--shape-sigma", "0.1")
+    assert line == f"{path}: keypoints[0].xyz: missing"
     assert refusal_line(capsys, "fit", path, "--similar") == (
         "--similar: has no effect together with a learned shape; leave out one of the two"
     )

@@ -109,7 +109,7 @@ def test_fit_of_a_photo_without_focal_length_takes_exif_into_account(
     assert result.camera.fx == pytest.approx(expected.camera.fx, rel=1e-9)
     assert result.camera.fx == pytest.approx(620, rel=0.03)
     assert result.focal_prior == prior
-    without = fitted(folder, "found.observation", "--no-exif")
+    without = fitted(folder, "found.observation", "--focal-prior", "usual")
     usual = FocalPrior.of_usual_lenses(640, 480)
     assert without.focal_prior == usual
     assert f"its prior: {usual}" in capsys.readouterr().err

@@ -47,7 +47,7 @@ def test_every_experiment_has_a_specification_with_its_name() -> None:
     ("experiment", "options"),
     [
         ("keypointnet", {"methods": ("optimal",), "visibility": "rays"}),
-        ("unseen", {"methods": ("shape",), "meshes": True}),
+        ("unseen", {"methods": ("shape",)}),
         ("photos", {"methods": ("rigid",)}),
     ],
 )
@@ -64,7 +64,7 @@ def test_workers_of_a_cluster_may_have_been_started_elsewhere(
     plan, _ = prepared(chosen, RunFolder(Path("run")), workers=None, dask="tcp://nowhere:8786")
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
-    rows = plan.experiment.evaluate(plan.tasks[:1]).rows
+    rows = plan.experiment.evaluate(plan.tasks[:1])
     assert [row["status"] for row in rows] == ["ok"]
     assert plan.config["root"] == str(tmp_path / "data")
 

@@ -51,7 +51,10 @@ def test_it_is_shown_wherever_metrics_are(
     table = cadalign.evaluate(sample_root, out=out, workers=1, **options)
     assert table[table.method == "aepnp"].spread.isna().all()
     assert (table[table.method == "optimal"].spread > 0).all()
-    assert main(["evaluate", "show", str(out)]) == 0
+    command = ["evaluate", "keypointnet", str(sample_root), "--out", str(out)]
+    command += ["--methods", "optimal", "aepnp"]
+    command += ["--metrics", "support.solving:depth_error", "support.solving:spread"]
+    assert main(command) == 0
     assert "depth error" in capsys.readouterr().out
     with (out / "summary.csv").open() as file:
         (row,) = (

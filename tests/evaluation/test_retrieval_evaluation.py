@@ -15,7 +15,7 @@ from cadalign import Box, Library
 from cadalign.cli import main
 from cadalign.errors import DataError, DegenerateError, InputError
 from cadalign.evaluation.api import run
-from cadalign.evaluation.experiments.retrieval import SPEC, RetrievalRunOptions, summarize
+from cadalign.evaluation.experiments.retrieval import SPEC, RetrievalRunOptions, summarize_queries
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.queries import (
     RetrievalTask,
@@ -187,11 +187,8 @@ class TestRows:
         path = tmp_path / "lib"
         Library.from_models([model, other]).save(path)
         options = replace(QUICK, keypoints=(14,), methods=("optimal",))
-        rows = (
-            retrieval_benchmark(str(path), options)
-            .evaluate([RetrievalTask("box", "001", 1.0, 14)])
-            .rows
-        )
+        experiment = retrieval_benchmark(str(path), options)
+        rows = experiment.evaluate([RetrievalTask("box", "001", 1.0, 14)])
         assert [row["status"] for row in rows] == ["no view", "no view"]
         assert "14 keypoints should be visible" in rows[0]["reason"]
 
@@ -201,7 +198,7 @@ class TestRows:
         path = tmp_path / "lib"
         Library.from_models(flat).save(path)
         experiment = retrieval_benchmark(str(path), replace(QUICK, methods=("optimal",)))
-        (row, _) = experiment.evaluate([RetrievalTask("box", "001", 1.0, 8)]).rows
+        (row, _) = experiment.evaluate([RetrievalTask("box", "001", 1.0, 8)])
         assert row["status"] == "ok"
         assert row["box_iou"] is None
 
@@ -291,7 +288,7 @@ class TestRuns:
 
 class TestSummaries:
     def test_rates_and_medians_are_those_of_the_rows(self, finished: RunFolder) -> None:
-        summaries = summarize(Run.open(finished.path))
+        summaries = summarize_queries(Run.open(finished.path))
         assert len(summaries) == 2 * 2 * 2
         for summary in summaries:
             rows = rows_of(
@@ -300,7 +297,7 @@ class TestSummaries:
                 method=summary.method,
                 keypoints=summary["keypoints"],
             )
-            assert (summary["queries"], summary["failed"]) == (MODELS, 0)
+            assert (summary["instances"], summary["failed"]) == (MODELS, 0)
             ious = [row["box_iou"] for row in rows]
             assert summary["box_iou"] == pytest.approx(np.median(ious))
             assert summary["box_iou_up_to_scale"] >= summary["box_iou"]
@@ -330,10 +327,10 @@ class TestSummaries:
         assert float(lines[0]["rank_1"]) == summaries[0]["rank_1"]
         assert [line["rank_1"] for line in lines if line["protocol"] == "leave-out"] == [""] * 4
         names = {
-            "leave_in_rank_1",
-            "leave_in_rank_5",
-            "leave_out_box_iou",
-            "leave_out_shape_distance",
+            "leave_in_rank_1_1",
+            "leave_in_rank_5_1",
+            "leave_out_box_iou_1",
+            "leave_out_shape_distance_1",
         }
         assert {path.stem for path in finished.figures.iterdir()} == names
         assert {path.suffix for path in finished.figures.iterdir()} == {".png", ".pdf"}
@@ -347,18 +344,19 @@ class TestCommand:
     ) -> None:
         out = tmp_path / "run"
         options = ["--keypoints", "8", "--noises-px", "1", "--max-models", "3", "--workers", "0"]
-        assert main(["evaluate", "retrieval", str(library), *options, "--out", str(out)]) == 0
+        command = ["evaluate", "retrieval", str(library), *options, "--out", str(out)]
+        assert main(command) == 0
         captured = capsys.readouterr()
         assert "first%" in captured.out
-        assert captured.out.count("leave-in") == captured.out.count("leave-out") == 2
+        assert captured.out.count("leave-in") == captured.out.count("leave-out") == 1
         assert f"Run: {out} (0 of 12 rows failed)" in captured.err
-        assert main(["evaluate", "show", str(out)]) == 0
+        assert main(command) == 0
         assert capsys.readouterr().out == captured.out
-        assert main(["evaluate", "show", str(out), "--json"]) == 0
+        assert main([*command, "--json"]) == 0
         shown = json.loads(capsys.readouterr().out)
         assert (shown["rows"], shown["failed"]) == (12, 0)
         first = shown["summary"][0]
-        assert (first["method"], first["rank_1"], first["queries"]) == ("optimal", 1.0, 3)
+        assert (first["method"], first["rank_1"], first["instances"]) == ("optimal", 1.0, 3)
         assert shown["summary"][-1]["rank_1"] is None
 
 

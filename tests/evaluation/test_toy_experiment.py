@@ -1,4 +1,4 @@
-"""An experiment in one file, this one: its run, tables, page, figures and `evaluate show`."""
+"""An experiment in one file, this one: its run, tables, page, and figures."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from cadalign.arrays import instance_rng
 from cadalign.cli import main
 from cadalign.evaluation import registry
 from cadalign.evaluation.api import run
-from cadalign.evaluation.metrics import CATEGORY, FAILED, INSTANCES, Metric
+from cadalign.evaluation.metrics import FAILED, INSTANCES, Metric
 from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.plots import Plot, Trace
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run
-from cadalign.evaluation.runs.work import Columns, Outcome, Plan, Rows
-from cadalign.evaluation.summary import medians
+from cadalign.evaluation.runs.work import Columns, Outcome, Plan, Row
+from cadalign.evaluation.summary import medians, summarize
 from cadalign.report import headline_text, write_report
 
 # --- the experiment: estimate the middle of noisy numbers -------------------------------------
@@ -68,15 +68,14 @@ class Middle:
     def columns(self) -> Columns:
         return COLUMNS
 
-    @property
-    def timing_columns(self) -> Columns:
-        return (*COLUMNS[:3], ("seconds", float))
+    record_columns: ClassVar[Columns] = ()
 
-    def evaluate(self, tasks: Sequence[tuple[str, int]]) -> Rows:
-        return Rows.of(outcome for task in tasks for outcome in self._outcomes(*task))
+    def evaluate(self, tasks: Sequence[tuple[str, int]]) -> list[Row]:
+        return [outcome.row() for task in tasks for outcome in self._outcomes(*task)]
 
-    def failure(self, task: tuple[str, int], reason: str) -> Rows:
-        return Rows.of(Outcome.failure(reason, names(*task, m)) for m in self.options.methods)
+    def failure(self, task: tuple[str, int], reason: str) -> list[Row]:
+        methods = self.options.methods
+        return [Outcome(names(*task, m), status="failed", reason=reason).row() for m in methods]
 
     def _outcomes(self, category: str, number: int) -> Iterator[Outcome]:
         rng = instance_rng(self.options.seed, category, str(number))
@@ -103,7 +102,7 @@ def plots(runs: Sequence[Run]) -> list[Plot]:
     traces = [
         Trace.of(index, line.method, [some.config["draws"]], [line.values[ERROR.key]], ERROR)
         for index, some in enumerate(runs)
-        for line in medians(some, [ERROR])
+        for line in summarize(some, medians(ERROR))
     ]
     return [Plot("middle", DRAWS, ERROR, traces)]
 
@@ -112,7 +111,7 @@ SPEC = Spec(
     options=MiddleOptions,
     plan=plan,
     columns=(INSTANCES, FAILED, ERROR),
-    summarize=partial(medians, columns=(ERROR,), group=CATEGORY),
+    summarize=partial(summarize, statistics=medians(ERROR)),
     plots=plots,
     note="Medians of toys.",
 )
@@ -185,11 +184,12 @@ def test_it_has_a_table_a_page_figures_and_a_data_frame(root: Path, tmp_path: Pa
 def test_it_is_shown_again(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
     run(MiddleOptions(root), RunFolder(out), workers=0, dask=None)
-    assert main(["evaluate", "show", str(out)]) == 3
+    arguments = ["evaluate", "middle", str(root), "--workers", "0", "--out", str(out)]
+    assert main(arguments) == 3
     assert "spoon" in capsys.readouterr().out
-    assert main(["evaluate", "show", str(out), "--json"]) == 3
+    assert main([*arguments, "--json"]) == 3
     shown = json.loads(capsys.readouterr().out)
-    assert (shown["rows"], shown["failed"], len(shown["summary"])) == (36, 12, 6)
+    assert (shown["rows"], shown["failed"], len(shown["summary"])) == (36, 12, 8)
     with (out / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert rows[0]["category"] == "bad"

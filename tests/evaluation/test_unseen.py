@@ -18,8 +18,7 @@ from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
 from cadalign.evaluation.api import run
 from cadalign.evaluation.experiments.unseen import METHODS, SPEC, UnseenOptions
-from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, KeypointTask
-from cadalign.evaluation.instances.pictures import keep_preview
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.unseen import UnseenTasks, observe_object
 from cadalign.evaluation.metrics.cramer_rao import probability_level
 from cadalign.evaluation.runs.folder import RunFolder
@@ -112,16 +111,6 @@ class TestRecords:
         page = embedded_payload(written.path)
         assert len(page["exhibits"]) == OBJECTS
         assert "keypoint_error" in [metric["key"] for metric in page["metrics"]]
-
-    def test_mesh_previews_are_kept_on_demand(self, tmp_path: Path, sample_root: Path) -> None:
-        folder = RunFolder(tmp_path)
-        options = UnseenOptions(sample_root, split="all", train="none", meshes=True)
-        key = ("chair", "sample_chair_000")
-        task = KeypointTask.of_model(KeypointNet(sample_root), *key, visibility="hull")
-        keep_preview(folder, options.root, task)
-        (preview,) = folder.previews.iterdir()
-        assert preview.name == "chair_sample_chair_000.json"
-        assert json.loads(preview.read_text())["faces"]
 
 
 def pose(record: dict[str, Any]) -> Alignment:
@@ -331,7 +320,7 @@ class TestCommand:
         captured = capsys.readouterr()
         assert "mean-rigid" in captured.out
         assert f"Run: {out} (0 of 4 rows failed)" in captured.err
-        assert main(["evaluate", "show", str(out)]) == 0
+        assert main([*arguments, "--workers", "0", "--out", str(out)]) == 0
         assert capsys.readouterr().out == captured.out
         assert "unseen objects" in (out / "report.html").read_text()
 

@@ -24,12 +24,13 @@ from cadalign.evaluation.experiments.photos import PhotosOptions
 from cadalign.evaluation.methods import MethodInput
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics import photos as metrics
-from cadalign.evaluation.metrics.photos import medians_of, score_alignment, score_columns
+from cadalign.evaluation.metrics.photos import score_alignment, score_columns, statistics_of
 from cadalign.evaluation.photos.methods import Sighting
 from cadalign.evaluation.photos.objects import PhotoObjects
 from cadalign.evaluation.photos.target import PhotoTask, PhotoTasks, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import Plan
+from cadalign.evaluation.summary import Group
 
 # --- a new experiment on photos: this module, and its line in the table -------------------------
 
@@ -109,4 +110,5 @@ def test_columns_scores_and_summaries_follow_from_the_line_of_a_metric() -> None
     box: Any = None
     rows = [score_alignment(target, [extended], est, box) for est in ests]
     cells = {depth.key: np.array([row[depth.key] for row in rows])}
-    assert medians_of([extended], cells) == {depth.key: 0.5}
+    found = statistics_of([extended], cells | {metrics.ROTATION.key: np.full(3, np.nan)})
+    assert found[depth.key](Group(cells, cells)) == 0.5

@@ -22,13 +22,13 @@ _VALUES = [
 _COMMANDS: dict[str, list[str]] = {
     "fit": ["--method", "--loss", "--stretch", "--max-reproj-error", "--focal", "--sigma",
             "--robust", "--similar", "--json", "--out", "--stretch-sigma", "--known-axis",
-            "--shape", "--shape-sigma", "--no-stretch-prior"],
+            "--shape", "--shape-sigma"],
     "observe": ["--image", "--model", "--out", "--object", "--min-score", "--sigma"],
     "retrieve": ["--library", "--out", "--top", "--category", "--json", "--loss"],
     "render": ["--out", "--width", "--height", "--view", "--keypoints"],
     "report": ["--out", "--format", "--assets"],
     "library": ["build", "show", "--out", "--categories"],
-    "evaluate": ["keypointnet", "show", "correspondences", "retrieval", "unseen", "--methods",
+    "evaluate": ["keypointnet", "correspondences", "retrieval", "unseen", "--methods",
                  "--noise-px", "--shape"],
 }  # fmt: skip
 

@@ -47,8 +47,8 @@ def test_markdown_has_best_values_bold() -> None:
     assert table_text(headline(), ["run"], format="md") == (
         "| category | method | instances | R error \\[deg\\] |\n"
         "| --- | --- | ---: | ---: |\n"
-        "| chair | optimal \\(ours\\) | 3 | **0.123** |\n"
-        "| chair | EPnP \\(no stretch\\) | 3 | 10.000 |\n"
+        "| chair | optimal | 3 | **0.123** |\n"
+        "| chair | epnp | 3 | 10.000 |\n"
         "| chair | stated | - | 0.998 |\n"
         "| all | Cramer-Rao bound | 3 | - |\n"
         "\n"

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from cadalign.evaluation.runs.work import AbortError, Columns, Rows
+from cadalign.evaluation.runs.work import AbortError, Columns, Row
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Squares:
         return (("task", int), ("square", float), ("reason", str))
 
     @property
-    def timing_columns(self) -> Columns:
+    def record_columns(self) -> Columns:
         return (("task", int), ("process", int))
 
     def __setstate__(self, state: dict[str, object]) -> None:
@@ -35,8 +35,8 @@ class Squares:
         if self.dead_on_arrival:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    def evaluate(self, tasks: Sequence[int]) -> Rows:
-        rows = []
+    def evaluate(self, tasks: Sequence[int]) -> list[Row]:
+        rows: list[Row] = []
         for task in tasks:
             if self.full_disk:
                 raise AbortError("no room")
@@ -49,9 +49,9 @@ class Squares:
                 if not flag.exists():
                     flag.touch()
                     os.kill(os.getpid(), signal.SIGKILL)
-            rows.append({"task": task, "square": float(task) ** 2, "reason": ""})
-        return Rows(rows, [{"task": task, "process": os.getpid()} for task in tasks])
+            row = {"task": task, "square": float(task) ** 2, "reason": "", "process": os.getpid()}
+            rows.append(row)
+        return rows
 
-    def failure(self, task: int, reason: str) -> Rows:
-        rows = [{"task": task, "square": None, "reason": reason}]
-        return Rows(rows, [{"task": task, "process": 0}])
+    def failure(self, task: int, reason: str) -> list[Row]:
+        return [{"task": task, "square": None, "reason": reason, "process": 0}]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -15,26 +16,25 @@ from cadalign.errors import InputError
 from cadalign.estimation.options import RansacOptions
 from cadalign.evaluation import metrics
 from cadalign.evaluation.methods import LIMIT
-from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.options import FunctionOptions
-from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, Trace
+from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, plot_against
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import OK, Columns, Plan
 from cadalign.evaluation.summary import (
-    Conclusion,
-    ConsoleTable,
+    Group,
     Quartiles,
     Summary,
     group_name,
-    median_of,
+    median,
+    share,
+    summarize,
     where,
-    with_medians,
 )
 
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.correspondences import CorrespondenceTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.tables import Cells, Run
+    from cadalign.evaluation.runs.tables import Run
 
 
 @dataclass(frozen=True)
@@ -89,10 +89,10 @@ class CorrespondenceOptions(FunctionOptions):
         self.replace_values(outliers=shares)
         if not shares:
             raise InputError("none is given", where="outliers", fix="give shares such as 0 0.5")
-        for share in shares:
-            if not 0 <= share < 1:
+        for each in shares:
+            if not 0 <= each < 1:
                 raise InputError(
-                    f"{share:g} is not a share of outliers",
+                    f"{each:g} is not a share of outliers",
                     where="outliers",
                     fix="give numbers from 0 to less than 1",
                 )
@@ -120,123 +120,49 @@ HEADLINE = (
     *(metrics.INSTANCES, metrics.FAILED, metrics.SUCCESS, *ERRORS),
     *(metrics.INLIER_RECALL, metrics.MILLISECONDS),
 )
-SUCCESS_NOTE = "success: rotation within 0.5 deg and both scales within 1 %"
 
 
-def summarize(run: Run) -> list[Summary]:
-    """A summary for every share of outliers and method, in the order of the run."""
-    cells = run.cells
-    return [
-        with_medians(
-            _summarize(share, method, cells), where(cells, cells["outliers"] == share), run.metrics
-        )
-        for share in np.unique(cells["outliers"]).tolist()
-        for method in run.methods
-    ]
+def _quartiles(key: str) -> Callable[[Group], Quartiles]:
+    """Quartiles of an error, which failures have infinite."""
+
+    def made(group: Group) -> Quartiles:
+        errors = np.where(group.rows["status"] == OK, group.rows[key].astype(float), np.inf)
+        return Quartiles.of(errors)
+
+    return made
 
 
-def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
-    """Quartiles of the errors, and medians, for the console."""
-    failed = replace(metrics.FAILED, symbol="fail")
-    shown = (failed, metrics.SUCCESS, *ERRORS, metrics.INLIER_RECALL)
-    return ConsoleTable(
-        title="Lower quartile, median and upper quartile per share of outliers and method",
-        labels=(metrics.OUTLIERS.symbol, "method"),
-        heads=tuple(each.symbol for each in (*shown, metrics.MILLISECONDS, *run.metrics)),
-        rows=[
-            (
-                f"{100 * s['outliers']:g} %",
-                s.method,
-                failed.text(s["failed"]),
-                metrics.SUCCESS.text(s["success"]),
-                *(_three(s[metric.key], metric) for metric in ERRORS),
-                _number(100 * s["inlier_recall"], digits=1),
-                _number(s["milliseconds"].median, digits=1),
-                *(metric.text(s[metric.key]) for metric in run.metrics),
-            )
-            for s in summaries
-        ],
-        note=(
-            f"{max(s['inputs'] for s in summaries)} inputs each; a failure counts as an error "
-            "beyond all others (-).\n"
-            "succ: R < 0.5 deg and both scales within 1 %; t: % of the camera's distance from the "
-            "mean of the points;\nfound: share of the inliers that were kept (median); ms: median."
-        ),
-        narrow=True,
+_STATISTICS = {
+    "success": share(lambda solved: solved["success"].astype(bool)),
+    **{metric.key: _quartiles(metric.key) for metric in ERRORS},
+    **{key: median(key) for key in ("inlier_precision", "inlier_recall")},
+    "milliseconds": lambda group: Quartiles.of(1e3 * group.rows["seconds"]),
+}
+
+
+def summarize_shares(run: Run) -> list[Summary]:
+    """A summary for every share of outliers and method, of the images that can be read."""
+    return summarize(
+        run,
+        _STATISTICS,
+        by=("outliers",),
+        name=partial(group_name, metrics.OUTLIERS),
+        cells=where(run.cells, ~np.isnan(run.cells["points"].astype(float))),
     )
-
-
-def conclude(run: Run, summaries: Sequence[Summary]) -> Conclusion:
-    """Numbers of rows, of failures, and of inputs whose image cannot be read."""
-    unreadable = sum(summary["unreadable"] for summary in summaries)
-    rows = sum(summary["inputs"] for summary in summaries) + unreadable
-    failed = sum(summary["failed"] for summary in summaries) + unreadable
-    note = f"{unreadable} of them because their image cannot be read" if unreadable else ""
-    return Conclusion(rows, failed, {"unreadable": unreadable}, note)
 
 
 def plots(runs: Sequence[Run]) -> list[Plot]:
     """Success, errors and times against the share of outliers."""
-    found = [summarize(run) for run in runs]
-    inputs = max((summary["inputs"] for summary in found[0]), default=0)
-    made = []
-    for metric in (metrics.SUCCESS, *ERRORS, metrics.MILLISECONDS):
-        note = f"{QUARTILES_NOTE}; failures count as infinite"
-        if metric is metrics.MILLISECONDS:
-            note = QUARTILES_NOTE
-        elif metric is metrics.SUCCESS:
-            note = ""
-        traces = []
-        for index, summaries in enumerate(found):
-            for method in runs[index].methods:
-                rows = [summary for summary in summaries if summary.method == method]
-                x = [100 * summary["outliers"] for summary in rows]
-                y = [summary[metric.key] for summary in rows]
-                traces.append(Trace.of(index, method, x, y, metric))
-        caption = f"{inputs} inputs each; {note or SUCCESS_NOTE}"
-        figure = f"outliers_{metric.key}"
-        made.append(Plot(metric.key, metrics.OUTLIERS, metric, traces, note, caption, figure))
-    return made
-
-
-def _summarize(share: float, method: str, cells: Cells) -> Summary:
-    chosen = (cells["outliers"] == share) & (cells["method"] == method)
-    # No points were given where the image cannot be read.
-    given = chosen & ~np.isnan(cells["points"].astype(float))
-    solved = given & (cells["status"] == OK)
-    inputs = int(given.sum())
-    quartiles = {}
-    for metric in ERRORS:
-        errors = np.full(inputs, np.inf)
-        errors[solved[given]] = cells[metric.key][solved].astype(float)
-        quartiles[metric.key] = Quartiles.of(errors)
-    values = {
-        "inputs": inputs,
-        "failed": inputs - int(solved.sum()),
-        "unreadable": int(chosen.sum()) - inputs,
-        "success": float(cells["success"][given].astype(float).mean()) if inputs else np.nan,
-        **quartiles,
-        "inlier_precision": median_of(cells["inlier_precision"][solved]),
-        "inlier_recall": median_of(cells["inlier_recall"][solved]),
-        "milliseconds": Quartiles.of(1e3 * cells["seconds"][given]),
+    found = [summarize_shares(run) for run in runs]
+    notes = {
+        metrics.SUCCESS: "rotation within 0.5 deg and both scales within 1 %",
+        **dict.fromkeys(ERRORS, f"{QUARTILES_NOTE}; failures count as infinite"),
+        metrics.MILLISECONDS: QUARTILES_NOTE,
     }
-    names = {"outliers": share, "method": method}
-    return Summary(group_name(metrics.OUTLIERS, share), names, values, tasks=inputs)
-
-
-def _three(values: Quartiles, metric: Metric) -> str:
-    quartiles = (values.lower, values.median, values.upper)
-    return " ".join(_number(metric.factor * value, digits=metric.digits) for value in quartiles)
-
-
-def _number(value: float, *, digits: int) -> str:
-    """A number with so many digits after the point, fewer for larger ones; a dash for NaN."""
-    if value != value:
-        return "-"
-    if value >= 1e4:
-        return f"{value:.0e}"
-    places = max(0, digits + 1 - len(str(int(value))))
-    return f"{value:.{places}f}"
+    return [
+        plot_against(found, metrics.OUTLIERS, metric, place="outliers", note=note)
+        for metric, note in notes.items()
+    ]
 
 
 _CHUNK = 8
@@ -255,26 +181,16 @@ def plan(options: CorrespondenceOptions, folder: RunFolder) -> Plan[Corresponden
     return correspondence_benchmark(options).plan(options, tasks, chunk=_CHUNK, **more)
 
 
-def _describe(run: Run) -> str:
-    images = run.count("image")
-    return (
-        f"on real correspondences in {images:,} image{'s' * (images != 1)} of {run.dataset}, with "
-        "a share of them moved to anywhere in the image"
-    )
-
-
 SPEC = Spec(
     options=CorrespondenceOptions,
     plan=plan,
     columns=HEADLINE,
     results=COLUMNS,
-    summarize=summarize,
-    table=console_table,
+    summarize=summarize_shares,
     group=lambda run: metrics.OUTLIERS,
     plots=plots,
-    conclude=conclude,
     topic="correspondences",
-    describe=_describe,
+    subject="draws of real correspondences",
     note=(
         "Medians; a failure counts as an error beyond all others. Success: rotation within 0.5 deg "
         "and both scales within 1 %."

@@ -2,32 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from cadalign.arrays import BoolArray
 from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import VIEW_NAMES
 from cadalign.evaluation.methods import LIMIT
-from cadalign.evaluation.metrics import INSTANCE_METRICS, UP_TO_SCALE, Metric
+from cadalign.evaluation.metrics import INSTANCE_METRICS
 from cadalign.evaluation.options import ViewOptions
-from cadalign.evaluation.plots import in_math, label_log_axis, look_of, new_figure, save_figure
+from cadalign.evaluation.plots import cumulative_curves
 from cadalign.evaluation.registry import Reference, Spec
-from cadalign.evaluation.runs.work import OK, SKIPPED, Columns, Plan
-from cadalign.evaluation.summary import (
-    ALL,
-    ConsoleTable,
-    Summary,
-    counted,
-    mean_of,
-    median_of,
-    summaries_of,
-)
+from cadalign.evaluation.runs.work import Columns, Plan
+from cadalign.evaluation.summary import Group, Summary, mean, medians, share, summarize
 
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.instance import KeypointTask
@@ -48,13 +41,13 @@ class KeypointNetOptions(ViewOptions):
     experiment = "keypointnet"
 
     _: KW_ONLY
+    split: str | None = None
+    """The dataset's split to take, such as test; all models by default."""
+    min_visible: int = 6
+    """Least number of keypoints that a view must show; of several views, the first."""
     methods: tuple[str, ...] = ("optimal", "aepnp", "aepnp-paper", "epnp", "limit")
     """Methods of `cadalign fit`, optimal-huber, optimal-cauchy, ransac-optimal, ransac-ap4p,
     ransac-aepnp, and limit: the Cramer-Rao bound."""
-    shape: Path | None = None
-    """File of `cadalign shape learn`, or a folder of such files: adds the method shape, which
-    aligns the learned shape of the category and knows nothing of the model; and errors up to scale,
-    since one image does not determine the object's size."""
     visibility: Literal["auto", "rays", "hull"] = "auto"
     """Keypoints are seen that rays cast at the mesh reach, or by a rule on the hull of the
     keypoints; auto takes rays where there is a mesh."""
@@ -85,122 +78,43 @@ TABLE = (
     *(metrics.SCALE_Y, metrics.SCALE_Z, metrics.BOX_IOU),
 )
 """Columns of the plain medians."""
-_MEDIANS = (*(metric for metric in INSTANCE_METRICS if metric is not metrics.RMS), *UP_TO_SCALE)
 _COUNTS = (metrics.INSTANCES, metrics.FAILED, metrics.SKIPPED)
 
 
-def summarize(run: Run) -> list[Summary]:
-    """A summary for every category and method, and for all categories together."""
-    return summaries_of(run.cells, run.methods, summarize_method, further=run.metrics, single=True)
+def _success(degrees: float, fraction: float) -> Callable[[Group], float]:
+    def is_within(solved: Cells) -> BoolArray:
+        within: BoolArray = solved["sym_rotation_error_deg"].astype(float) <= degrees
+        for key in ("sym_translation_error", "scale_y_error", "scale_z_error"):
+            within &= solved[key].astype(float) <= fraction
+        return within
+
+    return share(is_within)
 
 
-def summarize_method(category: str, method: str, cells: Cells) -> Summary:
-    """A summary of a method's rows, among those of all methods."""
-    counts, skipped, solved = counted(cells, method)
-    bound = median_of(counted(cells, LIMIT)[2]["rotation_error_deg"])
-    medians = {each.key: median_of(solved[each.key]) for each in _MEDIANS if each.key in solved}
-    values = {
-        **counts,
-        "keypoints": mean_of(solved["keypoints"]),
-        **medians,
-        "success_5deg_5pct": _success(solved, 5.0, 0.05, count=counts["instances"]),
-        "success_10deg_10pct": _success(solved, 10.0, 0.10, count=counts["instances"]),
-        "over_limit": medians["rotation_error_deg"] / bound if bound > 0 else np.nan,
-        "skipped": skipped,
-    }
-    return Summary(category, {"category": category, "method": method}, values)
+_STATISTICS = {
+    "keypoints": mean("keypoints"),
+    **medians(*(metric for metric in INSTANCE_METRICS if metric is not metrics.RMS)),
+    "success_5deg_5pct": _success(5.0, 0.05),
+    "success_10deg_10pct": _success(10.0, 0.10),
+}
 
 
-def _success(solved: Cells, degrees: float, fraction: float, *, count: int) -> float:
-    within = solved["sym_rotation_error_deg"].astype(float) <= degrees
-    for name in ("sym_translation_error", "scale_y_error", "scale_z_error"):
-        within &= solved[name].astype(float) <= fraction
-    return int(within.sum()) / count if count else np.nan
+def summarize_views(run: Run) -> list[Summary]:
+    """A summary for every category and method; the errors over those of the bound besides."""
+    found = summarize(run, _STATISTICS)
+    key = metrics.ROTATION.key
+    bounds = {each.group: each[key] for each in found if each.method == LIMIT}
+    ratios = [each[key] / (bounds.get(each.group, 0) or np.nan) for each in found]
+    return [
+        replace(each, values=each.values | {"over_limit": ratio})
+        for each, ratio in zip(found, ratios, strict=True)
+    ]
 
 
-def lines(summaries: Sequence[Summary]) -> list[Summary]:
-    """Lines of the headline table; a single category needs no line for all."""
-    single = len({summary.group for summary in summaries}) == 2
-    return [summary for summary in summaries if summary.group != ALL or not single]
-
-
-def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
-    """The summaries for the console."""
-    # The table must not be wider.
-    is_up_to_scale = metrics.BOX_IOU_UP_TO_SCALE.key in run.cells
-    rest = UP_TO_SCALE if is_up_to_scale else (metrics.SYM_ROTATION, metrics.SUCCESS_5)
-    told = [each for each in _COUNTS if metrics.told(each, [s[each.key] for s in summaries])]
-    return ConsoleTable.of(
-        "Medians per category and method; success over all instances",
-        summaries,
-        (*told, *TABLE, *rest, *run.metrics),
-        note="t in model diagonals; scaled about the camera centre: one image leaves the size open"
-        if is_up_to_scale
-        else "t in model diagonals; * rotations that map a model onto itself are no errors",
-    )
-
-
-_BARS = (metrics.ROTATION, metrics.TRANSLATION, metrics.SCALE_Y, metrics.SCALE_Z)
-_CURVES = (metrics.SYM_ROTATION, metrics.SYM_TRANSLATION, metrics.SCALE_Y)
-
-
-def draw_figures(run: Run, summaries: Sequence[Summary]) -> None:
-    """Draw all figures of a run, PNG and PDF."""
-    folder = run.folder.made_figures()
-    for metric in _BARS:
-        _draw_categories(folder / f"categories_{metric.key}", summaries, metric)
-    for metric in _CURVES:
-        _draw_curves(folder / f"within_{metric.key}", run, metric)
-
-
-def _draw_categories(path: Path, summaries: Sequence[Summary], metric: Metric) -> None:
-    categories = list(dict.fromkeys(summary.group for summary in summaries))
-    places = np.arange(len(categories))
-    with new_figure(figsize=(max(6.4, 0.62 * len(categories) + 2), 4.2)) as figure:
-        axes = figure.add_subplot()
-        for method in dict.fromkeys(summary.method for summary in summaries):
-            look = look_of(method)
-            found = {s.group: s[metric.key] for s in summaries if s.method == method}
-            heights = metric.factor * np.array([found.get(name, np.nan) for name in categories])
-            if look.marker:
-                axes.plot(places, heights, look.marker, color=look.color, label=look.label)
-            else:  # the Cramer-Rao bound: a floor beneath each category
-                axes.hlines(
-                    heights,
-                    places - 0.35,
-                    places + 0.35,
-                    color=look.color,
-                    linestyle=look.dash,
-                    lw=1.4,
-                    label=look.label,
-                )
-        axes.set_yscale("log")
-        label_log_axis(axes)
-        axes.set_xticks(range(len(categories)), categories)
-        axes.tick_params(axis="x", labelrotation=45 if len(categories) > 7 else 0)
-        axes.grid(visible=False, axis="x")
-        axes.set_ylabel(f"median {in_math(metric.axis)}")
-        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-        save_figure(figure, path)
-
-
-def _draw_curves(path: Path, run: Run, metric: Metric) -> None:
-    cells = run.cells
-    errors = metric.factor * cells[metric.key].astype(float)
-    with new_figure(figsize=(6.4, 4.2)) as figure:
-        axes = figure.add_subplot()
-        for method in run.methods:
-            chosen = (cells["method"] == method) & (cells["status"] != SKIPPED)
-            values = np.sort(errors[chosen & (cells["status"] == OK)])
-            share = 100 * np.arange(1, len(values) + 1) / max(int(chosen.sum()), 1)
-            look = look_of(method)
-            axes.plot(values, share, color=look.color, linestyle=look.dash, label=look.label)
-        axes.set_xlim(0, metric.limit)
-        axes.set_ylim(0, 100)
-        axes.set_xlabel(in_math(metric.axis))
-        axes.set_ylabel("instances with at most this error [%]")
-        axes.legend(loc="lower right")
-        save_figure(figure, path)
+_CURVES = tuple(
+    (metric, np.linspace(0, metric.limit / metric.factor, 41))
+    for metric in (metrics.SYM_ROTATION, metrics.SYM_TRANSLATION, metrics.SCALE_Y)
+)
 
 
 # A chunk is three files: with few instances in each, large runs spend their time on files.
@@ -211,7 +125,6 @@ _LARGE = 5_000  # views
 def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
     """Plan a run over the views of a dataset's models."""
     from cadalign.evaluation.instances.views import KeypointTasks, keypointnet_benchmark
-    from cadalign.evaluation.shape_files import NO_SHAPES, ShapeFiles
 
     dataset = KeypointNet(options.root, shapenet_root=options.shapenet).subset(
         categories=options.categories, split=options.split
@@ -220,15 +133,9 @@ def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
     drawn = options.render == "overlay"
     if drawn:
         _check_drawable(dataset, options)
-    shapes, more = NO_SHAPES, {}
-    if options.shape is not None:
-        shapes = ShapeFiles.find(options.shape, dataset.categories)
-        more = {"shapes": shapes.fingerprint()}
-    benchmark = keypointnet_benchmark(
-        options, folder.made_for_pictures() if drawn else None, shapes
-    )
+    benchmark = keypointnet_benchmark(options, folder.made_for_pictures() if drawn else None)
     chunk = _CHUNK_DRAWN if drawn else _CHUNK if len(tasks) < _LARGE else _LARGE_CHUNK
-    return benchmark.plan(options, tasks, chunk=chunk, annotations=tasks.fingerprint(), **more)
+    return benchmark.plan(options, tasks, chunk=chunk, annotations=tasks.fingerprint())
 
 
 def _check_drawable(dataset: KeypointNet, options: KeypointNetOptions) -> None:
@@ -245,17 +152,6 @@ def _check_drawable(dataset: KeypointNet, options: KeypointNetOptions) -> None:
             where="render",
             fix="name ShapeNet's folder by shapenet, or draw nothing",
         )
-
-
-def describe(run: Run) -> str:
-    """Numbers of views, models and categories, the dataset and the noise."""
-    views, models = run.count("category", "model_id", "view"), run.count("category", "model_id")
-    categories = run.count("category")
-    view_words = "" if views == models else f"{views:,} views of "
-    model_words = "1 model" if models == 1 else f"{models:,} models"
-    category_words = "1 category" if categories == 1 else f"{categories:,} categories"
-    noise = f"{run.noise_px or 0:g} px of noise"
-    return f"on {view_words}{model_words} in {category_words} of {run.dataset}, {noise}"
 
 
 # The AEPnP paper's Table 1 as printed: 1 px noise, medians [degrees, model units], mean keypoints.
@@ -289,17 +185,17 @@ def reference(runs: Sequence[Run], groups: set[str]) -> Reference:
 
 ON_INSTANCES: dict[str, Any] = {
     "columns": (
-        *(*_COUNTS, *TABLE, *UP_TO_SCALE, metrics.SYM_ROTATION),
+        *(*_COUNTS, *TABLE, metrics.TRANSLATION_UP_TO_SCALE, metrics.SYM_ROTATION),
         *(metrics.SUCCESS_5, metrics.SUCCESS_10, metrics.OVER_BOUND),
     ),
-    "results": COLUMNS[:-1],  # earlier runs lack the last
-    "summarize": summarize,
-    "lines": lines,
-    "table": console_table,
-    "metrics": (*INSTANCE_METRICS, *UP_TO_SCALE),
+    "results": COLUMNS,
+    "summarize": summarize_views,
+    "console": (*_COUNTS, *TABLE, metrics.SYM_ROTATION, metrics.SUCCESS_5),
+    "console_note": "t in model diagonals; * rotations that map a model onto itself are no errors",
+    "metrics": INSTANCE_METRICS,
     "kind": lambda run: "views of models",
     "topic": "alignment",
-    "describe": describe,
+    "subject": "views of models",
     "about": (
         "Each picture shows a model as it is; methods get its visible keypoints, with noise, and "
         "the model stretched by unknown factors along y and z. Green is the truth, red the "
@@ -316,4 +212,9 @@ ON_INSTANCES: dict[str, Any] = {
 }
 """Members of the specification of every experiment on views of models."""
 
-SPEC = Spec(options=KeypointNetOptions, plan=plan, write_more=draw_figures, **ON_INSTANCES)
+SPEC = Spec(
+    options=KeypointNetOptions,
+    plan=plan,
+    plots=partial(cumulative_curves, curves=_CURVES, of="of views"),
+    **ON_INSTANCES,
+)

@@ -2,49 +2,43 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Sequence
-from dataclasses import KW_ONLY, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-import tyro
 
 from cadalign.datasets.photos.dataset import PhotoDataset
-from cadalign.errors import DataError, InputError, quote
+from cadalign.errors import DataError
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import VIEW_NAMES
-from cadalign.evaluation.methods import PNP_METHODS
 from cadalign.evaluation.metrics import BOX_IOU
 from cadalign.evaluation.metrics.photos import (
     NINE_DOF,
     ROTATION,
     VIEWPOINT,
-    measured_columns,
-    medians_of,
     score_columns,
-    shares_of,
+    statistics_of,
 )
 from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
-from cadalign.evaluation.options import FunctionOptions, PhotoOptions, is_function
 from cadalign.evaluation.photos import protocols
+from cadalign.evaluation.photos.options import PhotosOptions
 from cadalign.evaluation.plots import cumulative_curves
-from cadalign.evaluation.registry import Spec, count_failures
-from cadalign.evaluation.runs.work import FAILED, LEFT_OUT, OK, UNREADABLE, Columns, Plan
+from cadalign.evaluation.registry import Spec
+from cadalign.evaluation.runs.work import LEFT_OUT, UNREADABLE, Columns, Plan, fingerprint
 from cadalign.evaluation.summary import (
     ALL,
     MEAN,
-    Conclusion,
-    ConsoleTable,
     Summary,
+    mean,
     mean_of,
+    median,
     milliseconds,
-    summaries_of,
-    where,
+    summarize,
 )
+from cadalign.io.files import read_bytes
 
 if TYPE_CHECKING:
     from cadalign.evaluation.photos.target import PhotoTask
@@ -56,53 +50,6 @@ COLUMNS: Columns = (
     *(("rms_px", float), *score_columns(protocols.SETS)),
 )
 """Columns of the result table; see docs/formats/runs.md."""
-
-
-@dataclass(frozen=True)
-class PhotosOptions(FunctionOptions, PhotoOptions, protocols.KeypointOptions):
-    """Evaluate methods on photos of real objects, by the metrics of their data set.
-
-    The folder may hold Scan2CAD, PASCAL3D+, ObjectNet3D or Pix3D. Keypoints
-    are the annotated or detected ones; where there are none, visible points of the model's mesh are
-    projected with the true pose, with noise, and called simulated. The model's width (x) is given,
-    as one image leaves size open; with a shape model in metres it is estimated. The
-    run's folder gets results.parquet with a row per object and method, summary.csv, figures and
-    report.html. A killed run continues when the same command is started again.
-    """
-
-    experiment = "photos"
-
-    root: Annotated[Path, tyro.conf.Positional]
-    """Folder of the data set, in any of the known formats."""
-    _: KW_ONLY
-    categories: tuple[str, ...] | None = None
-    """Categories to take; all by default."""
-    methods: tuple[str, ...] = ()
-    """epnp, rigid; stretched, prior (stretched, with a prior on the scales), similar (prior, and
-    keypoints that differ from the model's), shape (a shape model); each also with evidence, as in
-    rigid+mask, rigid+image (the photo itself) or similar+mask+gravity; and truth. By default the
-    first five, shape where there is one, and the evidence that the data have but the image."""
-    evidence: tuple[str, ...] = ()
-    """mask, gravity, image: what the methods by default get beside keypoints; what the data
-    have but the image, where none is named."""
-    shape: tuple[Path, ...] = ()
-    """Files of `cadalign shape learn`, each for its category."""
-    similar_sigma: float = 0.04
-    """Standard deviation of the object's keypoints from the model's, for the method similar, in
-    diagonals of the model."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 < self.similar_sigma < math.inf:
-            raise InputError(f"{self.similar_sigma} is not positive", where="similar_sigma")
-        self.replace_values(methods=tuple(dict.fromkeys(self.methods)))
-        protocols.check_evidence(self.evidence, self.methods)
-        names = [each for each in self.methods if not is_function(each)]
-        own = [name for name in names if name not in PNP_METHODS]
-        for name in own:
-            protocols.check_method(name)
-        if self.methods:
-            self.check_methods((*protocols.BASES, protocols.TRUTH, *own))
 
 
 GALLERY = (
@@ -118,17 +65,39 @@ HEADLINE = (
     *(metric for each in _OWN_FIRST for metric in each.details),
     *(metrics.RMS, metrics.QUERY_MILLISECONDS),
 )
+_CONSOLE = (
+    *(metrics.INSTANCES, metrics.FAILED, metrics.LEFT_OUT),
+    *(metric for each in _OWN_FIRST for metric in each.console),
+    *(replace(metrics.RMS, symbol="rms px"), metrics.QUERY_MILLISECONDS),
+)
 
 
-def summarize(run: Run) -> list[Summary]:
+def summarize_objects(run: Run) -> list[Summary]:
     """A summary for every category and method, for all together, and the mean of categories."""
-    marked = {**run.cells, "category": _categories(run.cells)}
-    summarize = partial(_summarize, measured=measured_columns(protocols.SETS, run.cells))
-    found = summaries_of(marked, run.methods, summarize, further=run.metrics)
-    names = dict.fromkeys(each.group for each in found if each.group not in (ALL, UNREADABLE))
-    if len(names) < 2:
+    cells = run.cells
+    statistics = {
+        "keypoints": mean("keypoints"),
+        **statistics_of(protocols.SETS, cells),
+        metrics.RMS.key: median(metrics.RMS.key),
+        "milliseconds": milliseconds,
+    }
+    marked = {**cells, "category": _categories(cells)}
+    found = summarize(run, statistics, apart=LEFT_OUT, cells=marked)
+    single = [each for each in found if each.group not in (ALL, UNREADABLE)]
+    if len({each.group for each in single}) < 2:
         return found
-    return [*found, *(_mean([s for s in found if s.method == name]) for name in run.methods)]
+    whole = [each for each in found if each.group == ALL]
+    return [*found, *(_mean(every, single) for every in whole)]
+
+
+def _mean(every: Summary, single: Sequence[Summary]) -> Summary:
+    """The mean of a method's values over categories; its counts are those of all."""
+    own = [each for each in single if each.method == every.method]
+    values = {
+        key: value if isinstance(value, int) else mean_of(np.array([s.values[key] for s in own]))
+        for key, value in every.values.items()
+    }
+    return Summary(MEAN, {"category": MEAN, "method": every.method}, values)
 
 
 def _categories(cells: Cells) -> npt.NDArray[np.object_]:
@@ -142,57 +111,6 @@ def _categories(cells: Cells) -> npt.NDArray[np.object_]:
         for name, mark in zip(categories.tolist(), marked.tolist(), strict=True)
     ]
     return np.array(names, dtype=object)
-
-
-def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
-    """The summaries for the console: the columns that the data set has."""
-    sets = protocols.protocol_of(str(run.config.get("kind"))).metrics
-    columns = (
-        *(metrics.INSTANCES, metrics.FAILED, metrics.LEFT_OUT),
-        *(column for each in sets for column in each.console),
-        *(replace(metrics.RMS, symbol="rms px"), metrics.QUERY_MILLISECONDS),
-        *run.metrics,
-    )
-    shown = [c for c in columns if metrics.told(c, [each.number(c.key) for each in summaries])]
-    has_simulated = any(protocols.SIMULATED in each.group for each in summaries)
-    more = f"; {protocols.SIMULATED}: keypoints projected with the true pose, with noise"
-    return ConsoleTable.of(
-        "Medians and shares per category and method",
-        summaries,
-        shown,
-        note=f"shares count failures{more if has_simulated else ''}",
-        narrow=True,
-        wraps=True,
-    )
-
-
-def _summarize(category: str, method: str, cells: Cells, *, measured: Collection[str]) -> Summary:
-    chosen = where(cells, cells["method"] == method)
-    left_out = chosen["status"] == LEFT_OUT
-    rated = where(chosen, ~left_out)
-    solved = where(rated, rated["status"] == OK)
-    values = {
-        "instances": len(rated["method"]),
-        "failed": int((rated["status"] == FAILED).sum()),
-        metrics.LEFT_OUT.key: int(left_out.sum()),
-        "keypoints": mean_of(solved["keypoints"]),
-        **medians_of(protocols.SETS, solved, metrics.RMS),
-        **shares_of(protocols.SETS, rated, solved, measured=measured),
-        "milliseconds": milliseconds(solved),
-    }
-    return Summary(category, {"category": category, "method": method}, values)
-
-
-def _mean(found: Sequence[Summary]) -> Summary:
-    """The mean of a method's values over categories; its counts are those of all."""
-    (every,) = (each for each in found if each.group == ALL)
-    single = [each for each in found if each.group not in (ALL, UNREADABLE)]
-    counts = ("instances", "failed", metrics.LEFT_OUT.key)
-    values = {
-        key: value if key in counts else mean_of(np.array([each.values[key] for each in single]))
-        for key, value in every.values.items()
-    }
-    return Summary(MEAN, {"category": MEAN, "method": every.method}, values)
 
 
 _CURVES = (
@@ -213,7 +131,7 @@ def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
     """Plan a run over the photos of a data set."""
     from cadalign.evaluation.photos.objects import photos_benchmark
     from cadalign.evaluation.photos.target import PhotoTasks, reopened
-    from cadalign.evaluation.shape_files import shapes_fingerprint, shapes_of
+    from cadalign.evaluation.shape_files import shapes_of
 
     dataset = reopened(options.root)
     protocol = protocols.protocol_of(dataset.kind)
@@ -221,10 +139,10 @@ def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
     if not options.methods:
         methods = protocols.default_methods(
             with_evidence=tuple(dict.fromkeys((protocols.RIGID, protocol.best))),
-            evidence=set(options.evidence) or _evidence(dataset),
+            evidence=_evidence(dataset),
             has_shape=bool(shapes),
         )
-        options = replace(options, methods=methods, evidence=())
+        options = replace(options, methods=methods)
     tasks = PhotoTasks(dataset, options.max_photos)
     pictures = folder.made_for_pictures()
     chunk = _CHUNK if len(tasks) < _LARGE else _LARGE_CHUNK
@@ -233,7 +151,7 @@ def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
         tasks,
         chunk=chunk,
         kind=dataset.kind,
-        shapes=shapes_fingerprint(shapes),
+        shapes=fingerprint(*map(read_bytes, options.shape)),
         annotations=tasks.fingerprint(),
     )
 
@@ -253,39 +171,21 @@ def _evidence(dataset: PhotoDataset) -> set[str]:
     return found
 
 
-def _describe(run: Run) -> str:
-    status, source = run.cells["status"], run.cells["source"]
-    objects = len({*run.cells["model_id"][status != LEFT_OUT].tolist()})
-    simulated = len({*run.cells["model_id"][source == protocols.SIMULATED].tolist()})
-    text = f"on {objects:,} objects in photos of {run.dataset} ({run.config.get('kind')})"
-    if not simulated:
-        return text
-    whose = "whose" if simulated == objects else f"the keypoints of {simulated:,} of which"
-    keypoints = "keypoints " if simulated == objects else ""
-    noise = run.config.get("simulated_noise_px") or 0
-    return f"{text}, {whose} {keypoints}are simulated: projected with the true pose, {noise:g} px"
-
-
-def _conclude(run: Run, summaries: Sequence[Summary]) -> Conclusion:
-    """Counts, and categories that no object is of."""
-    found = count_failures(run, summaries, apart=LEFT_OUT)
-    missing = set(run.config.get("categories") or ()).difference(run.cells["category"].tolist())
-    names = ", ".join(quote(name) for name in sorted(missing))
-    note = ", ".join(filter(None, (found.note, names and f"no object is a {names}")))
-    return replace(found, note=note)
-
-
 SPEC = Spec(
     options=PhotosOptions,
     plan=plan,
     results=COLUMNS,
     columns=HEADLINE,
-    summarize=summarize,
-    table=console_table,
+    summarize=summarize_objects,
+    console=_CONSOLE,
+    console_note=(
+        f"shares count failures; {protocols.SIMULATED}: keypoints projected with the true pose, "
+        "with noise"
+    ),
     plots=plots,
-    conclude=_conclude,
+    apart=LEFT_OUT,
     topic="alignment to photos",
-    describe=_describe,
+    subject="photos",
     metrics=GALLERY,
     about=(
         "Green is the truth, red what a method found: its box, and the model warped to the "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,20 +11,32 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
+from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
 from cadalign.evaluation import metrics
-from cadalign.evaluation.metrics import QUERIES, Metric
+from cadalign.evaluation.metrics import QUERIES
 from cadalign.evaluation.options import ModelOptions
-from cadalign.evaluation.plots import Plot, Trace
+from cadalign.evaluation.plots import Plot, plot_against
 from cadalign.evaluation.registry import Spec
-from cadalign.evaluation.runs.work import OK, Columns, Plan
-from cadalign.evaluation.summary import ALL, ConsoleTable, Summary, mean_of, median_of
+from cadalign.evaluation.runs.work import Columns, Plan
+from cadalign.evaluation.summary import (
+    ALL,
+    Group,
+    Summary,
+    known,
+    mean,
+    mean_of,
+    median,
+    medians,
+    milliseconds,
+    summarize,
+)
 
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.queries import RetrievalTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.tables import Cells, Run
+    from cadalign.evaluation.runs.tables import Run
     from cadalign.retrieval.library import Library
 
 NO_VIEW = "no view"
@@ -69,13 +81,13 @@ class RetrievalRunOptions(ModelOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, known in (("methods", METHODS), ("protocols", PROTOCOLS)):
+        for name, choices in (("methods", METHODS), ("protocols", PROTOCOLS)):
             chosen = tuple(dict.fromkeys(getattr(self, name)))
             self.replace_values(**{name: chosen})
-            unknown = [value for value in chosen if value not in known]
+            unknown = [value for value in chosen if value not in choices]
             if unknown or not chosen:
                 what = f"unknown: {unknown[0]!r}" if unknown else "none is given"
-                raise InputError(what, where=name, fix=f"known are {', '.join(known)}")
+                raise InputError(what, where=name, fix=f"known are {', '.join(choices)}")
         for name, least in (("noises_px", 0), ("keypoints", 4)):
             values = tuple(sorted(set(getattr(self, name))))
             self.replace_values(**{name: values})
@@ -97,10 +109,6 @@ COLUMNS: Columns = (
     *(("rms_px", float), ("shape_distance", float), ("box_iou", float)),
     *(("box_iou_up_to_scale", float), ("rotation_error_deg", float)),
 )
-REQUIRED_COLUMNS: Columns = tuple(
-    column for column in COLUMNS if column[0] not in ("box_iou_up_to_scale", "none_probability")
-)
-"""Those that all runs have; earlier ones lack the others."""
 HEADLINE = (
     *(metrics.INSTANCES, metrics.FAILED, metrics.RANK_1, metrics.RANK_5, metrics.RECIPROCAL_RANK),
     *(metrics.NONE, metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
@@ -115,137 +123,63 @@ _PLOTS = (
 )
 
 
-def summarize(run: Run) -> list[Summary]:
-    """A summary for every category, protocol, method, noise and number of keypoints."""
-    cells = run.cells
-    categories = sorted(set(cells["category"].tolist()))
-    groups = [*categories, ALL] if len(categories) > 1 else [ALL]
-    return [
-        _summarize(cells, category, protocol, method, noise, keypoints)
-        for category in groups
-        for protocol in dict.fromkeys(cells["protocol"].tolist())
-        for method in run.methods
-        for noise in np.unique(cells["noise_px"]).tolist()
-        for keypoints in np.unique(cells["keypoints"]).tolist()
-    ]
+def _of_ranks(statistic: Callable[[FloatArray], FloatArray]) -> Callable[[Group], float]:
+    """Mean of a number of the ranks, NaN beyond 50, where the library holds the true model."""
+
+    def made(group: Group) -> float:
+        ranked = group.rows["protocol"] == LEAVE_IN
+        return mean_of(statistic(group.rows["rank"][ranked].astype(float)))
+
+    return made
 
 
-def lines(summaries: Sequence[Summary]) -> list[Summary]:
-    """Lines of the headline table, those of a group together."""
-    groups: dict[str, list[Summary]] = {}
-    for summary in summaries:
-        if summary.tasks:
-            groups.setdefault(summary.group, []).append(summary)
-    return [summary for found in groups.values() for summary in found]
+_STATISTICS = {
+    "rank_1": _of_ranks(lambda ranks: (ranks == 1).astype(float)),
+    "rank_5": _of_ranks(lambda ranks: (ranks <= 5).astype(float)),
+    "reciprocal_rank": _of_ranks(lambda ranks: np.nan_to_num(1 / ranks)),
+    "score": mean("score"),
+    "none": lambda group: mean_of(known(group.solved["none_probability"]) > 0.5),
+    **medians(metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
+    "mean_box_iou": mean("box_iou"),
+    "rotation_error_deg": median("rotation_error_deg"),
+    "milliseconds": milliseconds,
+}
 
 
-def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
-    """Rates and medians over all categories for the console."""
-    shown = (
-        *(metrics.RANK_1, metrics.RANK_5, metrics.RECIPROCAL_RANK, metrics.SCORE),
-        *(metrics.NONE, metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
-        *(metrics.MATCH_ROTATION, metrics.QUERY_MILLISECONDS),
-    )
-    return ConsoleTable(
-        title="Rates over the queries, medians of the best match",
-        labels=("protocol", "method"),
-        heads=("px", metrics.KEYPOINTS.symbol, "n", *(metric.symbol for metric in shown)),
-        rows=[
-            (
-                s["protocol"],
-                s.method,
-                *(f"{s['noise_px']:g}", str(s["keypoints"]), str(s["queries"])),
-                *(metric.text(s[metric.key]) for metric in shown),
-            )
-            for s in summaries
-            if s["category"] == ALL
-        ],
-        note="",
-        narrow=True,
-        grouped=False,
+def summarize_queries(run: Run) -> list[Summary]:
+    """A summary for every category, protocol, noise, number of keypoints and method."""
+    return summarize(
+        run,
+        _STATISTICS,
+        by=("category", "protocol", "noise_px", "keypoints"),
+        name="{}, {}, {:g} px, {} keypoints".format,
+        apart=NO_VIEW,
     )
 
 
 def plots(runs: Sequence[Run]) -> list[Plot]:
     """Rates and medians against the number of keypoints, over all categories, for each noise."""
-    found = [[s for s in summarize(run) if s["category"] == ALL and s.tasks] for run in runs]
-    return [
-        _plot(metric, protocol, noise, found)
-        for metric, protocol in _PLOTS
-        for noise in sorted({s["noise_px"] for summaries in found for s in summaries})
-        if any(s["protocol"] == protocol and s["noise_px"] == noise for ss in found for s in ss)
-    ]
-
-
-def _plot(metric: Metric, protocol: str, noise: float, found: Sequence[Sequence[Summary]]) -> Plot:
-    chosen = [
-        [s for s in summaries if s["protocol"] == protocol and s["noise_px"] == noise]
-        for summaries in found
-    ]
-    traces = []
-    for index, summaries in enumerate(chosen):
-        for method in dict.fromkeys(s.method for s in summaries):
-            rows = [s for s in summaries if s.method == method]
-            y = [s[metric.key] for s in rows]
-            traces.append(Trace.of(index, method, [s["keypoints"] for s in rows], y, metric))
-    queries = sorted({s["queries"] for summaries in chosen for s in summaries})
-    count = f"{queries[0]:,} to {queries[-1]:,}" if len(queries) > 1 else f"{queries[0]:,}"
-    return Plot(
-        id=f"{metric.key}_{noise:g}",
-        x=_KEYPOINTS,
-        y=metric,
-        traces=traces,
-        note="over all categories",
-        caption=f"{protocol}; {metric.axis}; {count} queries each",
-        figure=f"{protocol.replace('-', '_')}_{metric.key}",
-        variant=f"{noise:g} px",
-        title=f"{metric.label}, {noise:g} px of noise, {protocol}",
-    )
-
-
-def _summarize(
-    cells: Cells, category: str, protocol: str, method: str, noise: float, keypoints: int
-) -> Summary:
-    chosen = (
-        (cells["protocol"] == protocol)
-        & (cells["method"] == method)
-        & (cells["noise_px"] == noise)
-        & (cells["keypoints"] == keypoints)
-    )
-    if category != ALL:
-        chosen &= cells["category"] == category
-    solved = chosen & (cells["status"] == OK)
-    made = chosen & (cells["status"] != NO_VIEW)
-    queries = int(made.sum())
-    ranks = cells["rank"][made].astype(float)  # NaN beyond 50
-    up_to_scale = cells.get("box_iou_up_to_scale", np.full(len(solved), np.nan))
-    none = cells.get("none_probability", np.full(len(solved), np.nan))
-    known = solved & np.isfinite(none)
-    ranked = queries and protocol == LEAVE_IN
-    values = {
-        "queries": queries,
-        "failed": queries - int(solved.sum()),
-        "rank_1": float((ranks == 1).mean()) if ranked else np.nan,
-        "rank_5": float((ranks <= 5).mean()) if ranked else np.nan,
-        "reciprocal_rank": float(np.nan_to_num(1 / ranks).mean()) if ranked else np.nan,
-        "score": mean_of(cells["score"][solved]),
-        "none": float((none > 0.5)[known].mean()) if known.any() else np.nan,
-        "shape_distance": median_of(cells["shape_distance"][solved]),
-        "box_iou": median_of(cells["box_iou"][solved]),
-        "box_iou_up_to_scale": median_of(up_to_scale[solved]),
-        "mean_box_iou": mean_of(cells["box_iou"][solved]),
-        "rotation_error_deg": median_of(cells["rotation_error_deg"][solved]),
-        "milliseconds": median_of(1e3 * cells["seconds"][solved]),
-    }
-    names = {
-        "category": category,
-        "protocol": protocol,
-        "method": method,
-        "noise_px": noise,
-        "keypoints": keypoints,
-    }
-    group = f"{category}, {protocol}, {noise:g} px, {keypoints} keypoints"
-    return Summary(group, names, values, tasks=queries)
+    found = []
+    for run in runs:
+        summaries = summarize_queries(run)
+        whole = {each["category"] for each in summaries}
+        kept = ALL if len(whole) > 1 else next(iter(whole))
+        found.append([each for each in summaries if each["category"] == kept])
+    drawn = []
+    for metric, protocol in _PLOTS:
+        for noise in sorted({each["noise_px"] for summaries in found for each in summaries}):
+            chosen = [
+                [s for s in some if (s["protocol"], s["noise_px"]) == (protocol, noise)]
+                for some in found
+            ]
+            if any(chosen):
+                words = {
+                    "id": f"{protocol.replace('-', '_')}_{metric.key}_{noise:g}",
+                    "note": "over all categories",
+                    "title": f"{metric.label}, {noise:g} px of noise, {protocol}",
+                }
+                drawn.append(plot_against(chosen, _KEYPOINTS, metric, place="keypoints", **words))
+    return drawn
 
 
 _CHUNK = 16
@@ -280,23 +214,18 @@ def _library_of(options: RetrievalRunOptions) -> Library:
     return Library.from_dataset(dataset, categories=categories)
 
 
-def _describe(run: Run) -> str:
-    models = run.count("category", "model_id")
-    return f"of finding {models:,} model{'s' * (models != 1)} of {run.dataset} again"
-
-
 SPEC = Spec(
     options=RetrievalRunOptions,
     plan=plan,
     columns=HEADLINE,
-    results=REQUIRED_COLUMNS,
-    summarize=summarize,
-    lines=lines,
-    table=console_table,
+    results=COLUMNS,
+    summarize=summarize_queries,
+    console=HEADLINE[2:],
+    apart=NO_VIEW,
     group=lambda run: QUERIES,
     plots=plots,
     topic="retrieval",
-    describe=_describe,
+    subject="views of models",
     note=(
         "Leave-in: the library holds the true model; models whose keypoints are the same after "
         "stretch count as it. Leave-out: it and these are taken out. Shape distance, box IoU, "

@@ -11,6 +11,7 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, fields, replace
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
@@ -23,11 +24,11 @@ from cadalign.evaluation.methods import Method, MethodInput
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.options import FunctionOptions, name_of, plain_value
-from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, Trace
+from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, plot_against
 from cadalign.evaluation.registry import Spec
-from cadalign.evaluation.runs.work import OK, Columns, Plan, Row
+from cadalign.evaluation.runs.work import Columns, Plan, Row
 from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
-from cadalign.evaluation.summary import ConsoleTable, Quartiles, Summary, group_name
+from cadalign.evaluation.summary import Group, Quartiles, Summary, group_name, summarize
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.documents import convert, in_file
 
@@ -190,8 +191,6 @@ class SweepProblems(Setting):
     """Random problems: the setting of the simulation."""
 
     columns = COLUMNS
-    # Seconds of one call where time is what is measured, a share of the batch's elsewhere.
-    names = (("points", int), ("run", int), ("method", str))
 
     kind: SweepKind
     seed: int
@@ -269,92 +268,29 @@ def varied(run: Run) -> Metric:
     return VARIED[kind_of(run).column]
 
 
-def summarize(run: Run) -> list[Summary]:
-    """Quartiles for every metric, method and value, as far as the run is."""
+def summarize_sweep(run: Run) -> list[Summary]:
+    """Quartiles of every metric for every value and method, over the problems that are solved."""
     kind, cells = kind_of(run), run.cells
     if kind.is_timed:
         cells = {**cells, metrics.MICROSECONDS.key: 1e6 * cells["seconds"]}
-    summaries = []
-    for metric in _metrics(kind, run):
-        for method in kind.methods:
-            for value in kind.values:
-                chosen = (cells["method"] == method) & (cells[kind.column] == value)
-                solved = chosen & (cells["status"] == OK)
-                found = Quartiles.of_solved(cells[metric.key][solved].astype(float))
-                count, failed = int(chosen.sum()), int((chosen & ~solved).sum())
-                if not count:
-                    continue
-                names = {"value": value, "method": method, "metric": metric.key}
-                values = {
-                    "runs": count,
-                    "failed": failed,
-                    "lower_quartile": found.lower,
-                    "median": found.median,
-                    "upper_quartile": found.upper,
-                }
-                group = group_name(VARIED[kind.column], value)
-                summaries.append(Summary(group, names, values, tasks=count))
-    return summaries
+    statistics = {metric.key: _quartiles(metric.key) for metric in _metrics(kind, run)}
+    name = partial(group_name, varied(run))
+    return summarize(run, statistics, by=(kind.column,), name=name, cells=cells)
 
 
-def lines(summaries: Sequence[Summary]) -> list[Summary]:
-    """Lines of the headline table, value by value, with the medians of all metrics."""
-    found: dict[tuple[float, str], Summary] = {}
-    for s in sorted(summaries, key=lambda s: float(s["value"])):
-        place = s["value"], s.method
-        values = found[place].values if place in found else {"failed": s["failed"]}
-        names = {"value": s["value"], "method": s.method}
-        found[place] = Summary(s.group, names, {**values, s["metric"]: s["median"]}, s.tasks)
-    return list(found.values())
-
-
-def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
-    """Medians of the first metric, a row for each value."""
-    metric = summaries[0]["metric"]
-    shown = [summary for summary in summaries if summary["metric"] == metric]
-    methods = list(dict.fromkeys(summary.method for summary in shown))
-    rows = []
-    for value in dict.fromkeys(summary["value"] for summary in shown):
-        row = {s.method: s for s in shown if s["value"] == value}
-        texts = [
-            "-" if s is None or s["failed"] == s["runs"] else f"{s['median']:.4g}"
-            for s in map(row.get, methods)
-        ]
-        rows.append((f"{value:g}", *texts))
-    heads = (kind_of(run).column, *methods)
-    return ConsoleTable(f"Median {metric}", (), heads, rows, "", grouped=False)
+def _quartiles(key: str) -> Callable[[Group], Quartiles]:
+    return lambda group: Quartiles.of_solved(group.solved[key].astype(float))
 
 
 def plots(runs: Sequence[Run]) -> list[Plot]:
     """Errors, and times where they are measured, against the quantity that is varied."""
     kind, x = kind_of(runs[0]), varied(runs[0])
-    found = [summarize(run) for run in runs]
-    count = max((summary["runs"] for summary in found[0]), default=0)
+    found = [summarize_sweep(run) for run in runs]
+    note = f"{_held(kind)}{kind.runs} problems each; {QUARTILES_NOTE}"
     return [
-        Plot(
-            id=metric.key,
-            x=x,
-            y=metric,
-            traces=[
-                _trace(index, method, metric, x, summaries)
-                for index, summaries in enumerate(found)
-                for method in kind_of(runs[index]).methods
-            ],
-            note=QUARTILES_NOTE,
-            caption=f"{_held(kind)}{count} problems each; {QUARTILES_NOTE}",
-            figure=f"{kind.name}_{metric.key}",
-        )
+        plot_against(found, x, metric, place=kind.column, note=note)
         for metric in _metrics(kind, runs[0])
     ]
-
-
-def _trace(run: int, method: str, metric: Metric, x: Metric, summaries: Sequence[Summary]) -> Trace:
-    rows = [s for s in summaries if s["metric"] == metric.key and s.method == method]
-    places = [x.factor * row["value"] for row in rows]
-    ends = ("lower_quartile", "median", "upper_quartile")
-    return Trace.of(
-        run, method, places, [Quartiles(*map(row.__getitem__, ends)) for row in rows], metric
-    )
 
 
 def _metrics(kind: SweepKind, run: Run) -> tuple[Metric, ...]:
@@ -379,24 +315,16 @@ def plan(options: SweepOptions, folder: RunFolder) -> Plan[SweepTask]:
     return Plan(benchmark, sweep_tasks(kind), config | benchmark.further, chunk)
 
 
-def _describe(run: Run) -> str:
-    kind = kind_of(run)
-    problems = f"{kind.runs:,} problems for each value"
-    return f"on the AEPnP paper's simulation, {kind.name} varied, {problems}"
-
-
 SPEC = Spec(
     options=SweepOptions,
     plan=plan,
     columns=(metrics.INSTANCES, metrics.FAILED, *ERRORS, metrics.MICROSECONDS),
     results=COLUMNS,
-    summarize=summarize,
-    lines=lines,
-    table=console_table,
+    summarize=summarize_sweep,
     group=varied,
     plots=plots,
     kind=lambda run: f"cadalign simulate {kind_of(run).name}",
     title=lambda runs: f"simulation: {kind_of(runs[0]).name}",
-    describe=_describe,
+    describe=lambda run: f"on {run.total:,} problems of the AEPnP paper's simulation",
     note="Medians over the problems that did not fail.",
 )

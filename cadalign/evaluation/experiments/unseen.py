@@ -4,39 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import VIEW_NAMES
 from cadalign.evaluation.methods import LIMIT, SHAPE
-from cadalign.evaluation.options import (
-    FunctionOptions,
-    ModelOptions,
-    NoiseOption,
-    SplitOptions,
-)
+from cadalign.evaluation.options import ViewOptions
 from cadalign.evaluation.plots import Plot, Trace, cumulative_curves
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Columns, Plan
 from cadalign.evaluation.summary import (
-    ConsoleTable,
-    Summary,
-    by_category_and_method,
+    Group,
     known,
     mean,
-    median,
+    mean_of,
+    medians,
     milliseconds,
     percentile,
+    summarize,
 )
 
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.instance import KeypointTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.tables import Cells, Run
+    from cadalign.evaluation.runs.tables import Run
 
 METHODS = (
     *("random-rigid", "random-stretched", "nearest", "mean-rigid", "mean-stretched"),
@@ -45,7 +42,7 @@ METHODS = (
 
 
 @dataclass(frozen=True)
-class UnseenOptions(ModelOptions, SplitOptions, NoiseOption, FunctionOptions):
+class UnseenOptions(ViewOptions):
     """Evaluate alignment to objects that are no stretched copy of any model.
 
     Objects of one split of KeypointNet are aligned with models of the other split, by
@@ -59,6 +56,10 @@ class UnseenOptions(ModelOptions, SplitOptions, NoiseOption, FunctionOptions):
     visibility: ClassVar[str] = "hull"
 
     _: KW_ONLY
+    split: str = "val"
+    """Split of the objects."""
+    train: str = "train"
+    """Split of the models to learn from."""
     noise_px: float = 2.0
     """Standard deviation of the keypoints' noise, in pixels."""
     keypoints: int | None = None
@@ -66,10 +67,6 @@ class UnseenOptions(ModelOptions, SplitOptions, NoiseOption, FunctionOptions):
     outliers: float = 0.0
     """Share of the given keypoints that are moved to anywhere in the image; methods then search
     for those that agree."""
-    views_per_model: int = 1
-    """Number of views of each object."""
-    meshes: bool = False
-    """Keep small copies of the objects' meshes, which the report shows warped to the estimates."""
     methods: tuple[str, ...] = METHODS
     """random-rigid, random-stretched: a random model of the category; nearest: the best of the
     library; mean-rigid, mean-stretched: the category's mean; shape: its shape model; exact: the
@@ -77,7 +74,10 @@ class UnseenOptions(ModelOptions, SplitOptions, NoiseOption, FunctionOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_least(keypoints=1, views_per_model=1)
+        if self.split == self.train:
+            what, fix = f"both are {self.split!r}", "objects must not be among the models"
+            raise InputError(what, where="split, train", fix=fix)
+        self.check_least(keypoints=1)
         if not 0 <= self.outliers < 1:
             raise InputError(f"{self.outliers} is not a share below 1", where="outliers")
         self.check_methods(METHODS)
@@ -110,19 +110,18 @@ HEADLINE = (
 )
 
 
-def _within(level: str, nominal: float) -> Callable[[Cells], float]:
+def _within(level: str, nominal: float) -> Callable[[Group], float]:
     """Share of the known levels that are at most the nominal one; NaN of none."""
+    return lambda group: mean_of(_flags(group.solved[level], nominal))
 
-    def share(cells: Cells) -> float:
-        found = known(cells[level])
-        return float((found <= nominal).mean()) if len(found) else np.nan
 
-    return share
+def _flags(levels: FloatArray, nominal: float) -> FloatArray:
+    return (known(levels) <= nominal).astype(float)
 
 
 _STATISTICS = {
     "keypoints": mean("keypoints"),
-    **{metric.key: median(metric.key) for metric in _MEDIANS},
+    **medians(*_MEDIANS),
     "rotation_error_deg_90": percentile("rotation_error_deg", 90),
     **{
         f"{name}_in_{percent}": _within(f"{name}_level", percent / 100)
@@ -132,27 +131,12 @@ _STATISTICS = {
     **{name: mean(name) for name in ("keypoints_within_68", "keypoints_within_95")},
     "milliseconds": milliseconds,
 }
-
-
-def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
-    """The summaries for the console."""
-    shown = (
-        *(metrics.INSTANCES, metrics.FAILED),
-        *(replace(metrics.ROTATION, digits=2), replace(metrics.ROTATION_90, digits=1)),
-        *(replace(metrics.TRANSLATION_UP_TO_SCALE, digits=3), metrics.BOX_IOU_UP_TO_SCALE),
-        *(replace(metrics.KEYPOINT_ERROR, digits=3), *_COVERAGE, metrics.QUERY_MILLISECONDS),
-        *run.metrics,
-    )
-    return ConsoleTable.of(
-        "Medians per category and method, and truths within stated regions",
-        summaries,
-        shown,
-        note="lengths in model diagonals; scaled: about the camera centre",
-        narrow=True,
-        wraps=True,
-    )
-
-
+_CONSOLE = (
+    *(metrics.INSTANCES, metrics.FAILED),
+    *(replace(metrics.ROTATION, digits=2), replace(metrics.ROTATION_90, digits=1)),
+    *(replace(metrics.TRANSLATION_UP_TO_SCALE, digits=3), metrics.BOX_IOU_UP_TO_SCALE),
+    *(replace(metrics.KEYPOINT_ERROR, digits=3), *_COVERAGE, metrics.QUERY_MILLISECONDS),
+)
 _CURVES = (
     (metrics.ROTATION, np.array([0.5, 1, 2, 3, 5, 7.5, 10, 15, 20, 30])),
     (replace(metrics.BOX_IOU_UP_TO_SCALE, log=False), np.arange(0, 1.01, 0.1)),
@@ -198,20 +182,8 @@ def plan(options: UnseenOptions, folder: RunFolder) -> Plan[KeypointTask]:
     tasks = UnseenTasks(dataset, options)
     learned = learn(dataset, tasks.categories, split=options.train, folder=folder)
     hashes = {"annotations": tasks.fingerprint(), "learned": learned.fingerprint()}
-    benchmark = unseen_benchmark(learned, options, folder if options.meshes else None)
+    benchmark = unseen_benchmark(learned, options)
     return benchmark.plan(options, tasks, chunk=_CHUNK, **hashes)
-
-
-def _describe(run: Run) -> str:
-    objects = run.count("category", "model_id")
-    given = run.config.get("keypoints")
-    keypoints = "all keypoints" if given is None else f"{given} random keypoints"
-    share = float(run.config.get("outliers") or 0.0)
-    outliers = f", {100 * share:g} % of them moved to anywhere" if share else ""
-    return (
-        f"on {objects:,} objects of {run.dataset} that are no stretched copy of any model, "
-        f"{keypoints} with {run.noise_px or 0:g} px of noise{outliers}"
-    )
 
 
 SPEC = Spec(
@@ -219,11 +191,12 @@ SPEC = Spec(
     plan=plan,
     results=COLUMNS,
     columns=HEADLINE,
-    summarize=lambda run: by_category_and_method(run, _STATISTICS),
-    table=console_table,
+    summarize=partial(summarize, statistics=_STATISTICS),
+    console=_CONSOLE,
+    console_note="lengths in model diagonals; scaled: about the camera centre",
     plots=plots,
     topic="unseen objects",
-    describe=_describe,
+    subject="views of objects that are no stretched copy of any model",
     metrics=_MEDIANS,
     about=(
         "Green is the object with the box of its keypoints, red what a method found: the object "

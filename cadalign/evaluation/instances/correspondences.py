@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 
@@ -19,10 +19,10 @@ from cadalign.errors import DataError
 from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.result import Result
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting, Tasks
-from cadalign.evaluation.experiments.correspondences import COLUMNS, NAMES, CorrespondenceOptions
+from cadalign.evaluation.experiments.correspondences import COLUMNS, CorrespondenceOptions
 from cadalign.evaluation.methods import Method, MethodInput
 from cadalign.evaluation.metrics.errors import alignment_errors
-from cadalign.evaluation.runs.work import Row, fingerprint
+from cadalign.evaluation.runs.work import Row, fingerprint_of_files
 from cadalign.evaluation.simulation import SimulatedProblem
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -51,7 +51,7 @@ class CorrespondenceTasks(Tasks[CorrespondenceTask]):
     """All draws, image by image and share by share."""
 
     def __init__(self, images: CorrespondenceSet, options: CorrespondenceOptions) -> None:
-        self._outliers = options.outliers
+        self._source, self._outliers = Path(images.root), options.outliers
         self._draws = options.draws
         self._ids = images.names[: options.max_images]
         if not self._ids:
@@ -86,18 +86,9 @@ class CorrespondenceTasks(Tasks[CorrespondenceTask]):
         )
 
     def fingerprint(self) -> str:
-        """Hash of all that is read: a run must not go on with other data."""
-        parts: list[Any] = []
-        for name in self._ids:
-            parts.append(f"{name}\0")
-            if name in self._problems:
-                parts.append(str(self._problems[name]))
-                continue
-            seen = self._read(name)
-            pose = seen.cam_from_world
-            parts += [seen.points_3d, seen.points_2d, pose.rotation, pose.translation]
-            parts.append(repr(seen.camera))
-        return fingerprint(*parts)
+        """Hash of the files: a run must not go on with other data."""
+        folder = self._source if self._source.is_dir() else self._source.parent
+        return fingerprint_of_files(sorted(path for path in folder.iterdir() if path.is_file()))
 
 
 SUCCESS_DEG = 0.5
@@ -116,7 +107,6 @@ SpoiledImage = tuple[SimulatedProblem, RansacOptions]
 class SpoiledImages(Setting):
     """Stretched scenes with outliers: the setting of the experiment on real correspondences."""
 
-    names = NAMES
     columns = COLUMNS
 
     options: CorrespondenceOptions

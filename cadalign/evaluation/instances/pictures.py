@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import base64
-import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +15,20 @@ import numpy.typing as npt
 from PIL import Image
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.datasets import KeypointNet
-from cadalign.errors import DataError, RenderError
-from cadalign.evaluation.instances.instance import Instance, KeypointTask
+from cadalign.errors import RenderError
+from cadalign.evaluation.instances.instance import Instance
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.pixels import rescaled_pixels
 from cadalign.geometry.simplify import cluster, mesh_edges, simplify
-from cadalign.io.files import dense_json, made_folder, write_text, write_whole
+from cadalign.io.files import dense_json, write_text, write_whole
 from cadalign.io.images import write_image
 from cadalign.render import RaycastRenderer, draw_overlay
 from cadalign.render.drawing.canvas import ByteImage
-
-logger = logging.getLogger("cadalign")
+from cadalign.render.scene import Geometry
 
 NO_PHOTO = 225
 """Grey of a photo that is not there."""
@@ -40,6 +39,51 @@ _QUALITY, _THUMB_QUALITY = 85, 75
 _EFFORT = 2  # of WebP's 6: half the time of 4, files 3 % larger
 
 
+def write_pictures(
+    folder: RunFolder,
+    stem: str,
+    photo: ByteImage,
+    camera: Camera,
+    *,
+    observed: FloatArray,
+    reprojected: FloatArray | None = None,
+    gt_box: Box | None = None,
+    est_box: Box | None = None,
+    est_frame: Callable[[Camera], Geometry] | None = None,
+    with_overlay: bool = True,
+) -> None:
+    """Write the pictures of an instance, named ``stem``, to a run's folder.
+
+    ``overlays`` gets the photo with the boxes of truth and estimate, the estimated model and the
+    keypoints (n, 2) [px]; ``thumbs`` the part around the object with the boxes; ``pictures`` the
+    photo alone. ``est_frame`` casts the estimated model for a camera.
+    """
+    small, near = shown_photo(photo, camera)
+    scale = near.width / camera.width
+    observed = rescaled_pixels(observed, scale)
+    boxes: dict[str, Any] = {"gt_box": gt_box, "est_box": est_box}
+    if with_overlay:
+        image = draw_overlay(
+            small,
+            near,
+            est_frame=None if est_frame is None else est_frame(near),
+            observed=observed,
+            reprojected=None if reprojected is None else rescaled_pixels(reprojected, scale),
+            **boxes,
+        )
+        write_image(folder.overlays / f"{stem}.png", image)
+    box = gt_box or est_box
+    corners = np.empty((0, 2)) if box is None else near.project_where_ahead(box.corners)
+    points = np.concatenate([observed, corners])
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        points = np.array([[0, 0], [near.width, near.height]], dtype=float)
+    crop, crop_camera = cut_out(small, near, points)
+    thumb = draw_overlay(crop, crop_camera, axes=False, legend=False, **boxes)
+    write_webp(folder.pictures / f"{stem}.webp", small)
+    write_webp(folder.thumbs / f"{stem}.webp", thumb, quality=_THUMB_QUALITY)
+
+
 def draw_instance(
     folder: RunFolder,
     instance: Instance,
@@ -48,32 +92,21 @@ def draw_instance(
     model_id: str,
     view: int = 0,
 ) -> None:
-    """Render an instance; write its pictures and its mesh preview to a run's folder.
-
-    ``overlays`` gets it with the boxes of truth and estimate and its keypoints, ``thumbs`` a small
-    one with the boxes, ``pictures`` it as it is, ``previews`` the preview of its model's mesh. Each
-    file appears whole or not at all.
-    """
+    """Render an instance; write its pictures and its mesh preview to a run's folder."""
     stem = record_stem(category, model_id, view)
     if instance.scene is None:
         raise RenderError("there is no mesh to draw", where=stem)
     frame = _renderer().render(instance.scene, instance.camera, instance.cam_from_model)
-    plain = frame.composite()
-    est_box = Box.from_model(instance.bounds, estimate)
-    image = draw_overlay(
-        plain,
+    write_pictures(
+        folder,
+        stem,
+        frame.composite(),
         instance.camera,
-        gt_box=instance.gt_box,
-        est_box=est_box,
         observed=instance.points_2d,
         reprojected=instance.camera.project_where_ahead(estimate.apply(instance.points_3d)),
+        gt_box=instance.gt_box,
+        est_box=Box.from_model(instance.bounds, estimate),
     )
-    size = _THUMB[0], round(instance.camera.height * _THUMB[0] / instance.camera.width)
-    small, camera = _resized(plain, instance.camera, *size)
-    thumb = draw_overlay(
-        small, camera, gt_box=instance.gt_box, est_box=est_box, axes=False, legend=False
-    )
-    write_pictures(folder, stem, plain, thumb, image, quality=_THUMB_QUALITY)
     preview = folder.previews / f"{record_stem(category, model_id)}.json"
     if view == 0 or not preview.exists():
         write_preview(preview, instance.scene.mesh)
@@ -82,8 +115,10 @@ def draw_instance(
 def shown_photo(photo: ByteImage, camera: Camera) -> tuple[ByteImage, Camera]:
     """A photo in a size for a page, its longer side at most 1024 pixels, and its camera."""
     factor = min(1.0, _MOST / max(camera.width, camera.height))
-    size = camera.width, camera.height
-    return _resized(photo, camera, *(max(1, round(factor * length)) for length in size))
+    size = tuple(max(1, round(factor * length)) for length in (camera.width, camera.height))
+    if photo.shape[1::-1] != size:
+        photo = np.asarray(cv2.resize(photo, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return photo, camera.resized(*size)
 
 
 def cut_out(photo: ByteImage, camera: Camera, points: FloatArray) -> tuple[ByteImage, Camera]:
@@ -107,28 +142,6 @@ def cut_out(photo: ByteImage, camera: Camera, points: FloatArray) -> tuple[ByteI
         cy=(camera.cy - top) / across,
     )
     return np.asarray(crop, dtype=np.uint8), near
-
-
-def _resized(image: ByteImage, camera: Camera, width: int, height: int) -> tuple[ByteImage, Camera]:
-    if image.shape[1::-1] != (width, height):
-        small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-        image = np.asarray(small, dtype=np.uint8)
-    return image, camera.resized(width, height)
-
-
-def write_pictures(
-    folder: RunFolder,
-    stem: str,
-    plain: ByteImage,
-    thumb: ByteImage,
-    overlay: ByteImage,
-    *,
-    quality: int = _QUALITY,
-) -> None:
-    """Write the pictures of an instance, the thumb in a quality, to the folders of a run."""
-    write_webp(folder.pictures / f"{stem}.webp", plain)
-    write_webp(folder.thumbs / f"{stem}.webp", thumb, quality=quality)
-    write_whole(folder.overlays / f"{stem}.png", lambda path: write_image(path, overlay))
 
 
 def write_webp(path: Path, image: ByteImage, *, quality: int = _QUALITY) -> None:
@@ -180,15 +193,7 @@ class MeshPreview:
 def preview_of(
     mesh: Mesh, *, max_faces: int = MAX_FACES, max_edges: int = MAX_EDGES
 ) -> MeshPreview:
-    """Simplify a mesh to at most so many triangles and lines, by merging vertices on a grid.
-
-    Examples
-    --------
-    >>> square = Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
-    >>> preview = preview_of(square)
-    >>> len(preview.faces), len(preview.edges)  # the diagonal is no crease
-    (2, 4)
-    """
+    """Simplify a mesh to at most so many triangles and lines, by merging vertices on a grid."""
     small = cluster(mesh, cells=_FINEST)
     if len(small.faces) > max_faces:
         small = simplify(mesh, max_faces=max_faces)
@@ -203,24 +208,6 @@ def preview_of(
 def write_preview(path: Path, mesh: Mesh) -> None:
     """Write a preview of a mesh as JSON."""
     write_text(path, dense_json(preview_of(mesh).to_dict()))
-
-
-def keep_preview(folder: RunFolder, root: Path, task: KeypointTask) -> None:
-    """Write the preview of an object's mesh to a run's folder; nothing without a readable mesh."""
-    model = _dataset(root)[task.category, task.model_id]
-    if model.mesh_path is None:
-        return
-    try:
-        mesh = model.load_mesh()
-    except DataError as error:
-        logger.warning("no preview of the mesh: %s", error)
-        return
-    write_preview(
-        made_folder(folder.previews) / f"{record_stem(task.category, task.model_id)}.json", mesh
-    )
-
-
-_dataset = lru_cache(maxsize=1)(KeypointNet)
 
 
 def _base64(values: npt.NDArray[Any], kind: str) -> str:

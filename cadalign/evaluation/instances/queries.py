@@ -24,7 +24,6 @@ from cadalign.evaluation.experiments.retrieval import (
     COLUMNS,
     LEAVE_IN,
     LEAVE_OUT,
-    NAMES,
     NO_VIEW,
     RetrievalRunOptions,
 )
@@ -133,7 +132,6 @@ class RetrievalInstance:
 class RetrievalQueries(Setting):
     """Queries of a library's file, which all workers map into memory: the experiment's setting."""
 
-    names = NAMES
     columns = COLUMNS
 
     library: str

@@ -18,7 +18,7 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Uncertainty
 from cadalign.estimation.warning import Warnings
-from cadalign.evaluation.runs.work import Columns, Outcome, Row
+from cadalign.evaluation.runs.work import Columns, Outcome
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 
@@ -94,16 +94,7 @@ def aligned_shape(
 def box_alignment(
     alignment: Alignment, bounds: FloatArray, *, model_bounds: FloatArray
 ) -> Alignment:
-    """The alignment that takes a model's box to where another one takes given bounds (2, 3).
-
-    Examples
-    --------
-    >>> found = Alignment(np.eye(3), [0, 0, 4], [1, 1, 1])
-    >>> other = box_alignment(found, np.array([[0, 0, 0], [1, 2, 3]]),
-    ...                       model_bounds=np.array([[-1, -1, -1], [1, 1, 1]]))
-    >>> other.scale.tolist(), other.translation.tolist()
-    ([0.5, 1.0, 1.5], [0.5, 1.0, 5.5])
-    """
+    """The alignment that takes a model's box to where another one takes given bounds (2, 3)."""
     lengths, given = np.ptp(bounds, axis=0) * alignment.scale, np.ptp(model_bounds, axis=0)
     scale = np.maximum(lengths, _LEAST_SCALE) / np.where(given > 0, given, 1.0)
     scale = np.where(given > 0, scale, 1.0)
@@ -129,8 +120,8 @@ def record_of(
     points_2d: FloatArray,
     ids: IntArray,
     stretch: FloatArray | None = None,
-) -> Row:
-    """The record of an instance as a table row, from each method's outcome and its estimate.
+) -> str:
+    """The record of an instance as JSON, from each method's outcome and its estimate.
 
     ``stretch`` (3,) is that of the model, by default what the true scale undoes.
     """
@@ -146,18 +137,11 @@ def record_of(
         "semantic_ids": ids.tolist(),
         "estimates": list(map(_described, outcomes, estimates)),
     }
-    row = {name: outcomes[0].names[name] for name in ("category", "model_id", "view")}
-    return {**row, "exhibit": _ENCODER.encode(record).decode()}
+    return _ENCODER.encode(record).decode()
 
 
 def record_stem(category: str, model_id: str, view: int = 0) -> str:
-    """The name, without an ending, of the files with an instance's pictures.
-
-    Examples
-    --------
-    >>> record_stem("chair", "88382b87", 2)
-    'chair_88382b87_2'
-    """
+    """The name, without an ending, of the files with an instance's pictures."""
     name = f"{category}_{model_id}"
     stem = name.replace("/", "_").replace("\0", "_")
     coded = name.encode("utf-8", "replace")

@@ -17,11 +17,10 @@ from cadalign.estimation.model import Model
 from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
-from cadalign.evaluation.benchmark import VIEW_NAMES, Benchmark, Case, Setting
+from cadalign.evaluation.benchmark import Benchmark, Case, Setting
 from cadalign.evaluation.experiments.unseen import COLUMNS, METHODS, UnseenOptions
 from cadalign.evaluation.instances.hull import sample_hull_view
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, KeypointTask
-from cadalign.evaluation.instances.pictures import keep_preview
 from cadalign.evaluation.instances.record import (
     RECORD_COLUMNS,
     AlignedShape,
@@ -32,8 +31,7 @@ from cadalign.evaluation.instances.views import KeypointTasks
 from cadalign.evaluation.methods import LIMIT, SHAPE, Method, MethodInput
 from cadalign.evaluation.metrics.cramer_rao import limit_estimate, probability_level
 from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
-from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.work import Outcome, Row, fingerprint
+from cadalign.evaluation.runs.work import Outcome, Row
 from cadalign.evaluation.shape_files import LearnedFiles
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.metrics import (
@@ -66,15 +64,6 @@ class UnseenTasks(KeypointTasks):
     def categories(self) -> tuple[str, ...]:
         """The categories that have objects, sorted."""
         return tuple(sorted({category for category, _ in self.keys}))
-
-    def fingerprint(self) -> str:
-        """Hash of the annotations."""
-        parts: list[Any] = []
-        for place in range(0, len(self), len(self) // len(self.keys)):
-            task = self.task(place)
-            parts.append(f"{task.category}\0{task.model_id}\0{task.problem}")
-            parts += [task.hull.xyz, task.ids]
-        return fingerprint(*parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,12 +220,10 @@ _SOLVERS: dict[str, Callable[[UnseenObject], ShapeEstimate]] = {
 }
 
 
-def unseen_benchmark(
-    learned: LearnedFiles, options: UnseenOptions, previews: RunFolder | None = None
-) -> Benchmark:
+def unseen_benchmark(learned: LearnedFiles, options: UnseenOptions) -> Benchmark:
     """The methods of the options on unseen objects."""
     own = {name: Method(name, _SOLVERS[name]) for name in METHODS}
-    setting = UnseenObjects(learned, options, previews)
+    setting = UnseenObjects(learned, options)
     return Benchmark.chosen(setting, options.methods, own, metrics=options.metrics)
 
 
@@ -247,13 +234,11 @@ def unseen_benchmark(
 class UnseenObjects(Setting):
     """Objects with what was learned from others: the setting of the experiment."""
 
-    names = VIEW_NAMES
     columns = COLUMNS
     record_columns = RECORD_COLUMNS
 
     learned: LearnedFiles
     options: UnseenOptions
-    previews: RunFolder | None = None  # of the objects' meshes
 
     def case(self, task: KeypointTask) -> Case:
         seen = observe_object(task, self.options)
@@ -287,14 +272,10 @@ class UnseenObjects(Setting):
     def row(self, method: Method, seen: UnseenObject, estimate: ShapeEstimate) -> Row:
         return _errors(estimate, seen)
 
-    def finish(
-        self, case: Case, outcomes: list[Outcome], estimates: list[Any]
-    ) -> tuple[list[Outcome], Row]:
-        """Keep the preview of the object's mesh; its record has the box of its keypoints."""
+    def finish(self, case: Case, outcomes: list[Outcome], estimates: list[Any]) -> str:
+        """The record has the box of the object's keypoints."""
         seen: UnseenObject = case.instance
-        if self.previews is not None and seen.task.view == 0:
-            keep_preview(self.previews, self.options.root, seen.task)
-        record = record_of(
+        return record_of(
             outcomes,
             [e if isinstance(e, Exception) else _described(e, seen) for e in estimates],
             camera=KEYPOINT_CAMERA,
@@ -304,7 +285,6 @@ class UnseenObjects(Setting):
             points_2d=seen.points_2d,
             ids=seen.ids,
         )
-        return outcomes, record
 
 
 def _errors(found: ShapeEstimate, seen: UnseenObject) -> Row:

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import time
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
-import numpy as np
-
 from cadalign.datasets import KeypointNet
-from cadalign.errors import CadalignError, DataError
-from cadalign.estimation.view import View
+from cadalign.errors import DataError
 from cadalign.evaluation.benchmark import (
-    VIEW_NAMES,
     Benchmark,
     Case,
     Pair,
@@ -29,23 +25,19 @@ from cadalign.evaluation.instances.instance import (
     KeypointTask,
     make_hull_instances,
     make_instance,
-    mesh_of,
     scene_of,
 )
 from cadalign.evaluation.instances.record import (
     RECORD_COLUMNS,
-    AlignedShape,
-    aligned_shape,
     pose_of,
     record_of,
 )
-from cadalign.evaluation.methods import SHAPE, Method, MethodInput
-from cadalign.evaluation.metrics import BOX_IOU_UP_TO_SCALE
-from cadalign.evaluation.metrics.errors import estimate_errors, overlap_up_to_scale
+from cadalign.evaluation.methods import Method, MethodInput
+from cadalign.evaluation.metrics.errors import estimate_errors
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.work import FAILED, Columns, Outcome, Row, fingerprint, reason_of
-from cadalign.evaluation.shape_files import NO_SHAPES, ShapeFiles
-from cadalign.geometry.alignment import Box
+from cadalign.evaluation.runs.work import Outcome, Row, fingerprint_of_files
+
+logger = logging.getLogger("cadalign")
 
 KeypointView = tuple[KeypointTask, Instance]
 """A view of a model as an instance of the benchmark: its task, and what it shows."""
@@ -82,18 +74,7 @@ class KeypointTasks(Tasks[KeypointTask]):
 
     def fingerprint(self) -> str:
         """Hash of the annotations: a run must not go on with others."""
-        parts: list[Any] = []
-        for key in self.keys:
-            parts.append("".join(f"{name}\0" for name in key))
-            try:
-                model = self.dataset[key]
-            except CadalignError as error:
-                parts.append(str(error))
-                continue
-            rotations = [rotation.keypoints for rotation in model.symmetries.rotations]
-            parts += [model.keypoints.xyz, repr((model.symmetries.reflections, rotations))]
-            parts.append("mesh" if mesh_of(model, self._visibility) else "")
-        return fingerprint(*parts)
+        return fingerprint_of_files(self.dataset.files)
 
 
 @dataclass(frozen=True)
@@ -104,27 +85,18 @@ class KeypointViews(Setting):
     if one is given; its folders for pictures must exist.
     """
 
-    names = VIEW_NAMES
+    columns = COLUMNS
     record_columns = RECORD_COLUMNS
 
     options: KeypointNetOptions
     drawn_in: RunFolder | None
-    shapes: ShapeFiles = NO_SHAPES
-
-    @property
-    def columns(self) -> Columns:
-        """The columns of the result table."""
-        return (*COLUMNS, (BOX_IOU_UP_TO_SCALE.key, float)) if self.shapes.paths else COLUMNS
 
     def cases(self, tasks: Sequence[KeypointTask]) -> list[Case]:
-        start = time.perf_counter()
-        instances = self._instances(tasks)
-        share = (time.perf_counter() - start) / max(len(tasks), 1)
         return [
-            replace(self.failed(task)[0], error=instance, seconds=share)
+            replace(self.failed(task)[0], error=instance)
             if isinstance(instance, Exception)
             else self._case(task, instance)
-            for task, instance in zip(tasks, instances, strict=True)
+            for task, instance in zip(tasks, self._instances(tasks), strict=True)
         ]
 
     def _case(self, task: KeypointTask, instance: Instance) -> Case:
@@ -136,17 +108,15 @@ class KeypointViews(Setting):
             "stretch_z": stretch_z,
             "symmetry": str(task.symmetry),
         }
-        return Case(task.names, facts, (task, instance), without=self._without(task))
+        return Case(task.names, facts, (task, instance))
 
     def failed(self, task: KeypointTask) -> list[Case]:
         facts = {"visibility": "", "symmetry": "" if task.problem else str(task.symmetry)}
-        return [Case(task.names, facts, without=self._without(task))]
-
-    def _without(self, task: KeypointTask) -> tuple[str, ...]:
-        return () if task.category in dict(self.shapes.paths) else (SHAPE,)
+        return [Case(task.names, facts)]
 
     def _instances(self, tasks: Sequence[KeypointTask]) -> list[Instance | Exception]:
-        how = self.options.drawn
+        names = ("noise_px", "min_visible", "seed")
+        how = {name: getattr(self.options, name) for name in names}
         plain = [task for task in tasks if not task.problem and task.model is None]
         of_hulls = iter(make_hull_instances(plain, **how))
         instances: list[Instance | Exception] = []
@@ -167,67 +137,28 @@ class KeypointViews(Setting):
     def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
         poses = [pose_of(estimate) for _, estimate in pairs]
         tasks, instances = zip(*(view for view, _ in pairs), strict=True)
-        symmetries = [task.symmetry for task in tasks]
-        rows: list[Row | Exception] = [*estimate_errors(poses, instances, symmetries)]
-        for (_, estimate), instance, pose, row in zip(pairs, instances, poses, rows, strict=True):
-            if isinstance(row, Exception):
-                continue
-            if isinstance(estimate, AlignedShape):
-                row["rms_px"] = estimate.rms
-            if self.shapes.paths:  # it takes longer than most methods
-                box = Box.from_model(instance.bounds, pose)
-                row[BOX_IOU_UP_TO_SCALE.key] = overlap_up_to_scale(est=box, gt=instance.gt_box)
-        return rows
+        return [*estimate_errors(poses, instances, [task.symmetry for task in tasks])]
 
-    def finish(
-        self, case: Case, outcomes: list[Outcome], estimates: list[Any]
-    ) -> tuple[list[Outcome], Row | None]:
+    def finish(self, case: Case, outcomes: list[Outcome], estimates: list[Any]) -> str:
         _, instance = case.instance
-        first = outcomes[0]
-        if self.drawn_in is not None and first.is_ok and instance.scene is not None:
+        if self.drawn_in is not None and outcomes[0].is_ok and instance.scene is not None:
             problem = attempt(_draw, self.drawn_in, case.instance, pose_of(estimates[0]))
             if problem is not None:
-                failed = replace(first, status=FAILED, reason=reason_of(problem), values=case.facts)
-                outcomes = [failed, *outcomes[1:]]
+                logger.warning("%s: not drawn: %s", case.names["model_id"], problem)
         names = ("camera", "gt", "bounds", "points_3d", "points_2d", "ids")
         parts = {name: getattr(instance, name) for name in names}
-        return outcomes, record_of(outcomes, estimates, **parts)
+        return record_of(outcomes, estimates, **parts)
 
 
 def keypointnet_benchmark(
-    options: KeypointNetOptions, drawn_in: RunFolder | None = None, shapes: ShapeFiles = NO_SHAPES
+    options: KeypointNetOptions, drawn_in: RunFolder | None = None
 ) -> Benchmark:
-    """The methods of the options on views of models, and that of learned shapes where there are."""
-    setting = KeypointViews(options, drawn_in, shapes)
-    found = Benchmark.chosen(setting, options.methods, metrics=options.metrics)
-    batched = frozenset(each.name for each in found.methods if not each.has_statistics)
-    aligned = partial(_aligned, shapes=shapes, sigma=options.sigma)
-    of_shapes = (Method(SHAPE, aligned),) if shapes.paths else ()
-    return replace(found, batched=batched, methods=(*found.methods, *of_shapes))
-
-
-def _aligned(view: KeypointView, *, shapes: ShapeFiles, sigma: float) -> AlignedShape:
-    """The estimate from the learned shape of the model's category, of the keypoints that it has."""
-    # Only here: its kernels take time to import, and most runs do without.
-    from cadalign.estimation.align import align
-
-    task, instance = view
-    shape = shapes.shape(task.category)
-    known = np.isin(instance.ids, shape.ids)
-    ids, pixels = instance.ids[known].tolist(), instance.points_2d[known]
-    result = align(shape, View(instance.camera, pixels, ids=ids, sigma=sigma))
-    shared = np.isin(task.ids, shape.ids)
-    rows = shape.rows(task.ids[shared].tolist())
-    return aligned_shape(
-        result,
-        rows,
-        task.hull.xyz[shared] / instance.gt.scale,
-        # Outliers included, as of the other methods.
-        rms=float(np.sqrt((result.residuals**2).sum(axis=1).mean())),
-        sigma=sigma,
-        model_bounds=instance.bounds,
-        spans_points=instance.scene is None and len(rows) > 0,
+    """The methods of the options on views of models."""
+    found = Benchmark.chosen(
+        KeypointViews(options, drawn_in), options.methods, metrics=options.metrics
     )
+    batched = frozenset(each.name for each in found.methods if not each.has_statistics)
+    return replace(found, batched=batched)
 
 
 def _draw(folder: RunFolder, view: KeypointView, estimate: Any) -> None:

@@ -208,10 +208,8 @@ OUTLIER_SHARE = replace(OUTLIERS, key="outlier_share")
 NOISE = Metric("noise_px", "noise of the keypoints", "px", better=None, log=False)
 POINTS = Metric("points", "number of points", better=None)
 
-UP_TO_SCALE = (TRANSLATION_UP_TO_SCALE, BOX_IOU_UP_TO_SCALE)
-"""Columns of runs over views of models that some runs lack."""
 INSTANCE_METRICS = (
     *(ROTATION, TRANSLATION, SCALE_Y, SCALE_Z, BOX_IOU),
-    *(SYM_ROTATION, SYM_TRANSLATION, SYM_BOX_IOU, RMS),
+    *(SYM_ROTATION, SYM_TRANSLATION, SYM_BOX_IOU, RMS, TRANSLATION_UP_TO_SCALE),
 )
 """Columns of runs over views of models."""

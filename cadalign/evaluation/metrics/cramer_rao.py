@@ -7,21 +7,14 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
 from cadalign.estimation.options import Sigma, pixel_information
-from cadalign.estimation.problems import whitening_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import (
     Camera,
-    faced,
-    needs_facing,
     projection_jacobian,
-    turned_alignment,
-    turned_covariance,
 )
-from cadalign.geometry.pixels import perspective
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.shapes.parts import probability_within
-from cadalign.solvers.alignment import covariance_of, keypoint_objective
-from cadalign.solvers.constants import UNKNOWNS, UNOBSERVABLE
+from cadalign.solvers.constants import UNKNOWNS
 
 _LEAST_INFORMATION = 1e-12
 _LARGEST_LOG = 50.0
@@ -40,32 +33,25 @@ def cramer_rao_bound(
     for independent Gaussian noise of the keypoints; as `cadalign.Result.covariance`, (9, 9) or
     (10, 10). ``sigma`` and ``focal`` are as for `cadalign.fit`.
     """
-    in_camera = gt.apply(points_3d)
-    if needs_facing([camera]):
-        facing = faced(camera, camera.project(in_camera))
-        turn = facing.lens_from_camera
-        turned = turned_alignment(gt, turn.T)
-        bound = cramer_rao_bound(points_3d, facing, turned, sigma=sigma, focal=focal)
-        return turned_covariance(bound, turn)
-    rays = perspective(in_camera)
-    objective = keypoint_objective(points_3d, rays, whitening_of(sigma, rays, camera))
-    covariance = np.zeros((UNKNOWNS, UNKNOWNS))
-    if covariance_of(objective, gt.packed, covariance) >= 0:
-        raise DegenerateError("the points do not determine the alignment", where="points_3d")
-    bound = np.zeros((_FOCAL + 1, _FOCAL + 1))
-    bound[np.ix_(_OF_STRETCHED[:-1], _OF_STRETCHED[:-1])] = covariance
-    if focal != "estimate":
-        return bound[:_FOCAL, :_FOCAL]
+    used = _OF_STRETCHED if focal == "estimate" else _OF_STRETCHED[:-1]
     whitening = np.linalg.cholesky(pixel_information(sigma, len(points_3d))).swapaxes(1, 2)
-    rows = whitening @ projection_jacobian(points_3d, camera, gt)[:, :, _OF_STRETCHED]
-    others, own = rows.reshape(-1, UNKNOWNS + 1)[:, :-1], rows[..., -1].ravel()
-    gain = covariance @ (own @ others)
-    alone = own - others @ gain
-    gain = np.append(-gain, 1.0)
-    # A focal length that the others leave open is as uncertain as rounding errors let it be known.
-    information = max(float(alone @ alone), UNOBSERVABLE * float(own @ own))
-    bound[np.ix_(_OF_STRETCHED, _OF_STRETCHED)] += np.outer(gain, gain) / information
-    return bound
+    rows = (whitening @ projection_jacobian(points_3d, camera, gt)[:, :, used]).reshape(
+        -1, len(used)
+    )
+    scaled, norms = _scaled(rows)
+    size = _FOCAL + 1 if focal == "estimate" else _FOCAL
+    covariance = np.zeros((size, size))
+    covariance[np.ix_(used, used)] = np.linalg.inv(scaled.T @ scaled) / np.outer(norms, norms)
+    return covariance
+
+
+def _scaled(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Equations with columns of length 1, and the lengths; raises DegenerateError if degenerate."""
+    norms = np.linalg.norm(rows, axis=0)
+    scaled = rows / np.where(norms > 0, norms, 1.0)
+    if len(rows) < rows.shape[1] or np.linalg.eigvalsh(scaled.T @ scaled)[0] < _LEAST_INFORMATION:
+        raise DegenerateError("the points do not determine the alignment", where="points_3d")
+    return scaled, norms
 
 
 def sample_limit(
@@ -102,14 +88,8 @@ def limit_estimate(
     jacobian = projection_jacobian(points_3d, camera, gt)[:, :, _OF_STRETCHED[:-1]]
     jacobian = jacobian.reshape(-1, UNKNOWNS)
     noise = (points_2d - camera.project(gt.apply(points_3d))).ravel()
-    norms = np.linalg.norm(jacobian, axis=0)
-    if len(noise) < UNKNOWNS or not (norms > 0).all():
-        raise DegenerateError("the points do not determine the alignment", where="points_3d")
-    scaled = jacobian / norms
-    information = scaled.T @ scaled
-    if np.linalg.eigvalsh(information)[0] < _LEAST_INFORMATION:
-        raise DegenerateError("the points do not determine the alignment", where="points_3d")
-    step = np.linalg.solve(information, scaled.T @ noise) / norms
+    scaled, norms = _scaled(jacobian)
+    step = np.linalg.solve(scaled.T @ scaled, scaled.T @ noise) / norms
     # The exponential of a weakly determined scale would overflow.
     factors = np.exp(np.clip(step[6:], -_LARGEST_LOG, _LARGEST_LOG))
     return Alignment(
@@ -129,13 +109,6 @@ def probability_level(
     distribution, without a Gaussian. The level is uniform over [0, 1] where the covariance is that
     of the errors, 1 if the error has a part in a direction without variance, and None if there is
     no variance at all.
-
-    Examples
-    --------
-    >>> round(probability_level(np.array([1.0]), np.array([[1.0]])), 4)
-    0.6827
-    >>> probability_level(np.zeros(2), np.zeros((2, 2))) is None
-    True
     """
     if not np.isfinite(covariance).all():
         return None

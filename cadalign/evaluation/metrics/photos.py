@@ -11,7 +11,7 @@ Estimation" (NOCS), CVPR 2019, section 5: IoU at 25, 50 and 75 %, and degrees an
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -22,8 +22,8 @@ from cadalign.arrays import BoolArray
 from cadalign.evaluation import metrics
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics.errors import overlap_up_to_scale
-from cadalign.evaluation.runs.work import FAILED, Columns, Row
-from cadalign.evaluation.summary import known, median_of
+from cadalign.evaluation.runs.work import Columns, Row
+from cadalign.evaluation.summary import Group, known, medians
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.metrics import box_iou
 from cadalign.geometry.symmetry import Symmetry, symmetric_rotation_error
@@ -31,6 +31,7 @@ from cadalign.geometry.symmetry import Symmetry, symmetric_rotation_error
 if TYPE_CHECKING:
     from cadalign.evaluation.photos.target import PhotoTarget
     from cadalign.evaluation.runs.tables import Cells
+    from cadalign.evaluation.summary import Statistics
 
 
 @dataclass(frozen=True)
@@ -83,40 +84,29 @@ def score_alignment(
     }
 
 
-def medians_of(sets: Sequence[MetricSet], solved: Cells, *further: Metric) -> dict[str, float]:
-    """Medians over the objects that did not fail."""
-    medians = (*(metric for each in sets for metric in each.medians), *further)
-    return {metric.key: median_of(solved[metric.key]) for metric in medians}
+def statistics_of(sets: Sequence[MetricSet], cells: Cells) -> Statistics:
+    """Medians of the objects that did not fail, and shares of all whose truth is known.
 
-
-def measured_columns(sets: Sequence[MetricSet], cells: Cells) -> frozenset[str]:
-    """The columns that have a value in some row of a whole table: what its truth allows."""
-    names = (name for each in sets for name in each.columns)
-    return frozenset(name for name in names if len(known(cells[name])))
-
-
-def shares_of(
-    sets: Sequence[MetricSet], rated: Cells, solved: Cells, *, measured: Collection[str] = ()
-) -> dict[str, float]:
-    """Shares of all objects whose truth is known, of which failures count as misses.
-
-    Columns that were ``measured`` elsewhere have a share where nothing was solved, too.
+    Failures count as misses. Shares of a column that has no value in a whole table, of ``cells``,
+    are left out.
     """
-    failures = int((rated["status"] == FAILED).sum())
-    may_be_all = failures > 0 and not len(solved["status"])
+    measured = {name for name, _ in score_columns(sets) if len(known(cells[name]))}
+    found = medians(*(metric for each in sets for metric in each.medians))
+    rates = (rate for each in sets for rate in (*each.rates, *map(_share_of, each.shares)))
+    shares = {
+        each.metric.key: partial(_rate, each) for each in rates if each.column.key in measured
+    }
+    return {**found, **shares}
 
-    def share(total: float, count: int, column: Metric) -> float:
-        is_known = count > 0 or (may_be_all and column.key in measured)
-        return total / (count + failures) if is_known else np.nan
 
-    found = {}
-    for rate in (rate for each in sets for rate in each.rates):
-        count = int(np.isfinite(solved[rate.column.key].astype(float)).sum())
-        found[rate.metric.key] = share(float(rate.is_within(solved).sum()), count, rate.column)
-    for metric in (metric for each in sets for metric in each.shares):
-        values = known(solved[metric.key])
-        found[metric.key] = share(float(values.sum()), len(values), metric)
-    return found
+def _share_of(metric: Metric) -> Rate:
+    return Rate(metric, metric, lambda cells: np.nan_to_num(numbers(cells, metric)))
+
+
+def _rate(rate: Rate, group: Group) -> float:
+    failures = len(group.rows["method"]) - len(group.solved["method"])
+    count = len(known(group.solved[rate.column.key])) + failures
+    return float(rate.is_within(group.solved).sum()) / count if count else np.nan
 
 
 def numbers(cells: Cells, metric: Metric) -> Any:
@@ -176,14 +166,6 @@ def degree_cm(
     """Rotation error [degrees], symmetry-aware, and translation error [cm].
 
     ``metres`` is the length of one unit of the camera frame [m].
-
-    Examples
-    --------
-    >>> gt = Alignment(np.eye(3), [0, 0, 1000], [1, 1, 1])
-    >>> est = Alignment(np.eye(3), [0, 30, 1040], [1, 1, 1])
-    >>> degrees, cm = degree_cm(est=est, gt=gt, symmetry=Symmetry.none(), metres=0.001)
-    >>> degrees, round(cm, 9)
-    (0.0, 5.0)
     """
     gap = float(np.linalg.norm(est.translation - gt.translation))
     degrees = symmetric_rotation_error(est=est, gt=gt, symmetry=symmetry)

@@ -74,13 +74,6 @@ def scan2cad_errors(*, est: Alignment, gt: PlacedModel) -> Scan2CadErrors:
 
     Rotations about an axis of symmetry are compared exactly; the benchmark's script takes steps of
     10 degrees there, so that its errors are larger by up to 5 degrees.
-
-    Examples
-    --------
-    >>> truth = PlacedModel("chair", Alignment(np.eye(3), [0, 0, 2], [1, 1, 1]))
-    >>> errors = scan2cad_errors(est=Alignment(np.eye(3), [0, 0.1, 2], [1, 1.5, 0.5]), gt=truth)
-    >>> errors.translation, errors.scale, errors.is_aligned, errors.is_aligned_on_each_axis
-    (0.1, 0.0, True, False)
     """
     places = [each.apply([gt.center])[0] for each in (est, gt.alignment)]
     return Scan2CadErrors(

@@ -20,7 +20,8 @@ from cadalign.estimation.view import View
 from cadalign.evaluation.instances.record import box_alignment
 from cadalign.evaluation.methods import SHAPE
 from cadalign.evaluation.photos import protocols
-from cadalign.evaluation.photos.protocols import KeypointOptions, Protocol
+from cadalign.evaluation.photos.options import PhotosOptions
+from cadalign.evaluation.photos.protocols import Protocol
 from cadalign.evaluation.photos.target import Cad, PhotoTarget, rectangle_of
 from cadalign.evaluation.runs.work import LeftOutError
 from cadalign.geometry.alignment import Alignment, Box
@@ -59,7 +60,7 @@ class Sighting:
         return self.model.xyz[[row_of[name] for name in self.names]]
 
 
-def sight(target: PhotoTarget, protocol: Protocol, options: KeypointOptions) -> Sighting:
+def sight(target: PhotoTarget, protocol: Protocol, options: PhotosOptions) -> Sighting:
     """Collect what methods are given of an object.
 
     Raises LeftOutError if it has no camera, no model, or too few keypoints; and DataError if its
@@ -108,7 +109,7 @@ def _simulated(
     camera: Camera,
     cad: Cad,
     model: NamedPoints | None,
-    options: KeypointOptions,
+    options: PhotosOptions,
 ) -> tuple[NamedPoints, tuple[str, ...], FloatArray]:
     """Points of the model, those that the photo shows, and their pixels with noise.
 
@@ -145,7 +146,7 @@ def _in_mask(mask: BoolArray, pixels: FloatArray) -> BoolArray:
     return np.asarray(near[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)])
 
 
-def _sigma(target: PhotoTarget, protocol: Protocol, options: KeypointOptions, source: str) -> float:
+def _sigma(target: PhotoTarget, protocol: Protocol, options: PhotosOptions, source: str) -> float:
     """The standard deviation of keypoints [px] that methods are given."""
     if source == protocols.SIMULATED:
         return max(options.simulated_noise_px, _LEAST_PX)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -12,18 +11,15 @@ import numpy as np
 from cadalign.errors import DataError
 from cadalign.estimation.result import Result
 from cadalign.evaluation.benchmark import (
-    VIEW_NAMES,
     Benchmark,
     Case,
     Setting,
     attempt,
     write_picture,
 )
-from cadalign.evaluation.experiments.photos import COLUMNS, PhotosOptions
+from cadalign.evaluation.experiments.photos import COLUMNS
 from cadalign.evaluation.instances.pictures import (
     NO_PHOTO,
-    cut_out,
-    shown_photo,
     write_pictures,
     write_preview,
 )
@@ -45,15 +41,12 @@ from cadalign.evaluation.photos.methods import (
     sight,
     with_all_evidence,
 )
+from cadalign.evaluation.photos.options import PhotosOptions
 from cadalign.evaluation.photos.protocols import TRUTH, is_own, protocol_of
 from cadalign.evaluation.photos.target import PhotoTarget, PhotoTask, opened, targets_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import Outcome, Row
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
-from cadalign.geometry.pixels import rescaled_pixels
-from cadalign.io.images import ByteImage
-from cadalign.render.drawing.overlay import draw_overlay
 from cadalign.render.raycast.renderer import cast_geometry
 from cadalign.shapes.model import ShapeModel
 
@@ -64,7 +57,6 @@ _NO_SOURCE: Row = {"source": ""}
 class PhotoObjects(Setting):
     """Objects in photos: the setting of the experiment."""
 
-    names = VIEW_NAMES
     columns = COLUMNS
     record_columns = RECORD_COLUMNS
 
@@ -116,11 +108,9 @@ class PhotoObjects(Setting):
         scores = score_alignment(sighting.target, sets, estimate.alignment, estimate.box)
         return {"rms_px": _rms(estimate, sighting)} | scores
 
-    def finish(
-        self, case: Case, outcomes: list[Outcome], estimates: list[Any]
-    ) -> tuple[list[Outcome], Row | None]:
+    def finish(self, case: Case, outcomes: list[Outcome], estimates: list[Any]) -> str | None:
         if not any(outcome.is_ok for outcome in outcomes):
-            return outcomes, None
+            return None
         sighting: Sighting = case.instance
         if sighting.target.is_shown:
             methods = [outcome.names["method"] for outcome in outcomes]
@@ -128,7 +118,17 @@ class PhotoObjects(Setting):
             found = (pairs.get(name) for name in (sighting.protocol.best, *methods, TRUTH))
             best = next((each for each in found if isinstance(each, PhotoEstimate)), None)
             write_picture(draw_sighting, self.drawn_in, sighting, best)
-        return outcomes, sighting_record(sighting, outcomes, estimates)
+        return record_of(
+            outcomes,
+            [_described(each, sighting) for each in estimates],
+            camera=sighting.camera,
+            gt=sighting.target.gt,
+            stretch=np.ones(3),
+            bounds=sighting.bounds,
+            points_3d=sighting.points_3d,
+            points_2d=sighting.points_2d,
+            ids=np.arange(len(sighting.names)),
+        )
 
 
 def photos_benchmark(
@@ -156,23 +156,6 @@ def _rms(found: PhotoEstimate, sighting: Sighting) -> float | None:
     return rms if np.isfinite(rms) else None
 
 
-def sighting_record(
-    sighting: Sighting, outcomes: Sequence[Outcome], estimates: Sequence[PhotoEstimate | Any]
-) -> Row:
-    """The record of an object, in terms of the data set's model."""
-    return record_of(
-        outcomes,
-        [_described(each, sighting) for each in estimates],
-        camera=sighting.camera,
-        gt=sighting.target.gt,
-        stretch=np.ones(3),
-        bounds=sighting.bounds,
-        points_3d=sighting.points_3d,
-        points_2d=sighting.points_2d,
-        ids=np.arange(len(sighting.names)),
-    )
-
-
 def _described(estimate: PhotoEstimate | Any, sighting: Sighting) -> Estimate | Any:
     """An estimate in terms of the data set's model; the error where there is none."""
     if not isinstance(estimate, PhotoEstimate):
@@ -195,40 +178,22 @@ def _described(estimate: PhotoEstimate | Any, sighting: Sighting) -> Estimate | 
 def draw_sighting(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate | None) -> None:
     """Write the pictures of an object in a photo, and the preview of its model, to a run's folder.
 
-    ``overlays`` gets the photo with the boxes of truth and estimate, the estimated model and the
-    keypoints, ``thumbs`` the part around the object with the boxes, ``pictures`` the photo alone,
-    the folder of previews that of its model. Files appear whole or not at all.
+    The photo is grey where there is none.
     """
-    names = sighting.target.names
+    names, camera, cad = sighting.target.names, sighting.camera, sighting.target.cad
     stem = record_stem(names["category"], names["model_id"])
-    photo, camera = _photo(sighting)
-    scale = camera.width / sighting.camera.width
-    est_box = None if estimate is None else estimate.box
-    boxes: dict[str, Any] = {"gt_box": sighting.target.gt_box, "est_box": est_box}
-    cad = sighting.target.cad
-    frame = predicted = None
+    has_mesh = cad is not None and cad.has_mesh
+    try:
+        photo = sighting.target.photo.read_image()
+    except DataError:
+        photo = np.full((camera.height, camera.width, 3), NO_PHOTO, dtype=np.uint8)
+    more: dict[str, Any] = {}
     if estimate is not None:
         predicted = camera.project_where_ahead(estimate.alignment.apply(sighting.points_3d))
-        if cad is not None and cad.has_mesh:
-            frame = cast_geometry(cad.scene, camera, estimate.alignment)
-    observed = rescaled_pixels(sighting.points_2d, scale)
-    marks: dict[str, Any] = {"observed": observed, "reprojected": predicted}
-    image = draw_overlay(photo, camera, est_frame=frame, **boxes, **marks)
-    points, box = observed, sighting.target.gt_box
-    if box is not None and (box.corners[:, 2] > 0).all():
-        points = np.concatenate([points, camera.project(box.corners)])
-    crop, near = cut_out(photo, camera, points)
-    thumb = draw_overlay(crop, near, axes=False, legend=False, **boxes)
-    write_pictures(folder, stem, photo, thumb, image)
-    if cad is not None and cad.has_mesh:
+        more = {"reprojected": predicted, "est_box": estimate.box}
+        if cad is not None and has_mesh:
+            more["est_frame"] = lambda near: cast_geometry(cad.scene, near, estimate.alignment)
+    gt_box = sighting.target.gt_box
+    write_pictures(folder, stem, photo, camera, observed=sighting.points_2d, gt_box=gt_box, **more)
+    if cad is not None and has_mesh:
         write_preview(folder.previews / f"{stem}.json", cad.scene.mesh)
-
-
-def _photo(sighting: Sighting) -> tuple[ByteImage, Camera]:
-    """The photo in a size for a page, and its camera; a grey one where there is none."""
-    camera = sighting.camera
-    try:
-        image = sighting.target.photo.read_image()
-    except DataError:
-        image = np.full((camera.height, camera.width, 3), NO_PHOTO, dtype=np.uint8)
-    return shown_photo(image, camera)

@@ -5,7 +5,6 @@ A method's name is a base, and the evidence beside the keypoints, as in ``rigid+
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection
 from dataclasses import dataclass
 
@@ -16,7 +15,6 @@ from cadalign.errors import InputError, quote
 from cadalign.evaluation.methods import SHAPE
 from cadalign.evaluation.metrics.photos import NINE_DOF, VIEWPOINT, MetricSet
 from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
-from cadalign.evaluation.options import ExperimentOptions
 
 SIMULATED = "simulated"
 """Source of keypoints that are projected with the true pose."""
@@ -28,14 +26,7 @@ EVIDENCE = (MASK, GRAVITY, IMAGE)
 
 
 def parts_of(method: str) -> tuple[str, frozenset[str]]:
-    """The base of a method, and its evidence.
-
-    Examples
-    --------
-    >>> base, evidence = parts_of("rigid+mask+gravity")
-    >>> base, sorted(evidence)
-    ('rigid', ['gravity', 'mask'])
-    """
+    """The base of a method, and its evidence."""
     base, *evidence = method.split("+")
     return base, frozenset(evidence)
 
@@ -60,33 +51,13 @@ def check_method(method: str) -> None:
         raise InputError(f"{base} takes keypoints alone", where="methods", fix=fix)
 
 
-def check_evidence(evidence: Collection[str], methods: Collection[str]) -> None:
-    """Check evidence that the methods by default are to get.
-
-    Raises InputError if a kind is unknown, or methods are given, which name their own.
-    """
-    for kind in evidence:
-        if kind not in EVIDENCE:
-            what = f"unknown evidence {quote(kind)}"
-            raise InputError(what, where="evidence", fix=f"known are {', '.join(EVIDENCE)}")
-    if evidence and methods:
-        fix = f"name it there, as in {RIGID}+{next(iter(evidence))}"
-        raise InputError("is for the methods by default alone", where="evidence", fix=fix)
-
-
 def default_methods(
     *,
     with_evidence: Collection[str],
     evidence: Collection[str],
     has_shape: bool,
 ) -> tuple[str, ...]:
-    """The methods for data that have some evidence, which the given bases get.
-
-    Examples
-    --------
-    >>> default_methods(with_evidence=("rigid",), evidence={"mask", "gravity"}, has_shape=False)[5:]
-    ('rigid+mask', 'rigid+gravity', 'rigid+mask+gravity')
-    """
+    """The methods for data that have some evidence, which the given bases get."""
     bases = [base for base in BASES if has_shape or base != SHAPE]
     more = []
     for base in (each for each in with_evidence if each in bases):
@@ -94,28 +65,6 @@ def default_methods(
         sets = [[kind] for kind in kinds] + ([kinds] if len(kinds) > 1 else [])
         more += ["+".join((base, *each)) for each in sets]
     return (*bases, *more)
-
-
-@dataclass(frozen=True, kw_only=True)
-class KeypointOptions(ExperimentOptions):
-    """Keypoints of objects in photos: which are given, and those that are simulated."""
-
-    simulated_noise_px: float = 1.0
-    """Standard deviation of simulated keypoints, in pixels."""
-    simulated_points: int = 24
-    """Number of points on a model of which the visible ones are simulated keypoints."""
-    sigma: float | None = None
-    """Standard deviation of annotated keypoints that methods are given, in pixels; by
-    default that of the data set."""
-    min_keypoints: int = 6
-    """Objects with fewer keypoints are left out."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_least(simulated_points=4, min_keypoints=1)
-        if self.sigma is not None and not 0 < self.sigma < math.inf:
-            raise InputError(f"{self.sigma} is not positive", where="sigma")
-        self.check_noise("simulated_noise_px")
 
 
 SETS = (VIEWPOINT, NINE_DOF, SCAN2CAD)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import platform
-import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -74,10 +73,9 @@ class RunFolder:
         """The files that pages and tables are made from."""
         return self.config_file, self.results, self.timings, self.records
 
-    def part(self, table: Path, index: int) -> Path:
-        """A chunk's rows of the results, timings or records."""
-        kind = "" if table == self.results else f".{table.stem}"
-        return self.parts / f"{index:07d}{kind}.parquet"
+    def part(self, index: int) -> Path:
+        """All cells of a chunk's rows."""
+        return self.parts / f"{index:07d}.parquet"
 
     def make(self) -> None:
         """Make the folder."""
@@ -89,17 +87,6 @@ class RunFolder:
             if (self.path / name).exists():
                 what = f"holds {name}, which is no run's: there is no {self.config_file.name}"
                 raise DataError(what, where=str(self.path), fix=_FIX_FOREIGN)
-
-    def remove(self) -> None:
-        """Remove a run without pictures; the folder stays where something else is in it."""
-        written = [self.path / name for name in _WRITTEN]
-        with self.locked():
-            shutil.rmtree(self.parts, ignore_errors=True)
-            for path in (self.results, self.records, *written, self.progress, self.config_file):
-                path.unlink(missing_ok=True)
-            (self.path / _LOCK).unlink(missing_ok=True)
-        with suppress(OSError):
-            self.path.rmdir()
 
     def made_for_pictures(self) -> RunFolder:
         """Make the folder and those in it that pictures go to; returns it by its full path."""

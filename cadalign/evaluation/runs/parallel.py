@@ -30,12 +30,13 @@ from concurrent.futures import (
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
 from functools import lru_cache, partial
+from itertools import chain
 from types import ModuleType
 from typing import Any, TypeVar
 
 from cadalign.arrays import worker_count
 from cadalign.errors import CadalignError, DataError, InputError
-from cadalign.evaluation.runs.work import AbortError, Experiment, Rows, reason_of
+from cadalign.evaluation.runs.work import AbortError, Experiment, Row, reason_of
 from cadalign.io.files import printable
 
 T = TypeVar("T")
@@ -47,7 +48,7 @@ _STARTS = 3  # of workers that die before they evaluate anything
 
 Chunk = tuple[int, Sequence[T]]
 """Number of a chunk, and its tasks."""
-Evaluated = Iterator[tuple[Chunk[T], Rows]]
+Evaluated = Iterator[tuple[Chunk[T], list[Row]]]
 Workers = Callable[[Experiment[Any], Iterable[Chunk[Any]]], Evaluated[Any]]
 """Place where chunks are evaluated, which yields each with its result, in any order."""
 
@@ -140,7 +141,7 @@ def _evaluated_elsewhere(
 
 def _evaluated(
     start: Callable[[], Executor],
-    call: Callable[[Sequence[T]], Rows],
+    call: Callable[[Sequence[T]], list[Row]],
     experiment: Experiment[T],
     chunks: Iterable[Chunk[T]],
     *,
@@ -154,7 +155,7 @@ def _evaluated(
     """
     executor, source = start(), iter(chunks)
     is_warm = is_broken = False
-    running: dict[Future[Rows], Chunk[T]] = {}
+    running: dict[Future[list[Row]], Chunk[T]] = {}
     lost: list[Chunk[T]] = []  # to be done again
     again: set[int] = set()
     try:
@@ -179,9 +180,8 @@ def _evaluated(
                         again.add(chunk[0])
                         lost.append(chunk)
                         continue
-                    rows = Rows.joined(
-                        [experiment.failure(each, KILLED_REASON) for each in chunk[1]]
-                    )
+                    failures = (experiment.failure(task, KILLED_REASON) for task in chunk[1])
+                    rows = list(chain.from_iterable(failures))
                 is_warm = True
                 yield chunk, rows
     finally:
@@ -256,11 +256,11 @@ def _load(pickled: bytes) -> None:
     _unpickled(pickled)
 
 
-def _evaluate_pickled(pickled: bytes, tasks: Sequence[Any]) -> Rows:
+def _evaluate_pickled(pickled: bytes, tasks: Sequence[Any]) -> list[Row]:
     return evaluate_chunk(_unpickled(pickled), tasks)
 
 
-def evaluate_chunk(experiment: Experiment[T], tasks: Sequence[T]) -> Rows:
+def evaluate_chunk(experiment: Experiment[T], tasks: Sequence[T]) -> list[Row]:
     """Evaluate tasks; one that raises becomes failed rows and does not stop the others."""
     try:
         return experiment.evaluate(tasks)
@@ -269,7 +269,7 @@ def evaluate_chunk(experiment: Experiment[T], tasks: Sequence[T]) -> Rows:
     except Exception as error:
         if len(tasks) == 1:
             return experiment.failure(tasks[0], reason_of(error))
-    return Rows.joined([evaluate_chunk(experiment, [task]) for task in tasks])
+    return [row for task in tasks for row in evaluate_chunk(experiment, [task])]
 
 
 # Workers of a cluster -----------------------------------------------------------------------------

@@ -10,7 +10,6 @@ interrupted or who did the work.
 from __future__ import annotations
 
 import logging
-import os
 import platform
 import shutil
 import time
@@ -24,7 +23,13 @@ from cadalign.arrays import is_whole as is_integer
 from cadalign.errors import InputError, quote
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.parallel import Workers, in_processes, in_this_process, on_dask
-from cadalign.evaluation.runs.tables import is_whole, read_table, write_rows, write_tables
+from cadalign.evaluation.runs.tables import (
+    SECONDS,
+    is_whole,
+    read_cells,
+    write_rows,
+    write_tables,
+)
 from cadalign.evaluation.runs.work import Columns, Experiment, Plan
 from cadalign.io.files import made_folder, write_json
 
@@ -61,9 +66,14 @@ def execute(
         _sweep(folder.path)
         if not folder.is_finished:
             _do_chunks(plan, folder, workers, on_progress)
-            for table, columns in _tables(plan.experiment, folder).items():
-                parts = (folder.part(table, k) for k in range(-(-total // plan.chunk_size)))
-                write_tables(table, columns, map(read_table, parts))
+            parts = [folder.part(k) for k in range(-(-total // plan.chunk_size))]
+            tables = {folder.timings: SECONDS, folder.records: plan.experiment.record_columns}
+            # The results last: they say that the run is done.
+            for path, columns in {**tables, folder.results: plan.experiment.columns}.items():
+                if columns:
+                    is_record = path == folder.records
+                    found = (read_cells(part, columns, is_record=is_record) for part in parts)
+                    write_tables(path, columns, found)
         on_progress(Progress(total, total))
         shutil.rmtree(folder.parts, ignore_errors=True)
 
@@ -90,7 +100,7 @@ def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: 
     _sweep(made_folder(folder.parts))
     experiment, tasks, size = plan.experiment, plan.tasks, plan.chunk_size
     starts = range(0, len(tasks), size)
-    missing = [k for k in range(len(starts)) if not _is_done(experiment, folder, k)]
+    missing = [k for k in range(len(starts)) if not _is_done(experiment, folder.part(k))]
     done = len(tasks) - sum(min(size, len(tasks) - starts[index]) for index in missing)
     note = _progress_file(folder.progress, len(tasks), done)
     on_progress(Progress(done, len(tasks)))
@@ -98,59 +108,44 @@ def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: 
         return
     chunks = ((index, tasks[starts[index] : starts[index] + size]) for index in missing)
     for (index, some), found in workers(experiment, chunks):
-        rows = {folder.timings: found.timings, folder.records: found.records}
-        for table, columns in _tables(experiment, folder).items():
-            part = folder.part(table, index)
-            write_rows(part, columns, rows.get(table, found.rows))
+        write_rows(folder.part(index), _columns_of_parts(experiment), found)
         done += len(some)
         note(done, False)
         on_progress(Progress(done, len(tasks)))
     note(done, True)
 
 
-def _is_done(experiment: Experiment[Any], folder: RunFolder, index: int) -> bool:
-    """True if all tables of a chunk can be read; one that was done, but is damaged, is told of."""
-    if not folder.part(folder.results, index).is_file():
+def _is_done(experiment: Experiment[Any], part: Path) -> bool:
+    """True if a chunk can be read; one that was done, but is damaged, is told of."""
+    if not part.is_file():
         return False
-    for table, columns in _tables(experiment, folder).items():
-        part = folder.part(table, index)
-        if not is_whole(part, columns):
-            logger.warning("%s: missing or damaged; its tasks are done again", part)
-            return False
+    if not is_whole(part, _columns_of_parts(experiment)):
+        logger.warning("%s: damaged; its tasks are done again", part)
+        return False
     return True
 
 
-def _tables(experiment: Experiment[Any], folder: RunFolder) -> dict[Path, Columns]:
-    tables = {folder.timings: experiment.timing_columns}
-    records: Columns | None = getattr(experiment, "record_columns", None)
-    if records is not None:
-        tables[folder.records] = records
-    # The results last: they say that a chunk, or the run, is done.
-    return {**tables, folder.results: experiment.columns}
+def _columns_of_parts(experiment: Experiment[Any]) -> Columns:
+    """Columns of the results, then the seconds, then what the records have besides."""
+    own = [each for each in experiment.record_columns if each not in experiment.columns]
+    return (*experiment.columns, *SECONDS, *own)
 
 
 def _progress_file(file: Path, total: int, done_before: int) -> Callable[[int, bool], None]:
     """A function that writes ``progress.json``, unless it has just done so and is not the last."""
     start, written = time.time(), 0.0
+    started = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(start))
+    fixed = {"tasks": total, "tasks_done_before": done_before, "started": started}
 
     def note(done: int, is_last: bool) -> None:
         nonlocal written
         now = time.time()
-        if not is_last and now - written < _PROGRESS_EVERY:
-            return
-        written = now
-        write_json(
-            file,
-            {
-                "tasks_done": done,
-                "tasks": total,
-                "tasks_done_before": done_before,
-                "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(start)),
-                "seconds": round(now - start, 3),
-                "host": platform.node(),
-                "process": os.getpid(),
-            },
-        )
+        if is_last or now - written >= _PROGRESS_EVERY:
+            written = now
+            seconds = round(now - start, 3)
+            write_json(
+                file, {**fixed, "tasks_done": done, "seconds": seconds, "host": platform.node()}
+            )
 
     return note
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cadalign.arrays import is_number
+from cadalign.arrays import FloatArray, is_number
 from cadalign.errors import DataError, quote
 from cadalign.evaluation.metrics import Metric, metric_named
 from cadalign.evaluation.options import name_of
@@ -38,8 +38,7 @@ _TYPES = {
 }
 Cells = dict[str, npt.NDArray[Any]]
 """Columns of a table by name."""
-_SECONDS: Columns = (("seconds", float),)
-_NO_TIMINGS = pa.table({})
+SECONDS: Columns = (("seconds", float),)
 _TIMINGS_FIX = "remove it: the run is shown without times"
 _RECORDS_FIX = "remove it: the run is shown without its instances"
 _FIX = "give a folder that cadalign demo, evaluate or simulate has written"
@@ -76,6 +75,14 @@ def read_table(path: Path, *, fix: str = DONE_ANEW) -> pa.Table:
         str((table.column_names, table.schema))
         table.validate(full=True)
         return table
+
+
+def read_cells(path: Path, columns: Columns, *, is_record: bool = False) -> pa.Table:
+    """Read some columns of a chunk; of records, the rows that have a cell in the last column."""
+    with _reading(path, DONE_ANEW):
+        names = [name for name, _ in columns]
+        table = pq.read_table(path, columns=names, use_threads=False)
+        return table.filter(table[names[-1]].is_valid()) if is_record else table
 
 
 def read_groups(path: Path, *, fix: str) -> Iterator[pa.Table]:
@@ -153,17 +160,17 @@ def _regrouped(tables: Iterable[pa.Table]) -> Iterator[pa.Table]:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A run with its tables: the rows that there are, of so many tasks that are done.
+    """A run with its results: the rows that there are, of so many tasks that are done.
 
-    ``name`` is its name beside others, ``config`` the content of ``run.json``; ``timings`` is empty
-    where times were not kept.
+    ``name`` is its name beside others, ``config`` the content of ``run.json``, ``seconds`` (n,) the
+    rows' times, NaN where they were not kept.
     """
 
     folder: RunFolder
     name: str
     config: dict[str, Any]
     results: pa.Table
-    timings: pa.Table
+    seconds: FloatArray
     done: int
     total: int
 
@@ -181,10 +188,18 @@ class Run:
         name = path.name if name is None else name
         total = int(config.get("tasks", 0))
         if folder.is_finished:
-            results, timings = _finished(folder, columns)
-            return cls(folder, name, config, results, timings, total, total)
+            results = checked(
+                read_table(folder.results), columns, path=folder.results, fix=DONE_ANEW
+            )
+            times = np.full(len(results), np.nan)
+            if folder.timings.is_file():
+                timings = read_table(folder.timings, fix=_TIMINGS_FIX)
+                timings = checked(timings, SECONDS, path=folder.timings, fix=_TIMINGS_FIX)
+                if len(timings) == len(results):
+                    times = timings["seconds"].to_numpy(zero_copy_only=False).astype(float)
+            return cls(folder, name, config, results, times, total, total)
         size = int(config.get("chunk_size", 1))
-        parts = [index for index in _parts(folder, folder.results) if index * size < total]
+        parts = [index for index in _parts(folder) if index * size < total]
         if not parts:
             raise DataError(
                 "nothing of the run is finished yet",
@@ -192,10 +207,10 @@ class Run:
                 fix="wait, or start the command that made it again: it goes on",
             )
         done = sum(min(size, total - index * size) for index in parts)
-        results = _joined([folder.part(folder.results, index) for index in parts], columns)
-        files = [folder.part(folder.timings, index) for index in parts]
-        timings = _joined(files, _SECONDS) if all(map(Path.is_file, files)) else _NO_TIMINGS
-        return cls(folder, name, config, results, timings, done, total)
+        table = _joined([folder.part(index) for index in parts], (*columns, *SECONDS))
+        own = table.column_names[: table.column_names.index("seconds")]
+        times = table["seconds"].to_numpy(zero_copy_only=False).astype(float)
+        return cls(folder, name, config, table.select(own), times, done, total)
 
     @property
     def experiment(self) -> str:
@@ -244,10 +259,7 @@ class Run:
     def cells(self) -> Cells:
         """Columns of the results, and ``seconds``, NaN where they were not kept."""
         cells = {name: self.column(name) for name in self.results.column_names}
-        seconds = np.full(len(self.results), np.nan)
-        if len(self.timings) == len(self.results):
-            seconds = self.timings["seconds"].to_numpy(zero_copy_only=False).astype(float)
-        return {**cells, "seconds": seconds}
+        return {**cells, "seconds": self.seconds}
 
     def column(self, name: str) -> npt.NDArray[Any]:
         """A column of the results."""
@@ -261,39 +273,25 @@ class Run:
         """Rows of the table of instance records; none of runs that keep none."""
         for path in self._record_files():
             for table in read_groups(path, fix=_RECORDS_FIX):
+                if not self.is_finished and columns[-1][0] in table.column_names:
+                    table = table.filter(table[columns[-1][0]].is_valid())
                 yield from checked(table, columns, path=path, fix=_RECORDS_FIX).to_pylist()
 
     def record_bytes(self) -> int:
         """Rough size of the instance records."""
-        count = 0
-        for path in self._record_files():
-            count += uncompressed_bytes(path, fix=_RECORDS_FIX)
-        return count
+        return sum(uncompressed_bytes(path, fix=_RECORDS_FIX) for path in self._record_files())
 
     def _record_files(self) -> list[Path]:
-        folder, whole = self.folder, self.folder.records
+        whole = self.folder.records
         if self.is_finished:
             return [whole] if whole.is_file() else []
-        return [folder.part(whole, index) for index in _parts(folder, whole)]
+        return [self.folder.part(index) for index in _parts(self.folder)]
 
 
-def _parts(folder: RunFolder, table: Path) -> list[int]:
-    """The finished chunks that have a part of a table, in order."""
-    names = (path.name.removesuffix(".parquet") for path in folder.parts.glob("*.parquet"))
-    indices = sorted(int(name) for name in names if name.isdecimal())
-    return [index for index in indices if folder.part(table, index).is_file()]
-
-
-def _finished(folder: RunFolder, columns: Columns) -> tuple[pa.Table, pa.Table]:
-    """The results and the timings of a finished run; the latter may have been removed."""
-    path = folder.results
-    results = checked(read_table(path), columns, path=path, fix=DONE_ANEW)
-    path = folder.timings
-    if not path.is_file():
-        return results, _NO_TIMINGS
-    return results, checked(
-        read_table(path, fix=_TIMINGS_FIX), _SECONDS, path=path, fix=_TIMINGS_FIX
-    )
+def _parts(folder: RunFolder) -> list[int]:
+    """The finished chunks, in order."""
+    names = (path.stem for path in folder.parts.glob("*.parquet"))
+    return sorted(int(name) for name in names if name.isdecimal())
 
 
 def _joined(paths: Sequence[Path], columns: Columns) -> pa.Table:

@@ -59,23 +59,15 @@ class Outcome:
     reason: str = ""
     seconds: float | None = None
 
-    @classmethod
-    def failure(cls, reason: str, names: Row, **values: Any) -> Outcome:
-        """A failed task; ``values`` are the columns that are known of it all the same."""
-        return cls(names, values, FAILED, reason)
-
     @property
     def is_ok(self) -> bool:
         """True where there are metrics."""
         return self.status == OK
 
     def row(self) -> Row:
-        """The row of the result table."""
-        return {**self.names, "status": self.status, "reason": self.reason, **self.values}
-
-    def timing(self) -> Row:
-        """The row of the table of timings."""
-        return {**self.names, "seconds": self.seconds}
+        """The row of the result table, and its seconds."""
+        named = {**self.names, "status": self.status, "reason": self.reason}
+        return {**named, **self.values, "seconds": self.seconds}
 
 
 def status_of(error: Exception) -> str:
@@ -93,49 +85,21 @@ def reason_of(error: Exception) -> str:
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
-@dataclass(frozen=True)
-class Rows:
-    """Table rows of some tasks: results, and what differs from run to run.
-
-    ``records`` are instance records, of experiments that have ``record_columns`` besides what
-    `Experiment` asks for.
-    """
-
-    rows: list[Row]
-    timings: list[Row]
-    records: list[Row] = field(default_factory=list)
-
-    @classmethod
-    def of(cls, outcomes: Iterable[Outcome], records: Iterable[Row] = ()) -> Rows:
-        """The rows of outcomes."""
-        found = list(outcomes)
-        return cls([o.row() for o in found], [o.timing() for o in found], list(records))
-
-    @classmethod
-    def joined(cls, parts: Sequence[Rows]) -> Rows:
-        """The rows of successive tasks."""
-        return cls(
-            [row for part in parts for row in part.rows],
-            [row for part in parts for row in part.timings],
-            [row for part in parts for row in part.records],
-        )
-
-
 class Experiment(Protocol[T_contra]):
-    """Interface by which a run turns tasks into rows."""
+    """Interface by which a run turns tasks into rows, with cells of all three tables."""
 
     @property
     def columns(self) -> Columns:
         """The columns of the result table."""
 
     @property
-    def timing_columns(self) -> Columns:
-        """The columns of the table of timings."""
+    def record_columns(self) -> Columns:
+        """The columns of the table of records, for rows that have the last one; may be empty."""
 
-    def evaluate(self, tasks: Sequence[T_contra]) -> Rows:
+    def evaluate(self, tasks: Sequence[T_contra]) -> list[Row]:
         """The rows of some tasks, in their order."""
 
-    def failure(self, task: T_contra, reason: str) -> Rows:
+    def failure(self, task: T_contra, reason: str) -> list[Row]:
         """The rows of a task that could not be evaluated."""
 
 

@@ -12,8 +12,9 @@ from cadalign.evaluation.metrics.photos import (
     MetricSet,
     degree_cm,
     nine_dof_iou,
-    shares_of,
+    statistics_of,
 )
+from cadalign.evaluation.summary import Group
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.symmetry import Symmetry
 
@@ -48,8 +49,12 @@ def test_degrees_and_centimetres():
 def shares(chosen: MetricSet, **columns: list[float]) -> dict[str, float]:
     """Shares of a set by its metrics' names, of objects that are all ok."""
     cells = {name: np.array(values, dtype=object) for name, values in columns.items()}
-    cells["status"] = np.array(["ok"] * len(next(iter(columns.values()))), dtype=object)
-    return shares_of([chosen], cells, cells)
+    count = len(next(iter(columns.values())))
+    cells["method"] = np.array(["rigid"] * count, dtype=object)
+    for name in chosen.columns:
+        cells.setdefault(name, np.full(count, np.nan))
+    found = statistics_of([chosen], cells)
+    return {name: statistic(Group(cells, cells)) for name, statistic in found.items()}
 
 
 def test_shares_over_thresholds():

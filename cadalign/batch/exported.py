@@ -20,8 +20,6 @@ from cadalign.io.observation import OBSERVATION, Observation, kind_of
 from cadalign.render.drawing.model_overlay import mesh_of
 from cadalign.shapes.model import ShapeModel
 
-_FOLDER_ENDING = "_fit"
-
 
 def read_exported(
     fit: Path,
@@ -33,9 +31,9 @@ def read_exported(
 ) -> AlignedObject:
     """Read the result of `cadalign fit`, the file ``fit``, and what it was fitted to.
 
-    By default the ``observation`` is ``photo.json`` beside the folder ``photo_fit`` of the fit, and
-    the learned ``shape`` the observation's, if it names one. Raises DataError if a file is missing
-    or invalid, or the observation is not the one that was fitted.
+    By default the ``observation`` and the learned ``shape`` are those that the fit's file states.
+    Raises DataError if a file is missing or invalid, or the observation is not the one that was
+    fitted.
     """
     data = read_json(fit)
     if not isinstance(data, Mapping):
@@ -95,15 +93,10 @@ def _stored(fit: Path, data: Mapping[str, Any], name: str) -> Path | None:
 
 
 def _observation_of(fit: Path, data: Mapping[str, Any]) -> Path:
-    """The observation that a fit's file states, or else by where the file lies."""
+    """The observation that a fit's file states."""
     stated = _stored(fit, data, "observation")
     if stated is not None:
         return stated
-    folder = fit.resolve().parent
-    if folder.name.endswith(_FOLDER_ENDING):
-        path = folder.with_name(f"{folder.name.removesuffix(_FOLDER_ENDING)}.json")
-        if path.is_file():
-            return path
     raise InputError(
         f"{fit} does not tell which observation it is the fit of",
         where="--observation",

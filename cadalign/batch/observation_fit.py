@@ -130,7 +130,7 @@ class ObservationFit:
                 where=self.named("focal_prior"),
                 fix=f"give {self.named('focal')} estimate with it",
             )
-        prior = self._prior_for(observation, given, note) if focal == "estimate" else None
+        prior = self._prior_for(observation, given) if focal == "estimate" else None
         shown = prior_of_camera(prior, observation.camera)
         if shown is not None:
             note(f"Focal length is estimated, its prior: {shown}")
@@ -150,10 +150,8 @@ class ObservationFit:
         values = {each.name: getattr(self.fitting, each.name) for each in fields(self.fitting)}
         return {name: each for name, each in values.items() if each != getattr(FitOptions, name)}
 
-    def _prior_for(
-        self, observation: Observation, stored: Mapping[str, Any], note: Note
-    ) -> PriorOption:
-        """The prior on an estimated focal length: the flag's, the file's, or the photos'."""
+    def _prior_for(self, observation: Observation, stored: Mapping[str, Any]) -> PriorOption:
+        """The prior on an estimated focal length: the flag's, the file's, or the photo's."""
         given = self.focal_prior
         if given is not None and not isinstance(given, str):
             return FocalPrior(given, self.focal_prior_sigma)
@@ -162,7 +160,7 @@ class ObservationFit:
         if "focal_prior" in stored:
             prior = stored["focal_prior"]
             return FocalPrior(**prior) if isinstance(prior, dict) else prior
-        return _prior_of_photos(observation, note) or USUAL
+        return _prior_of_photos(observation) or USUAL
 
     def check_for(self, observation: Observation) -> None:
         """Refuse options that have no effect together with a shape or further evidence."""
@@ -316,16 +314,6 @@ def _located(how: ObservationFit, where: str) -> Iterator[None]:
             raise
 
 
-def _prior_of_photos(observation: Observation, note: Note) -> FocalPrior | None:
-    """The prior of the first photo's EXIF data, unless those of another photo differ from it."""
-    if observation.image is None:
-        return None
-    first = FocalPrior.from_exif(observation.image)
-    photos = [view.image for view in observation.others if view.image is not None]
-    for other in map(FocalPrior.from_exif, photos if first is not None else ()):
-        if first is not None and other is not None and not first.is_like(other):
-            note(
-                f"The photos' EXIF data differ ({first.focal:.4g} and {other.focal:.4g} px): unused"
-            )
-            return None
-    return first
+def _prior_of_photos(observation: Observation) -> FocalPrior | None:
+    """The prior of the first photo's EXIF data."""
+    return None if observation.image is None else FocalPrior.from_exif(observation.image)

@@ -7,6 +7,7 @@ and camera of several views are the first's.
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,13 +18,14 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
 from cadalign.datasets.models.shapenet import name_of_synset
-from cadalign.errors import CadalignError, DataError, RenderError
+from cadalign.errors import CadalignError, RenderError
 from cadalign.estimation.result import Result
+from cadalign.evaluation.benchmark import write_picture
 from cadalign.evaluation.instances.pictures import write_pictures, write_preview
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
-from cadalign.evaluation.runs.work import OK, AbortError, Columns, Row
+from cadalign.evaluation.runs.work import OK, Columns, Row
 from cadalign.geometry.alignment import Box
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import quat_wxyz_from_rotation
@@ -174,15 +176,10 @@ def draw_fit(
     box = None if result is None else Box.from_model(result.bounds, result.alignment)
     try:
         if photo is not None:
-            how: dict[str, Any] = {"observed": seen.points_2d, "est_box": box}
-            write_pictures(folder, stem, photo, camera, with_overlay=False, **how)
+            how = partial(write_pictures, observed=seen.points_2d, est_box=box, with_overlay=False)
+            write_picture(how, folder, stem, photo, camera)
         if mesh is not None:
-            write_preview(folder.previews / f"{stem}.json", mesh)
-    except (DataError, OSError) as error:
-        raise AbortError(
-            f"a picture cannot be written: {error}",
-            fix="free some space, and start the same command again: the run goes on",
-        ) from None
+            write_picture(write_preview, folder.previews / f"{stem}.json", mesh)
     except RenderError as error:
         troubles.append(f"not drawn: {error}")
     return tuple(troubles)

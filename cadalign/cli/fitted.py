@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cadalign.cli.common import make_folder
-from cadalign.errors import DataError, InputError
-from cadalign.io.documents import read_json, written_path
-from cadalign.io.files import keeping, remove_earlier, write_text
+from cadalign.errors import InputError
+from cadalign.io.documents import written_path
+from cadalign.io.files import keeping, write_text
 
 if TYPE_CHECKING:
     from cadalign.arrays import BoolArray, FloatArray
@@ -47,19 +46,14 @@ class FittedFile:
     def write(self, out: Path, *, overlay: Path | None = None) -> list[Path]:
         """Write fit.json and the pictures to a folder; returns the pictures' paths.
 
-        The ``overlays`` go to ``overlay``, those of further views beside it. Pictures of an earlier
-        fit are removed.
+        The ``overlays`` go to ``overlay``, those of further views beside it.
         """
         make_folder(out)
-        earlier = {path.absolute() for path in _written_files(out)}
         with keeping(self.inputs):
             # First what somebody names, which may be refused.
             further = [] if overlay is None else _write_pictures(overlay, self.overlays)
             write_text(out / "fit.json", self.text(out))
-            written = _write_pictures(out / "overlay.png", self.pictures) + further
-            paths = (*written, out / "fit.json")
-            remove_earlier(out, earlier.difference(path.absolute() for path in paths))
-            return written
+            return _write_pictures(out / "overlay.png", self.pictures) + further
 
     def drawn(
         self,
@@ -113,18 +107,6 @@ class FittedFile:
             for photo, view in zip(photos, result.views, strict=True)
         )
         return replace(found, overlays=tuple(overlays))
-
-
-def _written_files(folder: Path) -> list[Path]:
-    """The files that a fit wrote to a folder, by its fit.json: this, and the pictures."""
-    path = folder / "fit.json"
-    found: Any = None
-    with suppress(DataError):
-        found = read_json(path)
-    views = found.get("views") if isinstance(found, dict) else None
-    if not isinstance(views, list) or not views:
-        return []
-    return [path, *_picture_paths(folder / "overlay.png", len(views))]
 
 
 def _picture_paths(path: Path, count: int) -> list[Path]:

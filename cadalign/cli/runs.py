@@ -12,13 +12,10 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
-    ProgressColumn,
-    Task,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.text import Text
 
 from cadalign.cli.common import beside, exit_code, new_console, print_json, print_table, say
 from cadalign.cli.options import flags_of, with_flags
@@ -86,17 +83,9 @@ def write_run_report(folder: RunFolder) -> None:
     say(f"Report: {report.path}")
 
 
-class _Rate(ProgressColumn):
-    """Tasks a second, lately."""
-
-    def render(self, task: Task) -> Text:
-        rate = task.speed or 0.0
-        return Text(f"{rate:,.0f}/s" if rate >= 10 else f"{rate:.1f}/s")
-
-
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
-    """Show a progress bar with rate and time left; yields what takes how many of all are done."""
+    """Show a progress bar with the time left; yields what takes how many of all are done."""
     if not sys.stderr.isatty():  # rich would end in an empty line; before 14.3 also if disabled
         yield lambda done, total: None
         return
@@ -104,7 +93,6 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
-        _Rate(),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from cadalign.arrays import is_number, is_real
 from cadalign.errors import CadalignError, InputError, quote, unknown
-from cadalign.evaluation.methods import PNP_METHODS, Method, MethodInput, fit_methods
+from cadalign.evaluation.methods import Method, MethodInput, fit_methods
 from cadalign.evaluation.metrics import Metric, metric_named
 from cadalign.evaluation.options import Function, is_function, name_of
 from cadalign.evaluation.runs.work import Columns
@@ -141,7 +141,7 @@ def choose_methods(
     ``own`` are a benchmark's own methods by name, by default those of `cadalign.fit`. Raises
     InputError if a method is unknown, or none is given.
     """
-    table = PNP_METHODS | dict(fit_methods() if own is None else own)
+    table = fit_methods() if own is None else own
     return tuple(
         Method(name_of(each), FunctionMethod(each), is_general=True)
         if is_function(each)
@@ -152,7 +152,7 @@ def choose_methods(
 
 def checked_methods(chosen: Iterable[Any], own: Collection[str] | None = None) -> tuple[Any, ...]:
     """The names and functions, each once, if all are known; see `choose_methods`."""
-    known = [*(fit_methods() if own is None else own), *PNP_METHODS]
+    known = fit_methods() if own is None else own
     found = tuple(dict.fromkeys(chosen))
     if not found:
         fix = f"known are {', '.join(known)}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -108,19 +107,6 @@ def new_figure(**options: Any) -> Iterator[Figure]:
         yield Figure(layout="constrained", **options)
 
 
-def label_log_axis(axes: Axes) -> None:
-    """Write plain numbers, also between the powers of ten, on a logarithmic vertical axis."""
-    from matplotlib.ticker import FuncFormatter, LogLocator
-
-    low, high = axes.get_ylim()
-    decades = np.log10(high / low)
-    subs = (1.0, 2.0, 5.0) if decades < 3.5 else (1.0,)
-    axes.yaxis.set_major_locator(LogLocator(subs=subs, numticks=30))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_locator(LogLocator(subs=[float(k) for k in range(2, 10)], numticks=99))
-    axes.yaxis.set_minor_formatter(FuncFormatter(lambda value, _: ""))
-
-
 def save_figure(figure: Figure, path: Path) -> list[Path]:
     """Write a figure as PNG and PDF, ``path`` being without an ending; returns the files."""
     files = [path.with_name(f"{path.name}.{ending}") for ending in ("png", "pdf")]
@@ -134,9 +120,6 @@ def save_figure(figure: Figure, path: Path) -> list[Path]:
 
 QUARTILES_NOTE = "line: median, band: quartiles"
 _DIGITS = 6
-# Of lines and markers [points].
-_THINNEST, _SMALLEST, _STEP = 1.5, 4.5, 0.35
-_MOST_STEPS = 7
 _MOST_TICKS = 30
 
 
@@ -250,28 +233,22 @@ def draw_plot(path: Path, plot: Plot) -> list[Path]:
             axes.minorticks_off()
             axes.tick_params(axis="x", labelrotation=45 if len(ticks) > 9 else 0)
         if y.log:
-            label_log_axis(axes)
-        axes.set_xlabel(in_math(x.axis))
-        axes.set_ylabel(in_math(y.axis))
+            axes.yaxis.set_major_formatter("{x:g}")
+        axes.set_xlabel(x.axis)
+        axes.set_ylabel(y.axis)
         axes.set_title(plot.note, fontsize=9, color="0.35", loc="left")
         figure.legend(loc="outside lower center", ncols=2, handlelength=3.6)
         return save_figure(figure, path)
 
 
-def in_math(label: str) -> str:
-    """A label with its indices set as such."""
-    return re.sub(r"\bs_([yz])\b", r"$s_\1$", label)
-
-
 def _draw_lines(axes: Axes, plot: Plot) -> list[tuple[Any, Any, Any, str]]:
-    """Draw lines, thinner ones last, since they often coincide; returns their bands."""
+    """Draw lines; returns their bands."""
     bands = []
-    for place, trace in enumerate(plot.traces):
+    for trace in plot.traces:
         look = look_of(trace.method)
         middle = np.array(trace.y, dtype=float)
         if not np.isfinite(middle).any():
             continue
-        below = _STEP * min(len(plot.traces) - 1 - place, _MOST_STEPS)
         axes.plot(
             trace.x,
             middle,
@@ -279,8 +256,6 @@ def _draw_lines(axes: Axes, plot: Plot) -> list[tuple[Any, Any, Any, str]]:
             linestyle=look.dash,
             marker=look.marker if len(trace.x) <= _MOST_TICKS else "",
             label=look.label,
-            linewidth=_THINNEST + below,
-            markersize=_SMALLEST + 2 * below,
         )
         # The Cramer-Rao bound, without markers, is a floor whose band would hide the others.
         if trace.low is not None and trace.high is not None and look.marker:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cadalign.datasets import AnnotatedModel, KeypointNet
-from cadalign.errors import DataError, InputError, quote
+from cadalign.errors import InputError, quote
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import fingerprint
 from cadalign.io.files import made_folder, read_bytes
@@ -65,7 +65,7 @@ def learn(
     shapes = []
     for category in categories:
         file = place / f"{category}-{_hash_of_models(train[category])}.shape"
-        if not _is_readable(file):
+        if not file.is_file():
             logger.info("learning the shape of %s from %d models", category, len(train[category]))
             ShapeModel.from_dataset(dataset, category, split=split, meshes=False).save(file)
         shapes.append((category, file.absolute()))
@@ -84,15 +84,6 @@ def learn(
 def _hash_of_models(models: Sequence[AnnotatedModel]) -> str:
     keypoints = ((each.model_id, each.keypoints) for each in models)
     return fingerprint(*(part for name, k in keypoints for part in (f"{name}\0", k.xyz, k.ids)))
-
-
-def _is_readable(file: Path) -> bool:
-    """True for a shape model's file of this version; others are learned anew."""
-    try:
-        ShapeModel.open(file)
-    except DataError:
-        return False
-    return True
 
 
 @lru_cache(maxsize=32)

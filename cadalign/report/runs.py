@@ -150,8 +150,7 @@ def summary_of(runs: Sequence[Run]) -> str:
 
 def settings_of(run: Run) -> list[tuple[str, str]]:
     """A run's settings by name."""
-    sweep = run.config.get("sweep")
-    config = {**run.config, **(sweep if isinstance(sweep, dict) else {})}
+    config = run.config
     # Data first, methods and seed last.
     names = [field.name for field in fields(spec_of(run).options)]
     names.sort(key=lambda name: {"root": -1, "path": -1, "methods": 1, "seed": 2}.get(name, 0))

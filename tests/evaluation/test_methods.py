@@ -22,7 +22,7 @@ from cadalign import Alignment, Camera, Model
 from cadalign.cli import main
 from cadalign.errors import InputError
 from cadalign.evaluation.experiments.photos import PhotosOptions
-from cadalign.evaluation.methods import PNP_METHODS, MethodInput
+from cadalign.evaluation.methods import MethodInput
 from cadalign.evaluation.plots import look_of
 from cadalign.evaluation.simulation import simulate_problem
 
@@ -90,7 +90,7 @@ def test_names_that_are_unknown_are_refused_with_all_that_are_known() -> None:
         InputError, match=r"unknown method 'optimum', did you mean 'optimal'\?"
     ) as e:
         simulate(["optimum"])
-    for name in ("optimal", "limit", "opencv-sqpnp", "poselib"):
+    for name in ("optimal", "limit", "ransac-optimal"):
         assert name in str(e.value)
 
 
@@ -226,7 +226,7 @@ def test_a_run_names_its_functions(tmp_path: Path) -> None:
     simulate([linear, "aepnp"], out=tmp_path / "run")
     simulate(["support.solving:linear", "aepnp"], out=tmp_path / "run")
     config = json.loads((tmp_path / "run" / "run.json").read_text())
-    assert config["sweep"]["methods"] == ["support.solving:linear", "aepnp"]
+    assert config["methods"] == ["support.solving:linear", "aepnp"]
 
 
 # --- on the command line -----------------------------------------------------------------------
@@ -280,30 +280,6 @@ def test_functions_that_cannot_be_used_are_refused(
 
 
 # --- the examples ------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["opencv-epnp", "opencv-sqpnp", "opencv-iterative", "poselib"])
-def test_foreign_solvers_find_the_pose_of_a_model_as_it_is(name: str) -> None:
-    if name == "poselib":
-        pytest.importorskip("poselib", reason="PoseLib is not installed")
-    rng = np.random.default_rng(1)
-    problem = simulate_problem(rng, points=12, noise_px=0.0, stretch=(1.0, 1.0))
-    given = MethodInput(problem.points_3d, problem.points_2d, problem.camera, 1.0)
-    found = PNP_METHODS[name].solve(given)
-    np.testing.assert_allclose(found.rotation, problem.alignment.rotation, atol=1e-4)
-    np.testing.assert_allclose(found.translation, problem.alignment.translation, atol=1e-3)
-
-
-def test_foreign_solvers_without_a_pose_fail_with_a_reason() -> None:
-    table = simulate(["opencv-iterative"], values=[4], runs=1)
-    assert table.status.tolist() == ["failed"]
-    assert table.reason[0].startswith("OpenCV: ")
-
-
-def test_a_missing_poselib_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "poselib", None)
-    table = simulate(["poselib"])
-    assert set(table.reason) == {"PoseLib is not installed; pip install poselib"}
 
 
 @pytest.mark.long

@@ -8,7 +8,6 @@ problems that a method solved at one value.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, fields, replace
 from functools import partial
@@ -17,20 +16,19 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from cadalign.arrays import instance_rng
-from cadalign.errors import DataError, InputError, refuse_unused, unknown
+from cadalign.errors import DataError, InputError, quote, refuse_unused, unknown
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
 from cadalign.evaluation.methods import Method, MethodInput
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics.errors import alignment_errors
-from cadalign.evaluation.options import FunctionOptions, name_of, plain_value
+from cadalign.evaluation.options import FunctionOptions, plain_value
 from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, plot_against
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Columns, Plan, Row
 from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
 from cadalign.evaluation.summary import Group, Quartiles, Summary, group_name, summarize
 from cadalign.geometry.alignment import Alignment
-from cadalign.io.documents import convert, in_file
 
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
@@ -254,13 +252,12 @@ VARIED = {metric.key: metric for metric in (metrics.NOISE, metrics.POINTS, metri
 
 
 def kind_of(run: Run) -> SweepKind:
-    """The sweep that a run makes."""
-    given = run.config.get("sweep")
-    with in_file(run.folder.config_file):
-        found: SweepKind = convert(given, SweepKind, "sweep")
-        if any(abs(value) > sys.float_info.max for value in found.values):
-            raise DataError("a value is beyond all numbers", where="sweep.values")
-    return replace(found, methods=tuple(map(name_of, found.methods)))
+    """The sweep that a run makes, with its own settings."""
+    name = str(run.config.get("sweep"))
+    if name not in SWEEPS:
+        where = f"{run.folder.config_file}: sweep"
+        raise DataError(f"{quote(name)} is not one of {', '.join(SWEEPS)}", where=where)
+    return SWEEPS[name]
 
 
 def varied(run: Run) -> Metric:
@@ -286,9 +283,8 @@ def plots(runs: Sequence[Run]) -> list[Plot]:
     """Errors, and times where they are measured, against the quantity that is varied."""
     kind, x = kind_of(runs[0]), varied(runs[0])
     found = [summarize_sweep(run) for run in runs]
-    note = f"{_held(kind)}{kind.runs} problems each; {QUARTILES_NOTE}"
     return [
-        plot_against(found, x, metric, place=kind.column, note=note)
+        plot_against(found, x, metric, place=kind.column, note=QUARTILES_NOTE)
         for metric in _metrics(kind, runs[0])
     ]
 
@@ -298,11 +294,6 @@ def _metrics(kind: SweepKind, run: Run) -> tuple[Metric, ...]:
     return (*times, *ERRORS, *run.metrics)
 
 
-def _held(kind: SweepKind) -> str:
-    noise = "" if kind.column == "noise_px" else f"noise {kind.noise_px:g} px, "
-    return noise if kind.column == "points" else f"{noise}{kind.points} points, "
-
-
 _CHUNK, _CHUNK_TIMED = 64, 20
 
 
@@ -310,9 +301,8 @@ def plan(options: SweepOptions, folder: RunFolder) -> Plan[SweepTask]:
     """Plan a sweep."""
     kind = options.kind
     benchmark = sweep_benchmark(kind, options.seed, options.metrics)
-    config = {"experiment": options.experiment, "seed": options.seed, "sweep": plain_value(kind)}
     chunk = _CHUNK_TIMED if kind.is_timed else _CHUNK
-    return Plan(benchmark, sweep_tasks(kind), config | benchmark.further, chunk)
+    return benchmark.plan(options, sweep_tasks(kind), chunk=chunk, **plain_value(kind))
 
 
 SPEC = Spec(

@@ -42,7 +42,6 @@ from cadalign.retrieval.models import LibraryModel, ModelKey
 TOP = 50
 """Ranks beyond this are one."""
 _LEAST_SIGMA = 0.5  # keypoints without noise would leave no other model any chance
-_UNIT_BOUNDS = np.array([[-0.3] * 3, [0.3] * 3])
 _OPTIONS: dict[str, dict[str, Any]] = {
     "optimal": {},
     "optimal-unstretched": {"stretch": "none"},

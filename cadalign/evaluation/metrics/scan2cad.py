@@ -6,7 +6,7 @@ the benchmark's script.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -56,31 +56,27 @@ class Scan2CadErrors:
         return self.is_aligned and bool((self.scale_axes <= MAX_SCALE).all())
 
 
-@dataclass(frozen=True, eq=False)
-class PlacedModel:
-    """A true model placed in a scene."""
+def scan2cad_errors(
+    *,
+    est: Alignment,
+    gt: Alignment,
+    symmetry: Symmetry | None = None,
+    center: FloatArray | None = None,
+) -> Scan2CadErrors:
+    """Errors of an estimate of a true alignment, in metres.
 
-    category: str
-    alignment: Alignment  # in metres
-    symmetry: Symmetry = field(default_factory=Symmetry.none)
-    """Motions that take the model to itself."""
-    center: FloatArray = field(default_factory=lambda: np.zeros(3))
-    """(3,), the point of the model whose positions are compared [model units]. The
-    benchmark's script takes minus the centre of the model's box."""
-
-
-def scan2cad_errors(*, est: Alignment, gt: PlacedModel) -> Scan2CadErrors:
-    """Errors of an estimate of a true model.
-
+    Positions of the point ``center`` (3,) of the model are compared, by default of its origin.
     Rotations about an axis of symmetry are compared exactly; the benchmark's script takes steps of
     10 degrees there, so that its errors are larger by up to 5 degrees.
     """
-    places = [each.apply([gt.center])[0] for each in (est, gt.alignment)]
+    symmetry = symmetry or Symmetry.none()
+    point = np.zeros(3) if center is None else center
+    gap = est.apply([point])[0] - gt.apply([point])[0]
     return Scan2CadErrors(
-        translation=float(np.linalg.norm(places[0] - places[1])),
-        rotation_deg=symmetric_rotation_error(est=est, gt=gt.alignment, symmetry=gt.symmetry),
-        scale=float(np.abs(np.mean(est.scale / gt.alignment.scale) - 1)),
-        scale_axes=scale_error(est=est, gt=gt.alignment),
+        translation=float(np.linalg.norm(gap)),
+        rotation_deg=symmetric_rotation_error(est=est, gt=gt, symmetry=symmetry),
+        scale=float(np.abs(np.mean(est.scale / gt.scale) - 1)),
+        scale_axes=scale_error(est=est, gt=gt),
     )
 
 
@@ -91,10 +87,9 @@ ALIGNED_AXES = metrics.rate("scan2cad_aligned_axes", "Scan2CAD accuracy, each ax
 
 
 def _measure(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
-    found, bounds = target.found, target.bounds
-    center = np.zeros(3) if bounds is None else -bounds.mean(axis=0)
-    truth = PlacedModel(found.category, gt, symmetry=found.symmetry, center=center)
-    errors = scan2cad_errors(est=est, gt=truth)
+    # The benchmark's script takes minus the centre of the model's box.
+    center = None if target.bounds is None else -target.bounds.mean(axis=0)
+    errors = scan2cad_errors(est=est, gt=gt, symmetry=target.found.symmetry, center=center)
     return {
         TRANSLATION.key: errors.translation,
         SCALE.key: errors.scale,

@@ -42,7 +42,7 @@ from cadalign.evaluation.photos.methods import (
     with_all_evidence,
 )
 from cadalign.evaluation.photos.options import PhotosOptions
-from cadalign.evaluation.photos.protocols import TRUTH, is_own, protocol_of
+from cadalign.evaluation.photos.protocols import TRUTH, protocol_of
 from cadalign.evaluation.photos.target import PhotoTarget, PhotoTask, opened, targets_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import Outcome, Row
@@ -139,7 +139,7 @@ def photos_benchmark(
     own = {
         name: Method(name, partial(estimate_object, method=name, **how))
         for name in options.methods
-        if not is_function(name) and is_own(name)
+        if not is_function(name)
     }
     setting = PhotoObjects(options, drawn_in)
     return Benchmark.chosen(setting, options.methods, own, metrics=options.metrics)

@@ -10,7 +10,6 @@ from typing import Annotated
 import tyro
 
 from cadalign.errors import InputError
-from cadalign.evaluation.methods import PNP_METHODS
 from cadalign.evaluation.options import FunctionOptions, is_function
 from cadalign.evaluation.photos import protocols
 
@@ -67,8 +66,7 @@ class PhotosOptions(FunctionOptions):
                 raise InputError(f"{value} is not positive", where=name)
         self.check_noise("simulated_noise_px")
         self.replace_values(methods=tuple(dict.fromkeys(self.methods)))
-        names = [each for each in self.methods if not is_function(each)]
-        own = [name for name in names if name not in PNP_METHODS]
+        own = [each for each in self.methods if not is_function(each)]
         for name in own:
             protocols.check_method(name)
         if self.methods:

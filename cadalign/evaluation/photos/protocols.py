@@ -31,11 +31,6 @@ def parts_of(method: str) -> tuple[str, frozenset[str]]:
     return base, frozenset(evidence)
 
 
-def is_own(method: str) -> bool:
-    """True for a name whose base is one of the experiment's."""
-    return parts_of(method)[0] in (*BASES, TRUTH)
-
-
 def check_method(method: str) -> None:
     """Check the name of a method.
 

@@ -14,11 +14,10 @@ from typing import Annotated, Any
 from msgspec import Meta, field
 
 from cadalign.errors import DataError
-from cadalign.io.documents import Count, ForeignDocument, convert, in_file
+from cadalign.io.documents import Count, ForeignDocument, convert, in_file, read_json
 from cadalign.io.files import (
     locked,
     made_folder,
-    read_text,
     refuse_nul,
     write_json,
 )
@@ -53,7 +52,6 @@ class RunFolder:
     results = _Inside("results.parquet")
     timings = _Inside("timings.parquet")
     records = _Inside("records.parquet")
-    progress = _Inside("progress.json")
     summary = _Inside("summary.csv")
     figures = _Inside("figures")
     overlays = _Inside("overlays")
@@ -112,15 +110,7 @@ class RunFolder:
         refuse_nul(path)
         if not path.exists():
             return None
-        try:
-            found = json.loads(read_text(path))
-        except DataError as error:
-            raise DataError(error.what, where=str(path), fix=_FIX) from None
-        except (ValueError, RecursionError) as error:
-            what = f"cannot be read ({str(error)[:200]})"
-            raise DataError(what, where=str(path), fix=_FIX) from None
-        if not isinstance(found, dict):
-            raise DataError("not the file of a run", where=str(path), fix=_FIX)
+        found: dict[str, Any] = read_json(path)
         with in_file(path):
             convert(found, _Config)
         return found

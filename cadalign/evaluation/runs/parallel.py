@@ -28,9 +28,10 @@ from concurrent.futures import (
     wait,
 )
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from functools import lru_cache, partial
 from itertools import chain
+from multiprocessing.process import BaseProcess
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -71,28 +72,45 @@ def in_processes(
 ) -> Evaluated[T]:
     """Evaluate chunks in so many processes on this machine; -1 for one for each core."""
     count = worker_count(count)
-    context = multiprocessing.get_context("spawn")
-    make = partial(_Processes, count, mp_context=context, initializer=_start_worker)
-    with ExitStack() as stack:
+    pools: list[_Processes] = []
+
+    def start() -> Executor:
+        pools.append(_Processes(count))
+        return pools[-1]
+
+    try:
         yield from _evaluated_elsewhere(
-            lambda: stack.enter_context(make()),
-            experiment,
-            chunks,
-            window=count + 1,
-            deadly=BrokenProcessPool,
+            start, experiment, chunks, window=count + 1, deadly=BrokenProcessPool
         )
+    finally:
+        for pool in pools:
+            pool.kill()
 
 
 class _Processes(ProcessPoolExecutor):
     """Processes that do not run this one's script again."""
 
+    def __init__(self, count: int) -> None:
+        context = multiprocessing.get_context("spawn")
+        super().__init__(count, mp_context=context, initializer=_start_worker)
+        self._started: set[BaseProcess] = set()
+
     def submit(self, *arguments: Any, **options: Any) -> Future[Any]:
         """Hand out a call; a process is started where all are busy."""
+        before = set(multiprocessing.active_children())
         try:
             with _spawning():
                 return super().submit(*arguments, **options)
         except OSError as error:  # no process can be started, or the pool is just breaking
             raise BrokenProcessPool(reason_of(error)) from None
+        finally:
+            self._started |= set(multiprocessing.active_children()) - before
+
+    def kill(self) -> None:
+        """End the processes, whatever they are doing; one that starts late would be waited for."""
+        for process in self._started:
+            process.kill()
+        self.shutdown(cancel_futures=True)
 
 
 @contextmanager

@@ -10,9 +10,7 @@ interrupted or who did the work.
 from __future__ import annotations
 
 import logging
-import platform
 import shutil
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -31,13 +29,11 @@ from cadalign.evaluation.runs.tables import (
     write_tables,
 )
 from cadalign.evaluation.runs.work import Columns, Experiment, Plan
-from cadalign.io.files import made_folder, write_json
+from cadalign.io.files import made_folder
 
 logger = logging.getLogger("cadalign")
 
 T = TypeVar("T")
-
-_PROGRESS_EVERY = 1.0  # seconds
 
 
 @dataclass(frozen=True)
@@ -102,7 +98,6 @@ def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: 
     starts = range(0, len(tasks), size)
     missing = [k for k in range(len(starts)) if not _is_done(experiment, folder.part(k))]
     done = len(tasks) - sum(min(size, len(tasks) - starts[index]) for index in missing)
-    note = _progress_file(folder.progress, len(tasks), done)
     on_progress(Progress(done, len(tasks)))
     if not missing:
         return
@@ -110,9 +105,7 @@ def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: 
     for (index, some), found in workers(experiment, chunks):
         write_rows(folder.part(index), _columns_of_parts(experiment), found)
         done += len(some)
-        note(done, False)
         on_progress(Progress(done, len(tasks)))
-    note(done, True)
 
 
 def _is_done(experiment: Experiment[Any], part: Path) -> bool:
@@ -129,25 +122,6 @@ def _columns_of_parts(experiment: Experiment[Any]) -> Columns:
     """Columns of the results, then the seconds, then what the records have besides."""
     own = [each for each in experiment.record_columns if each not in experiment.columns]
     return (*experiment.columns, *SECONDS, *own)
-
-
-def _progress_file(file: Path, total: int, done_before: int) -> Callable[[int, bool], None]:
-    """A function that writes ``progress.json``, unless it has just done so and is not the last."""
-    start, written = time.time(), 0.0
-    started = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(start))
-    fixed = {"tasks": total, "tasks_done_before": done_before, "started": started}
-
-    def note(done: int, is_last: bool) -> None:
-        nonlocal written
-        now = time.time()
-        if is_last or now - written >= _PROGRESS_EVERY:
-            written = now
-            seconds = round(now - start, 3)
-            write_json(
-                file, {**fixed, "tasks_done": done, "seconds": seconds, "host": platform.node()}
-            )
-
-    return note
 
 
 def _sweep(path: Path) -> None:

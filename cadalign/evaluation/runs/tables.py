@@ -21,7 +21,7 @@ from cadalign.evaluation.metrics import Metric, metric_named
 from cadalign.evaluation.options import name_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import COLUMNS, Columns, Row
-from cadalign.io.documents import convert, in_file, read_json
+from cadalign.io.documents import convert, in_file
 from cadalign.io.files import write_whole
 
 DONE_ANEW = "remove it and start the same run again: what is missing is done anew"
@@ -249,11 +249,8 @@ class Run:
     @property
     def day(self) -> str:
         """Day of its start, such as 2026-03-01 (UTC)."""
-        try:
-            return str(read_json(self.folder.progress)["started"])[:10]
-        except (DataError, KeyError, TypeError):
-            seconds = self.folder.config_file.stat().st_mtime
-            return time.strftime("%Y-%m-%d", time.gmtime(seconds))
+        seconds = self.folder.config_file.stat().st_mtime
+        return time.strftime("%Y-%m-%d", time.gmtime(seconds))
 
     @cached_property
     def cells(self) -> Cells:
@@ -264,10 +261,6 @@ class Run:
     def column(self, name: str) -> npt.NDArray[Any]:
         """A column of the results."""
         return np.asarray(self.results[name].to_numpy(zero_copy_only=False))
-
-    def count(self, *names: str) -> int:
-        """Number of different values of some columns."""
-        return len(self.results.select(names).group_by(list(names)).aggregate([]))
 
     def records(self, columns: Columns) -> Iterator[dict[str, Any]]:
         """Rows of the table of instance records; none of runs that keep none."""

@@ -6,18 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cadalign.evaluation.metrics.scan2cad import (
-    PlacedModel,
-    scan2cad_errors,
-)
-from cadalign.geometry.alignment import Alignment
+from cadalign.evaluation.metrics.scan2cad import scan2cad_errors
+from cadalign.geometry import Alignment
 from cadalign.geometry.symmetry import Symmetry
 
 
-def placed(category="chair", *, at=(0, 0, 2), yaw=0.0, scale=(1, 1, 1), fold=1):
+def placed(*, at=(0, 0, 2), yaw=0.0, scale=(1, 1, 1)):
     rotation = Rotation.from_euler("y", yaw, degrees=True).as_matrix()
-    symmetry = Symmetry.around((0, 1, 0), fold=fold)
-    return PlacedModel(category, Alignment(rotation, at, scale), symmetry)
+    return Alignment(rotation, at, scale)
 
 
 @pytest.mark.parametrize(
@@ -31,18 +27,19 @@ def placed(category="chair", *, at=(0, 0, 2), yaw=0.0, scale=(1, 1, 1), fold=1):
     ],
 )
 def test_rotations_are_compared_up_to_symmetry(yaw, fold, error):
-    errors = scan2cad_errors(est=placed(yaw=yaw).alignment, gt=placed(fold=fold))
+    symmetry = Symmetry.around((0, 1, 0), fold=fold)
+    errors = scan2cad_errors(est=placed(yaw=yaw), gt=placed(), symmetry=symmetry)
     assert errors.rotation_deg == pytest.approx(error, abs=1e-6)
 
 
 def test_scales_of_opposite_errors_cancel_in_the_benchmarks_error():
     """Ratios 1, 1.5, 0.5: their mean is 1. Ratios 1.3, 1.3, 1.3: 30 %."""
-    errors = scan2cad_errors(est=placed(scale=(2, 3, 1)).alignment, gt=placed(scale=(2, 2, 2)))
+    errors = scan2cad_errors(est=placed(scale=(2, 3, 1)), gt=placed(scale=(2, 2, 2)))
     assert errors.scale == pytest.approx(0)
     np.testing.assert_allclose(errors.scale_axes, [0, 0.5, 0.5])
     assert errors.is_aligned
     assert not errors.is_aligned_on_each_axis
-    large = scan2cad_errors(est=placed(scale=(1.3,) * 3).alignment, gt=placed())
+    large = scan2cad_errors(est=placed(scale=(1.3,) * 3), gt=placed())
     assert large.scale == pytest.approx(0.3)
     assert not large.is_aligned
 
@@ -59,11 +56,12 @@ def test_scales_of_opposite_errors_cancel_in_the_benchmarks_error():
     ],
 )
 def test_thresholds(change, is_aligned):
-    assert scan2cad_errors(est=placed(**change).alignment, gt=placed()).is_aligned == is_aligned
+    assert scan2cad_errors(est=placed(**change), gt=placed()).is_aligned == is_aligned
 
 
 def test_positions_are_those_of_the_centre():
     """Turned by 180 deg about the origin, the point (1, 0, 0) goes to (-1, 0, 0): 2 m."""
-    gt = PlacedModel("chair", placed().alignment, center=np.array([1.0, 0, 0]))
-    assert scan2cad_errors(est=placed(yaw=180).alignment, gt=gt).translation == pytest.approx(2)
-    assert scan2cad_errors(est=placed(yaw=180).alignment, gt=placed()).translation == 0
+    turned, center = placed(yaw=180), np.array([1.0, 0, 0])
+    found = scan2cad_errors(est=turned, gt=placed(), center=center)
+    assert found.translation == pytest.approx(2)
+    assert scan2cad_errors(est=placed(yaw=180), gt=placed()).translation == 0

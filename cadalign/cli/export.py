@@ -24,8 +24,8 @@ class Export:
 
     GLB holds the textured model, stretched or warped, the cameras and the photos behind it: it
     opens in Blender, three.js and viewers as the overlay shows it. OBJ and PLY hold the mesh.
-    A run of many fits becomes the observation and fit.json of each, overlays, or GLBs (a folder of
-    one each, or one file).
+    A run of many fits becomes a folder of the observation and fit.json of each, of overlays, or of
+    GLBs.
     """
 
     fit: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FIT.JSON|RUN")]
@@ -47,8 +47,6 @@ class Export:
     world: Path | None = None
     """Text file of the first camera's pose in the world, 4 x 4, as ScanNet's pose files; for
     --frame world."""
-    rows: tuple[int, ...] = ()
-    """For a run, the numbers of the observations to write, by default all."""
 
     def run(self) -> int:
         """Write the file; returns the exit code."""
@@ -60,7 +58,6 @@ class Export:
         if fit.is_dir():
             return self._export_run()
         with named_as_flags(self, others={"world_from_cam": "--world"}):
-            refuse_unused(self, ["rows"], "on one fit")
             if self.frame != "world":
                 refuse_unused(self, ["world"], "without --frame world")
             name = self.format or format_of(self.to)
@@ -83,11 +80,8 @@ class Export:
         require_run(RunFolder(self.fit))
         with named_as_flags(self):
             refuse_unused(self, ["observation", "shape", "world", "frame"], "on a run")
-            found = export_run(
-                self.fit, self.to, format=self.format, metres=self.metres, rows=self.rows
-            )
-        for error in found.left_out[:_MOST_LISTED]:
+            count, left_out = export_run(self.fit, self.to, format=self.format, metres=self.metres)
+        for error in left_out[:_MOST_LISTED]:
             say(f"left out: {error}")
-        rest = len(found.left_out)
-        say(f"{found.path}: {found.objects:,} objects, {rest:,} left out")
-        return SOME_FAILED if rest else SUCCESS
+        say(f"{self.to}: {count:,} objects, {len(left_out):,} left out")
+        return SOME_FAILED if left_out else SUCCESS

@@ -213,6 +213,6 @@ def write_overlays(run: RunFolder, to: Path) -> None:
     """Draw all aligned models of a run over their photos, in a folder."""
     from cadalign.batch.exports import export_run
 
-    found = export_run(run.path, to, format="overlay")
-    left = f", {len(found.left_out):,} left out" if found.left_out else ""
-    say(f"Overlays: {found.objects:,} in {to}{left}")
+    count, left_out = export_run(run.path, to, format="overlay")
+    left = f", {len(left_out):,} left out" if left_out else ""
+    say(f"Overlays: {count:,} in {to}{left}")

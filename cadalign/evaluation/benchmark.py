@@ -187,6 +187,7 @@ class Benchmark:
         ]
 
     def _answers(self, method: Method, cases: Sequence[Case]) -> list[tuple[Outcome, Any]]:
+        """Outcome and estimate of a method for every case; an error where there is no estimate."""
         instances = [case.instance for case in cases if case.instance is not None]
         solved = self._solved(method, instances)
         pairs = [
@@ -194,21 +195,18 @@ class Benchmark:
             for instance, (estimate, _) in zip(instances, solved, strict=True)
             if not isinstance(estimate, Exception)
         ]
-        rows = iter(self._measured(method, pairs))
-        estimates = iter(solved)
+        estimates, rows = iter(solved), iter(self._measured(method, pairs))
         answers: list[tuple[Outcome, Any]] = []
         for case in cases:
-            names = {**case.names, "method": method.name}
-            if case.instance is None:
-                error = case.error or ValueError("there is no instance")
-                status = case.status or status_of(error)
-                outcome = Outcome(names, case.facts, status, reason_of(error))
-                answers.append((outcome, error))
-                continue
-            estimate, seconds = next(estimates)
+            estimate: Any = case.error or ValueError("there is no instance")
+            seconds: float | None = None
+            if case.instance is not None:
+                estimate, seconds = next(estimates)
             row = estimate if isinstance(estimate, Exception) else next(rows)
+            names = {**case.names, "method": method.name}
             if isinstance(row, Exception):
-                outcome = Outcome(names, case.facts, status_of(row), reason_of(row), seconds)
+                status = case.status or status_of(row)
+                outcome = Outcome(names, case.facts, status, reason_of(row), seconds)
                 answers.append((outcome, row))
             else:
                 answers.append((Outcome(names, case.facts | row, seconds=seconds), estimate))

@@ -101,7 +101,7 @@ def test_matches_of_a_run_are_exported_as_fits_are(case: Case, tmp_path: Path) -
     run = tmp_path / "run"
     out = ["--out", str(run), "--no-picture"]
     assert main(["retrieve", *case.arguments, *out]) == 0
-    assert main(["export", str(run), "--to", str(tmp_path / "all.glb")]) == 0
+    assert main(["export", str(run), "--to", str(tmp_path / "glb")]) == 0
 
 
 def test_a_query_that_fails_is_a_row(

@@ -91,8 +91,6 @@ def test_the_command_says_what_is_missing(
     pose.write_text("1 0 0 0\n0 1 0\n")
     said = refusal(capsys, result, *to, *given, "--world", pose)
     assert "--world: has no effect without --frame world; leave it out" in said
-    said = refusal(capsys, result, *to, *given, "--rows", 1)
-    assert "--rows: has no effect on one fit; leave it out" in said
     said = refusal(capsys, result, *to, *given, "--frame", "world", "--world", pose)
     assert f"{pose}: " in said
     result.write_text(result.read_text()[:200])

@@ -96,7 +96,7 @@ def _results(folder: RunFolder) -> Iterator[tuple[int, Observation, Result]]:
             if record["result"]:
                 where = f"{folder.path}, row {record['row']}"
                 seen = Observation.from_dict(parse_json(record["observation"], where))
-                yield record["row"], seen, Result.from_json(record["result"])
+                yield record["row"], seen, Result.from_dict(parse_json(record["result"], where))
 
 
 def _write_documents(path: Path, seen: Observation, result: Result) -> None:

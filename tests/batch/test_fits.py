@@ -17,9 +17,9 @@ import pytest
 import cadalign
 from cadalign import Alignment, CadalignError, Camera, FocalPrior, Observation, Result, Results
 from cadalign.batch.experiment import FitRunOptions, plan_run
-from cadalign.batch.fits import run_many
 from cadalign.batch.observation_fit import ObservationFit
 from cadalign.batch.outputs import COLUMNS
+from cadalign.cli import main
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
@@ -315,15 +315,16 @@ def test_the_contents_are_those_of_every_file_that_options_name(tmp_path: Path) 
     assert set(seen[-1]["files"]) == set(map(str, paths))
 
 
-def test_failures_are_counted_by_reason(tmp_path: Path) -> None:
+def test_failures_are_counted_by_reason(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = lines(tmp_path / "o.jsonl", 3)
     with source.open("a") as file:
         file.write("{}\n{}\n[]\n")
-    options = FitRunOptions(inputs=(source,))
-    tally = run_many(options, RunFolder(tmp_path / "run"), workers=0, dask=None)
-    assert (tally.total, tally.failed) == (6, 3)
-    assert [count for _, count in tally.reasons] == [2, 1]
-    assert "line" not in tally.reasons[0][0]
+    assert main(["fit", str(source), "--no-picture", "--out", str(tmp_path / "run")]) == 3
+    first, second, last = capsys.readouterr().err.splitlines()
+    assert first.startswith("failed 2: ")
+    assert "line" not in first
+    assert second.startswith("failed 1: ")
+    assert last.startswith("3 of 6 aligned, 3 failed: ")
 
 
 def test_the_how_to_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

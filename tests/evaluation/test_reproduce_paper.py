@@ -35,8 +35,8 @@ def test_everything_is_in_one_folder_beside_the_papers_numbers(
     plan = script.PaperPlan(out=tmp_path, quick=True, workers=0)
     report = script.reproduce_paper(plan).read_text()
     assert "fractions" in report
-    for picture in ("noise_rotation_error_deg", "points_scale_z_error"):
-        assert f"figures/{picture}.png" in report
+    for picture in ("noise/figures/rotation_error_deg", "points/figures/scale_z_error"):
+        assert f"simulate_{picture}.png" in report
     for link in (part.split(")")[0] for part in report.split("](")[1:]):
         assert (tmp_path / link).is_file(), link
     assert len(re.findall(r"^\| :?---", report, re.M)) == 3

@@ -533,7 +533,7 @@ def test_a_simulation_has_lines_and_no_gallery(tmp_path: Path) -> None:
     for trace in plot["traces"]:
         for value, median in zip(("1", "4"), trace["y"], strict=True):
             assert medians[value, trace["method"]] == pytest.approx(median, rel=1e-5)
-    assert "the AEPnP paper's simulation, noise varied, 12 problems" in found["summary"]
+    assert "problems of the AEPnP paper's simulation" in found["summary"]
 
 
 def test_running_time_is_shown_where_it_is_what_was_measured(tmp_path: Path) -> None:
@@ -560,7 +560,7 @@ def test_correspondences_have_success_against_outliers(real_data: Path, tmp_path
     robust, epnp = success["traces"]
     assert robust["y"] == [100, 100]
     assert max(epnp["y"]) < 50
-    assert "4 images of maupertuis_colmap" in found["summary"]
+    assert "draws of real correspondences of maupertuis_colmap" in found["summary"]
     assert found["title"] == "Correspondences on maupertuis_colmap"
 
 
@@ -629,7 +629,7 @@ def unreadable(path: Path) -> None:
         (missing, "no such folder; give a folder that cadalign demo, evaluate or simulate"),
         (empty, "not the folder of a run: it has no run.json; give a folder"),
         (foreign, "no report on a run of 'brewing'; known are keypointnet, demo, simulate, c"),
-        (damaged, "cannot be read"),
+        (damaged, "not valid JSON"),
         (begun, "nothing of the run is finished yet; wait, or start the command"),
         (unreadable, "not a table that can be read"),
     ],

@@ -72,9 +72,9 @@ def reproduce_paper(plan: PaperPlan) -> Path:
     return report
 
 
-def _run(plan: PaperPlan, options: ExperimentOptions, name: str, *, is_timed: bool = False) -> Run:
+def _run(plan: PaperPlan, options: ExperimentOptions, name: str) -> Run:
     folder = RunFolder(plan.out / name)
-    how = {"workers": None, "dask": None} if is_timed else vars(plan)
+    how = vars(plan)
     with run_progress(name) as on_progress:
         run(options, folder, workers=how["workers"], dask=how["dask"], on_progress=on_progress)
     return Run.open(folder.path)
@@ -84,8 +84,8 @@ def _sweep_section(plan: PaperPlan, name: str) -> str:
     runs = max(SWEEPS[name].runs // 25, 20) if plan.quick else None
     options = SweepOptions(name, runs=runs, seed=plan.seed)
     kind = options.kind
-    summaries = SIMULATION.write(_run(plan, options, f"simulate_{name}", is_timed=kind.is_timed))
-    keys = [metric.key for metric in ((metrics.MICROSECONDS,) if kind.is_timed else ERRORS)]
+    summaries = SIMULATION.write(_run(plan, options, f"simulate_{name}"))
+    keys = [metric.key for metric in ERRORS]
     rows = [
         [f"{value:g}", *(f"{s[keys[0]].median:.3g}" for s in summaries if s[kind.column] == value)]
         for value in kind.values

@@ -39,7 +39,6 @@ _SWEEPS = {
     "noise": "Errors against the keypoints' noise, at 1,024 points.",
     "points": "Errors against the number of points, at 2 px noise.",
     "outliers": "Errors against the share of outliers, at 100 points and 2 px noise.",
-    "runtime": "Time of one call against the number of points.",
 }
 
 

@@ -45,7 +45,7 @@ def evaluate(
         "simulate", "demo"}
         Name of the experiment.
     workers : int, optional
-        Processes; -1 for one for each core (the default; for running times it is 1), 0 for none.
+        Processes; -1 for one for each core (the default), 0 for none.
     dask : str, optional
         Address of a Dask scheduler, whose workers are used instead.
     out : str or path-like, optional
@@ -117,7 +117,7 @@ def simulate(sweep: str, **options: Any) -> pd.DataFrame:
 
     Parameters
     ----------
-    sweep : {"noise", "points", "outliers", "runtime"}
+    sweep : {"noise", "points", "outliers"}
         The quantity that is varied.
     **options
         ``methods``, ``values``, ``runs``, ``points``, ``noise_px`` in place of the sweep's own (see

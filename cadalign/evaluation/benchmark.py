@@ -18,7 +18,7 @@ from cadalign.evaluation.functions import (
     choose_methods,
     choose_metrics,
 )
-from cadalign.evaluation.methods import LIMIT, Method, MethodInput
+from cadalign.evaluation.methods import Method, MethodInput
 from cadalign.evaluation.options import ExperimentOptions, text_of
 from cadalign.evaluation.runs.work import (
     FAILED,
@@ -124,7 +124,6 @@ class Benchmark:
     methods: tuple[Method, ...]
     batched: frozenset[str] = frozenset()
     """Methods that are given all instances of a chunk at once, and share the time among them."""
-    repeats: int = 1  # calls of a method on one instance, of which the quickest is timed
     metrics: tuple[FunctionMetric, ...] = ()  # further columns of the result table
 
     @classmethod
@@ -254,21 +253,16 @@ class Benchmark:
         return [(estimate, share) for estimate in found]
 
     def _timed(self, method: Method, instance: Any) -> tuple[Any, float | None]:
-        """An estimate of one instance, and the seconds of the quickest call."""
+        """An estimate of one instance, or why there is none, and its seconds."""
         given = attempt(self.setting.given, instance) if method.is_general else instance
         if isinstance(given, Exception):
             return given, None
-        is_measured = self.repeats == 1 or method.name != LIMIT
-        best = float("inf")
-        for _ in range(self.repeats if is_measured else 1):
-            start = time.perf_counter()
-            answer = attempt(method.solve, given)
-            best = min(best, time.perf_counter() - start)
-            if isinstance(answer, Exception):
-                return answer, best if self.repeats == 1 else None
-        if method.is_general:
+        start = time.perf_counter()
+        answer = attempt(method.solve, given)
+        seconds = time.perf_counter() - start
+        if method.is_general and not isinstance(answer, Exception):
             answer = attempt(self.setting.answered, method, instance, answer)
-        return answer, best if is_measured else None
+        return answer, seconds
 
 
 def attempt(function: Callable[..., R], *arguments: Any) -> R | Exception:

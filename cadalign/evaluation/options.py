@@ -198,7 +198,7 @@ class RunOptions:
     out: Path | None = None
     """The run's folder; one in runs/, named after the experiment, by default."""
     workers: int | None = None
-    """Processes; -1 for one for each core (the default; for running times it is 1), 0 for none."""
+    """Processes; -1 for one for each core (the default), 0 for none."""
     dask: str | None = None
     """Address of a Dask scheduler, whose workers are used instead."""
 

@@ -16,7 +16,7 @@ PATHS = (
     *("library build", "library show", "shape learn", "shape show"),
     *("evaluate keypointnet", "evaluate unseen", "evaluate photos"),
     *("evaluate correspondences", "evaluate retrieval"),
-    *("simulate noise", "simulate points", "simulate outliers", "simulate runtime"),
+    *("simulate noise", "simulate points", "simulate outliers"),
 )
 
 

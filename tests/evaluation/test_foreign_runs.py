@@ -182,8 +182,8 @@ def test_an_unfinished_run_with_a_missing_part_is_shown(
         ({"chunk_size": 0}, "chunk_size: 0 is not a whole number >= 1"),
         ({"versions": "new"}, "versions: 'new' is not an object"),
         ({"experiment": 3}, "experiment: 3 is not a text"),
-        ({"sweep": None}, "sweep: 'None' is not one of noise, points, outliers, runtime"),
-        ({"sweep": [1]}, "sweep: '[1]' is not one of noise, points, outliers, runtime"),
+        ({"sweep": None}, "sweep: 'None' is not one of noise, points, outliers"),
+        ({"sweep": [1]}, "sweep: '[1]' is not one of noise, points, outliers"),
     ],
 )
 def test_a_hostile_run_file_is_refused_by_field(

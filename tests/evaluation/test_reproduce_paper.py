@@ -28,8 +28,7 @@ def test_everything_is_in_one_folder_beside_the_papers_numbers(
     }
     for name, kind in small.items():
         monkeypatch.setitem(SWEEPS, name, kind)
-    for name in ("outliers", "runtime"):
-        monkeypatch.delitem(SWEEPS, name)
+    monkeypatch.delitem(SWEEPS, "outliers")
     monkeypatch.syspath_prepend(SCRIPT.parent)
     script = importlib.import_module(SCRIPT.stem)
     plan = script.PaperPlan(out=tmp_path, quick=True, workers=0)

@@ -536,14 +536,6 @@ def test_a_simulation_has_lines_and_no_gallery(tmp_path: Path) -> None:
     assert "problems of the AEPnP paper's simulation" in found["summary"]
 
 
-def test_running_time_is_shown_where_it_is_what_was_measured(tmp_path: Path) -> None:
-    options = SweepOptions("runtime", values=(8,), runs=2, methods=("aepnp",))
-    do_run(options, RunFolder(tmp_path / "run"), workers=0, dask=None)
-    found = report(tmp_path, tmp_path / "run")
-    assert found["plots"][0]["id"] == "microseconds"
-    assert found["headline"]["rows"][0]["cells"]["microseconds"] > 0
-
-
 def test_correspondences_have_success_against_outliers(real_data: Path, tmp_path: Path) -> None:
     options = CorrespondenceOptions(
         real_data / "sfm" / "maupertuis_colmap",

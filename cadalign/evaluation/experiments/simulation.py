@@ -49,11 +49,6 @@ class SweepKind:
     methods: tuple[str, ...]
     runs: int
 
-    @property
-    def is_timed(self) -> bool:
-        """True where the running time is measured."""
-        return self.name == "runtime"
-
 
 _NOISE = SweepKind(
     name="noise",
@@ -77,14 +72,7 @@ _OUTLIERS = replace(
     methods=("ransac-optimal", "ransac-aepnp", "optimal-cauchy", "optimal", "limit"),
     runs=500,
 )
-_RUNTIME = replace(
-    _POINTS,
-    name="runtime",
-    values=(6, 10, 20, 50, 100, 200, 500, 1024, 2048),
-    methods=("optimal", "aepnp", "aepnp-paper", "epnp"),
-    runs=100,
-)
-SWEEPS = {kind.name: kind for kind in (_NOISE, _POINTS, _OUTLIERS, _RUNTIME)}
+SWEEPS = {kind.name: kind for kind in (_NOISE, _POINTS, _OUTLIERS)}
 
 
 @dataclass(frozen=True)
@@ -95,7 +83,7 @@ class SweepOptions(FunctionOptions):
     command = "simulate"
 
     sweep: Annotated[str, tyro.conf.Suppress]
-    """The quantity that is varied: noise, points, outliers or runtime."""
+    """The quantity that is varied: noise, points or outliers."""
     _: KW_ONLY
     methods: tuple[str, ...] | None = None
     """Methods of `cadalign fit`, optimal-huber, optimal-cauchy, ransac-optimal, ransac-ap4p,
@@ -134,11 +122,6 @@ class SweepOptions(FunctionOptions):
         """Name of the run's folder, unless another is given."""
         return f"simulate_{self.sweep}"
 
-    @property
-    def default_workers(self) -> int:
-        """Processes side by side would slow one another down where times are measured."""
-        return 1 if self.kind.is_timed else -1
-
 
 # Quantities that may be varied: a check, a name, and values to give.
 _CHECKS: dict[str, tuple[Callable[[float], bool], str, str]] = {
@@ -166,7 +149,6 @@ def _check_values(kind: SweepKind) -> None:
         raise InputError(f"{kind.runs} is not positive", where="runs")
 
 
-_REPEATS = 5
 ERRORS = (metrics.ROTATION, metrics.TRANSLATION_IN_UNITS, metrics.SCALE_Y, metrics.SCALE_Z)
 COLUMNS: Columns = (
     *(("points", int), ("noise_px", float), ("outlier_share", float), ("run", int)),
@@ -238,13 +220,9 @@ class SweepProblems(Setting):
 
 
 def sweep_benchmark(kind: SweepKind, seed: int, metrics: Sequence[str] = ()) -> Benchmark:
-    """The methods of a sweep on its problems: in batches, or timed alone and several times."""
-    batched = frozenset[str]() if kind.is_timed else frozenset(kind.methods)
-    repeats = _REPEATS if kind.is_timed else 1
-    setting = SweepProblems(kind, seed)
-    return Benchmark.chosen(
-        setting, kind.methods, metrics=metrics, batched=batched, repeats=repeats
-    )
+    """The methods of a sweep on its problems, in batches."""
+    setting, batched = SweepProblems(kind, seed), frozenset(kind.methods)
+    return Benchmark.chosen(setting, kind.methods, metrics=metrics, batched=batched)
 
 
 VARIED = {metric.key: metric for metric in (metrics.NOISE, metrics.POINTS, metrics.OUTLIER_SHARE)}
@@ -267,12 +245,9 @@ def varied(run: Run) -> Metric:
 
 def summarize_sweep(run: Run) -> list[Summary]:
     """Quartiles of every metric for every value and method, over the problems that are solved."""
-    kind, cells = kind_of(run), run.cells
-    if kind.is_timed:
-        cells = {**cells, metrics.MICROSECONDS.key: 1e6 * cells["seconds"]}
-    statistics = {metric.key: _quartiles(metric.key) for metric in _metrics(kind, run)}
+    statistics = {metric.key: _quartiles(metric.key) for metric in (*ERRORS, *run.metrics)}
     name = partial(group_name, varied(run))
-    return summarize(run, statistics, by=(kind.column,), name=name, cells=cells)
+    return summarize(run, statistics, by=(kind_of(run).column,), name=name)
 
 
 def _quartiles(key: str) -> Callable[[Group], Quartiles]:
@@ -280,35 +255,28 @@ def _quartiles(key: str) -> Callable[[Group], Quartiles]:
 
 
 def plots(runs: Sequence[Run]) -> list[Plot]:
-    """Errors, and times where they are measured, against the quantity that is varied."""
-    kind, x = kind_of(runs[0]), varied(runs[0])
-    found = [summarize_sweep(run) for run in runs]
+    """Errors against the quantity that is varied."""
+    x, found = varied(runs[0]), [summarize_sweep(run) for run in runs]
     return [
-        plot_against(found, x, metric, place=kind.column, note=QUARTILES_NOTE)
-        for metric in _metrics(kind, runs[0])
+        plot_against(found, x, metric, place=x.key, note=QUARTILES_NOTE)
+        for metric in (*ERRORS, *runs[0].metrics)
     ]
 
 
-def _metrics(kind: SweepKind, run: Run) -> tuple[Metric, ...]:
-    times = (metrics.MICROSECONDS,) if kind.is_timed else ()
-    return (*times, *ERRORS, *run.metrics)
-
-
-_CHUNK, _CHUNK_TIMED = 64, 20
+_CHUNK = 64
 
 
 def plan(options: SweepOptions, folder: RunFolder) -> Plan[SweepTask]:
     """Plan a sweep."""
     kind = options.kind
     benchmark = sweep_benchmark(kind, options.seed, options.metrics)
-    chunk = _CHUNK_TIMED if kind.is_timed else _CHUNK
-    return benchmark.plan(options, sweep_tasks(kind), chunk=chunk, **plain_value(kind))
+    return benchmark.plan(options, sweep_tasks(kind), chunk=_CHUNK, **plain_value(kind))
 
 
 SPEC = Spec(
     options=SweepOptions,
     plan=plan,
-    columns=(metrics.INSTANCES, metrics.FAILED, *ERRORS, metrics.MICROSECONDS),
+    columns=(metrics.INSTANCES, metrics.FAILED, *ERRORS),
     results=COLUMNS,
     summarize=summarize_sweep,
     group=varied,

@@ -171,7 +171,6 @@ MILLISECONDS = Metric("milliseconds", "time of one call", "ms", symbol="ms")
 QUERY_MILLISECONDS = replace(
     MILLISECONDS, label="time of a query", head="time of a query", digits=1
 )
-MICROSECONDS = Metric("microseconds", "time of one call", "µs", digits=1)
 
 ROTATION_90 = _like(
     ROTATION,

@@ -41,7 +41,6 @@ _CAMERA_GAIN = 19.5  # by a focal length of its own, by chance in one of 100,000
 _PER_EQUATION = 3.0  # gain that a piece of evidence must leave, without which there are fewer
 _MOST_VIEWS = 10  # those with the largest residuals, of which each is left out
 _WRONG_UNIT = 100.0  # factor between an object's size and its model's
-_MEASURES = ("depth", "camera_height", "cam_from_rig")
 
 
 @np.errstate(all="ignore")
@@ -94,17 +93,18 @@ def _without_outlines(views: Sequence[View]) -> tuple[View, ...]:
 def _of_another_size(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
     """The warning about measured lengths that make the object larger than any of its kind."""
     size = float(np.exp(np.log(given.result.alignment.scale).mean()))
-    names = [
-        f"views[{view.number}].{name}"
-        for view in case.views
-        for name in _MEASURES
-        if getattr(view, name) is not None
-    ]
-    names += ["size"] if case.size is not None else []
-    if not names or 1 / _WRONG_UNIT < size < _WRONG_UNIT:
+    named = listed([f"`{name}`" for name in _measures_of(case)] or [""])
+    if not named or 1 / _WRONG_UNIT < size < _WRONG_UNIT:
         return None
-    text = f"{listed(names)}: the object is {size:.2g} times as large as the model, is it {UNIT}"
+    text = f"{named}: the object is {size:.2g} times as large as the model, is it {UNIT}"
     return EstimateWarning("unit", text)
+
+
+def _measures_of(case: DiagnosisCase) -> list[str]:
+    """Names of the fields that measure lengths."""
+    names = ("depth", "camera_height", "cam_from_rig")
+    found = [name for name in names if any(getattr(v, name) is not None for v in case.views)]
+    return found if case.size is None else [*found, "size"]
 
 
 def diagnose_fit(fitted: FittedKeypoints) -> EstimateWarning | None:
@@ -209,7 +209,7 @@ def _size(camera: Camera, factor: float) -> tuple[int, int]:
 
 def _measured(view: View, *, name: str, factor: float) -> View:
     """The view whose depths, height or motion are in another unit."""
-    value = getattr(view, name)
+    value = getattr(view, name, None)
     if value is None:
         return view
     value = np.array(value, dtype=np.float64)
@@ -228,8 +228,8 @@ def _left_out(view: View, *, number: int, name: str | None) -> View | None:
     """The view without a field, or None for the whole view, if it has the number."""
     if view.number != number:
         return view
-    nothing: dict[str, Any] = {} if name is None else {name: None}
-    return replace(view, **nothing) if nothing else None
+    nothing: dict[str, Any] = {str(name): None}
+    return None if name is None else replace(view, **nothing)
 
 
 # Rules -------------------------------------------------------------------------------------------
@@ -288,12 +288,12 @@ def _mistakes_in(case: DiagnosisCase) -> Iterator[Rule]:
             if axis != model.up_axis:
                 clause = f"the model's {axis} axis points up (give up_axis={axis!r})"
                 yield Rule("mistake", clause, undo_model=partial(replace, up_axis=axis))
-    for factor in (1e-3, 1e3):
-        for name in _MEASURES:
-            if any(getattr(view, name) is not None for view in views):
-                yield Rule("unit", f"`{name}`", partial(_measured, name=name, factor=factor))
-        if case.size is not None:
-            yield Rule("unit", "`size`", changes={"size": _remeasured(case.size, factor)})
+    for name in _measures_of(case):
+        for factor in (1e-3, 1e3):
+            undo = partial(_measured, name=name, factor=factor)
+            lengths = None if case.size is None else _remeasured(case.size, factor)
+            changes = {"size": lengths} if name == "size" else {}
+            yield Rule("unit", f"`{name}`", undo, changes=changes)
 
 
 def _other_sizes(case: DiagnosisCase) -> Iterator[Rule]:

@@ -30,9 +30,8 @@ _LARGEST_SHARE = 0.45  # of the keypoints' spread, of an estimated sigma
 _SAME_MIDDLE = 0.02  # of an image's size, from its middle to a principal point taken for it
 _LEAST_GAIN = 0.9  # of a standard deviation, relative to that of the prior alone
 _ANY_ROTATION = math.sqrt(math.pi**2 / 3 + 2)  # standard deviation of uniform rotations [rad]
-_SHALLOW = 0.5  # differences of depth over the distance
 _THIN = 0.1  # spread along an axis over the largest that counts as nearly a plane
-_END_ON_DEG = 15.0
+_END_ON = math.cos(math.radians(15.0))
 _ANOTHER_DEG = 10.0
 _LEAST_TURN = 1e-12  # [rad], and of a relative variance
 _REGION = 0.95  # probability of the stated region, which alternatives outside of it contradict
@@ -102,22 +101,27 @@ def weaknesses(
     must determine them better than the prior does.
     """
     warnings, std = [], uncertainty_of(covariance)
+
+    def warn(kind: Kind, what: str, to: str) -> None:
+        warnings.append(EstimateWarning(kind, f"{what} is known only to +-{to}"))
+
     if std.focal > UNDETERMINED:
-        why = "" if keypoints is None else _why_focal_is_weak(alignment.apply(keypoints))
-        warnings.append(_known_only("focal", "the focal length", percent(std.focal), why))
+        warn("focal", "the focal length", percent(std.focal))
     most = min(UNDETERMINED, _LEAST_GAIN * (stretch_sigma or math.inf))
     shares = np.ones(3) if lengths is None else lengths / np.linalg.norm(lengths)
     is_open = np.flatnonzero(np.multiply(std.scale, shares) > most).tolist()
     if keypoints is None or len(is_open) == 1 or _ratio_deviation(covariance, is_open) > most:
         for axis in is_open:
-            why = "" if keypoints is None else _why_scale_is_weak(keypoints, alignment, axis)
-            what = f"{'the length along ' if keypoints is None else 's_'}{'xyz'[axis]}"
-            warnings.append(_known_only("scale", what, percent(std.scale[axis]), why))
+            name, to = "xyz"[axis], percent(std.scale[axis])
+            if keypoints is None:
+                warn("scale", f"the length along {name}", to)
+            else:
+                warn("scale", f"s_{name}", to + _why_scale_is_open(keypoints, alignment, axis))
     if keypoints is not None and std.rotation_deg > UNDETERMINED_ROTATION_DEG:
-        warnings.append(_known_only("rotation", "the rotation", f"{std.rotation_deg:.2g} deg"))
+        warn("rotation", "the rotation", f"{std.rotation_deg:.2g} deg")
     share = float(np.linalg.norm(std.translation) / np.linalg.norm(alignment.translation))
     if share > UNDETERMINED and not is_open and std.focal <= UNDETERMINED:
-        warnings.append(_known_only("translation", "the distance", percent(share)))
+        warn("translation", "the distance", percent(share))
     return tuple(warnings)
 
 
@@ -130,35 +134,13 @@ def _ratio_deviation(covariance: FloatArray, axes: Sequence[int]) -> float:
     return math.sqrt(max(float(logs @ covariance @ logs), 0.0))
 
 
-def _known_only(kind: Kind, what: str, to: str, why: str = "") -> EstimateWarning:
-    reason = f": {why}" if why else ""
-    return EstimateWarning(kind, f"{what} is known only to +-{to}{reason}")
-
-
-def _are_flat(points: FloatArray) -> bool:
-    thickness = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(thickness[-1] < _THIN * thickness[0])
-
-
-def _why_focal_is_weak(in_camera: FloatArray) -> str:
-    if _are_flat(in_camera):
-        return "the keypoints lie nearly in one plane"
-    if np.ptp(in_camera[:, 2]) < _SHALLOW * in_camera[:, 2].mean():
-        return "the keypoints differ little in depth for their distance"
-    return "the keypoints show little perspective for their noise"
-
-
-def _why_scale_is_weak(points_3d: FloatArray, alignment: Alignment, axis: int) -> str:
+def _why_scale_is_open(points_3d: FloatArray, alignment: Alignment, axis: int) -> str:
     name, spread, center = "xyz"[axis], points_3d.std(axis=0), points_3d.mean(axis=0)
     if spread[axis] < _THIN * spread.max():
-        return f"the keypoints lie nearly in the plane {name} = {center[axis]:.3g}"
+        return f": the keypoints lie nearly in the plane {name} = {center[axis]:.3g}"
     ray = alignment.apply(center[None])[0]
     cosine = abs(ray @ alignment.rotation[:, axis]) / np.linalg.norm(ray)
-    if np.degrees(np.arccos(min(1.0, cosine))) < _END_ON_DEG:
-        return f"the model's {name} axis is seen nearly end-on"
-    if _are_flat(points_3d):
-        return "the keypoints lie nearly in one plane"
-    return "there are few keypoints for their noise"
+    return f": the model's {name} axis is seen nearly end-on" if cosine > _END_ON else ""
 
 
 def percent(fraction: float) -> str:
@@ -230,27 +212,20 @@ def outside_image(
 
 
 def _wrong_principal_point(camera: Camera) -> str | None:
-    """Says that a principal point is the middle of another image, or outside of its own."""
+    """Says that a principal point is the middle of another image."""
     if camera.is_centred:
         return None
-    size, own = f"{camera.width} x {camera.height} px", f"({camera.cx:.4g}, {camera.cy:.4g})"
+    own = f"({camera.cx:.4g}, {camera.cy:.4g})"
     middle = 2 * (camera.cx + PIXEL_CENTRE), 2 * (camera.cy + PIXEL_CENTRE)
     for factor in OTHER_SIZES:
-        other = camera.width * factor, camera.height * factor
-        apart = (abs(a - b) / b for a, b in zip(middle, other, strict=True))
-        if max(apart) < _SAME_MIDDLE:
+        width, height = camera.width * factor, camera.height * factor
+        if max(abs(middle[0] / width - 1), abs(middle[1] / height - 1)) < _SAME_MIDDLE:
             return (
-                f"the camera's principal point {own} is the middle of an image of "
-                f"{other[0]:.0f} x {other[1]:.0f} px, its own has {size}: if the photo was resized "
-                f"(not cut out), give Camera.resized({camera.width}, {camera.height}) of the "
-                "camera of that size"
+                f"the camera's principal point {own} is the middle of an image of {width:.0f} x "
+                f"{height:.0f} px, its own has {camera.width} x {camera.height} px: if the photo "
+                f"was resized, give Camera.resized({camera.width}, {camera.height}) of its camera"
             )
-    if camera.contains(np.array([[camera.cx, camera.cy]])).all():
-        return None
-    return (
-        f"the camera's principal point {own} lies outside of its image of {size}, which is right "
-        "only for a photo cut out of a larger one: compare the camera with the photo's size"
-    )
+    return None
 
 
 def unexplained(sigma: float, points_2d: Sequence[FloatArray]) -> Warnings:

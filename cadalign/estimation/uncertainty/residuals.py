@@ -60,11 +60,6 @@ def chi_square_tail(value: float, freedom: int) -> float:
     The sum of Poisson terms for an even number of degrees of freedom, with the complementary error
     function for an odd one: Abramowitz and Stegun, 26.4.4 and 26.4.5. Importing SciPy's takes
     longer than a fit.
-
-    Examples
-    --------
-    >>> round(chi_square_tail(3.841, 1), 4), round(chi_square_tail(5.991, 2), 4)
-    (0.05, 0.05)
     """
     if value <= 0 or value == math.inf:
         return float(value <= 0)
@@ -90,13 +85,7 @@ def chance_of(squares: float, redundancy: int, degrees_of_freedom: float | None 
 
 @lru_cache(maxsize=64)
 def chi_square_quantile(freedom: int, probability: float) -> float:
-    """The value that a chi-squared variable exceeds with a probability.
-
-    Examples
-    --------
-    >>> round(chi_square_quantile(8, 0.05), 3)
-    15.507
-    """
+    """The value that a chi-squared variable exceeds with a probability."""
     low, high = 0.0, float(freedom)
     while chi_square_tail(high, freedom) > probability:
         low, high = high, 2 * high

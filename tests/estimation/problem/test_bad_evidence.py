@@ -163,7 +163,7 @@ class TestDepthsInMillimetres:
         depth = in_camera(POINTS, truth_of(), np.eye(4))[:, 2]
         given = depth if kind == "at keypoints" else depth_image(POINTS, truth_of())
         (text,) = [each for each in self.warnings(depth=given) if UNIT in each]
-        assert text.startswith("views[0].depth: the ")
+        assert text.startswith("`depth`: the ")
 
     def test_beside_a_length(self) -> None:
         depth = in_camera(POINTS, truth_of(), np.eye(4))[:, 2]

@@ -26,7 +26,7 @@ from cadalign.estimation.warning import EstimateWarning
 from cadalign.evaluation.simulation import SIMULATION_CAMERA
 
 COVARIANCE = np.diag([1e-4, 1e-4, 1e-4, 0.0004, 0.0009, 0.01, 0, 0.0001, 0.0225])
-WARNING = "s_z is known only to +-15 %: there are few keypoints for their noise"
+WARNING = "s_z is known only to +-15 %"
 STATED = Posterior(
     COVARIANCE,
     fisher_covariance=COVARIANCE,
@@ -69,7 +69,7 @@ def test_text_of_a_result() -> None:
         "  translation  (0.5, -0.25, 6) +- (0.02, 0.03, 0.1)\n"
         "  stretch      (1, 0.75 +- 1 %, 1.25 +- 15 %)\n"
         "  also likely  (0.12 x): scale (1, 2, 0.5)\n"
-        "  warning      s_z is known only to +-15 %: there are few keypoints for their noise"
+        "  warning      s_z is known only to +-15 %"
     )
 
 

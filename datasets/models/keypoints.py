@@ -92,16 +92,6 @@ class RotationalSymmetry:
     """Where the object looks the same under any rotation about the circle's axis; None where only
     some rotations take it to itself, as the five feet of an office chair."""
 
-    @property
-    def is_circle(self) -> bool:
-        """True if any angle of rotation leaves the object as it is."""
-        return self.circle is not None
-
-    @property
-    def fold(self) -> int | None:
-        """Number of keypoints that trade places; None on a circle, which has no such number."""
-        return None if self.is_circle else len(self.keypoints)
-
 
 @dataclass(frozen=True)
 class Symmetries:
@@ -111,13 +101,6 @@ class Symmetries:
     """Keypoints that mirror each other, as rows in `Keypoints` (not semantic ids)."""
     rotations: tuple[RotationalSymmetry, ...] = ()
     """Keypoints that a rotation takes to one another."""
-
-    @property
-    def axes(self) -> FloatArray:
-        """The axes of the circles, (c, 3) float, of length 1 and pointing up (y > 0)."""
-        normals = [rotation.circle.normal for rotation in self.rotations if rotation.circle]
-        axes = np.array(normals).reshape(-1, 3)
-        return np.where(axes[:, 1:2] < 0, -axes, axes)
 
 
 # Annotation files -------------------------------------------------------------------------------

@@ -48,7 +48,6 @@ _CAD_FOLDERS = ("CAD", "CAD/mat", "cad")
 _CAD = "[Cc][Aa][Dd]/**/*.mat"  # files in any of these
 _IMAGE_FOLDERS = ("Images", "images")
 _IMAGES = (".jpg", ".JPEG", ".jpeg", ".png")
-_FLAGS = ("truncated", "occluded", "difficult")
 
 
 class Pascal3D(PhotoDataset):
@@ -146,7 +145,6 @@ def _object(
     corners = found.array("bbox").ravel() - _FIRST_PIXEL
     if len(corners) != 4:
         raise InputError(f"{len(corners)} numbers are not a rectangle", where="bbox")
-    flags = (name for name in _FLAGS if found.number(name, default=0.0))
     viewpoint = found.struct("viewpoint")
     return PhotoObject(
         object_id=str(number),
@@ -155,7 +153,6 @@ def _object(
         keypoints=_anchors(found.struct("anchors")),
         model=cad_model(root, category, index) if index >= 1 else None,
         bbox=corners,
-        flags=frozenset(flags),
     )
 
 

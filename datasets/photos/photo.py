@@ -134,8 +134,6 @@ class PhotoObject:
     """An image of the object's pixels; see `read_mask`."""
     bbox: FloatArray | None = None
     """(4,), left, top, right and bottom of its rectangle in the photo [px]."""
-    flags: frozenset[str] = frozenset()
-    """Some of "truncated", "occluded", "difficult"."""
 
     def read_mask(self) -> BoolArray:
         """Read the object's pixels, (h, w) bool; raises DataError if there are none."""

@@ -40,7 +40,6 @@ ANNOTATIONS = "pix3d.json"
 _SENSOR = 32.0
 # Pix3D's camera has x to the left, y up and z forward.
 _PIX3D_AXES = np.array([-1.0, -1.0, 1.0])
-_FLAGS = {"truncated": "truncated", "occluded": "occluded", "slightly_occluded": "occluded"}
 
 
 class _Entry(ForeignDocument):
@@ -55,14 +54,6 @@ class _Entry(ForeignDocument):
     trans_mat: Point3 | None = None
     focal_length: Positive | None = None
     bbox: tuple[Finite, Finite, Finite, Finite] | None = None
-    # Some entries have texts.
-    truncated: bool | str = False
-    occluded: bool | str = False
-    slightly_occluded: bool | str = False
-
-    def flags(self) -> frozenset[str]:
-        named = ((flag, getattr(self, name)) for name, flag in _FLAGS.items())
-        return frozenset(flag for flag, value in named if str(value).lower() == "true")
 
 
 class Pix3D(PhotoDataset):
@@ -101,7 +92,6 @@ class Pix3D(PhotoDataset):
             model=self._model(entry),
             mask_path=None if entry.mask is None else existing(self.root / entry.mask),
             bbox=None if entry.bbox is None else np.array(entry.bbox) - PIXEL_CENTRE,
-            flags=entry.flags(),
         )
         return Photo(self.names[index], existing(self.root / entry.img), camera, (shown,))
 

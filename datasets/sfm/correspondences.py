@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -49,8 +49,6 @@ class Correspondences:
     ...                        camera, pose)
     >>> seen.residuals().tolist()
     [[-1.0, 0.0], [0.0, 0.0]]
-    >>> len(seen.subset([False, True]))
-    1
     """
 
     id: str
@@ -88,22 +86,6 @@ class Correspondences:
         """
         projected = self.camera.project(self.cam_from_world.apply(self.points_3d))
         return np.asarray(projected - self.points_2d)
-
-    def subset(self, rows: npt.ArrayLike) -> Correspondences:
-        """Keep some of the points: ``rows`` is a mask (n,), or the rows to keep (k,)."""
-        chosen = np.asarray(rows)
-        is_mask = chosen.dtype.kind == "b" and chosen.shape == (len(self),)
-        if not is_mask and chosen.dtype.kind not in "iu":
-            if chosen.size:
-                what = f"neither a mask of {len(self)} values nor row numbers"
-                raise InputError(what, where="rows")
-            chosen = chosen.astype(np.int64)
-        return replace(
-            self,
-            points_3d=self.points_3d[chosen],
-            points_2d=self.points_2d[chosen],
-            point_ids=None if self.point_ids is None else self.point_ids[chosen],
-        )
 
 
 class CorrespondenceSet(RecordSet[Correspondences]):

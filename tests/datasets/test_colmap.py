@@ -375,19 +375,6 @@ def test_correspondences_are_checked_and_cannot_be_changed():
         )
 
 
-def test_subset_takes_masks_and_rows():
-    camera = Camera(64, 48, 50, 50, 31.5, 23.5)
-    pose = Alignment(np.eye(3), [0, 0, 2], [1, 1, 1])
-    points = np.arange(9.0).reshape(3, 3)
-    seen = Correspondences("a", points, np.ones((3, 2)), camera, pose, np.array([4, 5, 6]))
-    assert seen.subset([True, False, True]).point_ids.tolist() == [4, 6]
-    assert seen.subset([2, 0]).points_3d.tolist() == points[[2, 0]].tolist()
-    assert len(seen.subset([])) == 0
-    for rows in ([True, False], [0.5, 1.0], ["a"]):
-        with pytest.raises(InputError, match="rows"):
-            seen.subset(rows)
-
-
 # --- the real model
 
 

@@ -91,12 +91,9 @@ def test_keypoints_and_symmetries_arrive(root):
     np.testing.assert_allclose(keypoints.barycentric.sum(axis=1), 1, atol=1e-15)
     assert model.symmetries.reflections == ((0, 1),)
     ring, pair = model.symmetries.rotations
-    assert ring.is_circle
-    assert ring.fold is None
     assert ring.circle.radius == 0.5
     np.testing.assert_allclose(ring.circle.normal, [0, -1, 0])
-    np.testing.assert_allclose(model.symmetries.axes, [[0, 1, 0]])
-    assert (pair.keypoints, pair.is_circle, pair.fold) == ((2, 3), False, 2)
+    assert (pair.keypoints, pair.circle) == ((2, 3), None)
 
 
 def test_records_are_read_only_and_picklable(root):

@@ -90,7 +90,6 @@ def test_the_truth_projects_as_the_reference_does(root):
     assert np.linalg.norm(pose.translation) == pytest.approx(6.0)
     assert chair.truth.metres is None
     np.testing.assert_array_equal(chair.bbox, [10, 20, 50, 60])
-    assert chair.flags == {"truncated"}
 
 
 def test_visible_anchors_belong_to_the_models(root):

@@ -59,7 +59,6 @@ def test_keypoints_are_the_mean_of_those_who_marked_them(root):
     assert chair.model.load_keypoints().xyz.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
     assert chair.model.load_mesh().faces.shape == (4, 3)
     assert chair.read_mask().all()
-    assert chair.flags == {"occluded"}
 
 
 def test_what_is_missing_is_none(root):

@@ -292,7 +292,8 @@ class TestRows:
         assert few.method == "ransac-aepnp"
 
     def test_too_few_points_become_a_failed_row_with_the_reason(self):
-        few = seen_image("a", 1).subset(np.arange(5))
+        seen = seen_image("a", 1)
+        few = replace(seen, points_3d=seen.points_3d[:5], points_2d=seen.points_2d[:5])
         task = CorrespondenceTask("a", 0.0, 0, few)
         options = CorrespondenceOptions(ANY, methods=("aepnp-paper", "epnp"))
         paper, epnp = correspondence_benchmark(options).evaluate([task])

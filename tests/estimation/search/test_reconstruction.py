@@ -52,7 +52,7 @@ def test_points_of_the_scene_are_aligned_in_its_frame() -> None:
 
 def test_bad_keypoints_are_named() -> None:
     images = opened()
-    name = images.ids[0]
+    name = images.names[0]
     with pytest.raises(InputError, match="no image"):
         views_from(images, {"nowhere.jpg": ([[1.0, 2.0]], [0])})
     with pytest.raises(InputError, match="occurs twice") as caught:

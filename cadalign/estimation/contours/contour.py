@@ -37,11 +37,9 @@ REACH = 2.0
 _STEP = 0.25
 _LONGEST_STEP = 1.5  # [px], between rays on a normal: a thinner part may be missed
 _MOST_STEPS = 24  # to either side
-_PRECISION, _ROUGH = 0.05, 0.2  # [px], of a rim
+_PRECISION = 0.05  # [px], of a rim
 _STEEPEST = 1.2  # tangent of the angle between rim and contour above which these don't match
-# Widths [px] of the band about a rim where pixels may differ from the mask's, by the largest
-# distance [px] of the rim from the contour; smoothing does not reach beyond the last.
-_BANDS = ((0.5, 3), (1.5, 5), (np.inf, 7))
+_BAND = 5  # width [px] of the band about a rim where pixels may differ from the mask's
 _MARGIN = 8  # [px], about the rims: their reach, and that of smoothing
 _LEAST_COSINE = 0.3  # between rim and contour
 
@@ -169,13 +167,23 @@ def crossings(
     places = offsets + steps[:, None]
     along = points + places[..., None] * normals
     values = sampled(level, along.reshape(-1, 2)).reshape(places.shape)
-    falls = (values[:-1] >= 0.5) & (values[1:] < 0.5)
-    distance = np.where(falls, np.abs(steps[:-1] + _STEP / 2)[:, None], np.inf)
-    nearest, every = distance.argmin(axis=0), np.arange(len(offsets))
+    nearest, is_left = _nearest_exits(values >= 0.5, steps)
+    every = np.arange(len(offsets))
     before, after = values[nearest, every], values[nearest + 1, every]
     with np.errstate(divide="ignore", invalid="ignore"):
         found = places[nearest, every] + _STEP * (before - 0.5) / (before - after)
-    return np.where(np.isfinite(distance[nearest, every]), found, np.nan)
+    return np.where(is_left, found, np.nan)
+
+
+def _nearest_exits(inside: BoolArray, steps: FloatArray) -> tuple[IntArray, BoolArray]:
+    """Numbers (S,) of the last of K steps inside on normals, and which (S,) have one.
+
+    Of the exits of ``inside`` (K, S) that nearest to 0 of the ``steps`` (K,) counts.
+    """
+    exits = inside[:-1] & ~inside[1:]
+    middles = np.abs(steps[:-1] + steps[1:])
+    nearest = np.where(exits, middles[:, None], np.inf).argmin(axis=0)
+    return nearest, exits[nearest, np.arange(inside.shape[1])]
 
 
 def _resampled(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -285,20 +293,20 @@ class Sight(NamedTuple):
         return origin, flat @ by_pixel.T + first, np.True_
 
 
-def find_rims(sight: Sight, contour: Contour, reach: float, *, is_rough: bool = False) -> Rims:
+def find_rims(sight: Sight, contour: Contour, reach: float) -> Rims:
     """Find the rims that are nearest to a contour, at most ``reach`` [px] away.
 
-    A rim is a change from the object to the background in the contour's outward direction. It
-    ``is_rough`` where the `extraction_bias` is taken of it, which is as accurate for a rough one.
+    A rim is a change from the object to the background in the contour's outward direction.
     """
-    count, precision = len(contour.points), _ROUGH if is_rough else _PRECISION
+    count = len(contour.points)
     intervals = 2 * min(int(np.ceil(reach / _LONGEST_STEP)), _MOST_STEPS)
     steps = np.linspace(-reach, reach, intervals + 1)
-    first, found = _nearest_exits(sight, contour, steps)
+    places = np.repeat(steps[:, None], count, axis=1)
+    first, found = _nearest_exits(sight.covers(contour.at(places)), steps)
     rows = np.flatnonzero(found)
     some = contour.taken(rows)
     inner, outer = steps[first[rows]], steps[first[rows] + 1]
-    for _ in range(int(np.ceil(np.log2((steps[1] - steps[0]) / precision)))):
+    for _ in range(int(np.ceil(np.log2((steps[1] - steps[0]) / _PRECISION)))):
         half = (inner + outer) / 2
         inside = sight.covers(some.at(half))
         inner, outer = np.where(inside, half, inner), np.where(inside, outer, half)
@@ -312,29 +320,6 @@ def find_rims(sight: Sight, contour: Contour, reach: float, *, is_rough: bool = 
     surface[rows] = points[hit]
     faces[rows] = face[hit]
     return Rims(found, offset, surface, faces)
-
-
-def _nearest_exits(sight: Sight, contour: Contour, steps: FloatArray) -> tuple[IntArray, BoolArray]:
-    """Numbers (S,) of the last steps inside of the object on normals, and which (S,) have one.
-
-    The exit nearest to the middle of ``steps``, an odd number, counts: rays are cast from there in
-    both directions until one is found, and most normals need three.
-    """
-    middle, count = len(steps) // 2, len(contour.points)
-    exits, found = np.zeros(count, dtype=int), np.zeros(count, dtype=bool)
-    rows, ring, some = np.arange(count), 0, contour
-    inward = outward = sight.covers(contour.at(np.full(count, steps[middle])))
-    while len(rows) and ring < middle:
-        ring += 1
-        places = np.repeat(steps[[middle - ring, middle + ring], None], len(rows), axis=1)
-        before, after = sight.covers(some.at(places))
-        inside, outside = before & ~inward, outward & ~after
-        exits[rows] = np.where(inside, middle - ring, middle + ring - 1)
-        found[rows] = inside | outside
-        further = ~found[rows]
-        rows, inward, outward = rows[further], before[further], after[further]
-        some = contour.taken(rows)
-    return exits, found
 
 
 def without_steep(contour: Contour, rims: Rims, bias: FloatArray | float = 0.0) -> Rims:
@@ -393,32 +378,22 @@ def extraction_bias(sight: Sight, mask: MaskImage, contour: Contour, rims: Rims)
         return bias
     some, offsets = contour.taken(rows), rims.offset[rows]
     inside, places = mask
-    corner, rendered = _rendered(sight, inside, some.at(offsets), np.abs(offsets))
+    corner, rendered = _rendered(sight, inside, some.at(offsets))
     own = crossings(smoothed(rendered), some.points - corner, some.normals, offsets)
     bias[rows] = np.nan_to_num(offsets - (own - places[rows]))
     return np.where(np.abs(bias) < REACH, bias, 0.0)
 
 
-def _rendered(
-    sight: Sight, mask: Image, rims: FloatArray, distances: FloatArray
-) -> tuple[IntArray, Image]:
-    """The silhouette near rims (S, 2) [px], the mask about them; first the corner (2,) of it.
-
-    Where rims are at small ``distances`` (S,) [px] from the contour, all but the nearest pixels are
-    those of the mask.
-    """
+def _rendered(sight: Sight, mask: Image, rims: FloatArray) -> tuple[IntArray, Image]:
+    """The silhouette near rims (S, 2) [px], the mask about them; first the corner (2,) of it."""
     height, width = mask.shape
     places = np.clip(np.rint(rims).astype(int), 0, [width - 1, height - 1])
     corner = np.maximum(places.min(axis=0) - _MARGIN, 0)
     right, bottom = places.max(axis=0) + _MARGIN + 1
     rendered = mask[corner[1] : bottom, corner[0] : right].copy()
-    near, least = np.zeros(rendered.shape, dtype=np.uint8), 0.0
-    for most, band in _BANDS:
-        columns, rows = (places[(distances >= least) & (distances < most)] - corner).T
-        some = np.zeros_like(near)
-        some[rows, columns] = 1
-        near |= np.asarray(cv2.dilate(some, np.ones((band, band), np.uint8)), dtype=np.uint8)
-        least = most
+    near = np.zeros(rendered.shape, dtype=np.uint8)
+    near[tuple((places - corner).T[::-1])] = 1
+    near = np.asarray(cv2.dilate(near, np.ones((_BAND, _BAND), np.uint8)), dtype=np.uint8)
     pixels = cv2.findNonZero(near).reshape(-1, 2)  # five times as fast as NumPy
     rendered[pixels[:, 1], pixels[:, 0]] = sight.covers(pixels + corner)
     return corner, rendered

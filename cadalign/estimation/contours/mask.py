@@ -110,7 +110,7 @@ class MaskSource(OutlineSource):
 
     def outline(self, sight: Sight, surface: PosedSurface, track: Track) -> Outline:
         """See `OutlineSource`; a fine outline is free of the bias of the contour's extraction."""
-        rims = find_rims(sight, self.contour, track.reach, is_rough=track.is_fine)
+        rims = find_rims(sight, self.contour, track.reach)
         bias = np.zeros(len(rims.found))
         if track.is_fine:
             bias = extraction_bias(sight, self.mask, self.contour, rims)
@@ -124,7 +124,6 @@ class MaskSource(OutlineSource):
             rims.points,
             rims.face,
             across,
-            self.contour.size,
             track.reach,
         )
 

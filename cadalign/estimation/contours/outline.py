@@ -112,7 +112,6 @@ class Outline(NamedTuple):
     points: FloatArray
     face: IntArray
     across: FloatArray
-    size: float
     reach: float
     contrast: float = 0.0
 

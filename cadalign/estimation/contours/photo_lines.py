@@ -317,7 +317,6 @@ def outline_of(photo: PhotoPyramid, silhouette: Silhouette, reach: float) -> Out
         silhouette.points,
         silhouette.face,
         np.einsum("ni,nij->nj", silhouette.across, slopes),
-        silhouette.size,
         reach,
         contrast,
     )

@@ -8,7 +8,6 @@ if TYPE_CHECKING:
     from cadalign.geometry.alignment import Alignment, Box
     from cadalign.geometry.camera import Camera
     from cadalign.geometry.conventions import (
-        alignment_from_opengl,
         opengl_from_model,
         opengl_projection,
         up_from_gravity,
@@ -37,7 +36,6 @@ __all__ = [
     "Symmetry",
     "SymmetryAxis",
     "alignment_box_iou",
-    "alignment_from_opengl",
     "box_iou",
     "box_iou_up_to_scale",
     "nearest_truth",

@@ -37,20 +37,6 @@ def opengl_from_model(cam_from_model: Alignment) -> FloatArray:
     return np.asarray(OPENGL_FLIP @ cam_from_model.cam_from_model)
 
 
-def alignment_from_opengl(opengl_from_world: FloatArray) -> Alignment:
-    """Convert a rigid model-view matrix (4, 4) to a pose in cadalign's axes; scale 1.
-
-    Raises
-    ------
-    InputError
-        If the matrix is not a rotation and a translation.
-    """
-    matrix = OPENGL_FLIP @ opengl_from_world
-    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-9:
-        raise InputError("the last row is not (0, 0, 0, 1)", where="transform")
-    return Alignment(matrix[:3, :3], matrix[:3, 3], np.ones(3))
-
-
 def opengl_projection(
     camera: Camera,
     *,

@@ -122,8 +122,8 @@ class RayCaster:
         Its number is -1 and its distance infinite where there is none; ``start`` and distances,
         both (n,), count in the directions' own lengths.
         """
-        face = self.first_faces(origin, directions, start=start)
-        return face, self.distances(origin, directions, face)
+        face = self._engine.first_faces(*self._rays(origin, directions, start))
+        return face, self._distances(origin, directions, face)
 
     def normals(self, face: FaceArray | npt.NDArray[np.int64]) -> FloatArray:
         """Unit normals (n, 3) of triangles (n,)."""
@@ -145,12 +145,6 @@ class RayCaster:
             unit.astype(np.float32), (directions / self._radius).astype(np.float32), reach
         )
 
-    def first_faces(
-        self, origin: FloatArray, directions: FloatArray, *, start: FloatArray | None = None
-    ) -> FaceArray:
-        """Find the first triangle on each ray as `first_hits` does, without its distance."""
-        return self._engine.first_faces(*self._rays(origin, directions, start))
-
     def _rays(
         self, origin: FloatArray, directions: FloatArray, start: FloatArray | None = None
     ) -> tuple[SingleArray, SingleArray]:
@@ -170,11 +164,8 @@ class RayCaster:
         unit += _NUDGE
         return origins.astype(np.float32, copy=False), unit.astype(np.float32)
 
-    def distances(self, origin: FloatArray, directions: FloatArray, face: FaceArray) -> FloatArray:
-        """Measure how far rays (n, 3) from one point go to their triangles (n,); see `first_hits`.
-
-        Triangles are those of `first_faces`; (n,) float, infinite where there is none (-1).
-        """
+    def _distances(self, origin: FloatArray, directions: FloatArray, face: FaceArray) -> FloatArray:
+        """Distances of `first_hits`, in double precision."""
         distance = np.full(len(face), np.inf)
         hit = np.flatnonzero(face >= 0)
         found, along = face[hit], directions[hit]

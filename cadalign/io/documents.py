@@ -1,9 +1,9 @@
 """Reading JSON documents against declared types, with errors that name the file and the field.
 
-A format is declared as a `Document`: its fields, their types, meaning and defaults. `read_document`
-and `convert` check data against it without coercion (``true`` is no number, ``"1"`` is no number)
-and refuse unknown fields. Formats of other programs are a `ForeignDocument`, whose further fields
-are ignored. What the types cannot express is checked in ``__post_init__``, which raises
+A format is declared as a `Document`: its fields, their types, meaning and defaults. `convert`
+checks data against it without coercion (``true`` is no number, ``"1"`` is no number) and refuses
+unknown fields. Formats of other programs are a `ForeignDocument`, whose further fields are ignored.
+What the types cannot express is checked in ``__post_init__``, which raises
 `cadalign.errors.InputError`; its place is completed here.
 """
 
@@ -61,13 +61,6 @@ def require_unique(keypoints: Sequence[Any], field: str) -> None:
 
 class ForeignDocument(Struct):
     """Base of declared formats of other programs; unknown fields are ignored."""
-
-
-def read_document(path: Path, kind: type[T]) -> T:
-    """Read a JSON file of a declared type; errors name the file and the field."""
-    data = read_json(path)
-    with in_file(path):
-        return convert(data, kind)
 
 
 def read_json(path: Path) -> Any:

@@ -23,7 +23,15 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PixelOrigin
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.io.documents import Positive, in_file, path_from, read_json, within, written_path
+from cadalign.io.documents import (
+    Positive,
+    in_file,
+    parse_json,
+    path_from,
+    read_json,
+    within,
+    written_path,
+)
 from cadalign.io.evidence import ImageEvidence, ObservedImage, Size
 from cadalign.io.files import as_path, once_per_file, read_bytes, read_text, write_json
 from cadalign.io.observation_file import (
@@ -376,10 +384,10 @@ def _read_form(path: Path) -> dict[str, Any]:
     """The parsed form of a camera in a file."""
     if path.suffix.lower() == _ARRAY:
         return {"matrix": _read_array(path)}
-    if not _is_json(path):
-        numbers = read_text(path).replace(",", " ").replace(";", " ").split()
-        return {"matrix": _square(numbers, path)}
-    data = read_json(path)
+    text = read_text(path)
+    if path.suffix.lower() != ".json" and text.lstrip()[:1] not in ("{", "["):
+        return {"matrix": _square(text.replace(",", " ").replace(";", " ").split(), path)}
+    data = parse_json(text, str(path))
     if isinstance(data, list) and len(data) in (3, 9):
         return {"matrix": _square(data, path)}
     if not isinstance(data, dict):
@@ -390,11 +398,6 @@ def _read_form(path: Path) -> dict[str, Any]:
             rest = {key: value for key, value in data.items() if key != name}
             return {**rest, "matrix": _square(data[name], path)}
     return dict(data)
-
-
-def _is_json(path: Path) -> bool:
-    text = read_text(path)
-    return path.suffix.lower() == ".json" or text.lstrip()[:1] in ("{", "[")
 
 
 def _read_array(path: Path) -> Any:

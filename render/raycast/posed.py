@@ -159,22 +159,10 @@ class PosedScene:
         Linear light, premultiplied, and opacity: (n / samples, 4) float32. Rays that are not
         ``valid`` see nothing.
         """
-        directions = self._directions(rays)
-        face = self._caster.first_faces(self._origin, directions)
+        face, depth = self.cast(rays)
         face[~valid] = -1
-        surface = self.scene.surface
-        if surface.varies or not surface.opaque:
-            depth = self._caster.distances(self._origin, directions, face)
-            light = self.light_of_hits(rays, self._as_shown(face), depth, studio)
-            return np.asarray(light.reshape(-1, samples, 4).mean(axis=1))
-        # A triangle of one colour looks the same all over a pixel: one of its hits stands for all.
-        chosen, share = _one_of_each(face.reshape(-1, samples))
-        face = face[chosen]
-        depth = self._caster.distances(self._origin, directions[chosen], face)
-        light = self.light_of_hits(rays[chosen], self._as_shown(face), depth, studio)
-        light *= share[:, None]
-        begins = np.searchsorted(chosen // samples, np.arange(len(directions) // samples))
-        return np.asarray(np.add.reduceat(light, begins, axis=0))
+        light = self.light_of_hits(rays, face, depth, studio)
+        return np.asarray(light.reshape(-1, samples, 4).mean(axis=1))
 
     def light_of_hits(
         self, rays: FloatArray, face: FaceArray, depth: FloatArray, studio: Studio
@@ -214,16 +202,8 @@ class PosedScene:
         surface = self.scene.surface
         normal = self.normals[face]
         smooth = np.flatnonzero(self.scene.is_smooth[face])
-        weights: LinearArray | None = None
-        if surface.varies:
-            weights = self._weights(rays, face, depth)
-        if len(smooth):
-            chosen = (
-                self._weights(rays[smooth], face[smooth], depth[smooth])
-                if weights is None
-                else weights[smooth]
-            )
-            normal[smooth] = self._smooth_normals(face[smooth], chosen)
+        weights = self._weights(rays, face, depth)
+        normal[smooth] = self._smooth_normals(face[smooth], weights[smooth])
         color = surface.color(face, weights)
         view = (-rays).astype(np.float32)
         view /= np.sqrt(np.einsum("nk,nk->n", view, view))[:, None]
@@ -258,22 +238,6 @@ class PosedScene:
         rows = normals @ self._normal_matrix.T
         rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-30)
         return (rows * self._side[:, None]).astype(np.float32)
-
-
-def _one_of_each(faces: FaceArray) -> tuple[npt.NDArray[np.int64], LinearArray]:
-    """A place of each triangle in each row (n, k), row by row, and its share of the row.
-
-    Places count in the flattened array.
-    """
-    order = np.argsort(faces, axis=1)
-    ordered = np.take_along_axis(faces, order, axis=1)
-    begins = np.ones(faces.shape, dtype=bool)
-    begins[:, 1:] = ordered[:, 1:] != ordered[:, :-1]
-    firsts = np.flatnonzero(begins)
-    count = faces.shape[1]
-    places = firsts - firsts % count + order.ravel()[firsts]
-    shares = np.diff(firsts, append=faces.size).astype(np.float32) / np.float32(count)
-    return places, shares
 
 
 def pose_scene(

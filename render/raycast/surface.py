@@ -45,11 +45,6 @@ class SurfaceColors:
             }
 
     @property
-    def varies(self) -> bool:
-        """The colour changes within a face, so that a lookup needs weights."""
-        return self._corner_color is not None or bool(self._textures)
-
-    @property
     def opaque(self) -> bool:
         """Nothing can be seen through the surface."""
         color = self._face_color if self._corner_color is None else self._corner_color
@@ -57,13 +52,11 @@ class SurfaceColors:
             bool((texture[..., 3] >= 1).all()) for texture in self._textures.values()
         )
 
-    def color(self, face: FaceArray, weights: LinearArray | None) -> LinearArray:
+    def color(self, face: FaceArray, weights: LinearArray) -> LinearArray:
         """Look up linear colour and opacity (n, 4), not premultiplied, at points of triangles (n,).
 
-        Their barycentric coordinates ``weights`` (n, 3) are needed where the colour `varies`.
+        ``weights`` (n, 3) are their barycentric coordinates.
         """
-        if weights is None or not self.varies:
-            return np.asarray(self._face_color[face])
         if self._corner_color is None:
             color = self._face_color[face]
         else:

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from cadalign import Alignment, Camera, Mesh
-from cadalign.errors import InputError
 from cadalign.geometry.conventions import (
     OPENGL_AXES,
-    alignment_from_opengl,
     opengl_from_model,
     opengl_projection,
 )
@@ -100,11 +98,3 @@ def test_opengl_matrices_project_as_the_camera_does() -> None:
         y = top + (1 - device[:, 1]) / 2 * height - 0.5
         expected = PLAIN.project(pose.apply(points))
         np.testing.assert_allclose(np.column_stack([x, y]), expected, atol=1e-9)
-
-
-def test_opengl_poses_go_both_ways() -> None:
-    pose = look_at(azimuth=50, elevation=-20, distance=3)
-    again = alignment_from_opengl(opengl_from_model(pose))
-    np.testing.assert_allclose(again.cam_from_model, pose.cam_from_model, atol=1e-12)
-    with pytest.raises(InputError, match="last row"):
-        alignment_from_opengl(np.ones((4, 4)))

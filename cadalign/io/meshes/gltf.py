@@ -363,11 +363,9 @@ def _colors(file: _GltfFile, primitive: _Part) -> FloatArray | None:
 
 def _encoded(colors: FloatArray) -> FloatArray:
     """glTF's factors and vertex colours (..., 4), which are linear light, as sRGB."""
-    light = colors[..., :3]
-    bright = 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055
-    found = np.array(colors, dtype=np.float64)
-    found[..., :3] = np.where(light <= 0.0031308, 12.92 * light, bright)
-    return found
+    from trimesh.visual.color import linear_to_srgb  # takes time to import
+
+    return np.concatenate([linear_to_srgb(colors[..., :3]), colors[..., 3:]], axis=-1)
 
 
 def _moved(mesh: Mesh, transform: FloatArray) -> Mesh:

@@ -28,11 +28,7 @@ logger = logging.getLogger("cadalign")
 _Entry = dict[str, list[str]]
 
 WHITE = (1.0, 1.0, 1.0, 1.0)
-# How many values follow each option of map_Kd, after "The MTL file format", Wavefront 1995.
-_MAP_OPTIONS = {
-    "-blendu": 1, "-blendv": 1, "-cc": 1, "-clamp": 1, "-texres": 1, "-imfchan": 1, "-type": 1,
-    "-bm": 1, "-boost": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3,
-}  # fmt: skip
+_SWITCHES = ("on", "off")  # values of options of map_Kd
 
 
 def load_materials(
@@ -130,15 +126,13 @@ def _number(words: list[str] | None) -> float | None:
 
 
 def _without_options(words: Sequence[str]) -> Sequence[str]:
+    """The words of ``map_Kd`` without its options, such as ``-s 1 1 1`` and ``-clamp on``."""
     position = 0
-    while position < len(words) - 1 and words[position].lower() in _MAP_OPTIONS:
-        option = words[position].lower()
+    while position < len(words) - 1 and (
+        words[position].startswith("-")
+        or (position and (_number([words[position]]) is not None or words[position] in _SWITCHES))
+    ):
         position += 1
-        for value in words[position : position + _MAP_OPTIONS[option]]:
-            # -o, -s and -t may leave their second and third value out.
-            if option in ("-o", "-s", "-t") and _number([value]) is None:
-                break
-            position += 1
     return words[position:]
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from cadalign import Model, align, views_from
 from cadalign.datasets import Colmap
-from cadalign.errors import InputError
+from cadalign.errors import DataError, InputError
 
 
 def opened() -> Colmap:
@@ -53,7 +53,7 @@ def test_points_of_the_scene_are_aligned_in_its_frame() -> None:
 def test_bad_keypoints_are_named() -> None:
     images = opened()
     name = images.names[0]
-    with pytest.raises(InputError, match="no image"):
+    with pytest.raises(DataError, match="no image"):
         views_from(images, {"nowhere.jpg": ([[1.0, 2.0]], [0])})
     with pytest.raises(InputError, match="occurs twice") as caught:
         views_from(images, {name: ([[1.0, 2.0], [3.0, 4.0]], [0, 0])})

@@ -13,21 +13,20 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, copied
 from cadalign.errors import CadalignError
-from cadalign.estimation.assemble import result_of_keypoints
-from cadalign.estimation.fit import check_search, diagnosis_of_fit, fit_one
+from cadalign.estimation.fit import check_search, fit_one
 from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma, pixel_information
 from cadalign.estimation.problems import (
     Problems,
-    Solutions,
     each_of,
     in_threads,
     joined,
     pack_many,
+    pack_one,
 )
 from cadalign.estimation.result import Result
 from cadalign.estimation.results import COLUMNS, Entry, Results
-from cadalign.estimation.solve import are_solved_at_once, keypoints_of_solution, solve
+from cadalign.estimation.solve import are_solved_at_once, solve
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.solvers.constants import POSE_SIZE
@@ -139,37 +138,22 @@ def fit_batch(
 
 def _solve_at_once(each: Sequence[Problems], options: FitOptions) -> tuple[list[Entry], FloatArray]:
     """The entries of `Results`, each made when it is asked for, and their table (B, 17)."""
-    start, problems = time.perf_counter(), joined(each)
+    problems = joined(each)
     solutions = solve(problems, options)
-    errors = dict(solutions.errors)
-    solutions = solutions._replace(errors=errors)  # which can be pickled
-    seconds = (time.perf_counter() - start) / max(len(problems), 1)
     squares = np.append((solutions.residuals**2).sum(axis=1), 0.0)
     means = np.add.reduceat(squares, problems.offsets[:-1]) / np.maximum(problems.counts, 1)
     table = np.empty((len(problems), COLUMNS))
     table[:, :POSE_SIZE] = solutions.poses[:, 0]
     table[:, POSE_SIZE], table[:, POSE_SIZE + 1] = np.sqrt(means), problems.camera.fx
+    errors = solutions.errors
     table[list(errors)] = np.nan
     return [
-        errors.get(b) or partial(_single, one, solutions, options, seconds, b, problems.rows(b))
-        for b, one in enumerate(each)
+        errors.get(b) or partial(_single, problems, b, options) for b in range(len(each))
     ], table
 
 
-def _single(
-    problem: Problems,
-    solutions: Solutions,
-    options: FitOptions,
-    seconds: float,
-    b: int,
-    rows: slice,
-) -> Result:
-    """The result of problem ``b``, which has a solution, as `cadalign.fit` gives it."""
-    own: dict[str, Any] = {
-        name: None if value is None else value[b : b + 1].copy()
-        for name, value in solutions._asdict().items()
-        if name not in ("residuals", "errors")
-    }
-    own["residuals"] = solutions.residuals[rows].copy()
-    fitted = keypoints_of_solution(problem, Solutions(**own), options, seconds)
-    return result_of_keypoints(problem.points_2d, fitted, diagnosis=diagnosis_of_fit)
+def _single(problems: Problems, b: int, options: FitOptions) -> Result:
+    """The result of problem ``b``, which has a solution: that of `cadalign.fit`."""
+    start, rows = time.perf_counter(), problems.rows(b)
+    one = pack_one(problems.points_3d[rows], problems.points_2d[rows], problems.camera)
+    return fit_one(one, options, None, None, None, start)

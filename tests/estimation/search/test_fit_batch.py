@@ -90,7 +90,7 @@ def test_results_go_to_other_processes(workers: int, ransac: RansacOptions | Non
     for result, single in zip(again, batch, strict=True):
         assert isinstance(result, Result)
         assert isinstance(single, Result)
-        assert result.to_dict() == single.to_dict()
+        assert result.to_dict() | {"stats": None} == single.to_dict() | {"stats": None}
 
 
 def test_points_behind_a_lens_are_handled_alike() -> None:

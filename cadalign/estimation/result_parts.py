@@ -213,7 +213,8 @@ class EvidenceSummary:
         >>> EvidenceSummary("gravity", 1, 1, 0.5, 0.5, "deg").name
         'views[1].up'
         """
-        return name_of(self.kind, self.view)
+        field = _FIELDS.get(self.kind, self.kind)
+        return self.kind if self.view is None else f"views[{self.view}].{field}"
 
     def __str__(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
@@ -235,17 +236,6 @@ def keypoint_summary(
         squares = np.einsum("ni,nij,nj->", kept, information, kept)
         in_sigmas = float(np.sqrt(squares / (2 * count)))
     return EvidenceSummary("keypoints", number, len(kept), in_sigmas, rms, "px")
-
-
-def name_of(kind: str, view: int | None) -> str:
-    """The argument that gives a piece of evidence.
-
-    Examples
-    --------
-    >>> name_of("size", None), name_of("depth", 0)
-    ('size', 'views[0].depth')
-    """
-    return kind if view is None else f"views[{view}].{_FIELDS.get(kind, kind)}"
 
 
 def listed(clauses: Sequence[str]) -> str:

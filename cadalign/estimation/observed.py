@@ -196,9 +196,9 @@ def views_from(
     Raises
     ------
     InputError
-        If there is no such photo, or its keypoints are invalid.
+        If the keypoints of a photo are invalid.
     DataError
-        If the reconstruction describes a photo wrongly.
+        If there is no such photo, or the reconstruction describes it wrongly.
 
     Examples
     --------

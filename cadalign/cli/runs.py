@@ -64,7 +64,7 @@ def conclude(spec: Spec, run: Run, *, json: bool) -> int:
                 "rows": rows,
                 "failed": failed,
                 spec.apart.replace(" ", "_"): apart,
-                "summary": [summary.to_dict() for summary in summaries],
+                "summary": [summary.cells() for summary in summaries],
             }
         )
     else:

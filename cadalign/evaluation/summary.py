@@ -65,11 +65,6 @@ class Summary:
                 cells[name] = value
         return cells
 
-    def to_dict(self) -> Row:
-        """All cells for JSON."""
-        quartiles = {name: vars(v) for name, v in self.values.items() if isinstance(v, Quartiles)}
-        return {**self.names, **self.values, **quartiles}
-
 
 @dataclass(frozen=True)
 class ConsoleTable:

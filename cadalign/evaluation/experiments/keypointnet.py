@@ -140,17 +140,11 @@ def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
 
 def _check_drawable(dataset: KeypointNet, options: KeypointNetOptions) -> None:
     """Refuse overlays, before the run, where there is no mesh to draw."""
-    if options.visibility == "hull":
+    if options.visibility == "hull" or not dataset.subset(with_mesh=True).ids():
         raise InputError(
-            "visibility hull uses no meshes, so that there is nothing to draw",
+            "no mesh of the models is used, so that there is nothing to draw",
             where="render",
-            fix="choose auto or rays, or draw nothing",
-        )
-    if not dataset.subset(with_mesh=True).ids():
-        raise InputError(
-            "none of the models has a mesh, so that there is nothing to draw",
-            where="render",
-            fix="name ShapeNet's folder by shapenet, or draw nothing",
+            fix="name ShapeNet's folder by shapenet, leave out visibility hull, or draw nothing",
         )
 
 

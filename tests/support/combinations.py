@@ -339,7 +339,7 @@ class Request(NamedTuple):
 def has_covariance(cell: Cell) -> bool:
     """False for the unrefined hypothesis of a minimal solver, which is no optimum."""
     is_plain = cell.evidence == "keypoints" and cell.model in ("exact", "held", "symmetric")
-    return not (is_plain and cell.outliers == "unrefined")
+    return not (is_plain and cell.focal == "known" and cell.outliers == "unrefined")
 
 
 def _seen(rows: Sequence[int] = SHOWN, *, is_known: bool = True, **fields: Any) -> View:
@@ -421,7 +421,7 @@ def requests() -> list[Request]:
         Request(
             "keypoints of it in one plane, `ransac`",
             "the samples' stretch is not determined",
-            "points_3d: all keypoints lie in one plane, where the samples of ransac determine "
+            "points_3d: the points lie in the plane x = -0.5: the samples of ransac determine "
             "nothing; leave ransac away: use loss='cauchy', with stretch= or stretch_sigma=",
             lambda: align(exact, _seen([0, 1, 2, 3]), ransac=RansacOptions()),
         ),

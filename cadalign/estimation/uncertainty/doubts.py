@@ -27,6 +27,7 @@ FALSE_ALARMS = 0.004
 """Probability of residuals by chance, below which they fail their test."""
 _LARGE = 0.02  # estimated sigma, over the keypoints' extent, that is large
 _LARGEST_SHARE = 0.45  # of the keypoints' spread, of an estimated sigma
+_FAR_FROM_MIDDLE = 0.3  # of an image's size, from its middle to a principal point
 _SAME_MIDDLE = 0.02  # of an image's size, from its middle to a principal point taken for it
 _LEAST_GAIN = 0.9  # of a standard deviation, relative to that of the prior alone
 _ANY_ROTATION = math.sqrt(math.pi**2 / 3 + 2)  # standard deviation of uniform rotations [rad]
@@ -212,7 +213,7 @@ def outside_image(
 
 
 def _wrong_principal_point(camera: Camera) -> str | None:
-    """Says that a principal point is the middle of another image."""
+    """Says that a principal point is the middle of another image, or far from that of its own."""
     if camera.is_centred:
         return None
     own = f"({camera.cx:.4g}, {camera.cy:.4g})"
@@ -225,7 +226,13 @@ def _wrong_principal_point(camera: Camera) -> str | None:
                 f"{height:.0f} px, its own has {camera.width} x {camera.height} px: if the photo "
                 f"was resized, give Camera.resized({camera.width}, {camera.height}) of its camera"
             )
-    return None
+    off = max(abs(middle[0] / camera.width - 1), abs(middle[1] / camera.height - 1)) / 2
+    if off < _FAR_FROM_MIDDLE:
+        return None
+    return (
+        f"the camera's principal point {own} is far from the middle of its image of {camera.width} "
+        f"x {camera.height} px, which is right only for a photo cut out of a larger one"
+    )
 
 
 def unexplained(sigma: float, points_2d: Sequence[FloatArray]) -> Warnings:

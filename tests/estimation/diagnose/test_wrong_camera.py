@@ -87,8 +87,10 @@ def _of_double_size(seed: int) -> Result:
     [
         (Camera(640, 480, 1870, 1870, 639.5, 479.5), "the middle of an image of 1280 x 960 px"),
         (Camera(640, 480, 467.5, 467.5, 159.5, 119.5), "the middle of an image of 320 x 240 px"),
+        (Camera(640, 480, 935, 935, 900, 239.5), "(900, 239.5) is far from the middle"),
+        (Camera(640, 480, 935, 935, 0, 0), "(0, 0) is far from the middle"),
     ],
-    ids=["larger image", "smaller image"],
+    ids=["larger image", "smaller image", "outside", "corner"],
 )
 def test_principal_points_of_other_images_are_named(camera: Camera, words: str) -> None:
     points, pixels = _seen_by(CAMERA)

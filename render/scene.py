@@ -118,12 +118,6 @@ class Scene:
         return coincident_faces(self.mesh.vertices, self.mesh.faces)
 
     @cached_property
-    def is_smooth(self) -> npt.NDArray[np.bool_]:
-        """Triangles with corner normals that differ from their own, (m,) bool."""
-        difference = self.corner_normals - self.face_normals[:, None]
-        return np.asarray((np.abs(difference) > 1e-6).any(axis=(1, 2)))
-
-    @cached_property
     def barycentric_gradients(self) -> FloatArray:
         """Gradients of the barycentric weights of corners 1 and 2, (m, 2, 3) float.
 

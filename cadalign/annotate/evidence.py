@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Self
 
@@ -12,7 +13,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray
 from cadalign.errors import DataError, InputError
-from cadalign.io.images import read_mask
+from cadalign.io.images import open_picture, read_mask
 from cadalign.io.observation import Observation
 from cadalign.io.observation_file import StartFields
 
@@ -37,8 +38,8 @@ class MarkedMask:
     def pixels(self, width: int, height: int) -> BoolArray:
         """The mask (h, w); raises DataError if its file is none of that size."""
         if self.file is None:
-            encoded = np.frombuffer(self.png, np.uint8)
-            return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE)) > 0
+            with open_picture(BytesIO(self.png), len(self.png), where="mask") as image:
+                return np.asarray(image) > 0
         mask = read_mask(Path(self.file))
         if mask.shape != (height, width):
             raise DataError(

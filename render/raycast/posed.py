@@ -102,7 +102,7 @@ class PosedScene:
 
     def prepare_color(self) -> None:
         """Make now what `light_of_hits` needs, before several threads ask for it at once."""
-        _ = self.scene.surface, self.scene.is_smooth, self.scene.single_corner_normals
+        _ = self.scene.surface, self.scene.single_corner_normals
         _ = self.scene.barycentric_gradients
 
     def cast(
@@ -200,10 +200,8 @@ class PosedScene:
     ) -> LinearArray:
         """Light and opacity (n, 4) of hits, not premultiplied."""
         surface = self.scene.surface
-        normal = self.normals[face]
-        smooth = np.flatnonzero(self.scene.is_smooth[face])
         weights = self._weights(rays, face, depth)
-        normal[smooth] = self._smooth_normals(face[smooth], weights[smooth])
+        normal = self._smooth_normals(face, weights)
         color = surface.color(face, weights)
         view = (-rays).astype(np.float32)
         view /= np.sqrt(np.einsum("nk,nk->n", view, view))[:, None]

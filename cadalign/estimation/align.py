@@ -77,8 +77,8 @@ def align(
         As for `cadalign.fit`.
     ransac : RansacOptions, optional
         Search for the keypoints that agree, for views with outliers. Where the shape is not exact,
-        ``minimal`` names the size of the samples, of which at most ``max_iterations`` are drawn,
-        and ``refine=False`` refines only once on the inliers.
+        or the focal length is unknown, ``minimal`` names the size of the samples, of which at most
+        ``max_iterations`` are drawn, and ``refine=False`` refines only once on the inliers.
     focal : {"known", "estimate"}
         Take the focal lengths of the views' cameras as right, or estimate them: views of equal
         cameras share one. ``result.cameras`` have the estimates.

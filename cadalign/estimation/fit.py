@@ -86,7 +86,8 @@ def fit(
         that of usual lenses, `FocalPrior.of_usual_lenses`; None for none.
     ransac : RansacOptions, optional
         Search for the alignment with the most inliers, and fit to these: for keypoints with
-        outliers. ``result.inliers`` marks the inliers.
+        outliers. ``result.inliers`` marks the inliers. With an unknown focal length as for
+        `cadalign.align`.
     scores : (n,) float, optional
         Confidences of the keypoints, for ``ransac``: samples are drawn from the highest first.
     symmetry : Symmetry, optional

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import cast
 
@@ -231,6 +231,10 @@ class Lenses:
             camera if group < 0 else camera.with_focal(camera.fx * math.exp(log_focals[group]))
             for camera, group in zip(self.cameras, self.groups, strict=True)
         ]
+
+    def at(self, log_focals: FloatArray) -> Lenses:
+        """The lenses with references at focal lengths (F,), relative to those before."""
+        return replace(self, cameras=tuple(self.cameras_at(log_focals)))
 
     def grid(self) -> list[FloatArray]:
         """Focal lengths to start from: (F,) logarithms relative to the references, each."""

@@ -184,49 +184,19 @@ def compile_problem(
 
 
 def no_pose_error(problem: Problem) -> DegenerateError:
-    """The error where no start leads to a pose: what the evidence lacks, and what to give.
+    """The error where no start leads to a pose.
 
     Raises InputError if a mask or photo is given for a model without meshes.
     """
-    views = problem.views
-    seen = sum(len(view.keypoint_ids) > 0 for view in views)
-    shown = [
-        f"views[{view.number}].{'image' if view.mask is None else 'mask'}"
-        for view in views
-        if view.has_outline
-    ]
+    shown = [view for view in problem.views if view.has_outline]
     if shown:
         from cadalign.estimation.contours.surface import surface_of  # imports this package
 
         keypoints = problem.prior.components[0].mean[: len(problem.prior.ids)]
-        surface_of(problem.model, keypoints, shown[0])
-        is_rig = len(views) > 1 and views[0].cam_from_rig is not None
-        if not seen and len(views) == 1 and views[0].mask is not None:
-            return DegenerateError(
-                "a mask without keypoints does not tell the pose of an object that is only similar",
-                where=shown[0],
-                fix="give at least 3 keypoints, `init`, or the object's own model",
-            )
-        if not seen and len(views) == 1:
-            return DegenerateError(
-                "a photo without keypoints does not tell where its outline is to be sought",
-                where=shown[0],
-                fix="give `init`, at least 3 keypoints, or a mask",
-            )
-        if not seen:
-            return DegenerateError(
-                "masks and photos of several views tell no pose without keypoints",
-                where="views",
-                fix="give at least 3 keypoints in one view, or `init`",
-            )
-        if is_rig and seen == 1 and problem.size is None:
-            return DegenerateError(
-                "keypoints of one view alone leave open the size that the known motion gives",
-                where="views",
-                fix="give a keypoint in another view, `size`, or `init`",
-            )
+        field = "image" if shown[0].mask is None else "mask"
+        surface_of(problem.model, keypoints, f"views[{shown[0].number}].{field}")
     return DegenerateError(
-        "no pose has the keypoints in front of the camera",
+        "no pose with the keypoints in front of the camera follows from the evidence",
         where="views",
         fix="give at least 3 keypoints in one view, or `init`, and check which is which",
     )

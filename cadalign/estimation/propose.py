@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -45,7 +44,7 @@ def propose(problem: Problem, shape: Shape, init: Inits) -> tuple[Lenses, Starts
     found: list[_AtFocals] = []
     failure: InputError | None = None
     for log_focals in lenses.grid():
-        there = replace(lenses, cameras=tuple(lenses.cameras_at(log_focals)))
+        there = lenses.at(log_focals)
         try:
             if plain is None:
                 evidence = _thinned(problem.evidence(shape, there))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +15,6 @@ from cadalign.estimation.joint_robust import (
     JointConsensus,
     robust_minima,
     whitened_lengths,
-    with_sightings,
     with_whitening_times,
 )
 from cadalign.estimation.prior import Lenses
@@ -28,11 +26,9 @@ from cadalign.estimation.uncertainty.evidence import count_equations
 from cadalign.estimation.uncertainty.posterior import widening_of
 from cadalign.estimation.uncertainty.residuals import Support, area_of, check_support
 from cadalign.estimation.view import View
-from cadalign.solvers.joint.evidence import Evidence, State, points_of
+from cadalign.solvers.joint.evidence import Evidence, Shape, State, points_of
 from cadalign.solvers.joint.search import refine_joint, score_state, search_joint
 
-_SAME = 1e-3  # difference of rotations and log focal lengths of one minimum
-_ITERATIONS = 100  # about a lens that is linearised anew
 _LENS_ROUNDS = 12  # of linearising lenses with distortion about the focal lengths
 _SETTLED = 1e-8  # change of a log focal length
 _MOST_FREE = 2  # scales that keypoints determine; the size follows from other evidence
@@ -107,6 +103,8 @@ def search_at_noise(problem: Problem, init: Inits) -> SearchResult:
         else:
             found, used = _searched(problem, lenses, evidence, starts)
         iterations += used
+        if lenses.are_distorted:
+            lenses, found = _relinearised(problem, shape, lenses, found)
         prior_score = -2 * float(np.log(problem.prior.weights[number]))
         minima.extend(
             Minimum(number, *each._replace(score=each.score + prior_score), lenses)
@@ -115,8 +113,6 @@ def search_at_noise(problem: Problem, init: Inits) -> SearchResult:
     if problem.ransac is not None and minima:
         best = min(minima, key=lambda each: each.score)
         _check_support(problem, best, problem.threshold(problem.ransac))
-    if problem.lenses.are_distorted:
-        minima = _distinct([_relinearised(problem, each) for each in minima])
     minima.sort(key=lambda minimum: minimum.score)
     return SearchResult(problem, minima, iterations, hypotheses)
 
@@ -161,41 +157,27 @@ def _searched(
     return found, used
 
 
-def _distinct(minima: Sequence[Minimum]) -> list[Minimum]:
-    """The minima without those that lie at the same place as a likelier one."""
-    kept: list[Minimum] = []
-    for each in sorted(minima, key=lambda minimum: minimum.score):
-        if not any(_are_same(each, other) for other in kept):
-            kept.append(each)
-    return kept
-
-
-def _are_same(first: Minimum, second: Minimum) -> bool:
-    turned = np.abs(first.state.poses[:, :9] - second.state.poses[:, :9]).max()
-    zoomed = np.abs(np.log(first.focal_lengths / second.focal_lengths)).max(initial=0.0)
-    return first.component == second.component and max(turned, zoomed) < _SAME
-
-
-def _relinearised(problem: Problem, minimum: Minimum) -> Minimum:
-    """The minimum with lenses linearised about its own focal lengths."""
-    prior_score = minimum.prior_score
+def _relinearised(
+    problem: Problem, shape: Shape, lenses: Lenses, found: list[JointConsensus]
+) -> tuple[Lenses, list[JointConsensus]]:
+    """Lenses linearised about the focal lengths of the best minimum, and the minima there."""
     for _ in range(_LENS_ROUNDS):
-        log_focals = minimum.state.log_focals
-        if np.abs(log_focals).max(initial=0.0) < _SETTLED:
+        if not found or np.abs(found[0].state.log_focals).max() < _SETTLED:
             break
-        cameras = tuple(minimum.lenses.cameras_at(log_focals))
-        lenses = replace(minimum.lenses, cameras=cameras)
+        log_focals = found[0].state.log_focals
+        there = lenses.at(log_focals)
         try:
-            there = problem.evidence(minimum.evidence.shape, lenses)
+            evidence = problem.evidence(shape, there)
         except InputError:  # a lens cannot be undone at these
             break
-        evidence = with_sightings(there, minimum.inliers)
-        state = minimum.state._replace(log_focals=np.zeros_like(log_focals))
-        cost, _, state = refine_joint(evidence, _ITERATIONS, state)
-        if not cost < np.inf:
-            break
-        minimum = minimum._replace(evidence=evidence, state=state, cost=cost, lenses=lenses)
-    return minimum._replace(score=score_state(minimum.evidence, minimum.state) + prior_score)
+        states = [each.state for each in found]
+        starts = Starts(
+            np.array([state.poses for state in states]),
+            np.array([state.log_focals for state in states]) - log_focals,
+            np.array([state.log_scales for state in states]),
+        )
+        lenses, (found, _) = there, _searched(problem, there, evidence, starts)
+    return lenses, found
 
 
 def _check_support(problem: Problem, best: Minimum, max_reproj_error: float) -> None:

@@ -13,7 +13,6 @@ from typing import cast
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import DegenerateError
 from cadalign.estimation.estimates import as_given
 from cadalign.estimation.fit import fit_one
 from cadalign.estimation.joint import common_sigma, result_of
@@ -21,7 +20,7 @@ from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.pack import seen_keypoints
 from cadalign.estimation.prior import prior_of
-from cadalign.estimation.problem import Problem
+from cadalign.estimation.problem import Problem, no_pose_error
 from cadalign.estimation.problems import pack_one
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import LEAST_LIKELIHOOD, FitStats
@@ -82,11 +81,7 @@ def align_single(problem: Problem, start: float) -> Result:
     minima, hypotheses = search_view(mixture, seen, _given(init))
     count, iterations = minima.counts.tolist()
     if not count:
-        raise DegenerateError(
-            "no pose has the keypoints in front of the camera",
-            where="views",
-            fix="give `init`, and check which keypoint is which",
-        )
+        raise no_pose_error(problem)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
     likelihoods = np.exp((minima.scores[0] - minima.scores[:count]) / 2)
     likelihoods = likelihoods[likelihoods >= LEAST_LIKELIHOOD]

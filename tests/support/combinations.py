@@ -378,8 +378,8 @@ def requests() -> list[Request]:
         Request(
             "a mask without keypoints and `init`, `Model` with `shape_sigma` or `ShapeModel`",
             "other shapes in other poses have outlines alike",
-            "views[0].mask: a mask without keypoints does not tell the pose of an object that is "
-            "only similar; give at least 3 keypoints, `init`, or the object's own model",
+            "views: no pose with the keypoints in front of the camera follows from the evidence; "
+            "give at least 3 keypoints in one view, or `init`, and check which is which",
             lambda: align(similar, View(CAMERA, mask=mask)),
         ),
         Request(
@@ -391,7 +391,7 @@ def requests() -> list[Request]:
         Request(
             "two keypoints or fewer in one view, no `init`",
             "6 unknowns of the pose, 4 equations",
-            "views: no pose has the keypoints in front of the camera; "
+            "views: no pose with the keypoints in front of the camera follows from the evidence; "
             "give at least 3 keypoints in one view, or `init`, and check which is which",
             lambda: align(learned, _seen([0, 1])),
         ),

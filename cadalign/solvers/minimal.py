@@ -19,6 +19,7 @@ from cadalign.solvers.linalg import (
     minus,
     polish_rotation,
     scaled,
+    second_moments,
     unit,
 )
 from cadalign.solvers.polynomial import ROOTS_ROWS, real_roots
@@ -376,11 +377,7 @@ def reflect(points: FloatArray, pose: FloatArray, other: FloatArray) -> None:
     ``points`` (n, 3) are centred. The image from afar stays if depths are reversed, which mirrors
     the model; its mirror image in the plane that the points are nearest to is most like it.
     """
-    xx = xy = xz = yy = yz = zz = 0.0
-    for i in range(points.shape[0]):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        xx, xy, xz = xx + x * x, xy + x * y, xz + x * z
-        yy, yz, zz = yy + y * y, yz + y * z, zz + z * z
+    xx, xy, xz, yy, yz, zz = second_moments(points)
     # The adjugate's largest eigenvector is the moments' least one.
     first = (yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy)
     second = (first[1], xx * zz - xz * xz, xy * xz - xx * yz)

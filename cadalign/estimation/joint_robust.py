@@ -54,10 +54,7 @@ def robust_starts(
     scores: Sequence[FloatArray | None],
     init: Start | None = None,
 ) -> Starts:
-    """Starts for keypoints with outliers: poses under a robust loss, and those of small samples.
-
-    ``scores`` (n_v,) are those of every view's keypoints.
-    """
+    """Starts under a robust loss, and those of samples, drawn by ``scores`` (n_v,) of views."""
     starts = starts_of(under_cauchy(evidence), init)
     if evidence.rig.pose.max() > 0:
         return starts

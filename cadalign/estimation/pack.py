@@ -129,10 +129,7 @@ def _keypoint_depths(view: View, count: int) -> FloatArray:
 
 
 def _rig(views: Sequence[View], turns: Sequence[FloatArray] | None, axes: FloatArray) -> Rig:
-    """Motions of the cameras, with the turns of lenses, and the pose that each belongs to.
-
-    The pose of a view without evidence is -1.
-    """
+    """Motions and axes of cameras, and the pose of each; -1 of one without evidence."""
     posed = [view.cam_from_rig is not None for view in views]
     if any(posed) != all(posed):
         raise InputError(
@@ -220,10 +217,7 @@ _CAMERA = -1  # in the place of a point's row
 
 
 def known_directions(prior: ShapePrior, views: Sequence[View]) -> Directions:
-    """Gravity in the views.
-
-    Raises InputError if a view has some and the model no up axis.
-    """
+    """Gravity in the views; InputError if a view has some and the model no up axis."""
     told = [number for number, view in enumerate(views) if view.up is not None]
     ups = [cast(FloatArray, views[number].up) for number in told]
     whitening = [

@@ -59,10 +59,7 @@ class ShapePrior:
         return np.asarray(sum(weight * (each.mean[-1] - each.mean[-2]) for weight, each in pairs))
 
     def rows_of(self, ids: tuple[Hashable, ...], where: str) -> list[int]:
-        """Row numbers of keypoints.
-
-        Raises InputError if the model has no such keypoint.
-        """
+        """Row numbers of keypoints; InputError if the model has no such keypoint."""
         place = {name: row for row, name in enumerate(self.ids)}
         missing = [name for name in ids if name not in place]
         if missing:
@@ -75,10 +72,7 @@ class ShapePrior:
 
 
 def prior_of(model: object) -> ShapePrior:
-    """The prior of an exact, a stretched or a learned model.
-
-    Raises InputError if it is none of these.
-    """
+    """The prior of an exact, a stretched or a learned model; InputError of none of these."""
     if isinstance(model, Model):
         return _of_model(model)
     if isinstance(model, ShapeModel):
@@ -177,10 +171,7 @@ class Lenses:
 
     @classmethod
     def of(cls, views: Sequence[View], focal: str, prior: PriorOption) -> Lenses:
-        """The cameras of views, their focal lengths known or to be estimated.
-
-        Views without evidence have no focal length of their own.
-        """
+        """Cameras with focal lengths known or estimated; those of views with evidence alone."""
         cameras = tuple(view.camera for view in views)
         if focal == "known":
             for camera in cameras:

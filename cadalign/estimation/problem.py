@@ -39,26 +39,9 @@ _MOST_PIXELS = 500  # of a mask, amid which a wide lens is turned
 class Problem(NamedTuple):
     """Model, views, known lengths and options of an estimate.
 
-    Parameters
-    ----------
-    model, prior
-        The model as given, and as the kernels take it.
-    given : tuple of View
-        All views, as given.
-    views : tuple of View
-        The same with wide lenses turned; without evidence where one has no pose.
-    size : Size, optional
-    inits : sequence of Alignment or None
-        Given starts, as for `cadalign.align`.
-    options : FitOptions
-        Loss and focal length.
-    ransac : RansacOptions, optional
-    lenses : Lenses
-        Cameras of ``views``, with unknown focal lengths.
-    turns : tuple of (3, 3) float
-        Rotations that turn poses in the frames of ``views`` to those of the given ones.
-    noise : float
-        Standard deviation of keypoints that have none [px].
+    The ``views`` are those ``given`` with wide lenses turned, and without evidence where one has no
+    pose; ``turns`` (3, 3) lead from their frames to the given ones, ``lenses`` are their cameras.
+    Keypoints without sigma have the standard deviation ``noise`` [px].
     """
 
     model: Model | ShapeModel
@@ -226,10 +209,7 @@ def _lie_on_a_line(points: FloatArray) -> bool:
 
 
 def _facing_view(view: View) -> View:
-    """The view of a wide lens that is turned to what it shows.
-
-    Its direction and depths stay those in the lens's frame.
-    """
+    """The view of a wide lens turned to what it shows; ``up`` and depths stay the lens's."""
     if not needs_facing([view.camera]):
         return view
     return replace(view, camera=faced(view.camera, _pixels_of_object(view)))

@@ -77,10 +77,7 @@ def _starts_at(problem: Problem, evidence: Evidence, init: Inits) -> Starts:
 
 
 def _merged(found: list[_AtFocals], lenses: Lenses, *, leaves_out: bool) -> Starts:
-    """All starts by cost, with focal lengths relative to those of ``lenses``.
-
-    ``leaves_out`` those that a neighbouring focal length improves on.
-    """
+    """All starts by cost, relative to ``lenses``, or those that `_unimproved` leaves."""
     number = np.repeat(np.arange(len(found)), [len(each.costs) for each in found])
     costs = np.concatenate([each.costs for each in found])
     poses = np.concatenate([each.starts.poses for each in found])
@@ -111,11 +108,7 @@ def _zoomed(evidence: Evidence, log_focals: FloatArray, lenses: Lenses) -> Evide
 
 
 def _unimproved(poses: FloatArray, costs: FloatArray, number: IntArray) -> BoolArray:
-    """True for the starts (S,) that none at a neighbouring focal length improves on.
-
-    Starts whose rotations are nearly the same lie on the way to the same minimum; ``number`` (S,)
-    is that of their focal length in the grid.
-    """
+    """True for starts (S,) that none on the same way, at a neighbouring focal length, betters."""
     turns = poses[:, None, :, :9] - poses[None, :, :, :9]
     is_one = (np.linalg.norm(turns, axis=-1) < _SAME_BRANCH).all(axis=-1)
     is_next = np.abs(number[:, None] - number) == 1

@@ -43,10 +43,7 @@ _GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 class Minimum(NamedTuple):
-    """An estimate under one component of the prior; ``score`` is -2 log of its probability.
-
-    The state's focal lengths are relative to those of ``lenses``.
-    """
+    """An estimate under one component, relative to ``lenses``; ``score`` is -2 log probability."""
 
     component: int
     inliers: BoolArray
@@ -58,10 +55,7 @@ class Minimum(NamedTuple):
 
     @property
     def prior_score(self) -> float:
-        """The part of the score beside that of its evidence; 0 where the score is infinite.
-
-        It is that of its component's weight, and of what was left out.
-        """
+        """The score of the component's weight and of what was left out; 0 where it is infinite."""
         own = self.score - score_state(self.evidence, self.state)
         return own if np.isfinite(own) else 0.0
 
@@ -77,10 +71,7 @@ class Minimum(NamedTuple):
 
 
 class SearchResult(NamedTuple):
-    """Minima, the likeliest first, of a problem with its noise, and the effort that they took.
-
-    This is numbers of iterations and of starts.
-    """
+    """A problem with its noise, its minima, and the numbers of iterations and of starts."""
 
     problem: Problem
     minima: list[Minimum]
@@ -118,10 +109,7 @@ def search_at_noise(problem: Problem, init: Inits) -> SearchResult:
 
 
 def _is_left_to_outlines(problem: Problem, evidence: Evidence) -> bool:
-    """True where masks or photos determine what the other evidence leaves open.
-
-    That evidence would lead a given start astray.
-    """
+    """True where outlines determine what else is open: that would lead a start astray."""
     unknowns = 6 * problem.pose_count + int(evidence.scales.free.sum())
     equations = count_equations(evidence) - len(evidence.shape.modes)
     return problem.uses_outlines and equations < unknowns

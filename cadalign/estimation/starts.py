@@ -11,7 +11,7 @@ are linear in s and t, too. None is homogeneous, so that views with one keypoint
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -31,10 +31,10 @@ _MOST_CARRIED = 3  # stretches of the other view
 _MOST_SIZED = 3
 
 _GRID = 400  # rotations
-_SCREENED = 64
 _MOST_METRIC = 16
 _ROUNDS = 2  # of weighting by the depths of the last
-_RIDGE = 1e-14  # over the trace of normal equations
+_RIDGE = 1e-14  # of normal equations with a diagonal of 1
+_LEAST_SIZE = 1e-300
 _LEAST_SCALE = 1e-6
 
 _Start = tuple[FloatArray, FloatArray]  # a pose (12,), or those (P, 12) of all, and log scales (3,)
@@ -158,10 +158,7 @@ def _weakly_determined(evidence: Evidence) -> list[int]:
 def _carried_starts(
     evidence: Evidence, view: int, per_pose: Sequence[list[_Start]]
 ) -> list[_Start]:
-    """Poses of a view under the stretches of the view with the most keypoints, and these.
-
-    ``per_pose`` are the starts that the views' own keypoints suggest.
-    """
+    """Poses of a view under the stretches of the view with the most keypoints, and these."""
     counts, shape, scales = _keypoint_counts(evidence), evidence.shape, evidence.scales
     others = [v for v in np.argsort(-counts, kind="stable").tolist() if v != view]
     own: list[_Start] = next((f for v in others if (f := per_pose[evidence.rig.pose[v]])), [])
@@ -210,29 +207,47 @@ class _Rows(NamedTuple):
     weights: FloatArray
     is_ray: FloatArray
 
-    def depths(self, matrix: FloatArray, translation: FloatArray) -> FloatArray:
-        """Depths (N,) in the cameras of points at a pose."""
-        in_rig = self.points @ matrix.T + translation
-        return np.asarray((np.einsum("nij,nj->ni", self.turns, in_rig) + self.shifts)[:, 2])
+    def depths(self, matrices: FloatArray, translations: FloatArray) -> FloatArray:
+        """Depths (S, N) in the cameras of points at poses (S, 3, 3), (S, 3)."""
+        in_rig = self.points @ matrices.swapaxes(1, 2) + translations[:, None]
+        return np.asarray(np.einsum("nj,snj->sn", self.turns[:, 2], in_rig) + self.shifts[:, 2])
 
     def weights_at(self, depths: FloatArray) -> FloatArray:
-        """Weights (N,) of the equations at depths."""
+        """Weights (S, N) of the equations at depths."""
         return np.asarray(self.weights / np.where(self.is_ray > 0, np.maximum(depths, 1e-3), 1.0))
 
 
 def _metric_starts(evidence: Evidence, own: Sequence[_Start]) -> list[_Start]:
-    """Poses (1, 12) and log scales (3,) of evidence with one pose, the likeliest first.
+    """Likeliest poses (1, 12) and log scales of one pose: rotations of ``own``, or of a grid.
 
-    They have the rotations of its ``own`` starts or, where there are none, those of a grid.
+    Given a rotation, the equations are linear in the translation and the scales.
     """
     rows, is_tied = _rows_of(evidence), has_scale_prior(evidence.scales)
     basis = np.ones((3, 1)) if is_tied else np.eye(3)  # of scales that a prior holds together
-    rotations: Iterable[FloatArray] = [pose[:9].reshape(3, 3) for pose, _ in own]
-    if not own:
-        rotations = _screened(evidence, rows, spread_rotations(_GRID), basis)
-    placed = [_given_rotation(evidence, rows, rotation, basis) for rotation in rotations]
-    found = sorted((each for each in placed if each is not None), key=lambda each: each[0])
-    return [(pose[None], logs) for _, pose, logs in found[:_MOST_METRIC]]
+    given = [pose[:9].reshape(3, 3) for pose, _ in own]
+    rotations = np.array(given) if given else spread_rotations(_GRID)
+    by_scale = (rows.normals @ rotations) * rows.points
+    same = np.broadcast_to(rows.normals, by_scale.shape)
+    left = np.concatenate([same, by_scale @ basis], axis=2)
+    extra_left, extra_right = _other_rows(evidence, rotations, basis)
+    weights = np.broadcast_to(rows.weights, left.shape[:2])
+    for _ in range(_ROUNDS):
+        weighted = np.concatenate([left * weights[:, :, None], extra_left], axis=1)
+        target = np.concatenate([rows.right * weights, extra_right], axis=1)[:, :, None]
+        sizes = np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), _LEAST_SIZE)
+        scaled = weighted / sizes
+        normal = scaled.swapaxes(1, 2) @ scaled + _RIDGE * np.eye(left.shape[2])
+        solved = np.linalg.solve(normal, scaled.swapaxes(1, 2) @ target)
+        costs = ((scaled @ solved - target) ** 2).sum(axis=(1, 2))
+        found = solved[:, :, 0] / sizes[:, 0]
+        scales = found[:, 3:] @ basis.T
+        depths = rows.depths(rotations * scales[:, None], found[:, :3])
+        weights = rows.weights_at(depths)
+    valid = (scales > _LEAST_SCALE).all(axis=1) & (depths > 0).all(axis=1) & np.isfinite(costs)
+    costs = np.where(valid, costs + _costs_of_up(evidence, rotations), np.inf)
+    poses = np.concatenate([rotations.reshape(-1, 9), found[:, :3]], axis=1)
+    likely = np.argsort(costs, kind="stable")[: min(int(valid.sum()), _MOST_METRIC)]
+    return [(poses[k, None], np.log(scales[k])) for k in likely]
 
 
 def _rows_of(evidence: Evidence) -> _Rows:
@@ -264,83 +279,29 @@ def _rows_of(evidence: Evidence) -> _Rows:
     )
 
 
-def _given_rotation(
-    evidence: Evidence, rows: _Rows, rotation: FloatArray, basis: FloatArray
-) -> tuple[float, FloatArray, FloatArray] | None:
-    """Translation and scales from the equations that are linear once the rotation is given.
-
-    Scales are sums of the columns of the ``basis`` (3, k). Returns cost, pose (12,) and log scales.
-    """
-    by_scale = (rows.normals @ rotation) * rows.points
-    left = np.concatenate([rows.normals, by_scale @ basis], axis=1)
-    extra_left, extra_right = _other_rows(evidence, rotation, basis)
-    weights, cost = rows.weights, np.inf
-    found = np.zeros(left.shape[1])
-    for _ in range(_ROUNDS):
-        weighted = np.concatenate([left * weights[:, None], extra_left])
-        target = np.concatenate([rows.right * weights, extra_right])
-        sizes = np.linalg.norm(weighted, axis=0)
-        if not (sizes > 0).all():
-            return None
-        normal = (weighted / sizes).T @ (weighted / sizes)
-        try:
-            found = np.linalg.solve(normal, (weighted / sizes).T @ target) / sizes
-        except np.linalg.LinAlgError:
-            return None
-        error = weighted @ found - target
-        cost = float(error @ error)
-        scales = basis @ found[3:]
-        depths = rows.depths(rotation * scales, found[:3])
-        weights = rows.weights_at(depths)
-    if not (scales > _LEAST_SCALE).all() or not (depths > 0).all() or not np.isfinite(cost):
-        return None
-    pose = np.concatenate([rotation.ravel(), found[:3]])
-    return cost + _cost_of_up(evidence, rotation), pose, np.log(scales)
-
-
-def _screened(
-    evidence: Evidence, rows: _Rows, rotations: FloatArray, basis: FloatArray
-) -> FloatArray:
-    """The rotations (S, 3, 3) with the least algebraic error, unweighted by depth."""
-    by_scale = (rows.normals @ rotations) * rows.points
-    same = np.broadcast_to(rows.normals, by_scale.shape)
-    left = np.concatenate([same, by_scale @ basis], axis=2) * rows.weights[:, None]
-    right = rows.right * rows.weights
-    normal = left.swapaxes(1, 2) @ left
-    ridge = _RIDGE * np.trace(normal, axis1=1, axis2=2)[:, None, None]
-    normal = normal + ridge * np.eye(left.shape[2])
-    projected = (left.swapaxes(1, 2) @ right)[:, :, None]
-    try:
-        found = np.linalg.solve(normal, projected)
-    except np.linalg.LinAlgError:  # of one rotation, where the ridge is lost in rounding
-        found = np.linalg.pinv(normal, hermitian=True) @ projected
-    errors = (((left @ found)[:, :, 0] - right) ** 2).sum(axis=1)
-    costs = errors + [_cost_of_up(evidence, rotation) for rotation in rotations]
-    return np.asarray(rotations[np.argsort(costs)[:_SCREENED]])
-
-
 def _other_rows(
-    evidence: Evidence, rotation: FloatArray, basis: FloatArray
+    evidence: Evidence, rotations: FloatArray, basis: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Whitened equations of known distances, in translation and scales."""
-    offsets, mean = evidence.offsets, evidence.shape.mean
-    left, right = np.zeros((len(offsets.value), 6)), offsets.value.copy()
+    """Whitened equations (S, L, 3 + k) of known distances, in translation and scales."""
+    offsets, mean, count = evidence.offsets, evidence.shape.mean, len(rotations)
+    left = np.zeros((count, len(offsets.value), 6))
+    right = np.tile(offsets.value, (count, 1))
     for k, (image, direction) in enumerate(zip(offsets.image, offsets.direction, strict=True)):
         for point, sign in zip(offsets.ends[k], (-1.0, 1.0), strict=True):
             if point >= 0:
-                left[k, 3:] += sign * direction * mean[point]
+                left[:, k, 3:] += sign * direction * mean[point]
             else:
-                camera, turned = evidence.rig.cam_from_rig[image], rotation @ direction
-                left[k, :3] -= sign * turned
-                right[k] += sign * turned @ (camera[:9].reshape(3, 3).T @ camera[9:])
-    left = np.concatenate([left[:, :3], left[:, 3:] @ basis], axis=1)
+                camera, turned = evidence.rig.cam_from_rig[image], rotations @ direction
+                left[:, k, :3] -= sign * turned
+                right[:, k] += sign * turned @ (camera[:9].reshape(3, 3).T @ camera[9:])
+    left = np.concatenate([left[:, :, :3], left[:, :, 3:] @ basis], axis=2)
     return offsets.weight[:, None] * left, offsets.weight * right
 
 
-def _cost_of_up(evidence: Evidence, rotation: FloatArray) -> float:
-    """Squared whitened differences of known directions."""
+def _costs_of_up(evidence: Evidence, rotations: FloatArray) -> FloatArray:
+    """Squared whitened differences (S,) of known directions."""
     directions = evidence.directions
     turns = evidence.rig.cam_from_rig[directions.image][:, :9].reshape(-1, 3, 3)
-    seen = np.einsum("dij,dj->di", turns, directions.model @ rotation.T) - directions.camera
-    whitened = np.einsum("dij,dj->di", directions.whitening, seen)
-    return float((whitened * whitened).sum())
+    turned = np.einsum("dij,sjk,dk->sdi", turns, rotations, directions.model)
+    whitened = np.einsum("dij,sdj->sdi", directions.whitening, turned - directions.camera)
+    return np.asarray((whitened**2).sum(axis=(1, 2)))

@@ -180,10 +180,7 @@ def with_points(objective: Objective, points: FloatArray) -> Objective:
 
 @kernel
 def covariance_of(objective: Objective, pose: FloatArray, covariance: FloatArray) -> int:
-    """Write the covariance at a pose (15,) into (8, 8), with zeros for fixed unknowns.
-
-    Returns -1, or the number of an unknown that the points do not determine.
-    """
+    """Write the covariance (8, 8) at a pose (15,); returns -1, or an undetermined unknown."""
     center, unit = center_and_unit(objective.keypoints.points)
     local = with_points(objective, (objective.keypoints.points - center) / unit)
     equations = room_for(UNKNOWNS)
@@ -220,10 +217,7 @@ def _centered(pose: FloatArray, center: FloatArray, unit: float) -> FloatArray:
 
 @kernel
 def _invert(information: FloatArray, free: FloatArray, covariance: FloatArray) -> int:
-    """Write the inverse of an information matrix (8, 8), whose factor takes its place.
-
-    Returns -1, or the number of an undetermined unknown.
-    """
+    """Write the inverse of an information matrix (8, 8); returns as `covariance_of`."""
     diagonal = np.diag(information).copy()
     covariance[:] = 0.0
     if not cholesky(information, UNKNOWNS, UNOBSERVABLE):
@@ -249,11 +243,7 @@ def _invert(information: FloatArray, free: FloatArray, covariance: FloatArray) -
 def _uncenter_covariance(
     pose: FloatArray, center: FloatArray, unit: float, covariance: FloatArray
 ) -> None:
-    """Carry the covariance from points (x - center) / unit to points x, at the pose of x.
-
-    With t = unit t' - R S center, an infinitesimal change of the unknowns changes t by
-    unit dt' + [R S center]x d(rotation) - sum_k R_k s_k center_k d(log s_k).
-    """
+    """Carry the covariance to points x: t = unit t' - R S center, and its derivatives."""
     size = UNKNOWNS
     jacobian = np.eye(size)
     shift = np.zeros(3)

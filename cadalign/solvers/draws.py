@@ -29,11 +29,7 @@ class Centred(NamedTuple):
 
 
 class WhitenedPixels(NamedTuple):
-    """Whitened pixels of rays, linear about those of the alignment: ``fixed + slopes ray``.
-
-    They are over the principal point, as are the keypoints ``seen``, and grow with the focal
-    length.
-    """
+    """Whitened pixels over the principal point, as linear in rays: ``fixed + slopes ray``."""
 
     points: FloatArray  # (n, 3) about their centroid
     slopes: FloatArray  # (n, 2, 2)

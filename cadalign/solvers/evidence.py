@@ -43,10 +43,7 @@ def add_keypoints(
     hessian: FloatArray,
     gradient: FloatArray,
 ) -> float:
-    """Add the keypoints' part; returns its cost, infinite if a point lies behind the camera.
-
-    ``rows`` (UNKNOWNS + 1, 2 * BLOCK) is scratch space.
-    """
+    """Add the keypoints' part; returns its cost. ``rows`` (9, 2 * BLOCK) is scratch space."""
     cost = 0.0
     for start in range(0, keypoints.points.shape[0], BLOCK):
         size = min(BLOCK, keypoints.points.shape[0] - start)
@@ -61,11 +58,7 @@ def add_keypoints(
 def _write_rows(
     keypoints: KeypointEvidence, pose: FloatArray, start: int, size: int, rows: FloatArray
 ) -> float:
-    """Write whitened, loss-weighted derivatives and residuals of a block of points.
-
-    Row k < 8 of ``rows`` is unknown k, the last the residual; the block's u equations stand before
-    its v equations. Returns the block's cost, infinite if a point lies behind the camera.
-    """
+    """Write derivatives and, last, residuals, those of v behind those of u; returns the cost."""
     points, rays, whitening = keypoints.points, keypoints.rays, keypoints.whitening
     scalars = scalars_of(pose)
     loss, loss_scale = keypoints.loss, keypoints.loss_scale
@@ -89,10 +82,7 @@ def _write_rows(
 
 
 class Weighed(NamedTuple):
-    """Cost of an error of a ray, its whitened residual (u, v), and the whitening, with its loss.
-
-    The residual and the whitening are multiplied by the ``root`` of the weight that the loss gives.
-    """
+    """Cost of a ray's error, whitened residual (u, v) and whitening, times the weight's root."""
 
     cost: float
     root: float
@@ -204,9 +194,5 @@ def whole_information(prior: ScalePrior) -> float:
 
 @inlined
 def score_of_distance(distance: float) -> float:
-    """-2 log of the prior of a translation by which scores of minima are compared.
-
-    It is flat over directions and log distances, t^-3. A flat one would be a prior for large
-    distances, and for the large scales that go with these.
-    """
+    """-2 log of the prior of a translation, t^-3: flat over directions and log distances."""
     return float(6.0 * np.log(distance))

@@ -69,10 +69,7 @@ def second_moments(points: FloatArray) -> tuple[float, float, float, float, floa
 
 @fast_sums
 def add_products(rows: FloatArray, columns: int, hessian: FloatArray, gradient: FloatArray) -> None:
-    """Add J' J to the upper triangle of ``hessian`` (U, U), and J' r to ``gradient`` (U,).
-
-    The first U ``rows`` are J', the next one r, in the first ``columns``.
-    """
+    """Add J' J to the upper triangle (U, U) and J' r (U,); U ``rows`` are J', the next is r."""
     unknowns = gradient.shape[0]
     for k in range(unknowns):
         for m in range(k, unknowns + 1):
@@ -95,11 +92,7 @@ def mirror_upper(matrix: FloatArray) -> None:
 
 @kernel
 def cholesky(matrix: FloatArray, size: int, floor: float) -> bool:
-    """Replace the lower triangle of a symmetric matrix by its Cholesky factor.
-
-    Returns False where a pivot falls under ``floor`` times its diagonal entry: the matrix is then
-    not positive definite to that accuracy.
-    """
+    """Write the lower Cholesky factor; False where a pivot is under ``floor`` of its diagonal."""
     for i in range(size):
         diagonal = matrix[i, i]
         for j in range(i + 1):
@@ -132,10 +125,7 @@ def solve_cholesky(factor: FloatArray, size: int, right: FloatArray) -> None:
 
 @fast_sums
 def factorize(matrix: FloatArray) -> bool:
-    """Replace the lower triangle of a large symmetric matrix by its Cholesky factor.
-
-    Sums run on vector units. Returns False where it is not positive definite.
-    """
+    """As `cholesky` with a floor of 0, of a large matrix: sums run on vector units."""
     for i in range(matrix.shape[0]):
         for j in range(i):
             total = 0.0
@@ -169,10 +159,7 @@ def solve_factor(factor: FloatArray, right: FloatArray) -> None:
 
 @fast_sums
 def solve_factor_rows(factor: FloatArray, right: FloatArray) -> None:
-    """Solve for all columns of ``right`` (n, k) in place, with the factor that `factorize` left.
-
-    Blocks of columns stay in the processor's cache; a matrix product would use threads.
-    """
+    """Solve for all columns of ``right`` (n, k) in place, by blocks that fit the cache."""
     size = factor.shape[0]
     for start in range(0, right.shape[1], _COLUMNS):
         block = right[:, start : start + _COLUMNS]
@@ -212,10 +199,7 @@ def expected_decrease(gradient: FloatArray, step: FloatArray, size: int) -> floa
 
 @kernel
 def damp(blocks: FloatArray, border: FloatArray, damping: float) -> None:
-    """Add damping to the diagonals of the blocks (P, k, k) and of what they share (b, b).
-
-    The floor on it holds unknowns without evidence where they are.
-    """
+    """Add damping to the diagonals of blocks (P, k, k) and border (b, b), with a floor on it."""
     least = 1e-300
     for p in range(blocks.shape[0]):
         for k in range(blocks.shape[1]):
@@ -243,11 +227,7 @@ def multiply_3(first: FloatArray, second: FloatArray) -> FloatArray:
 
 @kernel
 def eigenvectors_4(matrix: FloatArray, vectors: FloatArray) -> None:
-    """Diagonalise a symmetric 4 x 4 matrix in place by Jacobi's method.
-
-    On return the diagonal of ``matrix`` holds the eigenvalues, in no order, and the columns of
-    ``vectors`` the eigenvectors.
-    """
+    """Diagonalise a symmetric matrix (4, 4) in place by Jacobi's method; vectors are columns."""
     for i in range(4):
         for j in range(4):
             vectors[i, j] = 1.0 if i == j else 0.0
@@ -340,10 +320,7 @@ def nearest_rotation(
 
 @kernel
 def polish_rotation(matrix: FloatArray, rotation: FloatArray) -> None:
-    """Write the rotation nearest to a matrix that is one but for small errors.
-
-    Newton-Schulz: R (3 I - R' R) / 2 squares the error; two steps take 1e-4 to rounding.
-    """
+    """Write the rotation nearest to a matrix that is nearly one, by two Newton-Schulz steps."""
     gram = np.empty((3, 3))
     for i in range(3):
         copy_into(rotation[i], matrix[i])

@@ -100,12 +100,7 @@ def out_of_range_error() -> DegenerateError:
 
 @fast_sums
 def _moments(points: FloatArray, rays: FloatArray, mean: FloatArray, products: FloatArray) -> None:
-    """Add up the 40 sums into which all data enter.
-
-    Row k of ``products`` (10, 4) is the k-th of the products 11, 1x, 1y, 1z, xx, xy, xz, yy, yz,
-    zz of a = (1, x - mean), summed with the weights 1, u, v, u^2 + v^2. ``mean`` (5,) receives the
-    means of the points and of u, v, which keep the sums well-conditioned.
-    """
+    """Sum products 11, 1x, ... zz of (1, x - mean) with 1, u, v, u^2 + v^2; means (5,) with uv."""
     n = points.shape[0]
     homogeneous = rays.shape[1] == 3
     sx = sy = sz = su = sv = 0.0
@@ -237,10 +232,7 @@ def _split_scale(linear: FloatArray, spread: FloatArray, rotation: FloatArray) -
 def aepnp_batch(
     points: FloatArray, rays: FloatArray, offsets: IntArray
 ) -> tuple[FloatArray, IntArray]:
-    """Solve every problem, with the rows ``offsets[b]`` to ``offsets[b + 1]``.
-
-    Returns packed poses (B, 1, 15) and statuses (B,).
-    """
+    """Packed poses (B, 1, 15) and statuses (B,) of problems ``offsets[b]:offsets[b + 1]``."""
     count = offsets.shape[0] - 1
     poses = np.empty((count, 1, POSE_SIZE))
     statuses = np.empty(count, dtype=np.int64)
@@ -277,11 +269,7 @@ def aepnp_kernel(points: FloatArray, rays: FloatArray, pose: FloatArray) -> int:
 def affine_rows(
     points: FloatArray, rays: FloatArray, mean: FloatArray, spread: FloatArray, rows: FloatArray
 ) -> int:
-    """Solve for the affine map to the camera frame, up to a factor; returns a status.
-
-    Row i of ``rows`` (3, 4) times (1, x - mean) is coordinate i; ``mean`` (5,) is as in `_moments`,
-    and ``spread`` (3,) receives the points' extent along their axes.
-    """
+    """Write the affine map (3, 4) of (1, x - mean) to the camera, up to a factor; a status."""
     if points.shape[0] < MIN_POINTS:
         return TOO_FEW
     products = np.empty((10, 4))

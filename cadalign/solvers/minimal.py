@@ -198,10 +198,7 @@ def _split_columns(memory: FloatArray) -> None:
 
 @inlined
 def _orthogonality_quadrics(memory: FloatArray) -> None:
-    """Write the quadrics that vanish where two columns are orthogonal.
-
-    Rows are column pairs (0, 1), (0, 2), (1, 2), each scaled to a largest coefficient of 1.
-    """
+    """Write the quadrics, of largest coefficient 1, that vanish where columns are orthogonal."""
     for row in range(3):
         j, k = _PARTS + 4 * (row // 2), _PARTS + 4 * ((row + 3) // 2)
         largest = 0.0

@@ -133,11 +133,7 @@ def _solve_one(
 
 @kernel
 def _search_minima(objective: Objective, rigid: bool | None, minima: Minima) -> int:
-    """Find the minima; returns the number of starts.
-
-    Where there are many points the search runs on some of them, and what it finds is refined on
-    all.
-    """
+    """Find the minima, of many points first on some; returns the number of starts."""
     linear = np.empty(POSE_SIZE)
     keypoints = objective.keypoints
     is_solved = aepnp_kernel(keypoints.points, keypoints.rays, linear) == OK
@@ -174,10 +170,7 @@ def _search_from_all_starts(
     is_solved: bool,
     minima: Minima,
 ) -> int:
-    """Refine the most promising of all starts; returns their number.
-
-    ``linear`` is the linear solver's pose, where it has one.
-    """
+    """Refine the likeliest starts, the pose ``linear`` among them; returns their number."""
     if rigid is not None:
         return _search_rigid(objective, minima)
     points, rays, free = objective.keypoints.points, objective.keypoints.rays, objective.free

@@ -145,10 +145,7 @@ def _add_pair(
     derivative: int,
     found: int,
 ) -> int:
-    """Add two roots, or an extremum near zero, in a narrow interval; returns the new number.
-
-    The derivative is written into the row with its number.
-    """
+    """Add two roots, or an extremum near zero, in a narrow interval; returns the new number."""
     low_value, low_slope = _evaluate(memory, first, degree, low)
     _, high_slope = _evaluate(memory, first, degree, high)
     if (low_slope > 0) == (high_slope > 0):

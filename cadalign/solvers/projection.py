@@ -128,10 +128,7 @@ def write_derivatives(
     first: int,
     second: int,
 ) -> None:
-    """Write the derivatives by unknown k, for ``weights`` (a, b, c), into row k < 8 of ``rows``.
-
-    Column ``first`` receives those of a u + b v, column ``second`` those of c v.
-    """
+    """Write derivatives (8,) of a u + b v and of c v into columns ``first`` and ``second``."""
     stretched = stretch(pose, point)
     turned = turn(pose, stretched)
     slopes = ray_slopes(see(shift(pose, turned)), weights)

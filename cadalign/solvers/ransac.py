@@ -268,12 +268,7 @@ def draw_subset(state: StateArray, count: int, chosen: IntArray) -> None:
 
 @kernel
 def grow_pool(growth: FloatArray, size: int, count: int, iteration: int) -> None:
-    """Widen the pool of the best points as PROSAC does.
-
-    Chum, Matas, "Matching with PROSAC - progressive sample consensus", 2005. ``growth`` (3,) holds
-    the pool's size, the average number of samples that fall into it (T_n), and the iteration until
-    which it lasts (T'_n).
-    """
+    """Widen the pool of the best points as PROSAC does (Chum, Matas, 2005): size, T_n, T'_n."""
     while growth[0] < count and iteration > growth[2]:
         wider = growth[1] * (growth[0] + 1) / (growth[0] + 1 - size)
         growth[2] += np.ceil(wider - growth[1])
@@ -310,11 +305,7 @@ def draw_sample(
 def rigid_hypotheses(
     keypoints: KeypointEvidence, draws: IntArray, limit: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Poses (S, 15) of samples (S, k) of keypoints, and their truncated scores (S,) on all.
-
-    The pose of a sample is the one from its first three keypoints that fits all of it best, after a
-    few steps; where there is none, the score is infinite.
-    """
+    """Poses (S, 15) of samples (S, k), from the first three, and truncated scores (S,) on all."""
     free = np.ones(UNKNOWNS)
     free[6:] = 0.0
     memory, solutions = p3p_memory(), np.empty((MAX_POSES, POSE_SIZE))

@@ -63,10 +63,7 @@ _LEAST_DAMPING = 1e-12
 
 @kernel
 def refine(system: Any, max_iterations: int, state: FloatArray) -> tuple[float, int, bool]:
-    """Improve ``state`` in place; returns the cost, the iterations, and if they converged.
-
-    The cost is infinite if a point lies behind a camera at the start.
-    """
+    """Improve ``state`` in place; returns the cost, the iterations, and if they converged."""
     current, new = room_of(system)
     step = np.zeros(current.gradient.shape[0])
     return _descend(system, max_iterations, state, state.copy(), step, current, new)
@@ -121,11 +118,7 @@ def _descend(
 
 
 class Effort(NamedTuple):
-    """Effort of a search.
-
-    At most ``starts`` of those of the lowest cost are refined by ``probe`` iterations, then by up
-    to ``iterations`` until none that is left lies within ``unlikely`` of the best cost.
-    """
+    """Starts, refined by ``probe`` iterations, then by more, within ``unlikely`` of the best."""
 
     starts: int
     probe: int
@@ -164,10 +157,7 @@ def room_for_minima(most: int, size: int) -> Minima:
 def search(
     system: Any, starts: FloatArray, effort: Effort, label: int, penalty: float, minima: Minima
 ) -> None:
-    """Add the minima that ``starts`` (S, D) lead to.
-
-    Minima of other labels may be there already; ``penalty`` adds to the scores of these.
-    """
+    """Add the minima that ``starts`` (S, D) lead to; ``penalty`` adds to their scores."""
     count = starts.shape[0]
     scores = np.empty(count)
     for s in range(count):  # a single one has no rank

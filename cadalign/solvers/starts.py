@@ -27,10 +27,7 @@ _LEAST_DEPTH = 1e-9
 def minimal_starts(
     points: FloatArray, rays: FloatArray, subsets: IntArray, count: int, poses: FloatArray
 ) -> int:
-    """Write every solution of the minimal solver on the given subsets; returns their number.
-
-    ``subsets`` (at least count, 4) holds point numbers, ``poses`` has room for 8 rows a subset.
-    """
+    """Write every solution of the minimal solver on ``subsets`` (S, 4); returns their number."""
     memory = minimal_memory()
     found = 0
     for s in range(count):
@@ -98,11 +95,7 @@ def _extent(points: FloatArray, chosen: IntArray) -> float:
 
 @kernel
 def relief(points: FloatArray, rays: FloatArray, whitening: FloatArray) -> float:
-    """Distance of points (n, 3) from their plane, in standard deviations of their image's noise.
-
-    The root mean square distance from the plane that fits best, about: for small ones, the least
-    eigenvalue of a covariance is its determinant over the sum of its principal minors.
-    """
+    """Root mean square distance of points (n, 3) from their plane in sigmas of the image, about."""
     a, p, q, b, r, c = second_moments(points)  # centred, as the search has them
     minors = a * b - p * p + a * c - q * q + b * c - r * r
     determinant = a * (b * c - r * r) - p * (p * c - q * r) + q * (p * r - b * q)

@@ -23,11 +23,7 @@ _LEAST_SHARE = 1e-12  # of an unknown's information that the others must leave
 
 
 class Arrow(NamedTuple):
-    """A symmetric matrix and a right side.
-
-    ``blocks`` (P, 6, 6) are those of each pose, ``coupling`` (P, 6, b) its products with the
-    border, and ``border`` (b, b) is the rest. The ``gradient`` (6 P + b,) is the right side.
-    """
+    """A symmetric matrix: blocks (P, 6, 6), coupling (P, 6, b), border (b, b); and a right side."""
 
     blocks: FloatArray
     coupling: FloatArray
@@ -84,10 +80,7 @@ def add_slope(arrow: Arrow, pose: int, row: FloatArray) -> None:
 
 @kernel
 def add_rows(arrow: Arrow, pose: int, rows: FloatArray, columns: int, products: FloatArray) -> None:
-    """Add the equations of a pose in the first ``columns`` of ``rows`` (6 + b + 1 or more, C).
-
-    Row 6 + b holds the residuals; ``products`` (6 + b + 1, 6 + b + 1) is scratch space.
-    """
+    """Add a pose's equations (6 + b + 1, C), last the residuals; ``products`` is scratch space."""
     unknowns = 6 + arrow.border.shape[0]
     first, own = border_start(arrow), arrow.blocks.shape[1] * pose
     matrix, right = products[:unknowns, :unknowns], products[unknowns, :unknowns]
@@ -136,10 +129,7 @@ def decide_on_undetermined(arrow: Arrow, is_shared: bool) -> None:
 
 @fast_sums
 def factorize_arrow(arrow: Arrow) -> bool:
-    """Replace a matrix by its factor: blocks and border by Cholesky's, coupling by L^-1 of it.
-
-    Returns False where it is not positive definite. The gradient stays.
-    """
+    """Replace a matrix by its factor; False where it is not positive definite."""
     poses, size, border = arrow.coupling.shape
     for p in range(poses):
         block, coupling = arrow.blocks[p], arrow.coupling[p]
@@ -209,10 +199,7 @@ def log_determinant(factor: Arrow) -> float:
 
 
 def invert_arrow(arrow: Arrow) -> Arrow | None:
-    """Blocks of the inverse matrix in the same pattern; None if it is not determined.
-
-    That is decided as by `decide_on_undetermined`.
-    """
+    """Blocks of the inverse; None where undetermined, as `decide_on_undetermined` has it."""
     share = _LEAST_SHARE if len(arrow.blocks) > 1 else -_LEAST_SHARE
     try:
         lower = np.linalg.inv(np.linalg.cholesky(arrow.blocks * (1.0 + share * np.eye(6))))

@@ -33,11 +33,7 @@ class JointCovariance(NamedTuple):
 
 
 def joint_covariance(evidence: Evidence, state: State) -> JointCovariance:
-    """The inverse information at a state; zero for log scales that are held.
-
-    A scale that only its bound keeps from running off is as uncertain as the whole prior. All is
-    infinite where something is not determined.
-    """
+    """The inverse information; infinite if not determined, and of the whole prior at a bound."""
     bound = evidence.scales.bound
     if bound.weight > 0:
         whole = ScalePrior(whole_information(bound), bound.width)
@@ -86,10 +82,7 @@ def _points_by_unknowns(
     equations: JointEquations,
     sighted: BoolArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Derivatives (m, 3, 6 + b) of all points by a pose and the border, covariances of the rest.
-
-    The rest (m, 3, 3) are displacements and the modes that the evidence doesn't tell apart.
-    """
+    """Derivatives (m, 3, 6 + b) of points by pose and border, covariances (m, 3, 3) of the rest."""
     shape, scale, axes = reduced.shape, np.exp(state.log_scales), np.arange(3)
     modes, points = shape.modes.transpose(1, 2, 0), points_of(shape, state)
     first = 6 + len(evidence.focals.low)
@@ -118,11 +111,7 @@ def _points_by_unknowns(
 def _in_first_camera(
     evidence: Evidence, state: State, rows: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Rotation (3, 3) of the first camera from the model, and derivatives (m, 3, 6 + b) there.
-
-    A point is exp(rotation vector) turned + translation, in the rig's frame; ``rows`` are its
-    derivatives in the model's.
-    """
+    """Rotation (3, 3) of the first camera from the model, and derivatives (m, 3, 6 + b) there."""
     rotation = state.poses[evidence.rig.pose[0], :9].reshape(3, 3)
     camera = evidence.rig.cam_from_rig[0, :9].reshape(3, 3)
     turn = camera @ rotation

@@ -21,7 +21,6 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, kernel
 from cadalign.solvers.joint.arrow import Arrow, add_slope, border_start, empty_arrow
-from cadalign.solvers.joint.blocks import count_block_equations, write_block_row
 from cadalign.solvers.joint.evidence import (
     Evidence,
     Shape,
@@ -31,6 +30,7 @@ from cadalign.solvers.joint.evidence import (
     undisplaced,
     unstretched,
 )
+from cadalign.solvers.joint.rows import count_block_equations, write_block_row
 from cadalign.solvers.linalg import cholesky, cross, dot, factorize, solve_factor_rows
 from cadalign.solvers.projection import slope_of_row, turn, turn_back
 
@@ -201,10 +201,7 @@ def follow(
 
 @kernel
 def add_log_determinant(evidence: Evidence, state: State, equations: JointEquations) -> float:
-    """Add half the derivative of the log determinant; returns that of the coefficients.
-
-    Half the derivatives by the points before the stretch are left in the equations' ``slopes``.
-    """
+    """Add half the derivative of the log determinant; returns that of the coefficients."""
     modes, total = evidence.shape.modes.shape[0], equations.seen.shape[1]
     first = evidence.focals.low.shape[0] + 3
     factor = equations.arrow.border[first:, first:].copy()
@@ -279,10 +276,7 @@ def _write_point_rows(
     by_model: FloatArray,
     by_modes: FloatArray,
 ) -> None:
-    """Write the rows by the point before the stretch (3, N), and by the coefficients (K, N).
-
-    The latter are those that remain where the displacements follow.
-    """
+    """Write the rows by the point before the stretch (3, N), and by the coefficients (K, N)."""
     sightings, modes, seen = evidence.sightings, evidence.shape.modes, equations.seen
     scale = exp_of(state.log_scales)
     column = 0

@@ -88,10 +88,7 @@ class Focals(NamedTuple):
 
 
 class Directions(NamedTuple):
-    """Directions ``model`` (D, 3) seen as ``camera`` (D, 3) in a view.
-
-    ``whitening`` (D, 3, 3) [1/rad] gives the difference of the unit vectors unit covariance.
-    """
+    """Unit vectors ``model`` and ``camera`` (D, 3) in views, ``whitening`` (D, 3, 3) [1/rad]."""
 
     model: FloatArray
     camera: FloatArray
@@ -130,7 +127,7 @@ class Evidence(NamedTuple):
     """Everything that is known about one object.
 
     The ``blocks`` are tables of evidence beside sightings, one of a kind, those of directions and
-    offsets first; `cadalign.solvers.joint.blocks` says what a block is.
+    offsets first; `cadalign.solvers.joint.rows` says what a block is.
     """
 
     shape: Shape

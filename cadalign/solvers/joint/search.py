@@ -36,10 +36,7 @@ class JointMinima(NamedTuple):
 def search_joint(
     evidence: Evidence, poses: FloatArray, log_focals: FloatArray, log_scales: FloatArray
 ) -> tuple[JointMinima, int]:
-    """Refine starts ``poses`` (S, P, 12), (S, F), (S, 3) to distinct minima.
-
-    Returns them and the number of iterations.
-    """
+    """Minima from starts (S, P, 12), (S, F), (S, 3), and the number of iterations."""
     reduction, count = reduce_modes(evidence), len(poses)
     fewer = reduction.evidence
     if not count:
@@ -73,10 +70,7 @@ def costs_at(
 
 
 def _excess(evidence: Evidence, start: FloatArray) -> float:
-    """Excess cost at which starts are given up, from that of the best (D,).
-
-    It grows with the residuals, since a wrong sigma should not make every other minimum unlikely.
-    """
+    """Excess cost at which starts are given up; it grows with the residuals of the best (D,)."""
     variance = equations_at(evidence, start)[0] / max(2 * len(evidence.sightings.point), 1)
     return _UNLIKELY * max(1.0, variance) if variance < np.inf else _UNLIKELY
 
@@ -90,10 +84,7 @@ def _has_latent(evidence: Evidence) -> bool:
 def refine_joint(
     evidence: Evidence, max_iterations: int, state: State
 ) -> tuple[float, float, State]:
-    """Improve a state; returns the cost, the score as of `score_state`, and the state.
-
-    Cost and score are infinite if a point lies behind a camera at the start.
-    """
+    """Improve a state; returns cost and score, infinite behind a camera, and the state."""
     reduction, row = reduced_row(evidence, state)
     fewer, effort = reduction.evidence, Effort(1, max_iterations, 0, np.inf)
     system = joint_system(fewer, integrates=_has_latent(fewer))

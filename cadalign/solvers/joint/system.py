@@ -204,11 +204,7 @@ def _move(
 
 @inlined
 def _follow_focals(evidence: Evidence, state: State, log_steps: FloatArray, moved: State) -> None:
-    """Let the distance of every view follow its focal length.
-
-    A longer lens and a larger distance give nearly the same image: along the curve on which both
-    grow by one factor the cost hardly changes, and steps can be long.
-    """
+    """Let distances follow focal lengths, along which the cost hardly changes."""
     for v in range(evidence.rig.pose.shape[0]):
         p, f = evidence.rig.pose[v], evidence.focals.group[v]
         if f >= 0:

@@ -21,10 +21,7 @@ from cadalign.compile import fast_sums, kernel
 
 
 class Mixture(NamedTuple):
-    """Gaussians over the same m points: means (G, m, 3), covariances (G, 3 m, 3 m).
-
-    ``penalties`` (G,) are -2 log of their weights.
-    """
+    """Gaussians: means (G, m, 3), covariances (G, 3 m, 3 m), ``penalties`` (G,) -2 log weight."""
 
     means: FloatArray
     covariances: FloatArray
@@ -100,10 +97,7 @@ def write_covariance(covariance: FloatArray, by_shape: FloatArray, matrix: Float
 
 @fast_sums
 def factorize_upper(matrix: FloatArray) -> float:
-    """Replace an upper triangle by its Cholesky factor, with the inverse of its diagonal.
-
-    Two rows at a time. Returns the log determinant, infinite where M is not positive definite.
-    """
+    """Replace an upper triangle by its Cholesky factor, diagonal inverted; log det, or infinite."""
     size = matrix.shape[0]
     log_determinant = 0.0
     for k in range(0, size, 2):

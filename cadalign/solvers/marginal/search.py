@@ -124,10 +124,7 @@ def _chosen(starts: FloatArray, given: int, first: int, end: int) -> IntArray:
 
 @kernel
 def _mean_starts(target: GaussianTarget, seen: Seen, whitening: FloatArray) -> FloatArray:
-    """Poses (S, 12) of the mean, the likeliest first.
-
-    The best of poses at evenly spread rotations are improved by a few steps.
-    """
+    """Poses (S, 12) of the mean, the likeliest first: the best of a grid after a few steps."""
     center, unit = center_and_unit(target.mean)
     if not unit > 0:
         return np.empty((0, 12))

@@ -35,6 +35,7 @@ from cadalign.solvers.ransac import Settings, ransac_kernel
 _MOST_EXHAUSTIVE = 1000  # subsets that are all tried rather than drawn from
 _CHANCE = 0.2  # bound on the expected number of models; 1 in 50 such problems has one
 _INLIER_ROUNDS = 5
+_LEAST_CONFIDENCE = 0.01  # over the largest: none is never drawn
 _FIRST, _FACTOR = 4.0, 2.0  # thresholds [px] that are tried where the noise is unknown
 _WIDEST = 0.25  # threshold, over the keypoints' extent
 
@@ -210,9 +211,10 @@ def _best_hypothesis(search: RobustSearch) -> tuple[Alignment, BoolArray, int, i
         raise InputError(
             f"{count} keypoints are too few", where="points_3d", fix=f"give at least {size}"
         )
-    by_score = _order_of_scores(search.scores, count)
+    confidence = _confidence(search.scores, count)
     order = np.random.default_rng(ransac.seed).permutation(count)
-    ranked = np.arange(count) if by_score is None else np.argsort(order)[by_score]
+    if len(confidence):
+        confidence = np.cumsum(confidence[order])
     facing = faced(camera, problems.points_2d)
     facing.require_focal()
     rays = rays_of(problems.points_2d[order], facing, clips=True)
@@ -224,7 +226,7 @@ def _best_hypothesis(search: RobustSearch) -> tuple[Alignment, BoolArray, int, i
     inliers = np.zeros(count, dtype=bool)
     score, iterations, hypotheses = ransac_kernel(
         Objective(options.free, keypoints, options.scale_prior),
-        ranked,
+        confidence,
         Settings(
             threshold=search.threshold,
             minimal=minimal,
@@ -234,7 +236,6 @@ def _best_hypothesis(search: RobustSearch) -> tuple[Alignment, BoolArray, int, i
             success_prob=float(ransac.success_prob),
             seed=int(ransac.seed),
             exhaustive=exhaustive,
-            guided=by_score is not None,
             optimize=ransac.refine,
         ),
         pose,
@@ -252,10 +253,10 @@ def _best_hypothesis(search: RobustSearch) -> tuple[Alignment, BoolArray, int, i
     return Alignment.from_packed(pose), kept, int(iterations), int(hypotheses), float(score)
 
 
-def _order_of_scores(scores: npt.ArrayLike | None, count: int) -> npt.NDArray[np.intp] | None:
-    """The order of falling scores; None where there are none, or all are alike."""
+def _confidence(scores: npt.ArrayLike | None, count: int) -> FloatArray:
+    """Shares of samples by scores (n,), empty where there are none, or all are alike."""
     if scores is None:
-        return None
+        return np.empty(0)
     values = as_floats(scores, name="scores", shape=(count,))
     if (values < 0).any():
         raise InputError(
@@ -263,4 +264,7 @@ def _order_of_scores(scores: npt.ArrayLike | None, count: int) -> npt.NDArray[np
             where="scores",
             fix="give numbers that are not negative",
         )
-    return np.argsort(-values, kind="stable") if np.ptp(values) > 0 else None
+    if not np.ptp(values) > 0:
+        return np.empty(0)
+    shares = values + _LEAST_CONFIDENCE * values.max()
+    return np.asarray(shares / shares.sum())

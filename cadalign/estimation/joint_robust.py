@@ -182,11 +182,7 @@ def _hypotheses(
 
 
 def _samples(count: int, size: int, ransac: RansacOptions, scores: FloatArray | None) -> IntArray:
-    """Samples (S, size) of keypoints: all where these are few, otherwise drawn at random.
-
-    So many that one without outliers is among them with the wanted probability, if 40 % of the
-    keypoints are inliers. With scores every other sample is drawn by these.
-    """
+    """Samples (S, size): all, or so many that of 40 % inliers one is pure; half drawn by scores."""
     without = math.log(1 - ransac.success_prob) / math.log1p(-(_INLIER_RATIO**size))
     wanted = min(max(math.ceil(without), ransac.min_iterations), ransac.max_iterations)
     if math.comb(count, size) <= wanted:

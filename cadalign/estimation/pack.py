@@ -34,7 +34,6 @@ _DEPTH_LOSS_SCALE = 3.0  # [sigma], of depths in an image: what hides a keypoint
 _RADIUS = 2  # of the window about a keypoint [px]
 _GAP = 4.0  # between surfaces in a window [sigma]
 _LEAST_PIXELS = 3  # of a surface in a window
-_LEAST_OF_PLANE = 6  # pixels of one whose slope is told
 _PLAIN = FitOptions()
 
 
@@ -173,35 +172,14 @@ def sample_depth(
         if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
             continue
         left, top = round(float(x)) - _RADIUS, round(float(y)) - _RADIUS
-        rows, columns = np.mgrid[
-            max(top, 0) : min(top + 2 * _RADIUS + 1, height),
-            max(left, 0) : min(left + 2 * _RADIUS + 1, width),
-        ].reshape(2, -1)
-        window = image[rows, columns]
-        order = np.argsort(window, kind="stable")[: np.isfinite(window).sum()]
-        depths = window[order]
+        window = image[max(top, 0) : top + 2 * _RADIUS + 1, max(left, 0) : left + 2 * _RADIUS + 1]
+        depths = np.sort(window[np.isfinite(window)])
         breaks = np.flatnonzero(np.diff(depths) > _GAP * sigma * depths[:-1]) + 1
-        surfaces = [part for part in np.split(order, breaks) if len(part) >= _LEAST_PIXELS]
+        surfaces = [part for part in np.split(depths, breaks) if len(part) >= _LEAST_PIXELS]
         if surfaces:
-            nearest = surfaces[0]
-            depths = window[nearest]
-            aside = np.column_stack([columns[nearest] - x, rows[nearest] - y])
-            found[row] = _depth_amid(aside, depths)
-            deviations[row] = max(sigma * found[row], depths.std())
+            found[row] = np.median(surfaces[0])
+            deviations[row] = max(sigma * found[row], surfaces[0].std())
     return found, deviations
-
-
-def _depth_amid(aside: FloatArray, depths: FloatArray) -> float:
-    """Depth at a keypoint of a surface with ``depths`` (k,) at pixels (k, 2) aside from it.
-
-    A keypoint at the edge of what is seen has more of the surface on one side: that of the plane
-    through the depths, whose inverses are linear in the image, within the range of these.
-    """
-    columns = np.column_stack([np.ones(len(depths)), aside])
-    if len(depths) < _LEAST_OF_PLANE or np.linalg.matrix_rank(columns) < 3:
-        return float(np.median(depths))
-    inverse = np.linalg.lstsq(columns, 1 / depths, rcond=None)[0][0]
-    return float(np.clip(1 / inverse, depths.min(), depths.max()) if inverse > 0 else depths.max())
 
 
 def seen_keypoints(view: View, pixels: FloatArray, rows: list[int], options: FitOptions) -> Seen:
@@ -233,10 +211,7 @@ def known_directions(prior: ShapePrior, views: Sequence[View]) -> Directions:
 
 
 def _across(direction: FloatArray, sigma_deg: Any) -> FloatArray:
-    """Whitening (3, 3) of a difference from a unit vector [1/rad]; along it as weak as across.
-
-    ``sigma_deg`` is its deviation about each axis across it [degrees], or a covariance (3, 3).
-    """
+    """Whitening (3, 3) of a unit vector [1/rad], by a deviation or covariance (3, 3) [degrees]."""
     sigma = np.asarray(sigma_deg, dtype=np.float64)
     if not sigma.ndim:
         return np.asarray(np.eye(3) / np.radians(sigma))
@@ -248,10 +223,7 @@ def _across(direction: FloatArray, sigma_deg: Any) -> FloatArray:
 
 
 def known_distances(prior: ShapePrior, views: Sequence[View], size: Size | None) -> Offsets:
-    """Lengths of the box between its corners, and heights of cameras above the lowest corner.
-
-    Raises InputError if a view has a height and the model no up axis, or no extent along a length.
-    """
+    """Lengths of the box between its corners, and heights of cameras above the lowest corner."""
     shape = prior.components[0]
     corners = len(shape.mean) - 2
     ends, images, directions, values, sigmas = [], [], [], [], []

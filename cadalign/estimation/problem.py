@@ -109,10 +109,7 @@ class Problem(NamedTuple):
         return everything._replace(shape=shape)
 
     def without(self, numbers: Sequence[int]) -> Problem:
-        """The problem without the evidence and the poses of some views.
-
-        Raises DegenerateError if the first is among them: the result is in its camera's frame.
-        """
+        """The problem without some views; DegenerateError if the first is among them."""
         if not numbers:
             return self
         if 0 in numbers:
@@ -167,10 +164,7 @@ def compile_problem(
 
 
 def no_pose_error(problem: Problem) -> DegenerateError:
-    """The error where no start leads to a pose.
-
-    Raises InputError if a mask or photo is given for a model without meshes.
-    """
+    """The error where no start leads to a pose; InputError of outlines without meshes."""
     shown = [view for view in problem.views if view.has_outline]
     if shown:
         from cadalign.estimation.contours.surface import surface_of  # imports this package

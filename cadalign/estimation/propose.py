@@ -8,7 +8,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import InputError
-from cadalign.estimation.joint_robust import robust_starts, with_sightings
+from cadalign.estimation.joint_robust import robust_starts
 from cadalign.estimation.prior import Lenses, is_exact
 from cadalign.estimation.problem import Inits, Problem
 from cadalign.estimation.starts import Start, Starts, starts_of
@@ -17,7 +17,6 @@ from cadalign.solvers.joint.search import costs_at
 
 _MOST_PER_FOCAL = 8  # starts of one pose, at each focal length of the grid
 _MOST_PER_FOCAL_OF_SEVERAL = 3
-_COARSE_SIGHTINGS = 256  # of a view of an exact model, which separate the starts
 _SAME_BRANCH = 0.6  # chord between rotations of one minimum at neighbouring focal lengths
 
 
@@ -40,16 +39,12 @@ def propose(problem: Problem, shape: Shape, init: Inits) -> tuple[Lenses, Starts
     lenses = problem.lenses
     if not lenses.count:
         return lenses, _starts_at(problem, problem.evidence(shape, lenses), init)
-    plain = None if lenses.are_distorted else _thinned(problem.evidence(shape, lenses))
     found: list[_AtFocals] = []
     failure: InputError | None = None
     for log_focals in lenses.grid():
         there = lenses.at(log_focals)
         try:
-            if plain is None:
-                evidence = _thinned(problem.evidence(shape, there))
-            else:
-                evidence = _zoomed(plain, log_focals, there)
+            evidence = problem.evidence(shape, there)
         except InputError as error:
             failure = error
             continue
@@ -60,7 +55,7 @@ def propose(problem: Problem, shape: Shape, init: Inits) -> tuple[Lenses, Starts
         found.append(_AtFocals(there, starts, costs_at(evidence, *starts)))
     if failure is not None and not found:
         raise failure
-    if plain is None:
+    if lenses.are_distorted:
         best = int(np.argmin([each.costs.min(initial=np.inf) for each in found]))
         lenses = found[best].lenses
     leaves_out = problem.ransac is None and is_exact(evidence)
@@ -87,24 +82,6 @@ def _merged(found: list[_AtFocals], lenses: Lenses, *, leaves_out: bool) -> Star
     if leaves_out:
         order = order[_unimproved(poses, costs, number)[order]]
     return Starts(poses[order], logs[number[order]], log_scales[order])
-
-
-def _thinned(evidence: Evidence) -> Evidence:
-    """The evidence, about an exact model with as many sightings as tell starts apart."""
-    count, most = len(evidence.sightings.point), _COARSE_SIGHTINGS * len(evidence.rig.pose)
-    if count <= most or not is_exact(evidence):
-        return evidence
-    return with_sightings(evidence, np.arange(most) * count // most)
-
-
-def _zoomed(evidence: Evidence, log_focals: FloatArray, lenses: Lenses) -> Evidence:
-    """The evidence with rays of ``lenses`` without distortion, ``log_focals`` (F,) longer."""
-    sightings = evidence.sightings
-    logs = np.append(log_focals, 0.0)[evidence.focals.group[sightings.image], None]
-    seen = sightings._replace(
-        rays=sightings.rays * np.exp(-logs), whitening=sightings.whitening * np.exp(logs)
-    )
-    return evidence._replace(sightings=seen, focals=lenses.focals())
 
 
 def _unimproved(poses: FloatArray, costs: FloatArray, number: IntArray) -> BoolArray:

@@ -65,11 +65,7 @@ def align_plain(
 
 
 def align_single(problem: Problem, start: float) -> Result:
-    """The result of `cadalign.align` where `is_single` holds, which was begun at ``start`` [s].
-
-    Raises InputError if the view names a keypoint that the model lacks; DegenerateError if no pose
-    has all keypoints in front of the camera.
-    """
+    """The result of `cadalign.align` where `is_single` holds, which was begun at ``start`` [s]."""
     model, view, options = cast(ShapeModel, problem.model), problem.views[0], problem.options
     prior, init = problem.prior, problem.inits[0]
     if init is not None:

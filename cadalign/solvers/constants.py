@@ -25,11 +25,7 @@ LEAST_POINTS: Final = 3
 
 
 class ScalePrior(NamedTuple):
-    """Prior on log s_y and log s_z: flat up to ``width`` about 0, the flank of a Gaussian beyond.
-
-    ``weight`` is the inverse variance of the flank, 0 for no prior; of a whole Gaussian, ``width``
-    is 0.
-    """
+    """Prior on log scales: flat up to ``width``, then a Gaussian flank; ``weight`` 0 is none."""
 
     weight: float
     width: float

@@ -177,14 +177,7 @@ def _to_points_basis(factor: FloatArray, vector: FloatArray) -> None:
 
 @kernel
 def _split_scale(linear: FloatArray, spread: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Find rotation and column scales d so that ``rotation @ diag(d)`` is close to ``linear``.
-
-    With n_j the columns of ``linear``, weighted by the points' spread along their axis, the best
-    scale for a given rotation is r_j . n_j, so what is left is to maximise the sum of
-    (r_j . n_j)^2 over rotations: Newton's method from the rotation nearest to the directions n_j.
-    Returns d (3,), always positive: a mirrored ``linear``, which noise on few points can give,
-    gets the least wrong rotation.
-    """
+    """Rotation and positive scales d (3,): ``rotation @ diag(d)`` is close to ``linear``."""
     columns = np.empty((3, 3))
     for j in range(3):
         for i in range(3):

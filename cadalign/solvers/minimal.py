@@ -147,12 +147,7 @@ def _solve_four(memory: FloatArray, solutions: FloatArray) -> int:
 
 @inlined
 def _column_weights(memory: FloatArray) -> bool:
-    """Find the weights by which the camera-frame points add up to the columns of R diag(s).
-
-    They are the inverse of the matrix of model-frame differences: with the weights w in row j from
-    `_WEIGHTS`, ``sum_i w[i] X_i`` is column j for the camera-frame points X_i. Returns False for
-    points in one plane.
-    """
+    """Weights by which camera-frame points add up to columns of R diag(s); False in a plane."""
     a, b, c = _difference(memory, 1), _difference(memory, 2), _difference(memory, 3)
     bc, ca, ab = cross(b, c), cross(c, a), cross(a, b)
     determinant = dot(a, bc)
@@ -369,11 +364,7 @@ def _frame(corners: tuple[Triple, Triple, Triple]) -> tuple[Triple, Triple, Trip
 
 @kernel
 def reflect(points: FloatArray, pose: FloatArray, other: FloatArray) -> None:
-    """Write the pose that looks like another one from afar: depths and the least axis reversed.
-
-    ``points`` (n, 3) are centred. The image from afar stays if depths are reversed, which mirrors
-    the model; its mirror image in the plane that the points are nearest to is most like it.
-    """
+    """Write the pose that looks like another one from afar: depths and the least axis reversed."""
     xx, xy, xz, yy, yz, zz = second_moments(points)
     # The adjugate's largest eigenvector is the moments' least one.
     first = (yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy)

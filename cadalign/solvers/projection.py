@@ -164,12 +164,7 @@ def reproject_batch(
     cameras: FloatArray,
     statuses: IntArray,
 ) -> tuple[FloatArray, IntArray]:
-    """Projected minus observed pixels (n, 2) of the first pose of every problem.
-
-    Problem b has the rows ``offsets[b]`` to ``offsets[b + 1]``; ``poses`` (B, k, 15) are packed;
-    ``cameras`` (1 or B, 4) holds fx, fy, cx, cy. Also returns the statuses (B,), in which a solved
-    problem with a point behind the camera becomes NOT_FOUND, and one that overflows OUT_OF_RANGE.
-    """
+    """Residuals (n, 2) [px] of first poses (B, k, 15), and statuses (B,) with unseen points."""
     residuals = np.empty((points.shape[0], 2))
     checked = statuses.copy()
     for b in range(offsets.shape[0] - 1):

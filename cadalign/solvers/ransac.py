@@ -38,16 +38,11 @@ _LEAST_POINTS = 5
 _FINAL_ROUNDS = 20
 _FINAL_ITERATIONS = 50
 _RIGID_ITERATIONS = 4
-_POOL_SAMPLES = 200_000.0  # after which all points are in the pool
+_SHARES = 1 << 31  # of which a number is drawn by confidence
 
 
 class Settings(NamedTuple):
-    """Options of the search; see `cadalign.RansacOptions`.
-
-    ``size`` is the minimal solver's number of points, ``threshold`` in pixels. An exhaustive search
-    tries every subset once, in order; a guided one draws from the first points first. ``optimize``
-    refines new best hypotheses, and the last one on all its inliers.
-    """
+    """Options of `cadalign.RansacOptions`; an exhaustive search tries every subset once."""
 
     threshold: float
     minimal: int
@@ -57,36 +52,31 @@ class Settings(NamedTuple):
     success_prob: float
     seed: int
     exhaustive: bool
-    guided: bool
     optimize: bool
 
 
 @kernel
 def ransac_kernel(
     objective: Objective,
-    ranked: IntArray,
+    confidence: FloatArray,
     settings: Settings,
     pose: FloatArray,
     inliers: BoolArray,
 ) -> tuple[float, int, int]:
     """Find the pose with the lowest truncated score.
 
-    The objective has the points in random order, in which scores look at them. ``ranked`` (n,)
-    holds their numbers, by falling confidence where the search is guided. Returns the score, a sum
-    of squared errors, each at most the threshold's square [px^2], and the numbers of iterations and
-    hypotheses.
+    The objective has the points in random order, in which scores look at them. ``confidence``
+    (n,) is the cumulative share by which every other sample is drawn, or empty. Returns the score,
+    a sum of squared errors, each at most the threshold's square [px^2], and the numbers of
+    iterations and hypotheses.
     """
     keypoints = objective.keypoints
     n = keypoints.points.shape[0]
     size = settings.size
-    guided = settings.guided
     limit = settings.threshold * settings.threshold
     state = np.empty(1, dtype=np.uint64)
     seed_state(settings.seed, state)
     chosen = np.arange(size)
-    sample = np.arange(size)
-    growth = np.empty(3)
-    start_pool(growth, size, n)
     candidates = np.empty((MAX_SOLUTIONS, POSE_SIZE))
     memory = minimal_memory()
     trial = np.empty(POSE_SIZE)
@@ -102,14 +92,9 @@ def ransac_kernel(
                 break
         else:
             # The most trusted points may all lie on one side: every other sample is of all points.
-            from_pool = guided and iterations % 2 == 0
-            if from_pool:
-                grow_pool(growth, size, n, iterations // 2)
-            draw_sample(state, growth, from_pool, n, chosen)
+            draw_subset(state, n, confidence if iterations % 2 == 0 else confidence[:0], chosen)
         iterations += 1
-        for k in range(size):
-            sample[k] = ranked[chosen[k]]
-        found = _solve_sample(keypoints, settings.minimal, sample, memory, candidates)
+        found = _solve_sample(keypoints, settings.minimal, chosen, memory, candidates)
         hypotheses += found
         for k in range(found):
             score, support = score_pose(keypoints, candidates[k], limit, best)
@@ -126,6 +111,7 @@ def ransac_kernel(
                     copy_into(pose, trial)
             if best_support > 0:
                 needed = _needed_samples(best_support / n, settings)
+                needed *= 2.0 if confidence.shape[0] > 0 else 1.0
     if best < np.inf and settings.optimize:
         best = _finish(objective, settings.threshold, best, pose)
     scalars = scalars_of(pose)
@@ -140,8 +126,7 @@ def _needed_samples(inlier_ratio: float, settings: Settings) -> float:
     good = inlier_ratio**settings.size
     if good >= 1.0:
         return 1.0
-    samples = np.log(1.0 - settings.success_prob) / np.log1p(-good)
-    return float(samples * (2.0 if settings.guided else 1.0))
+    return float(np.log(1.0 - settings.success_prob) / np.log1p(-good))
 
 
 @kernel
@@ -253,52 +238,22 @@ def draw_below(state: StateArray, bound: int) -> int:
 
 
 @kernel
-def draw_subset(state: StateArray, count: int, chosen: IntArray) -> None:
-    """Draw distinct point numbers below ``count``, any of them alike."""
+def draw_subset(state: StateArray, count: int, confidence: FloatArray, chosen: IntArray) -> None:
+    """Draw distinct point numbers below ``count``, alike or by cumulative confidence (n,)."""
     k = 0
     while k < chosen.shape[0]:
-        index = draw_below(state, count)
+        if confidence.shape[0] == 0:
+            index = draw_below(state, count)
+        else:
+            share, index = draw_below(state, _SHARES) / _SHARES, 0
+            while index < count - 1 and confidence[index] < share:
+                index += 1
         fresh = True
         for m in range(k):
             fresh = fresh and chosen[m] != index
         if fresh:
             chosen[k] = index
             k += 1
-
-
-@kernel
-def grow_pool(growth: FloatArray, size: int, count: int, iteration: int) -> None:
-    """Widen the pool of the best points as PROSAC does (Chum, Matas, 2005): size, T_n, T'_n."""
-    while growth[0] < count and iteration > growth[2]:
-        wider = growth[1] * (growth[0] + 1) / (growth[0] + 1 - size)
-        growth[2] += np.ceil(wider - growth[1])
-        growth[1] = wider
-        growth[0] += 1
-
-
-@kernel
-def start_pool(growth: FloatArray, size: int, count: int) -> None:
-    """The pool before the first sample: as many points as a sample has."""
-    average = _POOL_SAMPLES
-    for i in range(size):
-        average *= (size - i) / (count - i)
-    growth[0], growth[1], growth[2] = size, average, 1.0
-
-
-@kernel
-def draw_sample(
-    state: StateArray, growth: FloatArray, guided: bool, count: int, chosen: IntArray
-) -> None:
-    """Draw a sample: of the pool's points, with its newest one, or of all."""
-    pool = int(growth[0]) if guided else count
-    if pool >= count:
-        draw_subset(state, count, chosen)
-    elif pool == chosen.shape[0]:
-        for k in range(pool):
-            chosen[k] = k
-    else:
-        draw_subset(state, pool - 1, chosen[1:])
-        chosen[0] = pool - 1
 
 
 @kernel

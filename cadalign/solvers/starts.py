@@ -38,11 +38,7 @@ def minimal_starts(
 
 @kernel
 def choose_subsets(points: FloatArray, subsets: IntArray) -> int:
-    """Fill ``subsets`` (k, 3 or 4) with subsets of the points that span large areas or volumes.
-
-    All of them where there are no more than k, otherwise the best of a fixed sequence of draws.
-    Returns how many rows were filled.
-    """
+    """Fill ``subsets`` (k, 3 or 4) with all, or k that span much; returns how many were filled."""
     n = points.shape[0]
     wanted, size = subsets.shape
     draw = np.arange(size)
@@ -164,11 +160,7 @@ def rotation_starts(points: FloatArray, rays: FloatArray, poses: FloatArray) -> 
 def widen_by_shape(
     points: FloatArray, rays: FloatArray, variances: FloatArray, whitening: FloatArray
 ) -> FloatArray:
-    """Whitening (..., n, 3) of keypoints, widened by variances (..., n) of the shape's coordinates.
-
-    These are seen from the distance at which the mean ``points`` (..., n, 3) have the size of their
-    image.
-    """
+    """Whitening (..., n, 3) widened by variances (..., n) of the shape's coordinates."""
     extent, size = points.var(axis=-2).sum(axis=-1), rays.var(axis=0).sum()
     depth = np.maximum(np.sqrt(extent * 2.0 / 3.0 / max(size, 1e-30)), _LEAST_DEPTH)[..., None]
     # The variances add up for a whitening (a, b, c) whose b is small beside a and c.

@@ -223,11 +223,7 @@ def add_log_determinant(evidence: Evidence, state: State, equations: JointEquati
 
 @kernel
 def _add_block_slopes(evidence: Evidence, state: State, arrow: Arrow, factor: FloatArray) -> None:
-    """Add half the derivatives that blocks give.
-
-    A residual is linear in the coefficients, so that the derivative of its row by these, along
-    their response to it, is the change of the row as they move by the response.
-    """
+    """Add half the derivatives that blocks give: how rows move along the responses to them."""
     first, total = 6 + evidence.focals.low.shape[0] + 3, count_block_equations(evidence)
     row, moved_row = np.empty(6 + arrow.border.shape[0]), np.empty(6 + arrow.border.shape[0])
     still, moved = undisplaced(state), undisplaced(state)

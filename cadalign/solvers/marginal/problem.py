@@ -29,10 +29,7 @@ class Mixture(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """Keypoints of a view: their ``points`` (n,), rays (n, 2), whitening (n, 3), and the loss.
-
-    Whitening and loss are as in `cadalign.solvers.evidence.KeypointEvidence`.
-    """
+    """Keypoints of a view: their ``points`` (n,), rays (n, 2), whitening (n, 3), and the loss."""
 
     points: IntArray
     rays: FloatArray

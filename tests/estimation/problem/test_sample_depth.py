@@ -19,16 +19,6 @@ def test_windows_reach_two_pixels_to_every_side(axis: int, away: int, is_seen: i
     assert np.isfinite(found[0]) == bool(is_seen)
 
 
-def test_a_keypoint_at_the_edge_of_a_steep_surface_has_its_depth_there() -> None:
-    rows, columns = np.mgrid[:15, :15]
-    image = 1 / (0.5 + 0.001 * columns + 0.0005 * rows)
-    depth = image[7, 7]
-    image[:, :7] = 9.0
-    found, deviations = sample_depth(image, np.array([[7.0, 7.0]]), sigma=0.001)
-    assert found[0] == pytest.approx(depth, rel=1e-6)
-    assert deviations[0] > 1.5 * 0.001 * depth
-
-
 def test_two_hidden_keypoints_of_ten_hardly_shrink_the_object() -> None:
     points, truth, sigma = keypoints(10), truth_of(), 0.005
     places = CAMERA.project(truth.apply(points)).round().astype(int)

@@ -225,36 +225,30 @@ def _across(direction: FloatArray, sigma_deg: Any) -> FloatArray:
 def known_distances(prior: ShapePrior, views: Sequence[View], size: Size | None) -> Offsets:
     """Lengths of the box between its corners, and heights of cameras above the lowest corner."""
     shape = prior.components[0]
-    corners = len(shape.mean) - 2
-    ends, images, directions, values, sigmas = [], [], [], [], []
+    corners, rows = len(shape.mean) - 2, []
     if size is not None:
         own = (shape.spread[-2:] ** 2).sum()  # corners move by themselves
         for axis in np.flatnonzero(np.isfinite(size.lengths)).tolist():
             if not prior.lengths[axis] > 0:
                 what = f"the model has no extent along its {'xyz'[axis]}"
                 raise InputError(what, where=f"size.{LENGTHS[axis]}", fix="leave it away")
-            ends.append((corners, corners + 1))
-            images.append(-1)
-            directions.append(np.eye(3)[axis])
-            values.append(float(size.lengths[axis]))
-            sigmas.append(float(np.sqrt(size.deviations[axis] ** 2 + own)))
+            sigma = float(np.sqrt(size.deviations[axis] ** 2 + own))
+            rows.append(((corners, corners + 1), -1, np.eye(3)[axis], size.lengths[axis], sigma))
     for number, view in enumerate(views):
         if view.camera_height is None:
             continue
-        up = _upward("camera_height", prior, view)
+        up, height = _upward("camera_height", prior, view), view.camera_height
         lowest = corners + (0 if up.sum() > 0 else 1)  # the corner that lies in the lowest face
-        ends.append((lowest, _CAMERA))
-        images.append(number)
-        directions.append(up)
-        values.append(view.camera_height)
         relative = cast(float, view.camera_height_sigma)
-        sigmas.append(float(np.hypot(view.camera_height * relative, shape.spread[lowest])))
+        sigma = float(np.hypot(height * relative, shape.spread[lowest]))
+        rows.append(((lowest, _CAMERA), number, up, height, sigma))
+    ends, images, directions, values, sigmas = zip(*rows, strict=True) if rows else [()] * 5
     return Offsets(
         np.array(ends, dtype=np.int64).reshape(-1, 2),
         np.array(images, dtype=np.int64),
         np.array(directions, dtype=float).reshape(-1, 3),
         np.array(values, dtype=float),
-        np.array([1.0 / sigma for sigma in sigmas], dtype=float),
+        1.0 / np.array(sigmas, dtype=float),
     )
 
 

@@ -1,23 +1,33 @@
-"""The first stage of an estimate: starts, at known focal lengths or over a grid of unknown ones."""
+"""The first stage of an estimate: starts, of known focal lengths or of a grid, robust ones too."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import combinations
 from typing import NamedTuple, cast
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
 from cadalign.errors import InputError
-from cadalign.estimation.joint_robust import robust_starts
+from cadalign.estimation.options import MINIMAL_SOLVERS, RansacOptions
 from cadalign.estimation.prior import Lenses, is_exact
 from cadalign.estimation.problem import Inits, Problem
-from cadalign.estimation.starts import Start, Starts, starts_of
+from cadalign.estimation.starts import Start, Starts, in_rig, starts_of
+from cadalign.solvers.constants import CAUCHY, LINEAR, SAMPLE_SIZES
 from cadalign.solvers.joint.evidence import Evidence, Shape
-from cadalign.solvers.joint.search import costs_at
+from cadalign.solvers.joint.search import costs_at, keypoints_of
+from cadalign.solvers.ransac import rigid_hypotheses
 
 _MOST_PER_FOCAL = 8  # starts of one pose, at each focal length of the grid
 _MOST_PER_FOCAL_OF_SEVERAL = 3
 _SAME_BRANCH = 0.6  # chord between rotations of one minimum at neighbouring focal lengths
+_INLIER_RATIO = 0.4
+_LEAST_CONFIDENCE = 0.01  # over the largest: none is never drawn
+_LIMIT = 9.0  # squared whitened residual of a keypoint that speaks for a hypothesis
+_REFINED = 8
 
 
 class _AtFocals(NamedTuple):
@@ -110,3 +120,72 @@ def _start(init: Inits, evidence: Evidence) -> Start | None:
     if held.any():
         scale = np.where(held, 1.0, scale / scale[held].mean())
     return poses, np.log(scale)
+
+
+def robust_starts(
+    evidence: Evidence,
+    ransac: RansacOptions,
+    scores: Sequence[FloatArray | None],
+    init: Start | None = None,
+) -> Starts:
+    """Starts under a robust loss, and those of samples, drawn by ``scores`` (n_v,) of views."""
+    starts = starts_of(under_cauchy(evidence), init)
+    if evidence.rig.pose.max() > 0:
+        return starts
+    samples = np.array(
+        [
+            in_rig(pose, camera)
+            for view, camera in enumerate(evidence.rig.cam_from_rig)
+            for pose in _hypotheses(evidence, view, ransac, scores[view])
+        ]
+    ).reshape(-1, 12)
+    count, focals = len(samples), starts.log_focals.shape[1]
+    return Starts(
+        np.concatenate([starts.poses, samples[:, None]]),
+        np.concatenate([starts.log_focals, np.zeros((count, focals))]),
+        np.concatenate([starts.log_scales, np.zeros((count, 3))]),
+    )
+
+
+def under_cauchy(evidence: Evidence) -> Evidence:
+    """The same evidence under Cauchy's loss."""
+    old = evidence.sightings
+    return evidence._replace(sightings=old._replace(loss=np.full(len(old.loss), CAUCHY)))
+
+
+def _hypotheses(
+    evidence: Evidence, view: int, ransac: RansacOptions, scores: FloatArray | None
+) -> FloatArray:
+    """Camera poses (S, 12) from small samples of one view's keypoints, the best supported first."""
+    given = keypoints_of(evidence, view)._replace(loss=LINEAR)
+    count, size = len(given.points), SAMPLE_SIZES[MINIMAL_SOLVERS[ransac.minimal]]
+    if count < size:
+        return np.empty((0, 12))
+    poses, supports = rigid_hypotheses(given, _samples(count, size, ransac, scores), _LIMIT)
+    order = np.argsort(supports)[:_REFINED]
+    return poses[order[np.isfinite(supports[order])], :12]
+
+
+def _samples(count: int, size: int, ransac: RansacOptions, scores: FloatArray | None) -> IntArray:
+    """Samples (S, size): all, or so many that of 40 % inliers one is pure; half drawn by scores."""
+    without = math.log(1 - ransac.success_prob) / math.log1p(-(_INLIER_RATIO**size))
+    wanted = min(max(math.ceil(without), ransac.min_iterations), ransac.max_iterations)
+    if math.comb(count, size) <= wanted:
+        return np.array(list(combinations(range(count), size)))
+    told = None if scores is None or not scores.sum() > 0 else tuple(scores.tolist())
+    return _random_samples(count, size, wanted, ransac.seed, told)
+
+
+@lru_cache(maxsize=16)  # the same at every focal length, and with every mistake undone
+def _random_samples(
+    count: int, size: int, wanted: int, seed: int, scores: tuple[float, ...] | None
+) -> IntArray:
+    rng = np.random.default_rng(seed)
+    weights = None
+    if scores is not None:
+        weights = np.array(scores) + _LEAST_CONFIDENCE * max(scores)
+        weights = weights / weights.sum()
+    draws = [
+        rng.choice(count, size, replace=False, p=weights if k % 2 else None) for k in range(wanted)
+    ]
+    return read_only(np.unique(np.sort(draws, axis=1), axis=0))

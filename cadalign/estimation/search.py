@@ -4,34 +4,43 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.estimation.estimates import mean_state
-from cadalign.estimation.joint_robust import (
-    JointConsensus,
-    robust_minima,
-    whitened_lengths,
-    with_whitening_times,
-)
+from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.prior import Lenses
 from cadalign.estimation.problem import Inits, Problem
 from cadalign.estimation.problems import no_redundancy_error
-from cadalign.estimation.propose import propose
+from cadalign.estimation.propose import propose, under_cauchy
 from cadalign.estimation.starts import Starts
 from cadalign.estimation.uncertainty.evidence import count_equations
 from cadalign.estimation.uncertainty.posterior import widening_of
 from cadalign.estimation.uncertainty.residuals import Support, area_of, check_support
 from cadalign.estimation.view import View
-from cadalign.solvers.joint.evidence import Evidence, Shape, State, points_of
+from cadalign.solvers.joint.evidence import (
+    Evidence,
+    Shape,
+    State,
+    kept_rows,
+    log_focals_of,
+    points_of,
+    seen_in_cameras,
+)
 from cadalign.solvers.joint.search import refine_joint, score_state, search_joint
 
 _LENS_ROUNDS = 12  # of linearising lenses with distortion about the focal lengths
 _SETTLED = 1e-8  # change of a log focal length
 _MOST_FREE = 2  # scales that keypoints determine; the size follows from other evidence
+_OUTLIER_COST = 5.0  # of a keypoint left out, beyond the square of its threshold
+_WIDENING = 3.0  # standard deviations of a displacement that a threshold allows for
+_NEAREST = 1e-9  # depth
+_INLIER_ROUNDS = 5
+_KEPT = 4  # minima of the robust search that are settled on their inliers
+_LEAST_INLIERS = 3
 
 _NOISES = np.geomspace(0.1, 100.0, 10)  # [px]
 _USUAL, _USUAL_LOG_SIGMA = 2.0, 1.5  # [px], prior: few keypoints fit any noise by the shape
@@ -88,24 +97,27 @@ def search_at_noise(problem: Problem, init: Inits) -> SearchResult:
         hypotheses += len(starts.poses)
         if not len(starts.poses):
             continue
-        evidence = problem.evidence(shape, lenses)
-        if any(init) and _is_left_to_outlines(problem, evidence):
-            found, used = _states_of(evidence, starts), 0
+        whole = _whole(problem.evidence(shape, lenses), number, lenses)
+        if any(init) and _is_left_to_outlines(problem, whole.evidence):
+            found, used = _states_of(whole, starts), 0
         else:
-            found, used = _searched(problem, lenses, evidence, starts)
+            found, used = _searched(problem, whole, starts)
         iterations += used
         if lenses.are_distorted:
-            lenses, found = _relinearised(problem, shape, lenses, found)
+            found = _relinearised(problem, shape, found)
         prior_score = -2 * float(np.log(problem.prior.weights[number]))
-        minima.extend(
-            Minimum(number, *each._replace(score=each.score + prior_score), lenses)
-            for each in found
-        )
+        minima.extend(each._replace(score=each.score + prior_score) for each in found)
     if problem.ransac is not None and minima:
         best = min(minima, key=lambda each: each.score)
         _check_support(problem, best, problem.threshold(problem.ransac))
     minima.sort(key=lambda minimum: minimum.score)
     return SearchResult(problem, minima, iterations, hypotheses)
+
+
+def _whole(evidence: Evidence, component: int, lenses: Lenses) -> Minimum:
+    """An estimate from all sightings that has no state yet."""
+    every, no_state = np.ones(len(evidence.sightings.point), dtype=bool), cast(State, None)
+    return Minimum(component, every, evidence, no_state, 0.0, np.inf, lenses)
 
 
 def _is_left_to_outlines(problem: Problem, evidence: Evidence) -> bool:
@@ -115,47 +127,87 @@ def _is_left_to_outlines(problem: Problem, evidence: Evidence) -> bool:
     return problem.uses_outlines and equations < unknowns
 
 
-def _states_of(evidence: Evidence, starts: Starts) -> list[JointConsensus]:
+def _states_of(whole: Minimum, starts: Starts) -> list[Minimum]:
     """Starts as they are, with the score of the evidence there."""
-    every = np.ones(len(evidence.sightings.point), dtype=bool)
     states = [
-        mean_state(evidence, poses, log_scales)._replace(log_focals=log_focals)
+        mean_state(whole.evidence, poses, log_scales)._replace(log_focals=log_focals)
         for poses, log_focals, log_scales in zip(*starts, strict=True)
     ]
-    return [
-        JointConsensus(every, evidence, each, 0.0, score_state(evidence, each)) for each in states
-    ]
+    return [whole._replace(state=each, score=score_state(whole.evidence, each)) for each in states]
 
 
-def _searched(
-    problem: Problem, lenses: Lenses, evidence: Evidence, starts: Starts
-) -> tuple[list[JointConsensus], int]:
-    """Minima from starts, and the number of iterations."""
-    ransac = problem.ransac
-    if ransac is not None:
-        threshold = thresholds(evidence, lenses, problem.threshold(ransac))
-        projects = ransac.max_reproj_error is None
-        return robust_minima(evidence, starts, threshold, settles=ransac.refine, projects=projects)
-    every = np.ones(len(evidence.sightings.point), dtype=bool)
-    minima, used = search_joint(evidence, *starts)
+def _searched(problem: Problem, whole: Minimum, starts: Starts) -> tuple[list[Minimum], int]:
+    """Minima of the evidence of ``whole`` from starts, the best first, and the iterations."""
+    if problem.ransac is not None:
+        return _robust_minima(problem.ransac, problem.threshold(problem.ransac), whole, starts)
+    minima, used = search_joint(whole.evidence, *starts)
     found = [
-        JointConsensus(every, evidence, state, float(cost), float(score))
+        whole._replace(state=state, cost=float(cost), score=float(score))
         for state, cost, score in zip(*minima, strict=True)
     ]
     return found, used
 
 
-def _relinearised(
-    problem: Problem, shape: Shape, lenses: Lenses, found: list[JointConsensus]
-) -> tuple[Lenses, list[JointConsensus]]:
-    """Lenses linearised about the focal lengths of the best minimum, and the minima there."""
+def _robust_minima(
+    ransac: RansacOptions, limit: float, whole: Minimum, starts: Starts
+) -> tuple[list[Minimum], int]:
+    """Estimates that most keypoints support, the best first, with the iterations they took.
+
+    Each start is refined under a robust loss, then on its inliers, once or until these don't
+    change. A keypoint that is left out costs as much as one at its threshold, and the logarithm
+    that one more keypoint would add. Thresholds that are not given are widened by what a point's
+    own displacement projects to: the residual of one that is left out has all of it.
+    """
+    evidence = whole.evidence
+    threshold = thresholds(evidence, whole.lenses, limit)
+    minima, iterations = search_joint(under_cauchy(evidence), *starts)
+    found = []
+    for state in minima.states[:_KEPT]:
+        displaced = _WIDENING * _projected(evidence, state) * (ransac.max_reproj_error is None)
+        rounds = _INLIER_ROUNDS if ransac.refine else 1
+        settled = _settle(whole._replace(state=state), np.hypot(threshold, displaced), rounds)
+        if settled is not None:
+            found.append(settled)
+    found.sort(key=lambda minimum: minimum.score)
+    return found, iterations
+
+
+def _settle(whole: Minimum, threshold: FloatArray, rounds: int) -> Minimum | None:
+    """The best estimate on inliers alone, whose whitened residuals are below thresholds (N,)."""
+    best: Minimum | None = None
+    state = whole.state
+    inliers = whitened_lengths(whole.evidence, state) < threshold
+    for _ in range(rounds):
+        if inliers.sum() < _LEAST_INLIERS:
+            break
+        some = with_sightings(whole.evidence, inliers)
+        start = state.poses[None], state.log_focals[None], state.log_scales[None]
+        minima, _ = search_joint(some, *start)
+        if not minima.states:
+            break
+        state = minima.states[0]
+        left_out = threshold[~inliers] ** 2 + _OUTLIER_COST
+        score, cost = float(minima.scores[0] + left_out.sum()), float(minima.costs[0])
+        if best is None or score < best.score:
+            best = whole._replace(
+                inliers=inliers, evidence=some, state=state, cost=cost, score=score
+            )
+        again = whitened_lengths(whole.evidence, state) < threshold
+        if (again == inliers).all():
+            break
+        inliers = again
+    return best
+
+
+def _relinearised(problem: Problem, shape: Shape, found: list[Minimum]) -> list[Minimum]:
+    """The minima with lenses linearised about the focal lengths of the best."""
     for _ in range(_LENS_ROUNDS):
         if not found or np.abs(found[0].state.log_focals).max() < _SETTLED:
             break
         log_focals = found[0].state.log_focals
-        there = lenses.at(log_focals)
+        lenses = found[0].lenses.at(log_focals)
         try:
-            evidence = problem.evidence(shape, there)
+            evidence = problem.evidence(shape, lenses)
         except InputError:  # a lens cannot be undone at these
             break
         states = [each.state for each in found]
@@ -164,8 +216,8 @@ def _relinearised(
             np.array([state.log_focals for state in states]) - log_focals,
             np.array([state.log_scales for state in states]),
         )
-        lenses, (found, _) = there, _searched(problem, there, evidence, starts)
-    return lenses, found
+        found, _ = _searched(problem, _whole(evidence, found[0].component, lenses), starts)
+    return found
 
 
 def _check_support(problem: Problem, best: Minimum, max_reproj_error: float) -> None:
@@ -286,3 +338,43 @@ def _without_sigma(views: Sequence[View], minimum: Minimum) -> BoolArray:
 def _scaled(minimum: Minimum, chosen: BoolArray, factor: float) -> Minimum:
     """The minimum with the whitening of chosen sightings times a factor."""
     return minimum._replace(evidence=with_whitening_times(factor, chosen, minimum.evidence))
+
+
+def whitened_lengths(evidence: Evidence, state: State) -> FloatArray:
+    """Lengths (N,) of whitened residuals in the image; infinite behind a camera."""
+    return np.asarray(np.hypot(*_whitened_residuals(evidence, state).T))
+
+
+def _whitened_residuals(evidence: Evidence, state: State) -> FloatArray:
+    """Whitened residuals (N, 2) in the image; infinite behind a camera."""
+    sightings = evidence.sightings
+    points = points_of(evidence.shape, state)[sightings.point]
+    seen = seen_in_cameras(evidence, state.poses, points, sightings.image)
+    log_ratio = log_focals_of(evidence, state)[sightings.image][:, None]
+    error = np.exp(log_ratio) * seen[:, :2] / seen[:, 2:] - sightings.rays
+    error -= log_ratio * sightings.slopes
+    a, b, c = sightings.whitening.T
+    whitened = np.column_stack([a * error[:, 0] + b * error[:, 1], c * error[:, 1]])
+    return np.where(seen[:, 2:] > 0, whitened, np.inf)
+
+
+def _projected(evidence: Evidence, state: State) -> FloatArray:
+    """Whitened standard deviations (N,) that the points' displacements project to."""
+    sightings, shape = evidence.sightings, evidence.shape
+    points = points_of(shape, state)[sightings.point]
+    depths = seen_in_cameras(evidence, state.poses, points, sightings.image)[:, 2]
+    root = np.sqrt(sightings.whitening[:, 0] * sightings.whitening[:, 2])
+    scale = np.exp(state.log_scales.mean())
+    return np.asarray(root * scale * shape.spread[sightings.point] / np.maximum(depths, _NEAREST))
+
+
+def with_whitening_times(factor: float, chosen: BoolArray, evidence: Evidence) -> Evidence:
+    """The evidence with the whitening of ``chosen`` sightings (N,) times a factor."""
+    old = evidence.sightings
+    whitening = np.where(chosen[:, None], factor, 1.0) * old.whitening
+    return evidence._replace(sightings=old._replace(whitening=whitening))
+
+
+def with_sightings(evidence: Evidence, kept: BoolArray | IntArray) -> Evidence:
+    """The evidence of some sightings."""
+    return evidence._replace(sightings=kept_rows(evidence.sightings, kept))

@@ -21,7 +21,7 @@ from cadalign.estimation.contours.outline import (
     Track,
 )
 from cadalign.estimation.contours.problem import OWN_MODES, OutlineProblem
-from cadalign.estimation.joint_robust import with_whitening_times
+from cadalign.estimation.search import with_whitening_times
 from cadalign.solvers.joint.covariance import information_of, scaled_information
 from cadalign.solvers.joint.evidence import Evidence, State
 from cadalign.solvers.joint.search import objective_of, refine_joint

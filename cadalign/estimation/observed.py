@@ -30,20 +30,8 @@ def model_of(
 ) -> Model:
     """The model of an observation's own keypoints, those of all its views.
 
-    Parameters
-    ----------
-    observation : Observation
-    options : FitOptions
-        The known axis, the stretch and the prior on it count.
-    shape_sigma : float, optional
-        See `cadalign.Model`.
-    mesh : Mesh, optional
-        Mesh of the model.
-
-    Raises
-    ------
-    InputError
-        If views place the same keypoint at different points of the model.
+    Of the options the known axis, the stretch and the prior on it count. Raises InputError if views
+    place the same keypoint at different points of the model.
     """
     points: dict[Hashable, tuple[float, ...]] = {}
     labels = own_ids(observation.views)
@@ -75,27 +63,13 @@ def views_of(
     sigma: Sigma | None = None,
     with_photos: bool = False,
 ) -> tuple[View, ...]:
-    """Evidence of an observation's images about a model.
+    """Evidence of an observation's images about a model, at its sigma or at that given [px].
 
-    A learned shape's keypoints are found by semantic id or by name, as the shape has them.
+    A learned shape's keypoints are found by semantic id or by name, as the shape has them; a sigma
+    is 1 where none is known. Photos themselves are evidence where these are asked for.
 
-    Parameters
-    ----------
-    observation : Observation
-    model : Model or ShapeModel
-    sigma : float or array, optional
-        Standard deviation of the keypoints [px] in place of the observation's, which is 1 where it
-        has none.
-    with_photos : bool
-        Take the photos themselves as evidence, too.
-
-    Raises
-    ------
-    InputError
-        If the shape has no such keypoints, the observation has no ids or names, one of them occurs
-        twice, or what the observation says of an image is invalid.
-    DataError
-        If a mask, a depth image or a photo cannot be read.
+    Raises InputError if the shape has no such keypoints, the observation has no ids or names, one
+    occurs twice, or what is said of an image is invalid; DataError if a file cannot be read.
     """
     own = own_ids(observation.views)
     views = []

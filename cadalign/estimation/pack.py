@@ -157,14 +157,6 @@ def sample_depth(
     At a silhouette, a window about the keypoint shows the object and what is behind it: the depths
     are split at gaps of some ``sigma`` (relative), and the nearest surface's median is taken. Where
     that surface is steep, so much as its depths differ is added to ``sigma``.
-
-    Examples
-    --------
-    >>> image = np.full((5, 8), 9.0)
-    >>> image[:, :4] = 2.0
-    >>> keypoints = np.array([[3.4, 2.0], [7.0, 2.0], [60.0, 2.0]])
-    >>> [each.tolist() for each in sample_depth(image, keypoints, sigma=0.01)]
-    [[2.0, 9.0, nan], [0.02, 0.09, nan]]
     """
     height, width = image.shape
     found, deviations = np.full((2, len(points_2d)), np.nan)

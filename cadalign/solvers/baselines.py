@@ -8,12 +8,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
 from cadalign.geometry.alignment import describe_plane
-from cadalign.solvers.linear import (
-    MIN_POINTS,
-    SPAN_FIX,
-    aepnp_error,
-    out_of_range_error,
-)
+from cadalign.solvers.linear import MIN_POINTS, SPAN_FIX, aepnp_error, out_of_range_error
 
 _EPNP_POINTS = 4
 

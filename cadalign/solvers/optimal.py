@@ -25,9 +25,7 @@ from cadalign.solvers.constants import (
     ScalePrior,
 )
 from cadalign.solvers.evidence import KeypointEvidence, take_keypoints
-from cadalign.solvers.linalg import (
-    copy_into,
-)
+from cadalign.solvers.linalg import copy_into
 from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import MAX_POSES, MAX_SOLUTIONS, p3p_kernel, p3p_memory, reflect
 from cadalign.solvers.search import Effort, Minima, search

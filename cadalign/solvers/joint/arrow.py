@@ -12,12 +12,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import fast_sums, inlined, kernel
-from cadalign.solvers.linalg import (
-    add_products,
-    factorize,
-    mirror_upper,
-    solve_factor,
-)
+from cadalign.solvers.linalg import add_products, factorize, mirror_upper, solve_factor
 
 _LEAST_SHARE = 1e-12  # of an unknown's information that the others must leave
 

@@ -43,11 +43,7 @@ from cadalign.solvers.joint.evidence import (
     stretched_point,
     unpacked,
 )
-from cadalign.solvers.joint.rows import (
-    add_blocks,
-    bounded_scales,
-    write_rows,
-)
+from cadalign.solvers.joint.rows import add_blocks, bounded_scales, write_rows
 from cadalign.solvers.linalg import copy_into, damp, expected_decrease
 from cadalign.solvers.projection import shift, turn
 from cadalign.solvers.search import (

@@ -62,15 +62,7 @@ from cadalign.solvers.projection import (
     turn_back,
     write_motion,
 )
-from cadalign.solvers.search import (
-    are_same,
-    cost_at,
-    evaluate,
-    move,
-    room_of,
-    score_of,
-    solve,
-)
+from cadalign.solvers.search import are_same, cost_at, evaluate, move, room_of, score_of, solve
 from cadalign.solvers.unknowns import move_rigid, orthonormalize
 
 POSE_UNKNOWNS = 6

@@ -89,7 +89,7 @@ def fit(
         outliers. ``result.inliers`` marks the inliers. With an unknown focal length as for
         `cadalign.align`.
     scores : (n,) float, optional
-        Confidences of the keypoints, for ``ransac``: samples are drawn from the highest first.
+        Confidences of the keypoints, for ``ransac``: every other sample is drawn by them.
     symmetry : Symmetry, optional
         Motions that take the model to itself. The result is, among the alignments that are equal
         under it, the one nearest to upright, y up, with the model's z axis towards the camera, and

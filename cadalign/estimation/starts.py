@@ -1,7 +1,7 @@
 """Starts of a joint estimate: poses that the keypoints of each view suggest for the mean shape.
 
-Views whose few keypoints leave the stretch open take that of another view. Where a flat object's
-shape leaves open which side is seen, starts half a turn away are added.
+Views whose few keypoints leave the stretch open start at that of the view with the most. Where a
+flat object's shape leaves open which side is seen, starts half a turn away are added.
 
 An estimate that determines the object's size is linear in all but the rotation. For a camera (C, c)
 of a rig, a point of the model is seen at ``X = C (R diag(s) x + t) + c``. Its ray says
@@ -27,7 +27,6 @@ from cadalign.solvers.marginal.problem import GaussianTarget
 from cadalign.solvers.marginal.search import after_motion, half_turns
 
 _MOST_STARTS = 24
-_MOST_CARRIED = 3  # stretches of the other view
 _MOST_SIZED = 3
 
 _GRID = 400  # rotations
@@ -73,8 +72,11 @@ def _proposed(evidence: Evidence, init: Start | None) -> list[_Start]:
     rig = evidence.rig
     poses = int(rig.pose.max()) + 1
     per_pose: list[list[_Start]] = [[] for _ in range(poses)]
+    counts, unknowns = _keypoint_counts(evidence), 6 + int(evidence.scales.free.sum())
+    is_several = poses > 1 and unknowns > 6
     for view, camera in enumerate(rig.cam_from_rig):
-        found, logs = view_starts(evidence, view)
+        is_weak = is_several and 2 * counts[view] <= unknowns
+        found, logs = view_starts(_held(evidence) if is_weak else evidence, view)
         turned = _half_turned(evidence, view, found)
         moved = [(in_rig(pose, camera), scales) for pose, scales in zip(found, logs, strict=True)]
         moved += [(in_rig(pose, camera), np.zeros(3)) for pose in turned]
@@ -98,8 +100,6 @@ def _proposed(evidence: Evidence, init: Start | None) -> list[_Start]:
             return placed + [_sized(evidence, *each) for each in first]
         if rig.is_shared.any():  # nothing tells the size
             return []
-    for view in _weakly_determined(evidence):
-        per_pose[rig.pose[view]][:0] = _carried_starts(evidence, view, per_pose)
     if not all(per_pose):
         return []
     likeliest = [found[0] for found in per_pose]
@@ -110,7 +110,8 @@ def _proposed(evidence: Evidence, init: Start | None) -> list[_Start]:
         if rank < len(per_pose[p])
     ]
     chosen = [likeliest, *others][:_MOST_STARTS]
-    starts = [(np.array([pose for pose, _ in each]), each[0][1]) for each in chosen]
+    told = rig.pose[int(np.argmax(counts))] if init is None else 0  # the pose whose stretch counts
+    starts = [(np.array([pose for pose, _ in each]), each[told][1]) for each in chosen]
     return [_sized(evidence, *each) for each in starts] if is_metric else starts
 
 
@@ -144,33 +145,10 @@ def in_rig(pose: FloatArray, camera: FloatArray) -> FloatArray:
     return np.concatenate([turned.ravel(), rotation.T @ (pose[9:] - translation)])
 
 
-def _weakly_determined(evidence: Evidence) -> list[int]:
-    """Numbers of the views of unknown motion whose keypoints leave pose and stretch open."""
-    unknowns = 6 + int(evidence.scales.free.sum())
-    if unknowns == 6:
-        return []
-    counts = _keypoint_counts(evidence)
-    rig = evidence.rig
-    is_weak = (2 * counts <= unknowns) & ~rig.is_shared & (rig.pose >= 0) & (rig.pose.max() > 0)
-    return np.flatnonzero(is_weak).tolist()
-
-
-def _carried_starts(
-    evidence: Evidence, view: int, per_pose: Sequence[list[_Start]]
-) -> list[_Start]:
-    """Poses of a view under the stretches of the view with the most keypoints, and these."""
-    counts, shape, scales = _keypoint_counts(evidence), evidence.shape, evidence.scales
-    others = [v for v in np.argsort(-counts, kind="stable").tolist() if v != view]
-    own: list[_Start] = next((f for v in others if (f := per_pose[evidence.rig.pose[v]])), [])
-    starts: list[_Start] = []
-    for _, logs in own[:_MOST_CARRIED]:
-        stretched = evidence._replace(
-            shape=shape._replace(mean=shape.mean * np.exp(logs)),
-            scales=scales._replace(free=np.zeros(3), precision=np.zeros((3, 3))),
-        )
-        poses, _ = view_starts(stretched, view)
-        starts.extend((pose, logs) for pose in poses)
-    return starts
+def _held(evidence: Evidence) -> Evidence:
+    """The evidence without stretch."""
+    scales = evidence.scales._replace(free=np.zeros(3), precision=np.zeros((3, 3)))
+    return evidence._replace(scales=scales)
 
 
 def _keypoint_counts(evidence: Evidence) -> IntArray:

@@ -107,10 +107,7 @@ def cost_of(evidence: Evidence, state: State) -> float:
 
 def score_state(evidence: Evidence, state: State) -> float:
     """-2 log of the evidence by Laplace's approximation; infinite where it is not determined."""
-    reduction, row = reduced_row(evidence, state)
-    system = joint_system(reduction.evidence, integrates=False)
-    minima, _ = run_joint(system, row[None], Effort(1, 0, 0, np.inf))
-    return float(minima.scores[0])
+    return refine_joint(evidence, 0, state)[1]
 
 
 def equations_at(

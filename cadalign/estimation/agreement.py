@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -36,13 +36,6 @@ _FEW_REJECTED = 0.1  # share of the keypoints, up to which an uncertain shape is
 _MOST_REJECTED = 1 / 3  # share of the keypoints that are outliers; more are none
 _CHANCE_OF_RATIO = 1e-3  # that residuals of an unknown noise differ by as much
 _UPRIGHT = 0.5  # cosine between the model's y axis and the photo's upwards, at least
-
-
-class Again(Protocol):
-    """Estimate without a diagnosis; ``changes`` are those of its options, ransac and size."""
-
-    def __call__(self, model: AnyModel, views: Sequence[View], /, **changes: Any) -> Result:
-        """Raises CadalignError if there is none."""
 
 
 class Rule(NamedTuple):
@@ -92,11 +85,15 @@ class Agreement(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DiagnosisCase:
-    """The data of an estimate, the estimate as a function of these, and the search for inliers."""
+    """The data of an estimate, the estimate as a function of these, and the search for inliers.
+
+    The estimate ``again``, without a diagnosis, takes a model, views, and as keywords changes of
+    its options, ransac and size; it raises CadalignError if there is none.
+    """
 
     model: AnyModel
     views: Sequence[View]
-    again: Again
+    again: Callable[..., Result]
     ransac: RansacOptions | None = None
     size: Size | None = None
     has_rows: bool = False  # the ids of keypoints are their rows

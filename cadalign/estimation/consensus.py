@@ -20,7 +20,6 @@ from cadalign.estimation.uncertainty.residuals import (
     Support,
     area_of,
     check_support,
-    disagreeing,
     log_expected_by_chance,
     share_as_moderate,
 )
@@ -155,7 +154,6 @@ def _fit_to_inliers(search: RobustSearch, start: float) -> FittedKeypoints:
         solutions=SOLUTIONS_OF_FOUR,
         chance=_CHANCE,
         share=share,
-        disagreeing=disagreeing(np.linalg.norm(residuals, axis=1), inliers),
     )
     points, camera = problems.points_3d, problems.camera
     found = FittedKeypoints(points, residuals, inliers, alignment, camera, options)

@@ -194,45 +194,35 @@ def outside_image(
     All keypoints lie beyond one side, or, where they do not ``agree``, most outside: of an object
     that is hidden or cropped, some may, and they may surround the image.
     """
-    wrong = _wrong_principal_point(camera)
-    doubts = () if wrong is None else (EstimateWarning("camera", where + wrong, view),)
+    found, own = [], np.array([camera.width, camera.height])
+    point = f"{where}the camera's principal point ({camera.cx:.4g}, {camera.cy:.4g}) is"
+    sizes, middle = np.outer(OTHER_SIZES, own), np.array([camera.cx, camera.cy]) + PIXEL_CENTRE
+    same = np.flatnonzero(np.abs(2 * middle / sizes - 1).max(axis=1) < _SAME_MIDDLE).tolist()
+    if same:
+        width, height = sizes[same[0]]
+        text = (
+            f"{point} the middle of an image of {width:.0f} x {height:.0f} px, its own has "
+            f"{own[0]} x {own[1]} px: if the photo was resized, give Camera.resized({own[0]}, "
+            f"{own[1]}) of its camera"
+        )
+        found.append(EstimateWarning("camera", text, view))
+    elif np.abs(middle / own - 0.5).max() >= _FAR_FROM_MIDDLE:
+        text = (
+            f"{point} far from the middle of its image of {own[0]} x {own[1]} px, which is right "
+            "only for a photo cut out of a larger one"
+        )
+        found.append(EstimateWarning("camera", text, view))
     outside = np.flatnonzero(~camera.contains(points_2d)).tolist()
-    count = len(outside)
-    if 2 * count <= len(points_2d):
-        return doubts
-    last = np.array([camera.width, camera.height]) - PIXEL_CENTRE
+    last = own - PIXEL_CENTRE
     beyond = (points_2d < -PIXEL_CENTRE).all(axis=0) | (points_2d > last).all(axis=0)
-    if agree and not beyond.any():
-        return doubts
-    text = (
-        f"{where}{count} of {len(points_2d)} keypoints lie outside of the image of {camera.width} "
-        f"x {camera.height} px: are they of another resolution than the camera, or of another "
-        "photo?"
-    )
-    return (*doubts, EstimateWarning("outside-image", text, view, tuple(outside)))
-
-
-def _wrong_principal_point(camera: Camera) -> str | None:
-    """Says that a principal point is the middle of another image, or far from that of its own."""
-    if camera.is_centred:
-        return None
-    own = f"({camera.cx:.4g}, {camera.cy:.4g})"
-    middle = 2 * (camera.cx + PIXEL_CENTRE), 2 * (camera.cy + PIXEL_CENTRE)
-    for factor in OTHER_SIZES:
-        width, height = camera.width * factor, camera.height * factor
-        if max(abs(middle[0] / width - 1), abs(middle[1] / height - 1)) < _SAME_MIDDLE:
-            return (
-                f"the camera's principal point {own} is the middle of an image of {width:.0f} x "
-                f"{height:.0f} px, its own has {camera.width} x {camera.height} px: if the photo "
-                f"was resized, give Camera.resized({camera.width}, {camera.height}) of its camera"
-            )
-    off = max(abs(middle[0] / camera.width - 1), abs(middle[1] / camera.height - 1)) / 2
-    if off < _FAR_FROM_MIDDLE:
-        return None
-    return (
-        f"the camera's principal point {own} is far from the middle of its image of {camera.width} "
-        f"x {camera.height} px, which is right only for a photo cut out of a larger one"
-    )
+    if 2 * len(outside) > len(points_2d) and (beyond.any() or not agree):
+        text = (
+            f"{where}{len(outside)} of {len(points_2d)} keypoints lie outside of the image of "
+            f"{own[0]} x {own[1]} px: are they of another resolution than the camera, or of "
+            "another photo?"
+        )
+        found.append(EstimateWarning("outside-image", text, view, tuple(outside)))
+    return tuple(found)
 
 
 def unexplained(sigma: float, points_2d: Sequence[FloatArray]) -> Warnings:

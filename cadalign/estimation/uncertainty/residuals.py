@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import FloatArray
 from cadalign.errors import NoConsensusError
 from cadalign.geometry.camera import Camera
 from cadalign.shapes.parts import probability_within
@@ -133,14 +133,12 @@ def check_support(
     solutions: float = MAX_SOLUTIONS,
     chance: float = 0.1,
     share: float = 1.0,
-    disagreeing: str = "",
 ) -> None:
     """Refuse an estimate whose poses have no more support together than chance gives.
 
     ``size`` keypoints determine a pose, with so many ``solutions``; ``score`` is the truncated sum
     of squares [px^2], which the NoConsensusError carries. ``chance`` bounds the expected number of
-    models with as much support, of which a ``share`` is as moderate as this one; ``disagreeing``
-    are words about keypoints that disagree.
+    models with as much support, of which a ``share`` is as moderate as this one.
     """
     logarithm = sum(min(0.0, log_expected_by_chance(each, size, solutions)) for each in supports)
     if logarithm < 0 and share < 1:  # the distribution of the product of both
@@ -151,8 +149,7 @@ def check_support(
     inliers, count = sum(len(each.errors) for each in supports), sum(n for _, n, _ in supports)
     raise NoConsensusError(
         f"no alignment is supported: the best has {inliers} of {count} keypoints within "
-        f"{max_reproj_error:g} px, which chance gives as well (score {score:.4g} px^2)"
-        + (f"; {disagreeing}" if disagreeing else ""),
+        f"{max_reproj_error:g} px, which chance gives as well (score {score:.4g} px^2)",
         where=where,
         fix="check the correspondences and the camera, raise max_reproj_error or max_iterations, "
         'or use loss="cauchy" for a model that is only similar',
@@ -169,12 +166,6 @@ def share_as_moderate(scale: FloatArray, free: int) -> float:
     """
     largest = float(np.abs(np.log(scale)).max())
     return max(math.erf(largest / (math.sqrt(2) * _CHANCE_STRETCH)) ** free, _LEAST_SHARE)
-
-
-def disagreeing(errors: FloatArray, kept: BoolArray) -> str:
-    """Words about the keypoints with the largest errors (n,) [px] of those that are not kept."""
-    wrong = {row: errors[row] for row in np.flatnonzero(~kept).tolist()}
-    return f"keypoints that disagree: {named_keypoints(wrong)}" if wrong else ""
 
 
 def named_keypoints(errors: Mapping[Any, float]) -> str:

@@ -175,6 +175,7 @@ def result_of(
         own_stretch=np.where(
             has_length, best.lengths / np.where(has_length, prior.lengths, 1), 1.0
         ),
+        sigma=problem.noise if problem.lacks_sigma else common_sigma(problem.views),
         **of_result,
     )
 
@@ -233,7 +234,6 @@ def result_of_minima(
         cost=minimum.cost,
         stats=stats,
         component=minimum.component,
-        sigma=problem.noise if problem.lacks_sigma else common_sigma(views),
         known_axis=known_axis if known_axis and held["xyz".index(known_axis)] else None,
         stretched_axes=stretched_axes(held),
         symmetry=symmetry,

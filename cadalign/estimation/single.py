@@ -15,7 +15,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.estimation.estimates import as_given
 from cadalign.estimation.fit import fit_one
-from cadalign.estimation.joint import common_sigma, result_of
+from cadalign.estimation.joint import result_of
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.pack import seen_keypoints
@@ -101,7 +101,6 @@ def align_single(problem: Problem, start: float) -> Result:
         cost=cost,
         stats=stats,
         component=component,
-        sigma=common_sigma(problem.views),
         known_axis=None,
         stretched_axes="",
     )

@@ -459,7 +459,7 @@ def test_what_is_not_a_photo_is_refused(case: Case) -> None:
     missing = case.folder / "none.png"
     assert refusal_text(lambda: case.open(image=missing)) == f"{missing}: no such file or folder"
     assert refusal_text(lambda: case.open(model=missing.with_suffix(".obj"))).endswith(
-        "no such mesh file"
+        "no such file"
     )
 
 

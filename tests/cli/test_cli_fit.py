@@ -276,7 +276,7 @@ def test_photo_that_cannot_be_used(tmp_path: Path, capsys: pytest.CaptureFixture
 def test_model_that_cannot_be_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     model = tmp_path / "model.obj"
     path = write_observation(tmp_path / "chair.json", model=model)
-    assert refusal_line(capsys, "fit", path) == f"{model}: no such mesh file"
+    assert refusal_line(capsys, "fit", path) == f"{model}: no such file"
 
 
 def test_photo_sizes_that_cannot_be_drawn(

@@ -226,12 +226,10 @@ def mask_contour(mask: FloatArray | BoolArray, where: str) -> Contour:
     image's border, or the contour is longer than that of any object.
     """
     inside = mask if mask.dtype == bool else mask >= 0.5
-    if not inside.any():
-        fix = "give the mask of the object, or None"
-        raise InputError("contains no pixel of the object", where=where, fix=fix)
-    if inside.all():
+    if inside.all() or not inside.any():
+        where_is = "covers all of the image" if inside.all() else "contains no pixel of the object"
         fix = "give the mask of the object alone, or None"
-        raise InputError("covers all of the image, so that it has no contour", where=where, fix=fix)
+        raise InputError(f"{where_is}, so that it has no contour", where=where, fix=fix)
     contour = contour_of(mask)
     if not len(contour.points):
         raise InputError(

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, cast
+from typing import cast
 
 import numpy as np
 
@@ -57,32 +57,28 @@ _NO_OUTLINE = (
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A start, what is to be refined from there, and where that led."""
+    """A start, and the estimate to which it led."""
 
     start: Minimum
-    problem: OutlineProblem
     fit: OutlineFit
 
-    @cached_property
-    def measured(self) -> list[MeasuredOutline | None]:
-        """The outline that each source measures."""
-        return self.fit.measured(self.problem)
+    @property
+    def _measured(self) -> list[tuple[OutlineSource, MeasuredOutline | None]]:
+        return list(zip(self.fit.problem.sources, self.fit.measured, strict=True))
 
     @cached_property
     def supports(self) -> list[OutlineSupport]:
         """The agreement of each source with the outline."""
         return [
             OutlineSupport() if each is None else source.support(each)
-            for source, each in zip(self.problem.sources, self.measured, strict=True)
+            for source, each in self._measured
         ]
 
     @cached_property
     def rank(self) -> float:
         """-2 log of its probability by the other evidence and by the outlines, up to a constant."""
-        rest = cost_of(self.problem.evidence, self.fit.state) + self.start.prior_score
-        for source, each in zip(self.problem.sources, self.measured, strict=True):
-            rest += 0.0 if each is None else source.rank(each)
-        return rest
+        rest = cost_of(self.fit.problem.evidence, self.fit.state) + self.start.prior_score
+        return rest + sum(source.rank(each) for source, each in self._measured if each is not None)
 
     @cached_property
     def minimum(self) -> Minimum:
@@ -105,18 +101,24 @@ def refine_with_outlines(
     mask has no contour, or the model no mesh; DegenerateError if there is no estimate without the
     outlines, and none near it with them.
     """
-    search = OutlineSearch.of(model, prior, minima, views)
-    sources = left = search.sources
+    first, keypoints = minima[0], len(prior.ids)
+    is_exact, is_open = is_exact_model(model), not _is_determined(first)
+    hulls = [] if is_exact else _hulls_of(views)
+    sources = left = sources_of(hulls or views, first, is_exact=is_exact)
+    points, where = first.points[:keypoints], min(source.where for source in sources)
+    surface = surface_of(model, points, where, is_hull=bool(hulls))
+    likely = [each for each in minima if is_open or each.score < first.score + _UNLIKELY]
+    likely = likely[: _MOST_OPEN_STARTS if is_open else _MOST_STARTS]
     warnings: list[EstimateWarning] = []
     best: list[Candidate] = []
     wrong: tuple[OutlineSource, str] | None = None
     while left:
-        best = search.best(left)
+        best = _candidates(likely, left, surface, keypoints, is_open=is_open)
         wrong = _contradicting(best, left)
         if wrong is None:
             break
         source, reason = wrong
-        if search.is_open and len(left) == 1:
+        if is_open and len(left) == 1:
             if not best or not best[0].supports[0].share:
                 raise DegenerateError(reason, where=source.where, fix=_NO_OUTLINE)
             warnings.append(source.warning(f"{source.where}: {reason}"))
@@ -133,58 +135,31 @@ def refine_with_outlines(
     return found, OutlineNotes(tuple(summaries), tuple(warnings))
 
 
-class OutlineSearch(NamedTuple):
-    """Minima without outlines, and the sources and the surface that are brought together there.
-
-    The search ``is_open`` where nothing but the outlines determines the estimate.
-    """
-
-    minima: list[Minimum]
-    sources: list[OutlineSource]
-    surface: Surface
-    keypoints: int
-    is_open: bool
-
-    @classmethod
-    def of(
-        cls,
-        model: Model | ShapeModel,
-        prior: ShapePrior,
-        minima: Sequence[Minimum],
-        views: Sequence[View],
-    ) -> OutlineSearch:
-        """The search from the likely ones of minima."""
-        first, keypoints = minima[0], len(prior.ids)
-        is_exact = is_exact_model(model)
-        hulls = [] if is_exact else _hulls_of(views)
-        sources = sources_of(hulls or views, first, is_exact=is_exact)
-        points, where = first.points[:keypoints], min(source.where for source in sources)
-        surface = surface_of(model, points, where, is_hull=bool(hulls))
-        is_open = not _is_determined(first)
-        likely = [each for each in minima if is_open or each.score < first.score + _UNLIKELY]
-        most = _MOST_OPEN_STARTS if is_open else _MOST_STARTS
-        return cls(likely[:most], sources, surface, keypoints, is_open)
-
-    def best(self, sources: Sequence[OutlineSource]) -> list[Candidate]:
-        """Distinct candidates, the likeliest first."""
-        starts = [(each, each.state) for each in self.minima]
-        has_photo = not all(each.learns_sigma for each in sources)
-        if not self.is_open and (self.surface.is_exact or has_photo):
-            starts += _displaced(self.minima[0], is_exact=self.surface.is_exact)
-        near = []
-        for start, state in starts:
-            given = start.evidence, state, self.keypoints, sources, self.surface
-            problem, begun = OutlineProblem.of(*given)
-            fit = first_fit(problem, begun)
-            if fit is not None:
-                near.append(Candidate(start, problem, fit))
-        likely = _distinct_candidates(near)[:_MOST_FINISHED]
-        found = []
-        for each in likely:
-            if each.rank < likely[0].rank + _UNLIKELY:
-                end = last_fit(each.problem, each.fit)
-                found += [] if end is None else [replace(each, fit=end)]
-        return sorted(_distinct_candidates(found), key=lambda each: each.minimum.score)
+def _candidates(
+    likely: Sequence[Minimum],
+    sources: Sequence[OutlineSource],
+    surface: Surface,
+    keypoints: int,
+    *,
+    is_open: bool,
+) -> list[Candidate]:
+    """Distinct candidates near likely minima, the likeliest first."""
+    starts = [(each, each.state) for each in likely]
+    has_photo = not all(each.learns_sigma for each in sources)
+    if not is_open and (surface.is_exact or has_photo):
+        starts += _displaced(likely[0], is_exact=surface.is_exact)
+    near = []
+    for start, state in starts:
+        given = OutlineProblem.of(start.evidence, state, keypoints, sources, surface)
+        fit = first_fit(*given)
+        near += [] if fit is None else [Candidate(start, fit)]
+    near = _distinct_candidates(near)[:_MOST_FINISHED]
+    found = []
+    for each in near:
+        if each.rank < near[0].rank + _UNLIKELY:
+            end = last_fit(each.fit)
+            found += [] if end is None else [Candidate(each.start, end)]
+    return sorted(_distinct_candidates(found), key=lambda each: each.minimum.score)
 
 
 def _hulls_of(views: Sequence[View]) -> list[View]:
@@ -288,7 +263,7 @@ def _tension(candidate: Candidate) -> str | None:
 
     A contour's registration counts with them.
     """
-    start, problem, state = candidate.start, candidate.problem, candidate.fit.state
+    start, problem, state = candidate.start, candidate.fit.problem, candidate.fit.state
     evidence = start.evidence
     equations = 2 * int((evidence.sightings.whitening[:, 2] > 0).sum())
     if not equations:

@@ -39,14 +39,16 @@ class OutlineFit(NamedTuple):
     The evidence and its state ``with_outlines``, and the state without their points.
     """
 
+    problem: OutlineProblem
     with_outlines: tuple[Evidence, State]
     state: State
     outlines: list[Outline | None]
     tracks: list[Track]
 
-    def measured(self, problem: OutlineProblem) -> list[MeasuredOutline | None]:
+    @property
+    def measured(self) -> list[MeasuredOutline | None]:
         """The outline that each source measures, and its noise."""
-        offsets = problem.offsets(self.state, self.tracks)
+        offsets = self.problem.offsets(self.state, self.tracks)
         return [
             outline and MeasuredOutline(outline, offset, track.noise)
             for outline, offset, track in zip(self.outlines, offsets, self.tracks, strict=True)
@@ -58,11 +60,11 @@ def first_fit(problem: OutlineProblem, state: State) -> OutlineFit | None:
     return _approached(problem, state, [source.first() for source in problem.sources])
 
 
-def last_fit(problem: OutlineProblem, fit: OutlineFit) -> OutlineFit | None:
+def last_fit(fit: OutlineFit) -> OutlineFit | None:
     """The end near another estimate; None without an outline."""
-    begun = zip(problem.sources, fit.tracks, strict=True)
-    end = _approached(problem, fit.state, [source.last(track) for source, track in begun])
-    return None if end is None else _with_wider_noise(problem, end)
+    begun = zip(fit.problem.sources, fit.tracks, strict=True)
+    end = _approached(fit.problem, fit.state, [source.last(track) for source, track in begun])
+    return None if end is None else _with_wider_noise(end)
 
 
 def _approached(
@@ -92,7 +94,7 @@ def _approached(
             return None
         gain = objective_of(evidence, before) - objective_of(evidence, after)
         learned, state = _with_likeliest_offsets(problem, evidence, after, learned)
-        fit = OutlineFit((evidence, after), state, outlines, learned)
+        fit = OutlineFit(problem, (evidence, after), state, outlines, learned)
         is_settled = gain < _LEAST_GAIN and all(map(Track.is_like, learned, tracks))
         is_settled |= not any(source.learns_sigma for source in problem.sources)
         if is_settled and not any(track.levels for track in tracks):
@@ -132,14 +134,14 @@ def likeliest_offset(own: float, variance: float, noise: Noise) -> float:
     return max(float(np.sqrt(square)), LEAST_OFFSET)
 
 
-def _with_wider_noise(problem: OutlineProblem, fit: OutlineFit) -> OutlineFit:
+def _with_wider_noise(fit: OutlineFit) -> OutlineFit:
     """The same, with the noise of outlines as large as if unknowns fitted a part of it.
 
     Their residuals have as many degrees of freedom less as the outlines determine unknowns.
     """
     evidence, state = fit.with_outlines
     rows = np.arange(len(evidence.sightings.point))
-    is_outline = rows >= len(problem.evidence.sightings.point)
+    is_outline = rows >= len(fit.problem.evidence.sightings.point)
     (_, whole), (_, rest) = (
         information_of(with_whitening_times(times, is_outline, evidence), state)
         for times in (1.0, 0.0)

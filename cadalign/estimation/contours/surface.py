@@ -9,10 +9,12 @@ from typing import cast
 
 import numpy as np
 from scipy.spatial import ConvexHull
+from trimesh.triangles import points_to_barycentric
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.estimation.model import Model
+from cadalign.geometry.alignment import bounds_corners
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import RayCaster
 from cadalign.io.meshes.files import load_mesh
@@ -34,7 +36,7 @@ class RigidSurface:
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
         self.caster = RayCaster(mesh)
-        self.corners = corners_of(mesh)
+        self.corners = bounds_corners(*mesh.bounds)
 
     def at(self, shape: Shape, state: State) -> PosedSurface:
         """The mesh at a state."""
@@ -85,7 +87,7 @@ class Warped:
     @property
     def corners(self) -> FloatArray:
         """Corners (8, 3) of the box."""
-        return corners_of(self.mesh)
+        return bounds_corners(*self.mesh.bounds)
 
     def rows(self, points: FloatArray, face: IntArray) -> tuple[FloatArray, FloatArray]:
         """See `RigidSurface`."""
@@ -108,23 +110,10 @@ Surface = RigidSurface | WarpedSurface
 """A mesh that follows the shape."""
 
 
-def corners_of(mesh: Mesh) -> FloatArray:
-    """Corners (8, 3) of the box of a mesh."""
-    choices = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), axis=-1).reshape(-1, 3)
-    return np.asarray(mesh.bounds[choices, np.arange(3)])
-
-
 def _barycentric(triangles: FloatArray, points: FloatArray) -> FloatArray:
     """Barycentric coordinates (n, 3) of points (n, 3) on triangles (n, 3, 3)."""
-    edges = triangles[:, 1:] - triangles[:, :1]
-    gram = edges @ edges.swapaxes(1, 2)
-    right = (edges @ (points - triangles[:, 0])[:, :, None])[:, :, 0]
-    determinant = gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] ** 2
-    safe = np.where(determinant > 0, determinant, np.inf)
-    first = (gram[:, 1, 1] * right[:, 0] - gram[:, 0, 1] * right[:, 1]) / safe
-    second = (gram[:, 0, 0] * right[:, 1] - gram[:, 0, 1] * right[:, 0]) / safe
-    shares = np.column_stack([1 - first - second, first, second])
-    shares = np.clip(shares, 0.0, 1.0)
+    shares = points_to_barycentric(triangles, points)  # type: ignore[no-untyped-call]
+    shares = np.clip(np.where(np.isfinite(shares), shares, 1 / 3), 0.0, 1.0)
     return np.asarray(shares / shares.sum(axis=1, keepdims=True))
 
 

@@ -62,7 +62,8 @@ def changed(pose: np.ndarray, rows: slice | int, columns: slice | int, factor: f
         ),
         (
             lambda: align(MODEL, [View(CAMERA, PIXELS), View(CAMERA, PIXELS, mask=NOTHING)]),
-            "views[1].mask: contains no pixel of the object; give the mask of the object, or None",
+            "views[1].mask: contains no pixel of the object, so that it has no contour; "
+            "give the mask of the object alone, or None",
         ),
         (
             lambda: align(MODEL, View(CAMERA, PIXELS, mask=EVERYTHING)),

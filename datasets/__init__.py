@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
     from cadalign.datasets.models.shapenet import SYNSETS, ShapeNet, ShapeNetModel
     from cadalign.datasets.photos.dataset import PhotoDataset, PhotoSummary
-    from cadalign.datasets.photos.pascal3d import Pascal3D
+    from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
     from cadalign.datasets.photos.photo import CadModel, Photo, PhotoKeypoints, PhotoObject, Truth
     from cadalign.datasets.photos.pix3d import Pix3D
     from cadalign.datasets.photos.scan2cad import Scan2CAD
@@ -50,6 +50,7 @@ __all__ = [
     "ModelKeypoint",
     "ModelKeypoints",
     "Pascal3D",
+    "Pascal3DDetections",
     "Photo",
     "PhotoDataset",
     "PhotoKeypoints",

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from cadalign.datasets.photos.dataset import PhotoDataset
-from cadalign.datasets.photos.pascal3d import Pascal3D
+from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
 from cadalign.datasets.photos.pix3d import Pix3D
 from cadalign.datasets.photos.scan2cad import Scan2CAD
 from cadalign.datasets.sfm.blind_pnp import BlindPnP
@@ -15,7 +15,7 @@ from cadalign.datasets.sfm.correspondences import CorrespondenceSet
 from cadalign.errors import DataError, InputError
 from cadalign.io.files import as_path
 
-PHOTO_FORMATS = (Scan2CAD, Pix3D, Pascal3D)
+PHOTO_FORMATS = (Scan2CAD, Pix3D, Pascal3D, Pascal3DDetections)
 """The known formats, in the order in which they are looked for."""
 
 
@@ -25,7 +25,8 @@ def open_photos(path: str | os.PathLike[str]) -> PhotoDataset:
     Parameters
     ----------
     path : str or path-like
-        The folder; see the classes for what may lie in it: `Scan2CAD`, `Pix3D`, `Pascal3D`.
+        The folder; see the classes for what may lie in it: `Scan2CAD`, `Pix3D`, `Pascal3D`,
+        `Pascal3DDetections`.
 
     Returns
     -------

@@ -32,12 +32,21 @@ from cadalign.geometry.conventions import OPENGL_AXES
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.documents import (
+    Finite,
+    ForeignDocument,
+    PathText,
+    Point2,
+    Text,
+    convert,
     in_file,
+    read_json,
 )
 from cadalign.io.files import as_path, listed
 from cadalign.io.images import photo_size
 
 ANNOTATIONS = "Annotations"
+DETECTED = "annot"
+_OBSERVATIONS = "observations"
 _MOST_VERTICES = 2**31
 # MATLAB counts pixels from 1.
 _FIRST_PIXEL = 1.0
@@ -104,6 +113,93 @@ class Pascal3D(PhotoDataset):
 
         objects, problems = read_each(found.structs("objects"), read_object, where=str(path))
         return Photo(name, image, camera, objects, problems=problems)
+
+
+class _Keypoint(ForeignDocument):
+    uv: Point2
+    name: Text
+    confidence: Finite | None = None
+
+
+class _Observation(ForeignDocument):
+    image: PathText
+    keypoints: list[_Keypoint]
+
+
+class Pascal3DDetections(PhotoDataset):
+    """Photos of PASCAL3D+ with the keypoints of a detector, and without viewpoints.
+
+    The layout of the data of Pavlakos et al., "6-DoF Object Pose from Semantic Keypoints", ICRA
+    2017::
+
+        annot/*.mat           a struct ``annot`` of lists: imgname, class, cad_index
+        images/<imgname>.jpg
+        cad/<category>.mat    as in PASCAL3D+
+        observations/*.json   {"image", "keypoints": [{"name", "uv", "confidence"}]} of each photo
+
+    There are no poses, and the file's squares around the objects are crops, no rectangles of
+    theirs. Photos that are listed but not there are problems.
+
+    Raises DataError if there are no lists of photos, or one cannot be read.
+    """
+
+    kind = "PASCAL3D+ photos with detected keypoints"
+    signature = f"PASCAL3D+ photos with detected keypoints: {DETECTED}/*.mat"
+    marks = (f"{DETECTED}/*.mat",)
+    patterns = (f"{DETECTED}/*.mat", f"{_OBSERVATIONS}/*.json", _CAD)
+
+    def __init__(self, root: str | os.PathLike[str]) -> None:
+        folder = as_path(root, "root")
+        self._records: list[tuple[str, int]] = []  # category and number of the CAD model
+        names: list[str] = []
+        for path in listed(folder / DETECTED, "*.mat"):
+            found = read_structs(path, "annot")[0]
+            with in_file(path):
+                images, categories = found.texts("imgname"), found.texts("class")
+                indices = found.array("cad_index").ravel()
+                if len({len(each) for each in (images, categories, indices)}) != 1:
+                    raise InputError("its lists have different lengths")
+            names += images
+            self._records += zip(categories, map(int, indices), strict=True)
+        if not names:
+            raise DataError(f"there are no {DETECTED}/*.mat", where=str(folder))
+        super().__init__(folder, names)
+        self._observed: dict[str, list[_Keypoint]] | None = None  # by the photos' names
+
+    def read(self, index: int) -> Photo:
+        """Read the photo of a number from 0."""
+        name, (category, cad_index) = self.names[index], self._records[index]
+        image = find_image(self.root, name)
+        if image is None:
+            raise DataError("the image is missing", where=f"{self.root}, photo {name}")
+        shown = PhotoObject(
+            object_id="0",
+            category=category,
+            keypoints=self._keypoints(name),
+            model=cad_model(self.root, category, cad_index),
+        )
+        return Photo(name, image, Camera.without_focal(*photo_size(image)), (shown,))
+
+    def _keypoints(self, name: str) -> PhotoKeypoints | None:
+        if self._observed is None:
+            self._observed = {}
+            for path in listed(self.root / _OBSERVATIONS, "*.json"):
+                try:
+                    with in_file(path):
+                        observation = convert(read_json(path), _Observation)
+                    self._observed[Path(observation.image).stem] = observation.keypoints
+                except DataError as error:
+                    self._tell(str(path), error)
+        if name not in self._observed:
+            return None
+        found = self._observed[name]
+        scores = [each.confidence for each in found if each.confidence is not None]
+        return PhotoKeypoints(
+            points_2d=np.array([each.uv for each in found], dtype=float).reshape(-1, 2),
+            names=tuple(each.name for each in found),
+            visible=np.ones(len(found), dtype=bool),
+            scores=np.array(scores) if scores else None,
+        )
 
 
 def find_image(root: Path, name: str) -> Path | None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray, as_points
+from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points
 from cadalign.errors import DataError
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
@@ -33,6 +33,8 @@ class PhotoKeypoints:
     """(k,), what each one is called: the model's keypoint of the same name is the same point."""
     visible: BoolArray
     """(k,), false for a keypoint that is marked though something hides it."""
+    scores: FloatArray | None = None
+    """(k,), how sure a detector is of each."""
 
     def __post_init__(self) -> None:
         points = as_points(self.points_2d, name="keypoints", dimension=2)
@@ -41,6 +43,9 @@ class PhotoKeypoints:
         if len(self.names) != count or visible.shape != (count,):
             what = f"{count} keypoints, {len(self.names)} names, {len(visible)} visibilities"
             raise DataError(what, where="keypoints")
+        if self.scores is not None:
+            scores = as_floats(self.scores, name="scores", shape=(count,))
+            object.__setattr__(self, "scores", scores)
         object.__setattr__(self, "points_2d", points)
         object.__setattr__(self, "visible", visible)
 

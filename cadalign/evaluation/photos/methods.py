@@ -30,7 +30,8 @@ from cadalign.geometry.mesh import Mesh
 from cadalign.render.viewpoints import visible_keypoints
 from cadalign.shapes.model import ShapeModel
 
-ANNOTATED = "annotated"
+ANNOTATED, DETECTED = "annotated", "detected"
+_LEAST_SCORE = 0.4  # of a detected keypoint that methods are given
 _LEAST_PX = 0.5  # a standard deviation that keypoints are given at least
 # Evidence about the model's outline, which needs a mesh.
 _OUTLINED = frozenset({protocols.MASK, protocols.IMAGE})
@@ -74,7 +75,7 @@ def sight(target: PhotoTarget, protocol: Protocol, options: PhotosOptions) -> Si
     model = cad.model.load_keypoints()
     marks = target.found.keypoints
     if marks is not None and model is not None:
-        source = ANNOTATED
+        source = ANNOTATED if marks.scores is None else DETECTED
         names, pixels = _marked(marks, model)
     else:
         source = protocols.SIMULATED
@@ -101,6 +102,8 @@ def sight(target: PhotoTarget, protocol: Protocol, options: PhotosOptions) -> Si
 def _marked(marks: PhotoKeypoints, model: NamedPoints) -> tuple[tuple[str, ...], FloatArray]:
     """The visible keypoints that the model has, and their pixels."""
     good = marks.visible & np.isin(marks.names, model.names)
+    if marks.scores is not None:
+        good &= marks.scores > _LEAST_SCORE
     return tuple(np.array(marks.names)[good].tolist()), marks.points_2d[good]
 
 

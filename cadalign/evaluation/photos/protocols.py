@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from cadalign.datasets.photos.pascal3d import Pascal3D
+from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
 from cadalign.datasets.photos.pix3d import Pix3D
 from cadalign.datasets.photos.scan2cad import Scan2CAD
 from cadalign.errors import InputError, quote
@@ -85,6 +85,7 @@ _PROTOCOLS = {
     Scan2CAD.kind: Protocol((VIEWPOINT, SCAN2CAD, NINE_DOF), SIMILAR, sigma_of_width=1 / 60),
     Pix3D.kind: Protocol((VIEWPOINT, NINE_DOF), RIGID),
     Pascal3D.kind: Protocol((VIEWPOINT,), SIMILAR, up_axis="z"),
+    Pascal3DDetections.kind: Protocol((VIEWPOINT,), SIMILAR, up_axis="z"),
 }
 _OTHER = Protocol((VIEWPOINT, NINE_DOF), PRIOR)
 

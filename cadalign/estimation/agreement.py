@@ -22,6 +22,7 @@ from cadalign.shapes.parts import inflation_with, probability_within
 
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
+    from cadalign.estimation.result_parts import EvidenceSummary
 
 AnyModel = Model | ShapeModel
 
@@ -81,6 +82,12 @@ class Agreement(NamedTuple):
     def is_upright(self) -> bool:
         """True if the model's y axis points up in the photo."""
         return bool(-self.result.alignment.rotation[1, 1] > _UPRIGHT)
+
+
+def _equations_of(piece: EvidenceSummary) -> int:
+    """Number of equations of a piece of evidence; 0 for outlines, whose pixels are no such."""
+    each = {"keypoints": 2, "gravity": 2, "mask": 0, "photo": 0}
+    return each.get(piece.kind, 1) * piece.count
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,9 +162,13 @@ class DiagnosisCase:
                 area = area_of(own.points_2d, own.camera, threshold)
                 score += 2 * math.log(area) * int((~kept).sum())
         chi_square, redundancy = sum(squares), result.posterior.redundancy
-        if any(view.has_outline for view in views):
+        if any(view.has_outline or view.depth_image is not None for view in views):
+            # Of outlines nothing is tested, and of an image's depths those that are the object's.
             poses = 1 if views[0].cam_from_rig is not None else len(views)
-            redundancy = 2 * inliers - 6 * poses - len(result.stretched_axes)
+            counted = [(each, count) for each in result.evidence if (count := _equations_of(each))]
+            redundancy = sum(count for _, count in counted)
+            redundancy -= 6 * poses + len(result.stretched_axes)
+            chi_square = sum(count * each.rms_sigmas**2 for each, count in counted)
         elif result.cost is not None and inliers == int(result.inliers.sum()):
             chi_square = result.cost
         if isinstance(self.model, Model):  # outliers invite extreme stretches
@@ -188,7 +199,7 @@ class DiagnosisCase:
                 alone *= (others - 2) / (freedom - 2 + total - alone)
             chance = 1 - probability_within(alone, 2, others)
             return bool(found.keypoints * chance < FALSE_ALARMS)
-        counts = [each.count * (1 + (each.kind in ("keypoints", "gravity"))) for each in pieces]
+        counts = [_equations_of(each) for each in pieces]
         return len(pieces) > 1 and any(
             chance_of(count * each.rms_sigmas**2, count) * len(pieces) < FALSE_ALARMS
             for each, count in zip(pieces, counts, strict=True)

@@ -165,10 +165,10 @@ class DiagnosisCase:
         if any(view.has_outline or view.depth_image is not None for view in views):
             # Of outlines nothing is tested, and of an image's depths those that are the object's.
             poses = 1 if views[0].cam_from_rig is not None else len(views)
-            counted = [(each, count) for each in result.evidence if (count := _equations_of(each))]
-            redundancy = sum(count for _, count in counted)
+            counted = [each for each in result.evidence if _equations_of(each)]
+            redundancy = sum(map(_equations_of, counted))
             redundancy -= 6 * poses + len(result.stretched_axes)
-            chi_square = sum(count * each.rms_sigmas**2 for each, count in counted)
+            chi_square = sum(_equations_of(each) * each.rms_sigmas**2 for each in counted)
         elif result.cost is not None and inliers == int(result.inliers.sum()):
             chi_square = result.cost
         if isinstance(self.model, Model):  # outliers invite extreme stretches

@@ -16,7 +16,12 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
 from cadalign.estimation.contours.mask import MaskSource, convex_hull
-from cadalign.estimation.contours.outline import MeasuredOutline, OutlineSource, OutlineSupport
+from cadalign.estimation.contours.outline import (
+    MeasuredOutline,
+    OutlineSource,
+    OutlineSupport,
+    Track,
+)
 from cadalign.estimation.contours.photo import PhotoSource
 from cadalign.estimation.contours.photo_lines import photo_of
 from cadalign.estimation.contours.problem import OutlineProblem, with_displacement_modes
@@ -57,10 +62,11 @@ _NO_OUTLINE = (
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A start, and the estimate to which it led."""
+    """A start, the estimate to which it led, and the noise at which candidates compare."""
 
     start: Minimum
     fit: OutlineFit
+    tracks: list[Track]
 
     @property
     def _measured(self) -> list[tuple[OutlineSource, MeasuredOutline | None]]:
@@ -85,7 +91,8 @@ class Candidate:
         """The minimum, its score with the `rank` in the place of the cost."""
         evidence, state = self.fit.with_outlines
         cost = cost_of(evidence, state)
-        score = score_state(evidence, state) - cost + self.rank
+        at_common = self.fit.evidence_at(self.tracks)
+        score = score_state(at_common, state) - cost_of(at_common, state) + self.rank
         return self.start._replace(evidence=evidence, state=state, cost=cost, score=score)
 
 
@@ -152,14 +159,16 @@ def _candidates(
     for start, state in starts:
         given = OutlineProblem.of(start.evidence, state, keypoints, sources, surface)
         fit = first_fit(*given)
-        near += [] if fit is None else [Candidate(start, fit)]
+        near += [] if fit is None else [Candidate(start, fit, fit.tracks)]
     near = _distinct_candidates(near)[:_MOST_FINISHED]
     found = []
     for each in near:
         if each.rank < near[0].rank + _UNLIKELY:
             end = last_fit(each.fit)
-            found += [] if end is None else [Candidate(each.start, end)]
-    return sorted(_distinct_candidates(found), key=lambda each: each.minimum.score)
+            found += [] if end is None else [Candidate(each.start, end, end.tracks)]
+    found = _distinct_candidates(found)
+    alike = [replace(each, tracks=found[0].fit.tracks) for each in found]
+    return sorted(alike, key=lambda each: each.minimum.score)
 
 
 def _hulls_of(views: Sequence[View]) -> list[View]:

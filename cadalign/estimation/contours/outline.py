@@ -48,6 +48,11 @@ class Noise(NamedTuple):
         """Scale of Cauchy's loss, in standard deviations of a sample."""
         return max(LOSS_SCALE, LEAST_LOSS_SCALE / self.sigma)
 
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of a sample that is independent of its neighbours [px]."""
+        return self.sigma * float(np.sqrt(self.correlation))
+
     def costs(self, residuals: FloatArray) -> FloatArray:
         """Costs of samples' residuals [px]."""
         square = self.loss_scale**2
@@ -69,16 +74,21 @@ def trimmed_deviation(residuals: FloatArray, least: float) -> float:
 
 
 def correlation_length(
-    contour: Contour, residuals: FloatArray, kept: BoolArray, scale: float = np.inf
+    contour: Contour,
+    residuals: FloatArray,
+    kept: BoolArray,
+    scale: float = np.inf,
+    least: float = 0.0,
 ) -> float:
     """Number of neighbouring samples that count as one, at least 1.
 
     The integrated autocorrelation ``1 + 2 sum of rho`` of the influence under Cauchy's loss of a
     ``scale`` that the residuals (S,) have which are ``kept``, up to the first lag without positive
     correlation (Geyer, "Practical Markov chain Monte Carlo", 1992). Runs of outliers have it, too.
+    Of a variance below the square of ``least`` the rest is free of correlation.
     """
     values = np.where(kept, residuals / (1 + (residuals / scale) ** 2), 0.0)
-    variance = float((values**2).sum() / max(kept.sum(), 1))
+    variance = max(float((values**2).sum() / max(kept.sum(), 1)), least**2)
     if not variance > 0:
         return 1.0
     total = 1.0
@@ -128,7 +138,7 @@ class Outline(NamedTuple):
         relative = np.where(kept, residuals, 0.0) / self.sigmas
         sigma = max(trimmed_deviation(relative[kept], outlying), least.sigma)
         scale = least._replace(sigma=sigma).loss_scale * sigma
-        length = correlation_length(self.contour, relative, kept, scale)
+        length = correlation_length(self.contour, relative, kept, scale, least.sigma)
         return Noise(sigma, max(length, least.correlation), least.offset)
 
 
@@ -166,9 +176,8 @@ class Track(NamedTuple):
     def is_like(self, other: Track) -> bool:
         """True if samples weigh about the same."""
         one, two = self.noise, other.noise
-        weights = one.sigma**2 * one.correlation / (two.sigma**2 * two.correlation)
-        offsets = (one.offset / two.offset) ** 2
-        return bool(max(abs(np.log(weights)), abs(np.log(offsets))) < _ALIKE)
+        ratios = one.deviation / two.deviation, one.offset / two.offset
+        return bool(2 * np.abs(np.log(ratios)).max() < _ALIKE)
 
     @property
     def next(self) -> Track:

@@ -54,6 +54,17 @@ class OutlineFit(NamedTuple):
             for outline, offset, track in zip(self.outlines, offsets, self.tracks, strict=True)
         ]
 
+    def evidence_at(self, tracks: Sequence[Track]) -> Evidence:
+        """The evidence at the noise of other tracks, its residuals relative to the loss."""
+        counts = [0 if each is None else int(each.found.sum()) for each in self.outlines]
+        pairs = zip(self.tracks, tracks, strict=True)
+        ratios = [own.noise.deviation / other.noise.deviation for own, other in pairs]
+        evidence, factors = self.with_outlines[0], np.repeat(ratios, counts)
+        old = evidence.sightings
+        factors = np.append(np.ones(len(old.point) - len(factors)), factors)
+        whitening, scale = factors[:, None] * old.whitening, factors * old.loss_scale
+        return evidence._replace(sightings=old._replace(whitening=whitening, loss_scale=scale))
+
 
 def first_fit(problem: OutlineProblem, state: State) -> OutlineFit | None:
     """The estimate that rounds from a start lead to; None without an outline."""

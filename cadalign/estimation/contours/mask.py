@@ -54,6 +54,7 @@ _WIDE_REACH = 0.15  # without keypoints
 _LEAST_REACH = 4.0
 _REACH = 6.0  # in standard deviations of the residuals
 _OFFSETS = 2.0  # in standard deviations of the offset that all of a contour has in common
+_UNEVEN_RMS = 1.0  # [px], of an exact model's contour that meets its outline
 _INSIDE = 0.5  # probability of a mask's pixel
 _OPEN_BORDER = 3  # [px], within which a mask may go on outside of the image
 _LEAST_PIECE = 0.003  # of a piece of the mask, relative to the largest
@@ -165,16 +166,19 @@ class MaskSource(OutlineSource):
         return f"only {share} can be the model's outline{self.hint}"
 
     def doubt(self, support: OutlineSupport) -> str | None:
-        """See `OutlineSource`."""
-        if not self.is_wide:
-            return None
+        """See `OutlineSource`; beside keypoints, of an uneven contour that is met in parts alone.
+
+        Sharp parts alone are those of an object that is partly hidden.
+        """
         if support.share >= self.good_share:
-            if not _leaves_image(self.mask[0] >= _INSIDE):
+            if not (self.is_wide and _leaves_image(self.mask[0] >= _INSIDE)):
                 return None
             return (
                 f"{self.where} reaches the image's border, where the object may go on: alone it "
                 "may lead to another pose, give three keypoints beside it"
             )
+        if not self.is_wide and not (self.is_exact and support.rms > _UNEVEN_RMS):
+            return None
         return (
             f"{self.where}: only {100 * support.share:.0f} % of its contour meets the outline of "
             "the best pose found: the object may be partly hidden, the model another, or the pose "

@@ -40,12 +40,10 @@ _UPRIGHT = 0.5  # cosine between the model's y axis and the photo's upwards, at 
 
 
 class Rule(NamedTuple):
-    """A cause of residuals that are too large.
+    """A cause of residuals that are too large, and the text of its kind that has the ``clause``.
 
-    What is undone: ``undo_view``, ``undo_model``, and ``changes`` of the options; a view that is
-    None is left out. What the estimate must explain: so much ``gain`` of -2 log likelihood, and a
-    ``price`` of each equation that it lacks. What is said: the ``kind`` has a text, in which the
-    ``clause`` stands, with those of rules of the kind that are as likely.
+    A view that is undone to None is left out. An estimate must explain so much ``gain`` of -2 log
+    likelihood, and a ``price`` of each equation that it lacks.
     """
 
     kind: Kind
@@ -60,8 +58,7 @@ class Rule(NamedTuple):
 class Agreement(NamedTuple):
     """Agreement of all evidence with an estimate.
 
-    The ``score`` is -2 log likelihood of all keypoints, of which outliers lie anywhere, and
-    ``squares`` are the sums of squared residuals of every view's keypoints.
+    The ``score`` is -2 log likelihood of all keypoints, of which outliers lie anywhere.
     """
 
     result: Result
@@ -92,10 +89,9 @@ def _equations_of(piece: EvidenceSummary) -> int:
 
 @dataclass(frozen=True, eq=False)
 class DiagnosisCase:
-    """The data of an estimate, the estimate as a function of these, and the search for inliers.
+    """The data of an estimate, the estimate ``again`` as a function of these, and the search.
 
-    The estimate ``again``, without a diagnosis, takes a model, views, and as keywords changes of
-    its options, ransac and size; it raises CadalignError if there is none.
+    ``again`` takes a model, views and changed options; it raises CadalignError if there is none.
     """
 
     model: AnyModel
@@ -115,7 +111,6 @@ class DiagnosisCase:
 
     @property
     def is_exact(self) -> bool:
-        """True for a CAD model whose object has its shape, but for the stretch."""
         return is_exact_model(self.model)
 
     @property
@@ -208,8 +203,7 @@ class DiagnosisCase:
     def is_doubtful(self, given: Agreement) -> bool:
         """True if the residuals fail the test for mistakes.
 
-        An uncertain shape follows keypoints that a robust search would reject of an exact one,
-        which may agree with its mirror image.
+        An uncertain shape follows keypoints that a robust search would reject of an exact one.
         """
         rejected = given.keypoints - given.inliers
         if rejected > (0 if self.is_exact else _FEW_REJECTED * given.keypoints):

@@ -62,11 +62,7 @@ def result_of_keypoints(
     model: Model | None = None,
     view: View | None = None,
 ) -> Result:
-    """The result of keypoints (n, 2) [px] in one view.
-
-    With a symmetry it is the canonical one. With the ``model`` it has all of its keypoints, and
-    ids of those in the ``view``.
-    """
+    """The result of keypoints (n, 2) [px] in one view, with all keypoints of a ``model``."""
     points: FloatArray = fitted.points_3d
     bounds: FloatArray | None = None
     if model is not None:
@@ -118,10 +114,7 @@ def result_of_keypoints(
 def _canonical(
     fitted: FittedKeypoints, points: FloatArray, symmetry: Symmetry
 ) -> tuple[FittedKeypoints, FloatArray]:
-    """Keypoints with the canonical one of all equal alignments, and points (m, 3) as it has them.
-
-    Alternatives are others than that one.
-    """
+    """Keypoints as the canonical one of equal alignments has them, and so points (m, 3)."""
     from cadalign.estimation.symmetry import carried, distinct_ones, held_axes  # few have one
 
     held, covariance = held_axes(fitted.options.stretched_axes), fitted.fisher_covariance
@@ -147,5 +140,4 @@ def _canonical(
 
 @lru_cache(maxsize=64)
 def _rows(count: int) -> tuple[int, ...]:
-    """Rows of so many keypoints, which are their ids."""
     return tuple(range(count))

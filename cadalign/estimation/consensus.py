@@ -50,7 +50,6 @@ class RobustSearch:
 
     @property
     def threshold(self) -> float:
-        """Largest reprojection error of an inlier [px]."""
         return self.ransac.threshold(self.options.sigma)
 
     @property
@@ -94,10 +93,9 @@ def fit_robustly(
 ) -> FittedKeypoints:
     """Fit the only problem to the keypoints that support its best alignment.
 
-    Where neither the noise nor a threshold is known, several are tried, and the inliers that chance
-    explains least win. Raises NoConsensusError if no alignment has more support than chance gives,
-    with the best score reached; InputError if the keypoints are fewer than the minimal solver
-    needs, or options don't go together; DegenerateError if all keypoints lie in one plane.
+    Where neither noise nor threshold is known, the inliers of several that chance explains least
+    win. Raises NoConsensusError if chance gives as much support; InputError of too few keypoints or
+    wrong options; DegenerateError if all keypoints lie in one plane.
     """
     if options.method != "optimal":
         raise InputError(
@@ -169,10 +167,7 @@ def _fit_to_inliers(search: RobustSearch, start: float) -> FittedKeypoints:
 
 
 def _refined(search: RobustSearch, inliers: BoolArray) -> FittedKeypoints:
-    """The optimum of the inliers (n,), until these don't change.
-
-    Raises CadalignError if they do not determine the alignment.
-    """
+    """The optimum of the inliers (n,), until these don't change; CadalignError if there is none."""
     problems, sigma = search.problems, search.options.sigma
     points, pixels = problems.points_3d, problems.points_2d
     for last in range(_INLIER_ROUNDS + 1):
@@ -197,10 +192,7 @@ def _refined(search: RobustSearch, inliers: BoolArray) -> FittedKeypoints:
 
 
 def _best_hypothesis(search: RobustSearch) -> tuple[Alignment, BoolArray, int, int, float]:
-    """The best hypothesis of LO-RANSAC, which chance may give as well.
-
-    With its inliers (n,), numbers of samples and of hypotheses, and the score [px^2].
-    """
+    """LO-RANSAC's best hypothesis, inliers (n,), samples, hypotheses and score [px^2]."""
     problems, options, ransac = search.problems, search.options, search.ransac
     camera, points = problems.camera, problems.points_3d[:, options.axis_order]
     count, minimal = len(points), MINIMAL_SOLVERS[ransac.minimal]

@@ -47,8 +47,8 @@ _WRONG_UNIT = 100.0  # factor between an object's size and its model's
 def diagnose(case: DiagnosisCase, *, result: Result | None = None) -> EstimateWarning | None:
     """Name the likeliest cause without which all data agree, where the residuals fail their test.
 
-    ``case`` has the views that take part in the estimate, whose masks and photos are left out, and
-    ``result`` is the estimate; by default it is made again.
+    ``case`` has the views that take part; the estimate is made again where it is not the
+    ``result``.
     """
     if not any(len(view.keypoint_ids) for view in case.views):
         return None
@@ -82,7 +82,6 @@ def _likeliest(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
 
 
 def _without_outlines(views: Sequence[View]) -> tuple[View, ...]:
-    """The views with evidence beside masks and photos."""
     given = [
         replace(view, mask=None, mask_sigma=None, image=None) if view.has_outline else view
         for view in views
@@ -101,7 +100,6 @@ def _of_another_size(case: DiagnosisCase, given: Agreement) -> EstimateWarning |
 
 
 def _measures_of(case: DiagnosisCase) -> list[str]:
-    """Names of the fields that measure lengths."""
     names = ("depth", "camera_height", "cam_from_rig")
     found = [name for name in names if any(getattr(v, name) is not None for v in case.views)]
     return found if case.size is None else [*found, "size"]
@@ -124,10 +122,7 @@ def diagnose_fit(fitted: FittedKeypoints) -> EstimateWarning | None:
 
 @np.errstate(all="ignore")
 def diagnose_refusal(case: DiagnosisCase, *, with_keypoints: bool = True) -> str | None:
-    """Name the mistake without which there is an estimate, where there is none of the data.
-
-    Mistakes in keypoints are tried ``with_keypoints``, otherwise those in other evidence alone.
-    """
+    """Name the mistake (in keypoints if ``with_keypoints``) without which there is an estimate."""
     shown = replace(case, views=_without_outlines(case.views))
     if not shown.views:
         return None
@@ -147,7 +142,6 @@ def diagnose_refusal(case: DiagnosisCase, *, with_keypoints: bool = True) -> str
 def _case_of_rows(
     fitted: FittedKeypoints, kept: BoolArray, ransac: RansacOptions | None = None
 ) -> DiagnosisCase:
-    """The case of some keypoints, whose ids are their rows."""
     rows, options, sigma = np.flatnonzero(kept), fitted.options, fitted.options.sigma
     if sigma is not None and np.ndim(sigma) > 0:
         options = replace(options, sigma=np.asarray(sigma)[rows])
@@ -208,7 +202,6 @@ def _size(camera: Camera, factor: float) -> tuple[int, int]:
 
 
 def _measured(view: View, *, name: str, factor: float) -> View:
-    """The view whose depths, height or motion are in another unit."""
     value = getattr(view, name, None)
     if value is None:
         return view
@@ -219,7 +212,6 @@ def _measured(view: View, *, name: str, factor: float) -> View:
 
 
 def _remeasured(size: Size, factor: float) -> Size:
-    """The lengths in another unit."""
     lengths = {name: getattr(size, name) for name in LENGTHS}
     return replace(size, **{name: each and each * factor for name, each in lengths.items()})
 
@@ -259,7 +251,6 @@ MISFIT = Rule("misfit")
 
 
 def _rules_for(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
-    """The rules that may explain such residuals."""
     model, fails = case.model, not case.has_chance(given)
     yield from _mistakes_in(case)
     yield from _other_sizes(case)
@@ -274,7 +265,6 @@ def _rules_for(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
 
 
 def _mistakes_in(case: DiagnosisCase) -> Iterator[Rule]:
-    """Mistakes that such data may have."""
     model, views = case.model, case.views
     if isinstance(model, Model):  # learned models share one frame
         yield MIRRORED
@@ -297,10 +287,7 @@ def _mistakes_in(case: DiagnosisCase) -> Iterator[Rule]:
 
 
 def _other_sizes(case: DiagnosisCase) -> Iterator[Rule]:
-    """Mistakes in the resolution of keypoints, whose noise may grow with it.
-
-    Where their noise is not known: images that hold most of them, and the camera's does not.
-    """
+    """Mistakes in the resolution of keypoints, whose noise may grow with it."""
     camera, points = case.views[0].camera, np.concatenate([view.pixels for view in case.views])
     sizes = {(view.camera.width, view.camera.height) for view in case.views}
     # Another size leaves much open, so that other evidence which is wrong would pass for it.
@@ -394,7 +381,6 @@ def _named(likely: Sequence[tuple[Rule, Agreement]]) -> str:
 
 
 def _compared(best: Agreement, given: Agreement) -> str:
-    """Words that compare the corrected data with the given ones."""
     rejected = given.keypoints - given.inliers
     if rejected:
         share = f"{rejected} ({100 * rejected / given.keypoints:.0f} %)"

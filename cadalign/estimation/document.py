@@ -92,8 +92,6 @@ class _Result(
         "own_stretch": "stretch",
     },
 ):
-    """The fields of `cadalign.Result` and of its posterior."""
-
     version: Literal[1]
     method: str
     ids: list[int | str]
@@ -129,7 +127,6 @@ class _Result(
 def _check_lengths(
     document: ForeignDocument, names: Sequence[str], count: int, than: str, link: str = " "
 ) -> None:
-    """Refuse lists that are not of a length; None is no list."""
     for name in names:
         entries = getattr(document, name)
         if entries is not None and len(entries) != count:
@@ -185,7 +182,6 @@ def _plain(value: Any) -> Any:
 
 
 def _pixels(rows: Sequence[Point2 | None]) -> FloatArray:
-    """Rows (n, 2), NaN for those that are not known."""
     return np.array([row or (np.nan, np.nan) for row in rows]).reshape(-1, 2)
 
 
@@ -204,10 +200,7 @@ _VALUES: Mapping[str, Callable[[Any], Any]] = {
 
 
 def read_result(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Read the fields of a result from its parsed form; see `cadalign.Result.from_dict`.
-
-    Raises InputError if a field is missing or invalid.
-    """
+    """The fields of a `cadalign.Result` from its parsed form; InputError if one is invalid."""
     try:
         with np.errstate(over="ignore", invalid="ignore"):
             return _result(convert(data, _Result))
@@ -217,7 +210,6 @@ def read_result(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _values(read: ForeignDocument) -> dict[str, Any]:
-    """The fields of a form by name, as values of the class that it is the form of."""
     return {
         name: _VALUES[name](each) if name in _VALUES and each is not None else each
         for name, each in asdict(read).items()

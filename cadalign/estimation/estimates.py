@@ -39,10 +39,9 @@ def mean_state(evidence: Evidence, poses: FloatArray, log_scales: FloatArray) ->
 def pose_and_lengths(
     evidence: Evidence, state: State, unknowns: FloatArray, view: int = 0
 ) -> FloatArray:
-    """Covariance (9, 9) of a camera's pose and the log lengths of the box.
+    """Covariance (9, 9) of a camera's pose and log lengths; (10, 10) with the log focal length.
 
-    With an estimated focal length (10, 10), its logarithm last. ``unknowns`` is the covariance of
-    the view's pose and the border, see `cadalign.solvers.joint.covariance.pose_and_border`.
+    ``unknowns`` is that of `cadalign.solvers.joint.covariance.pose_and_border`.
     """
     shape, rig = evidence.shape, evidence.rig
     rotation = rig.cam_from_rig[view][:9].reshape(3, 3)
@@ -85,22 +84,11 @@ def poses_of(evidence: Evidence, state: State) -> list[Alignment]:
 
 
 def curvature_of_rotations(covariance: FloatArray) -> FloatArray:
-    """Covariance (3, 3) that a linearisation leaves out of large rotation errors.
+    """Covariance (3, 3) that a linearisation leaves out of large rotation errors [rad squared].
 
-    Where turns about two axes are uncertain, their order turns the object about the third: of
-    rotation vectors a and b, exp(a) exp(b) has the vector a + b + a x b / 2 + ... (Baker, Campbell,
-    Hausdorff). For independent a and b of covariance C the second-order term has the covariance
-    adj(C) / 2. It matters beyond some 20 degrees: for slender objects, which may roll and tilt.
-
-    Parameters
-    ----------
-    covariance : (3, 3) float
-        Covariance of the rotation vector [rad squared].
-
-    Examples
-    --------
-    >>> curvature_of_rotations(np.diag([0.01, 0.25, 0.64])).diagonal().round(4).tolist()
-    [0.08, 0.0032, 0.0012]
+    Of rotation vectors a and b, exp(a) exp(b) has the vector a + b + a x b / 2 + ... (Baker,
+    Campbell, Hausdorff): for independent a and b of covariance C, the second-order term has adj(C)
+    / 2. It matters beyond some 20 degrees, for slender objects, which may roll and tilt.
     """
     variances, axes = np.linalg.eigh(covariance)
     x, y, z = np.maximum(variances, 0.0)
@@ -110,8 +98,7 @@ def curvature_of_rotations(covariance: FloatArray) -> FloatArray:
 def with_box(evidence: Evidence, state: State, prior: ShapePrior) -> tuple[Evidence, State]:
     """Evidence and state whose box has those faces that outermost keypoints determine at these.
 
-    Such a face varies with its keypoint. The box remains the linear one where measured distances
-    determine it, and without keypoints.
+    Where measured distances determine the box, it remains the linear one.
     """
     shape, keypoints = evidence.shape, len(prior.ids)
     seen = np.unique(evidence.sightings.point)
@@ -135,9 +122,8 @@ def placed_box(
 ) -> tuple[FloatArray, IntArray]:
     """Corners (2, 3) of the box of points (m, 3), and the points (2, 3) that its faces vary with.
 
-    These are outermost ones of the ``keypoints``, the first of the points, or the last two, the
-    corners of the linear box. Where the ``model`` has no box, it is the extent of all keypoints;
-    otherwise margins tell where those that are ``seen`` determine it.
+    The last two points are the linear box. Without a box in the ``model`` it is the keypoints'
+    extent; otherwise margins tell where keypoints that are ``seen`` determine it.
     """
     linear, rows = points[-2:], seen if model.has_box else np.arange(keypoints)
     extreme = rows[np.array([points[rows].argmin(axis=0), points[rows].argmax(axis=0)])]
@@ -161,13 +147,11 @@ def widened_boxes(points: FloatArray, rows: IntArray) -> FloatArray:
 class Estimate(NamedTuple):
     """An estimate: points (m, 3), the box's corners last, poses, and covariances.
 
-    Poses, covariances (9, 9) of pose and log lengths of the box, and cameras are those of every
-    view that takes part, in the frames of the cameras that were given; ``of_points`` (m, 3, 3) are
-    those of the points in the model's frame, and ``of_seen`` in the first camera's, where they
-    include the pose. ``likelihood`` is relative to the best. The optimum is the one of the least
-    cost, which a shape without latent unknowns has. ``misses`` are the largest squared distance of
-    a keypoint from what the others predict, and that of all from the mean shape, in standard
-    deviations; None where nothing predicts a keypoint.
+    Poses, covariances (9, 9) and cameras are those of every view that takes part, in the frames of
+    the given cameras; ``of_points`` (m, 3, 3) are in the model's frame, ``of_seen``, with the pose,
+    in the first camera's. ``misses`` are squared distances in deviations, the largest of a keypoint
+    from what the others predict and that of all from the mean shape; None where nothing predicts a
+    keypoint.
     """
 
     points: FloatArray
@@ -183,7 +167,6 @@ class Estimate(NamedTuple):
 
     @property
     def lengths(self) -> FloatArray:
-        """Lengths (3,) of the box."""
         return np.asarray((self.points[-1] - self.points[-2]) * self.scale)
 
 
@@ -207,10 +190,7 @@ def as_given(estimate: Estimate, problem: Problem) -> Estimate:
 
 
 def steps_between(estimates: Sequence[Estimate], view: int) -> FloatArray:
-    """Steps (L, k) from the first estimate, in a view's camera.
-
-    Rotation vector, translation, log lengths and log focal length, as covariances have them.
-    """
+    """Steps (L, k) from the first estimate, in a view's camera, in the order of covariances."""
     best, *others = estimates
     steps: list[list[float]] = [[0.0] * 10]
     start, before = best.poses[view], [*best.lengths.tolist(), best.cameras[view].fx]
@@ -237,10 +217,7 @@ def second_moments(
 def one_of_equals(
     likely: Sequence[Estimate], symmetry: Symmetry | None, held: _Held
 ) -> Sequence[Estimate]:
-    """Estimates in their canonical form, without those that are equal to the first.
-
-    ``held`` are the axes whose scale is.
-    """
+    """Canonical estimates, without those equal to the first; ``held`` are axes of held scale."""
     if symmetry is None or symmetry.is_trivial:
         return likely
     poses, covariance = [each.poses[0] for each in likely], likely[0].covariances[0]
@@ -249,7 +226,6 @@ def one_of_equals(
 
 
 def _carried(estimate: Estimate, best: Equal) -> Estimate:
-    """An estimate as an equal one, without standard deviations that mean nothing."""
     turn, shift, scale = best.motion[:3, :3], best.motion[:3, 3], best.alignment.scale
     poses: list[Alignment] = []
     covariances = []

@@ -164,10 +164,7 @@ def fit_one(
     start: float,
     **seen: Any,
 ) -> Result:
-    """Fit the only problem, which was begun at ``start`` [s].
-
-    ``seen`` are the model and the view of `result_of_keypoints`.
-    """
+    """Fit the only problem, begun at ``start`` [s]; ``seen`` as of `result_of_keypoints`."""
     try:
         fitted = fit_once(problems, options, ransac, scores, start)
     except NoConsensusError as error:
@@ -183,7 +180,6 @@ def fit_one(
 
 
 def diagnosis_of_fit(fitted: FittedKeypoints) -> EstimateWarning | None:
-    """See `diagnose_fit`, which makes fits anew."""
     from cadalign.estimation.diagnose import diagnose_fit  # rarely asked
 
     return diagnose_fit(fitted)

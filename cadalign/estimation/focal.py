@@ -159,10 +159,7 @@ def check_prior(prior: object, *, focal: str) -> None:
 def log_focal_range(
     camera: Camera, prior: PriorOption, unit: float = 1.0
 ) -> tuple[float, float, float, float]:
-    """Bounds of a log focal length, which a prior may widen, and its mean and weight.
-
-    Focal lengths are in ``unit`` [px].
-    """
+    """Bounds of a log focal length, over ``unit`` [px], and its prior's mean and weight."""
     prior = prior_of_camera(prior, camera)
     side = max(camera.width, camera.height) / unit
     low, high = math.log(_SHORTEST * side), math.log(_LONGEST * side)

@@ -75,11 +75,8 @@ def result_of(
 ) -> Result:
     """The result of likely estimates, the best first.
 
-    Its covariance is the second moment, about the best estimate, of the mixture of Gaussians that
-    the likely ones are.
-
-    The rotations' covariances lack `curvature_of_rotations` where the estimate ``is_curved``;
-    ``of_result`` are further fields of `cadalign.Result`.
+    Its covariance is the second moment, about the best estimate, of their mixture of Gaussians,
+    with `curvature_of_rotations` where it ``is_curved``; ``of_result`` are further fields.
     """
     prior, views, numbers = problem.prior, problem.given, problem.numbers
     best = estimates[0]
@@ -187,10 +184,7 @@ def result_of_minima(
     *,
     notes: OutlineNotes = NO_NOTES,
 ) -> Result:
-    """The result of minima, of which the likely ones count, with a widened prior of the shape.
-
-    Raises DegenerateError if the evidence determines none of them.
-    """
+    """The result of minima, with a widened prior of the shape; DegenerateError if all are open."""
     prior, views, model = problem.prior, problem.views, problem.model
     minima = [each for each in minima if np.isfinite(each.score)]
     if not minima:

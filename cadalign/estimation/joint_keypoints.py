@@ -30,8 +30,7 @@ def fit_jointly(
 ) -> FittedKeypoints:
     """Fit the only problem, with ``ransac`` its inliers, which was begun at ``start`` [s].
 
-    Raises DegenerateError if there is no minimum, or the keypoints leave the best one open;
-    NoConsensusError as `search`.
+    Raises DegenerateError if no minimum is determined; NoConsensusError as `search`.
     """
     points, pixels = problems.points_3d.copy(), problems.points_2d
     if len(points) < options.min_points:

@@ -124,10 +124,7 @@ def check_axis(axis: object) -> None:
 
 
 def checked_ids(ids: Iterable[Any] | None, count: int) -> tuple[Hashable, ...]:
-    """Ids of ``count`` keypoints, each once; their numbers where none are given.
-
-    Raises InputError if there are more or fewer, one occurs twice, or they are no sequence.
-    """
+    """Ids of ``count`` keypoints, by default their numbers; InputError if these are no such."""
     if ids is None:
         return tuple(range(count))
     if isinstance(ids, str | bytes) or not isinstance(ids, Iterable):

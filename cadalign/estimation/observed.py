@@ -114,8 +114,7 @@ def shape_ids(image: ObservedImage, shape: ShapeModel) -> tuple[KeypointId, ...]
 def own_ids(images: Sequence[ObservedImage]) -> tuple[tuple[Hashable, ...], ...]:
     """Labels of the images' keypoints by which they are the same in several.
 
-    Their semantic ids or names, where these distinguish all keypoints of an image; otherwise their
-    numbers, in several images those of equal ``xyz``.
+    Ids or names where these distinguish all; otherwise numbers, in several images of equal ``xyz``.
     """
     shown = [image for image in images if len(image.points_2d)]
     for field in ("ids", "names"):

@@ -99,10 +99,7 @@ def plot_result(
 
 
 def _photo_axes(width: int, height: int, image: npt.ArrayLike | None, axes: Axes | None) -> Axes:
-    """Draw a photo (h, w[, 3]) of a camera with so many pixels, or grey where there is none.
-
-    Returns axes in its pixels: the given ones, or those of a new figure.
-    """
+    """Axes with a photo (h, w[, 3]), or grey, in its pixels; new ones where none are given."""
     if axes is None:
         from matplotlib import pyplot
 
@@ -155,10 +152,6 @@ def _plot_box(axes: Axes, camera: Camera, box: Box) -> None:
 def _plot_keypoints(
     axes: Axes, observed: FloatArray, residuals: FloatArray, inliers: BoolArray
 ) -> None:
-    """Draw observed keypoints (n, 2) as rings, reprojected ones as crosses, residuals as lines.
-
-    Keypoints that are no inliers (n,) are grey.
-    """
     predicted = observed + residuals
     for start, end, kept in zip(observed, predicted, inliers, strict=True):
         if np.isfinite(end).all():

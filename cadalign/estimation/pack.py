@@ -49,12 +49,9 @@ def evidence_of(
 ) -> Evidence:
     """Evidence of the views, of the size and of the first component of the prior.
 
-    Of the ``options`` the loss counts. By default the views' focal lengths are known. Lenses were
-    turned by ``turns``, (3, 3) each. Keypoints without a sigma have the standard deviation
-    ``noise`` [px].
-
-    Raises InputError if a view names a keypoint that the model lacks, lacks evidence, or has some
-    of an up axis that the model lacks, or if only some views have a known pose.
+    ``turns`` (3, 3) are those of lenses, ``noise`` [px] is that of keypoints without a sigma.
+    Raises InputError of keypoints or an up axis that the model lacks, and if only some views have a
+    pose.
     """
     if lenses is None:
         lenses = Lenses.of(views, "known", None)
@@ -154,9 +151,9 @@ def sample_depth(
 ) -> tuple[FloatArray, FloatArray]:
     """Depths (n,) of keypoints in a depth image, and their deviations; NaN where it holds none.
 
-    At a silhouette, a window about the keypoint shows the object and what is behind it: the depths
-    are split at gaps of some ``sigma`` (relative), and the nearest surface's median is taken. Where
-    that surface is steep, so much as its depths differ is added to ``sigma``.
+    At a silhouette, a window about the keypoint shows what is behind the object, too: it is split
+    at gaps of some ``sigma`` (relative), and the nearest surface counts, with its spread where
+    steep.
     """
     height, width = image.shape
     found, deviations = np.full((2, len(points_2d)), np.nan)

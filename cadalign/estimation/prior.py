@@ -36,9 +36,8 @@ _NO_BOUND = ScalePrior(0.0, 0.0)
 class ShapePrior:
     """Gaussian components of a shape, and what is known of its scales.
 
-    The rows of a component are the keypoints with ``ids`` (m,), then the least and the greatest
-    corner of the box. ``inflation``, ``degrees_of_freedom``, ``has_box``, ``box_margins`` and
-    ``few_keypoints`` are those of `cadalign.ShapeModel`.
+    Rows are the keypoints ``ids`` (m,), then the box's least and greatest corner; fields with
+    defaults are those of `cadalign.ShapeModel`.
     """
 
     ids: tuple[Hashable, ...]
@@ -122,7 +121,6 @@ def _of_category(model: ShapeModel) -> ShapePrior:
 
 
 def axis_vector(axis: str | None) -> FloatArray | None:
-    """The unit vector (3,) of an axis; None of none."""
     return None if axis is None else np.eye(3)["xyz".index(axis)]
 
 

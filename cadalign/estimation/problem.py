@@ -39,9 +39,8 @@ _MOST_PIXELS = 500  # of a mask, amid which a wide lens is turned
 class Problem(NamedTuple):
     """Model, views, known lengths and options of an estimate.
 
-    The ``views`` are those ``given`` with wide lenses turned, and without evidence where one has no
-    pose; ``turns`` (3, 3) lead from their frames to the given ones, ``lenses`` are their cameras.
-    Keypoints without sigma have the standard deviation ``noise`` [px].
+    The ``views`` are those ``given``, with lenses turned by ``turns`` (3, 3), and without evidence
+    where one has no pose. Keypoints without sigma have the deviation ``noise`` [px].
     """
 
     model: Model | ShapeModel
@@ -58,7 +57,6 @@ class Problem(NamedTuple):
 
     @property
     def lacks_sigma(self) -> bool:
-        """True if the keypoints' noise is to be estimated."""
         return any(view.sigma is None and len(view.keypoint_ids) for view in self.views)
 
     @property
@@ -73,12 +71,10 @@ class Problem(NamedTuple):
 
     @property
     def uses_outlines(self) -> bool:
-        """True if a view has a mask or a photo."""
         return any(view.has_outline for view in self.views)
 
     @property
     def pose_count(self) -> int:
-        """Number of unknown poses."""
         return 1 if self.is_rig else len(self.numbers)
 
     @property
@@ -135,9 +131,8 @@ def compile_problem(
 ) -> Problem:
     """The problem of checked arguments.
 
-    Raises InputError if a view has no evidence, or names a keypoint that the model lacks, or if
-    keypoints lie all around a wide lens, without ``ransac``; DegenerateError if the first view has
-    no pose.
+    Raises InputError if a view has no evidence, or keypoints that the model lacks or, without
+    ``ransac``, all around a wide lens; DegenerateError if the first view has no pose.
     """
     prior = prior_of(model)
     for view in views:
@@ -180,11 +175,7 @@ def no_pose_error(problem: Problem) -> DegenerateError:
 
 
 def _views_without_pose(problem: Problem) -> list[int]:
-    """Numbers of the views of unknown motion whose keypoints determine no pose.
-
-    Those are fewer than three keypoints, or keypoints on one line. A single view, and views with a
-    given start, are never among them.
-    """
+    """Numbers of several views of unknown motion, without a start, that determine no pose."""
     views, prior = problem.views, problem.prior
     if len(views) < 2 or any(view.cam_from_rig is not None for view in views):
         return []

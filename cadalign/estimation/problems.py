@@ -32,10 +32,9 @@ _NO_ERRORS: Mapping[int, CadalignError] = MappingProxyType({})
 
 @dataclass(frozen=True, eq=False)
 class Problems:
-    """The correspondences of one or many problems of one camera, one after the other.
+    """Correspondences of problems of one camera, points (n, 3) and (n, 2) [px].
 
-    Problem b has the rows ``offsets[b]`` to ``offsets[b + 1]`` of ``points_3d`` (n, 3) and
-    ``points_2d`` (n, 2) [px].
+    Problem b has the rows ``offsets[b]`` to ``offsets[b + 1]``.
     """
 
     points_3d: FloatArray
@@ -47,7 +46,6 @@ class Problems:
         return len(self.offsets) - 1
 
     def rows(self, problem: int) -> slice:
-        """The rows of a problem."""
         return slice(int(self.offsets[problem]), int(self.offsets[problem + 1]))
 
     @property
@@ -57,7 +55,6 @@ class Problems:
 
 
 def joined(problems: Sequence[Problems]) -> Problems:
-    """Problems of one camera as one."""
     return Problems(
         np.concatenate([each.points_3d for each in problems]),
         np.concatenate([each.points_2d for each in problems]),
@@ -69,11 +66,7 @@ def joined(problems: Sequence[Problems]) -> Problems:
 def pack_one(
     points_3d: npt.ArrayLike, points_2d: npt.ArrayLike, camera: Camera, place: str = ""
 ) -> Problems:
-    """Check one problem's arguments, which messages name with its ``place`` among others.
-
-    The arrays are writable ones (n, 3) and (n, 2) of finite numbers; the given ones if they are
-    that.
-    """
+    """Check one problem's arguments, which messages name with its ``place`` among others."""
     model, image = cast(FloatArray, points_3d), cast(FloatArray, points_2d)
     name_2d = f"points_2d{place}"
     if not (_is_kernel_array(model, 3) and _is_kernel_array(image, 2) and all_finite(model, image)):
@@ -152,10 +145,7 @@ def rays_of(points_2d: FloatArray, camera: Camera, *, clips: bool = False) -> Fl
 
 
 def focal_slopes(points_2d: FloatArray, camera: Camera, rays: FloatArray) -> FloatArray:
-    """Derivatives of undistorted pixels, over the focal length, by its logarithm.
-
-    (n, 2) float for pixels and rays (n, 2); (0, 2) for a lens without distortion, where they are 0.
-    """
+    """Slopes (n, 2) of undistorted pixels by the log focal length; (0, 2) without distortion."""
     if not camera.distortion:
         return np.empty((0, 2))
     distorted = (points_2d - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
@@ -166,9 +156,8 @@ def focal_slopes(points_2d: FloatArray, camera: Camera, rays: FloatArray) -> Flo
 def whitening_of(sigma: Sigma | None, rays: FloatArray, camera: Camera) -> FloatArray:
     """Weights (1 or n, 3) that turn errors of the rays (n, 2) into errors of unit covariance.
 
-    A row (a, b, c) is such that (a du + b dv, c dv) has unit covariance for the error (du, dv) of a
-    ray: the upper Cholesky factor of its information matrix. Lens distortion enters by its
-    derivative. A sigma of None counts as 1 px.
+    A row (a, b, c) is the upper Cholesky factor of the information of a ray: (a du + b dv, c dv) is
+    the whitened error. A sigma of None counts as 1 px.
     """
     if sigma is None:
         sigma = 1.0
@@ -193,10 +182,9 @@ def whitening_by(information: FloatArray) -> FloatArray:
 class Solutions(NamedTuple):
     """Minima of every problem, the best first.
 
-    ``poses`` (B, k, 15) are packed, ``costs`` (B, k) their whitened squared errors, infinite where
-    there is none; ``covariances`` (B, 8, 8), without the known scale, and ``residuals`` (n, 2) [px]
-    are those of the best. ``info`` (B, 4) counts minima, iterations and hypotheses, and names an
-    undetermined unknown or -1. ``errors`` are those of the problems without a solution.
+    ``poses`` (B, k, 15) are packed, ``costs`` (B, k) whitened squares; ``covariances`` (B, 8, 8)
+    and ``residuals`` (n, 2) [px] are the best's. ``info`` (B, 4) has the numbers of minima,
+    iterations and hypotheses, and an undetermined unknown or -1.
     """
 
     poses: FloatArray
@@ -236,7 +224,6 @@ def solver_error(
 
 
 def too_few_error(count: int, options: FitOptions) -> DegenerateError:
-    """The error of fewer keypoints than the method needs."""
     method = f"the method {options.method!r}"
     fix = f"give at least {options.min_points}"
     if options.method == "optimal":
@@ -247,7 +234,6 @@ def too_few_error(count: int, options: FitOptions) -> DegenerateError:
 
 
 def no_alignment_error() -> DegenerateError:
-    """The error of keypoints that no alignment has in front of the camera."""
     return DegenerateError(
         "no alignment with all keypoints in front of the camera was found",
         where="points_2d",

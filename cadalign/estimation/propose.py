@@ -41,10 +41,8 @@ class _AtFocals(NamedTuple):
 def propose(problem: Problem, shape: Shape, init: Inits) -> tuple[Lenses, Starts]:
     """Starts for one component of the shape, and the lenses that their focal lengths refer to.
 
-    Unknown focal lengths are those of a grid. Lenses with distortion are those of the start of the
-    lowest cost, since they are linear near it. Where a lens cannot be undone there are no starts.
-
-    Raises InputError if it can be undone nowhere.
+    Lenses with distortion are those of the start of the lowest cost, since they are linear near it.
+    Raises InputError if they can be undone at no focal length of the grid.
     """
     lenses = problem.lenses
     if not lenses.count:
@@ -73,7 +71,6 @@ def propose(problem: Problem, shape: Shape, init: Inits) -> tuple[Lenses, Starts
 
 
 def _starts_at(problem: Problem, evidence: Evidence, init: Inits) -> Starts:
-    """Starts at the focal lengths of the rays."""
     first, ransac = _start(init, evidence), problem.ransac
     if ransac is None:
         return starts_of(evidence, first)
@@ -148,7 +145,6 @@ def robust_starts(
 
 
 def under_cauchy(evidence: Evidence) -> Evidence:
-    """The same evidence under Cauchy's loss."""
     old = evidence.sightings
     return evidence._replace(sightings=old._replace(loss=np.full(len(old.loss), CAUCHY)))
 

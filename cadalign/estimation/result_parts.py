@@ -114,10 +114,7 @@ class KeypointSearch(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class FittedKeypoints:
-    """Keypoints of an exact or stretched model in one view, with the alignment that fits them.
-
-    Fields without a comment are those of `cadalign.Result`.
-    """
+    """Keypoints of an exact model in one view, with their alignment; fields as of `Result`."""
 
     points_3d: FloatArray  # (n, 3) on the model, of the keypoints that the view shows
     residuals: FloatArray
@@ -149,7 +146,6 @@ class FittedKeypoints:
 
     @property
     def chosen_sigma(self) -> Any:
-        """The keypoints' standard deviation or covariances [px]: given, or estimated."""
         return self.sigma if self.options.sigma is None else self.options.sigma
 
 
@@ -245,10 +241,7 @@ def listed(clauses: Sequence[str]) -> str:
 
 
 def quickly(kind: type[T], fields: dict[str, Any]) -> T:
-    """A frozen dataclass with these fields, unchecked; those left out have their defaults.
-
-    Setting them one by one takes longer than solving a small problem linearly.
-    """
+    """A frozen dataclass of fields, unchecked: setting them takes longer than a linear solver."""
     made = object.__new__(kind)
     made.__dict__.update(fields)
     return made

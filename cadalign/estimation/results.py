@@ -218,6 +218,5 @@ class Results(Sequence[Result | CadalignError]):
 
 
 def _read_result(texts: Any, row: int, where: str) -> Result:
-    """The result of a row of a column of JSON texts."""
     with in_file(where):
         return Result.from_dict(parse_json(texts[row].as_py(), "result"))

@@ -70,12 +70,10 @@ class Minimum(NamedTuple):
 
     @property
     def focal_lengths(self) -> FloatArray:
-        """The estimated focal lengths (F,) [px]."""
         return self.lenses.focal_lengths * np.exp(self.state.log_focals)
 
     @property
     def points(self) -> FloatArray:
-        """The shape's points (m, 3) before the stretch."""
         return points_of(self.evidence.shape, self.state) / np.exp(self.state.log_scales)
 
 
@@ -89,7 +87,6 @@ class SearchResult(NamedTuple):
 
 
 def search_at_noise(problem: Problem, init: Inits) -> SearchResult:
-    """Minima at the noise of a problem."""
     minima: list[Minimum] = []
     iterations = hypotheses = 0
     for number, shape in enumerate(problem.prior.components):
@@ -153,10 +150,9 @@ def _robust_minima(
 ) -> tuple[list[Minimum], int]:
     """Estimates that most keypoints support, the best first, with the iterations they took.
 
-    Each start is refined under a robust loss, then on its inliers, once or until these don't
-    change. A keypoint that is left out costs as much as one at its threshold, and the logarithm
-    that one more keypoint would add. Thresholds that are not given are widened by what a point's
-    own displacement projects to: the residual of one that is left out has all of it.
+    A keypoint that is left out costs as much as one at its threshold, and the logarithm that one
+    more would add. Thresholds that are not given are widened by what a point's displacement
+    projects to: the residual of one that is left out has all of it.
     """
     evidence = whole.evidence
     threshold = thresholds(evidence, whole.lenses, limit)
@@ -265,11 +261,8 @@ def search(problem: Problem, starts: Sequence[Inits]) -> SearchResult:
     """Minima from each of the given ``starts``, at the likeliest noise of keypoints without sigma.
 
     The shape is integrated out, and so is the pose by Laplace's approximation, so that the noise is
-    free of the bias that fitted unknowns cause.
-
-    Raises DegenerateError if noise is to be estimated, and the keypoints fit exactly whatever they
-    are; NoConsensusError if the likeliest has no more support by keypoints than chance gives, with
-    ``problem.ransac``.
+    free of the bias that fitted unknowns cause. Raises DegenerateError if keypoints of unknown
+    noise always fit; NoConsensusError, with ``problem.ransac``, if chance gives as much support.
     """
     if problem.lacks_sigma:
         counts = [len(view.keypoint_ids) for view in problem.views if view.sigma is None]
@@ -336,7 +329,6 @@ def _without_sigma(views: Sequence[View], minimum: Minimum) -> BoolArray:
 
 
 def _scaled(minimum: Minimum, chosen: BoolArray, factor: float) -> Minimum:
-    """The minimum with the whitening of chosen sightings times a factor."""
     return minimum._replace(evidence=with_whitening_times(factor, chosen, minimum.evidence))
 
 
@@ -376,5 +368,4 @@ def with_whitening_times(factor: float, chosen: BoolArray, evidence: Evidence) -
 
 
 def with_sightings(evidence: Evidence, kept: BoolArray | IntArray) -> Evidence:
-    """The evidence of some sightings."""
     return evidence._replace(sightings=kept_rows(evidence.sightings, kept))

@@ -107,7 +107,6 @@ def align_single(problem: Problem, start: float) -> Result:
 
 
 def _given(init: Alignment | None) -> FloatArray:
-    """A given start as a pose (1, 12) of the unstretched shape; none (0, 12) without."""
     if init is None:
         return np.empty((0, 12))
     return np.append(init.rotation, init.translation / init.scale.mean())[None]

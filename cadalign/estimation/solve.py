@@ -45,11 +45,7 @@ _NO_COST = read_only(np.array([[np.inf]]))
 
 
 def solve(problems: Problems, options: FitOptions) -> Solutions:
-    """Solve every problem with the method of the options.
-
-    One through a lens is the only one. Raises CadalignError if a lens cannot be undone,
-    or sigma is none.
-    """
+    """Solve every problem; one through a lens must be alone. CadalignError of lens or sigma."""
     camera = problems.camera
     camera.require_focal()
     facing = faced(camera, problems.points_2d) if camera.is_wide else camera
@@ -92,10 +88,6 @@ def are_solved_at_once(problems: Sequence[Problems], options: FitOptions) -> boo
 
 
 def solve_one(problems: Problems, options: FitOptions) -> Solutions:
-    """Solve the only problem.
-
-    Raises CadalignError if it has no solution.
-    """
     solutions = solve(problems, options)
     if solutions.errors:
         raise solutions.errors[0]
@@ -151,7 +143,6 @@ def _residuals(
 
 
 def _baseline(method: str, points: FloatArray, rays: FloatArray) -> Solutions:
-    """The guess of a solver of others for the only problem."""
     from cadalign.solvers.baselines import aepnp_paper, epnp
 
     rotation, translation, scale = (epnp if method == "epnp" else aepnp_paper)(points, rays)
@@ -203,12 +194,10 @@ def keypoints_of_solution(
 def fit_keypoints(problems: Problems, options: FitOptions, start: float) -> FittedKeypoints:
     """Fit all keypoints of the only problem, which was begun at ``start`` [s].
 
-    An unknown sigma is the one that the residuals have. It matters to the optimum where there is
-    something beside the keypoints: rounds end where they converge, or go in circles, for of two
+    An unknown sigma is the residuals'. Rounds end where they converge, or go in circles: of two
     optima each may be the better one at the other's noise. Keypoints that are given repeatedly
-    count once for the redundancy.
-
-    Raises DegenerateError if they always fit, so that the noise is open.
+    count once for the redundancy. Raises DegenerateError if they always fit, so that the noise is
+    open.
     """
     if options.sigma is not None or options.method != "optimal":
         return _fit_at_noise(problems, options, start)
@@ -245,8 +234,7 @@ def _fit_at_noise(problems: Problems, options: FitOptions, start: float) -> Fitt
 def _robust_sigma(squares: FloatArray, redundancy: int) -> float:
     """Standard deviation [px] from a quantile of the squared lengths (n,) of residuals.
 
-    The unknowns can make as many keypoints fit exactly as they have equations. The quantile is the
-    median of the others' lengths: that of all would be zero with few keypoints.
+    As many keypoints as have the unknowns' equations may fit exactly: it is the others' median.
     """
     count = len(squares)
     place = math.ceil(count - redundancy / 4)

@@ -54,10 +54,8 @@ Start = tuple[Sequence[FloatArray | None], FloatArray]
 def starts_of(evidence: Evidence, init: Start | None = None) -> Starts:
     """Starts at the focal lengths of the rays; none where every view has too few keypoints.
 
-    Where every view has a pose of its own, the likeliest ones are taken together, and then one of
-    them replaced by the next. The shape's uncertainty, seen from the distance at which the mean has
-    the size of its image, widens the keypoints' own. A start that is given comes first, poses half
-    a turn away come last.
+    Of several poses the likeliest are taken together, then one of them replaced by the next. A
+    given start comes first, poses half a turn away come last.
     """
     found = _proposed(evidence, init)
     return Starts(
@@ -68,7 +66,6 @@ def starts_of(evidence: Evidence, init: Start | None = None) -> Starts:
 
 
 def _proposed(evidence: Evidence, init: Start | None) -> list[_Start]:
-    """Poses (P, 12) and log scales (3,) of each start."""
     rig = evidence.rig
     poses = int(rig.pose.max()) + 1
     per_pose: list[list[_Start]] = [[] for _ in range(poses)]
@@ -146,13 +143,11 @@ def in_rig(pose: FloatArray, camera: FloatArray) -> FloatArray:
 
 
 def _held(evidence: Evidence) -> Evidence:
-    """The evidence without stretch."""
     scales = evidence.scales._replace(free=np.zeros(3), precision=np.zeros((3, 3)))
     return evidence._replace(scales=scales)
 
 
 def _keypoint_counts(evidence: Evidence) -> IntArray:
-    """Number of keypoints of every view (V,)."""
     sightings = evidence.sightings
     is_keypoint = sightings.whitening[:, 2] > 0
     return np.bincount(sightings.image[is_keypoint], minlength=len(evidence.rig.pose))
@@ -171,9 +166,8 @@ def _half_turned(evidence: Evidence, view: int, poses: FloatArray) -> list[Float
 
 
 class _Rows(NamedTuple):
-    """Equations in points of the rig: ``normals`` (N, 3), ``right`` (N,), inverse sigmas.
+    """Equations of the model's ``points`` (N, 3) in a rig's cameras, of ``weights`` (N,).
 
-    They are of the model's ``points`` (N, 3), seen from a camera with ``turns`` and ``shifts``;
     ``is_ray`` (N,) is 1 where the standard deviation is that of a ray: it grows with the depth.
     """
 
@@ -196,10 +190,7 @@ class _Rows(NamedTuple):
 
 
 def _metric_starts(evidence: Evidence, own: Sequence[_Start]) -> list[_Start]:
-    """Likeliest poses (1, 12) and log scales of one pose: rotations of ``own``, or of a grid.
-
-    Given a rotation, the equations are linear in the translation and the scales.
-    """
+    """Likeliest poses (1, 12) and log scales, linear at rotations of ``own`` or of a grid."""
     rows, is_tied = _rows_of(evidence), has_scale_prior(evidence.scales)
     basis = np.ones((3, 1)) if is_tied else np.eye(3)  # of scales that a prior holds together
     given = [pose[:9].reshape(3, 3) for pose, _ in own]

@@ -28,10 +28,7 @@ _SAME_SCALE = 1e-4
 
 
 def check_symmetry(symmetry: Symmetry) -> None:
-    """Check that a symmetry's motions make a group.
-
-    Raises InputError if it is something else, or its motions make none.
-    """
+    """Raise InputError for what is no symmetry, or whose motions make no group."""
     require_kind(symmetry, Symmetry, "symmetry", fix="see cadalign.Symmetry.from_dict")
     group_of(symmetry)
 
@@ -48,10 +45,7 @@ def stretched_axes(held: tuple[bool, bool, bool]) -> str:
 
 
 def without_free_turns(covariance: FloatArray, best: Equal) -> FloatArray:
-    """A covariance whose unknowns begin with rotation vector and translation, without free turns.
-
-    These are rotations about the symmetry's axes through its center.
-    """
+    """A covariance of pose and others without turns about the symmetry's axes."""
     size = len(covariance)
     arm, left = best.alignment.linear @ best.center, np.eye(size)
     for axis in best.free:
@@ -68,10 +62,7 @@ def distinct_ones(
     symmetry: Symmetry,
     held: tuple[bool, bool, bool],
 ) -> list[tuple[int, Equal]]:
-    """Canonical ones of alignments with their numbers, without those that equal the first.
-
-    Those are as near to it as the ``covariance`` of its errors allows.
-    """
+    """Canonical alignments with their numbers, without those as near the first as errors."""
     group = group_of(symmetry)
     first, *others = enumerate(group.canonical(each, held=held) for each in poses)
     best = first[1].alignment

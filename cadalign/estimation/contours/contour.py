@@ -48,11 +48,9 @@ Image = npt.NDArray[np.float32]
 
 
 class Contour(NamedTuple):
-    """Samples of a mask's contour, S of them, curve after curve in their order along each.
+    """Samples ``points`` (S, 2) [px] of a mask's contour, `SPACING` apart on each ``curve`` (S,).
 
-    ``points`` (S, 2) [px], unit ``normals`` (S, 2) from the object outwards, and the number
-    ``curve`` (S,) of the closed curve or stretch of one that a sample belongs to: neighbours of one
-    curve are `SPACING` apart.
+    The unit ``normals`` (S, 2) point outwards of the object.
     """
 
     points: FloatArray
@@ -74,16 +72,14 @@ class Contour(NamedTuple):
         return np.asarray(kept[lag:] & kept[:-lag] & same)
 
     def taken(self, chosen: BoolArray | IntArray) -> Contour:
-        """The samples that a mask or numbers choose."""
         return Contour(self.points[chosen], self.normals[chosen], self.curve[chosen])
 
 
 def contour_of(probability: FloatArray | BoolArray) -> Contour:
-    """Samples of the contour of a mask (h, w) of probabilities.
+    """Samples of the level line 0.5 of a smoothed mask (h, w) of probabilities.
 
-    The contour is the level line 0.5 of the smoothed mask: smoothing takes the stairs of a binary
-    mask away. Small pieces and holes are dropped, and samples near the image's border, where the
-    object may go on outside.
+    Small pieces and holes are dropped, and samples near the image's border, where the object may go
+    on.
     """
     image = np.ascontiguousarray(probability, dtype=np.float32)
     level = smoothed(image)
@@ -105,8 +101,7 @@ def contour_of(probability: FloatArray | BoolArray) -> Contour:
 def sampled(image: Image, points: FloatArray) -> FloatArray:
     """Values (n,) of an image (h, w) at points (n, 2), bilinear; outside those of the border.
 
-    OpenCV 4 rounds places to 1/32 px (`cv2.remap`), which moves contours by more than the precision
-    that is sought.
+    `cv2.remap` rounds places to 1/32 px, which moves contours by more than the precision sought.
     """
     places = np.fmin(np.fmax(points, 0.0), np.subtract(image.shape[::-1], 1))  # 0 for NaN
     values = map_coordinates(image, places.T[::-1], order=1, mode="nearest", output=np.float64)
@@ -159,10 +154,7 @@ def crossings(
     offsets: FloatArray,
     first: float = -REACH,
 ) -> FloatArray:
-    """Places (S,) on normals where a level line is left, nearest to ``offsets`` (S,); or NaN.
-
-    They are sought from ``first`` to `REACH` beside the offsets [px].
-    """
+    """Places (S,) on normals where a level line is left, nearest to ``offsets`` (S,); or NaN."""
     steps = np.arange(first, REACH + _STEP / 2, _STEP)
     places = offsets + steps[:, None]
     along = points + places[..., None] * normals
@@ -176,10 +168,7 @@ def crossings(
 
 
 def _nearest_exits(inside: BoolArray, steps: FloatArray) -> tuple[IntArray, BoolArray]:
-    """Numbers (S,) of the last of K steps inside on normals, and which (S,) have one.
-
-    Of the exits of ``inside`` (K, S) that nearest to 0 of the ``steps`` (K,) counts.
-    """
+    """Numbers (S,) of the last step inside, before the exit nearest to 0, and which have one."""
     exits = inside[:-1] & ~inside[1:]
     middles = np.abs(steps[:-1] + steps[1:])
     nearest = np.where(exits, middles[:, None], np.inf).argmin(axis=0)
@@ -220,11 +209,7 @@ def _inside(
 
 
 def mask_contour(mask: FloatArray | BoolArray, where: str) -> Contour:
-    """The contour of a checked mask (h, w).
-
-    Raises InputError if it is empty or covers all of the image, all of its contour lies at the
-    image's border, or the contour is longer than that of any object.
-    """
+    """The contour of a checked mask (h, w); InputError if there is none, or as long as noise's."""
     inside = mask if mask.dtype == bool else mask >= 0.5
     if inside.all() or not inside.any():
         where_is = "covers all of the image" if inside.all() else "contains no pixel of the object"
@@ -247,10 +232,10 @@ def mask_contour(mask: FloatArray | BoolArray, where: str) -> Contour:
 
 
 class Rims(NamedTuple):
-    """Rims on the normals of a contour's samples, for each of S samples.
+    """Rims on the normals of S samples, where ``found`` (S,).
 
-    ``found`` (S,), the ``offset`` (S,) of the rim outwards from the contour [px], the ``points``
-    (S, 3) of the surface in the model's frame before its stretch and their triangles ``face`` (S,).
+    The ``offset`` (S,) [px] is outwards of the contour; ``points`` (S, 3) in the model's frame
+    before its stretch lie on triangles ``face`` (S,).
     """
 
     found: BoolArray
@@ -292,10 +277,7 @@ class Sight(NamedTuple):
 
 
 def find_rims(sight: Sight, contour: Contour, reach: float) -> Rims:
-    """Find the rims that are nearest to a contour, at most ``reach`` [px] away.
-
-    A rim is a change from the object to the background in the contour's outward direction.
-    """
+    """Changes from object to background on normals, nearest to the contour within ``reach``."""
     count = len(contour.points)
     intervals = 2 * min(int(np.ceil(reach / _LONGEST_STEP)), _MOST_STEPS)
     steps = np.linspace(-reach, reach, intervals + 1)

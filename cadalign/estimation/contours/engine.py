@@ -74,7 +74,6 @@ class Candidate:
 
     @cached_property
     def supports(self) -> list[OutlineSupport]:
-        """The agreement of each source with the outline."""
         return [
             OutlineSupport() if each is None else source.support(each)
             for source, each in self._measured
@@ -104,9 +103,9 @@ def refine_with_outlines(
 ) -> tuple[list[Minimum], OutlineNotes]:
     """Refine the likely minima of the other evidence, the likeliest first, with masks and photos.
 
-    A photo counts where its view has no mask, which is the better outline. Raises InputError if a
-    mask has no contour, or the model no mesh; DegenerateError if there is no estimate without the
-    outlines, and none near it with them.
+    A photo counts where its view has no mask. Raises InputError if a mask has no contour, or the
+    model no mesh; DegenerateError if outlines alone determine the estimate, and there is none near
+    them.
     """
     first, keypoints = minima[0], len(prior.ids)
     is_exact, is_open = is_exact_model(model), not _is_determined(first)
@@ -174,9 +173,8 @@ def _candidates(
 def _hulls_of(views: Sequence[View]) -> list[View]:
     """Views with the convex hulls of their masks; none where a mask leaves the image, or lacks.
 
-    What lies between legs, or a hole, differs from object to object more than the outermost points
-    do, which keypoints and the box describe. The silhouette of a convex hull is the convex hull of
-    the silhouette.
+    Between legs, or in holes, objects differ more than in their outermost points, which keypoints
+    and box describe. The silhouette of a convex hull is the convex hull of the silhouette.
     """
     found = []
     for view in views:
@@ -208,10 +206,7 @@ def _is_determined(minimum: Minimum) -> bool:
 
 
 def _displaced(start: Minimum, *, is_exact: bool) -> list[tuple[Minimum, State]]:
-    """States beside an estimate without outlines, along the directions of which it knows least.
-
-    These are the ones that change a pose, or the stretch of an exact model, by much.
-    """
+    """States beside an estimate, along its weakest directions if these change it by much."""
     _, information = information_of(*reduced(start.evidence, start.state))
     poses, rest = 6 * len(start.state.poses), len(start.state.log_focals) + 3
     count = poses + rest * is_exact
@@ -258,7 +253,6 @@ def _are_alike(one: State, other: State) -> bool:
 def _contradicting(
     best: list[Candidate], sources: Sequence[OutlineSource]
 ) -> tuple[OutlineSource, str] | None:
-    """The source that contradicts the rest the most, and how; None where all agree."""
     supports = best[0].supports if best else [OutlineSupport()]
     worst = min(range(len(supports)), key=lambda number: supports[number].share)
     if supports[worst].share < _LEAST_SUPPORT:
@@ -268,10 +262,7 @@ def _contradicting(
 
 
 def _tension(candidate: Candidate) -> str | None:
-    """Report other residuals that rise from a start's more than chance and noise explain.
-
-    A contour's registration counts with them.
-    """
+    """Report other residuals that rise by more than chance, noise and registration explain."""
     start, problem, state = candidate.start, candidate.fit.problem, candidate.fit.state
     evidence = start.evidence
     equations = 2 * int((evidence.sightings.whitening[:, 2] > 0).sum())

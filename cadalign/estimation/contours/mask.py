@@ -65,10 +65,8 @@ _LEAST_KEYPOINTS = 4  # that tell whether a mask is inverted
 class MaskSource(OutlineSource):
     """The contour of a mask.
 
-    ``slopes`` (S, 2, 2) are the derivatives of its samples' places [px] by their rays; ``sigma`` is
-    the given standard deviation [px], None to estimate it. The contour is that of ``mask``.
-    Of a view without keypoints it ``is_wide``, for the start may be far off. A ``hint`` tells what
-    may be wrong.
+    ``slopes`` (S, 2, 2) are derivatives of its samples' places [px] by their rays; ``sigma`` [px]
+    is None to estimate it. It ``is_wide`` without keypoints, for the start may be far off.
     """
 
     kind = "mask"
@@ -86,10 +84,7 @@ class MaskSource(OutlineSource):
 
     @classmethod
     def of(cls, image: int, view: View, camera: Camera, *, is_exact: bool = True) -> MaskSource:
-        """The contour of a view's mask, without samples outside of its lens.
-
-        Raises InputError if the mask has no contour.
-        """
+        """The contour of a view's mask inside of its lens; InputError if it has none."""
         mask = cast("FloatArray | BoolArray", view.mask_image)
         contour = mask_contour(mask, f"views[{view.number}].mask")
         rays, valid = camera.normalize_where_valid(contour.points)
@@ -129,11 +124,9 @@ class MaskSource(OutlineSource):
         )
 
     def learned(self, outline: Outline, offset: float, track: Track) -> Track:
-        """See `OutlineSource`.
+        """See `OutlineSource`; edges lie unevenly by a share of their common offset.
 
-        Beside the rim a contour lies unevenly, by a share of the offset that all of an edge has in
-        common. Where the surface is only similar, samples without a rim count as the farthest:
-        there it lacks a part or has one more.
+        Where the surface is only similar, samples without a rim count as the farthest.
         """
         residuals = outline.residuals(offset)
         if not self.is_exact:
@@ -203,13 +196,12 @@ def convex_hull(mask: FloatArray | BoolArray) -> BoolArray | None:
 
 
 def _leaves_image(inside: BoolArray) -> bool:
-    """True if an object may go on outside of the image."""
     middle = inside[_OPEN_BORDER:-_OPEN_BORDER, _OPEN_BORDER:-_OPEN_BORDER]
     return bool(inside.sum() > middle.sum())
 
 
 def _off_mask(pixels: FloatArray, mask: FloatArray | BoolArray) -> str:
-    """Report that most keypoints lie off a mask, as they do where it is inverted."""
+    """A hint that most keypoints lie off a mask, as they do where it is inverted; or nothing."""
     places = np.round(pixels).astype(int)
     u, v = places[((places >= 0) & (places < mask.shape[::-1])).all(axis=1)].T
     count, off = len(u), int((mask[v, u] < _INSIDE).sum())

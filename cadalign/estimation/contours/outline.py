@@ -34,9 +34,8 @@ _ALIKE = 0.2  # change of a variance's logarithm
 class Noise(NamedTuple):
     """Noise of a contour's samples.
 
-    Their standard deviation ``sigma`` [px], or its factor where samples have their own, the number
-    of neighbours that count as one, and the standard deviation of the ``offset`` [px] that all have
-    in common.
+    Their deviation ``sigma`` [px], or its factor where samples have their own, the number of
+    neighbours that count as one, and the deviation of the ``offset`` [px] that all have in common.
     """
 
     sigma: float
@@ -54,7 +53,6 @@ class Noise(NamedTuple):
         return self.sigma * float(np.sqrt(self.correlation))
 
     def costs(self, residuals: FloatArray) -> FloatArray:
-        """Costs of samples' residuals [px]."""
         square = self.loss_scale**2
         return np.asarray(
             square / self.correlation * np.log1p((residuals / self.sigma) ** 2 / square)
@@ -62,10 +60,7 @@ class Noise(NamedTuple):
 
 
 def trimmed_deviation(residuals: FloatArray, least: float) -> float:
-    """Root mean square of residuals (n,) about 0 without outliers, which exceed ``least``.
-
-    It is 0 for none.
-    """
+    """Root mean square of residuals (n,) without outliers, which exceed ``least``; 0 of none."""
     if not len(residuals):
         return 0.0
     robust = _TO_SIGMA * float(np.median(np.abs(residuals)))
@@ -107,12 +102,11 @@ def correlation_length(
 class Outline(NamedTuple):
     """Measurements at S samples of a model's outline in one view.
 
-    ``points`` (S, 3) on the model's rim, in its frame before the stretch, lie on the triangles
-    ``face`` (S,). The source's contour is by ``places`` (S,) [px] outwards of the rim, along the
-    normals of ``contour``, where it is ``found`` (S,); ``sigmas`` (S,) are the relative standard
-    deviations of these. Rays that move by ``across`` (S, 2) [1/px] over its square move the image
-    by one pixel outwards. Contours are sought within the ``reach`` [px]. The ``contrast`` is that
-    of the colours inside and outside [nats].
+    ``points`` (S, 3) in the model's frame before the stretch lie on its rim, on triangles ``face``
+    (S,). The source's ``contour`` is ``places`` (S,) [px] outwards of it where ``found`` (S,), with
+    relative deviations ``sigmas`` (S,). Rays that move by ``across`` (S, 2) [1/px] over its square
+    move the image by one pixel outwards. Contours are sought within the ``reach`` [px]; the
+    ``contrast`` is that of the colours inside and outside [nats].
     """
 
     contour: Contour
@@ -130,10 +124,7 @@ class Outline(NamedTuple):
         return np.where(self.found, self.places - offset, np.nan)
 
     def noise(self, residuals: FloatArray, least: Noise, outlying: float) -> Noise:
-        """The noise that residuals (S,) show, at ``least`` some; NaN is none.
-
-        Outliers are at least ``outlying`` standard deviations off.
-        """
+        """The noise of residuals (S,), NaN for none; outliers exceed ``outlying`` deviations."""
         kept = np.isfinite(residuals)
         relative = np.where(kept, residuals, 0.0) / self.sigmas
         sigma = max(trimmed_deviation(relative[kept], outlying), least.sigma)
@@ -151,7 +142,6 @@ class MeasuredOutline(NamedTuple):
 
     @property
     def residuals(self) -> FloatArray:
-        """See `Outline`."""
         return self.outline.residuals(self.offset)
 
     @property
@@ -164,8 +154,8 @@ class MeasuredOutline(NamedTuple):
 class Track(NamedTuple):
     """Noise and reach of a source on the way to its outline.
 
-    The reach of a mask is in pixels; that of a photo is relative to the silhouette's size, and
-    ``levels`` are those of the next rounds. A track ``is_fine`` near its end.
+    The reach of a mask is in pixels, that of a photo relative to the silhouette's size; ``levels``
+    are those of the next rounds.
     """
 
     noise: Noise
@@ -190,8 +180,8 @@ class Track(NamedTuple):
 class OutlineSupport(NamedTuple):
     """Agreement of a source with a model's outline.
 
-    The ``share`` of the samples within the tolerance, 0 where the source tells nothing; the number
-    ``agreeing`` of those that do, their root mean square distance ``rms`` [px] and ``rms_sigmas``.
+    The ``share`` of its samples near it, 0 where nothing is known; the number of inliers and their
+    root mean square ``rms`` [px] and ``rms_sigmas``.
     """
 
     share: float = 0.0
@@ -202,10 +192,10 @@ class OutlineSupport(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class OutlineSource(ABC):
-    """A mask or a photo: rows of evidence that depend on the state.
+    """A mask or a photo of the view in place ``image``, whose ``number`` is the user's.
 
-    It is that of the view in place ``image``, whose ``number`` is the user's. The ``camera`` is
-    that of the evidence's rays. The surface ``is_exact``, or only similar to the object's.
+    The ``camera`` is that of the evidence's rays. The surface ``is_exact``, or similar to the
+    object's.
     """
 
     kind: ClassVar[Literal["mask", "photo"]]
@@ -224,13 +214,7 @@ class OutlineSource(ABC):
 
     @property
     def where(self) -> str:
-        """Name of its argument."""
         return f"views[{self.number}].{self.field}"
-
-    @property
-    def learns_offset(self) -> bool:
-        """True if the deviation of the offset that all of it has in common is estimated."""
-        return self.learns_sigma and self.is_exact
 
     @abstractmethod
     def first(self) -> Track:
@@ -261,7 +245,6 @@ class OutlineSource(ABC):
         """A warning about an estimate that little but the outlines determines."""
 
     def support(self, found: MeasuredOutline) -> OutlineSupport:
-        """The agreement with an outline."""
         least, exact, similar = self.tolerances
         tolerance = max(least, (exact if self.is_exact else similar) * found.outline.contour.size)
         near = np.abs(np.nan_to_num(found.residuals, nan=np.inf)) < tolerance
@@ -274,7 +257,6 @@ class OutlineSource(ABC):
         return OutlineSupport(float(near.mean()), len(kept), rms, rms_sigmas)
 
     def warning(self, text: str) -> EstimateWarning:
-        """A warning about it."""
         return EstimateWarning(self.kind, text, self.number)
 
     def summary(self, support: OutlineSupport) -> EvidenceSummary:

@@ -78,11 +78,7 @@ class PhotoSource(OutlineSource):
         return track._replace(noise=_noise_of(outline, outline.residuals(offset)))
 
     def rank(self, found: MeasuredOutline) -> float:
-        """See `OutlineSource`.
-
-        The log likelihoods are those that the colours give the silhouette, over one anywhere, and
-        that the lines' places give the outline, over places anywhere on the lines.
-        """
+        """See `OutlineSource`; over a silhouette anywhere, and places anywhere on the lines."""
         outline, residuals = found.outline, found.residuals
         noise = _noise_of(outline, residuals)
         sigmas = noise.sigma * outline.sigmas[outline.found]
@@ -120,5 +116,4 @@ def _contrast(outline: Outline) -> float:
 
 
 def _noise_of(outline: Outline, residuals: FloatArray) -> Noise:
-    """The noise that residuals (S,) [px] show."""
     return outline.noise(residuals, _LEAST, _LEAST_OUTLIER)

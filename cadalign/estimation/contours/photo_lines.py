@@ -53,7 +53,6 @@ _SMOOTHING = (_PADDED[:-2] + 2 * _PADDED[1:-1] + _PADDED[2:]) / 4  # of bins, by
 
 
 def _histogram(bins: IntArray) -> FloatArray:
-    """Shares of the colours by bins, smoothed over neighbouring ones."""
     counts = np.bincount(bins, minlength=_BINS**3).astype(np.float64)
     for _ in range(3):  # of red, green, and blue: each is the last axis once
         counts = (_SMOOTHING @ counts.reshape(_BINS, -1)).T
@@ -62,10 +61,10 @@ def _histogram(bins: IntArray) -> FloatArray:
 
 
 def regions_of(inside: IntArray, outside: IntArray) -> tuple[FloatArray, float]:
-    """Learn from the bins of the colours inside and outside: odds and contrast.
+    """Odds by bins, and contrast, from the bins of the colours inside and outside.
 
-    The odds are, by bins, the probability of the object minus that of the background; the contrast
-    is the mutual information of side and colour [nats], 0 without any, log 2 at most.
+    Odds are the probability of the object minus that of the background; the contrast is the mutual
+    information of side and colour [nats], log 2 at most.
     """
     own, other = _histogram(inside), _histogram(outside)
     both = (own + other) / 2
@@ -74,11 +73,7 @@ def regions_of(inside: IntArray, outside: IntArray) -> tuple[FloatArray, float]:
 
 
 def changes_of(odds: FloatArray, valid: BoolArray) -> FloatArray:
-    """Log likelihoods (S, 2 K + 1) of a change from the object's colours to others at each step.
-
-    ``odds`` (S, 2 K + 1) are those of `regions_of` at steps from the inside outwards, of which
-    ``valid`` ones count.
-    """
+    """Log likelihoods (S, 2 K + 1) of leaving the object at each step, by the ``valid`` odds."""
     steps = np.arange(odds.shape[1])
     gaps = steps[:, None] - steps  # of the crossing (rows) from the pixels (columns)
     step = _AMPLITUDE * np.tanh(gaps / (2 * _SLOPE))
@@ -89,10 +84,8 @@ def changes_of(odds: FloatArray, valid: BoolArray) -> FloatArray:
 def with_neighbours(logs: FloatArray, are_neighbours: BoolArray) -> FloatArray:
     """Add a share of the log likelihoods (S, 2 K + 1) of the next lines along the outline.
 
-    Near its place, an outline is displaced by nearly the same at neighbouring lines, so that these
-    help to choose between several crossings. Their colours are independent in part: the sum counts
-    by the root of its weights. ``are_neighbours`` (S - 1,) is true where a line and the next one
-    are.
+    These are displaced by nearly the same, and help to choose between crossings. Their colours are
+    independent in part: the sum counts by the root of its weights.
     """
     total = np.logaddexp.reduce(logs, axis=1, keepdims=True)
     bounded = np.logaddexp(logs - total, np.log(_STRAY / logs.shape[1]))
@@ -105,11 +98,10 @@ def with_neighbours(logs: FloatArray, are_neighbours: BoolArray) -> FloatArray:
 
 
 def crossings_of(logs: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Find the places where lines leave the object from the log likelihoods (S, 2 K + 1) of these.
+    """Places (S,), in steps outwards, and variances, by log likelihoods (S, 2 K + 1).
 
-    Returns places (S,), in steps outwards from the lines' middles, and their variances. The
-    posterior is taken relative to the uniform prior on the line, so that a line without contrast
-    has an infinite variance, and one with several crossings a large one.
+    The posterior is relative to the uniform prior: a line without contrast has an infinite
+    variance.
     """
     count = logs.shape[1]
     steps = np.arange(count) - count // 2
@@ -129,9 +121,9 @@ def crossings_of(logs: FloatArray) -> tuple[FloatArray, FloatArray]:
 def edges_of(colors: FloatArray, valid: BoolArray, step: float) -> FloatArray:
     """Log likelihoods (S, 2 K + 1) of a change of the colours (S, 2 K + 1, c) at each step.
 
-    On both sides of the change the colours are constant but for noise of unknown level: with the
-    sum E of squares about both means, the likelihood is E to the power of -n / 2 for n pixels. A
-    ``step`` is so many pixels long.
+    With constant colours on both sides but for noise of unknown level, and the sum E of squares
+    about both means, the likelihood is E to the power of -n / 2 for n pixels. A step has ``step``
+    pixels.
     """
     weights = valid.astype(np.float64)
     values = weights[..., None] * colors
@@ -180,7 +172,6 @@ class PhotoPyramid(NamedTuple):
 
 
 def photo_of(camera: Camera, pixels: ByteImage) -> PhotoPyramid:
-    """A photo (h, w, 3) with its smaller copies."""
     levels = [pixels]
     while min(levels[-1].shape[:2]) > _SMALLEST:
         height, width = levels[-1].shape[:2]
@@ -195,7 +186,7 @@ class Silhouette(NamedTuple):
     """The silhouette of a posed surface in cells of the image, and its rims.
 
     The cell (0, 0) of ``inside`` (h, w) lies at the pixel ``corner``, neighbours ``cell`` [px]
-    apart. The ``contour`` has samples on the rims, whose ``points`` (S, 3) lie on the triangles
+    apart. Samples of the ``contour`` are on the rims, whose ``points`` (S, 3) are on triangles
     ``face`` (S,).
     """
 
@@ -254,10 +245,7 @@ def silhouette_of(
 def _covered_cells(
     sight: Sight, corner: FloatArray, cell: float, shape: tuple[int, int]
 ) -> BoolArray:
-    """Cells (h, w) of the image that the object covers; see `Silhouette`.
-
-    Of every second row and column all are looked at, of the rest those near the outline.
-    """
+    """Cells (h, w) that the object covers: of every second row and column, and near the outline."""
     height, width = shape
     every_second = np.stack(np.meshgrid(np.arange(0, width, 2), np.arange(0, height, 2)), axis=-1)
     coarse = sight.covers(corner + cell * every_second).astype(np.uint8)
@@ -274,7 +262,7 @@ def _covered_cells(
 def _box_in_image(
     corners: FloatArray, camera: Camera, pose: Alignment
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Corners of the box in the image of the object's box; None where it is not in the image."""
+    """Corners of the object's box in the image; None where it is not there."""
     seen = pose.apply(corners)
     size = np.array([camera.width, camera.height]) - 1.0
     if (seen[:, 2] <= 0).any():
@@ -285,10 +273,7 @@ def _box_in_image(
 
 
 def outline_of(photo: PhotoPyramid, silhouette: Silhouette, reach: float) -> Outline | None:
-    """Find the photo's contour on lines that reach so far [px]; None where there are no colours.
-
-    Places are found where the lines tell one; their sigmas are standard deviations [px].
-    """
+    """The photo's contour on lines that reach so far [px]; None where there are no colours."""
     step = reach / STEPS
     inside, outside = _colors_beside(photo, silhouette, reach, step)
     if min(len(inside), len(outside)) < _LEAST_PIXELS:

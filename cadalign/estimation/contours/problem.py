@@ -55,7 +55,6 @@ class OutlineProblem(NamedTuple):
         sources: Sequence[OutlineSource],
         surface: Surface,
     ) -> tuple[OutlineProblem, State]:
-        """The problem and its start, of evidence and a state without outlines."""
         evidence, state = with_displacement_modes(evidence, state)
         shape, own = evidence.shape, np.zeros(OWN_MODES * len(sources))
         modes = np.concatenate([shape.modes, np.zeros((len(own), *shape.mean.shape))])
@@ -69,7 +68,6 @@ class OutlineProblem(NamedTuple):
         return state.coefficients[-count:].reshape(-1, OWN_MODES)
 
     def offsets(self, state: State, tracks: Sequence[Track]) -> list[float]:
-        """Offsets [px] of the sources."""
         own = self.own_of(state)[:, 0].tolist()
         return [each * track.noise.offset for each, track in zip(own, tracks, strict=True)]
 
@@ -117,11 +115,6 @@ class OutlineProblem(NamedTuple):
         )
         return evidence, state._replace(displacements=np.zeros_like(mean))
 
-    def without_outlines(self, state: State) -> State:
-        """The state without the outlines' points, with its own coefficients."""
-        still = np.zeros_like(self.evidence.shape.mean)
-        return state._replace(coefficients=state.coefficients.copy(), displacements=still)
-
     def _with_room(self, count: int) -> Evidence:
         """The evidence with the numbers that points have behind so many more of outlines."""
 
@@ -139,7 +132,7 @@ class OutlineProblem(NamedTuple):
         """Mean (n, 3), modes (K, n, 3) and sightings of the samples that a source found.
 
         At the state of the ``sight`` the residuals are the distances that were found, whatever the
-        normals are. The contour's own modes move its points outwards, to the right and down.
+        normals.
         """
         source = self.sources[number]
         kept = np.flatnonzero(outline.found)

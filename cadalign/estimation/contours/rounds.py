@@ -36,7 +36,7 @@ _LEAST_INFORMATION = 1e-12  # about a direction of the unknowns, relative
 class OutlineFit(NamedTuple):
     """An estimate, and the ``outlines`` from which the last round led there.
 
-    The evidence and its state ``with_outlines``, and the state without their points.
+    Evidence and state are those ``with_outlines``, the ``state`` that without their points.
     """
 
     problem: OutlineProblem
@@ -118,8 +118,10 @@ def _with_likeliest_offsets(
     problem: OutlineProblem, evidence: Evidence, state: State, tracks: Sequence[Track]
 ) -> tuple[list[Track], State]:
     """Tracks whose offsets have the likeliest deviations, and the bare state in terms of these."""
-    learned, bare = list(tracks), problem.without_outlines(state)
-    learning = np.flatnonzero([source.learns_offset for source in problem.sources])
+    still = np.zeros_like(problem.evidence.shape.mean)
+    bare = state._replace(coefficients=state.coefficients.copy(), displacements=still)
+    learned = list(tracks)
+    learning = np.flatnonzero([each.learns_sigma and each.is_exact for each in problem.sources])
     if not len(learning):
         return learned, bare
     own = problem.own_of(bare)
@@ -135,10 +137,7 @@ def _with_likeliest_offsets(
 
 
 def likeliest_offset(own: float, variance: float, noise: Noise) -> float:
-    """Likeliest standard deviation [px] of an offset of the coefficient ``own``.
-
-    The ``variance`` is that of the coefficient, whose prior is that of the ``noise``.
-    """
+    """Likeliest deviation [px] of an offset, by its coefficient and the variance of that."""
     without_prior = 1 / max(1 / min(variance, 1.0) - 1, 1e-6)  # in squares of the offset
     free = own * (1 + without_prior)
     square = noise.offset**2 * max(free**2 - without_prior, 0.0)
@@ -146,10 +145,7 @@ def likeliest_offset(own: float, variance: float, noise: Noise) -> float:
 
 
 def _with_wider_noise(fit: OutlineFit) -> OutlineFit:
-    """The same, with the noise of outlines as large as if unknowns fitted a part of it.
-
-    Their residuals have as many degrees of freedom less as the outlines determine unknowns.
-    """
+    """The same, its outlines' noise widened by the degrees of freedom that they determine."""
     evidence, state = fit.with_outlines
     rows = np.arange(len(evidence.sightings.point))
     is_outline = rows >= len(fit.problem.evidence.sightings.point)

@@ -63,9 +63,8 @@ T = TypeVar("T")
 class Whitened(NamedTuple):
     """Silhouettes by their first and second moments, N of them.
 
-    ``mean`` (N, 2) and ``spread`` (N, 2, 2), the square root of the covariance, and ``rings``
-    (N, `_RINGS`, `_TURNS`): the share in 255ths that is covered at these radii and angles, after
-    both are removed.
+    ``mean`` (N, 2), ``spread`` (N, 2, 2), the square root of the covariance, and ``rings`` (N,
+    `_RINGS`, `_TURNS`), shares in 255ths that are covered after both are removed.
     """
 
     mean: FloatArray
@@ -116,10 +115,9 @@ def resembling_poses(
     count: int,
     symmetry: Symmetry | None = None,
 ) -> list[tuple[Alignment, float]]:
-    """Distinct alignments whose silhouettes resemble a mask (h, w), and their overlaps.
+    """Distinct alignments whose silhouettes resemble a mask (h, w), and overlaps, the best first.
 
-    The overlap is the intersection over union, the best first. ``free`` (3,) marks the scales that
-    are unknown. Of alignments that are equal under the ``symmetry`` one is kept.
+    Overlaps are intersections over unions; ``free`` (3,) marks the unknown scales.
     """
     view = FacedMask.of(mask, camera)
     atlas = atlas_of(mesh, _eye_of(mesh, view.outline))
@@ -133,10 +131,7 @@ def resembling_poses(
 
 @lru_cache(maxsize=32)
 def atlas_of(mesh: Mesh, eye: float) -> Atlas:
-    """The silhouettes of a mesh, rendered once.
-
-    The ``eye`` is so far from the middle of the box, relative to half of its diagonal.
-    """
+    """Silhouettes of a mesh, from so far an ``eye``, relative to half of the box's diagonal."""
     surface = rigid_surface(mesh)
     caster, corners = surface.caster, surface.corners
     middle = corners.mean(axis=0)
@@ -182,14 +177,12 @@ def _eye_of(mesh: Mesh, query: Whitened) -> float:
 
 @cache
 def _around() -> FloatArray:
-    """Unit vectors (`_TURNS`, 2) in equal steps, all around."""
     angles = 2 * np.pi * np.arange(_TURNS) / _TURNS
     return np.column_stack([np.cos(angles), np.sin(angles)])
 
 
 @cache
 def _radii() -> FloatArray:
-    """Radii (`_RINGS`,) of rings [standard deviations]."""
     return np.asarray(_OUTERMOST * (np.arange(_RINGS) + 0.5) / _RINGS)
 
 
@@ -209,9 +202,8 @@ def _whitened(image: Image, corner: FloatArray, cell: float) -> Whitened:
 class FacedMask(NamedTuple):
     """A mask as a camera sees it that looks at its middle.
 
-    The ``outline`` is its silhouette. Of every second row and column of its image on the plane at
-    depth 1 the cells have values ``inside`` (m,), ``rays`` (m, 3) through them, and lie in the
-    photo where ``is_seen`` (m,).
+    The ``outline`` is its silhouette. Cells on the plane at depth 1 have values ``inside`` (m,),
+    ``rays`` (m, 3) through them, and lie in the photo where ``is_seen`` (m,).
     """
 
     outline: Whitened
@@ -222,7 +214,6 @@ class FacedMask(NamedTuple):
 
     @classmethod
     def of(cls, mask: FloatArray | BoolArray, camera: Camera) -> FacedMask:
-        """The mask (h, w) of a camera."""
         inside: BoolArray = np.asarray(mask, dtype=np.float64) >= 0.5
         pixels = np.argwhere(inside)[:, ::-1].astype(float)
         found, valid = camera.rays_where_valid(pixels[:: max(1, len(pixels) // 20_000)])
@@ -272,10 +263,7 @@ def _overlaps(views: Whitened, query: Whitened) -> FloatArray:
 
 
 def _affine_cameras(atlas: Atlas, query: Whitened) -> tuple[FloatArray, FloatArray]:
-    """Maps ``M x + b`` of the model to the query's plane, those of the best overlaps.
-
-    Matrices (n, 2, 3) and shifts (n, 2).
-    """
+    """Maps (n, 2, 3), (n, 2) ``M x + b`` of the model to the query's plane of the best overlaps."""
     overlap = _overlaps(atlas.views, query)
     # A whitened silhouette may fit at several turns.
     is_peak = (overlap >= np.roll(overlap, 1, 1)) & (overlap >= np.roll(overlap, -1, 1))
@@ -309,8 +297,7 @@ def _poses_of(
 def _stretches_of(matrices: FloatArray, free: BoolArray) -> FloatArray:
     """Scales (n, 3) that make the rows of ``matrix / scale`` orthogonal and of one length.
 
-    Least squares by Gauss and Newton, with a weak prior on the logarithms: some views leave a
-    stretch open.
+    Least squares, with a weak prior on the logarithms: some views leave a stretch open.
     """
     first, second = matrices[:, 0], matrices[:, 1]
     terms = np.stack([first * second, (first**2 - second**2) / 2], axis=1)
@@ -333,10 +320,7 @@ def _stretches_of(matrices: FloatArray, free: BoolArray) -> FloatArray:
 def distinct(
     found: Iterable[tuple[Alignment, T]], count: int, symmetry: Symmetry | None
 ) -> list[T]:
-    """The first ones, so many at most, whose alignments are too far apart for a common minimum.
-
-    Of alignments that are equal under the symmetry the canonical ones are compared.
-    """
+    """The first ones whose alignments, apart from symmetry, are too far apart for one minimum."""
     group = None if symmetry is None else group_of(symmetry)
     poses: list[Alignment] = []
     kept: list[T] = []
@@ -353,7 +337,6 @@ def distinct(
 
 
 def _differ(one: Alignment, other: Alignment) -> bool:
-    """True if rotations or scales are too far apart for one start to lead to both."""
     turn = angle_between(one.rotation, other.rotation)
     stretch = np.abs(np.log(one.scale / other.scale)).max()
     return bool(turn > _DISTINCT_DEG or stretch > _DISTINCT_STRETCH)

@@ -26,10 +26,7 @@ _QHULL = "QJ Pp"  # joggled, for a flat mesh has a hull, too
 
 
 class RigidSurface:
-    """The surface of an exact or stretched model; it is the same at all states.
-
-    It ``is_exact``: rim and contour differ by the errors of the contour alone.
-    """
+    """The surface of an exact or stretched model, the same at all states; it ``is_exact``."""
 
     is_exact = True
 
@@ -48,10 +45,7 @@ class RigidSurface:
 
 
 class WarpedSurface:
-    """A mesh whose keypoints are warped to the object's, or its convex hull.
-
-    ``source`` (n, 3) are the mesh's keypoints, ``rows`` (n,) their numbers in the shape.
-    """
+    """A mesh, or hull, warped from keypoints ``source`` (n, 3) to ``rows`` (n,) of the shape."""
 
     is_exact = False
 
@@ -81,12 +75,10 @@ class Warped:
 
     @cached_property
     def caster(self) -> RayCaster:
-        """The ray hierarchy."""
         return RayCaster(self.mesh)
 
     @property
     def corners(self) -> FloatArray:
-        """Corners (8, 3) of the box."""
         return bounds_corners(*self.mesh.bounds)
 
     def rows(self, points: FloatArray, face: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -126,9 +118,8 @@ def surface_of(
 ) -> Surface:
     """The surface of a shape whose keypoints are about ``points_3d`` (m, 3).
 
-    A learned shape has the mesh of the nearest training model that has one. One that is only
-    similar to the object's may be replaced by its convex hull. Raises InputError where
-    there is no mesh, which the mask or photo ``where`` needs; DataError if it cannot be read.
+    A learned shape has the mesh of the nearest training model. Raises InputError where there is no
+    mesh, which the mask or photo ``where`` needs; DataError if it cannot be read.
     """
     wanting = "a photo" if where.endswith("image") else "a mask"
     if isinstance(model, ShapeModel):
@@ -145,7 +136,6 @@ def surface_of(
 def _nearest_with_mesh(
     model: ShapeModel, points_3d: FloatArray, where: str, wanting: str
 ) -> tuple[Mesh, FloatArray, IntArray]:
-    """Mesh, keypoints and their numbers of the training model whose keypoints are nearest."""
     training = model.training
     rows = [] if training is None else training.rows_with_mesh
     if training is None or not rows:

@@ -75,7 +75,6 @@ def keypoint_warnings(
 
 
 def _fit(fitted: FittedKeypoints) -> bool:
-    """True for keypoints without a search that pass the test for mistakes, which take longer."""
     if fitted.search is not None or fitted.cost is None:
         return fitted.search is None
     if fitted.options.sigma is None:
@@ -94,12 +93,11 @@ def weaknesses(
 ) -> Warnings:
     """Warn about lengths, motion and focal length that are not determined.
 
-    ``lengths`` (3,) are those of the object: what is open of one counts relative to all, for that
-    of a flat object's thickness changes little. If ``keypoints`` (n, 3) are all evidence, the
-    reason is said, and the rotation counts. Two scales that are open together, whose ratio is not,
-    are none then: one image leaves size and distance open as far as the known axis does not tell
-    them, and the standard deviations of both say so. Beside a prior on the scales the keypoints
-    must determine them better than the prior does.
+    What is open of one of the object's ``lengths`` (3,) counts relative to all. If ``keypoints``
+    (n, 3) are all evidence, the reason is said, and the rotation counts. Two scales that are open
+    together, whose ratio is not, are none then: one image leaves size and distance open, and the
+    deviations of both say so. Beside a prior on the scales keypoints must determine them better
+    than it does.
     """
     warnings, std = [], uncertainty_of(covariance)
 
@@ -127,7 +125,6 @@ def weaknesses(
 
 
 def _ratio_deviation(covariance: FloatArray, axes: Sequence[int]) -> float:
-    """Standard deviation of the logarithm of the ratio of two scales; 0 without two."""
     if len(axes) < 2:
         return 0.0
     logs = np.zeros(len(covariance))
@@ -159,9 +156,9 @@ def another_pose(
 ) -> Warnings:
     """Warn about other poses, with likelihoods relative to the best, that the deviations conceal.
 
-    Those outside of the stated 95 % interval of the turn to them, where they have more than the 5 %
-    that it leaves them together; any, where the deviations leave every rotation open. ``near`` is
-    the likelihood of all further estimates whose pose is hardly another one.
+    Those outside of the 95 % interval of the turn to them, where they have more than the 5 % that
+    it leaves them together; any, where the deviations leave every rotation open. ``near`` is the
+    likelihood of further estimates of hardly another pose.
     """
     total = 1 + near + sum(likelihood for _, likelihood in others)
     is_open = covariance[:3, :3].trace() > (_LEAST_GAIN * _ANY_ROTATION) ** 2
@@ -189,10 +186,8 @@ def outside_image(
 ) -> Warnings:
     """Warn about keypoints (n, 2) and a principal point that are none of the image's.
 
-    ``view`` is the number of the view, ``where`` what the texts begin with.
-
-    All keypoints lie beyond one side, or, where they do not ``agree``, most outside: of an object
-    that is hidden or cropped, some may, and they may surround the image.
+    All keypoints lie beyond one side or, where they do not ``agree``, most outside. ``where``
+    begins the texts.
     """
     found, own = [], np.array([camera.width, camera.height])
     point = f"{where}the camera's principal point ({camera.cx:.4g}, {camera.cy:.4g}) is"
@@ -241,9 +236,6 @@ def unexplained(sigma: float, points_2d: Sequence[FloatArray]) -> Warnings:
 
 
 def is_large_sigma(sigma: float, points_2d: Sequence[FloatArray]) -> bool:
-    """True for an estimated sigma [px] that is large beside the extent of views' keypoints (n, 2).
-
-    It asks for a mistake.
-    """
+    """True for an estimated sigma [px] that is large beside the extent of keypoints (n, 2)."""
     extents = [float(np.ptp(points, axis=0).max()) for points in points_2d if len(points)]
     return sigma > _LARGE * max(extents, default=0.0)

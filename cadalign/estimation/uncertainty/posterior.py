@@ -55,10 +55,7 @@ _EFFICIENCY = {"linear": 1.0, "huber": 0.7, "cauchy": 0.7}
 
 
 def keypoint_covariance(fitted: FittedKeypoints) -> FloatArray | None:
-    """The covariance (9, 9) or (10, 10) by the posterior; None without a Fisher information.
-
-    Rotations about the axes of a symmetry count nothing. See `cadalign.Result.covariance`.
-    """
+    """The covariance (9, 9) or (10, 10) by the posterior; None without a Fisher information."""
     if fitted.fisher_covariance is None:
         return None
     if needs_facing([fitted.camera]):
@@ -106,9 +103,8 @@ def _posterior_covariance(fitted: FittedKeypoints) -> FloatArray:
 def _within_prior(covariance: FloatArray, result: FittedKeypoints) -> FloatArray:
     """The covariance (m, m), with log scales that vary no more than their prior does by itself.
 
-    A parabola, or an ellipsoid about a curved region, reaches past the ends of the prior: the mean
-    square of that about the estimate bounds the variance. A measurement of the log scale that leads
-    to the bound leaves what is known better, such as a ratio of scales, as it is.
+    A parabola, or an ellipsoid about a curved region, reaches past the ends of the prior, whose
+    mean square about the estimate bounds the variance. Ratios of scales that are known better stay.
     """
     weight, width = result.options.scale_prior
     if not weight:
@@ -139,10 +135,7 @@ class Chart(NamedTuple):
 
     @classmethod
     def of(cls, fitted: FittedKeypoints, widening: float) -> Chart:
-        """The chart of a fit, at a noise of ``widening`` times its variance.
-
-        A loss counts by its weights at the residuals.
-        """
+        """The chart of a fit, at ``widening`` times its variance; a loss counts by its weights."""
         camera, options, alignment = fitted.camera, fitted.options, fitted.alignment
         kept, points = fitted.inliers, fitted.points_3d[fitted.inliers]
         residuals = fitted.residuals[kept]
@@ -183,10 +176,6 @@ class Chart(NamedTuple):
         jacobian[3:6] /= depth
         return jacobian
 
-    def weighed(self, steps: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Deviations (k, 10), costs (k,) and log densities (k,) at coordinates (k, 10)."""
-        return weigh_draws(self.centred, self.keypoints, self.priors, steps)
-
 
 def _prior_information(options: FitOptions, size: int) -> FloatArray:
     """Inverse variances (9,) or (10,) of the priors; 0 for none."""
@@ -202,8 +191,7 @@ def _sample(fitted: FittedKeypoints, first: FloatArray, widening: float) -> Floa
     """A covariance (m, m) by draws from the posterior, or None where the proposals miss it.
 
     It is the inverse Fisher information, widened where the posterior is wider, and where the region
-    that the likelihood ratio does not reject at 5 % reaches farther: that region covers the truth
-    as often as stated with few keypoints too.
+    that the likelihood ratio does not reject at 5 % reaches farther: it covers the truth as stated.
     """
     chart, free = Chart.of(fitted, widening), fitted.options.estimated_unknowns
     scales = np.flatnonzero((free >= 6) & (free < 9))
@@ -218,7 +206,7 @@ def _sample(fitted: FittedKeypoints, first: FloatArray, widening: float) -> Floa
         draws, log_densities = _draws(round_, len(free))
         steps = np.zeros((count, 10))
         steps[:, free] = mean + draws @ np.linalg.cholesky(proposal).T
-        deviations, costs, log_weights = chart.weighed(steps)
+        deviations, costs, log_weights = weigh_draws(*chart, steps)
         log_weights -= log_densities
         log_weights[~np.isfinite(log_weights)] = -np.inf
         if not log_weights.max() > -np.inf:
@@ -234,7 +222,7 @@ def _sample(fitted: FittedKeypoints, first: FloatArray, widening: float) -> Floa
         mean = adapted @ steps[:, free]
         centered = steps[:, free] - mean
         proposal = _INFLATION * (centered * adapted[:, None]).T @ centered
-    (at_estimate,) = chart.weighed(np.zeros((1, 10)))[1]
+    (at_estimate,) = weigh_draws(*chart, np.zeros((1, 10)))[1]
     limit = chi_square_quantile(len(free), 1 - _COVERAGE)
     likely = costs - at_estimate <= limit
     covariance, among = np.zeros_like(first), np.ix_(free, free)
@@ -246,10 +234,7 @@ def _sample(fitted: FittedKeypoints, first: FloatArray, widening: float) -> Floa
 
 @lru_cache(maxsize=64)
 def _draws(round_: int, size: int) -> tuple[FloatArray, FloatArray]:
-    """The standard Student draws (k, size) of a round, and the logarithms of their densities.
-
-    They are the same for every result; densities (k,) are up to a constant.
-    """
+    """Student draws (k, size) of a round, the same for every result, and log densities (k,)."""
     rng = np.random.default_rng(_SEED)
     for count in _DRAWS[: round_ + 1]:
         normal = rng.standard_normal((count, size))
@@ -268,10 +253,8 @@ def _widened(
 ) -> FloatArray:
     """The covariance (m, m), widened along the directions in which the draws (k, m) reach farther.
 
-    The directions are the principal axes of the second moments relative to the covariance. Along
-    each the variance is that of the draws, or that whose ellipsoid reaches as far as the ``likely``
-    ones; it stays where both agree within the noise of the draws. ``prior`` (m,) is the information
-    of the priors.
+    Along principal axes of the second moments the variance is that of the draws, or that whose
+    ellipsoid reaches as far as the ``likely`` ones; it stays where both agree within their noise.
     """
     factor = np.linalg.cholesky(variance)
     used = (weights > 0) | likely

@@ -57,9 +57,7 @@ def loss_slopes(squares: FloatArray, loss: int, bend: float) -> tuple[FloatArray
 def chi_square_tail(value: float, freedom: int) -> float:
     """Probability that a chi-squared variable exceeds a value.
 
-    The sum of Poisson terms for an even number of degrees of freedom, with the complementary error
-    function for an odd one: Abramowitz and Stegun, 26.4.4 and 26.4.5. Importing SciPy's takes
-    longer than a fit.
+    Abramowitz and Stegun, 26.4.4 and 26.4.5: importing SciPy's takes longer than a fit.
     """
     if value <= 0 or value == math.inf:
         return float(value <= 0)
@@ -72,10 +70,7 @@ def chi_square_tail(value: float, freedom: int) -> float:
 
 
 def chance_of(squares: float, redundancy: int, degrees_of_freedom: float | None = None) -> float:
-    """Probability that whitened residuals have a larger sum of squares by chance, up to 1.
-
-    Those of learned shapes have the tails of `probability_within`.
-    """
+    """Probability of a larger sum of squares by chance; of learned shapes with their tails."""
     if redundancy <= 0 or squares <= redundancy:
         return 1.0
     if degrees_of_freedom is None:
@@ -105,11 +100,7 @@ def f_quantile(first: float, second: float, probability: float) -> float:
 
 
 class Support(NamedTuple):
-    """Keypoints that support one pose.
-
-    Their ``errors`` (k,) [px], the number of ``given`` keypoints, and the ``area`` [px^2] over
-    which outliers are scattered.
-    """
+    """Inliers' ``errors`` (k,) [px], of so many ``given``, and the ``area`` [px^2] of outliers."""
 
     errors: FloatArray
     given: int
@@ -134,11 +125,11 @@ def check_support(
     chance: float = 0.1,
     share: float = 1.0,
 ) -> None:
-    """Refuse an estimate whose poses have no more support together than chance gives.
+    """Raise NoConsensusError for poses that have no more support together than chance gives.
 
-    ``size`` keypoints determine a pose, with so many ``solutions``; ``score`` is the truncated sum
-    of squares [px^2], which the NoConsensusError carries. ``chance`` bounds the expected number of
-    models with as much support, of which a ``share`` is as moderate as this one.
+    ``size`` keypoints have so many ``solutions``; ``score`` is the truncated sum of squares [px^2].
+    ``chance`` bounds the expected number of models as well supported, a ``share`` of them as
+    moderate.
     """
     logarithm = sum(min(0.0, log_expected_by_chance(each, size, solutions)) for each in supports)
     if logarithm < 0 and share < 1:  # the distribution of the product of both
@@ -183,10 +174,9 @@ def log_expected_by_chance(support: Support, size: int, solutions: float) -> flo
     """Log of the expected number of models as well supported among keypoints scattered at random.
 
     Moisan, Stival, "A probabilistic criterion to detect rigid point matches between two images and
-    estimate the fundamental matrix", 2004: for the k best supported keypoints, each a sample of
-    ``size`` keypoints, all choices of k keypoints and of a sample among them are counted, and the
-    chance that the others lie within the largest of the k errors; the least such number over k
-    (over the smallest dozen and all of them, which is where it lies).
+    estimate the fundamental matrix", 2004: for the k best keypoints all choices of these and of a
+    sample are counted, and the chance that the others lie within the largest error; the least
+    number over k (over the smallest dozen and all of them, which is where it lies).
     """
     errors, count, area = support
     if len(errors) <= size:

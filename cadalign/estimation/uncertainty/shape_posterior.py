@@ -122,7 +122,6 @@ def shape_posterior(
 
 
 def gaussians_of(model: ShapeModel) -> Gaussians:
-    """The mixture of the stacked rows of a shape model."""
     weights, means, covariances = model.gaussians
     return Gaussians(weights, means.reshape(len(means), -1), covariances)
 
@@ -130,10 +129,7 @@ def gaussians_of(model: ShapeModel) -> Gaussians:
 def _linearised(
     points: FloatArray, pose: Alignment, seen: Seen
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Whitened errors (2 n,) of points in a view, weighted for their loss.
-
-    Also their derivatives by the points (2 n, 3 n) in the model's frame and by the pose (2 n, 6).
-    """
+    """Weighted errors (2 n,), and their derivatives by points (2 n, 3 n) and pose (2 n, 6)."""
     count, matrices = len(points), whitening_matrices(seen.whitening)
     errors = (matrices @ (perspective(pose.apply(points)) - seen.rays)[:, :, None])[:, :, 0]
     by_pose = matrices @ ray_derivatives(points, pose.packed)[:, :, :_POSE]
@@ -156,9 +152,8 @@ def single_posterior(
 ) -> Estimate:
     """The estimate at a state (D,) of a component, with its posterior.
 
-    The deviations of the prior are widened by the ``inflation``. The box holds the keypoints that
-    are seen, and has the faces that outermost ones determine by the ``model``. Covariances are
-    infinite where the pose is not determined.
+    The prior's deviations are widened by the ``inflation``. The box holds the keypoints that are
+    seen. Covariances are infinite where the pose is not determined.
     """
     count, m = len(seen.points), mixture.means.shape[1]
     rotation = state[:9].reshape(3, 3)
@@ -203,10 +198,7 @@ def single_posterior(
 
 
 def _misses(errors: FloatArray, weight: FloatArray) -> tuple[float, float] | None:
-    """Largest squared miss of a keypoint, and that of all, of predicted errors (2 n,).
-
-    ``weight`` (2 n, 2 n) is their inverse covariance beside any pose.
-    """
+    """Largest squared miss of a keypoint, and that of all; ``weight`` is inverse covariance."""
     count = len(errors) // 2
     forces = (weight @ errors).reshape(count, 2)
     blocks = np.einsum("iaib->iab", weight.reshape(count, 2, count, 2))

@@ -11,6 +11,7 @@ from cadalign import Alignment, Camera
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.uncertainty.posterior import Chart, FittedKeypoints
 from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.solvers.draws import weigh_draws
 
 CAMERA = Camera(640, 480, 900.0, 880.0, 330.0, 250.0)
 LENS = Camera(640, 480, 900.0, 880.0, 330.0, 250.0, distortion=(-0.2, 0.05, 1e-3, -1e-3))
@@ -58,21 +59,21 @@ def cost_of(result: cadalign.Result, deviation: np.ndarray) -> float:
 
 def test_costs_are_those_of_the_reprojection_errors() -> None:
     result = fitted(CAMERA)
-    deviations, costs, _ = chart_of(result).weighed(STEPS)
+    deviations, costs, _ = weigh_draws(*chart_of(result), STEPS)
     np.testing.assert_allclose(costs, [cost_of(result, each) for each in deviations], rtol=1e-9)
-    np.testing.assert_allclose(chart_of(result, 4.0).weighed(STEPS)[1], costs / 4)
+    np.testing.assert_allclose(weigh_draws(*chart_of(result, 4.0), STEPS)[1], costs / 4)
 
 
 def test_a_lens_counts_by_its_derivatives_at_the_estimate() -> None:
     result = fitted(LENS)
-    deviations, costs, _ = chart_of(result).weighed(STEPS / 20)
+    deviations, costs, _ = weigh_draws(*chart_of(result), STEPS / 20)
     expected = [cost_of(result, each) for each in deviations]
     np.testing.assert_allclose(costs, expected, rtol=2e-3)
 
 
 def test_deviations_are_to_first_order_those_of_the_unknowns() -> None:
     chart, step = chart_of(fitted(CAMERA)), 1e-6
-    deviations = chart.weighed(step * np.concatenate([np.eye(10), -np.eye(10)]))[0]
+    deviations = weigh_draws(*chart, step * np.concatenate([np.eye(10), -np.eye(10)]))[0]
     measured = (deviations[:10] - deviations[10:]) / (2 * step)
     np.testing.assert_allclose(measured.T @ chart.jacobian(), np.eye(10), atol=1e-6)
 
@@ -80,7 +81,7 @@ def test_deviations_are_to_first_order_those_of_the_unknowns() -> None:
 def test_priors_cost_what_their_deviations_say() -> None:
     prior = cadalign.FocalPrior(1000.0, 0.1)
     result = fitted(CAMERA, focal="estimate", focal_prior=prior, stretch_sigma=0.2)
-    deviations, costs, _ = chart_of(result).weighed(STEPS)
+    deviations, costs, _ = weigh_draws(*chart_of(result), STEPS)
     logs = np.log(result.alignment.scale) + deviations[:, 6:9]
     focal = np.log(result.camera.fx / 1000.0) + deviations[:, 9]
     expected = [cost_of(result, each) for each in deviations]
@@ -91,7 +92,7 @@ def test_priors_cost_what_their_deviations_say() -> None:
 def test_rotations_have_their_uniform_measure() -> None:
     steps = np.zeros((3, 10))
     steps[1:, 0] = 1.0, 3.0
-    _, costs, logs = chart_of(fitted(CAMERA)).weighed(steps)
+    _, costs, logs = weigh_draws(*chart_of(fitted(CAMERA)), steps)
     density = (np.sin(steps[1:, 0] / 2) / (steps[1:, 0] / 2)) ** 2
     np.testing.assert_allclose(np.exp(logs + costs / 2), [1.0, *density])
 
@@ -102,7 +103,7 @@ def test_rotations_have_their_uniform_measure() -> None:
 def test_beyond_the_priors_ends_nothing_is_likely(coordinate: int, value: float) -> None:
     step = np.zeros((1, 10))
     step[0, coordinate] = value
-    _, costs, logs = chart_of(fitted(CAMERA)).weighed(step)
+    _, costs, logs = weigh_draws(*chart_of(fitted(CAMERA)), step)
     assert logs == -np.inf
     assert costs > 0
 
@@ -111,6 +112,6 @@ def test_behind_the_camera_the_cost_is_infinite() -> None:
     result = fitted(CAMERA)
     step = np.zeros((1, 10))
     step[0, 5] = np.log(0.01)  # the centroid comes nearer than keypoints are to it
-    _, costs, logs = chart_of(result).weighed(step)
+    _, costs, logs = weigh_draws(*chart_of(result), step)
     assert costs == np.inf
     assert logs == -np.inf

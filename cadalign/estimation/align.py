@@ -10,7 +10,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from cadalign.arrays import worker_count
+from cadalign.arrays import FloatArray, worker_count
 from cadalign.errors import (
     CadalignError,
     DegenerateError,
@@ -22,22 +22,31 @@ from cadalign.errors import (
 from cadalign.estimation.agreement import DiagnosisCase
 from cadalign.estimation.contours import refine
 from cadalign.estimation.diagnose import diagnose, diagnose_refusal
+from cadalign.estimation.estimates import as_given
+from cadalign.estimation.fit import fit_one
 from cadalign.estimation.focal import PriorOption
-from cadalign.estimation.joint import result_of_minima, with_cause
-from cadalign.estimation.model import Model
+from cadalign.estimation.joint import result_of, result_of_minima, with_cause
+from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions, RansacOptions
-from cadalign.estimation.prior import Lenses
+from cadalign.estimation.pack import seen_keypoints
+from cadalign.estimation.prior import Lenses, prior_of
 from cadalign.estimation.problem import Problem, compile_problem, no_pose_error
-from cadalign.estimation.problems import each_of
+from cadalign.estimation.problems import each_of, pack_one
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import FitStats
+from cadalign.estimation.result_parts import LEAST_LIKELIHOOD, FitStats
 from cadalign.estimation.results import Results
 from cadalign.estimation.search import search, widened_by_noise
-from cadalign.estimation.single import align_plain, align_single, is_plain, is_single
+from cadalign.estimation.uncertainty.shape_posterior import single_posterior
 from cadalign.estimation.view import View, numbered
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import turned_alignment
 from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.parts import inflation_with
+from cadalign.solvers.constants import LEAST_POINTS
+from cadalign.solvers.marginal.equations import POSE_UNKNOWNS
+from cadalign.solvers.marginal.problem import Mixture
+from cadalign.solvers.marginal.search import search_view
 
 T = TypeVar("T")
 
@@ -119,9 +128,9 @@ def align(
     options = FitOptions(loss=loss, loss_scale=loss_scale, focal=focal, focal_prior=focal_prior)
     Lenses.of(given, focal, focal_prior)  # checks the cameras
     _check_numbers(model, given)
-    if size is None and init is None and is_plain(model, given):
+    if size is None and init is None and _is_plain(model, given):
         exact = cast(Model, model)
-        return align_plain(exact, given[0], options=options, ransac=ransac)
+        return _align_plain(exact, given[0], options=options, ransac=ransac)
     problem = compile_problem(model, given, size, inits, options, ransac)
 
     def again(
@@ -149,8 +158,8 @@ def align(
 
 def _estimate(problem: Problem, start: float) -> Result:
     """All stages of an estimate that was begun at ``start`` [s]."""
-    if is_single(problem):
-        return align_single(problem, start)
+    if _is_single(problem):
+        return _align_single(problem, start)
     starts = [problem.inits]
     if problem.is_mask_alone:
         from cadalign.estimation.contours.silhouettes import starts_of_mask  # with OpenCV
@@ -163,6 +172,82 @@ def _estimate(problem: Problem, start: float) -> Result:
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
     likely = widened_by_noise(problem, minima)
     return result_of_minima(problem, likely, stats, notes=notes)
+
+
+def _is_plain(model: object, views: Sequence[View]) -> bool:
+    """True where nothing but the keypoints of one view and an exact model is given."""
+    return is_exact_model(model) and len(views) == 1 and not views[0].sources
+
+
+def _is_single(problem: Problem) -> bool:
+    """True where nothing but the keypoints of one view and a learned shape is given."""
+    if problem.numbers != [0] or not isinstance(problem.model, ShapeModel):
+        return False
+    view = problem.views[0]
+    if view.sources or view.sigma is None or len(view.keypoint_ids) < LEAST_POINTS:
+        return False
+    return problem.size is None and problem.ransac is None and not problem.lenses.count
+
+
+def _align_plain(
+    model: Model, view: View, *, options: FitOptions, ransac: RansacOptions | None
+) -> Result:
+    """The result of `fit`, with all keypoints of the model."""
+    start, points = time.perf_counter(), cast(FloatArray, model.points_3d)
+    rows = prior_of(model).rows_of(view.keypoint_ids, "views[0].ids")
+    shape = {name: getattr(model, name) for name in ("stretch", "stretch_sigma", "known_axis")}
+    own = replace(options, sigma=view.sigma, **shape)
+    problems = pack_one(points[rows], view.pixels, view.camera)
+    scores = view.scores if ransac is not None else None
+    return fit_one(problems, own, ransac, scores, model.symmetry, start, model=model, view=view)
+
+
+def _align_single(problem: Problem, start: float) -> Result:
+    """The result of `cadalign.align` where `_is_single` holds, which was begun at ``start`` [s]."""
+    model, view, options = cast(ShapeModel, problem.model), problem.views[0], problem.options
+    prior, init = problem.prior, problem.inits[0]
+    if init is not None:
+        init = turned_alignment(init, problem.turns[0].T)
+    rows = prior.rows_of(view.keypoint_ids, f"views[{view.number}].ids")
+    weights, means, covariances = model.gaussians
+    mixture = Mixture(means, covariances, -2 * np.log(weights))
+    seen = seen_keypoints(view, view.pixels, rows, options)
+    minima, hypotheses = search_view(mixture, seen, _given(init))
+    count, iterations = minima.counts.tolist()
+    if not count:
+        raise no_pose_error(problem)
+    stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
+    likelihoods = np.exp((minima.scores[0] - minima.scores[:count]) / 2)
+    likelihoods = likelihoods[likelihoods >= LEAST_LIKELIHOOD]
+    inflation = inflation_with(len(rows), model.inflation, model.few_keypoints)
+    kept = zip(likelihoods.tolist(), minima.label.tolist(), minima.states, strict=False)
+    boxes = model if covariances.any() else None
+    estimates = [
+        single_posterior(mixture, component, seen, state, inflation, boxes)._replace(
+            likelihood=likelihood, cameras=(view.camera,)
+        )
+        for likelihood, component, state in kept
+    ]
+    component, cost = int(minima.label[0]), float(minima.costs[0])
+
+    return result_of(
+        problem,
+        [as_given(each, problem) for each in estimates],
+        inliers=[np.ones(len(rows), dtype=bool)],
+        is_curved=bool(covariances.any()),
+        redundancy=2 * len(rows) - POSE_UNKNOWNS,
+        cost=cost,
+        stats=stats,
+        component=component,
+        known_axis=None,
+        stretched_axes="",
+    )
+
+
+def _given(init: Alignment | None) -> FloatArray:
+    if init is None:
+        return np.empty((0, 12))
+    return np.append(init.rotation, init.translation / init.scale.mean())[None]
 
 
 def align_batch(
@@ -215,8 +300,8 @@ def align_batch(
     """
     threads = worker_count(workers)
     objects = each_of(objects, "objects", None, "views")
-    sizes = _one_each(size, len(objects), "size", Size)
-    starts = _one_each(init, len(objects), "init", Alignment)
+    sizes = _one_each(size, len(objects), "size", Size, "objects")
+    starts = _one_each(init, len(objects), "init", Alignment, "objects")
 
     options: dict[str, Any] = {
         "loss": loss,
@@ -241,9 +326,9 @@ def align_batch(
 
 
 def _one_each(
-    given: T | Sequence[T | None] | None, count: int, where: str, kind: type[T]
-) -> Sequence[T | None]:
-    """An argument given for each of so many objects, or for all."""
+    given: T | Sequence[T | None] | None, count: int, where: str, kind: type[T], of: str
+) -> list[T | None]:
+    """An argument given for each of so many objects or views, or for all."""
     if given is None or isinstance(given, kind):
         return [given] * count
     if not isinstance(given, Sequence):
@@ -251,16 +336,12 @@ def _one_each(
         raise InputError(f"{what}, got {type(given).__name__}", where=where)
     if len(given) != count:
         fix = "give one for all, or one or None for each"
-        raise InputError(f"{len(given)} for {count} objects", where=where, fix=fix)
-    return _require_each(given, where, kind)
-
-
-def _require_each(given: Sequence[Any], where: str, kind: type[T]) -> Sequence[T | None]:
+        raise InputError(f"{len(given)} for {count} {of}", where=where, fix=fix)
     for number, each in enumerate(given):
         if each is not None and not isinstance(each, kind):
             what = f"expected a cadalign.{kind.__name__} or None, got {type(each).__name__}"
             raise InputError(what, where=f"{where}[{number}]")
-    return given
+    return list(given)
 
 
 def _checked_views(given: object) -> list[View]:
@@ -291,18 +372,10 @@ def _check_numbers(model: object, views: Sequence[View]) -> None:
             )
 
 
-def _checked_inits(init: object, views: Sequence[View]) -> list[Alignment | None]:
+def _checked_inits(init: Any, views: Sequence[View]) -> list[Alignment | None]:
     """A start or None for each view; for the first one where a single start is given."""
-    if init is None or isinstance(init, Alignment):
-        return [init, *[None] * (len(views) - 1)]
-    if not isinstance(init, Sequence):
-        what = f"expected a cadalign.Alignment, got {type(init).__name__}"
-        raise InputError(what, where="init")
-    if len(init) != len(views):
-        fix = "give one, or one or None for each view"
-        raise InputError(f"{len(init)} for {len(views)} views", where="init", fix=fix)
-    given = list(_require_each(init, "init", Alignment))
-    if views[0].cam_from_rig is not None:  # they share one pose
-        known = next((each for each in given if each is not None), None)
+    given = _one_each(init, len(views), "init", Alignment, "views")
+    if init is None or isinstance(init, Alignment) or views[0].cam_from_rig is not None:
+        known = next((each for each in given if each is not None), None)  # a rig has one pose
         return [known, *[None] * (len(views) - 1)]
     return given

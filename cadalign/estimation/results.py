@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, cast, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.errors import CadalignError, DataError, InputError
+from cadalign.errors import CadalignError, DataError
 from cadalign.estimation.result import Result
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.documents import in_file, parse_json
@@ -41,19 +41,10 @@ class Results(Sequence[Result | CadalignError]):
         Results of single calls, or functions that make them when they are asked for.
     table : (B, 17) float, optional
         Packed alignments, rms and focal lengths, where they are known before the single results.
-
-    Raises
-    ------
-    InputError
-        If something among the entries is neither a result nor an error.
     """
 
     def __init__(self, entries: Iterable[Entry], table: FloatArray | None = None) -> None:
         self._entries, self._known = list(entries), table
-        for number, entry in enumerate(cast(list[object], self._entries)):
-            if not (callable(entry) or isinstance(entry, Result | CadalignError)):
-                what = f"expected a result or an error, got {type(entry).__name__}"
-                raise InputError(what, where=f"results[{number}]")
 
     def __len__(self) -> int:
         return len(self._entries)

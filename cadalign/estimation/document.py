@@ -85,13 +85,7 @@ class _Summary(ForeignDocument):
     share: NotNegative | None = None  # of a photo
 
 
-class _Result(
-    ForeignDocument,
-    rename={
-        "own_bounds": "bounds",
-        "own_stretch": "stretch",
-    },
-):
+class _Result(ForeignDocument, rename={"own_bounds": "bounds", "own_stretch": "stretch"}):
     version: Literal[1]
     method: str
     ids: list[int | str]

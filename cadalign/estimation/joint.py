@@ -42,10 +42,7 @@ from cadalign.estimation.result_parts import (
     keypoint_summary,
 )
 from cadalign.estimation.search import Minimum
-from cadalign.estimation.symmetry import (
-    SAME_SQUARES,
-    stretched_axes,
-)
+from cadalign.estimation.symmetry import SAME_SQUARES, stretched_axes
 from cadalign.estimation.uncertainty.doubts import (
     another_pose,
     outside_image,

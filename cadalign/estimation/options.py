@@ -139,11 +139,6 @@ class FitOptions(AlignmentOptions):
         first = "xyz".index(self.known_axis)
         return [first, (first + 1) % 3, (first + 2) % 3]
 
-    @property
-    def solver_rows(self) -> IntArray:
-        """Rows of a result's covariance (9, 9) that are the solvers' 8 unknowns, in their order."""
-        return np.array([*range(6), *(6 + axis for axis in self.axis_order[1:])])
-
     def in_model_axes(self, poses: FloatArray) -> FloatArray:
         """Packed poses (..., 15) of the reordered axes as poses of the model's own axes."""
         place = np.argsort(self.axis_order)

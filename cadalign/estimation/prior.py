@@ -12,12 +12,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError, quote
-from cadalign.estimation.focal import (
-    PriorOption,
-    focal_grid,
-    log_focal_range,
-    prior_of_camera,
-)
+from cadalign.estimation.focal import PriorOption, focal_grid, log_focal_range, prior_of_camera
 from cadalign.estimation.model import Model
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera

@@ -179,18 +179,13 @@ def _views_without_pose(problem: Problem) -> list[int]:
     views, prior = problem.views, problem.prior
     if len(views) < 2 or any(view.cam_from_rig is not None for view in views):
         return []
-    mean = prior.components[0].mean
-    return [
-        number
-        for number, view in enumerate(views)
-        if problem.inits[number] is None
-        and _lie_on_a_line(mean[prior.rows_of(view.keypoint_ids, f"views[{number}].ids")])
-    ]
-
-
-def _lie_on_a_line(points: FloatArray) -> bool:
-    """True for points (n, 3) that determine no rotation: fewer than three, or on one line."""
-    return len(points) < LEAST_POINTS or are_on_a_line(points, _ON_A_LINE)
+    mean, found = prior.components[0].mean, []
+    for number, view in enumerate(views):
+        points = mean[prior.rows_of(view.keypoint_ids, f"views[{number}].ids")]
+        is_open = len(points) < LEAST_POINTS or are_on_a_line(points, _ON_A_LINE)
+        if is_open and problem.inits[number] is None:
+            found.append(number)
+    return found
 
 
 def _facing_view(view: View) -> View:

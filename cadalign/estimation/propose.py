@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import lru_cache
 from itertools import combinations
 from typing import NamedTuple, cast
@@ -75,7 +74,22 @@ def _starts_at(problem: Problem, evidence: Evidence, init: Inits) -> Starts:
     if ransac is None:
         return starts_of(evidence, first)
     trusted = [cast("FloatArray | None", view.scores) for view in problem.views]
-    return robust_starts(evidence, ransac, trusted, first)
+    starts = starts_of(under_cauchy(evidence), first)
+    if evidence.rig.pose.max() > 0:
+        return starts
+    samples = np.array(
+        [
+            in_rig(pose, camera)
+            for view, camera in enumerate(evidence.rig.cam_from_rig)
+            for pose in _hypotheses(evidence, view, ransac, trusted[view])
+        ]
+    ).reshape(-1, 12)
+    count, focals = len(samples), starts.log_focals.shape[1]
+    return Starts(
+        np.concatenate([starts.poses, samples[:, None]]),
+        np.concatenate([starts.log_focals, np.zeros((count, focals))]),
+        np.concatenate([starts.log_scales, np.zeros((count, 3))]),
+    )
 
 
 def _merged(found: list[_AtFocals], lenses: Lenses, *, leaves_out: bool) -> Starts:
@@ -117,31 +131,6 @@ def _start(init: Inits, evidence: Evidence) -> Start | None:
     if held.any():
         scale = np.where(held, 1.0, scale / scale[held].mean())
     return poses, np.log(scale)
-
-
-def robust_starts(
-    evidence: Evidence,
-    ransac: RansacOptions,
-    scores: Sequence[FloatArray | None],
-    init: Start | None = None,
-) -> Starts:
-    """Starts under a robust loss, and those of samples, drawn by ``scores`` (n_v,) of views."""
-    starts = starts_of(under_cauchy(evidence), init)
-    if evidence.rig.pose.max() > 0:
-        return starts
-    samples = np.array(
-        [
-            in_rig(pose, camera)
-            for view, camera in enumerate(evidence.rig.cam_from_rig)
-            for pose in _hypotheses(evidence, view, ransac, scores[view])
-        ]
-    ).reshape(-1, 12)
-    count, focals = len(samples), starts.log_focals.shape[1]
-    return Starts(
-        np.concatenate([starts.poses, samples[:, None]]),
-        np.concatenate([starts.log_focals, np.zeros((count, focals))]),
-        np.concatenate([starts.log_scales, np.zeros((count, 3))]),
-    )
 
 
 def under_cauchy(evidence: Evidence) -> Evidence:

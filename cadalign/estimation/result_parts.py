@@ -105,11 +105,8 @@ class KeypointSearch(Protocol):
     """The search for inliers, by which those that were found may be doubted."""
 
     @property
-    def ransac(self) -> RansacOptions:
-        """Its options."""
-
-    def doubt(self, residuals: FloatArray, inliers: BoolArray) -> EstimateWarning | None:
-        """Warn where chance supports as many."""
+    def ransac(self) -> RansacOptions: ...
+    def doubt(self, residuals: FloatArray, inliers: BoolArray) -> EstimateWarning | None: ...
 
 
 @dataclass(frozen=True, eq=False)

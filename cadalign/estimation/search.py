@@ -8,7 +8,7 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.estimates import mean_state
 from cadalign.estimation.options import RansacOptions
@@ -176,7 +176,8 @@ def _settle(whole: Minimum, threshold: FloatArray, rounds: int) -> Minimum | Non
     for _ in range(rounds):
         if inliers.sum() < _LEAST_INLIERS:
             break
-        some = with_sightings(whole.evidence, inliers)
+        sightings = kept_rows(whole.evidence.sightings, inliers)
+        some = whole.evidence._replace(sightings=sightings)
         start = state.poses[None], state.log_focals[None], state.log_scales[None]
         minima, _ = search_joint(some, *start)
         if not minima.states:
@@ -221,7 +222,12 @@ def _check_support(problem: Problem, best: Minimum, max_reproj_error: float) -> 
     views, rig, sightings = problem.views, best.evidence.rig, best.evidence.sightings
     limits = thresholds(best.evidence, best.lenses, 1.0)
     errors = whitened_lengths(best.evidence, best.state) / limits
-    areas = outlier_areas(views, max_reproj_error)
+    areas = np.array(  # [px^2] over which outliers are scattered
+        [
+            area_of(view.pixels, view.camera, max_reproj_error) if len(view.keypoint_ids) else 1.0
+            for view in views
+        ]
+    )
     free = int(best.evidence.scales.free.sum())
     size = 3 + min(free, _MOST_FREE) // 2 + (problem.lenses.count > 0)
     supports = []
@@ -237,16 +243,6 @@ def _check_support(problem: Problem, best: Minimum, max_reproj_error: float) -> 
         left_out = len(best.inliers) - len(errors)
         score = float((errors**2).sum() + left_out * max_reproj_error**2)
         check_support(supports, size, max_reproj_error=max_reproj_error, score=score, where="views")
-
-
-def outlier_areas(views: Sequence[View], max_reproj_error: float) -> FloatArray:
-    """Areas [px^2] over which the outliers of each view are scattered; 1 without keypoints."""
-    return np.array(
-        [
-            area_of(view.pixels, view.camera, max_reproj_error) if len(view.keypoint_ids) else 1.0
-            for view in views
-        ]
-    )
 
 
 def thresholds(evidence: Evidence, lenses: Lenses, max_reproj_error: float) -> FloatArray:
@@ -334,11 +330,6 @@ def _scaled(minimum: Minimum, chosen: BoolArray, factor: float) -> Minimum:
 
 def whitened_lengths(evidence: Evidence, state: State) -> FloatArray:
     """Lengths (N,) of whitened residuals in the image; infinite behind a camera."""
-    return np.asarray(np.hypot(*_whitened_residuals(evidence, state).T))
-
-
-def _whitened_residuals(evidence: Evidence, state: State) -> FloatArray:
-    """Whitened residuals (N, 2) in the image; infinite behind a camera."""
     sightings = evidence.sightings
     points = points_of(evidence.shape, state)[sightings.point]
     seen = seen_in_cameras(evidence, state.poses, points, sightings.image)
@@ -346,8 +337,8 @@ def _whitened_residuals(evidence: Evidence, state: State) -> FloatArray:
     error = np.exp(log_ratio) * seen[:, :2] / seen[:, 2:] - sightings.rays
     error -= log_ratio * sightings.slopes
     a, b, c = sightings.whitening.T
-    whitened = np.column_stack([a * error[:, 0] + b * error[:, 1], c * error[:, 1]])
-    return np.where(seen[:, 2:] > 0, whitened, np.inf)
+    lengths = np.hypot(a * error[:, 0] + b * error[:, 1], c * error[:, 1])
+    return np.where(seen[:, 2] > 0, lengths, np.inf)
 
 
 def _projected(evidence: Evidence, state: State) -> FloatArray:
@@ -365,7 +356,3 @@ def with_whitening_times(factor: float, chosen: BoolArray, evidence: Evidence) -
     old = evidence.sightings
     whitening = np.where(chosen[:, None], factor, 1.0) * old.whitening
     return evidence._replace(sightings=old._replace(whitening=whitening))
-
-
-def with_sightings(evidence: Evidence, kept: BoolArray | IntArray) -> Evidence:
-    return evidence._replace(sightings=kept_rows(evidence.sightings, kept))

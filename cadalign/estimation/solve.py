@@ -87,13 +87,6 @@ def are_solved_at_once(problems: Sequence[Problems], options: FitOptions) -> boo
     return is_quick and options.sigma is not None and len(cameras) == 1 and not has_lens
 
 
-def solve_one(problems: Problems, options: FitOptions) -> Solutions:
-    solutions = solve(problems, options)
-    if solutions.errors:
-        raise solutions.errors[0]
-    return solutions
-
-
 def _optima(
     problems: Problems,
     options: FitOptions,
@@ -178,7 +171,8 @@ def keypoints_of_solution(
         "method": options.method,
     }
     if solutions.covariances is not None:
-        covariance, rows = np.zeros((9, 9)), options.solver_rows
+        covariance = np.zeros((9, 9))
+        rows = np.array([*range(6), *(6 + axis for axis in options.axis_order[1:])])
         covariance[rows[:, None], rows] = solutions.covariances[0]
         fitted["fisher_covariance"] = covariance
         fitted["cost"] = solutions.costs.item(0)
@@ -223,7 +217,9 @@ def fit_keypoints(problems: Problems, options: FitOptions, start: float) -> Fitt
 
 def _fit_at_noise(problems: Problems, options: FitOptions, start: float) -> FittedKeypoints:
     if options.focal == "known":
-        solutions = solve_one(problems, options)
+        solutions = solve(problems, options)
+        if solutions.errors:
+            raise solutions.errors[0]
         return keypoints_of_solution(problems, solutions, options, time.perf_counter() - start)
     # Only here: most cameras are calibrated, and its kernels take time to import.
     from cadalign.estimation.joint_keypoints import fit_jointly

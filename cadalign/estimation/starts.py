@@ -179,15 +179,6 @@ class _Rows(NamedTuple):
     weights: FloatArray
     is_ray: FloatArray
 
-    def depths(self, matrices: FloatArray, translations: FloatArray) -> FloatArray:
-        """Depths (S, N) in the cameras of points at poses (S, 3, 3), (S, 3)."""
-        in_rig = self.points @ matrices.swapaxes(1, 2) + translations[:, None]
-        return np.asarray(np.einsum("nj,snj->sn", self.turns[:, 2], in_rig) + self.shifts[:, 2])
-
-    def weights_at(self, depths: FloatArray) -> FloatArray:
-        """Weights (S, N) of the equations at depths."""
-        return np.asarray(self.weights / np.where(self.is_ray > 0, np.maximum(depths, 1e-3), 1.0))
-
 
 def _metric_starts(evidence: Evidence, own: Sequence[_Start]) -> list[_Start]:
     """Likeliest poses (1, 12) and log scales, linear at rotations of ``own`` or of a grid."""
@@ -210,8 +201,9 @@ def _metric_starts(evidence: Evidence, own: Sequence[_Start]) -> list[_Start]:
         costs = ((scaled @ solved - target) ** 2).sum(axis=(1, 2))
         found = solved[:, :, 0] / sizes[:, 0]
         scales = found[:, 3:] @ basis.T
-        depths = rows.depths(rotations * scales[:, None], found[:, :3])
-        weights = rows.weights_at(depths)
+        placed = rows.points @ (rotations * scales[:, None]).swapaxes(1, 2) + found[:, None, :3]
+        depths = np.einsum("nj,snj->sn", rows.turns[:, 2], placed) + rows.shifts[:, 2]
+        weights = rows.weights / np.where(rows.is_ray > 0, np.maximum(depths, 1e-3), 1.0)
     valid = (scales > _LEAST_SCALE).all(axis=1) & (depths > 0).all(axis=1) & np.isfinite(costs)
     costs = np.where(valid, costs + _costs_of_up(evidence, rotations), np.inf)
     poses = np.concatenate([rotations.reshape(-1, 9), found[:, :3]], axis=1)

@@ -12,7 +12,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import borrowing, inlined, kernel
-from cadalign.solvers.constants import LINEAR, UNKNOWNS, UNOBSERVABLE, ScalePrior
+from cadalign.solvers.constants import UNKNOWNS, UNOBSERVABLE, ScalePrior
 from cadalign.solvers.evidence import (
     BLOCK,
     KeypointEvidence,
@@ -63,13 +63,6 @@ def room_for(unknowns: int) -> Equations:
     )
 
 
-def keypoint_objective(points: FloatArray, rays: FloatArray, whitening: FloatArray) -> Objective:
-    """The plain objective: keypoints with squared errors, all unknowns free, no prior."""
-    points = np.require(points, np.float64, ["C", "W"])
-    keypoints = KeypointEvidence(points, rays, whitening, LINEAR, 1.0)
-    return Objective(np.ones(UNKNOWNS), keypoints, ScalePrior(0.0, 0.0))
-
-
 @room_of.of(Objective)
 @kernel
 def _room_of(objective: Objective) -> tuple[Equations, Equations]:
@@ -100,7 +93,6 @@ def evaluate_alignment(objective: Objective, pose: FloatArray, equations: Equati
 @cost_at.of(Objective)
 @borrowing
 def evaluate_cost(objective: Objective, pose: FloatArray) -> float:
-    """The cost of a pose, without derivatives."""
     prior = objective.scale_prior
     y, z = beyond(np.log(pose[13]), prior.width), beyond(np.log(pose[14]), prior.width)
     return keypoint_cost(objective.keypoints, pose) + float(prior.weight * (y * y + z * z))
@@ -162,13 +154,11 @@ def _are_same(objective: Objective, first: FloatArray, second: FloatArray) -> bo
 
 @kernel
 def with_keypoints(objective: Objective, keypoints: KeypointEvidence) -> Objective:
-    """The same objective for other keypoints."""
     return Objective(objective.free, keypoints, objective.scale_prior)
 
 
 @kernel
 def with_points(objective: Objective, points: FloatArray) -> Objective:
-    """The same objective for other model points."""
     old = objective.keypoints
     return with_keypoints(
         objective, KeypointEvidence(points, old.rays, old.whitening, old.loss, old.loss_scale)

@@ -50,11 +50,10 @@ class LogPriors(NamedTuple):
 def weigh_draws(
     centred: Centred, keypoints: WhitenedPixels, priors: LogPriors, steps: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Evaluate the alignments at coordinates (k, 10).
+    """Deviations (k, 10), costs (k,) and log densities (k,) at coordinates (k, 10).
 
-    Returns deviations (k, 10) of the unknowns of a result's covariance; the costs (k,), squared
-    lengths of residuals and of deviations from priors, infinite behind the camera; the logarithms
-    of the posterior's density (k,), of which rotations have the uniform measure.
+    Deviations are of the unknowns of a result's covariance; costs are infinite behind the camera;
+    densities are over uniform rotations.
     """
     count = len(steps)
     deviations, costs, logs = steps.copy(), np.empty(count), np.empty(count)
@@ -83,7 +82,6 @@ def weigh_draws(
 
 @kernel
 def _move(pose: FloatArray, step: FloatArray, rigid: FloatArray, moved: FloatArray) -> None:
-    """Write the alignment that a step of the coordinates leads to."""
     move_rigid(pose, rigid, moved)
     depth = pose[11] * np.exp(step[5])
     for i in range(2):

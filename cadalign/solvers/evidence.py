@@ -163,7 +163,6 @@ def take_keypoints(keypoints: KeypointEvidence, chosen: IntArray) -> KeypointEvi
 
 @inlined
 def beyond(value: float, width: float) -> float:
-    """The part of a value that lies beyond +-width."""
     return value - min(max(value, -width), width)
 
 

@@ -16,19 +16,16 @@ LEAST_INFORMATION = 1e-15
 
 @inlined
 def plus(a: Triple, b: Triple) -> Triple:
-    """The sum of two vectors."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 @inlined
 def minus(a: Triple, b: Triple) -> Triple:
-    """The difference of two vectors."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @inlined
 def scaled(a: Triple, factor: float) -> Triple:
-    """A multiple of a vector."""
     return a[0] * factor, a[1] * factor, a[2] * factor
 
 
@@ -40,13 +37,11 @@ def unit(a: Triple) -> Triple:
 
 @inlined
 def cross(a: Triple, b: Triple) -> Triple:
-    """The vector product."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @inlined
 def dot(a: Triple, b: Triple) -> float:
-    """The scalar product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
@@ -215,7 +210,6 @@ def damp(blocks: FloatArray, border: FloatArray, damping: float) -> None:
 
 @kernel
 def multiply_3(first: FloatArray, second: FloatArray) -> FloatArray:
-    """The product of two 3 x 3 matrices."""
     product = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -291,11 +285,11 @@ def rotation_from_quaternion(w: float, x: float, y: float, z: float, rotation: F
 def nearest_rotation(
     matrix: FloatArray, rotation: FloatArray, work: FloatArray, vectors: FloatArray
 ) -> None:
-    """Write the rotation R that maximises trace(R' matrix) into ``rotation``.
+    """Write the rotation R of determinant +1 that maximises trace(R' matrix) into ``rotation``.
 
     Horn, "Closed-form solution of absolute orientation using unit quaternions", 1987: the
-    quaternion is the dominant eigenvector of a symmetric 4 x 4 matrix. The determinant is always
-    +1. ``work`` and ``vectors`` are (4, 4) scratch space.
+    quaternion is the dominant eigenvector of a symmetric 4 x 4 matrix. ``work``, ``vectors`` (4, 4)
+    are scratch.
     """
     m = matrix
     work[0, 0] = m[0, 0] + m[1, 1] + m[2, 2]

@@ -90,7 +90,6 @@ def aepnp_error(points_3d: FloatArray) -> DegenerateError:
 
 
 def out_of_range_error() -> DegenerateError:
-    """The error for a solution whose numbers overflow."""
     return DegenerateError(
         "the alignment is beyond the range of floating-point numbers",
         where="points_3d",

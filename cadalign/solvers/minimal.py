@@ -123,7 +123,6 @@ def solve_subset(
 
 @inlined
 def _write_point(points: FloatArray, i: int, ray: Triple, memory: FloatArray, row: int) -> None:
-    """Write a point and its unit ray into the sample."""
     direction = unit(ray)
     for c in range(3):
         memory[_SAMPLE + row, c] = points[i, c]
@@ -132,7 +131,6 @@ def _write_point(points: FloatArray, i: int, ray: Triple, memory: FloatArray, ro
 
 @inlined
 def _solve_four(memory: FloatArray, solutions: FloatArray) -> int:
-    """Solve for the sample in the memory."""
     if not _column_weights(memory):
         return 0
     _split_columns(memory)
@@ -166,18 +164,16 @@ def _column_weights(memory: FloatArray) -> bool:
 
 @inlined
 def _difference(memory: FloatArray, i: int) -> Triple:
-    """From the sample's first point to another one."""
     return minus(_triple(memory, _SAMPLE + i), _triple(memory, _SAMPLE))
 
 
 @inlined
 def _split_columns(memory: FloatArray) -> None:
-    """Write the columns' derivatives by the unknowns: column j is the sum of
-    e_k times row 4 j + k from `_PARTS`.
+    """Write the columns' derivatives by the unknowns; column j sums e_k times row 4 j + k.
 
-    The unknowns are not the depths d but e = H d / 2 with the Hadamard matrix H: e_0 is the common
-    depth, the others are differences. Depths of an object are alike, so polynomials in their ratios
-    cancel badly near 1; in e they are evaluated near 0. Positive depths mean |e_k| < e_0.
+    The unknowns are not the depths d but e = H d / 2 with the Hadamard matrix H: depths of an
+    object are alike, so polynomials in their ratios cancel badly near 1; in e they are evaluated
+    near 0. Positive depths mean |e_k| < e_0.
     """
     for j in range(3):
         for c in range(3):
@@ -273,13 +269,11 @@ def p3p_memory() -> FloatArray:
 def p3p_kernel(
     points: FloatArray, rays: FloatArray, chosen: IntArray, memory: FloatArray, poses: FloatArray
 ) -> int:
-    """Pack the poses from the points with the 3 numbers ``chosen`` into ``poses`` (8, 15).
+    """Pack the poses from 3 ``chosen`` points into ``poses`` (8, 15); returns their number.
 
-    ``points`` (n, 3) are seen at normalised image coordinates ``rays`` (n, 2). The depths are d,
-    (1 + e p) d and (1 + e q) d, where e is the chord between two of the rays, so that p and q are
-    of one size near and far. The triangle's sides give two conics in p and q, whose difference is
-    linear in p: q is the root of a quartic, as the ratio of depths is in Grunert's of 1841. Returns
-    the number of poses.
+    The depths are d, (1 + e p) d and (1 + e q) d, with the chord e between two of the rays: p and q
+    are of one size near and far. The triangle's sides give two conics in p and q, whose difference
+    is linear in p: q is the root of a quartic, as in Grunert's of 1841.
     """
     first, second, third = chosen[0], chosen[1], chosen[2]
     a, b, c = _triple(points, first), _triple(points, second), _triple(points, third)
@@ -333,7 +327,6 @@ def _unit_ray(rays: FloatArray, i: int) -> Triple:
 
 @inlined
 def _apart(first: Triple, second: Triple) -> float:
-    """The square of the distance of two points."""
     difference = minus(first, second)
     return dot(difference, difference)
 

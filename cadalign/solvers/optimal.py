@@ -63,14 +63,12 @@ def optimal_batch(
     min_points: int,
     rigid: bool | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray, IntArray]:
-    """Find the optimum of every problem; a single fit is a batch of one.
+    """Find the optimum of every problem, of the rows ``offsets[b]`` to ``offsets[b + 1]``.
 
-    Problem b has the rows ``offsets[b]`` to ``offsets[b + 1]``. ``loss_scale`` and ``prior_weight``
-    (B,), the weight of a `ScalePrior` of ``prior_width``, are in units of the whitening's sigma;
-    ``rigid`` is the `rigid_flag`.
-    Returns the minima's poses (B, MAX_MINIMA, 15) and costs (B, MAX_MINIMA), the covariance of the
-    best (B, 8, 8), statuses (B,), and (B, 4) the number of minima, iterations, hypotheses, and the
-    number of an undetermined unknown or -1.
+    ``loss_scale`` and ``prior_weight`` (B,) of a `ScalePrior` are in units of the whitening's
+    sigma. Returns the minima's poses (B, MAX_MINIMA, 15) and costs (B, MAX_MINIMA), the covariance
+    of the best (B, 8, 8), statuses (B,), and (B, 4) the number of minima, iterations, hypotheses,
+    and the number of an undetermined unknown or -1.
     """
     count = offsets.shape[0] - 1
     poses = np.zeros((count, MAX_MINIMA, POSE_SIZE))

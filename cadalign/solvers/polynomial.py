@@ -17,18 +17,17 @@ ROOTS_ROWS = _HALVINGS + 3
 
 @inlined
 def real_roots(memory: FloatArray, first: int, degree: int, reach: float, touching: float) -> int:
-    """Find the real roots of a polynomial in (-reach, reach), and where it nearly touches zero.
+    """Real roots of a polynomial in (-reach, reach), and where it nearly touches zero.
 
-    Descartes' rule of signs on Bernstein coefficients: these do not change sign where there is no
-    root, and do once where there is one; intervals with more changes are halved (Lane, Riesenfeld,
-    "Bounds on a polynomial", 1981). Small roots are found as well as large ones. An extremum counts
-    as a root where its value is below the share ``touching`` of the sum of the terms' magnitudes: a
-    double root that rounding or noise has lifted off zero.
+    Descartes' rule of signs on Bernstein coefficients: intervals whose signs change more than once
+    are halved (Lane, Riesenfeld, "Bounds on a polynomial", 1981). An extremum counts as a root
+    where its value is below the share ``touching`` of the sum of the terms' magnitudes: a double
+    root that rounding or noise has lifted off zero.
 
-    Row ``first`` of ``memory`` holds the coefficients from the constant upwards, with a degree of
-    at least 2; the next row receives the roots (at most 2 * degree, which it must have room for),
-    and the rest of `ROOTS_ROWS` rows is scratch space: to pass a single array spares the counting
-    of references, which takes as long as the search. Returns the number of roots.
+    Row ``first`` of ``memory`` holds the coefficients from the constant upwards, of degree 2 or
+    more; the next receives the roots, the rest of `ROOTS_ROWS` rows is scratch space: to pass a
+    single array spares the counting of references, which takes as long as the search. Returns the
+    number of roots.
     """
     found = 0
     for end in (-reach, reach):

@@ -44,9 +44,8 @@ INTERSECTION_ROWS = _POLYNOMIAL + ROOTS_ROWS
 def intersect_quadrics(memory: FloatArray) -> int:
     """Find the points e at which three quadrics meet and the depths H e / 2 are positive.
 
-    H is the Hadamard matrix (see `hadamard`): the common depth e_0 is 1, the others are differences
-    between -1 and 1. ``memory`` (`INTERSECTION_ROWS`, 16) holds the quadrics in the rows from
-    `QUADRICS`, and receives the points in those from `POINTS`. Returns their number.
+    For H see `hadamard`; e_0 is 1. ``memory`` (`INTERSECTION_ROWS`, 16) holds the quadrics in rows
+    from `QUADRICS`, and receives the points in those from `POINTS`. Returns their number.
     """
     # Eliminate the pair of differences for which the quadrics tell y^2, yz, z^2 best.
     x, y, z, best = 1, 2, 3, -1.0
@@ -100,7 +99,6 @@ def _are_one_root(memory: FloatArray, row: int, other: int) -> bool:
 
 @inlined
 def _entry(i: int, j: int) -> int:
-    """Position of the coefficient of e_i e_j in a row of quadrics."""
     low, high = min(i, j), max(i, j)
     return low * 4 - low * (low - 1) // 2 + high - low
 

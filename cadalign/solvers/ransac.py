@@ -63,12 +63,10 @@ def ransac_kernel(
     pose: FloatArray,
     inliers: BoolArray,
 ) -> tuple[float, int, int]:
-    """Find the pose with the lowest truncated score.
+    """Find the pose with the lowest truncated score [px^2]; returns it, iterations and hypotheses.
 
-    The objective has the points in random order, in which scores look at them. ``confidence``
-    (n,) is the cumulative share by which every other sample is drawn, or empty. Returns the score,
-    a sum of squared errors, each at most the threshold's square [px^2], and the numbers of
-    iterations and hypotheses.
+    The objective has the points in random order. ``confidence`` (n,) is the cumulative share by
+    which every other sample is drawn, or empty.
     """
     keypoints = objective.keypoints
     n = keypoints.points.shape[0]
@@ -137,7 +135,6 @@ def _solve_sample(
     memory: FloatArray,
     candidates: FloatArray,
 ) -> int:
-    """Solve a minimal set; returns the number of hypotheses."""
     if minimal == AP4P:
         return solve_subset(keypoints.points, keypoints.rays, chosen, memory, candidates)
     some = take_keypoints(keypoints, chosen)
@@ -163,7 +160,6 @@ def score_pose(
 
 @kernel
 def _optimize_locally(objective: Objective, threshold: float, pose: FloatArray) -> None:
-    """Refine a pose on its inliers, first the wider ones."""
     for r in range(_LOCAL_ROUNDS):
         factor = _WIDE + (1.0 - _WIDE) * r / (_LOCAL_ROUNDS - 1)
         some = _inliers_of(objective, factor * threshold, pose, _LOCAL_POINTS)

@@ -127,11 +127,10 @@ class Effort(NamedTuple):
 
 
 class Minima(NamedTuple):
-    """Distinct minima, the best score first, and how many there are.
+    """Distinct minima, the best score first: ``states`` (M, D), ``costs`` (M,), ``scores`` (M,).
 
-    ``states`` (M, D), ``costs`` (M,), ``scores`` (M,), see `score_of`, and
-    the ``label`` (M,) of the system that each is of. ``counts`` (2,) are the number of minima, and
-    of iterations that were spent.
+    The ``label`` (M,) is that of each one's system; ``counts`` (2,) are numbers of minima and
+    iterations.
     """
 
     states: FloatArray
@@ -212,10 +211,9 @@ def descend(
 ) -> None:
     """Add the minima of the ``whole`` objective that ``likely`` states of a ``plain`` one lead to.
 
-    The whole one has the shape integrated out. The most promising state of this label is refined
-    first, none whose score exceeds the best one by ``unlikely``. Minima of the plain one are no
-    starts: some lie so near the camera that the descent ends in another minimum. The ``costs`` are
-    plain ones.
+    The whole one has the shape integrated out. The most promising state comes first, none whose
+    score exceeds the best by ``unlikely``. Minima of the plain one are no starts: some lie so near
+    the camera that the descent ends in another minimum. ``costs`` are plain ones.
     """
     count = likely.counts[0]
     scores = np.full(count, np.inf)

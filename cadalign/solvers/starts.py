@@ -108,9 +108,8 @@ def relief(points: FloatArray, rays: FloatArray, whitening: FloatArray) -> float
 def rotation_starts(points: FloatArray, rays: FloatArray, poses: FloatArray) -> int:
     """Fill ``poses`` (k, 15) with poses of the unstretched model at k evenly spread rotations.
 
-    The rotations are a super-Fibonacci spiral (Alexa, "Super-Fibonacci spirals: fast, low-
-    discrepancy sampling of SO(3)", 2022). Given a rotation, the equations are linear in the
-    translation. These starts need no volume, so they serve coplanar points.
+    A super-Fibonacci spiral (Alexa, "Super-Fibonacci spirals: fast, low-discrepancy sampling of
+    SO(3)", 2022). The translation is linear then, and coplanar points do, too.
     """
     wanted = poses.shape[0]
     rotation = np.empty((3, 3))
@@ -170,7 +169,6 @@ def widen_by_shape(
 
 @kernel
 def _square_spread(rows: FloatArray) -> float:
-    """Sum of the variances of the columns of a matrix."""
     total = 0.0
     for a in range(rows.shape[1]):
         mean = 0.0

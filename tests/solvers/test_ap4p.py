@@ -74,7 +74,9 @@ def test_truth_is_among_the_solutions() -> None:
 @pytest.mark.long
 def test_solver_is_as_complete_as_an_exhaustive_search() -> None:
     """No exact alignment that a local search from many starts finds is left out."""
-    from cadalign.solvers.alignment import keypoint_objective
+    from cadalign.solvers.alignment import Objective
+    from cadalign.solvers.constants import LINEAR, UNKNOWNS, ScalePrior
+    from cadalign.solvers.evidence import KeypointEvidence
     from cadalign.solvers.search import refine
 
     rng = np.random.default_rng(0)
@@ -83,7 +85,9 @@ def test_solver_is_as_complete_as_an_exhaustive_search() -> None:
         problem = problem_of(seed, points=4, noise_px=0.0)
         rays = problem.camera.normalize(problem.points_2d)
         whitening = np.array([[150.0, 0.0, 150.0]])
-        objective = keypoint_objective(problem.points_3d, rays, whitening)
+        points = np.require(problem.points_3d, np.float64, ["C", "W"])
+        keypoints = KeypointEvidence(points, rays, whitening, LINEAR, 1.0)
+        objective = Objective(np.ones(UNKNOWNS), keypoints, ScalePrior(0.0, 0.0))
         solutions = solve(problem)
         for rotation in Rotation.random(60, random_state=seed).as_matrix():
             scale = [1.0, *np.exp(rng.uniform(-1, 1, 2))]

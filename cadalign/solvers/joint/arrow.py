@@ -28,7 +28,6 @@ class Arrow(NamedTuple):
 
 @kernel
 def empty_arrow(poses: int, border: int) -> Arrow:
-    """Room for poses and a border."""
     return Arrow(
         np.zeros((poses, 6, 6)),
         np.zeros((poses, 6, border)),
@@ -39,13 +38,11 @@ def empty_arrow(poses: int, border: int) -> Arrow:
 
 @inlined
 def border_start(arrow: Arrow) -> int:
-    """Place of the border in the gradient."""
     return int(arrow.gradient.shape[0] - arrow.border.shape[0])
 
 
 @kernel
 def clear(arrow: Arrow) -> None:
-    """Set all entries to zero."""
     for part in (arrow.blocks.ravel(), arrow.coupling.ravel(), arrow.border.ravel()):
         part[:] = 0.0
     arrow.gradient[:] = 0.0
@@ -110,9 +107,8 @@ def hold(arrow: Arrow, k: int) -> None:
 def decide_on_undetermined(arrow: Arrow, is_shared: bool) -> None:
     """Make a singular matrix definite where several views share a shape, and else indefinite.
 
-    What the evidence leaves open gets a deviation, a million times its own scale, beside other
-    views, and is refused for one alone. Otherwise the rounding of the entries would tell whether
-    the matrix has a Cholesky factor.
+    What is open gets a deviation a million times its scale beside other views, and is refused for
+    one alone: rounding would tell whether the matrix has a Cholesky factor.
     """
     share = 1.0 + (_LEAST_SHARE if is_shared else -_LEAST_SHARE)
     for p in range(arrow.blocks.shape[0]):

@@ -19,10 +19,9 @@ from cadalign.solvers.joint.search import equations_at, reduce_modes, sighted_po
 class JointCovariance(NamedTuple):
     """Covariances of the unknowns, and of every point in two frames.
 
-    Blocks of every pose (P, 6, 6), of poses with the border (P, 6, b) and of the ``border`` (b, b):
-    log focal lengths, log scales, coefficients. ``points`` (m, 3, 3) in the model's frame are those
-    of the shape, scales and displacements included; ``seen`` (m, 3, 3) in the first view's camera
-    include the pose.
+    Poses (P, 6, 6), poses with the border (P, 6, b), ``border`` (b, b): log focal lengths, log
+    scales, coefficients. ``points`` (m, 3, 3) of the whole shape are in the model's frame, ``seen``
+    (m, 3, 3) in the first view's camera, with its pose.
     """
 
     poses: FloatArray

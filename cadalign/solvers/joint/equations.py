@@ -53,10 +53,10 @@ class Layout(NamedTuple):
 class JointEquations(NamedTuple):
     """Normal equations, and scratch space.
 
-    ``gradient`` is that of the ``arrow``; ``factor`` is for the damped one. ``rows`` and ``seen``
-    are those of `write_rows`. ``log_determinant`` (1,) is that of the covariances by which
-    eliminated displacements widened the equations; ``slopes`` (m, 3) are half the derivatives of
-    the whole log determinant by the points before the stretch.
+    ``gradient`` is that of the ``arrow``, ``factor`` of the damped one; for ``rows`` and ``seen``
+    see `write_rows`. ``log_determinant`` (1,) is that of the covariances by which eliminated
+    displacements widened equations; ``slopes`` (m, 3) are half the derivatives of the whole one by
+    unstretched points.
     """
 
     arrow: Arrow

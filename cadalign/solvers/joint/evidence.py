@@ -35,14 +35,12 @@ class Shape(NamedTuple):
 
 
 class Sightings(NamedTuple):
-    """Measurements of points in images, N of them.
+    """Measurements of points in images, N of them, numbered by ``point`` and ``image`` (N,).
 
-    ``point`` and ``image`` (N,) number point and view; ``rays`` (N, 2) are normalised, with
-    ``whitening`` (N, 3) as in `cadalign.solvers.evidence.KeypointEvidence`; ``depths`` (N, 3) holds
-    depths, their inverse standard deviations, 0 where there is none, and the scale of Cauchy's loss
-    on them, 0 for that of the ray. ``loss`` (N,) and ``loss_scale`` (N,) say how the length of each
-    residual counts. ``slopes`` (N, 2) are changes of undistorted pixels, over the focal length, by
-    its logarithm.
+    ``rays`` (N, 2) are normalised, with ``whitening`` (N, 3) as in `KeypointEvidence`; ``depths``
+    (N, 3) are depths, inverse deviations, 0 where there is none, and scales of Cauchy's loss, 0 for
+    that of the ray. ``loss``, ``loss_scale`` (N,) are those of each residual's length. ``slopes``
+    (N, 2) are changes of undistorted pixels, over the focal length, by its logarithm.
     """
 
     point: IntArray
@@ -73,11 +71,10 @@ class Rig(NamedTuple):
 
 
 class Focals(NamedTuple):
-    """Focal lengths to estimate, F of them, relative to those of the rays.
+    """F focal lengths to estimate, relative to the rays'; ``group`` (V,) is each view's, or -1.
 
-    ``group`` (V,) numbers the one of each view, -1 where it is known. The logarithms are bounded by
-    ``low`` and ``high`` (F,) and have a Gaussian prior of mean ``center`` (F,) and inverse variance
-    ``weight`` (F,), 0 for none.
+    Logarithms lie between ``low`` and ``high`` (F,), with a Gaussian prior of mean ``center`` (F,)
+    and inverse variance ``weight`` (F,), 0 for none.
     """
 
     group: IntArray
@@ -99,9 +96,8 @@ class Directions(NamedTuple):
 class Offsets(NamedTuple):
     """Distances ``value`` (L,) along a ``direction`` (L, 3) of the model between two of its points.
 
-    ``ends`` (L, 2) numbers the points from and to which they are measured, -1 for the place of the
-    camera ``image`` (L,), which is -1 where neither end is a camera. ``weight`` (L,) is the inverse
-    standard deviation.
+    ``ends`` (L, 2) numbers these, -1 for the place of the camera ``image`` (L,), -1 where there is
+    none. ``weight`` (L,) is the inverse standard deviation.
     """
 
     ends: IntArray
@@ -139,12 +135,10 @@ class Evidence(NamedTuple):
 
     @property
     def directions(self) -> Directions:
-        """Known directions."""
         return cast(Directions, self.blocks[0])
 
     @property
     def offsets(self) -> Offsets:
-        """Known distances."""
         return cast(Offsets, self.blocks[1])
 
     def with_block(self, block: Any) -> Evidence:
@@ -181,7 +175,6 @@ def unpacked(shape: Shape, focals: int, row: FloatArray) -> State:
 
 @kernel
 def undisplaced(state: State) -> State:
-    """A state with own coefficients and no displacements."""
     still = np.zeros_like(state.displacements)
     return State(state.poses, state.log_focals, state.log_scales, state.coefficients.copy(), still)
 
@@ -198,7 +191,6 @@ def stacked(tables: Sequence[Table]) -> Table:
 
 
 def packed(state: State) -> FloatArray:
-    """The state as a row of numbers."""
     return np.concatenate([np.ravel(part) for part in state])
 
 
@@ -244,7 +236,6 @@ def depths_along_axes(
 
 @inlined
 def exp_of(logs: FloatArray) -> Triple:
-    """The scales of their logarithms (3,)."""
     return np.exp(logs[0]), np.exp(logs[1]), np.exp(logs[2])
 
 

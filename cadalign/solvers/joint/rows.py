@@ -170,10 +170,9 @@ def write_rows(
     """Write whitened, loss-weighted derivatives and residuals of sightings; returns the cost.
 
     The ``chosen`` sightings are of one pose. Rows of ``rows`` (6 + b + 4, C) are the unknowns of
-    that pose and of the border, the residual, and the displacement of the point; columns are those
-    of the sightings, one after the other. ``seen`` (8, N) receives, from column
-    ``first_seen`` on, the vector by which the residual changes with the point in the rig's frame,
-    the camera's z there over the depth (none for equations in depth), the residual times
+    that pose and of the border, the residual, and the point's displacement; columns are sightings.
+    ``seen`` (8, N) receives, from column ``first_seen`` on, the residual's slope by the point in
+    the rig's frame, the camera's z there over the depth (none for depths), the residual times
     `fall_of_weight`, and the derivative by the log focal length.
     """
     shape, sightings, rig = evidence.shape, evidence.sightings, evidence.rig

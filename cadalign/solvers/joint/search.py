@@ -53,7 +53,6 @@ def search_joint(
 def _mean_rows(
     evidence: Evidence, poses: FloatArray, log_focals: FloatArray, log_scales: FloatArray
 ) -> FloatArray:
-    """States (S, D) of the mean shape."""
     count = len(poses)
     unmoved = np.zeros((count, len(evidence.shape.modes) + evidence.shape.mean.size))
     rows = poses.reshape(count, 12 * poses.shape[1])
@@ -76,7 +75,6 @@ def _excess(evidence: Evidence, start: FloatArray) -> float:
 
 
 def _has_latent(evidence: Evidence) -> bool:
-    """True if the evidence rests on a shape that may vary."""
     sighted = evidence.shape.spread[evidence.sightings.point]
     return bool(len(evidence.shape.modes) or sighted.any())
 
@@ -168,12 +166,11 @@ def view_starts(evidence: Evidence, view: int) -> tuple[FloatArray, FloatArray]:
 class Reduction(NamedTuple):
     """Evidence with fewer modes, those that it tells apart, and their basis in its own.
 
-    Modes move the s points that the evidence names in at most 3 s directions. In an orthonormal
-    ``basis`` (K + 3 u, r) of these, coefficients ``c = basis @ reduced`` plus a rest that moves no
-    such point: the rest keeps its standard normal prior, and the reduced coefficients have one,
-    too. Estimates, costs and determinants are those of all modes. With several poses, the
-    displacements of sighted points are modes as well, before the basis is chosen: rows K + 3 j + a
-    belong to that along axis a of point ``displaced[j]`` (u,). The ``whole`` shape is that of all.
+    Modes move the s points that the evidence names in at most 3 s directions: in an orthonormal
+    ``basis`` (K + 3 u, r), ``c = basis @ reduced`` plus a rest that moves none of them and keeps
+    its standard normal prior, as the reduced ones have. With several poses, displacements of
+    sighted points are modes, too: rows K + 3 j + a are axis a of ``displaced[j]`` (u,). ``whole``
+    is all the shape.
     """
 
     evidence: Evidence
@@ -182,7 +179,6 @@ class Reduction(NamedTuple):
     whole: Shape
 
     def reduced(self, state: State) -> State:
-        """A state in reduced coefficients."""
         moved = state.displacements[self.displaced] / self.whole.spread[self.displaced, None]
         displacements = state.displacements.copy()
         displacements[self.displaced] = 0.0

@@ -78,13 +78,11 @@ class Joint(NamedTuple):
 
 
 def joint_system(evidence: Evidence, *, integrates: bool) -> Joint:
-    """The system of all evidence."""
     return Joint(evidence, layout_of(evidence), integrates)
 
 
 @kernel
 def plain_system(system: Joint) -> Joint:
-    """The same with the shape estimated, not integrated out."""
     return Joint(system.evidence, system.layout, False)
 
 
@@ -150,7 +148,6 @@ def _cost_at(system: Joint, row: FloatArray) -> float:
 @solve.of(Joint)
 @kernel
 def _solve(system: Any, equations: JointEquations, damping: float, step: FloatArray) -> float:
-    """Write the damped step; see `cadalign.solvers.search.solve`."""
     factor, arrow = equations.factor, equations.arrow
     copy_into(factor.blocks.ravel(), arrow.blocks.ravel())
     copy_into(factor.coupling.ravel(), arrow.coupling.ravel())
@@ -172,7 +169,6 @@ def _move(
     step: FloatArray,
     moved_row: FloatArray,
 ) -> None:
-    """Write the state that a step leads to; see `cadalign.solvers.search.move`."""
     evidence = system.evidence
     shape, focals = evidence.shape, evidence.focals.low.shape[0]
     state, moved = unpacked(shape, focals, row), unpacked(shape, focals, moved_row)
@@ -281,10 +277,8 @@ def _are_same(system: Joint, first_row: FloatArray, second_row: FloatArray) -> b
 def run_joint(system: Joint, starts: FloatArray, effort: Effort) -> tuple[Minima, JointEquations]:
     """Search from starts (S, D); with ``effort.starts`` 0, write their costs and last equations.
 
-    A single kernel does both, since each would compile the equations anew. With
-    ``effort.iterations`` 0 the objective itself is probed; otherwise, where the shape is integrated
-    out, few steps tell the promising starts first. The ``costs`` of minima never have it integrated
-    out.
+    A single kernel does both, since each would compile the equations anew. Where the shape is
+    integrated out, few steps tell promising starts first; ``costs`` of minima never have it so.
     """
     plain, integrates, size = plain_system(system), system.integrates, starts.shape[1]
     equations = joint_room(system.evidence, system.layout)

@@ -350,7 +350,6 @@ def _score_of(system: Posed, state: FloatArray, cost: float) -> float:
 
 @kernel
 def _mean_depth(mean: FloatArray, state: FloatArray) -> float:
-    """Mean depth of the displaced points."""
     total = 0.0
     for i in range(mean.shape[0]):
         total += state[11]

@@ -54,7 +54,6 @@ def mixture_at(mixture: Mixture, seen: Seen) -> Mixture:
 
 @kernel
 def target_of(mixture: Mixture, component: int) -> GaussianTarget:
-    """A component of a mixture at the keypoints."""
     return GaussianTarget(mixture.means[component], mixture.covariances[component])
 
 

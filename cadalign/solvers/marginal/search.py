@@ -36,11 +36,10 @@ _FLATNESS = 0.01  # displacement that no image shows, relative to the extent
 
 
 def search_view(mixture: Mixture, seen: Seen, given: FloatArray) -> tuple[Minima, int]:
-    """Search from all starts, ``given`` poses (k, 12) among them.
+    """Minima of F from all starts, ``given`` poses (k, 12) among them, and their number.
 
-    Returns the minima of F, whose ``label`` is the component and whose ``costs`` are without log
-    det M, and the number of starts. The components share their starts: what the mean of one
-    suggests may be the best of another.
+    Their ``label`` is the component, ``costs`` are without log det M. Components share starts: what
+    the mean of one suggests may be the best of another.
     """
     own = mixture_at(mixture, seen)
     variances = own.covariances.diagonal(axis1=1, axis2=2).reshape(own.means.shape).mean(axis=2)

@@ -24,8 +24,13 @@ from cadalign.estimation.contours.outline import (
 )
 from cadalign.estimation.contours.photo import PhotoSource
 from cadalign.estimation.contours.photo_lines import photo_of
-from cadalign.estimation.contours.problem import OutlineProblem, with_displacement_modes
-from cadalign.estimation.contours.rounds import OutlineFit, first_fit, last_fit
+from cadalign.estimation.contours.rounds import (
+    OutlineFit,
+    OutlineProblem,
+    first_fit,
+    last_fit,
+    with_displacement_modes,
+)
 from cadalign.estimation.contours.surface import Surface, surface_of
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.prior import ShapePrior

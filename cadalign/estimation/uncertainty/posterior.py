@@ -30,12 +30,7 @@ from cadalign.estimation.uncertainty.residuals import (
     loss_slopes,
     whitening_matrices,
 )
-from cadalign.geometry.camera import (
-    faced,
-    needs_facing,
-    turned_alignment,
-    turned_covariance,
-)
+from cadalign.geometry.camera import faced, needs_facing, turned_alignment, turned_covariance
 from cadalign.geometry.rotations import by_rotation
 from cadalign.solvers.draws import Centred, LogPriors, WhitenedPixels, weigh_draws
 

@@ -18,4 +18,4 @@ def refine(problem: Problem, minima: Sequence[Minimum]) -> tuple[Sequence[Minimu
         return minima, NO_NOTES
     from cadalign.estimation.contours.engine import refine_with_outlines
 
-    return refine_with_outlines(problem.model, problem.prior, problem.views, minima)
+    return refine_with_outlines(problem, minima)

@@ -32,8 +32,8 @@ from cadalign.estimation.contours.rounds import (
     with_displacement_modes,
 )
 from cadalign.estimation.contours.surface import Surface, surface_of
-from cadalign.estimation.model import Model, is_exact_model
-from cadalign.estimation.prior import ShapePrior
+from cadalign.estimation.model import is_exact_model
+from cadalign.estimation.problem import Problem
 from cadalign.estimation.result_parts import OutlineNotes
 from cadalign.estimation.search import Minimum
 from cadalign.estimation.uncertainty.residuals import chi_square_quantile
@@ -41,7 +41,6 @@ from cadalign.estimation.view import View
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.rotations import angle_between, rotation_from_vector
 from cadalign.io.images import ByteImage
-from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.covariance import information_of, scaled_information
 from cadalign.solvers.joint.evidence import State
 from cadalign.solvers.joint.search import cost_of, reduced, score_state
@@ -101,10 +100,7 @@ class Candidate:
 
 
 def refine_with_outlines(
-    model: Model | ShapeModel,
-    prior: ShapePrior,
-    views: Sequence[View],
-    minima: Sequence[Minimum],
+    problem: Problem, minima: Sequence[Minimum]
 ) -> tuple[list[Minimum], OutlineNotes]:
     """Refine the likely minima of the other evidence, the likeliest first, with masks and photos.
 
@@ -112,8 +108,9 @@ def refine_with_outlines(
     model no mesh; DegenerateError if outlines alone determine the estimate, and there is none near
     them.
     """
-    first, keypoints = minima[0], len(prior.ids)
-    is_exact, is_open = is_exact_model(model), not _is_determined(first)
+    model, views, keypoints = problem.model, problem.views, len(problem.prior.ids)
+    first, is_exact = minima[0], is_exact_model(model)
+    is_open = not _is_determined(first)
     hulls = [] if is_exact else _hulls_of(views)
     sources = left = sources_of(hulls or views, first, is_exact=is_exact)
     points, where = first.points[:keypoints], min(source.where for source in sources)

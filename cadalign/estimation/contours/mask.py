@@ -94,14 +94,12 @@ class MaskSource(OutlineSource):
         return cls(image, view.number, camera, is_exact, *given, _off_mask(view.pixels, mask))
 
     def first(self) -> Track:
-        """See `OutlineSource`."""
         share = _WIDE_REACH if self.is_wide else _RELATIVE_REACH
         reach = max(_FIRST_REACH, share * self.contour.size)
         offset = _FIRST_OFFSET if self.is_exact else LEAST_OFFSET
         return Track(Noise(reach / 3, 1.0, offset), reach)
 
     def last(self, track: Track) -> Track:
-        """See `OutlineSource`."""
         return self._narrowed(self.first()._replace(noise=track.noise, is_fine=self.is_exact))
 
     def outline(self, sight: Sight, surface: PosedSurface, track: Track) -> Outline:
@@ -152,7 +150,6 @@ class MaskSource(OutlineSource):
         return float(noise.costs(residuals).sum()) + normalization
 
     def refusal(self, support: OutlineSupport) -> str:
-        """See `OutlineSource`."""
         if not support.share:
             return f"no part of the model's outline comes near its contour{self.hint}"
         share = f"{100 * support.share:.0f} % of its contour"

@@ -55,15 +55,12 @@ class PhotoSource(OutlineSource):
     photo: PhotoPyramid
 
     def first(self) -> Track:
-        """See `OutlineSource`."""
         return Track(_FIRST, _COARSE[0], _COARSE[1:])
 
     def last(self, track: Track) -> Track:
-        """See `OutlineSource`."""
         return Track(_FIRST, _FINE[0], _FINE[1:], is_fine=True)
 
     def outline(self, sight: Sight, surface: PosedSurface, track: Track) -> Outline | None:
-        """See `OutlineSource`."""
         cells = round(min(max(_REACH_CELLS / track.reach, _FEWEST_CELLS), _MOST_CELLS))
         silhouette = silhouette_of(surface, sight.camera, sight.pose, cells)
         if silhouette is None:
@@ -95,13 +92,11 @@ class PhotoSource(OutlineSource):
         return super().support(found)
 
     def refusal(self, support: OutlineSupport) -> str:
-        """See `OutlineSource`."""
         if not support.share:
             return "the object is not seen, or has the colours of what is around it"
         return f"it shows only {100 * support.share:.0f} % of the model's outline"
 
     def doubt(self, support: OutlineSupport) -> str | None:
-        """See `OutlineSource`."""
         if support.share < self.good_share:
             return f"{self.where} shows only {100 * support.share:.0f} % of the model's outline"
         if support.rms_sigmas > _MOST_RMS:

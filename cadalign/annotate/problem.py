@@ -44,6 +44,7 @@ _ROBUST_SHARE = 2.0  # of the median residual
 _EXPECTED_NOISE = 0.005
 _NOISE_EQUATIONS = 4
 _FIRST_NOISE = 4.0  # over the expected one
+_MOST_NOISE = 10.0  # the same; what needs more is a mistake, which the residuals then show
 _NOISE_ROUNDS = 12
 _NOISE_TOLERANCE = 0.02
 _UNKNOWNS = 8  # of a pose and a stretch
@@ -273,7 +274,7 @@ class LiveProblem:
             )
             if abs(factor / before - 1) < _NOISE_TOLERANCE:
                 break
-        return max(LEAST_SIGMA, factor)
+        return max(LEAST_SIGMA, factor if factor < _MOST_NOISE * expected else expected)
 
     def _residuals(self, result: Result) -> tuple[float, int]:
         """The sum of the squared residuals over the pairs' own sigmas, and their number."""

@@ -20,6 +20,8 @@ from cadalign.io.observation import OBSERVATION, Observation, kind_of
 from cadalign.render.drawing.model_overlay import mesh_of
 from cadalign.shapes.model import ShapeModel
 
+_FOLDER_ENDING = "_fit"
+
 
 def read_exported(
     fit: Path,
@@ -31,7 +33,8 @@ def read_exported(
 ) -> AlignedObject:
     """Read the result of `cadalign fit`, the file ``fit``, and what it was fitted to.
 
-    By default the ``observation`` and the learned ``shape`` are those that the fit's file states.
+    By default the ``observation`` and the learned ``shape`` are those that the fit's file states,
+    the observation otherwise ``photo.json`` beside the fit's folder ``photo_fit``.
     Raises DataError if a file is missing or invalid, or the observation is not the one that was
     fitted.
     """
@@ -93,10 +96,14 @@ def _stored(fit: Path, data: Mapping[str, Any], name: str) -> Path | None:
 
 
 def _observation_of(fit: Path, data: Mapping[str, Any]) -> Path:
-    """The observation that a fit's file states."""
+    """The observation that a fit's file states, or else the one beside the fit's folder."""
     stated = _stored(fit, data, "observation")
     if stated is not None:
         return stated
+    folder = fit.resolve().parent
+    beside = folder.with_name(f"{folder.name.removesuffix(_FOLDER_ENDING)}.json")
+    if folder.name.endswith(_FOLDER_ENDING) and beside.is_file():
+        return beside
     raise InputError(
         f"{fit} does not tell which observation it is the fit of",
         where="--observation",

@@ -130,7 +130,7 @@ class ObservationFit:
                 where=self.named("focal_prior"),
                 fix=f"give {self.named('focal')} estimate with it",
             )
-        prior = self._prior_for(observation, given) if focal == "estimate" else None
+        prior = self._prior_for(observation, given, note) if focal == "estimate" else None
         shown = prior_of_camera(prior, observation.camera)
         if shown is not None:
             note(f"Focal length is estimated, its prior: {shown}")
@@ -150,8 +150,10 @@ class ObservationFit:
         values = {each.name: getattr(self.fitting, each.name) for each in fields(self.fitting)}
         return {name: each for name, each in values.items() if each != getattr(FitOptions, name)}
 
-    def _prior_for(self, observation: Observation, stored: Mapping[str, Any]) -> PriorOption:
-        """The prior on an estimated focal length: the flag's, the file's, or the photo's."""
+    def _prior_for(
+        self, observation: Observation, stored: Mapping[str, Any], note: Note
+    ) -> PriorOption:
+        """The prior on an estimated focal length: the flag's, the file's, or the photos'."""
         given = self.focal_prior
         if given is not None and not isinstance(given, str):
             return FocalPrior(given, self.focal_prior_sigma)
@@ -160,7 +162,7 @@ class ObservationFit:
         if "focal_prior" in stored:
             prior = stored["focal_prior"]
             return FocalPrior(**prior) if isinstance(prior, dict) else prior
-        return _prior_of_photos(observation) or USUAL
+        return _prior_of_photos(observation, note) or USUAL
 
     def check_for(self, observation: Observation) -> None:
         """Refuse options that have no effect together with a shape or further evidence."""
@@ -314,6 +316,13 @@ def _located(how: ObservationFit, where: str) -> Iterator[None]:
             raise
 
 
-def _prior_of_photos(observation: Observation) -> FocalPrior | None:
-    """The prior of the first photo's EXIF data."""
-    return None if observation.image is None else FocalPrior.from_exif(observation.image)
+def _prior_of_photos(observation: Observation, note: Note) -> FocalPrior | None:
+    """The prior of the first photo's EXIF data, unless those of another photo differ from it."""
+    images = [view.image for view in observation.views if view.image is not None]
+    found = [prior for prior in map(FocalPrior.from_exif, images) if prior is not None]
+    for other in found[1:]:
+        if not found[0].is_like(other):
+            focals = f"{found[0].focal:.4g} and {other.focal:.4g} px"
+            note(f"The photos' EXIF data differ ({focals}): unused")
+            return None
+    return found[0] if found else None

@@ -86,7 +86,7 @@ def test_gravity_is_that_of_the_up_axis(case: Case, capsys: pytest.CaptureFixtur
     np.testing.assert_allclose(flat(command), flat(page), rtol=1e-9, atol=1e-12)
     wrong = z_up.open(up_axis="y")
     notes = page_state(wrong, 0)["alignment"]["notes"]
-    assert any("up axis (up_axis='z')" in note for note in notes)
+    assert any("give up_axis='z'" in note for note in notes)
 
 
 def up_on_screen(page: Page, axis: str) -> list[float]:

@@ -10,8 +10,6 @@ from fuzz import fits, mutations, readers
 from fuzz.failures import LONGEST_FIT, fit_outcome
 from fuzz.fit_cases import draw_case, draw_cases
 
-from cadalign.estimation import solve
-
 pytestmark = pytest.mark.long
 
 
@@ -47,15 +45,6 @@ def test_seeds_that_once_failed() -> None:
     seeds += (5020788, 5040797, 5053209, 5099758, 5117344)
     for seed in seeds:
         fits.run_case(draw_case(seed))
-
-
-def test_rounds_of_sigma_that_go_in_circles_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    estimated, calls = solve._estimate_sigmas, []
-    monkeypatch.setattr(
-        solve, "_estimate_sigmas", lambda *given: calls.append(1) or estimated(*given)
-    )
-    fits.run_case(draw_case(806635))  # of a lens that nothing explains: two optima took turns
-    assert 2 <= len(calls) < solve._SIGMA_ROUNDS
 
 
 def test_failures_name_their_seed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -181,6 +181,7 @@ def another_pose(
     return (EstimateWarning("alternative", text),)
 
 
+@np.errstate(over="ignore")  # sizes of images are any numbers
 def outside_image(
     points_2d: FloatArray, camera: Camera, *, agree: bool, view: int = 0, where: str = ""
 ) -> Warnings:
@@ -189,7 +190,8 @@ def outside_image(
     All keypoints lie beyond one side or, where they do not ``agree``, most outside. ``where``
     begins the texts.
     """
-    found, own = [], np.array([camera.width, camera.height])
+    found, own = [], np.array([camera.width, camera.height], dtype=float)
+    size = f"{camera.width} x {camera.height} px"
     point = f"{where}the camera's principal point ({camera.cx:.4g}, {camera.cy:.4g}) is"
     sizes, middle = np.outer(OTHER_SIZES, own), np.array([camera.cx, camera.cy]) + PIXEL_CENTRE
     same = np.flatnonzero(np.abs(2 * middle / sizes - 1).max(axis=1) < _SAME_MIDDLE).tolist()
@@ -197,13 +199,13 @@ def outside_image(
         width, height = sizes[same[0]]
         text = (
             f"{point} the middle of an image of {width:.0f} x {height:.0f} px, its own has "
-            f"{own[0]} x {own[1]} px: if the photo was resized, give Camera.resized({own[0]}, "
-            f"{own[1]}) of its camera"
+            f"{size}: if the photo was resized, give Camera.resized({camera.width}, "
+            f"{camera.height}) of its camera"
         )
         found.append(EstimateWarning("camera", text, view))
     elif np.abs(middle / own - 0.5).max() >= _FAR_FROM_MIDDLE:
         text = (
-            f"{point} far from the middle of its image of {own[0]} x {own[1]} px, which is right "
+            f"{point} far from the middle of its image of {size}, which is right "
             "only for a photo cut out of a larger one"
         )
         found.append(EstimateWarning("camera", text, view))
@@ -213,7 +215,7 @@ def outside_image(
     if 2 * len(outside) > len(points_2d) and (beyond.any() or not agree):
         text = (
             f"{where}{len(outside)} of {len(points_2d)} keypoints lie outside of the image of "
-            f"{own[0]} x {own[1]} px: are they of another resolution than the camera, or of "
+            f"{size}: are they of another resolution than the camera, or of "
             "another photo?"
         )
         found.append(EstimateWarning("outside-image", text, view, tuple(outside)))

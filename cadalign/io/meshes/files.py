@@ -15,6 +15,7 @@ from cadalign.io.files import (
     damaged,
     keep,
     made_folder,
+    reading,
     refuse_folder,
     write_text,
     write_whole,
@@ -85,7 +86,9 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
             where=str(path),
             fix=f"known are {', '.join(_READERS)}",
         )
-    if path.is_file() and not path.stat().st_size:
+    with reading(path):
+        is_empty = path.is_file() and not path.stat().st_size
+    if is_empty:
         raise DataError("the mesh file is empty", where=str(path), fix="get it again")
     keep(path)
     try:

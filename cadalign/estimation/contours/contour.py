@@ -63,7 +63,6 @@ class Contour(NamedTuple):
         return float(np.sqrt(np.prod(np.ptp(self.points, axis=0))))
 
     def at(self, places: FloatArray) -> FloatArray:
-        """Pixels (..., S, 2) at ``places`` (..., S) on the samples' normals."""
         return np.asarray(self.points + places[..., None] * self.normals)
 
     def neighbours(self, kept: BoolArray, lag: int = 1) -> BoolArray:
@@ -194,7 +193,6 @@ def _resampled(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, Flo
 def _inside(
     points: FloatArray, normals: FloatArray, shape: tuple[int, ...]
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """The stretches of a closed curve that stay away from the image's border."""
     if not len(points):
         return []
     size = np.array([shape[1], shape[0]]) - 1

@@ -102,11 +102,10 @@ class Candidate:
 def refine_with_outlines(
     problem: Problem, minima: Sequence[Minimum]
 ) -> tuple[list[Minimum], OutlineNotes]:
-    """Refine the likely minima of the other evidence, the likeliest first, with masks and photos.
+    """Refine likely minima with masks, or else photos, the likeliest first.
 
-    A photo counts where its view has no mask. Raises InputError if a mask has no contour, or the
-    model no mesh; DegenerateError if outlines alone determine the estimate, and there is none near
-    them.
+    Raises InputError if a mask has no contour, or the model no mesh; DegenerateError if outlines
+    alone determine the estimate, and there is none near them.
     """
     model, views, keypoints = problem.model, problem.views, len(problem.prior.ids)
     first, is_exact = minima[0], is_exact_model(model)
@@ -188,7 +187,6 @@ def _hulls_of(views: Sequence[View]) -> list[View]:
 
 
 def sources_of(views: Sequence[View], minimum: Minimum, *, is_exact: bool) -> list[OutlineSource]:
-    """The masks of views, and the photos of those that have none."""
     found: list[OutlineSource] = []
     for image, (view, camera) in enumerate(zip(views, minimum.lenses.cameras, strict=True)):
         if view.mask_image is not None:
@@ -246,7 +244,6 @@ def _distinct_candidates(candidates: list[Candidate]) -> list[Candidate]:
 
 
 def _are_alike(one: State, other: State) -> bool:
-    """True if first poses and stretches are nearly the same."""
     turn, other_turn = (each.poses[0, :9].reshape(3, 3) for each in (one, other))
     stretch = np.abs(one.log_scales - other.log_scales).max()
     return bool(angle_between(turn, other_turn) < _SAME_TURN_DEG and stretch < _SAME_STRETCH)

@@ -82,10 +82,7 @@ class Atlas(NamedTuple):
 
 
 def starts_of_mask(problem: Problem) -> list[Inits]:
-    """Alignments of the own model whose silhouettes resemble the mask of the only view.
-
-    Raises InputError if no prior says roughly what the focal length is.
-    """
+    """Alignments that resemble the only mask; InputError without a prior on the focal length."""
     (view,), camera, model = problem.views, problem.lenses.cameras[0], cast(Model, problem.model)
     known = prior_of_camera(problem.lenses.prior, camera)
     if problem.lenses.count and (known is None or known.relative_sigma > _LARGEST_FOCAL_SIGMA):

@@ -225,8 +225,8 @@ def outside_image(
 def unexplained(sigma: float, points_2d: Sequence[FloatArray]) -> Warnings:
     """Warn of an estimated sigma [px] that is nearly the spread of the keypoints of views (n, 2).
 
-    In 98 % of pairs of a category's models it is a smaller share, of keypoints in random order in
-    2 %.
+    It is a smaller share in 98 % of pairs of a category's models, in 2 % of keypoints in random
+    order.
     """
     with np.errstate(over="ignore"):  # of keypoints beyond all images
         spread = max(float(points.std(axis=0).max()) for points in points_2d if len(points))

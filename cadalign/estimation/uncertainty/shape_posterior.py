@@ -39,10 +39,8 @@ _POSE = 6
 class ShapePosterior(NamedTuple):
     """Knowledge of an object's shape from one image and a shape model.
 
-    ``shapes`` is a mixture over the stacked rows: x, y, z of each keypoint of the shape model, then
-    of the least and the greatest corner of its linear box [model units]. ``log_evidence`` is the
-    log of the probability density of the image's whitened keypoints, up to a constant, given that
-    the object is of the category: it compares shape models that have all of them.
+    ``shapes`` is a mixture over stacked rows: x, y, z of each keypoint, then of the box's corners.
+    ``log_evidence``, up to a constant, compares shape models that have all keypoints of the image.
     """
 
     shapes: Gaussians
@@ -52,35 +50,10 @@ class ShapePosterior(NamedTuple):
 def shape_posterior(
     result: Result, view: View, *, loss: str = "linear", loss_scale: float = 2.0
 ) -> ShapePosterior:
-    """Posterior of the shape whose alignment with one view's keypoints is ``result``.
+    """Posterior of the shape whose alignment with the inliers of one view is ``result``.
 
-    Parameters
-    ----------
-    result : Result
-        `align` of a `ShapeModel` with ``view`` alone. Its outliers are left out.
-    view : View
-        The keypoints; depths and directions are not used.
-    loss, loss_scale
-        Loss of the alignment: it weights the keypoints by their residuals.
-
-    Raises
-    ------
-    InputError
-        If the result is not that of a shape model and one view.
-
-    Examples
-    --------
-    The front side of a box that is as deep as it is wide determines the depth:
-
-    >>> from cadalign import Alignment, Camera, View, align
-    >>> corners = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], float)
-    >>> model = ShapeModel.from_basis(corners, [corners * [1, 0, 1]], [0.2], residual_sigma=1e-3)
-    >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
-    >>> wide = Alignment(np.diag([-1.0, -1.0, 1.0]), [0, 0, 9], [1.2, 1, 1.2])
-    >>> view = View(camera, camera.project(wide.apply(corners[4:])), ids=[4, 5, 6, 7])
-    >>> posterior = shape_posterior(align(model, view), view).shapes
-    >>> posterior.means.reshape(10, 3)[0].round(2).tolist()
-    [-1.2, -1.0, -1.2]
+    Depths and directions are not used; the ``loss`` weights keypoints by their residuals. Raises
+    InputError if the result is not that of a shape model and one view.
     """
     if not isinstance(result.model, ShapeModel) or len(result.poses) != 1:
         what = "expected the alignment of a shape model with one view"
@@ -150,10 +123,10 @@ def single_posterior(
     inflation: float,
     model: ShapeModel | None = None,
 ) -> Estimate:
-    """The estimate at a state (D,) of a component, with its posterior.
+    """The estimate at a state (D,) of a component, with its posterior; infinite without a pose.
 
     The prior's deviations are widened by the ``inflation``. The box holds the keypoints that are
-    seen. Covariances are infinite where the pose is not determined.
+    seen.
     """
     count, m = len(seen.points), mixture.means.shape[1]
     rotation = state[:9].reshape(3, 3)

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cadalign import Camera, View
 from cadalign.errors import InputError
 from cadalign.estimation.contours.contour import (
     SPACING,
@@ -20,7 +21,8 @@ from cadalign.estimation.contours.contour import (
     mask_contour,
     sampled,
 )
-from cadalign.estimation.contours.outline import Noise, correlation_length
+from cadalign.estimation.contours.mask import MaskSource
+from cadalign.estimation.contours.outline import Noise, OutlineSupport, correlation_length
 from cadalign.estimation.contours.rounds import likeliest_offset
 
 WIDTH, HEIGHT = 160, 120
@@ -112,6 +114,7 @@ def test_correlated_residuals_count_less() -> None:
     alike = np.convolve(independent, np.ones(10) / np.sqrt(10), mode="same")
     assert correlation_length(contour, independent, every) < 1.3
     assert 8 < correlation_length(contour, alike, every) < 12
+    assert correlation_length(contour, alike, every, least=100.0) < 1.1  # far below the noise
 
 
 @pytest.mark.parametrize("place", [2.0, 0.7, 0.5, 0.0])
@@ -168,3 +171,15 @@ def test_the_exit_nearest_to_each_sample_is_its_rim(
         nearest = exits[np.argmin(np.round(np.abs(middles), 9))]
         assert steps[nearest] <= offset <= steps[nearest + 1]
         assert np.abs(np.array(sight.edges[1::2]) - start - offset).min() < 0.03
+
+
+def test_an_uneven_mask_that_is_met_in_parts_alone_is_doubted() -> None:
+    mask = np.zeros((100, 100), dtype=bool)
+    mask[30:70, 20:80] = True
+    camera = Camera(100, 100, 100, 100, 49.5, 49.5)
+    view = View(camera, [[30, 40], [60, 40], [50, 60]], mask=mask)
+    source = MaskSource.of(0, view, camera)
+    uneven = OutlineSupport(share=0.75, agreeing=100, rms=1.8, rms_sigmas=1.0)
+    assert "only 75 % of its contour meets" in (source.doubt(uneven) or "")
+    for support in (uneven._replace(rms=0.1), uneven._replace(share=0.97)):
+        assert source.doubt(support) is None

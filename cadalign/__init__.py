@@ -9,8 +9,7 @@ if TYPE_CHECKING:
     from cadalign.batch.fits import fit_many
     from cadalign.errors import CadalignError
     from cadalign.estimation.align import align, align_batch
-    from cadalign.estimation.fit import fit
-    from cadalign.estimation.fit_batches import fit_batch
+    from cadalign.estimation.fit import fit, fit_batch
     from cadalign.estimation.focal import FocalPrior
     from cadalign.estimation.model import Model
     from cadalign.estimation.observed import views_from

@@ -10,7 +10,7 @@ from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
     from cadalign.estimation.align import align_batch
-    from cadalign.estimation.fit_batches import fit_batch
+    from cadalign.estimation.fit import fit_batch
     from cadalign.estimation.focal import FocalPrior
     from cadalign.estimation.model import Model
     from cadalign.estimation.observed import model_of, views_from, views_of

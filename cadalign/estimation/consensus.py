@@ -134,7 +134,7 @@ def _fit_to_inliers(search: RobustSearch, start: float) -> FittedKeypoints:
     options, ransac, problems = search.options, search.ransac, search.problems
     if options.focal == "estimate":
         # Only here: most cameras are calibrated, and its kernels take time to import.
-        from cadalign.estimation.joint_keypoints import fit_jointly
+        from cadalign.estimation.joint import fit_jointly
 
         found = fit_jointly(problems, options, ransac, search.scores, start)
         return replace(found, search=search)

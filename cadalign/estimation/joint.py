@@ -1,16 +1,18 @@
 """From likely estimates of all evidence to their result, by whatever search they were found.
 
 Together they are a mixture of Gaussians; of those that are equal under the model's symmetry one
-stands for all.
+stands for all. Keypoints of one exact model have their own form, for `cadalign.fit`.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
+import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, is_number
 from cadalign.errors import DegenerateError
@@ -27,8 +29,11 @@ from cadalign.estimation.estimates import (
     with_box,
 )
 from cadalign.estimation.focal import prior_of_camera
+from cadalign.estimation.model import Model
+from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.prior import camera_like, is_exact, widened
-from cadalign.estimation.problem import Problem
+from cadalign.estimation.problem import Problem, compile_problem
+from cadalign.estimation.problems import Problems, no_alignment_error, too_few_error
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import (
     LEAST_LIKELIHOOD,
@@ -36,12 +41,14 @@ from cadalign.estimation.result_parts import (
     Alternative,
     EvidenceSummary,
     FitStats,
+    FittedKeypoints,
     OutlineNotes,
     Posterior,
     ViewResult,
+    alternatives_of,
     keypoint_summary,
 )
-from cadalign.estimation.search import Minimum
+from cadalign.estimation.search import Minimum, search
 from cadalign.estimation.symmetry import SAME_SQUARES, stretched_axes
 from cadalign.estimation.uncertainty.doubts import (
     another_pose,
@@ -52,7 +59,7 @@ from cadalign.estimation.uncertainty.doubts import (
 from cadalign.estimation.uncertainty.evidence import redundancy_of, summaries_of
 from cadalign.estimation.view import View
 from cadalign.estimation.warning import EstimateWarning, Warnings
-from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.alignment import Alignment, describe_plane
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.shapes.parts import inflation_with
 from cadalign.solvers.joint.covariance import joint_covariance, pose_and_border
@@ -306,3 +313,61 @@ def _inliers(problem: Problem, minimum: Minimum) -> list[BoolArray]:
     kept[np.argsort(names, kind="stable")] = minimum.inliers
     ends = np.cumsum([len(view.keypoint_ids) for view in views])
     return np.split(kept, ends[:-1])
+
+
+def fit_jointly(
+    problems: Problems,
+    options: FitOptions,
+    ransac: RansacOptions | None,
+    scores: npt.ArrayLike | None,
+    start: float,
+) -> FittedKeypoints:
+    """Fit the only problem, with ``ransac`` its inliers, which was begun at ``start`` [s].
+
+    Raises DegenerateError if no minimum is determined; NoConsensusError as `search`.
+    """
+    points, pixels = problems.points_3d.copy(), problems.points_2d
+    if len(points) < options.min_points:
+        raise too_few_error(len(points), options)
+    model = Model(
+        points_3d=points,
+        stretch=options.stretch,
+        stretch_sigma=options.stretch_sigma,
+        known_axis=options.known_axis,
+    )
+    view = View(problems.camera, pixels, sigma=options.sigma, scores=scores)
+    compiled = compile_problem(model, [view], None, [None], options, ransac)
+    problem, minima, iterations, hypotheses = search(compiled, [[None]])
+    if ransac is None:  # the optimum comes first, whatever its volume
+        minima = sorted((each._replace(score=each.cost) for each in minima), key=lambda m: m.score)
+    if not minima:
+        raise no_alignment_error()
+    best = minima[0]
+    costs = [each.score for each in minima]
+    poses = [poses_of(each.evidence, each.state)[0] for each in minima]
+    cameras = [each.lenses.cameras_at(each.state.log_focals)[0] for each in minima]
+    found = joint_covariance(best.evidence, best.state)
+    covariance = pose_and_lengths(best.evidence, best.state, pose_and_border(found, 0))
+    if not np.isfinite(covariance).all():
+        raise DegenerateError(
+            "the alignment is not determined"
+            + (f": {why}" if (why := describe_plane(points)) else ""),
+            where="points_3d",
+            fix="add keypoints elsewhere, hold scales with stretch=, or give a prior",
+        )
+    residuals = cameras[0].project_where_ahead(poses[0].apply(points)) - pixels
+    stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
+    return FittedKeypoints(
+        points,
+        residuals,
+        best.inliers,
+        poses[0],
+        cameras[0],
+        options,
+        sigma=problem.noise if problem.lacks_sigma else common_sigma([view]),
+        fisher_covariance=covariance,
+        cost=best.cost,
+        alternatives=alternatives_of(points, poses, cameras, costs),
+        method="optimal" if ransac is None else "ransac-optimal",
+        stats=stats,
+    )

@@ -55,9 +55,7 @@ def evidence_of(
     """
     if lenses is None:
         lenses = Lenses.of(views, "known", None)
-    rows = []
-    for view in views:
-        rows.append(prior.rows_of(view.keypoint_ids, f"views[{view.number}].ids"))
+    rows = [prior.rows_of(view.keypoint_ids, f"views[{view.number}].ids") for view in views]
     offsets = known_distances(prior, views, size)
     directions = known_directions(prior, views)
     sightings = _sightings(rows, views, lenses.cameras, noise, options)

@@ -69,10 +69,6 @@ class Minimum(NamedTuple):
         return own if np.isfinite(own) else 0.0
 
     @property
-    def focal_lengths(self) -> FloatArray:
-        return self.lenses.focal_lengths * np.exp(self.state.log_focals)
-
-    @property
     def points(self) -> FloatArray:
         return points_of(self.evidence.shape, self.state) / np.exp(self.state.log_scales)
 

@@ -222,7 +222,7 @@ def _fit_at_noise(problems: Problems, options: FitOptions, start: float) -> Fitt
             raise solutions.errors[0]
         return keypoints_of_solution(problems, solutions, options, time.perf_counter() - start)
     # Only here: most cameras are calibrated, and its kernels take time to import.
-    from cadalign.estimation.joint_keypoints import fit_jointly
+    from cadalign.estimation.joint import fit_jointly
 
     return fit_jointly(problems, options, None, None, start)
 

@@ -128,7 +128,7 @@ def _fit(given: MethodInput, *, name: str) -> Result:
 
 def _fit_many(inputs: Sequence[MethodInput], *, name: str) -> list[Alignment | CadalignError]:
     """The alignments of many instances, in batches of one standard deviation and camera."""
-    from cadalign.estimation.fit_batches import fit_batch
+    from cadalign.estimation.fit import fit_batch
 
     found: list[Alignment | CadalignError] = []
     for (sigma, camera), group in groupby(inputs, key=lambda given: (given.sigma, given.camera)):

@@ -26,7 +26,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, worker_count
 from cadalign.datasets.models.shapenet import require_category
 from cadalign.errors import DegenerateError, InputError, quote, require_kind
-from cadalign.estimation.fit_batches import fit_batch
+from cadalign.estimation.fit import fit_batch
 from cadalign.estimation.options import LOSSES, Sigma
 from cadalign.estimation.problems import rays_of, whitening_of
 from cadalign.estimation.uncertainty.residuals import bent

@@ -7,12 +7,12 @@ from cadalign.names import lazy_names
 if TYPE_CHECKING:
     from cadalign import datasets, errors, geometry, metrics, render, retrieval, shapes, solvers
     from cadalign.batch.fits import fit_many
+    from cadalign.batch.observed import views_from
     from cadalign.errors import CadalignError
     from cadalign.estimation.align import align, align_batch
     from cadalign.estimation.fit import fit, fit_batch
     from cadalign.estimation.focal import FocalPrior
     from cadalign.estimation.model import Model
-    from cadalign.estimation.observed import views_from
     from cadalign.estimation.options import RansacOptions
     from cadalign.estimation.result import Result
     from cadalign.estimation.result_parts import EvidenceSummary

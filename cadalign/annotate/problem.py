@@ -16,12 +16,12 @@ import numpy as np
 from cadalign.annotate.models import ObjectShape
 from cadalign.annotate.outliers import PlacedRows, Rows, find_outliers
 from cadalign.arrays import FloatArray
+from cadalign.batch.observed import model_of, views_of
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import CadalignError
 from cadalign.estimation.align import align
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.model import Model
-from cadalign.estimation.observed import model_of, views_of
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View

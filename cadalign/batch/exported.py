@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from cadalign.arrays import FloatArray
+from cadalign.batch.observed import own_ids
 from cadalign.datasets import load_mesh
 from cadalign.errors import DataError, InputError
-from cadalign.estimation.observed import own_ids
-from cadalign.estimation.outputs import object_of
 from cadalign.estimation.result import Result
 from cadalign.export.aligned_object import AlignedObject
+from cadalign.export.results import object_of
 from cadalign.io.documents import in_file, read_json
 from cadalign.io.observation import OBSERVATION, Observation, kind_of
 from cadalign.render.drawing.model_overlay import mesh_of

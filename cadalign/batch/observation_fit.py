@@ -243,8 +243,8 @@ def _aligned(
     status: AbstractContextManager[Any] | None,
 ) -> tuple[Result, tuple[View, ...]]:
     """Align all evidence of an observation; returns its views, too."""
+    from cadalign.batch.observed import views_of
     from cadalign.estimation.align import align
-    from cadalign.estimation.observed import views_of
 
     model = _model(how, observation, where, options)
     stated, has_photos = how.stated_sigma(observation), how.uses_photos(observation)
@@ -277,7 +277,7 @@ def _aligned(
 def _model(
     how: ObservationFit, observation: Observation, where: str, options: FitOptions
 ) -> Model | ShapeModel:
-    from cadalign.estimation.observed import model_of
+    from cadalign.batch.observed import model_of
     from cadalign.io.meshes.files import load_mesh
 
     shape = how.shape_of(observation)

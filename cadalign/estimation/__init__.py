@@ -13,9 +13,7 @@ if TYPE_CHECKING:
     from cadalign.estimation.fit import fit_batch
     from cadalign.estimation.focal import FocalPrior
     from cadalign.estimation.model import Model
-    from cadalign.estimation.observed import model_of, views_from, views_of
     from cadalign.estimation.options import FitOptions, RansacOptions
-    from cadalign.estimation.outputs import object_of
     from cadalign.estimation.result import Result
     from cadalign.estimation.result_parts import (
         Alternative,
@@ -46,10 +44,6 @@ __all__ = [
     "ViewResult",
     "align_batch",
     "fit_batch",
-    "model_of",
-    "object_of",
-    "views_from",
-    "views_of",
 ]
 
 __getattr__ = lazy_names(__name__)

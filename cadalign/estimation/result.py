@@ -121,9 +121,9 @@ class Result:
     own_stretch: FloatArray | None = None
 
     def __str__(self) -> str:
-        from cadalign.estimation.outputs import text_of
+        from cadalign.export.results import result_text
 
-        return text_of(self)
+        return result_text(self)
 
     def __repr__(self) -> str:
         stretch = ", ".join(f"{value:.3g}" for value in self.stretch)
@@ -390,7 +390,7 @@ class Result:
         >>> [float(y) for y in axes.get_ylim()]
         [479.5, -0.5]
         """
-        from cadalign.estimation.outputs import plot_result
+        from cadalign.export.results import plot_result
 
         return plot_result(self, image, mesh, view=view, axes=axes)
 
@@ -412,14 +412,13 @@ class Result:
             As for `cadalign.export.export_object`.
         **of_the_object
             ``mesh``, ``image`` or ``images``, ``world_from_cam``, ``name`` and ``metres`` of
-            `cadalign.estimation.object_of`.
+            `cadalign.export.object_of`.
 
         Examples
         --------
         >>> result.export("chair.glb", mesh=mesh, image="chair.jpg")  # doctest: +SKIP
         """
-        from cadalign.estimation.outputs import object_of
-        from cadalign.export import export_object
+        from cadalign.export import export_object, object_of
 
         exported = object_of(self, **of_the_object)
         return export_object(path, exported, format=format, frame=frame)

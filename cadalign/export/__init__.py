@@ -2,5 +2,6 @@
 
 from cadalign.export.aligned_object import AlignedObject, ExportView
 from cadalign.export.formats import FORMATS, export_object, format_of
+from cadalign.export.results import object_of
 
-__all__ = ["FORMATS", "AlignedObject", "ExportView", "export_object", "format_of"]
+__all__ = ["FORMATS", "AlignedObject", "ExportView", "export_object", "format_of", "object_of"]

@@ -1,11 +1,11 @@
-"""Outputs of results: text, pictures on axes, and aligned objects for export."""
+"""Results of estimates as text, as pictures on axes and as aligned objects."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,8 +22,6 @@ from cadalign.io.images import ByteImage, read_photo
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from cadalign.estimation.result import Result
-
 Photo = Path | str | ByteImage | None
 _LONGEST_SIDE = 480  # of the grid of rays through a drawn model
 _MODEL_COLOR = (0.94, 0.2, 0.2)
@@ -33,7 +31,7 @@ _GREY = 0.9
 _LINE_POINTS = 17  # lens distortion bends the edges of a box
 
 
-def text_of(result: Result) -> str:
+def result_text(result: Any) -> str:
     """Keypoints, rotation, translation, stretch, focal length, alternatives, warnings."""
     count, of = int(result.inliers.sum()), len(result.inliers)
     some = f"{count}" if count == of else f"{count} of {of}"
@@ -73,7 +71,7 @@ def text_of(result: Result) -> str:
 
 
 def plot_result(
-    result: Result,
+    result: Any,
     image: npt.ArrayLike | str | os.PathLike[str] | None = None,
     mesh: Mesh | None = None,
     *,
@@ -190,7 +188,7 @@ def _shade(camera: Camera, alignment: Alignment, mesh: Mesh) -> FloatArray:
 
 
 def object_of(
-    result: Result,
+    result: Any,
     *,
     mesh: Mesh | str | os.PathLike[str] | None = None,
     image: Photo = None,
@@ -203,7 +201,7 @@ def object_of(
 
     Parameters
     ----------
-    result : Result
+    result : cadalign.Result
     mesh : Mesh or path, optional
         The model's as given; it is warped where the result knows its model, see `Result.mesh`.
     image : path or (h, w, 3) uint8, optional

@@ -89,6 +89,8 @@ def contour_of(probability: FloatArray | BoolArray) -> Contour:
     count = 0
     for chain in _chains(level):
         places, outwards = _on_level(chain, level, slope_x, slope_y)
+        if len(places) < 3:
+            continue
         for piece, directions in _inside(*_resampled(places, outwards), image.shape):
             points.append(piece)
             normals.append(directions)
@@ -142,8 +144,12 @@ def _on_level(
     known = np.isfinite(places)
     points = chain[known] + places[known, None] * normals[known]
     outwards = -np.column_stack([sampled(slope_x, points), sampled(slope_y, points)])
-    outwards /= np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-12)
-    return points, outwards
+    return points, _unit_rows(outwards)
+
+
+def _unit_rows(vectors: FloatArray) -> FloatArray:
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors / np.maximum(lengths, 1e-12))
 
 
 def crossings(
@@ -176,25 +182,19 @@ def _nearest_exits(inside: BoolArray, steps: FloatArray) -> tuple[IntArray, Bool
 
 def _resampled(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Samples `SPACING` apart along a closed curve of points (n, 2)."""
-    if len(points) < 3:
-        return np.empty((0, 2)), np.empty((0, 2))
-    ring = np.vstack([points, points[:1]])
-    lengths = np.linalg.norm(np.diff(ring, axis=0), axis=1)
+    rows = np.hstack([points, normals])
+    ring = np.vstack([rows, rows[:1]])
+    lengths = np.linalg.norm(np.diff(ring[:, :2], axis=0), axis=1)
     places = np.concatenate([[0.0], np.cumsum(lengths)])
     count = round(places[-1] / SPACING)
     wanted = (np.arange(count) + 0.5) * (places[-1] / max(count, 1))
-    around = np.vstack([normals, normals[:1]])
-    samples = [np.interp(wanted, places, ring[:, axis]) for axis in range(2)]
-    outwards = np.column_stack([np.interp(wanted, places, around[:, axis]) for axis in range(2)])
-    outwards /= np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-12)
-    return np.column_stack(samples), outwards
+    samples = np.column_stack([np.interp(wanted, places, column) for column in ring.T])
+    return samples[:, :2], _unit_rows(samples[:, 2:])
 
 
 def _inside(
     points: FloatArray, normals: FloatArray, shape: tuple[int, ...]
 ) -> list[tuple[FloatArray, FloatArray]]:
-    if not len(points):
-        return []
     size = np.array([shape[1], shape[0]]) - 1
     off_border = (points > _BORDER) & (points < size - _BORDER)
     kept: BoolArray = np.asarray(off_border.all(axis=1))
@@ -208,18 +208,13 @@ def _inside(
 
 def mask_contour(mask: FloatArray | BoolArray, where: str) -> Contour:
     """The contour of a checked mask (h, w); InputError if there is none, or as long as noise's."""
-    inside = mask if mask.dtype == bool else mask >= 0.5
-    if inside.all() or not inside.any():
-        where_is = "covers all of the image" if inside.all() else "contains no pixel of the object"
-        fix = "give the mask of the object alone, or None"
-        raise InputError(f"{where_is}, so that it has no contour", where=where, fix=fix)
     contour = contour_of(mask)
     if not len(contour.points):
-        raise InputError(
-            "no part of its contour is larger than a few pixels and off the image's border",
-            where=where,
-            fix="give a photo in which more of the object's outline is seen, or None",
+        what = "no part of its contour is larger than a few pixels and off the image's border"
+        fix = (
+            "give the mask of the object alone, in a photo that shows more of its outline, or None"
         )
+        raise InputError(what, where=where, fix=fix)
     length = SPACING * len(contour.points)
     diagonal = float(np.linalg.norm(np.ptp(contour.points, axis=0)))
     if length > max(SPACING, min(_LONGEST, _MOST_DIAGONALS * diagonal)):

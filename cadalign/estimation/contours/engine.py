@@ -18,7 +18,6 @@ from cadalign.errors import DegenerateError
 from cadalign.estimation.contours.mask import MaskSource, convex_hull
 from cadalign.estimation.contours.outline import (
     MeasuredOutline,
-    OutlineSource,
     OutlineSupport,
     Track,
 )
@@ -26,7 +25,7 @@ from cadalign.estimation.contours.photo import PhotoSource
 from cadalign.estimation.contours.photo_lines import photo_of
 from cadalign.estimation.contours.rounds import (
     OutlineFit,
-    OutlineProblem,
+    Source,
     first_fit,
     last_fit,
     with_displacement_modes,
@@ -73,7 +72,7 @@ class Candidate:
     tracks: list[Track]
 
     @property
-    def _measured(self) -> list[tuple[OutlineSource, MeasuredOutline | None]]:
+    def _measured(self) -> list[tuple[Source, MeasuredOutline | None]]:
         return list(zip(self.fit.problem.sources, self.fit.measured, strict=True))
 
     @cached_property
@@ -118,7 +117,7 @@ def refine_with_outlines(
     likely = likely[: _MOST_OPEN_STARTS if is_open else _MOST_STARTS]
     warnings: list[EstimateWarning] = []
     best: list[Candidate] = []
-    wrong: tuple[OutlineSource, str] | None = None
+    wrong: tuple[Source, str] | None = None
     while left:
         best = _candidates(likely, left, surface, keypoints, is_open=is_open)
         wrong = _contradicting(best, left)
@@ -144,7 +143,7 @@ def refine_with_outlines(
 
 def _candidates(
     likely: Sequence[Minimum],
-    sources: Sequence[OutlineSource],
+    sources: Sequence[Source],
     surface: Surface,
     keypoints: int,
     *,
@@ -157,8 +156,7 @@ def _candidates(
         starts += _displaced(likely[0], is_exact=surface.is_exact)
     near = []
     for start, state in starts:
-        given = OutlineProblem.of(start.evidence, state, keypoints, sources, surface)
-        fit = first_fit(*given)
+        fit = first_fit(start.evidence, state, keypoints, sources, surface)
         near += [] if fit is None else [Candidate(start, fit, fit.tracks)]
     near = _distinct_candidates(near)[:_MOST_FINISHED]
     found = []
@@ -186,8 +184,8 @@ def _hulls_of(views: Sequence[View]) -> list[View]:
     return found
 
 
-def sources_of(views: Sequence[View], minimum: Minimum, *, is_exact: bool) -> list[OutlineSource]:
-    found: list[OutlineSource] = []
+def sources_of(views: Sequence[View], minimum: Minimum, *, is_exact: bool) -> list[Source]:
+    found: list[Source] = []
     for image, (view, camera) in enumerate(zip(views, minimum.lenses.cameras, strict=True)):
         if view.mask_image is not None:
             found.append(MaskSource.of(image, view, camera, is_exact=is_exact))
@@ -249,9 +247,7 @@ def _are_alike(one: State, other: State) -> bool:
     return bool(angle_between(turn, other_turn) < _SAME_TURN_DEG and stretch < _SAME_STRETCH)
 
 
-def _contradicting(
-    best: list[Candidate], sources: Sequence[OutlineSource]
-) -> tuple[OutlineSource, str] | None:
+def _contradicting(best: list[Candidate], sources: Sequence[Source]) -> tuple[Source, str] | None:
     supports = best[0].supports if best else [OutlineSupport()]
     worst = min(range(len(supports)), key=lambda number: supports[number].share)
     if supports[worst].share < _LEAST_SUPPORT:

@@ -94,16 +94,18 @@ class MaskSource(OutlineSource):
         return cls(image, view.number, camera, is_exact, *given, _off_mask(view.pixels, mask))
 
     def first(self) -> Track:
+        """Noise and reach at the start."""
         share = _WIDE_REACH if self.is_wide else _RELATIVE_REACH
         reach = max(_FIRST_REACH, share * self.contour.size)
         offset = _FIRST_OFFSET if self.is_exact else LEAST_OFFSET
         return Track(Noise(reach / 3, 1.0, offset), reach)
 
     def last(self, track: Track) -> Track:
+        """Noise and reach of the last rounds."""
         return self._narrowed(self.first()._replace(noise=track.noise, is_fine=self.is_exact))
 
     def outline(self, sight: Sight, surface: PosedSurface, track: Track) -> Outline:
-        """See `OutlineSource`; a fine outline is free of the bias of the contour's extraction."""
+        """The outline of a posed surface; a fine one is free of the bias of extraction."""
         rims = find_rims(sight, self.contour, track.reach)
         bias = np.zeros(len(rims.found))
         if track.is_fine:
@@ -122,9 +124,10 @@ class MaskSource(OutlineSource):
         )
 
     def learned(self, outline: Outline, offset: float, track: Track) -> Track:
-        """See `OutlineSource`; edges lie unevenly by a share of their common offset.
+        """The track with the noise that residuals show before a step.
 
-        Where the surface is only similar, samples without a rim count as the farthest.
+        Edges lie unevenly by a share of their common offset. Where the surface is only similar,
+        samples without a rim count as the farthest.
         """
         residuals = outline.residuals(offset)
         if not self.is_exact:
@@ -143,22 +146,24 @@ class MaskSource(OutlineSource):
         return track._replace(reach=min(track.reach, max(_REACH * track.noise.sigma, least)))
 
     def rank(self, found: MeasuredOutline) -> float:
-        """See `OutlineSource`; the noise is that of the estimate, within bounds."""
+        """-2 log of its probability, to compare estimates, by their noise within bounds."""
         residuals = np.nan_to_num(found.residuals, nan=_LARGEST)
         noise = Noise(float(np.clip(found.noise.sigma, *_RANKED)), _RANKED_CORRELATION, 0.0)
         normalization = 2 * len(residuals) / _RANKED_CORRELATION * float(np.log(noise.sigma))
         return float(noise.costs(residuals).sum()) + normalization
 
     def refusal(self, support: OutlineSupport) -> str:
+        """The reason to leave the source out, for its support is too low."""
         if not support.share:
             return f"no part of the model's outline comes near its contour{self.hint}"
         share = f"{100 * support.share:.0f} % of its contour"
         return f"only {share} can be the model's outline{self.hint}"
 
     def doubt(self, support: OutlineSupport) -> str | None:
-        """See `OutlineSource`; beside keypoints, of an uneven contour that is met in parts alone.
+        """A warning about an estimate that little but the outlines determines.
 
-        Sharp parts alone are those of an object that is partly hidden.
+        Beside keypoints, it is of an uneven contour that is met in parts alone. Sharp parts alone
+        are those of an object that is partly hidden.
         """
         if support.share >= self.good_share:
             if not (self.is_wide and _leaves_image(self.mask[0] >= _INSIDE)):

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.estimation.contours.contour import Contour, Sight
-from cadalign.estimation.contours.surface import PosedSurface
+from cadalign.estimation.contours.contour import Contour
 from cadalign.estimation.result_parts import EvidenceSummary
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
@@ -191,8 +189,8 @@ class OutlineSupport(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class OutlineSource(ABC):
-    """A mask or a photo of the view in place ``image``, whose ``number`` is the user's.
+class OutlineSource:
+    """What masks and photos have in common, of the view ``image``, the user's ``number``.
 
     The ``camera`` is that of the evidence's rays. The surface ``is_exact``, or similar to the
     object's.
@@ -215,34 +213,6 @@ class OutlineSource(ABC):
     @property
     def where(self) -> str:
         return f"views[{self.number}].{self.field}"
-
-    @abstractmethod
-    def first(self) -> Track:
-        """Noise and reach at the start."""
-
-    @abstractmethod
-    def last(self, track: Track) -> Track:
-        """Noise and reach of the last rounds."""
-
-    @abstractmethod
-    def outline(self, sight: Sight, surface: PosedSurface, track: Track) -> Outline | None:
-        """The outline of a posed surface as it is measured; None where nothing is."""
-
-    @abstractmethod
-    def learned(self, outline: Outline, offset: float, track: Track) -> Track:
-        """The track with the noise that residuals show before a step."""
-
-    @abstractmethod
-    def rank(self, found: MeasuredOutline) -> float:
-        """-2 log of the probability of what was measured, to compare estimates."""
-
-    @abstractmethod
-    def refusal(self, support: OutlineSupport) -> str:
-        """The reason to leave the source out, for its support is too low."""
-
-    @abstractmethod
-    def doubt(self, support: OutlineSupport) -> str | None:
-        """A warning about an estimate that little but the outlines determines."""
 
     def support(self, found: MeasuredOutline) -> OutlineSupport:
         least, exact, similar = self.tolerances

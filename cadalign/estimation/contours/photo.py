@@ -69,13 +69,13 @@ class PhotoSource(OutlineSource):
         return found if found is not None and found.found.any() else None
 
     def learned(self, outline: Outline, offset: float, track: Track) -> Track:
-        """See `OutlineSource`; noise is learned at the last level."""
+        """The track with the noise of the residuals, at the last level."""
         if not track.is_fine or track.levels:
             return track
         return track._replace(noise=_noise_of(outline, outline.residuals(offset)))
 
     def rank(self, found: MeasuredOutline) -> float:
-        """See `OutlineSource`; over a silhouette anywhere, and places anywhere on the lines."""
+        """-2 log of its probability over a silhouette, and places on lines, anywhere."""
         outline, residuals = found.outline, found.residuals
         noise = _noise_of(outline, residuals)
         sigmas = noise.sigma * outline.sigmas[outline.found]
@@ -86,7 +86,7 @@ class PhotoSource(OutlineSource):
         return -2 * (float(gains.sum() / noise.correlation) + _contrast(outline))
 
     def support(self, found: MeasuredOutline) -> OutlineSupport:
-        """See `OutlineSource`; nothing is told by colours that are the same on both sides."""
+        """Agreement with the outline, none by colours that are the same on both sides."""
         if _contrast(found.outline) < _LEAST_CONTRAST:
             return OutlineSupport()
         return super().support(found)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.contours.contour import (
@@ -25,7 +26,7 @@ from cadalign.estimation.contours.contour import (
 )
 from cadalign.estimation.contours.outline import Outline
 from cadalign.estimation.contours.surface import PosedSurface
-from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.alignment import Alignment, bounds_corners
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PIXEL_CENTRE, rescaled_pixels
 from cadalign.io.images import ByteImage
@@ -205,19 +206,15 @@ class Silhouette(NamedTuple):
 
     def at(self, points: FloatArray) -> BoolArray:
         """Tell if pixels (..., 2) lie inside."""
-        height, width = self.inside.shape
-        cells = np.rint((points - self.corner) / self.cell).astype(int)
-        columns, rows = np.moveaxis(cells, -1, 0)
-        held = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-        found = self.inside[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
-        return np.asarray(found & held)
+        columns, rows = np.moveaxis(np.rint((points - self.corner) / self.cell), -1, 0)
+        return np.asarray(map_coordinates(self.inside, [rows, columns], order=0))
 
 
 def silhouette_of(
     surface: PosedSurface, camera: Camera, pose: Alignment, cells: int
 ) -> Silhouette | None:
     """The silhouette, so many ``cells`` long, and its rims; None where no rim is seen."""
-    box = _box_in_image(surface.corners, camera, pose)
+    box = _box_in_image(bounds_corners(*surface.mesh.bounds), camera, pose)
     if box is None:
         return None
     low, high = box
@@ -330,13 +327,9 @@ def _colors_beside(
 
 def _on_own_side(photo: PhotoPyramid, silhouette: Silhouette, pixels: FloatArray) -> BoolArray:
     """Pixels (S, 2 K + 1, 2) of lines, up to where a line leaves the image or enters again."""
-    inside = silhouette.at(pixels)
-    seen = photo.camera.contains(pixels, margin=PIXEL_CENTRE)
-    middle = STEPS
-    inner = (inside & seen)[:, :middle][:, ::-1]
-    outer = (~inside & seen)[:, middle + 1 :]
-    inner[:, 0] = outer[:, 0] = True  # cells are coarser than the rim
-    kept = np.ones(inside.shape, dtype=bool)
-    kept[:, :middle] = np.logical_and.accumulate(inner, axis=1)[:, ::-1]
-    kept[:, middle + 1 :] = np.logical_and.accumulate(outer, axis=1)
-    return kept
+    kept = silhouette.at(pixels) == (np.arange(2 * STEPS + 1) < STEPS)
+    kept &= photo.camera.contains(pixels, margin=PIXEL_CENTRE)
+    kept[:, STEPS - 1 : STEPS + 2] = True  # cells are coarser than the rim
+    for half in (kept[:, STEPS::-1], kept[:, STEPS:]):
+        np.logical_and.accumulate(half, axis=1, out=half)
+    return np.asarray(kept)

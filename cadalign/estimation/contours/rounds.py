@@ -17,15 +17,16 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.contours.contour import Sight
+from cadalign.estimation.contours.mask import MaskSource
 from cadalign.estimation.contours.outline import (
     LEAST_OFFSET,
     REGISTRATION,
     MeasuredOutline,
     Noise,
     Outline,
-    OutlineSource,
     Track,
 )
+from cadalign.estimation.contours.photo import PhotoSource
 from cadalign.estimation.contours.surface import PosedSurface, Surface
 from cadalign.estimation.estimates import poses_of
 from cadalign.estimation.search import with_whitening_times
@@ -41,6 +42,8 @@ from cadalign.solvers.joint.evidence import (
 )
 from cadalign.solvers.joint.search import displaced_modes, objective_of, refine_joint
 
+Source = MaskSource | PhotoSource
+"""A mask or a photo of a view."""
 _OWN_MODES = 3
 """Unknowns of a contour: its offset outwards, its registration along x and along y."""
 _MOST_ROUNDS = 16
@@ -55,25 +58,8 @@ class OutlineProblem(NamedTuple):
 
     evidence: Evidence
     keypoints: int
-    sources: Sequence[OutlineSource]
+    sources: Sequence[Source]
     surface: Surface
-
-    @classmethod
-    def of(
-        cls,
-        evidence: Evidence,
-        state: State,
-        keypoints: int,
-        sources: Sequence[OutlineSource],
-        surface: Surface,
-    ) -> tuple[OutlineProblem, State]:
-        """The problem and its start, of evidence and a state without outlines."""
-        evidence, state = with_displacement_modes(evidence, state)
-        shape, own = evidence.shape, np.zeros(_OWN_MODES * len(sources))
-        modes = np.concatenate([shape.modes, np.zeros((len(own), *shape.mean.shape))])
-        with_own = evidence._replace(shape=shape._replace(modes=modes))
-        start = state._replace(coefficients=np.append(state.coefficients, own))
-        return cls(with_own, keypoints, sources, surface), start
 
     def own_of(self, state: State) -> FloatArray:
         """Coefficients (V, 3) of the contours' own modes."""
@@ -228,9 +214,17 @@ class OutlineFit(NamedTuple):
         return evidence._replace(sightings=old._replace(whitening=whitening, loss_scale=scale))
 
 
-def first_fit(problem: OutlineProblem, state: State) -> OutlineFit | None:
-    """The estimate that rounds from a start lead to; None without an outline."""
-    return _approached(problem, state, [source.first() for source in problem.sources])
+def first_fit(
+    evidence: Evidence, state: State, keypoints: int, sources: Sequence[Source], surface: Surface
+) -> OutlineFit | None:
+    """The estimate that rounds lead to, of evidence and a state without outlines; or None."""
+    evidence, state = with_displacement_modes(evidence, state)
+    shape, own = evidence.shape, np.zeros(_OWN_MODES * len(sources))
+    modes = np.concatenate([shape.modes, np.zeros((len(own), *shape.mean.shape))])
+    with_own = evidence._replace(shape=shape._replace(modes=modes))
+    start = state._replace(coefficients=np.append(state.coefficients, own))
+    problem = OutlineProblem(with_own, keypoints, sources, surface)
+    return _approached(problem, start, [source.first() for source in sources])
 
 
 def last_fit(fit: OutlineFit) -> OutlineFit | None:

@@ -15,7 +15,7 @@ equations in the inverse squares of its scales.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import NamedTuple, TypeVar, cast
 
 import cv2
@@ -29,7 +29,7 @@ from cadalign.estimation.contours.surface import rigid_surface
 from cadalign.estimation.focal import prior_of_camera
 from cadalign.estimation.model import Model
 from cadalign.estimation.problem import Inits, Problem
-from cadalign.geometry.alignment import Alignment, model_rays
+from cadalign.geometry.alignment import Alignment, bounds_corners, model_rays
 from cadalign.geometry.camera import Camera, turned_alignment
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import RayCaster
@@ -43,7 +43,9 @@ _DIRECTIONS = 800  # all around, 7 degrees apart
 _AFAR = 60.0  # distance of an eye whose rays are almost parallel, relative to half a box's diagonal
 _EYES = (5.0, 12.0, _AFAR)  # distances from which silhouettes are rendered
 _RINGS = 24
-_OUTERMOST = 3.0  # [standard deviations], of the rings
+_ANGLES = 2 * np.pi * np.arange(_TURNS) / _TURNS
+_AROUND = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+_RADII = 3.0 * (np.arange(_RINGS) + 0.5) / _RINGS  # [standard deviations]
 _LEAST_CELLS = 4
 _CELL_VARIANCE = 1e-3  # that every silhouette has at least
 _MARGIN = 1.5  # of the image in which silhouettes are compared, relative to the mask's
@@ -129,8 +131,7 @@ def resembling_poses(
 @lru_cache(maxsize=32)
 def atlas_of(mesh: Mesh, eye: float) -> Atlas:
     """Silhouettes of a mesh, from so far an ``eye``, relative to half of the box's diagonal."""
-    surface = rigid_surface(mesh)
-    caster, corners = surface.caster, surface.corners
+    caster, corners = rigid_surface(mesh).caster, bounds_corners(*mesh.bounds)
     middle = corners.mean(axis=0)
     far = eye * float(np.linalg.norm(corners - middle, axis=1).max())
     bases, views = [], []
@@ -172,17 +173,6 @@ def _eye_of(mesh: Mesh, query: Whitened) -> float:
     return min(_EYES, key=lambda eye: abs(np.log(eye / far)))
 
 
-@cache
-def _around() -> FloatArray:
-    angles = 2 * np.pi * np.arange(_TURNS) / _TURNS
-    return np.column_stack([np.cos(angles), np.sin(angles)])
-
-
-@cache
-def _radii() -> FloatArray:
-    return np.asarray(_OUTERMOST * (np.arange(_RINGS) + 0.5) / _RINGS)
-
-
 def _whitened(image: Image, corner: FloatArray, cell: float) -> Whitened:
     """The silhouette of an image whose cells lie ``cell`` apart from the ``corner`` (2,) on."""
     points = np.argwhere(image > 0.5)[:, ::-1].astype(float)
@@ -190,7 +180,7 @@ def _whitened(image: Image, corner: FloatArray, cell: float) -> Whitened:
     covariance = np.cov(points.T, bias=True) + _CELL_VARIANCE * np.eye(2)
     variances, axes = np.linalg.eigh(covariance)
     spread = (axes * np.sqrt(variances)) @ axes.T
-    rays = (_radii()[:, None, None] * _around()).reshape(-1, 2)
+    rays = (_RADII[:, None, None] * _AROUND).reshape(-1, 2)
     covered = sampled(np.pad(image, 1), mean + rays @ spread + 1)
     rings = np.rint(255 * covered).astype(np.uint8).reshape(1, _RINGS, _TURNS)
     return Whitened((corner + cell * mean)[None], cell * spread[None], rings)
@@ -250,7 +240,7 @@ class FacedMask(NamedTuple):
 def _overlaps(views: Whitened, query: Whitened) -> FloatArray:
     """Intersections over unions (N, turns) of silhouettes and one that is turned."""
     rings = query.rings[0].astype(np.float32) / 255
-    weights = np.repeat(_radii(), _TURNS).astype(np.float32)
+    weights = np.repeat(_RADII, _TURNS).astype(np.float32)
     turns = (np.arange(_TURNS)[:, None] + np.arange(_TURNS)) % _TURNS
     weighted = rings[:, turns].transpose(0, 2, 1).reshape(-1, _TURNS) * weights[:, None]
     flat = views.rings.reshape(len(views.rings), -1).astype(np.float32) / 255
@@ -268,7 +258,7 @@ def _affine_cameras(atlas: Atlas, query: Whitened) -> tuple[FloatArray, FloatArr
     peaks = np.nonzero(is_peak)
     best = np.argsort(-overlap[peaks])[:_MOST_AFFINE]
     row, number = (each[best] for each in peaks)
-    cosine, sine = _around()[number].T
+    cosine, sine = _AROUND[number].T
     turns = np.stack([cosine, -sine, sine, cosine], axis=1).reshape(-1, 2, 2)
     planes = query.spread[0] @ turns @ np.linalg.inv(atlas.views.spread[row])
     shifts = query.mean[0] - (planes @ atlas.views.mean[row][:, :, None])[:, :, 0]

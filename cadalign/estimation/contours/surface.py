@@ -14,7 +14,6 @@ from trimesh.triangles import points_to_barycentric
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.estimation.model import Model
-from cadalign.geometry.alignment import bounds_corners
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import RayCaster
 from cadalign.io.meshes.files import load_mesh
@@ -33,7 +32,6 @@ class RigidSurface:
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
         self.caster = RayCaster(mesh)
-        self.corners = bounds_corners(*mesh.bounds)
 
     def at(self, shape: Shape, state: State) -> PosedSurface:
         """The mesh at a state."""
@@ -76,10 +74,6 @@ class Warped:
     @cached_property
     def caster(self) -> RayCaster:
         return RayCaster(self.mesh)
-
-    @property
-    def corners(self) -> FloatArray:
-        return bounds_corners(*self.mesh.bounds)
 
     def rows(self, points: FloatArray, face: IntArray) -> tuple[FloatArray, FloatArray]:
         """See `RigidSurface`."""
@@ -152,6 +146,4 @@ def _nearest_with_mesh(
     return _mesh_at(cast(Path, training.mesh_paths[row])), source[known], known
 
 
-@lru_cache(maxsize=16)
-def _mesh_at(path: Path) -> Mesh:
-    return load_mesh(path)
+_mesh_at = lru_cache(maxsize=16)(load_mesh)

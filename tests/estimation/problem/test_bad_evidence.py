@@ -62,13 +62,15 @@ def changed(pose: np.ndarray, rows: slice | int, columns: slice | int, factor: f
         ),
         (
             lambda: align(MODEL, [View(CAMERA, PIXELS), View(CAMERA, PIXELS, mask=NOTHING)]),
-            "views[1].mask: contains no pixel of the object, so that it has no contour; "
-            "give the mask of the object alone, or None",
+            "views[1].mask: no part of its contour is larger than a few pixels and off the image's "
+            "border; give the mask of the object alone, in a photo that shows more of its outline, "
+            "or None",
         ),
         (
             lambda: align(MODEL, View(CAMERA, PIXELS, mask=EVERYTHING)),
-            "views[0].mask: covers all of the image, so that it has no contour; "
-            "give the mask of the object alone, or None",
+            "views[0].mask: no part of its contour is larger than a few pixels and off the image's "
+            "border; give the mask of the object alone, in a photo that shows more of its outline, "
+            "or None",
         ),
         (
             lambda: View(CAMERA, PIXELS, mask=EVERYTHING.astype(int) * 255),

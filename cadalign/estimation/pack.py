@@ -24,6 +24,7 @@ from cadalign.solvers.joint.evidence import (
     Evidence,
     Offsets,
     Rig,
+    Shape,
     Sightings,
     kept_rows,
     stacked,
@@ -34,27 +35,25 @@ _DEPTH_LOSS_SCALE = 3.0  # [sigma], of depths in an image: what hides a keypoint
 _RADIUS = 2  # of the window about a keypoint [px]
 _GAP = 4.0  # between surfaces in a window [sigma]
 _LEAST_PIXELS = 3  # of a surface in a window
-_PLAIN = FitOptions()
 
 
 def evidence_of(
     prior: ShapePrior,
+    shape: Shape,
     views: Sequence[View],
-    size: Size | None = None,
+    size: Size | None,
     *,
-    options: FitOptions = _PLAIN,
-    lenses: Lenses | None = None,
-    turns: Sequence[FloatArray] | None = None,
-    noise: float = 1.0,
+    options: FitOptions,
+    lenses: Lenses,
+    turns: Sequence[FloatArray],
+    noise: float,
 ) -> Evidence:
-    """Evidence of the views, of the size and of the first component of the prior.
+    """Evidence of the views, of the size and of one component of the prior.
 
     ``turns`` (3, 3) are those of lenses, ``noise`` [px] is that of keypoints without a sigma.
     Raises InputError of keypoints or an up axis that the model lacks, and if only some views have a
     pose.
     """
-    if lenses is None:
-        lenses = Lenses.of(views, "known", None)
     rows = [prior.rows_of(view.keypoint_ids, f"views[{view.number}].ids") for view in views]
     offsets = known_distances(prior, views, size)
     directions = known_directions(prior, views)
@@ -69,7 +68,7 @@ def evidence_of(
     is_rig = len(views) > 1 and views[0].cam_from_rig is not None
     is_metric = bool(is_rig or len(offsets.value) or sightings.depths[:, 1].any())
     return Evidence(
-        prior.components[0],
+        shape,
         sightings,
         _rig(views, turns, of_lenses[:, 2]),
         lenses.focals(),
@@ -122,7 +121,7 @@ def _keypoint_depths(view: View, count: int) -> FloatArray:
     return found
 
 
-def _rig(views: Sequence[View], turns: Sequence[FloatArray] | None, axes: FloatArray) -> Rig:
+def _rig(views: Sequence[View], turns: Sequence[FloatArray], axes: FloatArray) -> Rig:
     """Motions and axes of cameras, and the pose of each; -1 of one without evidence."""
     posed = [view.cam_from_rig is not None for view in views]
     if any(posed) != all(posed):
@@ -133,10 +132,8 @@ def _rig(views: Sequence[View], turns: Sequence[FloatArray] | None, axes: FloatA
         )
     is_rig = all(posed)
     rows = []
-    for number, view in enumerate(views):
-        motion = np.asarray(view.cam_from_rig if is_rig else np.eye(4))[:3]
-        if turns is not None:
-            motion = turns[number].T @ motion
+    for turn, view in zip(turns, views, strict=True):
+        motion = turn.T @ np.asarray(view.cam_from_rig if is_rig else np.eye(4))[:3]
         rows.append(np.append(motion[:, :3], motion[:, 3]))
     if is_rig:
         return Rig(np.array(rows), np.zeros(len(views), dtype=np.int64), axes)

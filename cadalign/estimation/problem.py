@@ -93,8 +93,9 @@ class Problem(NamedTuple):
 
     def evidence(self, shape: Shape, lenses: Lenses) -> Evidence:
         """The evidence about one component of the shape, with rays of ``lenses``."""
-        everything = evidence_of(
+        return evidence_of(
             self.prior,
+            shape,
             self.views,
             self.size,
             options=self.options,
@@ -102,7 +103,6 @@ class Problem(NamedTuple):
             turns=self.turns,
             noise=self.noise,
         )
-        return everything._replace(shape=shape)
 
     def without(self, numbers: Sequence[int]) -> Problem:
         """The problem without some views; DegenerateError if the first is among them."""

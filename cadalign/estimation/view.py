@@ -213,14 +213,9 @@ class View(BeyondKeypoints):
 
 def numbered(views: Iterable[View]) -> list[View]:
     """The views, each with its place among them."""
-    return [_with_number(view, place) for place, view in enumerate(views)]
-
-
-def _with_number(view: View, number: int) -> View:
-    if view.number == number:
-        return view
-    same = copy(view)  # what was checked need not be checked again
-    object.__setattr__(same, "number", number)
+    same = list(map(copy, views))  # what was checked need not be checked again
+    for place, view in enumerate(same):
+        object.__setattr__(view, "number", place)
     return same
 
 

@@ -129,12 +129,11 @@ def _plot_mesh(axes: Axes, camera: Camera, alignment: Alignment, mesh: Mesh) -> 
     color = np.zeros((*shade.shape, 4))
     color[..., :3] = np.array(_MODEL_COLOR) * np.where(seen, shade, 0.0)[..., None]
     color[..., 3] = _MODEL_OPACITY * seen
-    axes.imshow(color, extent=(-0.5, camera.width - 0.5, camera.height - 0.5, -0.5))
-    height, width = shade.shape
-    columns = rescaled_pixels(np.arange(width, dtype=float), camera.width / width)
-    rows = rescaled_pixels(np.arange(height, dtype=float), camera.height / height)
+    right, bottom = camera.width - 0.5, camera.height - 0.5
+    axes.imshow(color, extent=(-0.5, right, bottom, -0.5))
     if not seen.all() and min(shade.shape) > 1:
-        axes.contour(columns, rows, seen, levels=[0.5], colors=[_MODEL_COLOR], linewidths=1.2)
+        place: Any = {"extent": (-0.5, right, -0.5, bottom), "origin": "lower"}  # rows from above
+        axes.contour(seen, levels=[0.5], colors=[_MODEL_COLOR], linewidths=1.2, **place)
 
 
 def _plot_box(axes: Axes, camera: Camera, box: Box) -> None:
@@ -167,8 +166,7 @@ def _shade(camera: Camera, alignment: Alignment, mesh: Mesh) -> FloatArray:
     from cadalign.geometry.raycaster import RayCaster
 
     step = max(1.0, max(camera.width, camera.height) / _LONGEST_SIDE)
-    width, height = round(camera.width / step), round(camera.height / step)
-    width, height = max(width, 1), max(height, 1)
+    width, height = (max(round(side / step), 1) for side in (camera.width, camera.height))
     across = rescaled_pixels(np.arange(width, dtype=float), camera.width / width)
     down = rescaled_pixels(np.arange(height, dtype=float), camera.height / height)
     pixels = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
@@ -179,11 +177,11 @@ def _shade(camera: Camera, alignment: Alignment, mesh: Mesh) -> FloatArray:
     caster = RayCaster(mesh)
     faces, distance = caster.first_hits(origin, directions)
     hit = (faces >= 0) & valid & (distance > 0)
-    normals = (caster.normals(faces[hit]) / alignment.scale) @ alignment.rotation.T
-    towards = np.abs(np.einsum("nk,nk->n", normals, rays[hit]))
-    towards /= np.linalg.norm(normals, axis=1) * np.linalg.norm(rays[hit], axis=1) + 1e-300
+    normals = caster.normals(faces[hit])
+    lengths = np.linalg.norm(normals / alignment.scale, axis=1) * np.linalg.norm(rays[hit], axis=1)
+    towards = np.abs(np.einsum("nk,nk->n", normals, directions[hit]))  # equal in both frames
     shade = np.full(len(rays), np.nan)
-    shade[hit] = 0.25 + 0.75 * towards
+    shade[hit] = 0.25 + 0.75 * towards / (lengths + 1e-300)
     return shade.reshape(height, width)
 
 

@@ -66,8 +66,7 @@ class _View(ForeignDocument):
     covariance: Matrix | None
 
     def __post_init__(self) -> None:
-        count = len(self.residuals)
-        _check_lengths(self, ("ids", "points_2d", "inliers"), count, "for {} residuals")
+        _check_lengths(self, ("ids", "points_2d", "inliers"), "residuals")
         for row, (residual, kept) in enumerate(zip(self.residuals, self.inliers, strict=True)):
             if kept and residual is None:
                 raise InputError("an inlier's residual is not finite", where=f"residuals[{row}]")
@@ -115,17 +114,15 @@ class _Result(ForeignDocument, rename={"own_bounds": "bounds", "own_stretch": "s
         if not self.views:
             raise InputError("there are none", where="views")
         names = ("ids", "points_covariance", "points_cam_covariance")
-        _check_lengths(self, names, len(self.points_3d), "but points_3d has {}", ", ")
+        _check_lengths(self, names, "points_3d")
 
 
-def _check_lengths(
-    document: ForeignDocument, names: Sequence[str], count: int, than: str, link: str = " "
-) -> None:
+def _check_lengths(document: ForeignDocument, names: Sequence[str], other: str) -> None:
+    count = len(getattr(document, other))
     for name in names:
         entries = getattr(document, name)
         if entries is not None and len(entries) != count:
-            what = f"{len(entries)} entries{link}{than.format(count)}"
-            raise InputError(what, where=name)
+            raise InputError(f"{len(entries)} entries, but {other} has {count}", where=name)
 
 
 _FORMS: Mapping[type, type[ForeignDocument]] = {

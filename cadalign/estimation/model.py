@@ -85,9 +85,12 @@ class Model:
         object.__setattr__(self, "ids", checked_ids(self.ids, len(points)))
         if self.mesh is not None:
             require_kind(self.mesh, Mesh, "mesh", fix="read it with cadalign.load_mesh")
-        if self.shape_sigma is not None and not len(points):
-            fix = "give points_3d, whose positions it is about, or leave it away"
-            raise InputError("the model has no keypoints", where="shape_sigma", fix=fix)
+        if self.shape_sigma is not None:
+            if not len(points):
+                fix = "give points_3d, whose positions it is about, or leave it away"
+                raise InputError("the model has no keypoints", where="shape_sigma", fix=fix)
+            sigma = as_positive(self.shape_sigma, name="shape_sigma")
+            object.__setattr__(self, "shape_sigma", sigma)
         given = self.bounds
         if given is None:
             given = self.mesh.bounds if self.mesh is not None else extent(points)
@@ -95,9 +98,6 @@ class Model:
         if (bounds[1] < bounds[0]).any():
             raise InputError("the first row must hold the least coordinates", where="bounds")
         object.__setattr__(self, "bounds", read_only(bounds))
-        if self.shape_sigma is not None:
-            sigma = as_positive(self.shape_sigma, name="shape_sigma")
-            object.__setattr__(self, "shape_sigma", sigma)
         if self.symmetry is not None:
             check_symmetry(self.symmetry)
         check_axis(self.up_axis)

@@ -21,7 +21,7 @@ from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import Lenses, ShapePrior, prior_of
-from cadalign.estimation.view import View, without_evidence
+from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment, are_on_a_line
 from cadalign.geometry.camera import faced, needs_facing, rays_ahead
 from cadalign.io.evidence import Size
@@ -104,22 +104,6 @@ class Problem(NamedTuple):
             noise=self.noise,
         )
 
-    def without(self, numbers: Sequence[int]) -> Problem:
-        """The problem without some views; DegenerateError if the first is among them."""
-        if not numbers:
-            return self
-        if 0 in numbers:
-            raise DegenerateError(
-                "its keypoints do not determine its pose, and the result is in its camera's frame",
-                where="views[0]",
-                fix="give at least 3 keypoints, not on one line, or another view first",
-            )
-        views = list(self.views)
-        for number in numbers:
-            views[number] = without_evidence(views[number])
-        lenses = Lenses.of(views, self.options.focal, self.options.focal_prior)
-        return self._replace(views=tuple(views), lenses=lenses)
-
 
 def compile_problem(
     model: Model | ShapeModel,
@@ -155,7 +139,7 @@ def compile_problem(
     problem = Problem(
         model, prior, tuple(views), tuple(facing), size, inits, options, ransac, lenses, turns
     )
-    return problem.without(_views_without_pose(problem))
+    return _with_poses(problem)
 
 
 def no_pose_error(problem: Problem) -> DegenerateError:
@@ -174,18 +158,28 @@ def no_pose_error(problem: Problem) -> DegenerateError:
     )
 
 
-def _views_without_pose(problem: Problem) -> list[int]:
-    """Numbers of several views of unknown motion, without a start, that determine no pose."""
-    views, prior = problem.views, problem.prior
+def _with_poses(problem: Problem) -> Problem:
+    """The problem without views of unknown motion, without a start, that determine no pose.
+
+    Raises DegenerateError if the first is one of these.
+    """
+    views, prior = list(problem.views), problem.prior
     if len(views) < 2 or any(view.cam_from_rig is not None for view in views):
-        return []
-    mean, found = prior.components[0].mean, []
-    for number, view in enumerate(views):
-        points = mean[prior.rows_of(view.keypoint_ids, f"views[{number}].ids")]
+        return problem
+    for number, view in enumerate(problem.views):
+        rows = prior.rows_of(view.keypoint_ids, f"views[{number}].ids")
+        points = prior.components[0].mean[rows]
         is_open = len(points) < LEAST_POINTS or are_on_a_line(points, _ON_A_LINE)
         if is_open and problem.inits[number] is None:
-            found.append(number)
-    return found
+            views[number] = View(view.camera, number=view.number)
+    if not views[0].has_evidence:
+        raise DegenerateError(
+            "its keypoints do not determine its pose, and the result is in its camera's frame",
+            where="views[0]",
+            fix="give at least 3 keypoints, not on one line, or another view first",
+        )
+    lenses = Lenses.of(views, problem.options.focal, problem.options.focal_prior)
+    return problem._replace(views=tuple(views), lenses=lenses)
 
 
 def _facing_view(view: View) -> View:

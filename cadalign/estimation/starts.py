@@ -71,9 +71,11 @@ def _proposed(evidence: Evidence, init: Start | None) -> list[_Start]:
     per_pose: list[list[_Start]] = [[] for _ in range(poses)]
     counts, unknowns = _keypoint_counts(evidence), 6 + int(evidence.scales.free.sum())
     is_several = poses > 1 and unknowns > 6
+    still = evidence.scales._replace(free=np.zeros(3), precision=np.zeros((3, 3)))
+    held = evidence._replace(scales=still)
     for view, camera in enumerate(rig.cam_from_rig):
         is_weak = is_several and 2 * counts[view] <= unknowns
-        found, logs = view_starts(_held(evidence) if is_weak else evidence, view)
+        found, logs = view_starts(held if is_weak else evidence, view)
         turned = _half_turned(evidence, view, found)
         moved = [(in_rig(pose, camera), scales) for pose, scales in zip(found, logs, strict=True)]
         moved += [(in_rig(pose, camera), np.zeros(3)) for pose in turned]
@@ -140,11 +142,6 @@ def in_rig(pose: FloatArray, camera: FloatArray) -> FloatArray:
     rotation, translation = camera[:9].reshape(3, 3), camera[9:]
     turned = rotation.T @ pose[:9].reshape(3, 3)
     return np.concatenate([turned.ravel(), rotation.T @ (pose[9:] - translation)])
-
-
-def _held(evidence: Evidence) -> Evidence:
-    scales = evidence.scales._replace(free=np.zeros(3), precision=np.zeros((3, 3)))
-    return evidence._replace(scales=scales)
 
 
 def _keypoint_counts(evidence: Evidence) -> IntArray:

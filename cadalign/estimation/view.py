@@ -219,11 +219,6 @@ def numbered(views: Iterable[View]) -> list[View]:
     return same
 
 
-def without_evidence(view: View) -> View:
-    """The camera of a view, and nothing of what it shows."""
-    return View(view.camera, cam_from_rig=view.cam_from_rig, number=view.number)
-
-
 def _depths(given: Any, camera: Camera, count: int, scale: float | None) -> FloatArray:
     """Depths of the keypoints (n,), or a depth image (h, w); NaN where unknown."""
     factor = None if scale is None else as_positive(scale, name="depth_scale")

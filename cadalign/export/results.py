@@ -150,11 +150,10 @@ def _plot_keypoints(
     axes: Axes, observed: FloatArray, residuals: FloatArray, inliers: BoolArray
 ) -> None:
     predicted = observed + residuals
-    for start, end, kept in zip(observed, predicted, inliers, strict=True):
-        if np.isfinite(end).all():
-            color = "#ffd21f" if kept else "#999999"
-            axes.plot(*np.stack([start, end]).T, color=color, linewidth=1)
-            axes.plot(*end, "x", color=color, markersize=6, markeredgewidth=1.5)
+    ends = np.stack([observed, predicted], axis=1).T  # (2, 2, n)
+    for chosen, color in ((~inliers, "#999999"), (inliers, "#ffd21f")):
+        axes.plot(*ends[..., chosen], color=color, linewidth=1)
+        axes.plot(*predicted[chosen].T, "x", color=color, markersize=6, markeredgewidth=1.5)
     for chosen, color in ((inliers, "white"), (~inliers, "#999999")):
         x, y = observed[chosen].T
         axes.plot(x, y, "o", color="black", markerfacecolor="none", markersize=10)

@@ -143,7 +143,7 @@ def with_view(**changes: Any) -> str:
             with_view(residuals=[None] * 6),
             "result: views[0].residuals[1]: an inlier's residual is not finite",
         ),
-        (with_view(inliers=[True]), "result: views[0].inliers: 1 entries for 6 residuals"),
+        (with_view(inliers=[True]), "result: views[0].inliers: 1 entries, but residuals has 6"),
         (changed(known_axis="q"), "result: known_axis: 'q' is not one of 'x', 'y', 'z'"),
         (changed(sigma="1"), "result: sigma: '1' is not a finite number"),
         (changed(stats={"speed": 1}), "result: stats.iterations: missing"),

@@ -209,17 +209,6 @@ def damp(blocks: FloatArray, border: FloatArray, damping: float) -> None:
 
 
 @kernel
-def multiply_3(first: FloatArray, second: FloatArray) -> FloatArray:
-    product = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            product[i, j] = (
-                first[i, 0] * second[0, j] + first[i, 1] * second[1, j] + first[i, 2] * second[2, j]
-            )
-    return product
-
-
-@kernel
 def eigenvectors_4(matrix: FloatArray, vectors: FloatArray) -> None:
     """Diagonalise a symmetric matrix (4, 4) in place by Jacobi's method; vectors are columns."""
     for i in range(4):

@@ -11,9 +11,7 @@ from cadalign.errors import DegenerateError
 from cadalign.solvers.constants import DEGENERATE, OK, OUT_OF_RANGE, POSE_SIZE, TOO_FEW
 from cadalign.solvers.linalg import (
     cholesky,
-    copy_into,
     eigenvectors_4,
-    multiply_3,
     nearest_rotation,
     rotation_from_quaternion,
     solve_cholesky,
@@ -205,9 +203,10 @@ def _split_scale(linear: FloatArray, spread: FloatArray, rotation: FloatArray) -
             break
         solve_cholesky(curvature, 3, slope)
         rotation_from_quaternion(1.0, slope[0] / 2, slope[1] / 2, slope[2] / 2, turned)
-        turned = multiply_3(turned, rotation)
-        for i in range(3):
-            copy_into(rotation[i], turned[i])
+        for j in range(3):
+            x, y, z = rotation[0, j], rotation[1, j], rotation[2, j]
+            for i in range(3):
+                rotation[i, j] = turned[i, 0] * x + turned[i, 1] * y + turned[i, 2] * z
         if slope[0] ** 2 + slope[1] ** 2 + slope[2] ** 2 < 1e-18:
             break
     scale = np.empty(3)

@@ -136,7 +136,7 @@ def _eliminate(memory: FloatArray) -> None:
     a0, b0, c0 = _parabola(memory, 0), _parabola(memory, 1), _parabola(memory, 2)
     a1, b1, c1 = _line(memory, 0, 3), _line(memory, 1, 3), _line(memory, 2, 3)
     a2, b2, c2 = _line(memory, 0, 5), _line(memory, 1, 5), _line(memory, 2, 5)
-    d, e = _minus_2(a1, b2), _minus_2(c2, b1)
+    d, e = (a1[0] - b2[0], a1[1] - b2[1]), (c2[0] - b1[0], c2[1] - b1[1])
     y1 = minus(minus(_times_22(a2, c1), _times_22(b1, b2)), b0)  # equal to z2
     z1 = plus(plus(_times_22(d, b2), _times_22(a2, e)), a0)
     w1 = _minus_4(_plus_4(_times_23(d, b0), _times_23(a2, c0)), _times_23(b1, a0))
@@ -147,14 +147,8 @@ def _eliminate(memory: FloatArray) -> None:
     b12 = _times_22(b1, b2)
     yz = minus(minus(plus(b12, b12), _times_22(a1, c2)), _times_22(a2, c1))
     f, g, h = plus(b0, yz), minus(zz, a0), minus(yy, c0)
-    y3 = _plus_4(
-        _plus_4(_times_23(b1, plus(b0, f)), _times_23(c1, g)),
-        _times_23(a1, h),
-    )
-    z3 = _plus_4(
-        _plus_4(_times_23(b2, plus(b0, f)), _times_23(c2, g)),
-        _times_23(a2, h),
-    )
+    y3 = _plus_4(_plus_4(_times_23(b1, plus(b0, f)), _times_23(c1, g)), _times_23(a1, h))
+    z3 = _plus_4(_plus_4(_times_23(b2, plus(b0, f)), _times_23(c2, g)), _times_23(a2, h))
     w3 = _plus_5(_plus_5(_times_33(b0, f), _times_33(c0, g)), _times_33(yy, a0))
     _write(memory, 0, (y1[0], y1[1], y1[2], 0.0, 0.0))
     _write(memory, 1, (z1[0], z1[1], z1[2], 0.0, 0.0))
@@ -165,17 +159,18 @@ def _eliminate(memory: FloatArray) -> None:
     _write(memory, 6, (y3[0], y3[1], y3[2], y3[3], 0.0))
     _write(memory, 7, (z3[0], z3[1], z3[2], z3[3], 0.0))
     _write(memory, 8, w3)
-    y = _minus_6(_times_34(z1, w2), _times_34(y1, w1))
-    z = _minus_6(_times_34(y2, w1), _times_34(y1, w2))
-    w = _minus_5(_times_33(y1, y1), _times_33(y2, z1))
+    y, other_y = _times_34(z1, w2), _times_34(y1, w1)
+    z, other_z = _times_34(y2, w1), _times_34(y1, w2)
+    w, other_w = _times_33(y1, y1), _times_33(y2, z1)
     for k in range(_DEGREE + 1):
         memory[_POLYNOMIAL, k] = 0.0
     for i in range(6):
         for k in range(4):
-            memory[_POLYNOMIAL, i + k] += y[i] * y3[k] + z[i] * z3[k]
+            share = (y[i] - other_y[i]) * y3[k] + (z[i] - other_z[i]) * z3[k]
+            memory[_POLYNOMIAL, i + k] += share
     for i in range(5):
         for k in range(5):
-            memory[_POLYNOMIAL, i + k] += w[i] * w3[k]
+            memory[_POLYNOMIAL, i + k] += (w[i] - other_w[i]) * w3[k]
 
 
 @inlined
@@ -286,32 +281,13 @@ def _plus_5(p: Quintuple, q: Quintuple) -> Quintuple:
 
 
 @inlined
-def _minus_2(p: Pair, q: Pair) -> Pair:
-    return p[0] - q[0], p[1] - q[1]
-
-
-@inlined
 def _minus_4(p: Quadruple, q: Quadruple) -> Quadruple:
     return p[0] - q[0], p[1] - q[1], p[2] - q[2], p[3] - q[3]
 
 
 @inlined
-def _minus_5(p: Quintuple, q: Quintuple) -> Quintuple:
-    return p[0] - q[0], p[1] - q[1], p[2] - q[2], p[3] - q[3], p[4] - q[4]
-
-
-@inlined
-def _minus_6(p: Sextuple, q: Sextuple) -> Sextuple:
-    return p[0] - q[0], p[1] - q[1], p[2] - q[2], p[3] - q[3], p[4] - q[4], p[5] - q[5]
-
-
-@inlined
 def _times_22(p: Pair, q: Pair) -> Triple:
-    return (
-        p[0] * q[0],
-        p[0] * q[1] + p[1] * q[0],
-        p[1] * q[1],
-    )
+    return p[0] * q[0], p[0] * q[1] + p[1] * q[0], p[1] * q[1]
 
 
 @inlined

@@ -101,7 +101,7 @@ def relief(points: FloatArray, rays: FloatArray, whitening: FloatArray) -> float
     if not minors > 0.0:
         return 0.0
     share = max(determinant, 0.0) / minors / (a + b + c)
-    return float(np.sqrt(share * _square_spread(rays) * information))
+    return float(np.sqrt(share * (rays[:, 0].var() + rays[:, 1].var()) * information))
 
 
 @kernel
@@ -165,18 +165,6 @@ def widen_by_shape(
     # The variances add up for a whitening (a, b, c) whose b is small beside a and c.
     information = np.square(whitening[:, ::2]).sum(axis=1) / 2.0
     return np.asarray(whitening / np.sqrt(1.0 + variances / depth**2 * information)[..., None])
-
-
-@kernel
-def _square_spread(rows: FloatArray) -> float:
-    total = 0.0
-    for a in range(rows.shape[1]):
-        mean = 0.0
-        for n in range(rows.shape[0]):
-            mean += rows[n, a] / rows.shape[0]
-        for n in range(rows.shape[0]):
-            total += (rows[n, a] - mean) ** 2 / rows.shape[0]
-    return total
 
 
 @kernel

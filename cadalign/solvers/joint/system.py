@@ -81,11 +81,6 @@ def joint_system(evidence: Evidence, *, integrates: bool) -> Joint:
     return Joint(evidence, layout_of(evidence), integrates)
 
 
-@kernel
-def plain_system(system: Joint) -> Joint:
-    return Joint(system.evidence, system.layout, False)
-
-
 @room_of.of(Joint)
 @kernel
 def _room_of(system: Joint) -> tuple[JointEquations, JointEquations]:
@@ -213,8 +208,9 @@ def _bounded(log_step: float) -> float:
 @score_of.of(Joint)
 @kernel
 def _score_of(system: Joint, row: FloatArray, cost: float) -> float:
-    evidence, equations = system.evidence, joint_room(system.evidence, system.layout)
-    cost, arrow = evaluate_joint(plain_system(system), row, equations), equations.arrow
+    evidence, layout = system.evidence, system.layout
+    equations = joint_room(evidence, layout)
+    cost, arrow = evaluate_joint(Joint(evidence, layout, False), row, equations), equations.arrow
     if not cost < np.inf:
         return np.inf
     decide_on_undetermined(arrow, arrow.blocks.shape[0] > 1)
@@ -280,7 +276,8 @@ def run_joint(system: Joint, starts: FloatArray, effort: Effort) -> tuple[Minima
     A single kernel does both, since each would compile the equations anew. Where the shape is
     integrated out, few steps tell promising starts first; ``costs`` of minima never have it so.
     """
-    plain, integrates, size = plain_system(system), system.integrates, starts.shape[1]
+    plain = Joint(system.evidence, system.layout, False)
+    integrates, size = system.integrates, starts.shape[1]
     equations = joint_room(system.evidence, system.layout)
     minima = room_for_minima(effort.starts if effort.starts > 0 else starts.shape[0], size)
     if effort.starts == 0:

@@ -105,7 +105,7 @@ class RayCaster:
     def __init__(
         self, mesh: Mesh, normals: FloatArray | None = None, *, engine: EngineMaker = EmbreeEngine
     ) -> None:
-        low, high = mesh.bounds
+        low, high = self.bounds = mesh.bounds
         self._center = (low + high) / 2
         # A mesh of a single point has no size; any radius serves.
         self._radius = float(np.linalg.norm(high - low)) / 2 or 1.0

@@ -17,7 +17,6 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
 from cadalign.estimation.contours.mask import MaskSource, convex_hull
 from cadalign.estimation.contours.outline import (
-    MeasuredOutline,
     OutlineSupport,
     Track,
 )
@@ -71,22 +70,18 @@ class Candidate:
     fit: OutlineFit
     tracks: list[Track]
 
-    @property
-    def _measured(self) -> list[tuple[Source, MeasuredOutline | None]]:
-        return list(zip(self.fit.problem.sources, self.fit.measured, strict=True))
-
     @cached_property
     def supports(self) -> list[OutlineSupport]:
         return [
             OutlineSupport() if each is None else source.support(each)
-            for source, each in self._measured
+            for source, each in self.fit.measured
         ]
 
     @cached_property
     def rank(self) -> float:
         """-2 log of its probability by the other evidence and by the outlines, up to a constant."""
         rest = cost_of(self.fit.problem.evidence, self.fit.state) + self.start.prior_score
-        return rest + sum(source.rank(each) for source, each in self._measured if each is not None)
+        return rest + sum(source.rank(each) for source, each in self.fit.measured if each)
 
     @cached_property
     def minimum(self) -> Minimum:

@@ -35,7 +35,6 @@ from cadalign.estimation.contours.outline import (
     OutlineSupport,
     Track,
 )
-from cadalign.estimation.contours.surface import PosedSurface
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
 
@@ -104,7 +103,7 @@ class MaskSource(OutlineSource):
         """Noise and reach of the last rounds."""
         return self._narrowed(self.first()._replace(noise=track.noise, is_fine=self.is_exact))
 
-    def outline(self, sight: Sight, surface: PosedSurface, track: Track) -> Outline:
+    def outline(self, sight: Sight, track: Track) -> Outline:
         """The outline of a posed surface; a fine one is free of the bias of extraction."""
         rims = find_rims(sight, self.contour, track.reach)
         bias = np.zeros(len(rims.found))

@@ -23,7 +23,6 @@ from cadalign.estimation.contours.outline import (
     Track,
 )
 from cadalign.estimation.contours.photo_lines import PhotoPyramid, outline_of, silhouette_of
-from cadalign.estimation.contours.surface import PosedSurface
 
 # Reaches of the lines of every round, relative to the silhouette's size.
 _COARSE, _FINE = (0.16, 0.08), (0.04, 0.02, 0.02)
@@ -60,9 +59,9 @@ class PhotoSource(OutlineSource):
     def last(self, track: Track) -> Track:
         return Track(_FIRST, _FINE[0], _FINE[1:], is_fine=True)
 
-    def outline(self, sight: Sight, surface: PosedSurface, track: Track) -> Outline | None:
+    def outline(self, sight: Sight, track: Track) -> Outline | None:
         cells = round(min(max(_REACH_CELLS / track.reach, _FEWEST_CELLS), _MOST_CELLS))
-        silhouette = silhouette_of(surface, sight.camera, sight.pose, cells)
+        silhouette = silhouette_of(sight, cells)
         if silhouette is None:
             return None
         found = outline_of(self.photo, silhouette, max(track.reach * silhouette.size, _LEAST_REACH))

@@ -25,8 +25,7 @@ from cadalign.estimation.contours.contour import (
     without_steep,
 )
 from cadalign.estimation.contours.outline import Outline
-from cadalign.estimation.contours.surface import PosedSurface
-from cadalign.geometry.alignment import Alignment, bounds_corners
+from cadalign.geometry.alignment import bounds_corners
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PIXEL_CENTRE, rescaled_pixels
 from cadalign.io.images import ByteImage
@@ -210,11 +209,9 @@ class Silhouette(NamedTuple):
         return np.asarray(map_coordinates(self.inside, [rows, columns], order=0))
 
 
-def silhouette_of(
-    surface: PosedSurface, camera: Camera, pose: Alignment, cells: int
-) -> Silhouette | None:
+def silhouette_of(sight: Sight, cells: int) -> Silhouette | None:
     """The silhouette, so many ``cells`` long, and its rims; None where no rim is seen."""
-    box = _box_in_image(bounds_corners(*surface.mesh.bounds), camera, pose)
+    box = _box_in_image(sight)
     if box is None:
         return None
     low, high = box
@@ -222,7 +219,6 @@ def silhouette_of(
     # Room for the contour's smoothing, and for colours of the background.
     corner = low - 4 * cell
     width, height = (np.ceil((high - low) / cell).astype(int) + 9).tolist()
-    sight = Sight(surface.caster, camera, pose)
     inside = _covered_cells(sight, corner, cell, (height, width))
     rough = contour_of(inside)
     if not len(rough.points):
@@ -231,7 +227,9 @@ def silhouette_of(
     rims = without_steep(contour, find_rims(sight, contour, _RIM_REACH * cell))
     on_rim = contour._replace(points=contour.at(rims.offset))
     across = across_rims(on_rim, rims._replace(offset=np.zeros(len(rims.offset))))
-    within = (on_rim.points > _BORDER) & (on_rim.points < [camera.width - 3, camera.height - 3])
+    within = (on_rim.points > _BORDER) & (
+        on_rim.points < [sight.camera.width - 3, sight.camera.height - 3]
+    )
     kept = rims.found & within.all(axis=1)
     if not kept.any():
         return None
@@ -256,11 +254,9 @@ def _covered_cells(
     return inside
 
 
-def _box_in_image(
-    corners: FloatArray, camera: Camera, pose: Alignment
-) -> tuple[FloatArray, FloatArray] | None:
+def _box_in_image(sight: Sight) -> tuple[FloatArray, FloatArray] | None:
     """Corners of the object's box in the image; None where it is not there."""
-    seen = pose.apply(corners)
+    camera, seen = sight.camera, sight.pose.apply(bounds_corners(*sight.caster.bounds))
     size = np.array([camera.width, camera.height]) - 1.0
     if (seen[:, 2] <= 0).any():
         return np.zeros(2), size

@@ -194,12 +194,14 @@ class OutlineFit(NamedTuple):
     tracks: list[Track]
 
     @property
-    def measured(self) -> list[MeasuredOutline | None]:
+    def measured(self) -> list[tuple[Source, MeasuredOutline | None]]:
         """The outline that each source measures, and its noise."""
-        offsets = self.problem.offsets(self.state, self.tracks)
+        sources, offsets = self.problem.sources, self.problem.offsets(self.state, self.tracks)
         return [
-            outline and MeasuredOutline(outline, offset, track.noise)
-            for outline, offset, track in zip(self.outlines, offsets, self.tracks, strict=True)
+            (source, outline and MeasuredOutline(outline, offset, track.noise))
+            for source, outline, offset, track in zip(
+                sources, self.outlines, offsets, self.tracks, strict=True
+            )
         ]
 
     def evidence_at(self, tracks: Sequence[Track]) -> Evidence:
@@ -243,7 +245,7 @@ def _approached(
         posed = problem.surface.at(problem.evidence.shape, state)
         sights, offsets = problem.sights(state, posed), problem.offsets(state, tracks)
         outlines = [
-            source.outline(sight, posed, track)
+            source.outline(sight, track)
             for source, sight, track in zip(problem.sources, sights, tracks, strict=True)
         ]
         learned = [

@@ -14,9 +14,8 @@ equations in the inverse squares of its scales.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from functools import lru_cache
-from typing import NamedTuple, TypeVar, cast
+from typing import NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -58,8 +57,6 @@ _DISTINCT_DEG = 10.0
 _DISTINCT_STRETCH = 0.2
 _RESEMBLING = 12  # silhouettes from which a mask alone starts
 _LARGEST_FOCAL_SIGMA = 0.25  # relative: poses are sought at the focal length of the prior
-
-T = TypeVar("T")
 
 
 class Whitened(NamedTuple):
@@ -123,7 +120,7 @@ def resembling_poses(
     poses = _poses_of(*_affine_cameras(atlas, view.outline), atlas, free)
     found = [(pose, view.overlap(atlas.caster, pose)) for pose in poses]
     found.sort(key=lambda each: -each[1])
-    kept = distinct(((each[0], each) for each in found), count, symmetry)
+    kept = distinct(found, count, symmetry)
     turn = view.camera_from_facing
     return [(turned_alignment(pose, turn), overlap) for pose, overlap in kept]
 
@@ -305,16 +302,16 @@ def _stretches_of(matrices: FloatArray, free: BoolArray) -> FloatArray:
 
 
 def distinct(
-    found: Iterable[tuple[Alignment, T]], count: int, symmetry: Symmetry | None
-) -> list[T]:
+    found: list[tuple[Alignment, float]], count: int, symmetry: Symmetry | None
+) -> list[tuple[Alignment, float]]:
     """The first ones whose alignments, apart from symmetry, are too far apart for one minimum."""
     group = None if symmetry is None else group_of(symmetry)
     poses: list[Alignment] = []
-    kept: list[T] = []
-    for given, each in found:
-        pose = given
+    kept = []
+    for each in found:
+        pose = each[0]
         if group is not None:
-            pose = group.canonical(given, tolerance=_DISTINCT_STRETCH).alignment
+            pose = group.canonical(pose, tolerance=_DISTINCT_STRETCH).alignment
         if all(_differ(pose, other) for other in poses):
             poses.append(pose)
             kept.append(each)

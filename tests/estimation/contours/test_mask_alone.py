@@ -59,10 +59,10 @@ def test_of_equal_poses_one_is_a_start() -> None:
     turns = [posed(0).rotation @ rotation_from_vector([0, angle, 0]) for angle in (0, 0.7, 1.5)]
     other = rotation_from_vector([0.6, 0, 0]) @ posed(0).rotation
     poses = [Alignment(turn, [0, 0, 3], np.ones(3)) for turn in (*turns, other)]
-    found = list(zip(poses, range(4), strict=True))
-    assert distinct(found, 4, None) == [0, 1, 2, 3]
-    assert distinct(found, 4, about) == [0, 3]
-    assert distinct(found, 2, None) == [0, 1]
+    found = [(pose, 0.5) for pose in poses]
+    assert distinct(found, 4, None) == found
+    assert distinct(found, 4, about) == [found[0], found[3]]
+    assert distinct(found, 2, None) == found[:2]
 
 
 def test_a_prior_on_the_focal_length_is_enough() -> None:

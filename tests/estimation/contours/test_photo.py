@@ -237,12 +237,12 @@ class TestSilhouette:
     @pytest.mark.parametrize("seed", range(3))
     def test_its_cells_are_those_that_rays_meet(self, seed: int) -> None:
         mesh, truth = wedge(), scene(seed).truth
-        surface = RigidSurface(mesh)
-        found = silhouette_of(surface, CAMERA, truth, 150)
+        sight = Sight(RigidSurface(mesh).caster, CAMERA, truth)
+        found = silhouette_of(sight, 150)
         assert found is not None
         rows, columns = np.indices(found.inside.shape)
         pixels = found.corner + found.cell * np.stack([columns, rows], axis=-1)
-        met = Sight(surface.caster, CAMERA, truth).covers(pixels)
+        met = sight.covers(pixels)
         assert 0.2 < met.mean() < 0.9
         # The wedge is nowhere thinner than two cells.
         assert (found.inside == met).all()

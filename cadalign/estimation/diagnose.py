@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import FloatArray
 from cadalign.errors import quote
 from cadalign.estimation.agreement import Agreement, AnyModel, DiagnosisCase, Rule
 from cadalign.estimation.assemble import result_of_keypoints
@@ -107,17 +107,22 @@ def _measures_of(case: DiagnosisCase) -> list[str]:
 
 def diagnose_fit(fitted: FittedKeypoints) -> EstimateWarning | None:
     """As `diagnose`, of keypoints in one view; after a robust search also of its inliers."""
-    options, cause = fitted.options, None
-    ahead = np.asarray(np.isfinite(fitted.residuals).all(axis=1))
-    if fitted.search is not None:
+    search, options, observed = fitted.search, fitted.options, fitted.observed
+    first = None if search is None else search.ransac
+    passes = [(np.isfinite(fitted.residuals).all(axis=1), first)]
+    if search and options.sigma is not None and fitted.fisher_covariance is not None:
+        passes.append((fitted.inliers, None))
+    for kept, ransac in passes:
+        rows, own = np.flatnonzero(kept), options
+        if options.sigma is not None and np.ndim(options.sigma) > 0:
+            own = replace(options, sigma=np.asarray(options.sigma)[rows])
         # Samples need not be drawn where all agree.
-        ransac = fitted.search.ransac
-        own = _case_of_rows(fitted, ahead, None if fitted.inliers.all() else ransac)
-        cause = diagnose(replace(own, ransac=ransac))
-    is_last = fitted.search is not None and options.sigma is None
-    if cause is not None or is_last or fitted.fisher_covariance is None:
-        return cause
-    return diagnose(_case_of_rows(fitted, ahead if options.sigma is None else fitted.inliers))
+        drawn = None if fitted.inliers.all() else ransac
+        seen = fitted.points_3d, observed[rows], fitted.camera
+        case = case_of_fit(*seen, own, drawn, rows.tolist())
+        if cause := diagnose(replace(case, ransac=ransac)):
+            return cause
+    return None
 
 
 @np.errstate(all="ignore")
@@ -137,16 +142,6 @@ def diagnose_refusal(case: DiagnosisCase, *, with_keypoints: bool = True) -> str
     best = min((each for _, each in found), key=lambda each: each.score)
     likely = [each for each in found if each[1].score <= best.score + _AS_LIKELY]
     return f"{_named(likely)}: corrected, {best.inliers} of {best.keypoints} keypoints agree"
-
-
-def _case_of_rows(
-    fitted: FittedKeypoints, kept: BoolArray, ransac: RansacOptions | None = None
-) -> DiagnosisCase:
-    rows, options, sigma = np.flatnonzero(kept), fitted.options, fitted.options.sigma
-    if sigma is not None and np.ndim(sigma) > 0:
-        options = replace(options, sigma=np.asarray(sigma)[rows])
-    observed = fitted.observed[rows]
-    return case_of_fit(fitted.points_3d, observed, fitted.camera, options, ransac, rows.tolist())
 
 
 def case_of_fit(
@@ -189,16 +184,12 @@ def _flipped(view: View, *, axis: int) -> View:
     return replace(view, points_2d=pixels)
 
 
-def _resized(view: View, *, factor: float, noise: float) -> View:
-    """The view of images that are larger by a factor, with keypoints whose noise is."""
+def _resized(view: View, *, size: tuple[int, int], noise: float) -> View:
+    """The view of images of another size, with keypoints whose noise is larger by a factor."""
     sigma, power = view.sigma, 2 if np.ndim(cast(FloatArray, view.sigma)) == 3 else 1
     if sigma is not None:
         sigma = np.asarray(sigma) * noise**power
-    return replace(view, camera=view.camera.resized(*_size(view.camera, factor)), sigma=sigma)
-
-
-def _size(camera: Camera, factor: float) -> tuple[int, int]:
-    return max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
+    return replace(view, camera=view.camera.resized(*size), sigma=sigma)
 
 
 def _measured(view: View, *, name: str, factor: float) -> View:
@@ -303,10 +294,10 @@ def _other_sizes(case: DiagnosisCase) -> Iterator[Rule]:
         is_usual = (factor > 1) != is_inside and (factor > 1 or case.ransac is None)
         if not case.is_plain and not (is_usual and holds_most(factor)):
             continue
-        width, height = _size(camera, factor)
+        width, height = (max(1, round(side * factor)) for side in (camera.width, camera.height))
         clause = f"the keypoints are of images of {width} x {height} px, the camera of {own}"
         for noise in sorted({1.0, 1.0 if is_inside else max(factor, 1.0)}):
-            undo = partial(_resized, factor=factor, noise=noise)
+            undo = partial(_resized, size=(width, height), noise=noise)
             yield Rule("mistake", clause, undo, gain=_CAMERA_GAIN)
 
 

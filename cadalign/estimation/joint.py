@@ -95,12 +95,13 @@ def result_of(
     turns, of_turns = steps[0][:, :3], best.covariances[0][:3, :3]
     squares = (turns @ np.linalg.pinv(of_turns, hermitian=True) * turns).sum(axis=1)
     is_far = squares > SAME_SQUARES
-    others = [each for each, far in zip(estimates, is_far, strict=True) if far]
+    judged = list(zip(estimates, is_far, strict=True))
+    others = [(each.poses[0], each.likelihood) for each, far in judged if far]
     alternatives = tuple(
         Alternative(
             each.poses[0], each.likelihood, each.cameras[0], each.points[:-2], each.points[-2:]
         )
-        for each, far in zip(estimates, is_far, strict=True)
+        for each, far in judged
         if far or (each.is_optimum and each is not best)
     )
     pose, points = best.poses[0], best.points[:-2]
@@ -136,14 +137,10 @@ def result_of(
             *weaknesses(pose, covariances[0], lengths=best.lengths),
             *another_pose(
                 pose,
-                [(each.poses[0], each.likelihood) for each in others],
+                others,
                 covariances[0],
                 prior.degrees_of_freedom,
-                near=sum(
-                    each.likelihood
-                    for each, far in zip(estimates[1:], is_far[1:], strict=True)
-                    if not far
-                ),
+                near=sum(each.likelihood for each, far in judged[1:] if not far),
             ),
             *(
                 EstimateWarning(

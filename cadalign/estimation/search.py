@@ -17,7 +17,7 @@ from cadalign.estimation.problem import Inits, Problem
 from cadalign.estimation.problems import no_redundancy_error
 from cadalign.estimation.propose import propose, under_cauchy
 from cadalign.estimation.starts import Starts
-from cadalign.estimation.uncertainty.evidence import count_equations
+from cadalign.estimation.uncertainty.evidence import redundancy_of
 from cadalign.estimation.uncertainty.posterior import widening_of
 from cadalign.estimation.uncertainty.residuals import Support, area_of, check_support
 from cadalign.estimation.view import View
@@ -115,9 +115,7 @@ def _whole(evidence: Evidence, component: int, lenses: Lenses) -> Minimum:
 
 def _is_left_to_outlines(problem: Problem, evidence: Evidence) -> bool:
     """True where outlines determine what else is open: that would lead a start astray."""
-    unknowns = 6 * problem.pose_count + int(evidence.scales.free.sum())
-    equations = count_equations(evidence) - len(evidence.shape.modes)
-    return problem.uses_outlines and equations < unknowns
+    return problem.uses_outlines and redundancy_of(evidence) < 0
 
 
 def _states_of(whole: Minimum, starts: Starts) -> list[Minimum]:

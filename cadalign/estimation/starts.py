@@ -18,7 +18,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.prior import has_scale_prior
-from cadalign.estimation.uncertainty.evidence import count_equations
+from cadalign.estimation.uncertainty.evidence import redundancy_of
 from cadalign.geometry.rotations import spread_rotations
 from cadalign.solvers.constants import LEAST_POINTS
 from cadalign.solvers.joint.evidence import Evidence, depths_along_axes, distances_of
@@ -82,8 +82,7 @@ def _proposed(evidence: Evidence, init: Start | None) -> list[_Start]:
         per_pose[rig.pose[view]].extend(moved)
     is_metric = init is None and bool(evidence.scales.free.all())
     if init is not None:
-        unknowns = 6 * poses + int(evidence.scales.free.sum())
-        is_open = count_equations(evidence) - len(evidence.shape.modes) < unknowns
+        is_open = redundancy_of(evidence) < 0
         for given, found_of_pose in zip(init[0], per_pose, strict=True):
             if given is None:
                 continue

@@ -19,24 +19,17 @@ from cadalign.solvers.joint.evidence import (
 _OUTLIER = 8.0  # [sigma], of a depth: it is that of something else
 
 
-def count_equations(evidence: Evidence) -> int:
-    """Number of equations, those of priors included; what is exact adds none."""
+def redundancy_of(evidence: Evidence) -> int:
+    """Equations, those of priors on the lengths included, minus unknowns; what is exact is none."""
     whitening, depths = evidence.sightings.whitening, evidence.sightings.depths
     # Two of a keypoint's ray, one of a ray along a contour's normal.
     count = int(
         (whitening[:, 2] > 0).sum() + whitening.any(axis=1).sum() + (depths[:, 1] > 0).sum()
     )
     count += 2 * len(evidence.directions.image) + len(evidence.offsets.weight)
-    count += len(evidence.shape.modes)
     if has_scale_prior(evidence.scales):
         count += int(np.linalg.matrix_rank(evidence.scales.precision))
-    return count
-
-
-def redundancy_of(evidence: Evidence) -> int:
-    """Equations minus unknowns, where all of these are determined."""
-    unknowns = 6 * int(evidence.rig.pose.max() + 1) + int(evidence.scales.free.sum())
-    return count_equations(evidence) - len(evidence.shape.modes) - unknowns
+    return count - 6 * int(evidence.rig.pose.max() + 1) - int(evidence.scales.free.sum())
 
 
 def summaries_of(evidence: Evidence, state: State) -> list[EvidenceSummary]:

@@ -8,10 +8,26 @@ import numpy as np
 
 from cadalign import Alignment, Model, Size, View
 from cadalign.estimation.estimates import mean_state, pose_and_lengths
+from cadalign.estimation.options import FitOptions
 from cadalign.estimation.pack import evidence_of
-from cadalign.estimation.prior import prior_of
+from cadalign.estimation.prior import Lenses, ShapePrior, prior_of
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.solvers.joint.covariance import joint_covariance, pose_and_border
+from cadalign.solvers.joint.evidence import Evidence
+
+
+def plain_evidence(prior: ShapePrior, views: Sequence[View], size: Size | None = None) -> Evidence:
+    """Evidence about the first component, of cameras that are known and not turned."""
+    return evidence_of(
+        prior,
+        prior.components[0],
+        views,
+        size,
+        options=FitOptions(),
+        lenses=Lenses.of(views, "known", None),
+        turns=[np.eye(3)] * len(views),
+        noise=1.0,
+    )
 
 
 def bound_of(
@@ -21,7 +37,7 @@ def bound_of(
 
     ``truths`` are in the frame of each pose: the rig's, or each view's camera.
     """
-    evidence = evidence_of(prior_of(model), views, size)
+    evidence = plain_evidence(prior_of(model), views, size)
     poses = np.array([each.packed[:12] for each in truths])
     state = mean_state(evidence, poses, np.log(truths[0].scale))
     unknowns = pose_and_border(joint_covariance(evidence, state), 0)

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from support.bounds import plain_evidence
 from support.scenes import (
     CAMERA,
     around,
@@ -25,7 +26,6 @@ from support.scenes import (
 from cadalign import Alignment, Model, ShapeModel, Size, View, align
 from cadalign.errors import InputError
 from cadalign.estimation.estimates import with_box
-from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.uncertainty.evidence import redundancy_of
@@ -292,7 +292,7 @@ def test_bad_input_is_named(call: Any, message: str) -> None:
 def test_points_that_are_no_keypoints_end_no_box() -> None:
     prior = prior_of(similar())
     views = [seen(keypoints(12), truth_of((1, 1, 1)), np.eye(4))]
-    evidence = evidence_of(prior, views)
+    evidence = plain_evidence(prior, views)
     modes, mean = evidence.shape.modes, evidence.shape.mean
     pose = truth_of((1, 1, 1)).packed[None, :12]
     state = State(pose, np.zeros(0), np.zeros(3), np.zeros(len(modes)), np.zeros_like(mean))
@@ -310,5 +310,5 @@ def test_equations_beyond_the_unknowns_are_counted() -> None:
     views = [seen(points, truth, np.eye(4)), seen(points, truth, np.eye(4))]
     prior = prior_of(Model(points_3d=points))
     for few, poses in ((views[:1], 1), (views, 2)):
-        evidence = evidence_of(prior, few)
+        evidence = plain_evidence(prior, few)
         assert redundancy_of(evidence) == 24 * poses - 6 * poses - 2

@@ -1,7 +1,9 @@
 """Robust search: LO-RANSAC over the minimal solver.
 
-Truncated squared errors (MSAC) rank the hypotheses; a new best one is optimised locally (Chum,
-Matas, Kittler, "Locally optimized RANSAC", 2003).
+Truncated squared errors (MSAC) rank the hypotheses; a sequential probability ratio test rejects
+bad ones after a few points (Matas, Chum, "Randomized RANSAC with sequential probability ratio
+test", 2005); a new best one is optimised locally (Chum, Matas, Kittler, "Locally optimized RANSAC",
+2003).
 """
 
 from __future__ import annotations
@@ -30,6 +32,10 @@ from cadalign.solvers.projection import scalars_of
 from cadalign.solvers.search import refine
 from cadalign.solvers.starts import next_subset
 
+_FEW_POINTS = 24  # so few are always all looked at
+_RANDOM_SUPPORT = 0.02  # share of the points that a wrong hypothesis fits, at first
+_LEAST_SUPPORT = 0.03  # share of the points that a hypothesis is expected to fit, at least
+_REJECTION = 200.0  # likelihood ratio at which a hypothesis is rejected
 _LOCAL_POINTS = 120
 _LOCAL_ITERATIONS = 6
 _LOCAL_ROUNDS = 3
@@ -78,7 +84,9 @@ def ransac_kernel(
     candidates = np.empty((MAX_SOLUTIONS, POSE_SIZE))
     memory = minimal_memory()
     trial = np.empty(POSE_SIZE)
+    random_support = _RANDOM_SUPPORT
     best = np.inf
+    best_support = 0
     iterations = 0
     hypotheses = 0
     needed = float(settings.max_iterations)
@@ -95,7 +103,12 @@ def ransac_kernel(
         found = _solve_sample(keypoints, settings.minimal, chosen, memory, candidates)
         hypotheses += found
         for k in range(found):
-            score, support = score_pose(keypoints, candidates[k], limit, best)
+            share = best_support / n
+            score, support, seen = score_pose(
+                keypoints, candidates[k], limit, best, share, random_support
+            )
+            if seen < n and seen > 0:  # rejected: learn how much support a wrong one finds
+                random_support = 0.98 * random_support + 0.02 * max(support / seen, 0.002)
             if not score < best:
                 continue
             best, best_support = score, support
@@ -103,7 +116,7 @@ def ransac_kernel(
             if settings.optimize:
                 copy_into(trial, candidates[k])
                 _optimize_locally(objective, settings.threshold, trial)
-                score, support = score_pose(keypoints, trial, limit, best)
+                score, support, _ = score_pose(keypoints, trial, limit, np.inf, 0.0, 1.0)
                 if score < best:
                     best, best_support = score, support
                     copy_into(pose, trial)
@@ -124,6 +137,8 @@ def _needed_samples(inlier_ratio: float, settings: Settings) -> float:
     good = inlier_ratio**settings.size
     if good >= 1.0:
         return 1.0
+    # A rejection test that errs once in _REJECTION costs that many more samples.
+    good *= 1.0 - 1.0 / _REJECTION
     return float(np.log(1.0 - settings.success_prob) / np.log1p(-good))
 
 
@@ -143,19 +158,40 @@ def _solve_sample(
 
 @kernel
 def score_pose(
-    keypoints: KeypointEvidence, pose: FloatArray, limit: float, best: float
-) -> tuple[float, int]:
-    """Truncated score and number of inliers; infinite once the score exceeds the best one."""
+    keypoints: KeypointEvidence,
+    pose: FloatArray,
+    limit: float,
+    best: float,
+    inlier_ratio: float,
+    random_support: float,
+) -> tuple[float, int, int]:
+    """Truncated score, number of inliers, and how many points were looked at.
+
+    Gives up, with an infinite score, once the score exceeds the best one, or once the points seen
+    so far are much likelier under a wrong model than under one as good as the best.
+    """
+    n = keypoints.points.shape[0]
+    few = n <= _FEW_POINTS
+    # Before anything good is found, a hypothesis must look better than chance.
+    sought = min(max(inlier_ratio, _LEAST_SUPPORT, 1.5 * random_support), 0.99)
+    miss = 1.0 if few else (1.0 - random_support) / (1.0 - sought)
+    hit = 1.0 if few else random_support / sought
     scalars = scalars_of(pose)
     score = 0.0
     support = 0
-    for k in range(keypoints.points.shape[0]):
+    ratio = 1.0
+    for k in range(n):
         square = squared_error(keypoints, scalars, k)
-        score += min(square, limit)
-        support += square < limit
-        if score >= best:
-            return np.inf, support
-    return score, support
+        if square < limit:
+            score += square
+            support += 1
+            ratio *= hit
+        else:
+            score += limit
+            ratio *= miss
+        if score >= best or ratio > _REJECTION:
+            return np.inf, support, k + 1
+    return score, support, n
 
 
 @kernel
@@ -196,7 +232,7 @@ def _finish(objective: Objective, threshold: float, best: float, pose: FloatArra
         if some.keypoints.points.shape[0] < 4:
             return best
         refine(some, _FINAL_ITERATIONS, trial)
-        score, inside = score_pose(objective.keypoints, trial, limit, np.inf)
+        score, inside, _ = score_pose(objective.keypoints, trial, limit, np.inf, 0.0, 1.0)
         if score > best * (1.0 + 1e-9):
             return best
         copy_into(pose, trial)
@@ -272,5 +308,5 @@ def rigid_hypotheses(
                 least = cost
                 copy_into(poses[s], solutions[k])
         if least < np.inf:
-            scores[s] = score_pose(keypoints, poses[s], limit, np.inf)[0]
+            scores[s] = score_pose(keypoints, poses[s], limit, np.inf, 0.0, 1.0)[0]
     return poses, scores

@@ -12,7 +12,6 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray, as_floats, is_masked, is_number
 from cadalign.errors import InputError, quote
 from cadalign.geometry.pixels import (
-    PIXEL_CENTRE,
     LensKind,
     PixelOrigin,
     checked_coefficients,
@@ -230,12 +229,6 @@ class Calibration:
         if not self.focal_known:
             fix = 'estimate it with focal="estimate", or give it: camera.with_focal(...)'
             raise InputError("the focal length is unknown", where="camera", fix=fix)
-
-    @property
-    def is_centred(self) -> bool:
-        """True if the principal point is within an eighth of the image's size of its middle."""
-        x, y = (self.cx + PIXEL_CENTRE) / self.width, (self.cy + PIXEL_CENTRE) / self.height
-        return max(abs(x - 1 / 2), abs(y - 1 / 2)) < 1 / 8
 
     def contains(self, points_2d: FloatArray, *, margin: float = 0.0) -> BoolArray:
         """Say which pixels (..., 2) lie at least ``margin`` [px] inside the image; (...) bool."""

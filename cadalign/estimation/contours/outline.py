@@ -190,7 +190,7 @@ class OutlineSupport(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class OutlineSource:
-    """What masks and photos have in common, of the view ``image``, the user's ``number``.
+    """The part that masks and photos share, of the view ``image``, the user's ``number``.
 
     The ``camera`` is that of the evidence's rays. The surface ``is_exact``, or similar to the
     object's.

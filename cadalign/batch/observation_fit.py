@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from cadalign.shapes.model import ShapeModel
 
 _NOT_OF_FIT = ("shape_sigma", "image")  # stored options of the model and of the views
-_OF_THE_MODEL = ("stretch", "known_axis", "stretch_sigma")  # options that a learned shape lacks
+_OF_THE_MODEL = ("stretch", "stretch_sigma")  # options that a learned shape lacks
 Note = Callable[[str], object]
 """What is told about an estimate, such as the source of its focal length."""
 

@@ -30,7 +30,7 @@ def model_of(
 ) -> Model:
     """The model of an observation's own keypoints, those of all its views.
 
-    Of the options the known axis, the stretch and the prior on it count. Raises InputError if views
+    Of the options the stretch and the prior on it count. Raises InputError if views
     place the same keypoint at different points of the model.
     """
     points: dict[Hashable, tuple[float, ...]] = {}
@@ -50,7 +50,6 @@ def model_of(
         shape_sigma=shape_sigma,
         stretch=options.stretch,
         stretch_sigma=options.stretch_sigma,
-        known_axis=options.known_axis,
         symmetry=observation.symmetry,
         up_axis=observation.up_axis,
     )

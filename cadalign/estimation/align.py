@@ -195,8 +195,8 @@ def _align_plain(
     """The result of `fit`, with all keypoints of the model."""
     start, points = time.perf_counter(), cast(FloatArray, model.points_3d)
     rows = prior_of(model).rows_of(view.keypoint_ids, "views[0].ids")
-    shape = {name: getattr(model, name) for name in ("stretch", "stretch_sigma", "known_axis")}
-    own = replace(options, sigma=view.sigma, **shape)
+    shape = model.stretch, model.stretch_sigma
+    own = replace(options, sigma=view.sigma, stretch=shape[0], stretch_sigma=shape[1])
     problems = pack_one(points[rows], view.pixels, view.camera)
     scores = view.scores if ransac is not None else None
     return fit_one(problems, own, ransac, scores, model.symmetry, start, model=model, view=view)
@@ -239,7 +239,6 @@ def _align_single(problem: Problem, start: float) -> Result:
         cost=cost,
         stats=stats,
         component=component,
-        known_axis=None,
         stretched_axes="",
     )
 

@@ -95,7 +95,6 @@ def result_of_keypoints(
         "points_3d": points,
         "method": fitted.method,
         "posterior": posterior,
-        "known_axis": options.known_axis,
         "stretched_axes": options.stretched_axes,
         "focal": options.focal,
         "focal_prior": options.focal_prior,

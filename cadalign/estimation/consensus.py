@@ -194,7 +194,7 @@ def _refined(search: RobustSearch, inliers: BoolArray) -> FittedKeypoints:
 def _best_hypothesis(search: RobustSearch) -> tuple[Alignment, BoolArray, int, int, float]:
     """LO-RANSAC's best hypothesis, inliers (n,), samples, hypotheses and score [px^2]."""
     problems, options, ransac = search.problems, search.options, search.ransac
-    camera, points = problems.camera, problems.points_3d[:, options.axis_order]
+    camera, points = problems.camera, problems.points_3d
     count, minimal = len(points), MINIMAL_SOLVERS[ransac.minimal]
     size = SAMPLE_SIZES[minimal]
     if count < size:
@@ -237,7 +237,7 @@ def _best_hypothesis(search: RobustSearch) -> tuple[Alignment, BoolArray, int, i
             where="points_3d",
             fix="leave ransac away: use loss='cauchy', with stretch= or stretch_sigma=",
         )
-    pose = turned_poses(options.in_model_axes(pose), facing.lens_from_camera)
+    pose = turned_poses(pose, facing.lens_from_camera)
     kept = np.empty(count, dtype=bool)
     kept[order] = inliers
     return Alignment.from_packed(pose), kept, int(iterations), int(hypotheses), float(score)

@@ -154,7 +154,7 @@ def case_of_fit(
 ) -> DiagnosisCase:
     """The case of a fit of a model's keypoints (m, 3), by their rows, to those of an image."""
     seen = View(camera, points_2d, ids=rows, sigma=options.sigma)
-    shape = {name: getattr(options, name) for name in ("stretch", "stretch_sigma", "known_axis")}
+    shape = {name: getattr(options, name) for name in ("stretch", "stretch_sigma")}
 
     def again(model: AnyModel, views: Sequence[View], /, **changes: Any) -> Result:
         exact, (view,) = cast(Model, model), views

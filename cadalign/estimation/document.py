@@ -91,7 +91,6 @@ class _Result(ForeignDocument, rename={"own_bounds": "bounds", "own_stretch": "s
     points_3d: list[Point3]
     views: list[_View]
     fisher_covariance: Matrix | None
-    known_axis: Literal["x", "y", "z"] | None
     stretched_axes: str
     focal: Literal["known", "estimate"]
     stats: FitStats

@@ -46,7 +46,6 @@ def fit(
     loss_scale: float = FitOptions.loss_scale,
     stretch: str | None = FitOptions.stretch,
     stretch_sigma: float | None = FitOptions.stretch_sigma,
-    known_axis: str = FitOptions.known_axis,
     focal: str = FitOptions.focal,
     focal_prior: PriorOption = FitOptions.focal_prior,
     ransac: RansacOptions | None = None,
@@ -80,14 +79,12 @@ def fit(
     loss_scale : float
         Length at which a robust loss begins to bend [sigma].
     stretch : str, optional
-        The axes whose scale is estimated: with x known, ``"yz"`` (the default), ``"y"``, ``"z"``
-        or ``"none"``. The others keep the scale 1.
+        The axes whose scale is estimated: ``"yz"`` (the default), ``"y"``, ``"z"`` or ``"none"``.
+        The others keep the scale 1; x always does, since one image leaves size and distance open.
     stretch_sigma : float, optional
         Standard deviation of a Gaussian prior on the logarithm of each scale, about the scale 1.
         It keeps keypoints in one plane, or seen end-on, solvable. By default the prior is flat from
         1/5 to 5 and falls off beyond: it bounds what keypoints leave open, and moves nothing else.
-    known_axis : {"x", "y", "z"}
-        The model's axis whose length is right. One image alone leaves size and distance open.
     focal : {"known", "estimate"}
         Take the camera's focal length as right, or estimate it too: a ninth unknown, for which
         5 points are needed. ``result.camera`` has the estimate. Principal point and shape of the
@@ -140,7 +137,7 @@ def fit(
     150.0
     """
     start = time.perf_counter()
-    shape, lens = (stretch, stretch_sigma, known_axis), (focal, focal_prior)
+    shape, lens = (stretch, stretch_sigma), (focal, focal_prior)
     chosen: tuple[Any, ...] = (method, sigma, loss, loss_scale, *shape, *lens)
     try:
         options = _checked_options(*chosen)
@@ -228,7 +225,6 @@ def fit_batch(
     loss_scale: float = FitOptions.loss_scale,
     stretch: str | None = FitOptions.stretch,
     stretch_sigma: float | None = FitOptions.stretch_sigma,
-    known_axis: str = FitOptions.known_axis,
     focal: str = FitOptions.focal,
     focal_prior: PriorOption = FitOptions.focal_prior,
     ransac: RansacOptions | None = None,
@@ -248,7 +244,7 @@ def fit_batch(
         One for all problems, or one each.
     sigma : float, None, or sequence of B
         As for `fit`, for all problems; a sequence gives each problem its own.
-    method, loss, loss_scale, stretch, stretch_sigma, known_axis, focal, focal_prior
+    method, loss, loss_scale, stretch, stretch_sigma, focal, focal_prior
         As for `fit`; every problem has a focal length of its own.
     ransac
         As for `fit`.
@@ -284,7 +280,7 @@ def fit_batch(
     """
     per_problem = isinstance(sigma, list | tuple) or np.ndim(sigma) > 0  # type: ignore[arg-type]
     given: Any = 1.0 if per_problem else sigma
-    shape, lens = (stretch, stretch_sigma, known_axis), (focal, focal_prior)
+    shape, lens = (stretch, stretch_sigma), (focal, focal_prior)
     options = FitOptions(method, given, loss, loss_scale, *shape, *lens)
     problems = pack_many(points_3d, points_2d, camera)
     count = len(problems)

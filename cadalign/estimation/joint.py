@@ -207,7 +207,7 @@ def result_of_minima(
                 likely = [*likely, estimate]
             elif not likely:
                 raise _undetermined_error()
-    symmetry, known_axis = getattr(model, "symmetry", None), getattr(model, "known_axis", None)
+    symmetry = getattr(model, "symmetry", None)
     x, y, z = (minimum.evidence.scales.free == 0).tolist()
     held = x, y, z
     likely = one_of_equals(likely, symmetry, held)
@@ -229,7 +229,6 @@ def result_of_minima(
         cost=minimum.cost,
         stats=stats,
         component=minimum.component,
-        known_axis=known_axis if known_axis and held["xyz".index(known_axis)] else None,
         stretched_axes=stretched_axes(held),
         symmetry=symmetry,
         rig_from_model=in_rig,
@@ -326,12 +325,7 @@ def fit_jointly(
     points, pixels = problems.points_3d.copy(), problems.points_2d
     if len(points) < options.min_points:
         raise too_few_error(len(points), options)
-    model = Model(
-        points_3d=points,
-        stretch=options.stretch,
-        stretch_sigma=options.stretch_sigma,
-        known_axis=options.known_axis,
-    )
+    model = Model(points_3d=points, stretch=options.stretch, stretch_sigma=options.stretch_sigma)
     view = View(problems.camera, pixels, sigma=options.sigma, scores=scores)
     compiled = compile_problem(model, [view], None, [None], options, ransac)
     problem, minima, iterations, hypotheses = search(compiled, [[None]])

@@ -36,7 +36,7 @@ class Model:
         Standard deviation of the keypoints' positions about the model's, along each axis, before
         the stretch [model units]: for an object that is only similar. None for the exact,
         stretched model.
-    stretch, known_axis
+    stretch : str, optional
         As for `cadalign.fit`.
     stretch_sigma : float, optional
         As for `cadalign.fit`; 0.2 by default where ``shape_sigma`` is given: an object that is only
@@ -67,7 +67,6 @@ class Model:
     shape_sigma: float | None = None
     stretch: str | None = None
     stretch_sigma: float | None = None
-    known_axis: str = "x"
     up_axis: str | None = "y"
     symmetry: Symmetry | None = None
 
@@ -108,7 +107,7 @@ class Model:
         prior = self.stretch_sigma
         if prior is None and self.shape_sigma is not None:
             prior = SIMILAR_SCALE_SIGMA
-        return FitOptions(stretch=self.stretch, stretch_sigma=prior, known_axis=self.known_axis)
+        return FitOptions(stretch=self.stretch, stretch_sigma=prior)
 
 
 def is_exact_model(model: object) -> bool:

@@ -21,7 +21,7 @@ from cadalign.solvers.constants import AEPNP, AP4P, CAUCHY, HUBER, LINEAR, UNKNO
 
 METHODS = ("optimal", "aepnp", "aepnp-paper", "epnp")
 FOCALS = ("known", "estimate")
-AXES = ("x", "y", "z")
+STRETCHES = ("yz", "y", "z", "none")
 SIMILAR_SCALE_SIGMA = 0.2
 """Default standard deviation of the log scales of an object that is only similar to its model."""
 USUAL_STRETCH = 5.0
@@ -73,8 +73,6 @@ class FitOptions(AlignmentOptions):
     stretch_sigma: float | None = None
     """Standard deviation of a Gaussian prior on the logarithm of each scale, about scale 1; by
     default one that is flat from 1/5 to 5, and falls off beyond."""
-    known_axis: str = "x"
-    """Axis of the model whose length is right: x, y or z."""
     focal: str = "known"
     """Focal length: known (the camera's) or estimate."""
     focal_prior: PriorOption = USUAL
@@ -84,7 +82,6 @@ class FitOptions(AlignmentOptions):
     def __post_init__(self) -> None:
         _check_known("method", self.method, METHODS)
         _check_known("loss", self.loss, LOSSES)
-        _check_known("known_axis", self.known_axis, AXES)
         _check_known("focal", self.focal, FOCALS)
         _set_positive(self, "loss_scale")
         if self.stretch_sigma is not None:
@@ -95,15 +92,7 @@ class FitOptions(AlignmentOptions):
             except ValueError:
                 raise InputError("its entries are not of one shape", where="sigma") from None
         if self.stretch is not None:
-            axes = [axis for axis in "xyz" if axis != self.known_axis]
-            allowed = ("".join(axes), axes[0], axes[1], "none")
-            if not isinstance(self.stretch, str) or self.stretch not in allowed:
-                raise InputError(
-                    f"{quote(self.stretch)} are not axes that can stretch where {self.known_axis} "
-                    "is known",
-                    where="stretch",
-                    fix=f"give one of {', '.join(allowed)}",
-                )
+            _check_known("stretch", self.stretch, STRETCHES)
         check_prior(self.focal_prior, focal=self.focal)
         if self.focal == "known":
             object.__setattr__(self, "focal_prior", None)
@@ -131,25 +120,14 @@ class FitOptions(AlignmentOptions):
         """The axes whose scale is estimated."""
         if self.stretch == "none":
             return ""
-        return self.stretch or "xyz".replace(self.known_axis, "")
-
-    @property
-    def axis_order(self) -> list[int]:
-        """The model's axes in the solvers' order: the known one first, no reflection."""
-        first = "xyz".index(self.known_axis)
-        return [first, (first + 1) % 3, (first + 2) % 3]
-
-    def in_model_axes(self, poses: FloatArray) -> FloatArray:
-        """Packed poses (..., 15) of the reordered axes as poses of the model's own axes."""
-        place = np.argsort(self.axis_order)
-        return poses[..., np.concatenate([place, 3 + place, 6 + place, [9, 10, 11], 12 + place])]
+        return self.stretch or "yz"
 
     @property
     def free(self) -> FloatArray:
         """1 for each of the solvers' 8 unknowns that is estimated, 0 for the others."""
         free = np.ones(UNKNOWNS)
-        for place, axis in enumerate(self.axis_order[1:]):
-            free[6 + place] = float("xyz"[axis] in self.stretched_axes)
+        for place, axis in enumerate("yz"):
+            free[6 + place] = float(axis in self.stretched_axes)
         return free
 
     @property
@@ -171,12 +149,8 @@ class FitOptions(AlignmentOptions):
 
     @property
     def estimated_unknowns(self) -> IntArray:
-        """Rows of a result's covariance that belong to unknowns that are estimated.
-
-        Scales come in cyclic order from the known axis, so that names of axes change no result.
-        """
-        cyclic = self.axis_order[1:]
-        stretched = [6 + axis for axis in cyclic if "xyz"[axis] in self.stretched_axes]
+        """Rows of a result's covariance that belong to unknowns that are estimated."""
+        stretched = [6 + "xyz".index(axis) for axis in self.stretched_axes]
         return np.array([*range(6), *stretched, *[9][: self.focal == "estimate"]])
 
     def prior_equations(self, scale: FloatArray) -> int:

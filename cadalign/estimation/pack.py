@@ -15,7 +15,7 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.options import LOSSES, FitOptions
 from cadalign.estimation.prior import Lenses, ShapePrior, scale_priors
-from cadalign.estimation.problems import focal_slopes, rays_of, whitening_of
+from cadalign.estimation.problems import rays_of, whitening_of
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
 from cadalign.io.evidence import LENGTHS, Size
@@ -98,7 +98,6 @@ def _sightings(
                 _keypoint_depths(view, count),
                 np.full(count, LOSSES[options.loss]),
                 np.full(count, float(options.loss_scale)),
-                focal_slopes(pixels, camera, rays) if camera.distortion else 0.0 * rays,
             )
         )
     whole = stacked(tables)

@@ -171,8 +171,8 @@ class Lenses:
                 camera.require_focal()
             return cls(cameras, (-1,) * len(cameras))
         for camera in cameras:
-            if camera.is_wide:
-                what = f"the focal length of a {camera.lens} lens is not estimated"
+            if camera.is_wide or camera.distortion:
+                what = "the focal length of a lens with distortion is not estimated"
                 raise InputError(what, where="focal", fix='calibrate it, and give focal="known"')
         distinct = list(dict.fromkeys(view.camera for view in views if view.has_evidence))
         reference = []
@@ -187,12 +187,6 @@ class Lenses:
     def count(self) -> int:
         """Number of unknown focal lengths."""
         return max(self.groups, default=-1) + 1
-
-    @property
-    def are_distorted(self) -> bool:
-        """True if a camera of unknown focal length has lens distortion."""
-        own = zip(self.cameras, self.groups, strict=True)
-        return any(bool(camera.distortion) and group >= 0 for camera, group in own)
 
     @property
     def focal_lengths(self) -> FloatArray:

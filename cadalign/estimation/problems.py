@@ -144,15 +144,6 @@ def rays_of(points_2d: FloatArray, camera: Camera, *, clips: bool = False) -> Fl
     return pinhole_rays(points_2d, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
-def focal_slopes(points_2d: FloatArray, camera: Camera, rays: FloatArray) -> FloatArray:
-    """Slopes (n, 2) of undistorted pixels by the log focal length; (0, 2) without distortion."""
-    if not camera.distortion:
-        return np.empty((0, 2))
-    distorted = (points_2d - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-    inverse = np.linalg.inv(camera.distortion_jacobian(rays))
-    return np.asarray(rays - np.einsum("nij,nj->ni", inverse, distorted))
-
-
 def whitening_of(sigma: Sigma | None, rays: FloatArray, camera: Camera) -> FloatArray:
     """Weights (1 or n, 3) that turn errors of the rays (n, 2) into errors of unit covariance.
 
@@ -214,7 +205,7 @@ def solver_error(
     elif undetermined < 6:
         missing = f"the translation along the camera's {'xyz'[undetermined - 3]}"
     else:
-        missing = f"the scale s_{'xyz'[options.axis_order[undetermined - 5]]}"
+        missing = f"the scale s_{'yz'[undetermined - 6]}"
     fix = "add keypoints elsewhere, hold scales fixed with stretch=, or give stretch_sigma"
     return DegenerateError(
         f"{missing} is not determined: {reason or 'seen from there, the keypoints leave it open'}",

@@ -10,7 +10,6 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
-from cadalign.errors import InputError
 from cadalign.estimation.options import MINIMAL_SOLVERS, RansacOptions
 from cadalign.estimation.prior import Lenses, is_exact
 from cadalign.estimation.problem import Inits, Problem
@@ -38,33 +37,19 @@ class _AtFocals(NamedTuple):
 
 
 def propose(problem: Problem, shape: Shape, init: Inits) -> tuple[Lenses, Starts]:
-    """Starts for one component of the shape, and the lenses that their focal lengths refer to.
-
-    Lenses with distortion are those of the start of the lowest cost, since they are linear near it.
-    Raises InputError if they can be undone at no focal length of the grid.
-    """
+    """Starts for one component of the shape, and the lenses that their focal lengths refer to."""
     lenses = problem.lenses
     if not lenses.count:
         return lenses, _starts_at(problem, problem.evidence(shape, lenses), init)
     found: list[_AtFocals] = []
-    failure: InputError | None = None
     for log_focals in lenses.grid():
         there = lenses.at(log_focals)
-        try:
-            evidence = problem.evidence(shape, there)
-        except InputError as error:
-            failure = error
-            continue
+        evidence = problem.evidence(shape, there)
         starts = _starts_at(problem, evidence, init)
         one = starts.poses.shape[1] == 1
         most = _MOST_PER_FOCAL if one else _MOST_PER_FOCAL_OF_SEVERAL
         starts = Starts(*(column[:most] for column in starts))
         found.append(_AtFocals(there, starts, costs_at(evidence, *starts)))
-    if failure is not None and not found:
-        raise failure
-    if lenses.are_distorted:
-        best = int(np.argmin([each.costs.min(initial=np.inf) for each in found]))
-        lenses = found[best].lenses
     leaves_out = problem.ransac is None and is_exact(evidence)
     return lenses, _merged(found, lenses, leaves_out=leaves_out)
 

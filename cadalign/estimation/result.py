@@ -67,8 +67,6 @@ class Result:
         together.
     posterior : Posterior
         The uncertainty, and warnings about it.
-    known_axis : {"x", "y", "z"}, optional
-        The model's axis whose scale was taken as 1; None where all of them are estimated, or none.
     stretched_axes : str
         The axes whose scale was estimated.
     focal : {"known", "estimate"}
@@ -104,7 +102,6 @@ class Result:
     points_3d: FloatArray
     method: str
     posterior: Posterior = field(repr=False)
-    known_axis: str | None = "x"
     stretched_axes: str = "yz"
     focal: str = "known"
     focal_prior: FocalPrior | None = None

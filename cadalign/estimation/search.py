@@ -9,7 +9,6 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.errors import InputError
 from cadalign.estimation.estimates import mean_state
 from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.prior import Lenses
@@ -23,7 +22,6 @@ from cadalign.estimation.uncertainty.residuals import Support, area_of, check_su
 from cadalign.estimation.view import View
 from cadalign.solvers.joint.evidence import (
     Evidence,
-    Shape,
     State,
     kept_rows,
     log_focals_of,
@@ -32,8 +30,6 @@ from cadalign.solvers.joint.evidence import (
 )
 from cadalign.solvers.joint.search import refine_joint, score_state, search_joint
 
-_LENS_ROUNDS = 12  # of linearising lenses with distortion about the focal lengths
-_SETTLED = 1e-8  # change of a log focal length
 _MOST_FREE = 2  # scales that keypoints determine; the size follows from other evidence
 _OUTLIER_COST = 5.0  # of a keypoint left out, beyond the square of its threshold
 _WIDENING = 3.0  # standard deviations of a displacement that a threshold allows for
@@ -96,8 +92,6 @@ def search_at_noise(problem: Problem, init: Inits) -> SearchResult:
         else:
             found, used = _searched(problem, whole, starts)
         iterations += used
-        if lenses.are_distorted:
-            found = _relinearised(problem, shape, found)
         prior_score = -2 * float(np.log(problem.prior.weights[number]))
         minima.extend(each._replace(score=each.score + prior_score) for each in found)
     if problem.ransac is not None and minima:
@@ -188,27 +182,6 @@ def _settle(whole: Minimum, threshold: FloatArray, rounds: int) -> Minimum | Non
             break
         inliers = again
     return best
-
-
-def _relinearised(problem: Problem, shape: Shape, found: list[Minimum]) -> list[Minimum]:
-    """The minima with lenses linearised about the focal lengths of the best."""
-    for _ in range(_LENS_ROUNDS):
-        if not found or np.abs(found[0].state.log_focals).max() < _SETTLED:
-            break
-        log_focals = found[0].state.log_focals
-        lenses = found[0].lenses.at(log_focals)
-        try:
-            evidence = problem.evidence(shape, lenses)
-        except InputError:  # a lens cannot be undone at these
-            break
-        states = [each.state for each in found]
-        starts = Starts(
-            np.array([state.poses for state in states]),
-            np.array([state.log_focals for state in states]) - log_focals,
-            np.array([state.log_scales for state in states]),
-        )
-        found, _ = _searched(problem, _whole(evidence, found[0].component, lenses), starts)
-    return found
 
 
 def _check_support(problem: Problem, best: Minimum, max_reproj_error: float) -> None:
@@ -329,7 +302,6 @@ def whitened_lengths(evidence: Evidence, state: State) -> FloatArray:
     seen = seen_in_cameras(evidence, state.poses, points, sightings.image)
     log_ratio = log_focals_of(evidence, state)[sightings.image][:, None]
     error = np.exp(log_ratio) * seen[:, :2] / seen[:, 2:] - sightings.rays
-    error -= log_ratio * sightings.slopes
     a, b, c = sightings.whitening.T
     lengths = np.hypot(a * error[:, 0] + b * error[:, 1], c * error[:, 1])
     return np.where(seen[:, 2] > 0, lengths, np.inf)

@@ -41,6 +41,7 @@ _TINY = 1e-100
 _EXACT_COST = 1e-6
 # Minima, iterations, hypotheses, undetermined unknown of a method that makes one guess.
 _ONE_MINIMUM = read_only(np.array([[1, 0, 1, -1]]))
+_UNKNOWNS = read_only(np.array([0, 1, 2, 3, 4, 5, 7, 8]))  # of the solvers, among a result's
 _NO_COST = read_only(np.array([[np.inf]]))
 
 
@@ -50,8 +51,6 @@ def solve(problems: Problems, options: FitOptions) -> Solutions:
     camera.require_focal()
     facing = faced(camera, problems.points_2d) if camera.is_wide else camera
     points = problems.points_3d
-    if options.known_axis != "x":
-        points = np.ascontiguousarray(points[:, options.axis_order])
     rays = rays_of(problems.points_2d, facing)
     whitening = whitening_of(options.sigma, rays, facing)  # which checks sigma
     if options.method == "optimal":
@@ -68,8 +67,6 @@ def solve(problems: Problems, options: FitOptions) -> Solutions:
         for b in statuses.nonzero()[0].tolist()
     }
     poses, covariances = found.poses, found.covariances
-    if options.known_axis != "x":
-        poses = options.in_model_axes(poses)
     if facing is not camera:
         poses = turned_poses(poses[0], facing.lens_from_camera)[None]
         if covariances is not None:
@@ -172,8 +169,7 @@ def keypoints_of_solution(
     }
     if solutions.covariances is not None:
         covariance = np.zeros((9, 9))
-        rows = np.array([*range(6), *(6 + axis for axis in options.axis_order[1:])])
-        covariance[rows[:, None], rows] = solutions.covariances[0]
+        covariance[_UNKNOWNS[:, None], _UNKNOWNS] = solutions.covariances[0]
         fitted["fisher_covariance"] = covariance
         fitted["cost"] = solutions.costs.item(0)
     if minima > 1:

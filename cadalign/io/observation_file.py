@@ -95,7 +95,6 @@ class FitFields(Document):
     loss_scale: Positive | UnsetType = UNSET
     stretch: Text | UnsetType | None = UNSET
     stretch_sigma: Positive | UnsetType | None = UNSET
-    known_axis: Text | UnsetType = UNSET
     focal: Literal["known", "estimate"] | UnsetType = UNSET
     focal_prior: FocalPriorFields | Literal["usual"] | UnsetType | None = UNSET
     shape_sigma: Positive | UnsetType = UNSET

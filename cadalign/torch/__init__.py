@@ -127,7 +127,6 @@ def fit(
     loss_scale: float = FitOptions.loss_scale,
     stretch: str | None = FitOptions.stretch,
     stretch_sigma: float | None = FitOptions.stretch_sigma,
-    known_axis: str = FitOptions.known_axis,
     focal: str = FitOptions.focal,
     focal_prior: PriorOption = FitOptions.focal_prior,
     exact: bool = True,
@@ -152,7 +151,7 @@ def fit(
     mask : (B, n) bool tensor, optional
         Marks the keypoints that are present. Those that are not finite, or whose sigma is not
         positive, count as absent.
-    loss, loss_scale, stretch, stretch_sigma, known_axis, focal, focal_prior
+    loss, loss_scale, stretch, stretch_sigma, focal, focal_prior
         As for `cadalign.fit`; with ``focal="estimate"`` all images have one size.
     exact : bool
         Take the cost's Hessian for the gradients, otherwise its Gauss-Newton matrix.
@@ -189,7 +188,6 @@ def fit(
         loss_scale=loss_scale,
         stretch=stretch,
         stretch_sigma=stretch_sigma,
-        known_axis=known_axis,
         focal=focal,
         focal_prior=focal_prior,
     )

@@ -34,7 +34,7 @@ CAMERA = Camera(640, 480, 900.0, 900.0, 319.5, 239.5)
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
 NAMES = tuple("abcdefgh")
 FIT_ALONE = ("--similar", "--method aepnp")
-STRETCH = ("--stretch y", "--known-axis z", "--stretch-sigma 0.1")
+STRETCH = ("--stretch y", "--stretch-sigma 0.1")
 FIX = "leave out one of the two"
 RIGHT = np.array([1.1, 0.9, 1.2])  # lengths of the object's box
 TRUTH = Alignment(np.diag([1.0, -1, -1]) @ np.array([[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]]),
@@ -139,13 +139,11 @@ def test_shape_of_the_file_is_fitted(
 def test_similar_model_is_that_of_the_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    stored = {"stretch_sigma": 0.1, "known_axis": "y", "sigma": 2.0}
+    stored = {"stretch_sigma": 0.1, "sigma": 2.0}
     path = write(tmp_path, 8, fit_options=stored)
     assert main(["fit", str(path), "--shape-sigma", "0.05", "--stretch", "z"]) == 0
     seen = Observation.load(path)
-    model = Model(
-        points_3d=CORNERS, shape_sigma=0.05, stretch="z", known_axis="y", stretch_sigma=0.1
-    )
+    model = Model(points_3d=CORNERS, shape_sigma=0.05, stretch="z", stretch_sigma=0.1)
     expected = align(model, View(CAMERA, seen.points_2d, sigma=2.0))
     assert capsys.readouterr().out == f"{expected}\n"
 

@@ -21,8 +21,8 @@ _VALUES = [
 ]  # fmt: skip
 _COMMANDS: dict[str, list[str]] = {
     "fit": ["--method", "--loss", "--stretch", "--max-reproj-error", "--focal", "--sigma",
-            "--robust", "--similar", "--json", "--out", "--stretch-sigma", "--known-axis",
-            "--shape", "--shape-sigma"],
+            "--robust", "--similar", "--json", "--out", "--stretch-sigma", "--shape",
+            "--shape-sigma"],
     "observe": ["--image", "--model", "--out", "--object", "--min-score", "--sigma"],
     "retrieve": ["--library", "--out", "--top", "--category", "--json", "--loss"],
     "render": ["--out", "--width", "--height", "--view", "--keypoints"],

@@ -15,7 +15,7 @@ from cadalign import Alignment, Camera, FocalPrior, RansacOptions
 CAMERA = Camera(640, 480, 500.0, 505.0, 319.5, 239.5)
 LENS = Camera(640, 480, 500.0, 520.0, 310.0, 250.0, (-0.25, 0.08, 0.004, -0.003))
 OPTIONS = (
-    "method", "sigma", "loss", "loss_scale", "stretch", "stretch_sigma", "known_axis", "focal",
+    "method", "sigma", "loss", "loss_scale", "stretch", "stretch_sigma", "focal",
     "focal_prior", "ransac", "scores",
 )  # fmt: skip
 
@@ -66,13 +66,10 @@ def draw_cases(seed: int, count: int) -> list[Case]:
 # --- right problems, without noise ---------------------------------------------------------------
 
 
-def draw_pose(rng: np.random.Generator, *, known: str = "x", free: str = "yz") -> Alignment:
+def draw_pose(rng: np.random.Generator, *, free: str = "yz") -> Alignment:
     """Draw a pose in front of the camera, stretched along the ``free`` axes."""
     rotation = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
-    scale = [
-        float(np.exp(rng.uniform(-0.7, 0.7))) if axis in free and axis != known else 1.0
-        for axis in "xyz"
-    ]
+    scale = [float(np.exp(rng.uniform(-0.7, 0.7))) if axis in free else 1.0 for axis in "xyz"]
     return Alignment(rotation, [*rng.uniform(-1, 1, 2), rng.uniform(4, 9)], scale)
 
 
@@ -87,13 +84,11 @@ def _cloud(rng: np.random.Generator, least: int, most: int) -> np.ndarray:
 
 def _exact(rng: np.random.Generator) -> Case:
     """Generic points, from 4 up, and options that change nothing of the answer."""
-    known = str(rng.choice(["x", "x", "y", "z"]))
-    others = "xyz".replace(known, "")
-    free = str(rng.choice([others, others, others[0], others[1], "none"]))
+    free = str(rng.choice(["yz", "yz", "y", "z", "none"]))
     points = _cloud(rng, 4, 20)
     camera = LENS if rng.random() < 0.2 else CAMERA
-    pose = draw_pose(rng, known=known, free=free)
-    options: dict[str, Any] = {"known_axis": known, "stretch": free}
+    pose = draw_pose(rng, free=free)
+    options: dict[str, Any] = {"stretch": free}
     if rng.random() < 0.5:
         options["sigma"] = float(10 ** rng.uniform(-2, 2))
     elif len(points) > 5 and rng.random() < 0.3:
@@ -153,8 +148,6 @@ def _options(rng: np.random.Generator) -> dict[str, Any]:
         return options
     if rng.random() < 0.2:
         options["stretch"] = str(rng.choice(["yz", "y", "z", "none"]))
-    if rng.random() < 0.05:
-        options["known_axis"] = str(rng.choice(["y", "z"]))
     if rng.random() < 0.2:
         options["stretch_sigma"] = float(rng.choice([1e-3, 0.1, 0.3, 3.0]))
     if rng.random() < 0.2:
@@ -198,7 +191,7 @@ def _box(rng: np.random.Generator) -> Case:
         points[:, rng.integers(3)] *= 0.02
     pixels = _pixels(draw_pose(rng), points)
     options = _options(rng)
-    if "method" not in options and "known_axis" not in options:
+    if "method" not in options:
         options["stretch"] = str(rng.choice(["none", "none", "y", "z", "yz"]))
     return Case(
         "", points, pixels + rng.normal(0, rng.choice([0, 1, 5]), pixels.shape), CAMERA, options

@@ -51,7 +51,7 @@ def test_results_are_those_of_fit_batch(focal: str) -> None:
         {"loss": "huber"},
         {"focal": "estimate"},
         {"stretch": "none"},
-        {"known_axis": "z", "stretch_sigma": 0.2},
+        {"stretch": "y", "stretch_sigma": 0.2},
     ],
     ids=str,
 )

@@ -61,7 +61,6 @@ def evidence_of(
         depths,
         np.full(count, loss),
         np.full(count, 2.0),
-        0.05 * rng.normal(size=(count, 2)),
     )
     rotations = Rotation.from_rotvec([[0, 0, 0], [0.1, 0.3, 0]]).as_matrix().reshape(VIEWS, 9)
     cameras = np.concatenate([rotations, 0.1 * rng.normal(size=(VIEWS, 3))], axis=1)

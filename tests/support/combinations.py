@@ -446,9 +446,9 @@ def requests() -> list[Request]:
             lambda: align(similar, _seen(), focal_prior=FocalPrior(FOCAL)),
         ),
         Request(
-            'a fisheye or fov lens, `focal="estimate"`',
+            'a lens with distortion, `focal="estimate"`',
             "the focal length and the lens's coefficients bend the image alike",
-            "focal: the focal length of a fisheye lens is not estimated; "
+            "focal: the focal length of a lens with distortion is not estimated; "
             'calibrate it, and give focal="known"',
             lambda: align(similar, _wide(), focal="estimate"),
         ),

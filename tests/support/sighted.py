@@ -31,7 +31,6 @@ def sighted_evidence(shape: Shape, rays: np.ndarray, focals: Focals = KNOWN_FOCA
         np.zeros((count, 3)),
         np.zeros(count, dtype=np.int64),
         np.ones(count),
-        np.zeros((count, 2)),
     )
     blocks = (
         Directions(np.empty((0, 3)), np.empty((0, 3)), _NONE, np.empty((0, 3, 3))),

@@ -162,7 +162,6 @@ class OutlineProblem(NamedTuple):
             np.zeros((count, 3)),
             np.full(count, CAUCHY),
             np.full(count, noise.loss_scale / root),
-            np.zeros((count, 2)),
         )
         return mean, every, sightings
 

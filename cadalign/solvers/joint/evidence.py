@@ -39,8 +39,7 @@ class Sightings(NamedTuple):
 
     ``rays`` (N, 2) are normalised, with ``whitening`` (N, 3) as in `KeypointEvidence`; ``depths``
     (N, 3) are depths, inverse deviations, 0 where there is none, and scales of Cauchy's loss, 0 for
-    that of the ray. ``loss``, ``loss_scale`` (N,) are those of each residual's length. ``slopes``
-    (N, 2) are changes of undistorted pixels, over the focal length, by its logarithm.
+    that of the ray. ``loss``, ``loss_scale`` (N,) are those of each residual's length.
     """
 
     point: IntArray
@@ -50,7 +49,6 @@ class Sightings(NamedTuple):
     depths: FloatArray
     loss: IntArray
     loss_scale: FloatArray
-    slopes: FloatArray
 
 
 class Rig(NamedTuple):

@@ -196,9 +196,8 @@ def write_rows(
         log_ratio = state.log_focals[group] if group >= 0 else 0.0
         ratio = np.exp(log_ratio)
         # In pixels over the reference focal length; by its logarithm.
-        by_log_u, by_log_w = ratio * u - sightings.slopes[n, 0], ratio * w - sightings.slopes[n, 1]
-        du = ratio * u - sightings.rays[n, 0] - log_ratio * sightings.slopes[n, 0]
-        dw = ratio * w - sightings.rays[n, 1] - log_ratio * sightings.slopes[n, 1]
+        by_log_u, by_log_w = ratio * u, ratio * w
+        du, dw = by_log_u - sightings.rays[n, 0], by_log_w - sightings.rays[n, 1]
         loss, loss_scale = sightings.loss[n], sightings.loss_scale[n]
         error = weigh_error(triple(sightings.whitening[n]), du, dw, loss, loss_scale)
         a, b, c = error.whitening

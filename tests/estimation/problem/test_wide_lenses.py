@@ -289,7 +289,7 @@ def test_what_wide_lenses_do_not_go_with_is_refused() -> None:
     points, truth = points_of(1), placed(20)
     pixels = FISHEYE.project(truth.apply(points))
     text = (
-        r"focal: the focal length of a fisheye lens is not estimated; "
+        r"focal: the focal length of a lens with distortion is not estimated; "
         r'calibrate it, and give focal="known"'
     )
     with pytest.raises(InputError, match=text):
@@ -298,6 +298,9 @@ def test_what_wide_lenses_do_not_go_with_is_refused() -> None:
         fit(points, pixels, FISHEYE, focal="estimate", focal_prior=FocalPrior(280.0))
     with pytest.raises(InputError, match=text):
         fit(points, pixels, FISHEYE, focal="estimate", ransac=RansacOptions())
+    bent = Camera(640, 480, 900, 900, 319.5, 239.5, distortion=(-0.2, 0.05, 0.0, 0.0))
+    with pytest.raises(InputError, match=text):
+        fit(points, pixels, bent, focal="estimate")
     model = Model(points_3d=points, shape_sigma=0.1)
     with pytest.raises(InputError, match=text):
         align(model, View(FISHEYE, pixels), focal="estimate")

@@ -91,10 +91,10 @@ def test_text_of_a_result_without_statistics() -> None:
         MADE,
         fit_problem(problem_of(0, points=5, noise_px=1.0), sigma=np.full(5, 1.5)),
         fit_problem(problem_of(0), method="aepnp"),
-        fit_problem(problem_of(0), known_axis="y", stretch="x"),
+        fit_problem(problem_of(0), stretch="z"),
         fit_problem(problem_of(0), focal="estimate", focal_prior=FocalPrior(140.0, 0.1)),
     ],
-    ids=["made", "alternatives", "linear", "known axis", "unknown focal length"],
+    ids=["made", "alternatives", "linear", "one stretch", "unknown focal length"],
 )
 def test_json_brings_back_the_same_result(result: Result) -> None:
     text = json.dumps(result.to_dict())
@@ -144,7 +144,7 @@ def with_view(**changes: Any) -> str:
             "result: views[0].residuals[1]: an inlier's residual is not finite",
         ),
         (with_view(inliers=[True]), "result: views[0].inliers: 1 entries, but residuals has 6"),
-        (changed(known_axis="q"), "result: known_axis: 'q' is not one of 'x', 'y', 'z'"),
+        (changed(focal="q"), "result: focal: 'q' is not one of 'estimate', 'known'"),
         (changed(sigma="1"), "result: sigma: '1' is not a finite number"),
         (changed(stats={"speed": 1}), "result: stats.iterations: missing"),
     ],

@@ -194,28 +194,6 @@ def test_prior_makes_keypoints_in_one_plane_solvable(seed: int, axis: int) -> No
     assert any(f"in the plane {'xyz'[axis]} = 0.1" in text for text in map(str, result.warnings))
 
 
-# --- which axis is known ----------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("known_axis", "order"), [("y", [2, 0, 1]), ("z", [1, 2, 0])])
-def test_renaming_the_models_axes_renames_the_result(known_axis: str, order: list[int]) -> None:
-    problem = problem_of(8, points=14)
-    base = fit_problem(problem)
-    other = fit(
-        problem.points_3d[:, order], problem.points_2d, problem.camera, known_axis=known_axis
-    )
-    np.testing.assert_allclose(
-        other.alignment.rotation, base.alignment.rotation[:, order], rtol=0, atol=1e-12
-    )
-    np.testing.assert_allclose(other.alignment.scale, base.alignment.scale[order], rtol=1e-12)
-    np.testing.assert_allclose(other.alignment.translation, base.alignment.translation)
-    place = [0, 1, 2, 3, 4, 5, *(6 + axis for axis in order)]
-    np.testing.assert_allclose(
-        other.fisher_covariance, base.fisher_covariance[np.ix_(place, place)]
-    )
-    assert other.std.scale == pytest.approx([base.std.scale[axis] for axis in order])
-
-
 @pytest.mark.parametrize("points", [6, 8, 14])
 def test_exchanging_the_axes_that_stretch_exchanges_their_deviations(points: int) -> None:
     problem = problem_of(8, points=points)
@@ -224,29 +202,6 @@ def test_exchanging_the_axes_that_stretch_exchanges_their_deviations(points: int
     other = fit(exchanged, problem.points_2d, problem.camera)
     assert other.std.scale == pytest.approx([base.std.scale[axis] for axis in (0, 2, 1)], rel=1e-3)
     assert other.std.rotation_deg == pytest.approx(base.std.rotation_deg, rel=1e-3)
-
-
-@pytest.mark.parametrize("method", ["optimal", "aepnp"])
-@pytest.mark.parametrize("known_axis", ["x", "y", "z"])
-def test_known_axis_keeps_its_length(method: str, known_axis: str) -> None:
-    problem = problem_of(8, points=14, noise_px=0.0)
-    result = fit_problem(problem, known_axis=known_axis, method=method)
-    size = problem.alignment.scale["xyz".index(known_axis)]
-    assert result.alignment.scale["xyz".index(known_axis)] == 1.0
-    np.testing.assert_allclose(result.alignment.scale, problem.alignment.scale / size, rtol=1e-6)
-    np.testing.assert_allclose(
-        result.alignment.translation, problem.alignment.translation / size, rtol=1e-6
-    )
-
-
-@pytest.mark.parametrize("known_axis", ["y", "z"])
-def test_which_axis_is_known_only_sets_the_overall_size(known_axis: str) -> None:
-    problem = problem_of(8, points=14, noise_px=1.0)
-    base, other = fit_problem(problem), fit_problem(problem, known_axis=known_axis)
-    size = base.alignment.scale["xyz".index(known_axis)]
-    np.testing.assert_allclose(other.alignment.scale, base.alignment.scale / size, rtol=1e-5)
-    assert rotation_error(est=other.alignment, gt=base.alignment) < 1e-4
-    np.testing.assert_allclose(other.residuals, base.residuals, rtol=0, atol=1e-4)
 
 
 # --- other explanations -----------------------------------------------------------------------

@@ -69,8 +69,6 @@ RAGGED = problems_of([6, 20, 7, 100, 10, 64])
         {"stretch": "y"},
         {"stretch_sigma": 0.3},
         {"stretch_sigma": 0.3, "sigma": None},
-        {"known_axis": "y"},
-        {"known_axis": "z", "method": "aepnp"},
     ],
     ids=str,
 )

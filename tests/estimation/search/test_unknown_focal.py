@@ -106,21 +106,6 @@ def test_a_prior_sharpens_the_focal_length() -> None:
     assert one.camera == known.camera
 
 
-def test_a_lens_with_distortion_is_undone_at_the_focal_length_that_is_found() -> None:
-    model, points = models()["learned"]
-    lens = Camera(640, 480, FOCAL, FOCAL, 319.5, 239.5, (-0.2, 0.05, 0.0, 0.0))
-    (pose,) = poses(1)
-    seen = lens.project(pose.apply(points))
-    unknown = Camera.without_focal(640, 480, cx=319.5, cy=239.5, distortion=lens.distortion)
-    result = align(model, View(unknown, seen, sigma=0.1), focal="estimate")
-    assert result.std is not None
-    assert abs(np.log(result.camera.fx / FOCAL)) < 3 * result.std.focal
-    assert result.rms < 0.2
-    view = View(unknown, seen, sigma=0.1)
-    exact = align(Model(points_3d=points), view, focal="estimate", focal_prior=None)
-    assert exact.camera.fx == pytest.approx(FOCAL, rel=1e-6)
-
-
 def test_outliers_depth_gravity_and_a_length_go_with_it() -> None:
     model, points = models()["learned"]
     (pose,), (photo,) = poses(1), photos(points, 1)

@@ -31,7 +31,7 @@ from cadalign.estimation.estimates import (
 from cadalign.estimation.focal import prior_of_camera
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
-from cadalign.estimation.prior import camera_like, is_exact, widened
+from cadalign.estimation.prior import camera_like, is_exact, redundancy_of, widened
 from cadalign.estimation.problem import Problem, compile_problem
 from cadalign.estimation.problems import Problems, no_alignment_error, too_few_error
 from cadalign.estimation.result import Result
@@ -56,7 +56,7 @@ from cadalign.estimation.uncertainty.doubts import (
     unexplained,
     weaknesses,
 )
-from cadalign.estimation.uncertainty.evidence import redundancy_of, summaries_of
+from cadalign.estimation.uncertainty.residuals import summaries_of
 from cadalign.estimation.view import View
 from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment, describe_plane

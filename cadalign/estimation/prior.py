@@ -140,6 +140,19 @@ def has_scale_prior(scales: ScalePriors) -> bool:
     return bool((scales.precision > 2 / _PROPORTION_SIGMA**2).any())
 
 
+def redundancy_of(evidence: Evidence) -> int:
+    """Equations, those of priors on the lengths included, minus unknowns; what is exact is none."""
+    whitening, depths = evidence.sightings.whitening, evidence.sightings.depths
+    # Two of a keypoint's ray, one of a ray along a contour's normal.
+    count = int(
+        (whitening[:, 2] > 0).sum() + whitening.any(axis=1).sum() + (depths[:, 1] > 0).sum()
+    )
+    count += 2 * len(evidence.directions.image) + len(evidence.offsets.weight)
+    if has_scale_prior(evidence.scales):
+        count += int(np.linalg.matrix_rank(evidence.scales.precision))
+    return count - 6 * int(evidence.rig.pose.max() + 1) - int(evidence.scales.free.sum())
+
+
 def widened(evidence: Evidence, state: State, factor: float) -> tuple[Evidence, State]:
     """The same points under a prior of wider standard deviations."""
     if factor == 1:

@@ -11,12 +11,11 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.estimates import mean_state
 from cadalign.estimation.options import RansacOptions
-from cadalign.estimation.prior import Lenses
+from cadalign.estimation.prior import Lenses, redundancy_of
 from cadalign.estimation.problem import Inits, Problem
 from cadalign.estimation.problems import no_redundancy_error
 from cadalign.estimation.propose import propose, under_cauchy
 from cadalign.estimation.starts import Starts
-from cadalign.estimation.uncertainty.evidence import redundancy_of
 from cadalign.estimation.uncertainty.posterior import widening_of
 from cadalign.estimation.uncertainty.residuals import Support, area_of, check_support
 from cadalign.estimation.view import View

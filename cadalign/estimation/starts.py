@@ -17,8 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.estimation.prior import has_scale_prior
-from cadalign.estimation.uncertainty.evidence import redundancy_of
+from cadalign.estimation.prior import has_scale_prior, redundancy_of
 from cadalign.geometry.rotations import spread_rotations
 from cadalign.solvers.constants import LEAST_POINTS
 from cadalign.solvers.joint.evidence import Evidence, depths_along_axes, distances_of

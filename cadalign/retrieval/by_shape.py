@@ -34,17 +34,13 @@ from cadalign.datasets.models.shapenet import require_category
 from cadalign.errors import DegenerateError, InputError, require_kind
 from cadalign.estimation.align import align
 from cadalign.estimation.focal import FocalPrior
-from cadalign.estimation.uncertainty.shape_posterior import (
-    ShapePosterior,
-    gaussians_of,
-    shape_posterior,
-)
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, turned_alignment
 from cadalign.retrieval.models import ModelTable
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import CandidateSet, Observed, Ranking
+from cadalign.retrieval.shape_posterior import ShapePosterior, gaussians_of, shape_posterior
 from cadalign.shapes.gaussians import Gaussians, Vectors, log_likelihoods
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import BOX_ROWS

@@ -11,9 +11,19 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import NoConsensusError
+from cadalign.estimation.result_parts import EvidenceSummary
 from cadalign.geometry.camera import Camera
 from cadalign.shapes.parts import probability_within
 from cadalign.solvers.constants import CAUCHY, HUBER
+from cadalign.solvers.joint.evidence import (
+    Evidence,
+    State,
+    depths_along_axes,
+    distances_of,
+    kept_rows,
+    points_of,
+    seen_in_cameras,
+)
 from cadalign.solvers.minimal import MAX_SOLUTIONS
 
 SOLUTIONS_OF_FOUR = 2.3
@@ -23,6 +33,7 @@ LEAST_ERROR = 0.1
 _CHANCE_STRETCH = 3.2  # standard deviation of log scales of alignments by chance
 _LEAST_SHARE = 0.01  # of alignments by chance that are as moderate, at a factor of 1.5
 _MOST_NAMED = 5  # keypoints, in a message
+_OUTLIER = 8.0  # [sigma], of a depth: it is that of something else
 
 
 def whitening_matrices(whitening: FloatArray) -> FloatArray:
@@ -194,3 +205,37 @@ def log_expected_by_chance(support: Support, size: int, solutions: float) -> flo
 
 def _log_choose(n: int, k: int) -> float:
     return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
+
+
+def summaries_of(evidence: Evidence, state: State) -> list[EvidenceSummary]:
+    """Root mean square residuals of all but keypoints and outlines, kind by kind."""
+    points, poses = points_of(evidence.shape, state), state.poses
+    some = kept_rows(evidence.sightings, evidence.sightings.depths[:, 1] > 0)
+    depths = depths_along_axes(evidence, poses, points[some.point], some.image) - some.depths[:, 0]
+    directions, offsets = evidence.directions, evidence.offsets
+    seen = [
+        seen_in_cameras(evidence, poses, ends, directions.image)
+        for ends in (directions.model, 0.0 * directions.model)
+    ]
+    turned = seen[0] - seen[1] - directions.camera
+    across = np.linalg.norm(np.einsum("nij,nj->ni", directions.whitening, turned), axis=1)
+    angles = np.degrees(2 * np.arcsin(np.minimum(np.linalg.norm(turned, axis=1) / 2, 1.0)))
+    lengths = distances_of(evidence, poses, points) - offsets.value
+    tables = (
+        ("depth", some.image, depths, depths * some.depths[:, 1], "", 1),
+        ("gravity", directions.image, angles, across, "deg", 2),
+        ("length", offsets.image, lengths, lengths * offsets.weight, "", 1),
+    )
+    found = []
+    for kind, image, errors, whitened, unit, equations in tables:
+        for view in np.unique(image).tolist():
+            rows = image == view
+            counted = rows & (np.abs(whitened) < _OUTLIER)
+            rows = counted if counted.any() else rows
+            count = int(rows.sum())
+            in_sigmas = float(np.sqrt((whitened[rows] ** 2).sum() / (equations * count)))
+            rms = float(np.sqrt((errors[rows] ** 2).mean()))
+            name = kind if kind != "length" else "size" if view < 0 else "camera height"
+            number = None if view < 0 else view
+            found.append(EvidenceSummary(name, number, count, in_sigmas, rms, unit))
+    return found

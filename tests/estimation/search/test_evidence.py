@@ -26,9 +26,8 @@ from support.scenes import (
 from cadalign import Alignment, Model, ShapeModel, Size, View, align
 from cadalign.errors import InputError
 from cadalign.estimation.estimates import with_box
-from cadalign.estimation.prior import prior_of
+from cadalign.estimation.prior import prior_of, redundancy_of
 from cadalign.estimation.result import Result
-from cadalign.estimation.uncertainty.evidence import redundancy_of
 from cadalign.shapes.parts import BoxMargins
 from cadalign.solvers.joint.evidence import State
 

@@ -7,7 +7,7 @@ import pytest
 
 from cadalign import Alignment, Camera, Model, ShapeModel, View, align
 from cadalign.errors import InputError
-from cadalign.estimation.uncertainty.shape_posterior import gaussians_of, shape_posterior
+from cadalign.retrieval.shape_posterior import gaussians_of, shape_posterior
 
 CAMERA = Camera(width=640, height=480, fx=900.0, fy=900.0, cx=319.5, cy=239.5)
 LENS = Camera(640, 480, 900.0, 880.0, 319.5, 239.5, (-0.1, 0.03, 0.001, -0.002))

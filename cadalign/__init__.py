@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from cadalign.errors import CadalignError
     from cadalign.estimation.align import align, align_batch
     from cadalign.estimation.fit import fit, fit_batch
-    from cadalign.estimation.focal import FocalPrior
     from cadalign.estimation.model import Model
     from cadalign.estimation.options import RansacOptions
     from cadalign.estimation.result import Result
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     from cadalign.geometry.mesh import Material, Mesh
     from cadalign.geometry.symmetry import Symmetry
     from cadalign.io.evidence import Size
+    from cadalign.io.focal import FocalPrior
     from cadalign.io.meshes.files import load_mesh
     from cadalign.io.observation import Observation
     from cadalign.retrieval.library import Library

@@ -11,7 +11,7 @@ from typing import Any
 from cadalign.annotate.evidence import MarkedEvidence
 from cadalign.annotate.photos import FocalChoice
 from cadalign.errors import InputError
-from cadalign.estimation.focal import FocalPrior
+from cadalign.io.focal import FocalPrior
 
 _LONGEST = 1000  # documents in memory
 _UNKNOWN = FocalChoice(known=False)

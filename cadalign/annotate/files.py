@@ -28,10 +28,10 @@ from cadalign.annotate.names import LastContent
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import DataError, InputError
-from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.result import Result
 from cadalign.io.documents import Document, Point2, convert, in_file, read_json, within
 from cadalign.io.files import write_json, writing
+from cadalign.io.focal import FocalPrior
 from cadalign.io.observation import Observation
 from cadalign.io.observation_file import SeenKeypoint
 

@@ -13,10 +13,10 @@ from PIL import Image
 
 from cadalign.datasets.sfm.colmap import Colmap
 from cadalign.errors import DataError, InputError
-from cadalign.estimation.focal import FocalPrior
 from cadalign.geometry.camera import Camera, require_perspective
 from cadalign.io.documents import in_file
 from cadalign.io.files import listed, read_bytes, reading, require_utf8
+from cadalign.io.focal import FocalPrior
 from cadalign.io.images import PHOTO_ENDINGS, open_photo, photo_size, upright_pixels
 from cadalign.io.observation import read_camera as read_camera_file
 

@@ -20,7 +20,6 @@ from cadalign.batch.observed import model_of, views_of
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import CadalignError
 from cadalign.estimation.align import align
-from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.result import Result
@@ -29,6 +28,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.evidence import Size
+from cadalign.io.focal import FocalPrior
 from cadalign.io.observation import Observation
 from cadalign.shapes.model import ShapeModel
 

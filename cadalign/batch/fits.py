@@ -20,7 +20,6 @@ from cadalign.batch.experiment import FitRunOptions, ManyOptions, plan_run
 from cadalign.batch.observation_fit import ObservationFit
 from cadalign.batch.outputs import write_csv
 from cadalign.errors import DataError, InputError, require_kind
-from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.results import Results
 from cadalign.evaluation.runs.folder import RunFolder
@@ -29,6 +28,7 @@ from cadalign.evaluation.runs.run import OnProgress, execute, workers_of
 from cadalign.io.documents import convert
 from cadalign.io.evidence import Size
 from cadalign.io.files import as_path, write_whole
+from cadalign.io.focal import FocalPrior
 from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
 
 _FEW = 200  # observations, which are aligned sooner than processes start

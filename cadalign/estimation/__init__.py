@@ -11,7 +11,6 @@ from cadalign.names import lazy_names
 if TYPE_CHECKING:
     from cadalign.estimation.align import align_batch
     from cadalign.estimation.fit import fit_batch
-    from cadalign.estimation.focal import FocalPrior
     from cadalign.estimation.model import Model
     from cadalign.estimation.options import FitOptions, RansacOptions
     from cadalign.estimation.result import Result
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from cadalign.estimation.view import View
     from cadalign.estimation.warning import EstimateWarning
     from cadalign.io.evidence import Size
+    from cadalign.io.focal import FocalPrior
 
 __all__ = [
     "Alternative",

@@ -17,7 +17,6 @@ from msgspec.structs import asdict
 
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import CadalignError, InputError
-from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.result_parts import (
     Alternative,
     EvidenceSummary,
@@ -39,6 +38,7 @@ from cadalign.io.documents import (
     convert,
     within,
 )
+from cadalign.io.focal import FocalPrior
 
 Matrix = list[list[Finite]]
 Matrix3 = tuple[Point3, Point3, Point3]

@@ -2,131 +2,22 @@
 
 from __future__ import annotations
 
-import logging
 import math
-import os
-from dataclasses import dataclass, field
 from typing import Final, Literal
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, as_positive
+from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
+from cadalign.io.focal import LONGEST, SHORTEST, FocalPrior
 
-logger = logging.getLogger("cadalign")
-
-_SHORTEST, _LONGEST = 0.1, 50.0
-"""Over the longer side of the image: fields of view from 157 to 1 degrees."""
 _GRID = (0.15, 0.22, 0.3, 0.4, 0.55, 0.72, 0.95, 1.25, 1.65, 2.3, 3.3, 5.0, 10.0, 30.0)
 
 USUAL: Final = "usual"
 """In the place of a prior: that of usual lenses, `FocalPrior.of_usual_lenses`."""
-_USUAL_FOCAL = 1.2  # over the longer side of the image
-_USUAL_SIGMA = 0.6
-_EXIF_SIGMA = 0.05  # roundings, focusing, and corrections of the lens inside the camera
-_SAME_LENS = 0.01
 _CONTRADICTING_SIGMAS = 3.0
-
-
-@dataclass(frozen=True)
-class FocalPrior:
-    """Prior on a focal length: a Gaussian on its logarithm.
-
-    Parameters
-    ----------
-    focal : float
-        The horizontal focal length [px].
-    relative_sigma : float
-        Its standard deviation, relative: 0.05 is 5 %.
-    source : str
-        What it was taken from, for the texts of results.
-
-    Raises
-    ------
-    InputError
-        If a value is not positive.
-
-    Examples
-    --------
-    >>> FocalPrior(935.0)
-    FocalPrior(focal=935.0, relative_sigma=0.05)
-    """
-
-    focal: float
-    relative_sigma: float = _EXIF_SIGMA
-    source: str = field(default="", compare=False, repr=False)
-
-    def __post_init__(self) -> None:
-        for name in ("focal", "relative_sigma"):
-            value = getattr(self, name)
-            object.__setattr__(self, name, as_positive(value, name=f"focal_prior.{name}"))
-
-    def is_like(self, other: FocalPrior) -> bool:
-        """True if both can be of one lens: the focal lengths differ by less than 1 %."""
-        return abs(math.log(self.focal / other.focal)) < _SAME_LENS
-
-    def __str__(self) -> str:
-        """The focal length with its standard deviation and source."""
-        return f"{self.focal:.4g} px +- {100 * self.relative_sigma:.2g} %" + (
-            f", {self.source}" if self.source else ""
-        )
-
-    @classmethod
-    def of_usual_lenses(cls, width: int, height: int) -> FocalPrior:
-        """The prior on the focal length of a photo of which nothing but the size is known.
-
-        Its mean is 1.2 times the longer side, the guess of COLMAP and openMVG where a photo does
-        not say, and its 95 % range, 0.37 to 3.9 times the longer side, is that of lenses of 13 to
-        140 mm (35 mm equivalent): wide phones to telephoto lenses. It holds 99 % of the
-        distribution of photos' focal lengths, log-normal above 14 mm, that Hold-Geoffroy et al.
-        draw from, "A Perceptual Measure for Deep Single Image Camera Calibration", CVPR 2018.
-
-        Parameters
-        ----------
-        width, height : int
-            Image size [px].
-
-        Examples
-        --------
-        >>> print(FocalPrior.of_usual_lenses(640, 480))
-        768 px +- 60 %, usual lenses
-        """
-        return cls(_USUAL_FOCAL * max(width, height), _USUAL_SIGMA, "usual lenses")
-
-    @classmethod
-    def from_exif(
-        cls, path: str | os.PathLike[str], *, relative_sigma: float = _EXIF_SIGMA
-    ) -> FocalPrior | None:
-        """Read a photo's focal length from its EXIF data.
-
-        From the 35 mm equivalent (taken along the diagonal, as CIPA defines it), otherwise from the
-        focal length, times the digital zoom, and the pixels' size on the sensor. A photo turned
-        upright has the same focal length. One that no camera has is ignored with a warning (logger
-        "cadalign").
-
-        Parameters
-        ----------
-        path : str or path-like
-            The photo.
-        relative_sigma : float
-            How far to trust it.
-
-        Returns
-        -------
-        FocalPrior or None
-            None where the photo does not say.
-
-        Raises
-        ------
-        DataError
-            If the file is missing or not an image.
-        """
-        from cadalign.io.exif import read_focal  # only here: a known focal length needs none
-
-        focal = read_focal(path)
-        return None if focal is None else cls(focal, relative_sigma, "the photo's EXIF data")
 
 
 PriorOption = FocalPrior | Literal["usual"] | None
@@ -162,7 +53,7 @@ def log_focal_range(
     """Bounds of a log focal length, over ``unit`` [px], and its prior's mean and weight."""
     prior = prior_of_camera(prior, camera)
     side = max(camera.width, camera.height) / unit
-    low, high = math.log(_SHORTEST * side), math.log(_LONGEST * side)
+    low, high = math.log(SHORTEST * side), math.log(LONGEST * side)
     if prior is None:
         return low, high, 0.0, 0.0
     mean = math.log(prior.focal / unit)

@@ -15,7 +15,6 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, is_number
 from cadalign.errors import DataError, InputError, quote
-from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.result_parts import (
     NO_STATS,
@@ -32,6 +31,7 @@ from cadalign.geometry.alignment import Alignment, Box, extent
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.files import as_path, write_json
+from cadalign.io.focal import FocalPrior
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -33,10 +33,10 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets.models.shapenet import require_category
 from cadalign.errors import DegenerateError, InputError, require_kind
 from cadalign.estimation.align import align
-from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, turned_alignment
+from cadalign.io.focal import FocalPrior
 from cadalign.retrieval.models import ModelTable
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import CandidateSet, Observed, Ranking

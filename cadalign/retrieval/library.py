@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.errors import DataError, InputError, quote
-from cadalign.estimation.focal import FocalPrior
 from cadalign.geometry.camera import Camera
 from cadalign.io.files import as_path, checksum
+from cadalign.io.focal import FocalPrior
 from cadalign.retrieval.absence import none_probability
 from cadalign.retrieval.by_shape import camera_by_shape, rank_by_shape, shapes_by_category
 from cadalign.retrieval.match import Match

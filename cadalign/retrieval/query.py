@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 from cadalign.arrays import IntArray
 from cadalign.errors import DataError, InputError
-from cadalign.estimation.focal import FocalPrior
 from cadalign.io.documents import in_file
 from cadalign.io.files import once_per_file, time_of
+from cadalign.io.focal import FocalPrior
 from cadalign.io.observation import Observation
 from cadalign.retrieval.options import RetrievalOptions
 

@@ -20,7 +20,6 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
-from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import LOSSES, FitOptions, pixel_information
 from cadalign.estimation.problems import whitening_by
 from cadalign.estimation.result_parts import FittedKeypoints
@@ -32,6 +31,7 @@ from cadalign.estimation.uncertainty.residuals import (
 )
 from cadalign.geometry.camera import faced, needs_facing, turned_alignment, turned_covariance
 from cadalign.geometry.rotations import by_rotation
+from cadalign.io.focal import FocalPrior
 from cadalign.solvers.draws import Centred, LogPriors, WhitenedPixels, weigh_draws
 
 MOST_POINTS = 100

@@ -1,0 +1,172 @@
+"""Priors on focal lengths, and the focal length that a photo's EXIF data state."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from cadalign.arrays import as_positive
+
+logger = logging.getLogger("cadalign")
+
+SHORTEST, LONGEST = 0.1, 50.0
+"""Focal lengths that a camera has [longer sides of the image]: 157 to 1 degrees are seen."""
+_USUAL_FOCAL = 1.2  # over the longer side of the image
+_USUAL_SIGMA = 0.6
+_EXIF_SIGMA = 0.05  # roundings, focusing, and corrections of the lens inside the camera
+_SAME_LENS = 0.01
+_FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
+# EXIF tags, and the length of their units [mm].
+_EXIF_IFD = 0x8769
+_FOCAL_LENGTH = 0x920A
+_DIGITAL_ZOOM = 0xA404
+_FOCAL_LENGTH_35MM = 0xA405
+_PLANE_X_RESOLUTION = 0xA20E
+_PLANE_UNIT = 0xA210
+_PIXEL_X_DIMENSION = 0xA002
+_PIXEL_Y_DIMENSION = 0xA003
+_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+
+
+@dataclass(frozen=True)
+class FocalPrior:
+    """Prior on a focal length: a Gaussian on its logarithm.
+
+    Parameters
+    ----------
+    focal : float
+        The horizontal focal length [px].
+    relative_sigma : float
+        Its standard deviation, relative: 0.05 is 5 %.
+    source : str
+        What it was taken from, for the texts of results.
+
+    Raises
+    ------
+    InputError
+        If a value is not positive.
+
+    Examples
+    --------
+    >>> FocalPrior(935.0)
+    FocalPrior(focal=935.0, relative_sigma=0.05)
+    """
+
+    focal: float
+    relative_sigma: float = _EXIF_SIGMA
+    source: str = field(default="", compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        for name in ("focal", "relative_sigma"):
+            value = getattr(self, name)
+            object.__setattr__(self, name, as_positive(value, name=f"focal_prior.{name}"))
+
+    def is_like(self, other: FocalPrior) -> bool:
+        """True if both can be of one lens: the focal lengths differ by less than 1 %."""
+        return abs(math.log(self.focal / other.focal)) < _SAME_LENS
+
+    def __str__(self) -> str:
+        """The focal length with its standard deviation and source."""
+        return f"{self.focal:.4g} px +- {100 * self.relative_sigma:.2g} %" + (
+            f", {self.source}" if self.source else ""
+        )
+
+    @classmethod
+    def of_usual_lenses(cls, width: int, height: int) -> FocalPrior:
+        """The prior on the focal length of a photo of which nothing but the size is known.
+
+        Its mean is 1.2 times the longer side, the guess of COLMAP and openMVG where a photo does
+        not say, and its 95 % range, 0.37 to 3.9 times the longer side, is that of lenses of 13 to
+        140 mm (35 mm equivalent): wide phones to telephoto lenses. It holds 99 % of the
+        distribution of photos' focal lengths, log-normal above 14 mm, that Hold-Geoffroy et al.
+        draw from, "A Perceptual Measure for Deep Single Image Camera Calibration", CVPR 2018.
+
+        Parameters
+        ----------
+        width, height : int
+            Image size [px].
+
+        Examples
+        --------
+        >>> print(FocalPrior.of_usual_lenses(640, 480))
+        768 px +- 60 %, usual lenses
+        """
+        return cls(_USUAL_FOCAL * max(width, height), _USUAL_SIGMA, "usual lenses")
+
+    @classmethod
+    def from_exif(
+        cls, path: str | os.PathLike[str], *, relative_sigma: float = _EXIF_SIGMA
+    ) -> FocalPrior | None:
+        """Read a photo's focal length from its EXIF data.
+
+        From the 35 mm equivalent (taken along the diagonal, as CIPA defines it), otherwise from the
+        focal length, times the digital zoom, and the pixels' size on the sensor. A photo turned
+        upright has the same focal length. One that no camera has is ignored with a warning (logger
+        "cadalign").
+
+        Parameters
+        ----------
+        path : str or path-like
+            The photo.
+        relative_sigma : float
+            How far to trust it.
+
+        Returns
+        -------
+        FocalPrior or None
+            None where the photo does not say.
+
+        Raises
+        ------
+        DataError
+            If the file is missing or not an image.
+        """
+        focal = read_focal(path)
+        return None if focal is None else cls(focal, relative_sigma, "the photo's EXIF data")
+
+
+def read_focal(path: str | os.PathLike[str]) -> float | None:
+    """Read the focal length [px]; None where the photo does not say.
+
+    One that no camera has is ignored with a warning. Raises DataError if the file is missing or not
+    an image.
+    """
+    from cadalign.io.images import open_photo  # a known focal length needs no reader of images
+
+    with open_photo(path) as image:
+        tags, size = image.getexif().get_ifd(_EXIF_IFD), image.size
+    focal, side = _focal_in_pixels(tags, *size), max(size)
+    if focal is None or SHORTEST * side < focal < LONGEST * side:
+        return focal
+    text = "%s: the EXIF data state a focal length of %.4g px, which no camera has; ignored"
+    logger.warning(text, path, focal)
+    return None
+
+
+def _focal_in_pixels(tags: Mapping[int, Any], width: int, height: int) -> float | None:
+    """The focal length [px] that EXIF tags state; None where they do not."""
+    equivalent = _positive(tags, _FOCAL_LENGTH_35MM)
+    if equivalent is not None:  # which has the digital zoom in it
+        return equivalent / _FULL_FRAME_DIAGONAL_MM * math.hypot(width, height)
+    millimetres, density = _positive(tags, _FOCAL_LENGTH), _positive(tags, _PLANE_X_RESOLUTION)
+    x = _positive(tags, _PIXEL_X_DIMENSION) or float(width)
+    y = _positive(tags, _PIXEL_Y_DIMENSION) or float(height)
+    is_cropped = abs(x * height - y * width) > 0.01 * y * width  # since it was taken
+    if millimetres is None or density is None or is_cropped:
+        return None
+    zoom = max(_positive(tags, _DIGITAL_ZOOM) or 1.0, 1.0)
+    unit = _UNIT_MM.get(tags.get(_PLANE_UNIT, 2), 25.4)
+    return millimetres * zoom * density / unit * width / x
+
+
+def _positive(tags: Mapping[int, Any], tag: int) -> float | None:
+    """A tag's value; None where it is missing or no positive number: 0 says that it is unknown."""
+    try:
+        value = float(tags.get(tag, 0.0))
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return value if 0 < value < math.inf else None

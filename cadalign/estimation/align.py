@@ -223,10 +223,10 @@ def _align_single(problem: Problem, start: float) -> Result:
     kept = zip(likelihoods.tolist(), minima.label.tolist(), minima.states, strict=False)
     boxes = model if covariances.any() else None
     estimates = [
-        single_posterior(mixture, component, seen, state, inflation, boxes)._replace(
-            likelihood=likelihood, cameras=(view.camera,)
-        )
-        for likelihood, component, state in kept
+        single_posterior(
+            mixture, component, seen, state, inflation, boxes, is_best=not rank
+        )._replace(likelihood=likelihood, cameras=(view.camera,))
+        for rank, (likelihood, component, state) in enumerate(kept)
     ]
     component, cost = int(minima.label[0]), float(minima.costs[0])
 

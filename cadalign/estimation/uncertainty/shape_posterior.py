@@ -22,13 +22,14 @@ def linearised(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Weighted errors (2 n,), and their derivatives by points (2 n, 3 n) and pose (2 n, 6)."""
     count, matrices = len(points), whitening_matrices(seen.whitening)
-    errors = (matrices @ (perspective(pose.apply(points)) - seen.rays)[:, :, None])[:, :, 0]
+    rays = perspective(points @ pose.linear.T + pose.translation)
+    errors = (matrices @ (rays - seen.rays)[:, :, None])[:, :, 0]
     by_pose = matrices @ ray_derivatives(points, pose.packed)[:, :, :_POSE]
     weights, _ = loss_slopes((errors**2).sum(axis=1), seen.loss, seen.loss_scale)
     roots = np.sqrt(weights)[:, None]
     by_pose *= roots[..., None]
     blocks = np.zeros((count, 2, count, 3))  # a translation moves every point alike
-    np.einsum("iaib->iab", blocks)[:] = by_pose[..., 3:] @ (pose.rotation * pose.scale)
+    np.einsum("iaib->iab", blocks)[:] = by_pose[..., 3:] @ pose.linear
     rows = blocks.reshape(2 * count, 3 * count)
     return (roots * errors).ravel(), rows, by_pose.reshape(2 * count, _POSE)
 
@@ -40,11 +41,13 @@ def single_posterior(
     state: FloatArray,
     inflation: float,
     model: ShapeModel | None = None,
+    *,
+    is_best: bool = True,
 ) -> Estimate:
     """The estimate at a state (D,) of a component, with its posterior; infinite without a pose.
 
     The prior's deviations are widened by the ``inflation``. The box holds the keypoints that are
-    seen.
+    seen. Misses are those of the best estimate alone.
     """
     count, m = len(seen.points), mixture.means.shape[1]
     rotation = state[:9].reshape(3, 3)
@@ -83,6 +86,8 @@ def single_posterior(
     logs = np.concatenate([np.eye(_POSE), relative[:, None] * by_steps[m]])
     covariance = logs @ of_pose @ logs.T
     covariance[_POSE:, _POSE:] += relative[:, None] * relative * left[m]
+    if not is_best:
+        return Estimate(boxed, still, (pose,), (covariance,), whole[:m], of_seen)
     moved = (points - mixture.means[component])[seen.points].ravel()
     misses = _misses(errors - rows @ moved, inverse - weight.T @ of_pose @ weight)
     return Estimate(boxed, still, (pose,), (covariance,), whole[:m], of_seen, misses=misses)

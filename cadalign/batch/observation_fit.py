@@ -211,10 +211,16 @@ class ObservationFit:
         model's keypoints in one image. Raises CadalignError if options or observation are invalid,
         or there is no alignment.
         """
-        notes: list[str] = []
+        notes = [text for view in observation.views if (text := view.text_of_not_found)]
         options = self.options_for(observation, where, notes.append)
         is_exact = self.shape_of(observation) is None and self.shape_sigma_of(observation) is None
         views: tuple[View, ...] | None = None
+        if observation.model is not None and self.shape_of(observation) is None:
+            from cadalign.io.meshes.files import check_keypoints
+
+            with in_file(where):
+                for view in observation.views:
+                    check_keypoints(view.points_3d, observation.model, where="keypoints.xyz")
         if observation.is_plain and is_exact and not self.uses_photos(observation):
             from cadalign.estimation.fit import fit  # not for help of a command
 
@@ -278,7 +284,7 @@ def _model(
     how: ObservationFit, observation: Observation, where: str, options: FitOptions
 ) -> Model | ShapeModel:
     from cadalign.batch.observed import model_of
-    from cadalign.io.meshes.files import load_mesh
+    from cadalign.io.meshes.files import mesh_at
 
     shape = how.shape_of(observation)
     if shape is not None:
@@ -289,7 +295,7 @@ def _model(
                 fix="leave out one of the two",
             )
         return _opened(shape)
-    mesh = None if observation.model is None else load_mesh(observation.model)
+    mesh = None if observation.model is None else mesh_at(observation.model)
     sigma = how.shape_sigma_of(observation)
     with _located(how, where):
         found = model_of(observation, options=options, shape_sigma=sigma, mesh=mesh)

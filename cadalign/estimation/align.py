@@ -359,9 +359,16 @@ def _checked_views(given: object) -> list[View]:
 
 
 def _check_numbers(model: object, views: Sequence[View]) -> None:
-    """Refuse views without ids where the model's first keypoints are not called 0, 1, 2, ..."""
+    """Refuse views without ids that are not of all keypoints of a model, called 0, 1, 2, ..."""
     known = model.ids if isinstance(model, Model | ShapeModel) else ()
     for number, view in enumerate(views):
+        count = len(view.keypoint_ids)
+        if view.is_numbered and count not in (0, len(known or ())):
+            raise InputError(
+                f"{count} keypoints without ids, but the model has {len(known or ())}",
+                where=f"views[{number}].ids",
+                fix="give the model's id of each keypoint of the view, in the view's order",
+            )
         own = tuple(known or ())[: len(view.keypoint_ids)]
         if view.is_numbered and own != tuple(range(len(own))):
             listed = ", ".join(quote(each) for each in own[:5]) + (", ..." if len(own) > 5 else "")

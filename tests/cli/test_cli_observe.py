@@ -215,12 +215,12 @@ def test_csv_goes_the_same_way(folder: Path) -> None:
         (["--image", "{folder}/none.jpg"], "{folder}/none.jpg: no such file"),
         (
             ["--image", "{folder}/found.json"],
-            "{folder}/found.json: not an image that can be read (",
+            "{folder}/found.json: a detector's keypoints, not a photo; give a photo",
         ),
         (["--camera", "{folder}/none.json"], "{folder}/none.json: no such file"),
         (
             ["--camera", "{folder}/found.json"],
-            "{folder}/found.json: camera: expected an object, got list",
+            "{folder}/found.json: a detector's keypoints, not a camera; give 3 x 3 numbers",
         ),
         (["--image", "{folder}/photo.jpg", "--object", "3"], "--object: object 3 of 1; "),
     ],

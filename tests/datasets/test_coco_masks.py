@@ -64,7 +64,7 @@ def test_a_polygon_may_leave_the_image() -> None:
     ("segmentation", "text"),
     [
         (7, "segmentation: 7 is not a list"),
-        ([[1.0, 2.0]], "segmentation[0]: [1.0, 2.0] is not a list of at least 6"),
+        ([[1.0, 2.0]], "segmentation[0]: [1.0, 2.0] is not a polygon of three or more points"),
         ([[1.0] * 7], "segmentation[0]: 7 numbers are not x, y of points; "),
         ([[0.0, 0, 1e9, 0, 1e9, 9]], "segmentation[0]: has points far outside of the image; "),
         ([[0.0, 0, 1, float("nan"), 3, 4]], "segmentation[0][3]: nan is not a finite number"),

@@ -206,7 +206,8 @@ class ManyEstimates:
         lost = [view.text_of_not_found for view in seen.views]
         troubles += [("left-out", text) for text in lost if text]
         row["warning_count"] += len(troubles)
-        for name, more in zip(("warning_kinds", "warnings"), zip(*troubles, strict=True)):
+        for column, name in enumerate(("warning_kinds", "warnings")):
+            more = [trouble[column] for trouble in troubles]
             row[name] = "; ".join(filter(None, (row[name], *more)))
         return row | _record(seen, found) | {"seconds": time.perf_counter() - start}
 

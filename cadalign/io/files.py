@@ -371,7 +371,11 @@ class Seal:
         """
         view = memoryview(content).cast("B")
         if len(view) < _HEADER.size or bytes(view[:16]) != self.magic:
-            raise DataError(f"not a {self.noun}", where=where, fix=self.fix)
+            from cadalign.io.kinds import kind_of_file  # which imports this module
+
+            found = kind_of_file(Path(where))
+            what = f"not a {self.noun}" if found is None else f"{found}, not a {self.noun}"
+            raise DataError(what, where=where, fix=self.fix)
         _, version, _, size, expected = _HEADER.unpack(view[: _HEADER.size])
         payload = view[_HEADER.size :]
         if version != self.version:

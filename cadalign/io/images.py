@@ -17,7 +17,7 @@ from cadalign.arrays import BoolArray
 from cadalign.errors import DataError, brief
 from cadalign.geometry.camera import Camera
 from cadalign.io.files import as_path, open_input, write_whole
-from cadalign.io.kinds import PHOTO, refuse_other_file
+from cadalign.io.kinds import IMAGE, refuse_other_file
 from cadalign.io.kinds import PHOTO_ENDINGS as PHOTO_ENDINGS
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def open_photo(path: str | os.PathLike[str]) -> Iterator[Image]:
         try:
             image = opened.enter_context(open_picture(file, file.size, where=str(path)))
         except DataError:
-            refuse_other_file(path, PHOTO)
+            refuse_other_file(path, IMAGE)
             raise
         yield image
 

@@ -10,6 +10,7 @@ from cadalign.errors import CadalignError, DataError
 from cadalign.io.files import open_input
 
 PHOTO = "a photo"
+IMAGE = "an image"
 MESH = "a mesh"
 OBSERVATION = "an observation"
 DETECTOR = "a detector's keypoints"
@@ -25,7 +26,8 @@ TABLE = ".csv"
 MESH_ENDINGS = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
 PHOTO_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
-_HEAD_BYTES = 256
+_HEAD_BYTES = 1024
+_MATRIX = 9  # numbers of a calibration matrix as text
 _MOST_BYTES = 2**26  # of a JSON file that is read to name its kind
 _STARTS = {
     PHOTO: (b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"II*\0", b"MM\0*"),
@@ -43,7 +45,7 @@ _FIXES = {
     CAMERA: "give 3 x 3 numbers, or a JSON file with model, width, height and params as COLMAP "
     "does",
     MESH: f"give a file that ends in {', '.join(MESH_ENDINGS)}",
-    PHOTO: "give a photo, such as a PNG or a JPEG",
+    IMAGE: "give a picture, such as a PNG or a JPEG",
 }
 
 
@@ -86,6 +88,9 @@ def kind_of_file(path: Path) -> str | None:
             file.seek(0)
             if (kind_found := kind_of(json.loads(file.read()))) is not None:
                 return kind_found
+        elif file.size <= _HEAD_BYTES and suffix not in MESH_ENDINGS:
+            if len([float(word) for word in head.replace(b",", b" ").split()]) == _MATRIX:
+                return CAMERA
     if is_there and suffix in MESH_ENDINGS:
         return MESH
     return PHOTO if is_there and suffix in (*PHOTO_ENDINGS, ".gif", ".heic") else None
@@ -93,7 +98,7 @@ def kind_of_file(path: Path) -> str | None:
 
 def other_kind(path: Path, wanted: str, found: str | None) -> DataError | None:
     """The error of a file of a kind that is not wanted; None where its kind is not known."""
-    if found is None or found == wanted:
+    if found in (None, wanted) or (found, wanted) == (PHOTO, IMAGE):
         return None
     fix = _FIXES.get(wanted)
     if wanted == OBSERVATION and found in (MESH, PHOTO):

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import UNSET, Meta, UnsetType
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import DataError
+from cadalign.errors import DataError, quote
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PixelOrigin, check_pixels, shift_of, unmeasured
@@ -219,9 +219,11 @@ def read_image_fields(read: ViewFields | OneView, folder: Path | None) -> Observ
     camera = Camera.from_dict(read.camera)
     pixels = [each.uv or (None, None) for each in read.keypoints]
     points_2d = np.array(pixels, dtype=float).reshape(-1, 2)
-    infinite = np.flatnonzero(np.isinf(points_2d).any(axis=1))
-    if len(infinite):
-        raise DataError("is not finite", where=f"keypoints[{infinite[0]}].uv")
+    bad = np.argwhere(np.isinf(points_2d) | (np.isnan(points_2d) != np.isnan(points_2d[:, ::-1])))
+    for row, column in bad:
+        if not np.isfinite(points_2d[row, column]):
+            what = f"{quote(pixels[row][column])} is not a finite number"
+            raise DataError(what, where=f"keypoints[{row}].uv[{column}]")
     kept = np.flatnonzero(~unmeasured(points_2d)).tolist()
     lost = tuple(sorted(set(range(len(pixels))).difference(kept)))
     columns = {

@@ -240,8 +240,6 @@ def _points(entry: _Object, where: str) -> tuple[FloatArray, Any]:
             what = f"{len(flat)} numbers are not x, y and visibility of keypoints"
             raise DataError(what, where=where)
         numbers = np.reshape(flat, (-1, 3))
-    if np.isinf(numbers).any():
-        raise DataError("has infinite values", where=where)
     third: Any = entry.keypoint_scores
     if third is None and numbers.shape[1] == 3:
         third = numbers[:, 2]

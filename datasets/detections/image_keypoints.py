@@ -11,7 +11,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats
 from cadalign.datasets.models.model_keypoints import ModelKeypoints
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import check_pixels, unmeasured
 from cadalign.io.kinds import PHOTO_ENDINGS
@@ -59,8 +59,11 @@ class ImageKeypoints:
     def __post_init__(self) -> None:
         where = f"{self.source}: keypoints"
         points = as_floats(self.points_2d, name=where, shape=(None, 2), finite=False)
-        if np.isinf(points).any():
-            raise InputError("has infinite values", where=where)
+        bad = np.isinf(points).any(axis=1) | (np.isnan(points).sum(axis=1) == 1)
+        if bad.any():
+            row = int(bad.argmax())
+            what = f"keypoint {row} is at {quote(points[row].tolist())}"
+            raise DataError(what, where=where, fix="give NaN for both, where it was not found")
         object.__setattr__(self, "points_2d", points)
         measured = ~unmeasured(points, least=1)
         for name in ("scores", "sigma"):

@@ -215,7 +215,7 @@ def test_csv_goes_the_same_way(folder: Path) -> None:
         (["--image", "{folder}/none.jpg"], "{folder}/none.jpg: no such file"),
         (
             ["--image", "{folder}/found.json"],
-            "{folder}/found.json: a detector's keypoints, not a photo; give a photo",
+            "{folder}/found.json: a detector's keypoints, not an image; give a picture",
         ),
         (["--camera", "{folder}/none.json"], "{folder}/none.json: no such file"),
         (

@@ -363,9 +363,9 @@ def _check_numbers(model: object, views: Sequence[View]) -> None:
     known = model.ids if isinstance(model, Model | ShapeModel) else ()
     for number, view in enumerate(views):
         count = len(view.keypoint_ids)
-        if view.is_numbered and count not in (0, len(known or ())):
+        if known and view.is_numbered and count not in (0, len(known)):
             raise InputError(
-                f"{count} keypoints without ids, but the model has {len(known or ())}",
+                f"{count} keypoints without ids, but the model has {len(known)}",
                 where=f"views[{number}].ids",
                 fix="give the model's id of each keypoint of the view, in the view's order",
             )

@@ -70,11 +70,11 @@ def unmeasured(points_2d: FloatArray, *, least: int = _SEVERAL) -> BoolArray:
     >>> unmeasured(np.array([[0.0, 0.0], [51, 20], [np.nan, 3], [0, 0]])).tolist()
     [True, False, True, True]
     """
-    finite = np.isfinite(points_2d).all(axis=1)
-    bad = ~finite
+    bad = np.asarray(~np.isfinite(points_2d).all(axis=1))
     for value in _PLACEHOLDERS:
         here = (points_2d == value).all(axis=1)
-        bad |= here if np.count_nonzero(here) >= least else False
+        if np.count_nonzero(here) >= least:
+            bad |= here
     known = points_2d[~bad]
     if len(known) >= _CROWD and np.ptp(known, axis=0).max() >= _CROWDED_SPAN:
         _, of, counts = np.unique(known, axis=0, return_inverse=True, return_counts=True)

@@ -16,7 +16,6 @@ _UNITS = {
     100.0: "in centimetres beside a mesh in metres",
     25.4: "in millimetres beside a mesh in inches",
     10.0: "in millimetres beside a mesh in centimetres",
-    0.1: "in centimetres beside a mesh in millimetres",
     0.01: "in metres beside a mesh in centimetres",
     0.001: "in metres beside a mesh in millimetres",
 }
@@ -77,4 +76,5 @@ def check_near(points_3d: FloatArray, bounds: FloatArray, *, where: str) -> None
 
 def _outside(points: FloatArray, bounds: FloatArray) -> FloatArray:
     """Distances (k,) of points (k, 3) from a box, 0 inside."""
-    return np.linalg.norm(np.maximum(bounds[0] - points, points - bounds[1]).clip(0), axis=1)
+    beyond = np.maximum(bounds[0] - points, points - bounds[1]).clip(0)
+    return np.asarray(np.linalg.norm(beyond, axis=1))

@@ -88,9 +88,9 @@ def kind_of_file(path: Path) -> str | None:
             file.seek(0)
             if (kind_found := kind_of(json.loads(file.read()))) is not None:
                 return kind_found
-        elif file.size <= _HEAD_BYTES and suffix not in MESH_ENDINGS:
-            if len([float(word) for word in head.replace(b",", b" ").split()]) == _MATRIX:
-                return CAMERA
+        numbers = head.replace(b",", b" ").split() if suffix not in MESH_ENDINGS else []
+        if len(numbers) == _MATRIX and list(map(float, numbers)):
+            return CAMERA
     if is_there and suffix in MESH_ENDINGS:
         return MESH
     return PHOTO if is_there and suffix in (*PHOTO_ENDINGS, ".gif", ".heic") else None

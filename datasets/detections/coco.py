@@ -255,7 +255,7 @@ def _number(entry: _Object, name: str, where: str) -> float | None:
     """A number that an object can do without; what is none is warned of and left out."""
     value = getattr(entry, name)
     if value is None or is_number(value):
-        return value
+        return None if value is None else float(value)
     logger.warning("%s.%s: %s is not a number; left out", where, name, quote(value))
     return None
 

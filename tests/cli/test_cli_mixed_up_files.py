@@ -140,3 +140,10 @@ def test_unknown_field_is_answered_by_fields(
 def test_folder_is_no_mesh(folder: Path) -> None:
     with pytest.raises(cadalign.errors.DataError, match="a folder, not a mesh file"):
         cadalign.load_mesh(folder)
+
+
+def test_exchanged_arguments_are_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["annotate", "model.obj", "photo.png", "--no-open"])
+    text = "PHOTO MODEL: model.obj is a mesh and photo.png a photo: they are exchanged"
+    assert text in capsys.readouterr().err

@@ -383,6 +383,10 @@ def test_a_damaged_result_is_refused_by_field() -> None:
             ),
             "views[0].ids: the model has no keypoint 77; the model has 0, 1, 2",
         ),
+        (
+            lambda: align(Model(points_3d=keypoints()), View(CAMERA, 9 + keypoints(9)[:, :2])),
+            "views[0].ids: 9 keypoints without ids, but the model has 10; give the model's id",
+        ),
         (lambda: align(Model(points_3d=keypoints()), []), "views: none is given"),
         (
             lambda: align(Model(points_3d=keypoints()), [keypoints()]),  # type: ignore[list-item]

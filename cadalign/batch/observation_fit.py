@@ -5,11 +5,14 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
 
 from cadalign.errors import InputError
 from cadalign.estimation.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
@@ -222,17 +225,16 @@ class ObservationFit:
                 for view in observation.views:
                     check_keypoints(view.points_3d, observation.model, where="keypoints.xyz")
         if observation.is_plain and is_exact and not self.uses_photos(observation):
-            from cadalign.estimation.fit import fit  # not for help of a command
+            from cadalign.estimation.fit import check_search, fit_one  # not for help of a command
+            from cadalign.estimation.problems import pack_one
 
-            result = fit(
-                observation.points_3d,
-                observation.points_2d,
-                observation.camera,
-                **vars(options),
-                ransac=self.ransac if self.robust else None,
-                scores=observation.scores if self.robust else None,
-                symmetry=observation.symmetry,
-            )
+            start, seen = time.perf_counter(), observation
+            problem = pack_one(seen.points_3d, seen.points_2d, seen.camera)
+            ransac, scores = (self.ransac, seen.scores) if self.robust else (None, None)
+            check_search(ransac, scores, seen.symmetry)
+            with np.errstate(all="ignore"):
+                search = (ransac, scores, seen.symmetry, start)
+                result = fit_one(problem, options, *search, labels=seen.labels)
         else:
             self.check_for(observation)
             result, views = _aligned(self, observation, where, options, status)

@@ -199,7 +199,9 @@ def _align_plain(
     own = replace(options, sigma=view.sigma, **shape)
     problems = pack_one(points[rows], view.pixels, view.camera)
     scores = view.scores if ransac is not None else None
-    return fit_one(problems, own, ransac, scores, model.symmetry, start, model=model, view=view)
+    labels = () if view.is_numbered else view.keypoint_ids
+    search = ransac, scores, model.symmetry, start
+    return fit_one(problems, own, *search, labels=labels, model=model, view=view)
 
 
 def _align_single(problem: Problem, start: float) -> Result:

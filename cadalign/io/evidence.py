@@ -234,6 +234,14 @@ class ObservedImage:
         object.__setattr__(self, "depths", depths)
 
     @property
+    def labels(self) -> tuple[str | int, ...]:
+        """What messages call the keypoints: their names, or else their rows in the file."""
+        count = len(self.points_2d) + len(self.not_found)
+        if self.names is not None and len(set(self.names)) == len(self.names):
+            return self.names
+        return tuple(row for row in range(count) if row not in self.not_found)
+
+    @property
     def text_of_not_found(self) -> str:
         """What is said of the keypoints that are left out; empty where none is."""
         if not self.not_found:

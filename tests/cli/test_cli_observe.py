@@ -466,6 +466,28 @@ def test_keypoints_that_were_not_found_are_counted(
     assert text in (folder / "found_fit" / "results.csv").read_text()
 
 
+def test_messages_name_keypoints_as_the_file_does(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Left out are keypoints before the wrong one; without names it is row 9 of the file."""
+    pixels = POINTS_2D.copy()
+    pixels[[2, 5]] = 0
+    pixels[9] += 80
+    keypoints = [
+        {"name": name, "xyz": xyz, "uv": uv}
+        for name, xyz, uv in zip(NAMES, POINTS_3D.tolist(), pixels.tolist(), strict=True)
+    ]
+    for is_named, called in ((True, "'corner 9'"), (False, "9")):
+        kept = [
+            {field: value for field, value in each.items() if is_named or field != "name"}
+            for each in keypoints
+        ]
+        data = {"camera": TRUE.to_dict(), "keypoints": kept}
+        (folder / "seen.json").write_text(json.dumps(data))
+        assert main(["fit", str(folder / "seen.json"), "--no-picture"]) == 0
+        assert f"keypoint {called} (" in capsys.readouterr().out
+
+
 def test_keypoints_and_mesh_of_different_units_are_refused_by_observe_and_fit(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

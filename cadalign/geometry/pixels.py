@@ -96,7 +96,7 @@ def check_pixels(points_2d: FloatArray, width: int, height: int, *, where: str) 
     """
     if not len(points_2d):
         return
-    if not (points_2d > 0).all():  # else none is a placeholder, which is quickly told
+    if not points_2d.min() > 0:  # else none is a placeholder, which is quickly told
         _refuse_placeholders(points_2d, where)
     if abs(points_2d.item(0)) > _NORMALISED:
         return

@@ -15,7 +15,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -35,6 +35,7 @@ Index = Annotated[int, Meta(ge=-(2**63) + 1, le=2**63 - 1)]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 _PATH = r"\A[^\0]+\Z"
 _FILE_NAME = r"\A(?!\.{1,2}\Z)[^/\\\0]+\Z"
+_FIELD_END = b'":'
 _HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]")
 _HALF_REASON = r"a text has half of a character, such as \ud800 without its second half"
 Text = Annotated[str, Meta(pattern=r"\S")]
@@ -88,6 +89,11 @@ def parse_json(text: str | bytes, where: str) -> Any:
     """
     reason, twice = "nested too deeply", dict[int, str]()
     is_line = isinstance(text, bytes)
+    if isinstance(text, bytes):  # of hundreds of thousands, several times as fast
+        with suppress(msgspec.MsgspecError, UnicodeError, RecursionError):
+            line = msgspec.json.decode(text)
+            if msgspec.json.encode(line).count(_FIELD_END) == text.count(_FIELD_END):
+                return line  # no field stands twice
 
     def made(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         fields = dict(pairs)

@@ -84,6 +84,8 @@ def test_a_matrix_as_text_is_a_camera(tmp_path: Path) -> None:
 def test_a_field_that_stands_twice_is_named(text: str, place: str) -> None:
     wanted = f"o.json: {place}: the field stands twice in one object; leave one of the two out"
     assert refusal_text(lambda: parse_json(text, "o.json")) == wanted
+    assert refusal_text(lambda: parse_json(text.encode(), "o.json")) == wanted  # a line of a file
+    assert parse_json(b'{"a": {"b": "x\\":"}, "c" : 1}', "") == {"a": {"b": 'x":'}, "c": 1}
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ _MODEL_FOLDERS = ("ShapeNetCore.v2", "shapenet", "ShapeNet", "Meshes", "samples/
 _UP = (0.0, 1.0, 0.0)
 # Corners nearer than this are as good as behind the camera [m].
 _NEAR = 0.05
-_FARTHEST = 200.0  # distance of an object in a scan of rooms [m]
+_FARTHEST = 1000.0  # distance of an object in a scan of rooms [m]
 
 
 class _Trs(ForeignDocument):

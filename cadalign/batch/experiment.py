@@ -39,7 +39,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file, parse_json
 from cadalign.io.evidence import ObservedImage
 from cadalign.io.files import read_bytes, read_text
-from cadalign.io.images import photo_size
+from cadalign.io.images import exif_note, photo_size, require_one_size
 from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
 from cadalign.shapes.model import ShapeModel
 
@@ -146,9 +146,10 @@ def _photo_doubt(view: ObservedImage) -> str:
         return ""
     if (width, height) == (view.camera.width, view.camera.height):
         return ""
+    note = exif_note(view.image, (view.camera.width, view.camera.height))
     return (
         f"{view.image.name} is {width} x {height} px, the camera {view.camera.width} x "
-        f"{view.camera.height}: give camera and keypoints of its resolution "
+        f"{view.camera.height}{note}: give camera and keypoints of its resolution "
         "(`Camera.resized`, `Camera.cropped`)"
     )
 
@@ -201,9 +202,12 @@ class ManyEstimates:
             return _failed(task, str(error), seen)
         seen, result = found.observation, found.result
         row = naming_row(task.row, task.name, seen) | result_row(result) | found.cells
-        troubles = self._draw(task, row, seen, result)
+        troubles = [("picture", text) for text in self._draw(task, row, seen, result)]
+        lost = [view.text_of_not_found for view in seen.views]
+        troubles += [("left-out", text) for text in lost if text]
         row["warning_count"] += len(troubles)
-        for name, more in (("warning_kinds", ["picture"] * len(troubles)), ("warnings", troubles)):
+        for column, name in enumerate(("warning_kinds", "warnings")):
+            more = [trouble[column] for trouble in troubles]
             row[name] = "; ".join(filter(None, (row[name], *more)))
         return row | _record(seen, found) | {"seconds": time.perf_counter() - start}
 
@@ -224,7 +228,7 @@ class ManyEstimates:
         if isinstance(task.content, ImageKeypoints):
             seen = self._detected(task.content, folder)
         else:
-            data = _read(task) if task.content is None else _parsed(task.content, task.name)
+            data = _read(task) if task.content is None else parse_json(task.content, task.name)
             seen = self.options.read(data, task.name, folder=folder)
         return seen if shape is None else replace(seen, shape=shape.absolute())
 
@@ -234,7 +238,12 @@ class ManyEstimates:
         photo = None
         if found.image is not None:
             photo = _photo_in(detector.images or folder, found.image)
-        size = found.size or (None if photo is None else photo_size(photo))
+        sizes = {} if photo is None else {str(photo): photo_size(photo)}
+        if found.size is not None:
+            sizes[found.source] = found.size
+        if sizes:
+            require_one_size(sizes, photo)
+        size = next(iter(sizes.values()), None)
         with in_file(found.source):
             camera = changes.read_camera(size)
             if camera is None and size is None:
@@ -306,13 +315,6 @@ def _read(task: ObservationTask) -> Any:
     except DataError as error:
         raise DataError(error.what, where=task.name, fix=error.fix) from None
     return parse_json(text, task.name)
-
-
-def _parsed(content: bytes, name: str) -> Any:
-    try:
-        return msgspec.json.decode(content)
-    except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
-        raise DataError(f"not valid JSON: {error}", where=name) from None
 
 
 def _failed(task: ObservationTask, reason: str, seen: Observation | None) -> Row:

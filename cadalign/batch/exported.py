@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from cadalign.arrays import FloatArray
 from cadalign.batch.observed import own_ids
-from cadalign.datasets import load_mesh
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.result import Result
 from cadalign.export.aligned_object import AlignedObject
 from cadalign.export.results import object_of
 from cadalign.io.documents import in_file, read_json
-from cadalign.io.observation import OBSERVATION, Observation, kind_of
+from cadalign.io.kinds import FIT
+from cadalign.io.meshes.files import mesh_at
+from cadalign.io.observation import Observation
 from cadalign.render.drawing.model_overlay import mesh_of
 from cadalign.shapes.model import ShapeModel
 
@@ -38,12 +38,9 @@ def read_exported(
     Raises DataError if a file is missing or invalid, or the observation is not the one that was
     fitted.
     """
-    data = read_json(fit)
+    data = read_json(fit, FIT)
     if not isinstance(data, Mapping):
         raise DataError("is not a fit's result", where=str(fit), fix="give a fit.json")
-    if kind_of(data) == OBSERVATION and "alignment" not in data:
-        fix = f"fit it first, `cadalign fit {fit.name}`, and give the fit.json that this writes"
-        raise DataError("an observation, not the result of a fit", where=str(fit), fix=fix)
     path = observation or _observation_of(fit, data)
     seen = Observation.load(path, needs_xyz=False)
     with in_file(fit):
@@ -63,7 +60,7 @@ def exported_object(
     for view, image in zip(result.views, seen.views, strict=True):
         _require_same(len(view.residuals), len(image.points_2d), path, "keypoints")
     if result.method != "align":
-        mesh = None if seen.model is None else _loaded(seen.model)
+        mesh = None if seen.model is None else mesh_at(seen.model)
         own = _labels(seen)  # a fit of pairs knows rows, of which a photo may lack some
         views = tuple(replace(view, ids=own) for view in result.views)
         result = replace(result, ids=own, views=views)
@@ -83,9 +80,6 @@ def _labels(seen: Observation) -> tuple[Hashable, ...]:
     """Names of the only view's keypoints, or what else tells them apart."""
     names = seen.names
     return names if names is not None and len(set(names)) == len(names) else own_ids([seen])[0]
-
-
-_loaded = lru_cache(maxsize=8)(load_mesh)  # many objects of a run may share a mesh
 
 
 def _stored(fit: Path, data: Mapping[str, Any], name: str) -> Path | None:

@@ -5,11 +5,14 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
 
 from cadalign.errors import InputError
 from cadalign.estimation.focal import USUAL, PriorOption, prior_of_camera
@@ -212,22 +215,27 @@ class ObservationFit:
         model's keypoints in one image. Raises CadalignError if options or observation are invalid,
         or there is no alignment.
         """
-        notes: list[str] = []
+        notes = [text for view in observation.views if (text := view.text_of_not_found)]
         options = self.options_for(observation, where, notes.append)
         is_exact = self.shape_of(observation) is None and self.shape_sigma_of(observation) is None
         views: tuple[View, ...] | None = None
-        if observation.is_plain and is_exact and not self.uses_photos(observation):
-            from cadalign.estimation.fit import fit  # not for help of a command
+        if observation.model is not None and self.shape_of(observation) is None:
+            from cadalign.io.meshes.files import check_keypoints
 
-            result = fit(
-                observation.points_3d,
-                observation.points_2d,
-                observation.camera,
-                **vars(options),
-                ransac=self.ransac if self.robust else None,
-                scores=observation.scores if self.robust else None,
-                symmetry=observation.symmetry,
-            )
+            with in_file(where):
+                for view in observation.views:
+                    check_keypoints(view.points_3d, observation.model, where="keypoints.xyz")
+        if observation.is_plain and is_exact and not self.uses_photos(observation):
+            from cadalign.estimation.fit import check_search, fit_one  # not for help of a command
+            from cadalign.estimation.problems import pack_one
+
+            start, seen = time.perf_counter(), observation
+            problem = pack_one(seen.points_3d, seen.points_2d, seen.camera)
+            ransac, scores = (self.ransac, seen.scores) if self.robust else (None, None)
+            check_search(ransac, scores, seen.symmetry)
+            with np.errstate(all="ignore"):
+                search = (ransac, scores, seen.symmetry, start)
+                result = fit_one(problem, options, *search, labels=seen.labels)
         else:
             self.check_for(observation)
             result, views = _aligned(self, observation, where, options, status)
@@ -279,7 +287,7 @@ def _model(
     how: ObservationFit, observation: Observation, where: str, options: FitOptions
 ) -> Model | ShapeModel:
     from cadalign.batch.observed import model_of
-    from cadalign.io.meshes.files import load_mesh
+    from cadalign.io.meshes.files import mesh_at
 
     shape = how.shape_of(observation)
     if shape is not None:
@@ -290,7 +298,7 @@ def _model(
                 fix="leave out one of the two",
             )
         return _opened(shape)
-    mesh = None if observation.model is None else load_mesh(observation.model)
+    mesh = None if observation.model is None else mesh_at(observation.model)
     sigma = how.shape_sigma_of(observation)
     with _located(how, where):
         found = model_of(observation, options=options, shape_sigma=sigma, mesh=mesh)

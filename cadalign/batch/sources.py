@@ -26,14 +26,14 @@ from cadalign.errors import DataError
 from cadalign.evaluation.runs.work import fingerprint, fingerprint_of_files
 from cadalign.io.documents import read_json
 from cadalign.io.files import listed, open_input, read_bytes
-from cadalign.io.observation import (
+from cadalign.io.kinds import (
     DETECTOR,
     LINES,
     OBSERVATION,
     TABLE,
     is_pattern,
     kind_of,
-    refuse_photo_or_mesh,
+    refuse_other_file,
 )
 from cadalign.io.observation_file import named_files
 
@@ -225,14 +225,16 @@ def _of_folder(folder: Path) -> list[Source]:
 
 def _of_file(path: Path) -> Source:
     suffix = path.suffix.lower()
-    refuse_photo_or_mesh(path)
     if suffix in LINES:
         lines = Lines(path)
         if not len(lines):
             raise DataError("the file holds no observation", where=str(path))
         return lines
-    if suffix == TABLE or _kind_of_file(path) == DETECTOR:
+    kind = DETECTOR if suffix == TABLE else _kind_of_file(path)
+    if kind == DETECTOR:
         return Detections(path)
+    if kind != OBSERVATION:
+        refuse_other_file(path, OBSERVATION)
     return Files([path])
 
 
@@ -248,7 +250,7 @@ def _folder(path: Path) -> str:
     return str(path.absolute().parent)
 
 
-def _kind_of_file(path: Path) -> str:
+def _kind_of_file(path: Path) -> str | None:
     kinds = dict[str, msgspec.Raw] | list[msgspec.Raw]
     try:
         return kind_of(msgspec.json.decode(read_bytes(path), type=kinds))

@@ -16,6 +16,7 @@ from cadalign.annotate.options import FileOptions, SessionOptions
 from cadalign.cli.common import UsageError, answer, make_folder, say, waiting
 from cadalign.cli.options import flag_of
 from cadalign.io.files import writing
+from cadalign.io.kinds import MESH, PHOTO, kind_of_file
 
 if TYPE_CHECKING:
     from cadalign.annotate.session import Session
@@ -63,6 +64,9 @@ class Annotate(FileOptions):
         if files:
             what = f"{files[0]} is one file too many"
             raise UsageError(what, where="PHOTO MODEL", fix="give a folder for several photos")
+        if [kind_of_file(found[name]) for name in ("image", "model")] == [MESH, PHOTO]:
+            what = f"{found['image']} is a mesh and {found['model']} a photo: they are exchanged"
+            raise UsageError(what, where="PHOTO MODEL", fix="cadalign annotate PHOTO MODEL")
         rest: dict[str, Any] = {
             field.name: getattr(self, field.name) for field in fields(FileOptions)
         }

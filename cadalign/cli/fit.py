@@ -34,12 +34,8 @@ from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import read_json
 from cadalign.io.files import keeping
-from cadalign.io.observation import (
-    Observation,
-    ObservationChanges,
-    is_of_many,
-    refuse_photo_or_mesh,
-)
+from cadalign.io.kinds import OBSERVATION, is_of_many
+from cadalign.io.observation import Observation, ObservationChanges
 
 if TYPE_CHECKING:
     pass
@@ -110,15 +106,14 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
         if not self.observations and "mask" in self.given and self.model is not None:
             return self._fit_mask(self.given["mask"])
         path = self.first()
-        refuse_photo_or_mesh(path)
         is_read = len(self.observations) == 1 and path.suffix.lower() == ".json" and path.is_file()
         data = read_json(path) if is_read else None
         if len(self.observations) > 1 or is_of_many(path, data):
             return self._fit_many()
         with named_as_flags(self, self.fitting, self.ransac):
-            self.refuse_of_many()
-            data = read_json(path) if data is None else data
+            data = read_json(path, OBSERVATION) if data is None else data
             observation = self.read(data, str(path), folder=path.parent, changes=self.changes)
+            self.refuse_of_many()
         return self._write(self._fitted(observation, path, {"observation": path}), path)
 
     def _write(self, fitted: FittedFile, path: Path) -> int:

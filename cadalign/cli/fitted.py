@@ -71,7 +71,7 @@ class FittedFile:
         """
         if not picture and not overlay:
             return self
-        from cadalign.io.meshes.files import load_mesh
+        from cadalign.io.meshes.files import mesh_at
         from cadalign.render.drawing.model_overlay import draw_result, mesh_of, photo_of
 
         result = self.result
@@ -83,7 +83,7 @@ class FittedFile:
             mesh = shown = mesh_of(observation, result)
             masks = [view.mask_image for view in views]
         elif observation.model is not None:
-            mesh = load_mesh(observation.model)
+            mesh = mesh_at(observation.model)
             bounds = mesh.bounds
         found = self
         if picture:

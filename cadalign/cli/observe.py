@@ -35,8 +35,10 @@ from cadalign.errors import CadalignError, DataError, InputError, brief, refuse_
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file, read_json
 from cadalign.io.files import keeping, listed
-from cadalign.io.images import photo_size, read_grey, read_mask, write_image
-from cadalign.io.observation import OBSERVATION, Observation, kind_of, with_lens
+from cadalign.io.images import photo_size, read_grey, read_mask, require_one_size, write_image
+from cadalign.io.kinds import OBSERVATION, kind_of
+from cadalign.io.meshes.files import check_keypoints
+from cadalign.io.observation import Observation, with_lens
 
 # Arguments of the library's functions, and their names on the command line.
 _FLAGS = {"image": "--image", "number": "--object", "sigma_from_scores": "--sigma"}
@@ -86,6 +88,8 @@ class Observe(CameraOptions, EvidenceOptions):
                 refuse_unused(self, ["sigma"], "without --weigh", fix=fix)
         objects = read_image_keypoints(self.keypoints)
         model = ModelKeypoints.load(self.model_keypoints)
+        with in_file(self.model_keypoints):
+            check_keypoints(model.xyz, model.model, where="keypoints.xyz")
         inputs = [self.keypoints, self.model_keypoints, model.model, self.camera, self.image]
         inputs += [value for value in self.given.values() if isinstance(value, Path)]
         with keeping(inputs):
@@ -104,6 +108,8 @@ class Observe(CameraOptions, EvidenceOptions):
         if name is not None and Path(called).suffix and not found.is_of(name):
             say(f"{self.keypoints} calls the photo {called}; its keypoints count for {name}")
         text = f"{len(observation.points_2d)} of {len(found)} keypoints: {out}"
+        if observation.not_found:
+            say(f"{found.source}: {observation.text_of_not_found}")
         if observation.evidence.mask is not None:
             text += f"; mask: {observation.evidence.mask}"
         answer(text)
@@ -145,8 +151,12 @@ class Observe(CameraOptions, EvidenceOptions):
             missing = "--camera" if not camera.focal_known else "a model in MODEL_KEYPOINTS"
             say(f"The mask is left out: a fit to it needs {missing}.")
             return None
-        with in_file(found.source):
-            mask = decode_segmentation(found.segmentation, width=camera.width, height=camera.height)
+        size = {"width": camera.width, "height": camera.height}
+        try:
+            mask = decode_segmentation(found.segmentation, **size)
+        except DataError as error:
+            say(f"{found.source}: the mask is left out: {error}")
+            return None
         path = out.with_suffix(".mask.png")
         write_image(path, np.where(mask, 255, 0).astype(np.uint8))
         return path
@@ -168,15 +178,8 @@ class Observe(CameraOptions, EvidenceOptions):
             raise DataError(
                 "the photo's size is unknown", where=found.source, fix="give --image or --camera"
             )
-        (first, size), *others = sizes.items()
-        for name, other in others:
-            if other != size:
-                raise DataError(
-                    f"the image has {other[0]} x {other[1]} pixels, that of {first} "
-                    f"{size[0]} x {size[1]}",
-                    where=name,
-                    fix="give keypoints, photo and camera of one image",
-                )
+        require_one_size(sizes, image)
+        size = next(iter(sizes.values()))
         changes = self.of_camera
         return with_lens(camera or Camera.without_focal(*size), changes.focal, fov=changes.fov)
 

@@ -15,7 +15,7 @@ from cadalign.estimation.options import Sigma
 from cadalign.io.documents import read_json
 from cadalign.io.files import keeping
 from cadalign.io.images import read_image
-from cadalign.io.observation import is_of_many, refuse_photo_or_mesh
+from cadalign.io.kinds import is_of_many
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.query import ObservationRetrieval, read_query
 
@@ -59,7 +59,6 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
     def run(self) -> int:
         """Run the retrieval, or the retrievals; returns the exit code."""
         path = self.first()
-        refuse_photo_or_mesh(path)
         is_file = path.suffix.lower() == ".json" and path.is_file()
         is_many = is_of_many(path, read_json(path) if is_file else None)
         with named_as_flags(self, self.ranking):

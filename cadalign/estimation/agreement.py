@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -100,6 +100,7 @@ class DiagnosisCase:
     ransac: RansacOptions | None = None
     size: Size | None = None
     has_rows: bool = False  # the ids of keypoints are their rows
+    labels: Sequence[Hashable] = ()  # what the user calls the keypoints of these rows
 
     @property
     def inflation(self) -> float:

@@ -199,7 +199,9 @@ def _align_plain(
     own = replace(options, sigma=view.sigma, stretch=shape[0], stretch_sigma=shape[1])
     problems = pack_one(points[rows], view.pixels, view.camera)
     scores = view.scores if ransac is not None else None
-    return fit_one(problems, own, ransac, scores, model.symmetry, start, model=model, view=view)
+    labels = () if view.is_numbered else view.keypoint_ids
+    search = ransac, scores, model.symmetry, start
+    return fit_one(problems, own, *search, labels=labels, model=model, view=view)
 
 
 def _align_single(problem: Problem, start: float) -> Result:
@@ -358,9 +360,16 @@ def _checked_views(given: object) -> list[View]:
 
 
 def _check_numbers(model: object, views: Sequence[View]) -> None:
-    """Refuse views without ids where the model's first keypoints are not called 0, 1, 2, ..."""
+    """Refuse views without ids that are not of all keypoints of a model, called 0, 1, 2, ..."""
     known = model.ids if isinstance(model, Model | ShapeModel) else ()
     for number, view in enumerate(views):
+        count = len(view.keypoint_ids)
+        if known and view.is_numbered and count not in (0, len(known)):
+            raise InputError(
+                f"{count} keypoints without ids, but the model has {len(known)}",
+                where=f"views[{number}].ids",
+                fix="give the model's id of each keypoint of the view, in the view's order",
+            )
         own = tuple(known or ())[: len(view.keypoint_ids)]
         if view.is_numbered and own != tuple(range(len(own))):
             listed = ", ".join(quote(each) for each in own[:5]) + (", ..." if len(own) > 5 else "")

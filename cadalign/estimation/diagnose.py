@@ -8,7 +8,7 @@ what is said. Of the rules that explain the residuals the likeliest is named. To
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, cast
@@ -105,8 +105,13 @@ def _measures_of(case: DiagnosisCase) -> list[str]:
     return found if case.size is None else [*found, "size"]
 
 
-def diagnose_fit(fitted: FittedKeypoints) -> EstimateWarning | None:
-    """As `diagnose`, of keypoints in one view; after a robust search also of its inliers."""
+def diagnose_fit(
+    fitted: FittedKeypoints, labels: Sequence[Hashable] = ()
+) -> EstimateWarning | None:
+    """As `diagnose`, of keypoints in one view; after a robust search also of its inliers.
+
+    Messages name keypoints by their ``labels``, by default their rows.
+    """
     search, options, observed = fitted.search, fitted.options, fitted.observed
     first = None if search is None else search.ransac
     passes = [(np.isfinite(fitted.residuals).all(axis=1), first)]
@@ -120,7 +125,7 @@ def diagnose_fit(fitted: FittedKeypoints) -> EstimateWarning | None:
         drawn = None if fitted.inliers.all() else ransac
         seen = fitted.points_3d, observed[rows], fitted.camera
         case = case_of_fit(*seen, own, drawn, rows.tolist())
-        if cause := diagnose(replace(case, ransac=ransac)):
+        if cause := diagnose(replace(case, ransac=ransac, labels=labels)):
             return cause
     return None
 
@@ -355,7 +360,13 @@ def _outliers_of(case: DiagnosisCase, best: Agreement) -> tuple[str, int | None,
             numbers = [names[row] for row in rows] if case.has_rows else rows
             wrong[view.number] = tuple(cast("list[int]", numbers))
             where = f"views[{view.number}]: " if len(case.views) > 1 else ""
-            texts.append(where + named_keypoints({quote(names[row]): errors[row] for row in rows}))
+            called = (
+                [case.labels[each] for each in wrong[view.number]]
+                if case.labels
+                else [names[row] for row in rows]
+            )
+            of_each = zip(map(quote, called), errors[rows].tolist(), strict=True)
+            texts.append(where + named_keypoints(dict(of_each)))
     total = sum(map(len, wrong.values()))
     text = f"{'keypoint' if total == 1 else 'keypoints'} {'; '.join(texts)} do{'es' * (total == 1)}"
     return (text, None, ()) if len(wrong) > 1 else (text, *next(iter(wrong.items())))

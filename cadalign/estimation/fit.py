@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any
@@ -170,9 +170,13 @@ def fit_one(
     scores: npt.ArrayLike | None,
     symmetry: Symmetry | None,
     start: float,
+    labels: Sequence[Hashable] = (),
     **seen: Any,
 ) -> Result:
-    """Fit the only problem, begun at ``start`` [s]; ``seen`` as of `result_of_keypoints`."""
+    """Fit the only problem, begun at ``start`` [s]; ``seen`` as of `result_of_keypoints`.
+
+    Warnings name the keypoints by their ``labels``, by default their rows.
+    """
     try:
         fitted = fit_once(problems, options, ransac, scores, start)
     except NoConsensusError as error:
@@ -183,14 +187,20 @@ def fit_one(
         error.fix = diagnose_refusal(case) or error.fix
         raise
     return result_of_keypoints(
-        problems.points_2d, fitted, diagnosis=diagnosis_of_fit, symmetry=symmetry, **seen
+        problems.points_2d,
+        fitted,
+        diagnosis=partial(diagnosis_of_fit, labels=tuple(labels)),
+        symmetry=symmetry,
+        **seen,
     )
 
 
-def diagnosis_of_fit(fitted: FittedKeypoints) -> EstimateWarning | None:
+def diagnosis_of_fit(
+    fitted: FittedKeypoints, labels: Sequence[Hashable] = ()
+) -> EstimateWarning | None:
     from cadalign.estimation.diagnose import diagnose_fit  # rarely asked
 
-    return diagnose_fit(fitted)
+    return diagnose_fit(fitted, labels)
 
 
 def fit_once(

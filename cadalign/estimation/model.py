@@ -16,6 +16,7 @@ from cadalign.estimation.symmetry import check_symmetry
 from cadalign.geometry.alignment import extent
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry
+from cadalign.geometry.units import check_near
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -84,6 +85,7 @@ class Model:
         object.__setattr__(self, "ids", checked_ids(self.ids, len(points)))
         if self.mesh is not None:
             require_kind(self.mesh, Mesh, "mesh", fix="read it with cadalign.load_mesh")
+            check_near(points, self.mesh.bounds, where="points_3d")
         if self.shape_sigma is not None:
             if not len(points):
                 fix = "give points_3d, whose positions it is about, or leave it away"

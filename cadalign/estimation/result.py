@@ -440,9 +440,10 @@ class Result:
             If the file cannot be read, or a field is missing or invalid; the message names both.
         """
         from cadalign.io.documents import in_file, read_json
+        from cadalign.io.kinds import FIT
 
         path = as_path(path)
-        data = read_json(path)
+        data = read_json(path, FIT)
         with in_file(path):
             return cls.from_dict(data)
 

@@ -30,7 +30,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import check_pixels
 from cadalign.geometry.rotations import nearest_rigid
 from cadalign.io.evidence import BeyondKeypoints
-from cadalign.io.images import ByteImage, read_grey, read_mask, read_photo
+from cadalign.io.images import ByteImage, exif_note, read_grey, read_mask, read_photo
 
 _FILE_SCALE = 0.001  # of a 16-bit depth image: millimetres to metres
 _SYMMETRY_TOLERANCE = 1e-9
@@ -52,7 +52,7 @@ class View(BeyondKeypoints):
     points_2d : (n, 2) float
         Keypoints in the image [px]; integers are pixel centres.
     ids : sequence of n int or str, optional
-        The model's ids or names of these keypoints; by default its first n, in its order.
+        The model's ids or names of these keypoints; by default all of the model's, in its order.
     sigma : float, (n,) float, (n, 2, 2) float, or None
         Standard deviation of the keypoints, of each, or covariance of each [px]. None estimates one
         for all views that have none, by its likelihood under a weak prior about 2 px.
@@ -267,7 +267,9 @@ def _mask(given: Any, camera: Camera) -> FloatArray | BoolArray:
 
 def _photo(given: Any, camera: Camera) -> ByteImage:
     """A photo (h, w, 3) uint8 in RGB."""
+    note = ""
     if isinstance(given, str | os.PathLike):
+        note = exif_note(Path(given), (camera.width, camera.height))
         given = read_photo(given)
     pixels = np.asarray(given)
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
@@ -275,7 +277,7 @@ def _photo(given: Any, camera: Camera) -> ByteImage:
         raise InputError(what, where="image", fix="give the photo's array, or its path")
     if pixels.shape[:2] != (camera.height, camera.width):
         size = f"{pixels.shape[1]} x {pixels.shape[0]}"
-        what = f"the photo is {size}, the camera {camera.width} x {camera.height}"
+        what = f"the photo is {size}, the camera {camera.width} x {camera.height}{note}"
         raise InputError(what, where="image", fix="give the photo that the camera is of")
     return pixels
 

@@ -84,13 +84,7 @@ class Calibration:
         if not isinstance(known, bool | np.bool_):
             what = f"{quote(known)} is neither True nor False"
             raise InputError(what, where="camera.focal_known")
-        try:
-            if np.iscomplexobj(self.distortion) or is_masked(self.distortion):
-                raise TypeError
-            coefficients = tuple(float(value) for value in self.distortion)
-        except (TypeError, ValueError, OverflowError, NotImplementedError):  # of a memoryview
-            raise InputError("not a sequence of numbers", where="camera.distortion") from None
-        coefficients = checked_coefficients(self.lens, coefficients)
+        coefficients = checked_coefficients(self.lens, _listed(self.distortion))
         object.__setattr__(self, "distortion", coefficients)
         if not self.focal_known:
             require_perspective_lens(self.lens, where="camera.lens")
@@ -308,6 +302,18 @@ class Calibration:
         """
         fields = _read_form(data)
         return cls(**fields) if "fx" in fields else cls.without_focal(**fields)
+
+
+def _listed(distortion: Any) -> tuple[float, ...]:
+    """Coefficients (n,) of a lens; OpenCV returns them as (1, n), and wants (n, 1) sometimes."""
+    try:
+        if np.iscomplexobj(distortion) or is_masked(distortion):
+            raise TypeError
+        if np.ndim(distortion) == 2 and 1 in np.shape(distortion):
+            distortion = np.ravel(distortion)
+        return tuple(float(value) for value in distortion)
+    except (TypeError, ValueError, OverflowError, NotImplementedError):  # of a memoryview
+        raise InputError("not a sequence of numbers", where="camera.distortion") from None
 
 
 def _whole_size(size: Any, name: str) -> int:

@@ -44,10 +44,10 @@ class Camera(Calibration):
     cx, cy : float
         Principal point [px].
     distortion : tuple of float, optional
-        For a perspective lens OpenCV's coefficients in OpenCV's order: (k1, k2, p1, p2), or with
-        k3, or with k3, k4, k5, k6; empty for none. For a fisheye (k1, k2, k3, k4) as in
-        ``cv2.fisheye``, 0 by default, or (k1, k2, p1, p2, k3, k4, sx1, sy1) as in COLMAP's
-        THIN_PRISM_FISHEYE. For a fov lens (omega,) as in COLMAP's FOV.
+        For a perspective lens OpenCV's coefficients in OpenCV's order and shapes: (k1, k2, p1, p2),
+        or with k3, or with k3, k4, k5, k6; empty for none. Its further ones must be 0. For a
+        fisheye (k1, k2, k3, k4) as in ``cv2.fisheye``, 0 by default, or (k1, k2, p1, p2, k3, k4,
+        sx1, sy1) as in COLMAP's THIN_PRISM_FISHEYE. For a fov lens (omega,) as in COLMAP's FOV.
     lens : {"perspective", "fisheye", "fov"}
         Kind of lens. A fisheye or fov lens may see points beside and behind the camera's plane;
         its focal length has to be known.

@@ -26,6 +26,10 @@ from cadalign.errors import InputError, quote
 PIXEL_CENTRE = 0.5
 """The centre of the top-left pixel, in x and y, in OpenGL, COLMAP and NeRF programs."""
 _NORMALISED = 1.5  # beyond all normalised coordinates of what is guessed outside of an image [px]
+_PLACEHOLDERS = (0.0, -1.0)  # of both coordinates of a keypoint that was not found
+_SEVERAL = 2  # of these, which no detector finds by chance
+_CROWD = 3  # keypoints at one and the same pixel
+_CROWDED_SPAN = 32  # of an object in which so many do not meet [px]
 _LEAST_SIZE = 16  # of an image in which so small an object is a mistake [px]
 
 PixelOrigin = Literal["center", "corner"]
@@ -54,10 +58,35 @@ def rescaled_pixels(pixels: FloatArray, factor: float | FloatArray) -> FloatArra
     return np.asarray((pixels + PIXEL_CENTRE) * factor - PIXEL_CENTRE)
 
 
-def check_pixels(points_2d: FloatArray, width: int, height: int, *, where: str) -> None:
-    """Refuse normalised coordinates (n, 2) in the place of the pixels of an image of that size.
+def unmeasured(points_2d: FloatArray, *, least: int = _SEVERAL) -> BoolArray:
+    """Say which rows of pixels (n, 2) are no measurements, (n,) bool.
 
-    Raises InputError if all lie within a pixel or so of the image's corner, but not in one place.
+    These are what detectors write for keypoints that they did not find: values that are not finite;
+    exactly (0, 0) or (-1, -1), if it is written ``least`` times; and a pixel that three or more
+    share.
+
+    Examples
+    --------
+    >>> unmeasured(np.array([[0.0, 0.0], [51, 20], [np.nan, 3], [0, 0]])).tolist()
+    [True, False, True, True]
+    """
+    bad = np.asarray(~np.isfinite(points_2d).all(axis=1))
+    for value in _PLACEHOLDERS:
+        here = (points_2d == value).all(axis=1)
+        if np.count_nonzero(here) >= least:
+            bad |= here
+    known = points_2d[~bad]
+    if len(known) >= _CROWD and np.ptp(known, axis=0).max() >= _CROWDED_SPAN:
+        _, of, counts = np.unique(known, axis=0, return_inverse=True, return_counts=True)
+        bad[~bad] = counts[of.reshape(-1)] >= _CROWD
+    return np.asarray(bad)
+
+
+def check_pixels(points_2d: FloatArray, width: int, height: int, *, where: str) -> None:
+    """Refuse what is no pixels (n, 2) of an image of that size.
+
+    Raises InputError if several are placeholders of detectors, see `unmeasured`, or if all are
+    normalised coordinates: within a pixel or so of the image's corner, but not in one place.
 
     Examples
     --------
@@ -65,7 +94,11 @@ def check_pixels(points_2d: FloatArray, width: int, height: int, *, where: str) 
     Traceback (most recent call last):
     cadalign.errors.InputError: points_2d: all 2 keypoints ... give pixels: multiply fractions ...
     """
-    if not len(points_2d) or abs(points_2d.item(0)) > _NORMALISED:  # in a fraction of a microsecond
+    if not len(points_2d):
+        return
+    if not points_2d.min() > 0:  # else none is a placeholder, which is quickly told
+        _refuse_placeholders(points_2d, where)
+    if abs(points_2d.item(0)) > _NORMALISED:
         return
     if min(width, height) < _LEAST_SIZE or not np.ptp(points_2d, axis=0).any():
         return
@@ -73,6 +106,16 @@ def check_pixels(points_2d: FloatArray, width: int, height: int, *, where: str) 
         what = f"all {len(points_2d)} keypoints lie within {_NORMALISED:g} px of pixel (0, 0)"
         fix = f"give pixels: multiply fractions by the image's width {width} and height {height}"
         raise InputError(f"{what}, as normalised coordinates (0 to 1) do", where=where, fix=fix)
+
+
+def _refuse_placeholders(points_2d: FloatArray, where: str) -> None:
+    for value in _PLACEHOLDERS:
+        rows = np.flatnonzero((points_2d == value).all(axis=1))
+        if len(rows) >= _SEVERAL:
+            listed = ", ".join(map(str, rows[:5])) + (", ..." if len(rows) > 5 else "")
+            what = f"{len(rows)} keypoints, rows {listed}, are at exactly ({value:g}, {value:g})"
+            fix = "detectors write this for keypoints that they did not find: leave these out"
+            raise InputError(what, where=where, fix=fix)
 
 
 def perspective(points_cam: FloatArray) -> FloatArray:
@@ -94,6 +137,7 @@ _COEFFICIENTS = {
     "fisheye": ((0, 4, 8), "give (k1, k2, k3, k4), or (k1, k2, p1, p2, k3, k4, sx1, sy1)"),
     "fov": ((1,), "give (omega,), an angle in rad between 0 and pi"),
 }
+_WITH_MORE = (12, 14)  # numbers of OpenCV's, with thin prism terms, and with the sensor's tilt
 _NEWTON_STEPS = 50
 _TABLE = 257  # angles at which a fisheye's radius is tabulated
 _ROUNDS = 6  # of such tables, each within a step of the one before
@@ -108,6 +152,16 @@ def checked_coefficients(kind: object, coefficients: tuple[float, ...]) -> tuple
         what, fix = f"{quote(kind)} is not a kind of lens", f"known are {', '.join(_COEFFICIENTS)}"
         raise InputError(what, where="camera.lens", fix=fix)
     counts, fix = _COEFFICIENTS[kind]
+    if kind == "perspective" and len(coefficients) in _WITH_MORE:
+        if any(coefficients[12:]):
+            what = f"the sensor's tilt, {quote(coefficients[12:])}, is not modelled"
+            fix = "calibrate without cv2.CALIB_TILTED_MODEL"
+            raise InputError(what, where="camera.distortion", fix=fix)
+        if any(coefficients[8:]):
+            what = f"the thin prism terms s1 to s4, {quote(coefficients[8:12])}, are not modelled"
+            fix = "calibrate without cv2.CALIB_THIN_PRISM_MODEL"
+            raise InputError(what, where="camera.distortion", fix=fix)
+        coefficients = coefficients[:8]
     is_right = len(coefficients) in counts and bool(np.isfinite(coefficients).all())
     if not is_right or (kind == "fov" and not 0 < coefficients[0] < math.pi):
         what = f"{quote(coefficients)} are not distortion coefficients"

@@ -18,6 +18,7 @@ from cadalign.io.files import as_path
 LENGTHS = ("width", "height", "length")
 """Names of the lengths along the model's x, y and z."""
 _LENGTH_SIGMA = 0.01  # relative
+_LISTED = 8  # rows of keypoints in a message
 
 
 REFINED = {
@@ -183,6 +184,9 @@ class ObservedImage:
         Depth of each keypoint [model units]; NaN where unknown.
     evidence : ImageEvidence
         What is known beyond keypoints.
+    not_found : tuple of int
+        Rows of the file's keypoints that are left out here: their pixels are no measurements, see
+        `cadalign.geometry.pixels.unmeasured`.
 
     Raises
     ------
@@ -200,6 +204,7 @@ class ObservedImage:
     image: Path | None = None
     depths: FloatArray | None = field(default=None, kw_only=True)
     evidence: ImageEvidence = field(default_factory=ImageEvidence, kw_only=True)
+    not_found: tuple[int, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         require_kind(self.camera, Camera, "camera")
@@ -227,6 +232,26 @@ class ObservedImage:
             what = f"shape {depths.shape}, expected ({len(points_3d)},)"
             raise InputError(what, where="depths")
         object.__setattr__(self, "depths", depths)
+
+    @property
+    def labels(self) -> tuple[str | int, ...]:
+        """What messages call the keypoints: their names, or else their rows in the file."""
+        count = len(self.points_2d) + len(self.not_found)
+        if self.names is not None and len(set(self.names)) == len(self.names):
+            return self.names
+        return tuple(row for row in range(count) if row not in self.not_found)
+
+    @property
+    def text_of_not_found(self) -> str:
+        """What is said of the keypoints that are left out; empty where none is."""
+        if not self.not_found:
+            return ""
+        count, rows = len(self.not_found), ", ".join(map(str, self.not_found[:_LISTED]))
+        rows += ", ..." if count > _LISTED else ""
+        return (
+            f"{count} of {count + len(self.points_2d)} keypoints are not found and left out "
+            f"(rows {rows}): their pixels are missing, (0, 0), or one and the same"
+        )
 
     @property
     def has_more(self) -> bool:

@@ -1,4 +1,4 @@
-"""Atomic writes, reads of regular files of bounded size, and sealed files; errors name the file."""
+"""Atomic writes, and reads of regular files of bounded size; errors name the file."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ import logging
 import math
 import os
 import stat
-import struct
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from dataclasses import dataclass
 from functools import lru_cache, wraps
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -334,64 +332,6 @@ def require_utf8(path: Path) -> None:
     except UnicodeEncodeError:
         fix = "rename it, or the folder that it is in"
         raise DataError("the path is not UTF-8", where=printable(path), fix=fix) from None
-
-
-_HEADER = struct.Struct("<16sIIQ32s")
-
-
-@dataclass(frozen=True)
-class Seal:
-    """One format of sealed files: a header of 64 bytes, then the payload.
-
-    The header holds, in little-endian order, the 16 bytes that name the format, its version (4
-    bytes), 4 bytes of zero, the payload's length (8 bytes) and its BLAKE2b checksum (32 bytes).
-    """
-
-    magic: bytes  # the 16 bytes
-    version: int  # that is written and read
-    noun: str  # its name in messages, such as "library file"
-    fix: str  # how to make such a file
-
-    def write(self, path: Path, payload: Any) -> None:
-        """Write a file atomically; ``payload`` is bytes or a buffer."""
-        size = memoryview(payload).nbytes
-        header = _HEADER.pack(self.magic, self.version, 0, size, checksum(payload))
-
-        def write(unfinished: Path) -> None:
-            with unfinished.open("wb") as file:
-                file.write(header)
-                file.write(payload)
-
-        write_whole(path, write)
-
-    def unwrap(self, content: Any, where: str) -> memoryview:
-        """Check the header and the checksum; returns the payload, which is not copied.
-
-        Raises DataError if the content is of another format or version, truncated or damaged.
-        """
-        view = memoryview(content).cast("B")
-        if len(view) < _HEADER.size or bytes(view[:16]) != self.magic:
-            raise DataError(f"not a {self.noun}", where=where, fix=self.fix)
-        _, version, _, size, expected = _HEADER.unpack(view[: _HEADER.size])
-        payload = view[_HEADER.size :]
-        if version != self.version:
-            raise DataError(
-                f"a {self.noun} of version {version}, but this cadalign reads version "
-                f"{self.version}",
-                where=where,
-                fix=self.fix,
-            )
-        if len(payload) != size:
-            what = "truncated" if len(payload) < size else "too long"
-            raise self.error(f"is {what}: {len(payload)} bytes, {size} expected", where, again=True)
-        if checksum(payload) != expected:
-            raise self.error("is damaged: its checksum is wrong", where, again=True)
-        return payload
-
-    def error(self, what: str, where: str, *, again: bool = False) -> DataError:
-        """The error of a file whose content is wrong."""
-        fix = f"copy it again, or {self.fix}" if again else self.fix
-        return DataError(f"the {self.noun} {what}", where=where, fix=fix)
 
 
 def checksum(payload: Any) -> bytes:

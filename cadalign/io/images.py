@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import struct
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -17,6 +17,8 @@ from cadalign.arrays import BoolArray
 from cadalign.errors import DataError, brief
 from cadalign.geometry.camera import Camera
 from cadalign.io.files import as_path, open_input, write_whole
+from cadalign.io.kinds import IMAGE, refuse_other_file
+from cadalign.io.kinds import PHOTO_ENDINGS as PHOTO_ENDINGS
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -39,7 +41,12 @@ _FREE_BYTES = 2**26
 def open_photo(path: str | os.PathLike[str]) -> Iterator[Image]:
     """Open a photo; its pixels are read when they are asked for, errors then named as well."""
     path = as_path(path)
-    with open_input(path) as file, open_picture(file, file.size, where=str(path)) as image:
+    with open_input(path) as file, ExitStack() as opened:
+        try:
+            image = opened.enter_context(open_picture(file, file.size, where=str(path)))
+        except DataError:
+            refuse_other_file(path, IMAGE)
+            raise
         yield image
 
 
@@ -114,13 +121,43 @@ def photo_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     return (height, width) if is_on_its_side else (width, height)
 
 
+def exif_note(path: Path, size: tuple[int, int]) -> str:
+    """What is said of a photo of another size (width, height) than this one, if EXIF turned it."""
+    with open_photo(path) as image:
+        is_turned = image.size == size and image.getexif().get(_ORIENTATION) in _ON_ITS_SIDE
+    if not is_turned:
+        return ""
+    return (
+        f"; its EXIF data say that it was held on its side: as it is stored, it has {size[0]} x "
+        f"{size[1]} pixels, but it is read upright, as photo programs show it"
+    )
+
+
+def require_one_size(sizes: Mapping[str, tuple[int, int]], photo: Path | None) -> None:
+    """Refuse parts of an image that differ in size (width, height), by their names.
+
+    The ``photo`` is one of them.
+    """
+    (first, size), *others = sizes.items()
+    for name, other in others:
+        if other != size:
+            note = "" if photo is None else exif_note(photo, other) or exif_note(photo, size)
+            raise DataError(
+                f"the image has {other[0]} x {other[1]} pixels, that of {first} "
+                f"{size[0]} x {size[1]}{note}",
+                where=name,
+                fix="give keypoints, photo and camera of one image",
+            )
+
+
 def read_image(path: Path, camera: Camera) -> ByteImage:
     """Read a photo as `read_photo` does and require the camera's size of it."""
     pixels = read_photo(path)
     height, width = pixels.shape[:2]
     if (width, height) != (camera.width, camera.height):
+        note = exif_note(path, (camera.width, camera.height))
         raise DataError(
-            f"the image is {width} x {height}, the camera {camera.width} x {camera.height}",
+            f"the image is {width} x {height}, the camera {camera.width} x {camera.height}{note}",
             where=str(path),
             fix="give the camera of this image",
         )
@@ -166,6 +203,3 @@ def write_image(path: Path, image: ByteImage) -> None:
     if not encoded:
         raise DataError(f"the picture cannot be encoded as {kind[1:].upper()}", where=str(path))
     write_whole(path, lambda unfinished: unfinished.write_bytes(data.tobytes()))
-
-
-PHOTO_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")

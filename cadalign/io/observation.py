@@ -34,6 +34,7 @@ from cadalign.io.documents import (
 )
 from cadalign.io.evidence import ImageEvidence, ObservedImage, Size
 from cadalign.io.files import as_path, once_per_file, read_bytes, read_text, write_json
+from cadalign.io.kinds import CAMERA, OBSERVATION, kind_of, other_kind, refuse_other_file
 from cadalign.io.observation_file import (
     fill_xyz,
     read_fields,
@@ -41,14 +42,6 @@ from cadalign.io.observation_file import (
     read_size,
     write_image_fields,
 )
-
-LINES = (".jsonl", ".ndjson")
-"""Endings of files with an observation in every line."""
-TABLE = ".csv"
-OBSERVATION, DETECTOR, OTHER = "observation", "detector", "other"
-_WILD = frozenset("*?[")
-_MESHES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
-_PHOTOS = (".bmp", ".gif", ".heic", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +142,7 @@ class Observation(ObservedImage):
             message names file and field.
         """
         path = as_path(path)
-        data = read_json(path)
+        data = read_json(path, OBSERVATION)
         if needs_xyz is None:
             needs_xyz = not (isinstance(data, dict) and data.get("shape"))
         if not needs_xyz:
@@ -160,21 +153,23 @@ class Observation(ObservedImage):
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], *, folder: Path | None = None) -> Observation:
         """Read the parsed form of an observation file; paths are relative to ``folder``."""
-        if isinstance(data, Mapping) and "alignment" in data:
-            fix = "give the observation that was fitted"
-            raise DataError("the result of a fit, not an observation", fix=fix)
+        if error := other_kind(Path(), OBSERVATION, kind_of(data)):
+            raise DataError(error.what, fix=error.fix)
         read, fields = read_fields(data)
         images = []
         for number, each in enumerate(fields):
             with nullcontext() if each is read else within(f"views[{number}]"):
                 images.append(read_image_fields(each, folder))
         first, *others = images
+        options = msgspec.to_builtins(read.fit)
+        if first.not_found and isinstance(options.get("sigma"), list):
+            options["sigma"] = np.delete(options["sigma"], first.not_found).tolist()
         with within("init"):
             init = None if read.init is None else read.init.alignment
         return cls(
             **vars(first),
             model=None if read.model is None else path_from(read.model, folder),
-            fit_options=msgspec.to_builtins(read.fit),
+            fit_options=options,
             others=tuple(others),
             size=read_size(read.size),
             shape=None if read.shape is None else path_from(read.shape, folder),
@@ -295,47 +290,6 @@ class DetectorOptions:
     """Leave out a detector's keypoints that the model does not have."""
 
 
-def is_of_many(path: Path, data: object = None) -> bool:
-    """True for an input that may hold many observations; ``data`` is the content of a JSON file."""
-    if path.is_dir() or path.suffix.lower() in (*LINES, TABLE):
-        return True
-    return kind_of(data) == DETECTOR or is_pattern(path)
-
-
-def is_pattern(path: Path) -> bool:
-    """True for what matches files, and is none."""
-    return not _WILD.isdisjoint(str(path)) and not path.exists()
-
-
-def kind_of(data: object) -> str:
-    """Kind of a JSON file, by its content."""
-    if isinstance(data, list):
-        return DETECTOR
-    if not isinstance(data, dict):
-        return OTHER
-    if {"annotations", "instance_info"} & set(data):
-        return DETECTOR
-    is_meant = "views" in data or ("keypoints" in data and "format" not in data)
-    return OBSERVATION if is_meant else OTHER
-
-
-def refuse_photo_or_mesh(path: Path) -> None:
-    """Refuse an image or a mesh in the place of an observation, and say what makes one."""
-    if path.suffix.lower() in _MESHES:
-        raise InputError(
-            "a mesh, not an observation, which is a JSON file with camera and keypoints",
-            where=str(path),
-            fix=f"mark keypoints with `cadalign annotate PHOTO {path.name}`, which writes one",
-        )
-    if path.suffix.lower() in _PHOTOS:
-        raise InputError(
-            "a photo, not an observation, which is a JSON file with camera and keypoints",
-            where=str(path),
-            fix=f"mark keypoints with `cadalign annotate {path.name} MODEL`, which writes one, or "
-            "use a detector's with `cadalign observe`",
-        )
-
-
 _ARRAY = ".npy"
 _MOST_BYTES = 2**20  # of an array, which has nine numbers
 _MATRIX_NAMES = ("matrix", "K", "camera_matrix", "cam_K")
@@ -384,11 +338,17 @@ def _read_form(path: Path) -> dict[str, Any]:
     """The parsed form of a camera in a file."""
     if path.suffix.lower() == _ARRAY:
         return {"matrix": _read_array(path)}
-    text = read_text(path)
-    if path.suffix.lower() != ".json" and text.lstrip()[:1] not in ("{", "["):
-        return {"matrix": _square(text.replace(",", " ").replace(";", " ").split(), path)}
-    data = parse_json(text, str(path))
-    if isinstance(data, list) and len(data) in (3, 9):
+    try:
+        text = read_text(path)
+        if path.suffix.lower() != ".json" and text.lstrip()[:1] not in ("{", "["):
+            return {"matrix": _square(text.replace(",", " ").replace(";", " ").split(), path)}
+        data = parse_json(text, str(path))
+    except DataError:
+        refuse_other_file(path, CAMERA)
+        raise
+    if error := other_kind(path, CAMERA, kind_of(data)):
+        raise error
+    if isinstance(data, list):
         return {"matrix": _square(data, path)}
     if not isinstance(data, dict):
         what = f"camera: expected an object, got {type(data).__name__}"

@@ -14,17 +14,16 @@ import numpy as np
 from msgspec import UNSET, Meta, UnsetType
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import DataError
+from cadalign.errors import DataError, quote
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.pixels import PixelOrigin, check_pixels, shift_of
+from cadalign.geometry.pixels import PixelOrigin, check_pixels, shift_of, unmeasured
 from cadalign.io.documents import (
     Document,
     Finite,
     Index,
     NotNegative,
     PathText,
-    Point2,
     Point3,
     Positive,
     Text,
@@ -49,6 +48,7 @@ _EVIDENCE: dict[str, Any] = {
     "cam_from_rig": tuple[_Row4, _Row4, _Row4, _Row4],
 }
 _PATHS = ("mask", "depth")
+_COLUMNS = ("name", "semantic_id", "sigma", "score")  # of all keypoints, or of none
 Declared = TypeVar("Declared", bound=Document)
 
 
@@ -74,7 +74,7 @@ class KeypointFields(SeenKeypoint, kw_only=True):
     """One entry of ``keypoints``."""
 
     xyz: Point3
-    uv: Point2
+    uv: tuple[float | None, float | None] | None  # null, or NaN, where it was not found
     name: Text | None = None
 
 
@@ -212,26 +212,40 @@ def read_image_fields(read: ViewFields | OneView, folder: Path | None) -> Observ
 
     Raises InputError if the camera is invalid, or fields contradict each other.
     """
-    names = _column(read.keypoints, "name")
-    ids = _column(read.keypoints, "semantic_id")
     for field in ("name", "semantic_id"):
         require_unique(read.keypoints, field)
+    columns = {name: _column(read.keypoints, name) for name in _COLUMNS}
     camera = Camera.from_dict(read.camera)
-    points_2d = np.array([each.uv for each in read.keypoints]).reshape(-1, 2)
+    pixels = [each.uv or (None, None) for each in read.keypoints]
+    points_2d = np.array(pixels, dtype=float).reshape(-1, 2)
+    bad = np.argwhere(np.isinf(points_2d) | (np.isnan(points_2d) != np.isnan(points_2d[:, ::-1])))
+    for row, column in bad:
+        if not np.isfinite(points_2d[row, column]):
+            what = f"{quote(pixels[row][column])} is not a finite number"
+            raise DataError(what, where=f"keypoints[{row}].uv[{column}]")
+    kept = np.flatnonzero(~unmeasured(points_2d)).tolist()
+    lost = tuple(sorted(set(range(len(pixels))).difference(kept)))
+    columns = {
+        name: None if column is None else [column[row] for row in kept]
+        for name, column in columns.items()
+    }
+    keypoints, points_2d = [read.keypoints[row] for row in kept], points_2d[kept]
+    ids, names = columns["semantic_id"], columns["name"]
     check_pixels(points_2d, camera.width, camera.height, where="keypoints.uv")
     evidence = {name: getattr(read, name) for name in _EVIDENCE}
     for name in _PATHS:
         evidence[name] = evidence[name] and path_from(evidence[name], folder)
     return ObservedImage(
-        points_3d=np.array([each.xyz for each in read.keypoints]).reshape(-1, 3),
+        points_3d=np.array([each.xyz for each in keypoints]).reshape(-1, 3),
         points_2d=points_2d - shift_of(read.pixel_origin),
         camera=camera,
-        sigma=_column(read.keypoints, "sigma"),
+        sigma=columns["sigma"],
         ids=None if ids is None else np.array(ids, dtype=np.int64),
         names=None if names is None else tuple(names),
-        scores=_column(read.keypoints, "score"),
+        scores=columns["score"],
         image=None if read.image is None else path_from(read.image, folder),
-        depths=_depths(read.keypoints),
+        depths=_depths(keypoints),
+        not_found=lost,
         evidence=ImageEvidence(**evidence),
     )
 

@@ -27,7 +27,8 @@ from cadalign.datasets import AnnotatedModel, load_mesh
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.alignment import extent
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.files import Seal, as_path
+from cadalign.io.files import as_path
+from cadalign.io.sealed import Seal
 
 ModelKey = tuple[str, str]
 """Category name and model id."""

@@ -5,49 +5,52 @@ The forms that are read are described in docs/formats/detections.md.
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
-from msgspec import Meta, field
+from msgspec import field
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import BoolArray, FloatArray, is_number
 from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
-from cadalign.datasets.models.model_keypoints import FORMAT as MODEL_KEYPOINTS_FORMAT
 from cadalign.datasets.photos.dataset import leaving_out
 from cadalign.errors import DataError, InputError, quote
 from cadalign.io.documents import Count, Finite, ForeignDocument, Text, convert, in_file, read_json
+from cadalign.io.kinds import DETECTOR
+
+logger = logging.getLogger("cadalign")
 
 _FIX = "is it COCO's keypoint JSON, or a detector's? see cadalign's page on keypoints of detectors"
 _Id = int | str
 _Reader = tuple[str, Callable[[], ImageKeypoints | None]]
 """The place of an object in its file, and what reads it."""
-_Size = Annotated[float, Meta(ge=1, le=2**31)]
+_LARGEST = 2**31  # width or height of an image
 
 
 class _ByAxis(ForeignDocument):
     """The keypoints of one object as ultralytics writes them."""
 
-    x: list[Finite]
-    y: list[Finite]
-    visible: list[Finite] | None = None
+    x: list[float | None]
+    y: list[float | None]
+    visible: list[float | None] | None = None
 
 
 class _Object(ForeignDocument):
     """One object of any form, or one frame of a video with its objects."""
 
     keypoints: list[Any] | _ByAxis | None = None
-    keypoint_scores: list[Finite] | None = None
-    score: Finite | None = None
-    bbox_score: Finite | None = None
-    confidence: Finite | None = None
+    keypoint_scores: list[float | None] | None = None
+    score: Any = None
+    bbox_score: Any = None
+    confidence: Any = None
     image_id: _Id | None = None
     category_id: _Id | None = None
-    num_keypoints: int | None = None
+    num_keypoints: Any = None
     frame_id: _Id | None = None
     instances: list[_Object] | None = None
     segmentation: Any = None
@@ -56,8 +59,19 @@ class _Object(ForeignDocument):
 class _Image(ForeignDocument):
     id: _Id
     file_name: Text | None = None
-    width: _Size | None = None
-    height: _Size | None = None
+    width: Any = None
+    height: Any = None
+
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """Width and height; None where either is missing or is none."""
+        given = (self.width, self.height)
+        if given == (None, None):
+            return None
+        if all(is_number(each) and 1 <= each <= _LARGEST for each in given):
+            return int(self.width), int(self.height)
+        logger.warning("images: %s x %s is not a size; left out", *map(quote, given))
+        return None
 
 
 class _Category(ForeignDocument):
@@ -91,7 +105,7 @@ def read_coco_keypoints(
 
     For ``problems`` see `cadalign.datasets.read_image_keypoints`.
     """
-    data = read_json(path)
+    data = read_json(path, DETECTOR)
     with in_file(path):
         readers = list(_readers(data))
     objects = []
@@ -99,6 +113,8 @@ def read_coco_keypoints(
         with leaving_out(f"{path}: {where}", problems), in_file(path):
             if (found := read()) is not None:
                 objects.append(replace(found, source=f"{path}: {where}"))
+    if _are_flags([found.scores for found in objects if found.scores is not None]):
+        objects = [_with_flags_read(found) for found in objects]
     if not objects:
         none = DataError("there are no keypoints", where=str(path))
         raise next(iter((problems or {}).values()), none)
@@ -114,8 +130,6 @@ def _readers(data: Any) -> Iterable[_Reader]:
         return _from_predictions(convert(data, _File))
     if not isinstance(data, dict):
         raise DataError(f"{quote(data)} is not an object or a list", fix=_FIX)
-    if data.get("format") == MODEL_KEYPOINTS_FORMAT:
-        raise DataError("keypoints of a model, not those that a detector found in a photo")
     raise DataError("neither annotations nor instance_info", where="top level", fix=_FIX)
 
 
@@ -157,10 +171,8 @@ def _annotated(
     image = images.get(entry.image_id)
     if image is None:
         raise DataError(f"there is no image {quote(entry.image_id)}", where=f"{where}.image_id")
-    size = None
-    if image.width is not None and image.height is not None:
-        size = int(image.width), int(image.height)
-    return replace(found, image=image.file_name or found.image, size=size, images=len(images))
+    called = image.file_name or found.image
+    return replace(found, image=called, size=image.size, images=len(images))
 
 
 def _from_predictions(data: _File) -> Iterator[_Reader]:
@@ -193,10 +205,10 @@ def _image_keypoints(entry: _Object, where: str, *, names: list[str] | None) -> 
         raise DataError(what, where=place)
     if third is not None and len(third) != len(points):
         raise DataError(f"{len(third)} scores of {len(points)} keypoints", where=place)
-    given = (entry.score, entry.bbox_score, entry.confidence)
+    given = (_number(entry, name, where) for name in ("score", "bbox_score", "confidence"))
     return ImageKeypoints(
         points_2d=points,
-        scores=None if third is None else _scores(np.asarray(third, dtype=float)),
+        scores=None if third is None else np.array(third, dtype=float),
         names=None if names is None else tuple(names),
         image=None if entry.image_id is None else str(entry.image_id),
         score=next((score for score in given if score is not None), None),
@@ -213,17 +225,17 @@ def _points(entry: _Object, where: str) -> tuple[FloatArray, Any]:
     if isinstance(value, _ByAxis):
         if len(value.x) != len(value.y):
             raise DataError(f"{len(value.y)} values, but x has {len(value.x)}", where=f"{where}.y")
-        return np.column_stack([value.x, value.y]), value.visible
+        return np.column_stack([_floats(value.x), _floats(value.y)]), value.visible
     if not value:
         raise DataError("expected a list of numbers", where=where)
-    if isinstance(value[0], list):
-        rows = convert(value, list[list[Finite]], where=where)
-        width = len(rows[0])
-        if width not in (2, 3) or any(len(row) != width for row in rows):
+    if any(isinstance(each, list) for each in value):
+        rows = convert(value, list[list[float | None] | None], where=where)
+        width = max(len(row or ()) for row in rows)
+        if width not in (2, 3) or any(len(row) != width for row in rows if row is not None):
             raise DataError(f"{quote(rows)} are not x, y and score of each keypoint", where=where)
-        numbers = np.array(rows)
+        numbers = _floats([row or [None] * width for row in rows])
     else:
-        flat = convert(value, list[Finite], where=where)
+        flat = _floats(convert(value, list[float | None], where=where))
         if len(flat) % 3:
             what = f"{len(flat)} numbers are not x, y and visibility of keypoints"
             raise DataError(what, where=where)
@@ -234,10 +246,30 @@ def _points(entry: _Object, where: str) -> tuple[FloatArray, Any]:
     return np.ascontiguousarray(numbers[:, :2]), third
 
 
-def _scores(third: FloatArray) -> FloatArray:
-    if np.isin(third, (0, 1, 2)).all() and (third == 2).any():
-        return np.choose(third.astype(int), list(VISIBILITY_SCORES))
-    return third
+def _floats(values: Any) -> FloatArray:
+    """Numbers as an array, NaN for None."""
+    return np.array(values, dtype=float)
+
+
+def _number(entry: _Object, name: str, where: str) -> float | None:
+    """A number that an object can do without; what is none is warned of and left out."""
+    value = getattr(entry, name)
+    if value is None or is_number(value):
+        return None if value is None else float(value)
+    logger.warning("%s.%s: %s is not a number; left out", where, name, quote(value))
+    return None
+
+
+def _are_flags(scores: Sequence[FloatArray]) -> bool:
+    """True where all the third numbers of a file are COCO's flags: 0, 1 or 2, and one is 2."""
+    values = np.concatenate([np.empty(0), *scores])
+    return bool(np.isin(values, (0, 1, 2)).all() and (values == 2).any())
+
+
+def _with_flags_read(found: ImageKeypoints) -> ImageKeypoints:
+    if found.scores is None:
+        return found
+    return replace(found, scores=np.choose(found.scores.astype(int), list(VISIBILITY_SCORES)))
 
 
 # Masks ------------------------------------------------------------------------------------------
@@ -246,7 +278,7 @@ _MASK_FIX = "give COCO polygons, or the run lengths of a mask of this image"
 _FIRST, _LAST = 48, 111  # characters of compressed run lengths
 _MOST_BITS = 35  # of a length: more than any image has pixels
 _MOST_PIXELS = 2**28
-_Polygon = Annotated[list[Finite], Meta(min_length=6)]
+_LEAST_NUMBERS = 6  # of a polygon
 
 
 class _Runs(ForeignDocument):
@@ -279,11 +311,23 @@ def decode_segmentation(segmentation: Any, *, width: int, height: int) -> BoolAr
     if isinstance(segmentation, dict):
         mask = _decode_runs(convert(segmentation, _Runs, "segmentation"), width, height)
     else:
-        polygons = convert(segmentation, list[_Polygon], "segmentation")
-        mask = _fill(polygons, width, height)
+        mask = _fill(_polygons(segmentation), width, height)
     if not mask.any():
         raise DataError("the mask is empty", where="segmentation", fix=_MASK_FIX)
     return mask
+
+
+def _polygons(segmentation: Any) -> list[list[float]]:
+    """Polygons, without those of fewer than three points that stand beside others."""
+    given = convert(segmentation, list[list[Finite]], "segmentation")
+    kept = [polygon for polygon in given if len(polygon) >= _LEAST_NUMBERS]
+    if given and not kept:
+        what = f"{quote(given[0])} is not a polygon of three or more points"
+        raise DataError(what, where="segmentation[0]", fix=_MASK_FIX)
+    if len(kept) < len(given):
+        text = "segmentation: %d of %d polygons have fewer than three points; left out"
+        logger.warning(text, len(given) - len(kept), len(given))
+    return kept
 
 
 def _decode_runs(runs: _Runs, width: int, height: int) -> BoolArray:

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, as_floats, as_points
+from cadalign.arrays import BoolArray, FloatArray, as_floats
 from cadalign.datasets.models.model_keypoints import ModelKeypoints
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.pixels import check_pixels
-from cadalign.io.images import PHOTO_ENDINGS
+from cadalign.geometry.pixels import check_pixels, unmeasured
+from cadalign.io.kinds import PHOTO_ENDINGS
 from cadalign.io.observation import Observation
 
 VISIBILITY_SCORES = (0.0, 0.5, 1.0)
@@ -27,7 +27,7 @@ class ImageKeypoints:
     """The keypoints of one object in one image."""
 
     points_2d: FloatArray
-    """(k, 2), pixels; integers are pixel centres."""
+    """(k, 2), pixels; integers are pixel centres. NaN for a keypoint that was not found."""
     scores: FloatArray | None = None
     """(k,), how sure the detector is of each, 0 for a keypoint that was not found. Visibility flags
     are scores of 0 (not labelled), 0.5 (hidden) and 1 (visible)."""
@@ -49,32 +49,54 @@ class ImageKeypoints:
     """The file and the place in it, for messages."""
     camera: Camera | None = field(default=None, kw_only=True)
     """The calibrated camera, where the file has it."""
+    measured: BoolArray = field(init=False, repr=False)
+    """Which keypoints (k,) have a pixel that is a measurement, whatever their score; see
+    `cadalign.geometry.pixels.unmeasured`."""
     segmentation: Any = field(default=None, kw_only=True)
     """The object's mask as COCO writes it, unchecked; see
     `cadalign.datasets.detections.coco.decode_segmentation`."""
 
     def __post_init__(self) -> None:
-        points = as_points(self.points_2d, name=f"{self.source}: keypoints", dimension=2)
+        where = f"{self.source}: keypoints"
+        points = as_floats(self.points_2d, name=where, shape=(None, 2), finite=False)
+        bad = np.isinf(points).any(axis=1) | (np.isnan(points).sum(axis=1) == 1)
+        if bad.any():
+            row = int(bad.argmax())
+            what = f"keypoint {row} is at {quote(points[row].tolist())}"
+            raise DataError(what, where=where, fix="give NaN for both, where it was not found")
         object.__setattr__(self, "points_2d", points)
+        measured = ~unmeasured(points, least=1)
         for name in ("scores", "sigma"):
             if (value := getattr(self, name)) is None:
                 continue
             where = f"{self.source}: {name}"
-            value = as_floats(value, name=where, shape=(len(points),))
-            object.__setattr__(self, name, value)
+            value = as_floats(value, name=where, shape=(len(points),), finite=name == "sigma")
             what, bad = ("not positive", value <= 0) if name == "sigma" else ("negative", value < 0)
+            bad = measured & (bad | np.isnan(value))
             if bad.any():
                 row = int(np.argmax(bad))
                 reason = f"keypoint {row} has the value {value[row]:g}, which is {what}"
+                if np.isnan(value[row]):
+                    reason = f"keypoint {row} has a pixel, but no score"
                 raise DataError(reason, where=where)
+            if name == "scores":
+                value = np.where(measured & (value > 0), value, 0.0)
+            object.__setattr__(self, name, value)
         for name in ("names", "ids"):
             values = getattr(self, name)
             if values is not None and len(values) != len(points):
                 what = f"{len(points)} keypoints but {len(values)} {name}"
                 raise DataError(what, where=self.source)
 
+        object.__setattr__(self, "measured", measured)
+
     def __len__(self) -> int:
         return len(self.points_2d)
+
+    @property
+    def is_found(self) -> BoolArray:
+        """Which keypoints were found (k,): a measured pixel, and no score of 0."""
+        return self.measured if self.scores is None else np.asarray(self.scores > 0)
 
     def check_camera(self, camera: Camera) -> None:
         """Refuse a camera of images of another size, or in whose image no such pixels are."""
@@ -82,7 +104,7 @@ class ImageKeypoints:
             what = "the image has {} x {} pixels".format(*self.size)
             what += f", that of the camera {camera.width} x {camera.height}"
             raise DataError(what, where=self.source, fix="give the camera of these images")
-        check_pixels(self.points_2d, camera.width, camera.height, where=self.source)
+        check_pixels(self.points_2d[self.measured], camera.width, camera.height, where=self.source)
 
     def is_of(self, photo: str) -> bool:
         """True if the image's name, or its id, is that of the photo's file."""
@@ -204,9 +226,9 @@ def join_keypoints(
         If ``sigma_from_scores`` is not positive.
     """
     found.check_camera(camera)
-    kept = list(range(len(found)))
+    kept = np.flatnonzero(found.is_found).tolist()
     if found.scores is not None:
-        kept = np.flatnonzero((found.scores > 0) & (found.scores >= min_score)).tolist()
+        kept = [row for row in kept if found.scores[row] >= min_score]
     places = _places(found, model)
     unknown = [row for row in kept if places[row] is None]
     if unknown and not ignore_unknown:
@@ -243,6 +265,7 @@ def join_keypoints(
         scores=scores if sigma_from_scores is None else None,
         image=image,
         model=model.model,
+        not_found=tuple(np.flatnonzero(~found.measured).tolist()),
     )
 
 

@@ -18,6 +18,9 @@ from cadalign.io.documents import Finite, Text, convert, in_file
 from cadalign.io.files import as_path, read_text
 
 _OTHER_NAMES = {"x": "u", "y": "v"}
+_MISSING = ("", "nan", "none", "null", "na", "n/a")
+"""What programs write as the pixel of a keypoint that was not found."""
+_OF_MISSING = {"u": "0", "v": "0", "score": "0", "visibility": "0", "sigma": "1"}
 _COLUMNS: dict[str, Any] = {
     "u": Finite,
     "v": Finite,
@@ -112,13 +115,14 @@ def _header(cells: list[str], where: str) -> list[str]:
 def _row(
     header: list[str], line: list[str], cells: dict[str, str], where: str
 ) -> dict[str, Any] | None:
-    """One line; None for one that is empty or has no pixel."""
+    """One line, its pixel NaN where it has none; None for an empty line."""
     if not any(cells.values()):
         return None
     if len(line) != len(header):
         raise DataError(f"{len(line)} values for {len(header)} columns", where=where)
-    if not cells["u"] and not cells["v"]:
-        return None
+    is_missing = all(cells[name].lower() in _MISSING for name in ("u", "v"))
+    if is_missing:
+        cells = cells | {name: text for name, text in _OF_MISSING.items() if name in cells}
     with in_file(where):
         row = {
             name: convert(_value(name, cell), _COLUMNS[name], where=name)
@@ -128,7 +132,7 @@ def _row(
             raise InputError(f"{row['semantic_id']} is not a whole number", where="semantic_id")
         if row.get("visibility", 0) not in (0, 1, 2):
             raise InputError(f"{row['visibility']:g} is not 0, 1 or 2", where="visibility")
-    return row
+    return row | dict.fromkeys(("u", "v"), np.nan) if is_missing else row
 
 
 def _value(name: str, cell: str) -> str | float:

@@ -31,6 +31,7 @@ from cadalign.io.documents import (
     written_path,
 )
 from cadalign.io.files import as_path, write_json
+from cadalign.io.kinds import MODEL_KEYPOINTS
 
 FORMAT = "cadalign model keypoints"
 VERSION = 1
@@ -162,7 +163,7 @@ class ModelKeypoints:
             file and field.
         """
         path = as_path(path)
-        data = read_json(path)
+        data = read_json(path, MODEL_KEYPOINTS)
         if isinstance(data, list):
             return cls._from_annotations(data, path, model)
         with in_file(path):

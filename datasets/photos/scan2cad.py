@@ -49,6 +49,7 @@ _MODEL_FOLDERS = ("ShapeNetCore.v2", "shapenet", "ShapeNet", "Meshes", "samples/
 _UP = (0.0, 1.0, 0.0)
 # Corners nearer than this are as good as behind the camera [m].
 _NEAR = 0.05
+_FARTHEST = 1000.0  # distance of an object in a scan of rooms [m]
 
 
 class _Trs(ForeignDocument):
@@ -197,10 +198,15 @@ def _object(
     """An object of the scan as a photo shows it; None where its box is not in the image."""
     world_from_model = found.trs.alignment()
     cam_from_model = cam_from_world @ world_from_model
+    center = np.array(found.center or (0.0, 0.0, 0.0))
+    distance = float(np.linalg.norm(cam_from_model.apply(center[None])))
+    if distance > _FARTHEST:
+        what = f"the object lies {distance:.3g} m from the camera, as with millimetres for metres"
+        fix = "give the frame's pose and the annotations in metres, such as divided by 1000"
+        raise InputError(what, where="trs.translation", fix=fix)
     if found.sym not in SCAN2CAD_FOLDS:
         known = ", ".join(SCAN2CAD_FOLDS)
         raise InputError(f"{quote(found.sym)} is no symmetry", where="sym", fix=f"known: {known}")
-    center = np.array(found.center or (0.0, 0.0, 0.0))
     bounds = box = bbox = None
     if found.bbox is not None:
         half = np.array(found.bbox)

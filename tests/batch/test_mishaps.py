@@ -220,26 +220,24 @@ def test_objects_of_a_detector_that_cannot_be_read_fail_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bad = [
-        {"keypoints": [float("nan"), 2.0, 1.0]},
+        {"keypoints": [float("nan"), 2.0, 1.0] * 8},
         {"keypoints": [1.0] * 32},
         {"keypoints": None},
         {"keypoints": [1.0, 2.0, -0.5] * 8},
         {"keypoints": [1.0, "12.5", 0.5] * 8},
         {"image_id": 7},
-        {"score": "high"},
     ]
-    source = coco(tmp_path / "found.json", {}, *bad, {"category_id": 5})
+    source = coco(tmp_path / "found.json", {}, *bad, {"category_id": 5}, {"score": "high"})
     rows = detected(tmp_path, source)
-    assert [row["status"] for row in rows] == ["ok", "ok", *["failed"] * len(bad)]
-    assert [row["reason"].removeprefix(f"{source}: annotations") for row in rows[2:]] == [
-        "[1].keypoints[0]: nan is not a finite number",
+    assert [row["status"] for row in rows] == ["ok", "ok", "ok", *["failed"] * len(bad)]
+    assert [row["reason"].removeprefix(f"{source}: annotations") for row in rows[3:]] == [
+        "[1]: keypoints: keypoint 0 is at [nan, 2.0]; give NaN for both, where it was not found",
         "[2].keypoints: 32 numbers are not x, y and visibility of keypoints",
         "[3].keypoints: missing; is it COCO's keypoint JSON, or a detector's? see cadalign's "
         "page on keypoints of detectors",
         "[4]: scores: keypoint 0 has the value -0.5, which is negative",
         "[5].keypoints[1]: '12.5' is not a finite number",
         "[6].image_id: there is no image 7",
-        "[7].score: 'high' is not a finite number",
     ]
     assert "failed 1: " in capsys.readouterr().err
 
@@ -264,9 +262,9 @@ def test_a_bad_line_of_a_table_fails_its_object_alone(tmp_path: Path) -> None:
 def test_a_detectors_file_without_a_good_object_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    source = coco(tmp_path / "found.json", {"keypoints": [float("nan")] * 24})
+    source = coco(tmp_path / "found.json", {"keypoints": [float("inf")] * 24})
     assert main(["fit", str(source), "--model", "m.keypoints.json"]) == 1
-    reason = f"{source}: annotations[0].keypoints[0]: nan is not a finite number"
+    reason = f"{source}: annotations[0]: keypoints: keypoint 0 is at [inf, inf]"
     assert reason in capsys.readouterr().err
 
 

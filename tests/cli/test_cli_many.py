@@ -213,9 +213,8 @@ def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     [
         (
             ["fit", "{folder}/a.png"],
-            "{folder}/a.png: a photo, not an observation, which is a JSON file with camera and "
-            "keypoints; mark keypoints with `cadalign annotate a.png MODEL`, which writes one, or "
-            "use a detector's with `cadalign observe`",
+            "{folder}/a.png: a photo, not an observation; mark keypoints with `cadalign annotate "
+            "a.png MODEL`, which writes one, or use a detector's with `cadalign observe`",
         ),
         (["fit", "{folder}/empty"], "{folder}/empty: the folder holds no observation; "),
         (

@@ -63,11 +63,6 @@ def test_photo_is_no_query(folder: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert line.startswith("photo.png: a photo, not an observation")
 
 
-def test_text_that_is_none_is_called_so(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    line = refusal_line(capsys, "export", "model.ply", "--to", "x.glb")
-    assert line == "model.ply: cannot be read as text: byte 4 is not UTF-8"
-
-
 def test_observation_and_fit_are_told_apart(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -119,8 +114,8 @@ def test_keypoints_of_the_model_are_none_of_a_photo(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     line = refusal_line(capsys, "observe", "model.keypoints.json", "found.json")
-    what = "keypoints of a model, not those that a detector found in a photo"
-    assert line == f"model.keypoints.json: {what}"
+    what = "keypoints of a model, not a detector's keypoints"
+    assert line.startswith(f"model.keypoints.json: {what}; ")
 
 
 def test_another_name_of_the_photo_is_said(
@@ -145,3 +140,10 @@ def test_unknown_field_is_answered_by_fields(
 def test_folder_is_no_mesh(folder: Path) -> None:
     with pytest.raises(cadalign.errors.DataError, match="a folder, not a mesh file"):
         cadalign.load_mesh(folder)
+
+
+def test_exchanged_arguments_are_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["annotate", "model.obj", "photo.png", "--no-open"])
+    text = "PHOTO MODEL: model.obj is a mesh and photo.png a photo: they are exchanged"
+    assert text in capsys.readouterr().err

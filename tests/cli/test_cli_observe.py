@@ -215,12 +215,12 @@ def test_csv_goes_the_same_way(folder: Path) -> None:
         (["--image", "{folder}/none.jpg"], "{folder}/none.jpg: no such file"),
         (
             ["--image", "{folder}/found.json"],
-            "{folder}/found.json: not an image that can be read (",
+            "{folder}/found.json: a detector's keypoints, not an image; give a picture",
         ),
         (["--camera", "{folder}/none.json"], "{folder}/none.json: no such file"),
         (
             ["--camera", "{folder}/found.json"],
-            "{folder}/found.json: camera: expected an object, got list",
+            "{folder}/found.json: a detector's keypoints, not a camera; give 3 x 3 numbers",
         ),
         (["--image", "{folder}/photo.jpg", "--object", "3"], "--object: object 3 of 1; "),
     ],
@@ -394,3 +394,113 @@ def test_what_would_have_no_effect_or_be_no_direction_is_refused(
         "--sigma: has no effect without --weigh; give both, or the fit `--sigma`"
     )
     assert "up: a direction must not be zero" in refusal_line(capsys, *given, "--up", 0, 0, 0)
+
+
+def coco(folder: Path, **changes: Any) -> Path:
+    """COCO's annotations of the photo, with changes to the image's and the object's fields."""
+    flat = np.column_stack([POINTS_2D, np.full(24, 2)]).ravel().tolist()
+    image = {"id": 1, "file_name": "photo.jpg", "width": 640, "height": 480}
+    entry = {"id": 1, "image_id": 1, "category_id": 1, "keypoints": flat}
+    names = {"id": 1, "keypoints": NAMES}
+    image |= {name: changes.pop(name) for name in ("width", "height") if name in changes}
+    path = folder / "coco.json"
+    data = {"images": [image], "annotations": [entry | changes], "categories": [names]}
+    path.write_text(json.dumps(data))
+    return path
+
+
+def mesh_of_keypoints(folder: Path) -> dict[str, Any]:
+    """Write a mesh whose vertices are the keypoints; returns the content of their file with it."""
+    vertices = "".join(f"v {x} {y} {z}\n" for x, y, z in POINTS_3D.tolist())
+    corners = " ".join(map(str, range(1, 25)))
+    (folder / "model.obj").write_text(f"{vertices}f {corners}\n")
+    data: dict[str, Any] = json.loads((folder / "model.keypoints.json").read_text())
+    return data | {"model": "model.obj"}
+
+
+@pytest.mark.parametrize(
+    ("size", "says_exif"), [((1280, 960), False), ((480, 640), True)], ids=["other", "as stored"]
+)
+def test_observe_and_fit_refuse_a_photo_of_another_size_alike(
+    folder: Path, capsys: pytest.CaptureFixture[str], size: tuple[int, int], says_exif: bool
+) -> None:
+    found, model = coco(folder, width=size[0], height=size[1]), folder / "model.keypoints.json"
+    photo = folder / "photo.jpg"
+    line = refusal_line(capsys, "observe", str(found), str(model), "--image", str(photo))
+    what = f"the image has {size[0]} x {size[1]} pixels, that of {photo} 640 x 480"
+    assert line.startswith(f"{found}: annotations[0]: {what}")
+    assert ("EXIF data say that it was held on its side" in line) == says_exif
+    assert main(["fit", str(found), "--model", str(model), "--no-picture"]) == 1
+    assert line in capsys.readouterr().err
+
+
+def test_a_flawed_mask_leaves_the_keypoints(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = folder / "model.keypoints.json"
+    path.write_text(json.dumps(mesh_of_keypoints(folder)))
+    np.savetxt(folder / "K.txt", TRUE.matrix)
+    found = coco(folder, segmentation={"size": [480, 640], "counts": [5]})
+    arguments = ["--image", str(folder / "photo.jpg"), "--camera", str(folder / "K.txt")]
+    assert main(["observe", str(found), str(path), *arguments]) == 0
+    said = capsys.readouterr()
+    assert f"{found}: annotations[0]: the mask is left out: segmentation.counts: " in said.err
+    assert said.out.startswith("24 of 24 keypoints: ")
+
+
+def test_keypoints_that_were_not_found_are_counted(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flat = np.column_stack([POINTS_2D, np.full(24, 0.4)])
+    flat[[3, 20], :2] = 0
+    found, model = folder / "found.json", folder / "model.keypoints.json"
+    found.write_text(json.dumps([{"image_id": 1, "keypoints": flat.ravel().tolist()}]))
+    text = "2 of 24 keypoints are not found and left out (rows 3, 20)"
+    assert observe(folder, "--image", str(folder / "photo.jpg")) == 0
+    said = capsys.readouterr()
+    assert said.out.startswith("22 of 24 keypoints: ")
+    assert text in said.err
+    (folder / "K.json").write_text(json.dumps(TRUE.to_dict()))
+    camera = ["--camera", str(folder / "K.json")]
+    assert main(["fit", str(found), "--model", str(model), *camera, "--no-picture"]) == 0
+    assert text in (folder / "found_fit" / "results.csv").read_text()
+
+
+def test_messages_name_keypoints_as_the_file_does(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Left out are keypoints before the wrong one; without names it is row 9 of the file."""
+    pixels = POINTS_2D.copy()
+    pixels[[2, 5]] = 0
+    pixels[9] += 80
+    keypoints = [
+        {"name": name, "xyz": xyz, "uv": uv}
+        for name, xyz, uv in zip(NAMES, POINTS_3D.tolist(), pixels.tolist(), strict=True)
+    ]
+    for is_named, called in ((True, "'corner 9'"), (False, "9")):
+        kept = [
+            {field: value for field, value in each.items() if is_named or field != "name"}
+            for each in keypoints
+        ]
+        data = {"camera": TRUE.to_dict(), "keypoints": kept}
+        (folder / "seen.json").write_text(json.dumps(data))
+        assert main(["fit", str(folder / "seen.json"), "--no-picture"]) == 0
+        assert f"keypoint {called} (" in capsys.readouterr().out
+
+
+def test_keypoints_and_mesh_of_different_units_are_refused_by_observe_and_fit(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, path = mesh_of_keypoints(folder), folder / "model.keypoints.json"
+    for keypoint in data["keypoints"]:
+        keypoint["xyz"] = [1000 * value for value in keypoint["xyz"]]
+    path.write_text(json.dumps(data))
+    photo = ["--image", str(folder / "photo.jpg")]
+    line = refusal_line(capsys, "observe", str(folder / "found.json"), str(path), *photo)
+    assert line.startswith(f"{path}: keypoints.xyz: the keypoints span ")
+    assert line.endswith("multiply the keypoints by 0.001")
+    seen = Observation(1000 * POINTS_3D, POINTS_2D, TRUE, model=folder / "model.obj")
+    seen.save(folder / "seen.json")
+    line = refusal_line(capsys, "fit", str(folder / "seen.json"), "--no-picture")
+    assert line.startswith(f"{folder / 'seen.json'}: keypoints.xyz: the keypoints span ")
+    assert line.endswith("multiply the keypoints by 0.001")

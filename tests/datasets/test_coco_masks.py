@@ -64,7 +64,7 @@ def test_a_polygon_may_leave_the_image() -> None:
     ("segmentation", "text"),
     [
         (7, "segmentation: 7 is not a list"),
-        ([[1.0, 2.0]], "segmentation[0]: [1.0, 2.0] is not a list of at least 6"),
+        ([[1.0, 2.0]], "segmentation[0]: [1.0, 2.0] is not a polygon of three or more points"),
         ([[1.0] * 7], "segmentation[0]: 7 numbers are not x, y of points; "),
         ([[0.0, 0, 1e9, 0, 1e9, 9]], "segmentation[0]: has points far outside of the image; "),
         ([[0.0, 0, 1, float("nan"), 3, 4]], "segmentation[0][3]: nan is not a finite number"),
@@ -105,3 +105,10 @@ def test_any_text_is_decoded_or_refused(text: str) -> None:
     except CadalignError:
         return
     assert mask.shape == (2, 3)
+
+
+def test_a_polygon_of_two_points_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
+    square = [1.0, 0.0, 3.0, 0.0, 3.0, 2.0, 1.0, 2.0]
+    mask = decode_segmentation([[1, 1, 2, 2], square], width=4, height=2)
+    assert mask.tolist() == decode_segmentation([square], width=4, height=2).tolist()
+    assert "1 of 2 polygons have fewer than three points; left out" in caplog.text

@@ -85,6 +85,22 @@ def test_a_step_that_is_no_number_of_frames_is_refused(root, every):
         Scan2CAD(root, every=every)
 
 
+def test_millimetres_for_metres_are_named(root):
+    """The annotation is in millimetres, the frame's pose in metres."""
+
+    def in_millimetres(scans):
+        for part in (scans[0], *scans[0]["aligned_models"]):
+            part["trs"]["translation"] = [1000 * v for v in part["trs"]["translation"]]
+        return scans
+
+    edit(root, in_millimetres)
+    photo = Scan2CAD(root)[0]
+    assert photo.objects == ()
+    (problem,) = photo.problems
+    assert "m from the camera, as with millimetres for metres" in str(problem)
+    assert str(problem).startswith(f"{root / 'full_annotations.json'}, scene0000_00/0, object 0: ")
+
+
 def test_objects_out_of_view_are_left_out(root):
     behind = scan2cad_model(rigid(9, (-500.0, 0, 0)))
     edit(root, lambda scans: [{**scans[0], "aligned_models": [behind]}])

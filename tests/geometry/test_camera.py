@@ -531,3 +531,38 @@ def test_half_a_focal_length_is_refused(params: list[Any], text: str) -> None:
 def test_whole_numbers_beyond_all_floats_are_refused() -> None:
     with pytest.raises(InputError, match="not a finite number"):
         Camera(640, 480, 10**400, 500.0, 320.0, 240.0)
+
+
+COEFFICIENTS = (0.1, -0.05, 0.001, 0.002, 0.03, 0.02, -0.01, 0.005, *(0.0,) * 6)
+
+
+@pytest.mark.parametrize("count", [4, 5, 8, 12, 14])
+@pytest.mark.parametrize("shape", [(-1,), (1, -1), (-1, 1)])
+@pytest.mark.parametrize("form", [tuple, list, np.asarray])
+def test_coefficients_are_read_as_opencv_returns_them(count: int, shape: Any, form: Any) -> None:
+    given = np.array(COEFFICIENTS[:count]).reshape(shape)
+    camera = camera_with(given if form is np.asarray else form(given.tolist()))
+    assert camera.distortion == COEFFICIENTS[: min(count, 8)]
+    matrix = camera.matrix.tolist()
+    read = Camera.from_dict(
+        {"matrix": matrix, "width": 640, "height": 480, "distortion": given.tolist()}
+    )
+    assert read.distortion == camera.distortion
+    point, zero = np.array([[0.2, -0.1, 1.5]]), np.zeros(3)
+    expected, _ = cv2.projectPoints(point, zero, zero, camera.matrix, given.ravel())
+    np.testing.assert_allclose(camera.project(point), expected[0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("row", "text"),
+    [
+        (13, "camera.distortion: the sensor's tilt, (0.0, 0.01), is not modelled; calibrate with"),
+        (8, "camera.distortion: the thin prism terms s1 to s4, (0.01, 0.0, 0.0, 0.0), are not mo"),
+    ],
+)
+def test_terms_that_are_not_modelled_are_refused_by_name(row: int, text: str) -> None:
+    given = np.array(COEFFICIENTS)
+    given[row] = 0.01
+    with pytest.raises(InputError) as caught:
+        camera_with(tuple(given.tolist()))
+    assert str(caught.value).startswith(text)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from support.refusals import refusal_text
 
 from cadalign import Mesh
 from cadalign.datasets import check_solid, flat_axes, load_mesh
@@ -399,3 +400,72 @@ def test_flat_models_are_told_by_their_axis(axis):
 def test_thin_models_are_solid():
     box = trimesh.creation.box(extents=(1, 1, 1e-3))
     check_solid(Mesh(box.vertices, box.faces))
+
+
+# --- what a file announces, and what is there
+
+CUBE = trimesh.creation.box()
+VERTICES = "".join(f"{x} {y} {z}\n" for x, y, z in CUBE.vertices)
+FACES = "".join(f"3 {a} {b} {c}\n" for a, b, c in CUBE.faces)
+
+
+@pytest.mark.parametrize(
+    ("header", "vertex", "face"),
+    [
+        ("OFF\n8 12 0 # counts\n", "\n", "\n"),
+        ("OFF 8 12 0\n", " # of the vertex\n", "\n"),
+        ("OFF8 12\n", "\n", " # of the face\n"),
+        ("# first\noff\n# then\n8 12 18\n", "\n# between\n\n", "\n# between\n"),
+        ("COFF\n8 12 0\n", " 255 0 0 255\n", " 0.5 0.5 0.5\n"),
+        ("STCNOFF\n8 12 0\n", " 0 0 1 1 0 0 1 0 0\n", "\n"),
+    ],
+)
+def test_forms_of_off_give_the_same_cube(write, header, vertex, face):
+    text = header + VERTICES.replace("\n", vertex) + FACES.replace("\n", face)
+    for end in ("\n", "\r\n"):
+        mesh = load_mesh(write(text.replace("\n", end).encode(), "a.off"))
+        np.testing.assert_array_equal(mesh.vertices, CUBE.vertices)
+        np.testing.assert_array_equal(mesh.faces, CUBE.faces)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("OFF\n8 13 0\n", "the header announces 13 faces, but only 12 are there; the file is cut"),
+        ("OFF\n30 1 0\n", "the header announces 30 vertices, but only 20 are there; the file is"),
+        ("OFF\n7 13 0\n", "face 0 is '0.5 0.5 0.5', behind the 7 vertices announced; the file is"),
+        ("OFF\n-8 12 0\n", "the header announces -8 vertices and 12 faces; the file is cut short"),
+        ("4OFF\n8 12 0\n", "an OFF file that is of more than three dimensions is not read; save"),
+        ("OFF BINARY\n8 12 0\n", "an OFF file that is binary is not read; save it as text of th"),
+    ],
+)
+def test_counts_of_off_that_lie_are_named(write, text, message):
+    path = write(text + VERTICES + FACES, "a.off")
+    assert refusal_text(lambda: load_mesh(path)).startswith(f"{path}: {message}")
+
+
+@pytest.mark.parametrize("kind", ["off", "stl_ascii", "glb"])
+def test_surplus_behind_a_mesh_is_warned_of(write, kind, caplog):
+    content = CUBE.export(file_type=kind)
+    content = content if isinstance(content, bytes) else content.encode()
+    surplus = {"off": b"\n3 0 1 2\n", "stl_ascii": b"\nmore\n", "glb": b"\n"}[kind]
+    mesh = load_mesh(write(content + surplus, f"a.{kind.removesuffix('_ascii')}"))
+    np.testing.assert_allclose(mesh.triangles, CUBE.triangles)
+    assert "bytes behind its data are left out" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("kind", "cut", "message"),
+    [
+        ("stl", -10, "the header announces 12 faces, but only 11 are there"),
+        ("stl", 60, "60 bytes, but the header alone has 84"),
+        ("stl_ascii", -8, "the text ends before 'endsolid', after 12 faces"),
+        ("glb", -10, r"the header announces \d+ bytes, but only \d+ are there"),
+        ("glb", 15, r"the header announces \d+ bytes, but only 15 are there"),
+    ],
+)
+def test_what_is_cut_short_says_what_is_there(write, kind, cut, message):
+    content = CUBE.export(file_type=kind)
+    content = (content if isinstance(content, bytes) else content.encode()).rstrip()
+    with pytest.raises(DataError, match=message):
+        load_mesh(write(content[:cut], f"a.{kind.removesuffix('_ascii')}"))

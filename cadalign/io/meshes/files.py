@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -10,17 +11,20 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import CadalignError, DataError, InputError, brief
 from cadalign.geometry.mesh import Mesh, face_normals, spread_colors
+from cadalign.geometry.units import check_near
 from cadalign.io.files import (
     as_path,
     damaged,
     keep,
     made_folder,
+    once_per_file,
     reading,
     refuse_folder,
     write_text,
     write_whole,
 )
 from cadalign.io.images import write_image
+from cadalign.io.kinds import MESH, refuse_other_file
 from cadalign.io.meshes.gltf import read_gltf
 from cadalign.io.meshes.obj import read_obj
 from cadalign.io.meshes.ply import read_ply
@@ -81,6 +85,7 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
     if reader is None and path.is_dir():
         raise DataError("a folder, not a mesh file", where=str(path), fix="give a file in it")
     if reader is None:
+        refuse_other_file(path, MESH)
         raise DataError(
             f"{path.suffix or 'no extension'} is not a known mesh format",
             where=str(path),
@@ -96,17 +101,35 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
             mesh = reader(path)
             has_area = np.linalg.norm(face_normals(mesh.triangles), axis=1).any()
     except CadalignError as error:
+        refuse_other_file(path, MESH)
         where = str(path) if error.where is None else error.where
         if str(path) not in where:
             where = f"{path}: {where}"
         raise DataError(error.what, where=where, fix=error.fix) from None
     except Exception as error:  # of damaged content any kind
+        refuse_other_file(path, MESH)
         reason = f"{type(error).__name__}: {brief(error)}"
         kind = path.suffix[1:].upper()
         raise damaged(f"cannot be read as a {kind} file ({reason})", path) from None
     if not has_area:
         raise DataError("no face of the mesh has an area", where=str(path))
     return mesh
+
+
+def check_keypoints(points_3d: FloatArray, model: Path | None, *, where: str) -> None:
+    """Refuse keypoints (k, 3) that lie far from the mesh in a file, see `check_near`.
+
+    A file that is missing or no mesh is passed over here.
+    """
+    if model is None or not model.is_file():
+        return
+    with suppress(DataError):
+        bounds = mesh_at(model).bounds
+        check_near(points_3d, bounds, where=where)
+
+
+mesh_at = once_per_file(16)(load_mesh)
+"""As `load_mesh`, and remembers the last meshes: many objects of a run may share one."""
 
 
 def as_mesh(given: object, *, where: str) -> Mesh:

@@ -23,7 +23,7 @@ from cadalign.errors import DataError, brief, quote
 from cadalign.geometry.mesh import GREY, Material, Mesh, join
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.io.documents import parse_json
-from cadalign.io.files import damaged, read_bytes, reading
+from cadalign.io.files import damaged, read_bytes, reading, require_count
 from cadalign.io.meshes.materials import WHITE, Texture, Textures
 
 logger = logging.getLogger("cadalign")
@@ -159,8 +159,11 @@ def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes]:
             break
         found.append(data[place + 8 : place + 8 + length])
         place += 8 + length
-    if not found or place > len(data):
-        raise damaged("a part of the GLB file is missing or cut short", path)
+    announced = max(place, int.from_bytes(data[8:12], "little"))
+    surplus = max(len(data) - announced, 0)
+    require_count("bytes", announced, len(data), surplus, path)
+    if not found:
+        raise damaged("the GLB file has no part that describes it", path)
     return found[0], b"".join(found[1:])
 
 

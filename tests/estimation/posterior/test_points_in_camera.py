@@ -41,7 +41,7 @@ def test_those_of_a_stretched_model_follow_from_its_covariance() -> None:
 
 def test_keypoints_that_are_seen_are_better_known_than_the_rest() -> None:
     model = Model(points_3d=CORNERS, shape_sigma=0.05)
-    result = align(model, View(CAMERA, photo_of(CORNERS)[:6]))
+    result = align(model, View(CAMERA, photo_of(CORNERS)[:6], ids=range(6)))
     in_camera = result.alignment.apply(result.points_3d)
     covariances = CAMERA.projected_covariances(in_camera, result.points_cam_covariance)
     deviations = np.sqrt(np.linalg.eigvalsh(covariances)[:, -1])

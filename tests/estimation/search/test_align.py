@@ -206,7 +206,7 @@ class TestSeveralViews:
     def test_a_view_with_two_keypoints_sharpens_the_estimate(self) -> None:
         points, truth = keypoints(), truth_of((1.0, 1.0, 1.0))
         first = seen(points, truth, np.eye(4), cam_from_rig=np.eye(4))
-        second = seen(points[:2], truth, around(40), cam_from_rig=around(40))
+        second = seen(points[:2], truth, around(40), ids=[0, 1], cam_from_rig=around(40))
         two = align(Model(points_3d=points), [first, second])
         alone = align(Model(points_3d=points), View(CAMERA, first.points_2d))
         assert two.std.scale[1] < alone.std.scale[1]
@@ -280,7 +280,7 @@ class TestOutliers:
 def test_a_batch_is_its_single_results_and_keeps_errors() -> None:
     model = spreads(0.03)
     views = [seen(keypoints(), truth_of((1, 1, 1)), around(angle)) for angle in (0, 5, 10)]
-    too_few = View(CAMERA, [[100.0, 100.0]])
+    too_few = View(CAMERA, [[100.0, 100.0]], ids=[0])
     batch = align_batch(model, [*views, too_few], workers=2)
     assert isinstance(batch[3], DegenerateError)
     for view, result in zip(views, batch, strict=False):
@@ -293,7 +293,7 @@ def test_a_batch_takes_a_size_and_a_start_for_each_object() -> None:
     views = [seen(keypoints(), truth_of((1, 1, 1)), around(angle)) for angle in (0, 5)]
     size = Size(width=3.0)
     four, two = (
-        View(CAMERA, CAMERA.project(truth_of((1, 1, 1)).apply(keypoints()[:count])))
+        seen(keypoints()[:count], truth_of((1, 1, 1)), np.eye(4), ids=range(count))
         for count in (4, 2)
     )
     start = truth_of((1, 1, 1))
@@ -324,7 +324,8 @@ def test_a_start_does_not_change_what_the_keypoints_tell() -> None:
 
 def test_three_keypoints_suffice_with_a_prior() -> None:
     model = spreads(0.01)
-    view = View(CAMERA, CAMERA.project(truth_of((1, 1, 1)).apply(keypoints()[:3])))
+    pixels = CAMERA.project(truth_of((1, 1, 1)).apply(keypoints()[:3]))
+    view = View(CAMERA, pixels, ids=range(3))
     result = align(model, view)
     likely = [result.alignment, *(other.alignment for other in result.alternatives)]
     truth = truth_of((1, 1, 1))
@@ -381,6 +382,10 @@ def test_a_damaged_result_is_refused_by_field() -> None:
                 Model(points_3d=keypoints()), View(CAMERA, [[1, 2]] * 4, ids=[0, 1, 2, 77])
             ),
             "views[0].ids: the model has no keypoint 77; the model has 0, 1, 2",
+        ),
+        (
+            lambda: align(Model(points_3d=keypoints()), View(CAMERA, 9 + keypoints(9)[:, :2])),
+            "views[0].ids: 9 keypoints without ids, but the model has 10; give the model's id",
         ),
         (lambda: align(Model(points_3d=keypoints()), []), "views: none is given"),
         (

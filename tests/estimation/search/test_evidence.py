@@ -203,7 +203,8 @@ class TestFewKeypoints:
     def test_an_initial_alignment_starts_where_keypoints_do_not(self) -> None:
         points, truth = keypoints(), truth_of((1.0, 1.0, 1.0))
         model = Model(points_3d=points, stretch="none")
-        view = seen(points[:2], truth, np.eye(4), up=truth.rotation[:, 1], up_sigma_deg=0.5)
+        up = {"up": truth.rotation[:, 1], "up_sigma_deg": 0.5}
+        view = seen(points[:2], truth, np.eye(4), ids=[0, 1], **up)
         start = Alignment(truth.rotation, truth.translation + 0.1, np.ones(3))
         result = align(model, view, init=start)
         assert result.rms < 1e-3

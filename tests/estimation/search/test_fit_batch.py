@@ -295,7 +295,7 @@ def test_stack_with_nan_names_the_problem_and_the_row() -> None:
     points_3d = np.stack([p.points_3d for p in problems_of([9] * 4)])
     points_3d[2, 5, 1] = np.nan
     with pytest.raises(InputError) as caught:
-        fit_batch(points_3d, np.zeros((4, 9, 2)), RAGGED[0].camera)
+        fit_batch(points_3d, np.ones((4, 9, 2)), RAGGED[0].camera)
     assert str(caught.value) == (
         "points_3d[2]: NaN or infinite values in row 5; remove or repair these"
     )

@@ -1,0 +1,101 @@
+"""Files of a kind that is not wanted, fields that are missing or stand twice."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.files import TETRAHEDRON
+from support.refusals import refusal_text
+
+from cadalign import Result, ShapeModel, load_mesh
+from cadalign.datasets import ModelKeypoints, read_image_keypoints
+from cadalign.errors import DataError
+from cadalign.io.documents import parse_json
+from cadalign.io.images import read_photo
+from cadalign.io.observation import Observation, read_camera
+
+CAMERA = {"model": "PINHOLE", "width": 640, "height": 480, "params": [900, 900, 320, 240]}
+CONTENTS: dict[str, Any] = {
+    "a photo": ("a.jpg", None),
+    "a mesh": ("a.obj", TETRAHEDRON),
+    "an observation": ("seen.json", {"camera": CAMERA, "keypoints": [{"xyz": [0, 0, 0]}]}),
+    "a detector's keypoints": ("found.json", {"annotations": [], "images": []}),
+    "keypoints of a model": (
+        "a.keypoints.json",
+        {"format": "cadalign model keypoints", "version": 1, "keypoints": []},
+    ),
+    "the result of a fit": ("fit.json", {"alignment": {}, "method": "optimal"}),
+    "a camera": ("camera.json", CAMERA),
+}
+READERS: dict[str, Callable[[Path], Any]] = {
+    "an image": read_photo,
+    "a mesh": load_mesh,
+    "an observation": Observation.load,
+    "a detector's keypoints": read_image_keypoints,
+    "keypoints of a model": ModelKeypoints.load,
+    "the result of a fit": Result.load,
+    "a camera": read_camera,
+    "a shape file": ShapeModel.open,
+}
+SAME = {("a photo", "an image")}
+
+
+def written(folder: Path, kind: str) -> Path:
+    name, content = CONTENTS[kind]
+    path = folder / name
+    if content is None:
+        Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(path)
+    else:
+        path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+@pytest.mark.parametrize("wanted", READERS)
+@pytest.mark.parametrize("kind", CONTENTS)
+def test_readers_name_what_a_file_is(tmp_path: Path, kind: str, wanted: str) -> None:
+    if kind == wanted or (kind, wanted) in SAME:
+        return
+    path = written(tmp_path, kind)
+    with pytest.raises(DataError) as caught:
+        READERS[wanted](path)
+    assert str(caught.value).startswith(f"{path}: {kind}, not {wanted}; ")
+
+
+def test_a_matrix_as_text_is_a_camera(tmp_path: Path) -> None:
+    path = tmp_path / "K.txt"
+    path.write_text("900 0 320\n0 900 240\n0 0 1\n")
+    assert refusal_text(lambda: Observation.load(path)).startswith(f"{path}: a camera, not an ")
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        ('{"a": 1, "a": 2}', "a"),
+        ('{"keypoints": [{}, {"uv": [1, 2], "uv": [3, 4]}]}', "keypoints[1].uv"),
+        ('[{"camera": {"width": 1, "width": 1}}]', "[0].camera.width"),
+    ],
+)
+def test_a_field_that_stands_twice_is_named(text: str, place: str) -> None:
+    wanted = f"o.json: {place}: the field stands twice in one object; leave one of the two out"
+    assert refusal_text(lambda: parse_json(text, "o.json")) == wanted
+    assert refusal_text(lambda: parse_json(text.encode(), "o.json")) == wanted  # a line of a file
+    assert parse_json(b'{"a": {"b": "x\\":"}, "c" : 1}', "") == {"a": {"b": 'x":'}, "c": 1}
+
+
+@pytest.mark.parametrize(
+    ("keypoint", "text"),
+    [
+        ({"xyz": [0, 0, 0], "xy": [1, 2]}, "keypoints[0].uv: missing, and there is an unknown "),
+        ({"position": [0, 0, 0], "uv": [1, 2]}, "keypoints[0].xyz: missing, and there is an unk"),
+        ({"xyz": [0, 0, 0], "uv": [1, 2], "nmae": "a"}, "keypoints[0]: unknown field 'nmae', did"),
+    ],
+)
+def test_a_missing_field_is_named_before_a_guess(keypoint: dict[str, Any], text: str) -> None:
+    data = {"camera": CAMERA, "keypoints": [keypoint]}
+    assert refusal_text(lambda: Observation.from_dict(data)).startswith(text)

@@ -24,11 +24,11 @@ from cadalign.datasets.detections.image_keypoints import (
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.estimation.result import Result
+from cadalign.estimation.results import failed_row
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.evaluation.options import ExperimentOptions, absolute_paths
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import (
-    FAILED,
     Columns,
     Plan,
     Row,
@@ -316,8 +316,7 @@ def _parsed(content: bytes, name: str) -> Any:
 
 
 def _failed(task: ObservationTask, reason: str, seen: Observation | None) -> Row:
-    row = naming_row(task.row, task.name, seen) | {"status": FAILED, "reason": reason}
-    return {**row, "method": "", "warning_kinds": "", "warnings": "", **_record(seen, None)}
+    return naming_row(task.row, task.name, seen) | failed_row(reason) | _record(seen, None)
 
 
 def _record(seen: Observation | None, found: Estimated | None) -> Row:

@@ -19,12 +19,12 @@ if TYPE_CHECKING:
         Alternative,
         EvidenceSummary,
         FitStats,
-        Uncertainty,
         ViewResult,
     )
     from cadalign.estimation.results import Results
     from cadalign.estimation.view import View
     from cadalign.estimation.warning import EstimateWarning
+    from cadalign.geometry.uncertainty import Uncertainty
     from cadalign.io.evidence import Size
 
 __all__ = [

@@ -20,12 +20,12 @@ from cadalign.geometry.alignment import Alignment, extent
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import by_rotation
 from cadalign.geometry.symmetry import Symmetry
+from cadalign.geometry.uncertainty import Uncertainty, uncertainty_of
 
 T = TypeVar("T")
 
 LEAST_LIKELIHOOD = 1e-3
 """Relative likelihood above which another minimum is reported as an alternative."""
-_ROUNDING = 1e-12  # relative standard deviation below which a length is known
 _FIELDS = {
     "keypoints": "points_2d",
     "photo": "image",
@@ -148,33 +148,6 @@ class FittedKeypoints:
 
 Diagnosis = Callable[[FittedKeypoints], EstimateWarning | None]
 """A function that names the cause of a misfit; see `cadalign.estimation.diagnose.diagnose_fit`."""
-
-
-@dataclass(frozen=True)
-class Uncertainty:
-    """Predicted standard deviations of an alignment."""
-
-    rotation_deg: float
-    """Rotation [degrees]: the root of the sum of the variances about three axes."""
-    translation: tuple[float, float, float]
-    """Along the camera's axes [model units]."""
-    scale: tuple[float, float, float]
-    """Scale along the model's x, y, z, relative (0.02 is 2 %); 0 where it is known."""
-    focal: float
-    """Focal length, relative; 0 where it is known."""
-
-
-def uncertainty_of(covariance: FloatArray) -> Uncertainty:
-    """Standard deviations from a covariance (9, 9) or (10, 10)."""
-    variance = np.maximum(covariance.diagonal(), 0.0)
-    variance[6:9][variance[6:9] < _ROUNDING**2] = 0.0
-    x, y, z, sx, sy, sz = np.sqrt(variance[3:9]).tolist()
-    return Uncertainty(
-        rotation_deg=float(np.degrees(np.sqrt(variance[:3].sum()))),
-        translation=(x, y, z),
-        scale=(sx, sy, sz),
-        focal=float(np.sqrt(variance[9:].sum())),
-    )
 
 
 @dataclass(frozen=True)

@@ -125,7 +125,7 @@ def _print_table(matches: Sequence[Match]) -> None:
     from cadalign.retrieval.page import score_text
 
     labels = ("", "category", "model")
-    heads = ("score", "log-lik.", "rms px", "kpts", "s_y", "s_z")
+    heads = ("score", "log-lik.", "rms px", "kpts", "s_y", "s_z", "uncertain")
     rows: list[tuple[str, ...]] = [
         (
             str(rank).rjust(len(str(len(matches)))),
@@ -135,8 +135,8 @@ def _print_table(matches: Sequence[Match]) -> None:
             f"{match.log_likelihood:.1f}",
             f"{match.rms:.2f}",
             f"{match.shared}/{match.observed}",
-            f"{match.alignment.scale[1]:.3f}",
-            f"{match.alignment.scale[2]:.3f}",
+            *match.stretch_texts,
+            ", ".join(match.result.uncertain),
         )
         for rank, match in enumerate(matches, start=1)
     ]

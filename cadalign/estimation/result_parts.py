@@ -251,13 +251,19 @@ def points_covariances(
 ) -> tuple[FloatArray, FloatArray]:
     """Covariances (m, 3, 3) of stretched points in the model's frame and in the camera's."""
     covariance = covariance[:9, :9]
-    stretched = points * alignment.scale
-    by_logs = stretched[:, :, None] * np.eye(3)
+    by_logs = (points * alignment.scale)[:, :, None] * np.eye(3)
     of_points = by_logs @ covariance[6:, 6:] @ by_logs.swapaxes(1, 2)
-    turned = stretched @ alignment.rotation.T
-    shifts = np.broadcast_to(np.eye(3), by_logs.shape)
-    rows = np.concatenate([by_rotation(turned), shifts, alignment.rotation @ by_logs], axis=2)
+    rows = point_slopes(points, alignment)
     return of_points, rows @ covariance @ rows.swapaxes(1, 2)
+
+
+def point_slopes(points: FloatArray, alignment: Alignment) -> FloatArray:
+    """Derivatives (m, 3, 9) of points in the camera's frame by the unknowns of a covariance."""
+    stretched = points * alignment.scale
+    by_logs = alignment.rotation * stretched[:, None]
+    shifts = np.broadcast_to(np.eye(3), by_logs.shape)
+    by_turns = by_rotation(stretched @ alignment.rotation.T)
+    return np.concatenate([by_turns, shifts, by_logs], axis=2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -264,4 +264,4 @@ class Library:
             observed = observe(points_2d, ids, camera, plain)
             candidates = gather_candidates(self._table, observed, plain, exclude, workers)
             ranking = rank_by_shape(self._table, candidates, observed, chosen, shapes)
-        return make_matches(self._table, candidates, observed, ranking, chosen.top, absent)
+        return make_matches(self._table, candidates, observed, ranking, chosen, absent)

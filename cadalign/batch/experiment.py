@@ -90,6 +90,11 @@ class ManyOptions(ExperimentOptions):
         """The learned shape that keypoints of detectors may be named after."""
         raise NotImplementedError
 
+    @property
+    def keypoints(self) -> ModelKeypoints | None:
+        """Those that a detector's are paired with, where no model's are given."""
+        return None if self.learned is None else _keypoints_of_shape(self.learned)
+
     def read(self, data: Any, where: str, *, folder: Path) -> Observation:
         """Read the parsed form of an observation, which messages call ``where``."""
         raise NotImplementedError
@@ -279,17 +284,20 @@ def plan_run(options: ManyOptions, folder: RunFolder) -> Plan[ObservationTask]:
 
 
 def _model_keypoints(options: ManyOptions) -> ModelKeypoints:
-    """The keypoints that a detector's are paired with: the model's, or else the shape's."""
+    """The keypoints that a detector's are paired with: those of --model, or else the options'."""
     if options.detector.model is not None:
         return ModelKeypoints.load(options.detector.model)
-    shape = options.learned
-    if shape is None:
+    if (found := options.keypoints) is None:
         raise InputError(
             "the keypoints of the model are not known",
             where="model",
             fix="give the model's NAME.keypoints.json, or a learned shape",
         )
-    opened = ShapeModel.open(shape)
+    return found
+
+
+def _keypoints_of_shape(path: Path) -> ModelKeypoints:
+    opened = ShapeModel.open(path)
     named = isinstance(opened.ids[0], str)
     pairs = zip(opened.ids, opened.components[0].mean.tolist(), strict=False)
     keypoints = (ModelKeypoint(str(k), tuple(xyz), None if named else int(k)) for k, xyz in pairs)

@@ -15,9 +15,9 @@ from cadalign.estimation.options import Sigma
 from cadalign.io.documents import read_json
 from cadalign.io.files import keeping
 from cadalign.io.images import read_image
-from cadalign.io.observation import is_of_many, refuse_photo_or_mesh
+from cadalign.io.observation import Observation, is_of_many, refuse_photo_or_mesh
 from cadalign.retrieval.options import RetrievalOptions
-from cadalign.retrieval.query import ObservationRetrieval, read_query
+from cadalign.retrieval.query import ObservationRetrieval
 
 if TYPE_CHECKING:
     from cadalign.retrieval.match import Match
@@ -38,7 +38,8 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
     """Find the models of a library that explain an image's keypoints best.
 
     Each model is posed and stretched. The observation is a file as for `cadalign fit`; its
-    keypoints need a semantic_id and no xyz. With --out, writes matches.json, an overlay of each
+    keypoints need a semantic_id, or the name that the library has for it, and no xyz. A detector's
+    file needs no --model. With --out, writes matches.json, an overlay of each
     match, its observation and fit, and index.html, which shows them side by side.
     Many observations are a run, as of `cadalign fit`: it writes results.parquet and results.csv
     with a row for each, and report.html.
@@ -84,7 +85,8 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
         """Retrieve the models of one observation; returns the exit code."""
         from cadalign.retrieval.page import none_text, write_retrieval
 
-        query = self.of_camera.applied_to(read_query(path), str(path))
+        query = self.with_ids(Observation.load(path, needs_xyz=False), str(path))
+        query = self.of_camera.applied_to(query, str(path))
         library, _ = self.opened()
         camera = query.camera
         # The table needs no photo, which may have been moved.

@@ -115,7 +115,7 @@ def _describe(library: Library) -> str:
     listed = ", ".join(f"{count} {category}" for category, count in counts.items())
     without = len(library) - library.with_mesh
     text = f"{len(library)} models: {listed}" + (f"; {without} without a mesh" if without else "")
-    return f"{text}\nKeypoints: {', '.join(library.keypoints.names)}"
+    return f"{text}\nKeypoints: {', '.join(library.names)}" if library.names else text
 
 
 LibraryCommand = group_of(

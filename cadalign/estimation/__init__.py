@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from cadalign.estimation.results import Results
     from cadalign.estimation.view import View
     from cadalign.estimation.warning import EstimateWarning
-    from cadalign.geometry.uncertainty import Uncertainty
+    from cadalign.geometry.alignment import Uncertainty
     from cadalign.io.evidence import Size
 
 __all__ = [

@@ -26,10 +26,16 @@ from cadalign.estimation.result_parts import (
     points_covariances,
     rms_of,
 )
-from cadalign.geometry.alignment import Alignment, Box, extent
+from cadalign.geometry.alignment import (
+    Alignment,
+    Box,
+    Uncertainty,
+    extent,
+    uncertain_of,
+    uncertainty_of,
+)
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.geometry.uncertainty import Uncertainty, uncertain_of, uncertainty_of
 from cadalign.io.files import as_path, write_json
 
 if TYPE_CHECKING:

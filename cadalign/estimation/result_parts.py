@@ -16,11 +16,10 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.options import FitOptions, RansacOptions, pixel_information
 from cadalign.estimation.warning import EstimateWarning, Warnings
-from cadalign.geometry.alignment import Alignment, extent
+from cadalign.geometry.alignment import Alignment, Uncertainty, extent, uncertainty_of
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import by_rotation
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.geometry.uncertainty import Uncertainty, uncertainty_of
 
 T = TypeVar("T")
 

@@ -13,17 +13,19 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
 from cadalign.export.aligned_object import AlignedObject, ExportView
-from cadalign.geometry.alignment import BOX_EDGES, Alignment, Box
-from cadalign.geometry.camera import Camera
-from cadalign.geometry.mesh import Mesh
-from cadalign.geometry.pixels import rescaled_pixels
-from cadalign.geometry.uncertainty import (
+from cadalign.geometry.alignment import (
+    BOX_EDGES,
     NOT_DETERMINED,
     NOT_DETERMINED_ROTATION_DEG,
+    Alignment,
+    Box,
     deviation_text,
     distance_deviation,
     why_open,
 )
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.pixels import rescaled_pixels
 from cadalign.io.images import ByteImage, read_photo
 
 if TYPE_CHECKING:

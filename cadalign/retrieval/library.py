@@ -204,13 +204,18 @@ class Library:
         return tuple(self._table.keys)
 
     @property
+    def names(self) -> Mapping[str, int]:
+        """Semantic ids by the keypoints' names; empty where a data set has no names."""
+        return self._table.names
+
+    @property
     def keypoints(self) -> ModelKeypoints:
         """Names and semantic ids of the models' keypoints, without places.
 
         A detector's keypoints are paired with them. Those of a data set without names are called
         "keypoint 3" by their id.
         """
-        names = {number: name for name, number in self._table.names.items()}
+        names = {number: name for name, number in self.names.items()}
         return ModelKeypoints(
             tuple(
                 ModelKeypoint(names.get(number, f"keypoint {number}"), (0.0, 0.0, 0.0), number)

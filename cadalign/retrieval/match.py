@@ -14,9 +14,8 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Posterior, ViewResult
-from cadalign.geometry.alignment import Alignment, Box
+from cadalign.geometry.alignment import Alignment, Box, Uncertainty, deviation_text, uncertainty_of
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.uncertainty import Uncertainty, deviation_text, uncertainty_of
 from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
 

@@ -18,9 +18,8 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.result import Result
 from cadalign.estimation.warning import Warnings
 from cadalign.evaluation.runs.work import Columns, Outcome
-from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.alignment import Alignment, Uncertainty
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.uncertainty import Uncertainty
 
 RECORD_COLUMNS: Columns = (("category", str), ("model_id", str), ("view", int), ("exhibit", str))
 # More than any picture can show, and little enough to store.

@@ -31,7 +31,7 @@ _TURN, _PLACE, _STRETCH = (-2.578, -0.193, 0.824), (0.0, 0.291, 2.735), (1.0, 1.
 
 @dataclass(frozen=True)
 class Sample:
-    """Write the files of the README's example: a model, its keypoints, a photo, a detection.
+    """Write the files of the README's example, to try commands with.
 
     They are chair.obj, chair.keypoints.json, photo.jpg, which shows another chair with a focal
     length of 935 px, and found.json, as a detector finds its keypoints.

@@ -6,7 +6,6 @@ import re
 from pathlib import Path
 
 import pytest
-from support import readme
 from support.wheels import ROOT, Environment, build_wheel
 
 import cadalign
@@ -24,10 +23,23 @@ RUN_SNIPPETS = r"""
 import re, sys
 from pathlib import Path
 
+import cadalign
+from cadalign.estimation.warning import MISFIT_KINDS
+
+BAD = {*MISFIT_KINDS, "contradiction", "unit", "noise", "chance"}
 for page in sys.argv[1:]:
     names = {}
     for block in re.findall(r"```python\n(.*?)```", Path(page).read_text("utf-8"), re.DOTALL):
         exec(compile(block, page, "exec"), names)
+    for name, found in names.items():
+        for each in found if isinstance(found, list | tuple) else [found]:
+            each = getattr(each, "result", each)
+            if not isinstance(each, cadalign.Result):
+                continue
+            assert not {w.kind for w in each.warnings} & BAD, (page, name, str(each))
+            assert 0.25 < each.stretch.min() <= each.stretch.max() < 4, (page, name, str(each))
+            in_sigmas = [e.rms_sigmas for e in each.evidence if each.sigma is not None]
+            assert max(in_sigmas, default=0) < 3, (page, name, str(each))
     print("ran", page)
 """
 IPYTHON = """
@@ -101,7 +113,7 @@ def test_ipython_completes_names(user: Environment, use_jedi: bool) -> None:
 
 @pytest.mark.long
 def test_snippets_of_readme_and_site_run(user: Environment) -> None:
-    readme.write_files(user.home)
+    user.run("cadalign", ["sample"])
     assert len(PAGES) > 5
     ran = user.run("python", ["-c", RUN_SNIPPETS, *map(str, PAGES)])
     assert [line for line in ran.splitlines() if line.startswith("ran ")] == [

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
-from support import readme
 from support.layers import layers
 
 import cadalign
 from cadalign.cli import main
+from cadalign.cli.sample import FOUND, KEYPOINTS
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [*ROOT.glob("*.md")]  # those in docs: tests/docs/test_site.py
@@ -24,15 +26,25 @@ def blocks(language: str) -> list[str]:
 
 
 @pytest.mark.long
-def test_python_snippets_run_and_find_the_stretch(
+def test_snippets_run_in_an_empty_folder_and_find_the_stretch(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    readme.write_files(tmp_path)
     monkeypatch.chdir(tmp_path)
+    (commands,) = [block for block in blocks("sh") if "cadalign sample" in block]
+    for line in commands.splitlines():
+        assert main(shlex.split(line, comments=True)[1:]) == 0, line
+    (tmp_path / "chair.glb").unlink()  # the Python snippet's is another
     names: dict[str, Any] = {}
     for block in blocks("python"):
         exec(compile(block, "README.md", "exec"), names)
     result = names["result"]
+    np.testing.assert_array_equal(names["model"], KEYPOINTS)
+    np.testing.assert_array_equal(names["photo"], FOUND)
+    same = cadalign.Result.load(tmp_path / "photo_fit" / "fit.json")
+    np.testing.assert_allclose(same.alignment.packed, result.alignment.packed, atol=1e-9)
+    photo = cv2.imread(str(tmp_path / "photo.jpg"))
+    seat = photo[300, 320].astype(int) - photo[5, 5]
+    assert np.abs(seat).max() > 50  # the chair is drawn where its keypoints are
     # The snippet's keypoints were made with the stretch (1, 1.3, 0.8).
     deviation = np.array(result.std.scale[1:])
     np.testing.assert_array_less(np.abs(result.alignment.scale[1:] / [1.3, 0.8] - 1), 4 * deviation)
@@ -43,7 +55,7 @@ def test_python_snippets_run_and_find_the_stretch(
 @pytest.mark.slow
 def test_named_commands_exist(capsys: pytest.CaptureFixture[str]) -> None:
     commands = set(re.findall(r"^cadalign ([a-z]+)", "\n".join(blocks("sh")), flags=re.MULTILINE))
-    assert {"annotate", "fit", "export"} <= commands
+    assert {"sample", "observe", "fit", "export"} <= commands
     for command in commands:
         with pytest.raises(SystemExit) as stop:
             main([command, "--help"])

@@ -24,11 +24,11 @@ from cadalign.datasets.detections.image_keypoints import (
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.estimation.result import Result
+from cadalign.estimation.results import failed_row
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.evaluation.options import ExperimentOptions, absolute_paths
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import (
-    FAILED,
     Columns,
     Plan,
     Row,
@@ -89,6 +89,11 @@ class ManyOptions(ExperimentOptions):
     def learned(self) -> Path | None:
         """The learned shape that keypoints of detectors may be named after."""
         raise NotImplementedError
+
+    @property
+    def keypoints(self) -> ModelKeypoints | None:
+        """Those that a detector's are paired with, where no model's are given."""
+        return None if self.learned is None else _keypoints_of_shape(self.learned)
 
     def read(self, data: Any, where: str, *, folder: Path) -> Observation:
         """Read the parsed form of an observation, which messages call ``where``."""
@@ -288,17 +293,20 @@ def plan_run(options: ManyOptions, folder: RunFolder) -> Plan[ObservationTask]:
 
 
 def _model_keypoints(options: ManyOptions) -> ModelKeypoints:
-    """The keypoints that a detector's are paired with: the model's, or else the shape's."""
+    """The keypoints that a detector's are paired with: those of --model, or else the options'."""
     if options.detector.model is not None:
         return ModelKeypoints.load(options.detector.model)
-    shape = options.learned
-    if shape is None:
+    if (found := options.keypoints) is None:
         raise InputError(
             "the keypoints of the model are not known",
             where="model",
             fix="give the model's NAME.keypoints.json, or a learned shape",
         )
-    opened = ShapeModel.open(shape)
+    return found
+
+
+def _keypoints_of_shape(path: Path) -> ModelKeypoints:
+    opened = ShapeModel.open(path)
     named = isinstance(opened.ids[0], str)
     pairs = zip(opened.ids, opened.components[0].mean.tolist(), strict=False)
     keypoints = (ModelKeypoint(str(k), tuple(xyz), None if named else int(k)) for k, xyz in pairs)
@@ -318,8 +326,7 @@ def _read(task: ObservationTask) -> Any:
 
 
 def _failed(task: ObservationTask, reason: str, seen: Observation | None) -> Row:
-    row = naming_row(task.row, task.name, seen) | {"status": FAILED, "reason": reason}
-    return {**row, "method": "", "warning_kinds": "", "warnings": "", **_record(seen, None)}
+    return naming_row(task.row, task.name, seen) | failed_row(reason) | _record(seen, None)
 
 
 def _record(seen: Observation | None, found: Estimated | None) -> Row:

@@ -7,12 +7,12 @@ and camera of several views are the first's.
 
 from __future__ import annotations
 
+from collections import Counter
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
@@ -20,37 +20,27 @@ import pyarrow.parquet as pq
 from cadalign.datasets.models.shapenet import name_of_synset
 from cadalign.errors import CadalignError, RenderError
 from cadalign.estimation.result import Result
+from cadalign.estimation.results import RESULT_COLUMNS, row_of
 from cadalign.evaluation.benchmark import write_picture
 from cadalign.evaluation.instances.pictures import write_pictures, write_preview
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
-from cadalign.evaluation.runs.work import OK, Columns, Row
+from cadalign.evaluation.runs.work import Columns, Row
 from cadalign.geometry.alignment import Box
 from cadalign.geometry.mesh import Mesh
-from cadalign.geometry.rotations import quat_wxyz_from_rotation
 from cadalign.io.files import write_whole
 from cadalign.io.images import read_image
 from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.model_overlay import mesh_of
 
-_AXES = "xyz"
 _LISTS: Columns = (
     *(("covariance", list[float]), ("residuals", list[float]), ("is_inlier", list[bool])),
 )
 COLUMNS: Columns = (
     *(("row", int), ("source", str), ("image", str), ("object", str), ("model", str)),
-    *(("status", str), ("reason", str), ("method", str)),
-    *(("views", int), ("keypoints", int), ("inliers", int)),
-    *((f"q{axis}", float) for axis in "wxyz"),
-    *((f"t{axis}", float) for axis in _AXES),
-    *((f"scale_{axis}", float) for axis in _AXES),
-    *(("focal_length", float), ("sigma", float), ("rotation_std_deg", float)),
-    *((f"t{axis}_std", float) for axis in _AXES),
-    *((f"scale_{axis}_std", float) for axis in _AXES),
-    *(("focal_length_std", float), ("rms_px", float), ("cost", float)),
-    *(("alternatives", int), ("warning_count", int), ("warning_kinds", str), ("warnings", str)),
+    *RESULT_COLUMNS,
     *_LISTS,
 )
 RECORD_COLUMNS: Columns = (("row", int), ("observation", str), ("result", str))
@@ -69,37 +59,9 @@ def naming_row(row: int, source: str, observation: Observation | None) -> Row:
 
 
 def result_row(result: Result) -> Row:
-    """The cells of a result."""
-    pose, std, warnings = result.alignment, result.std, result.warnings
-    sigma: Any = result.sigma
-    if sigma is None and result.options is not None:
-        sigma = result.options.sigma
-    row: Row = {
-        "status": OK,
-        "reason": "",
-        "method": result.method,
-        "views": len(result.views),
-        "keypoints": len(result.inliers),
-        "inliers": int(result.inliers.sum()),
-        "focal_length": result.camera.fx,
-        "sigma": None if sigma is None or np.ndim(sigma) else float(sigma),
-        "rms_px": result.rms,
-        "cost": result.cost,
-        "alternatives": len(result.alternatives),
-        "warning_count": len(warnings),
-        "warning_kinds": "; ".join(each.kind for each in warnings),
-        "warnings": "; ".join(each.text for each in warnings),
-        "residuals": result.residuals.ravel().tolist(),
-        "is_inlier": result.inliers.tolist(),
-    }
-    by_axis: dict[str, Any] = {"t{}": pose.translation, "scale_{}": pose.scale}
-    if std is not None:
-        by_axis |= {"t{}_std": std.translation, "scale_{}_std": std.scale}
-        row |= {"rotation_std_deg": std.rotation_deg, "focal_length_std": std.focal}
-    for name, values in by_axis.items():
-        row |= {name.format(axis): float(each) for axis, each in zip(_AXES, values, strict=True)}
-    quaternion = quat_wxyz_from_rotation(pose.rotation).tolist()
-    row |= {f"q{axis}": value for axis, value in zip("wxyz", quaternion, strict=True)}
+    """The cells of a result, those that are lists, too."""
+    row = row_of(result)
+    row |= {"residuals": result.residuals.ravel().tolist(), "is_inlier": result.inliers.tolist()}
     if result.covariance is not None:
         row["covariance"] = result.covariance.ravel().tolist()
     return row
@@ -121,6 +83,22 @@ def read_rows(folder: RunFolder) -> list[Row]:
     """The rows of a finished run, without the columns that are lists."""
     groups = read_groups(folder.results, fix=DONE_ANEW)
     return [row for table in groups for row in without_lists(table).to_pylist()]
+
+
+WARNED = {"warning_kinds": "with warnings", "uncertain": "uncertain"}
+"""Columns that list what is said of a row, by name."""
+
+
+def warnings_text(table: pa.Table) -> str:
+    """How many rows of a table have warnings, of which kinds, and what is uncertain of how many."""
+    said = []
+    for column, label in WARNED.items():
+        rows = [{*cell.split("; ")} for cell in table[column].to_pylist() if cell]
+        of_each = Counter(sorted(name for row in rows for name in row)).most_common()
+        if rows:
+            listed = ", ".join(f"{name} {count:,}" for name, count in of_each)
+            said.append(f"{len(rows):,} {label}: {listed}")
+    return "; ".join(said)
 
 
 def without_lists(table: pa.Table) -> pa.Table:

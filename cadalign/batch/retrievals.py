@@ -14,6 +14,7 @@ from cadalign.arrays import worker_count
 from cadalign.batch.experiment import Estimated, ManyOptions, plan_run
 from cadalign.batch.spec import SPEC as FIT_SPEC
 from cadalign.batch.spec import summarize_by
+from cadalign.datasets.models.model_keypoints import ModelKeypoints
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.runs.work import Columns
 from cadalign.evaluation.summary import median
@@ -53,12 +54,17 @@ class RetrieveRunOptions(ManyOptions):
     def learned(self) -> Path | None:
         return self.estimate.shape[0] if len(self.estimate.shape) == 1 else None
 
+    @property
+    def keypoints(self) -> ModelKeypoints:
+        return self.estimate.opened()[0].keypoints
+
     def read(self, data: Any, where: str, *, folder: Path) -> Observation:
         with in_file(where):
             seen = Observation.from_dict(fill_xyz(data), folder=folder)
         return self.changes.applied_to(seen, where)
 
     def estimate_of(self, seen: Observation, where: str) -> Estimated:
+        seen = self.estimate.with_ids(seen, where)
         matches = self.estimate.retrieve(seen, where, workers=1)
         best = matches[0]
         cells = {

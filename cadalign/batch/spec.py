@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,7 +15,7 @@ import pyarrow as pa
 
 from cadalign.batch.experiment import FitRunOptions, plan_run
 from cadalign.batch.outputs import COLUMNS as TABLE_COLUMNS
-from cadalign.batch.outputs import NAMING, RECORD_COLUMNS, page_names, without_lists
+from cadalign.batch.outputs import NAMING, RECORD_COLUMNS, page_names, warnings_text, without_lists
 from cadalign.errors import DataError
 from cadalign.estimation.result import Result
 from cadalign.evaluation import metrics
@@ -144,12 +143,8 @@ def _plots(runs: Sequence[Run]) -> list[Plot]:
 def _describe(run: Run) -> str:
     inputs = [Path(each).name for each in run.config.get("inputs", ())]
     listed = ", ".join(inputs[:3]) + (f" and {len(inputs) - 3} more" if len(inputs) > 3 else "")
-    cells = [each for each in run.column("warning_kinds").tolist() if each]
-    kinds = Counter(kind for each in cells for kind in each.split("; "))
-    counted = ", ".join(f"{count:,} {kind}" for kind, count in kinds.most_common())
-    return f"on {run.total:,} observations of {listed}" + (
-        f"; warnings: {counted}" if kinds else ""
-    )
+    said = warnings_text(run.results)
+    return f"on {run.total:,} observations of {listed}" + (f"; {said}" if said else "")
 
 
 SPEC = Spec(

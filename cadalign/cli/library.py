@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -11,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from cadalign.cli.common import JsonOption, answer, group_of, make_folder_of, print_json, say
+from cadalign.cli.options import named_as_flags
+from cadalign.errors import refuse_unused
 from cadalign.io.files import keeping, refuse_input, require_utf8
 
 if TYPE_CHECKING:
@@ -20,10 +23,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LibraryBuild:
-    """Build a library of a data set's annotated models, as one file."""
+    """Build a library of own models, or of a data set's annotated ones, as one file."""
 
-    root: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ROOT")]
-    """Folder in KeypointNet's layout."""
+    root: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
+    """Folder of meshes with their NAME.keypoints.json, whose subfolders are categories; or one in
+    KeypointNet's layout."""
     out: Path = Path("library.cadalign")
     """File to write."""
     categories: tuple[str, ...] | None = None
@@ -36,30 +40,45 @@ class LibraryBuild:
     def run(self) -> int:
         """Build the library; returns the exit code."""
         from cadalign.datasets import KeypointNet
+        from cadalign.retrieval.own_models import keypoint_files
 
         for folder in (self.root, self.shapenet):
             if folder is not None:
                 require_utf8(folder)
+        files = keypoint_files(self.root) if self.root.is_dir() else []
+        if files:
+            with named_as_flags(self):
+                refuse_unused(self, {"split", "shapenet"}, "on a folder of own models")
+            return self._write(files, len(files))
         dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
         dataset = dataset.subset(categories=self.categories, split=self.split)
-        with keeping(dataset.files):
-            refuse_input(self.out)
-            make_folder_of(self.out)
-            return self._build(dataset)
-
-    def _build(self, dataset: KeypointNet) -> int:
-        from cadalign.cli.runs import progress_bar
-        from cadalign.retrieval import Library
-
-        total, done = len(dataset.ids()), count(1)
-        with progress_bar("reading models") as show:
-            library = Library.from_dataset(dataset, on_model=lambda: show(next(done), total))
-        library.save(self.out)
-        megabytes = self.out.stat().st_size / 1e6
-        say(f"{_describe(library)}\nWritten: {self.out} ({megabytes:.1f} MB)")
+        self._write(dataset.files, len(dataset.ids()), dataset)
         left_out = len(dataset.problems)
         if left_out:
             say(f"Left out: {left_out} models with malformed annotations")
+        return 0
+
+    def _write(self, files: Iterable[Path], total: int, dataset: KeypointNet | None = None) -> int:
+        """Write the library of a data set, or else of own models."""
+        from cadalign.cli.runs import progress_bar
+        from cadalign.retrieval import Library
+
+        done = count(1)
+        with keeping(files), progress_bar("reading models") as show:
+            refuse_input(self.out)
+            make_folder_of(self.out)
+
+            def on_model() -> None:
+                show(next(done), total)
+
+            if dataset is None:
+                chosen = self.categories
+                library = Library.from_folder(self.root, categories=chosen, on_model=on_model)
+            else:
+                library = Library.from_dataset(dataset, on_model=on_model)
+            library.save(self.out)
+        megabytes = self.out.stat().st_size / 1e6
+        say(f"{_describe(library)}\nWritten: {self.out} ({megabytes:.1f} MB)")
         return 0
 
 
@@ -95,7 +114,8 @@ def _describe(library: Library) -> str:
     counts = _summary(library)["categories"]
     listed = ", ".join(f"{count} {category}" for category, count in counts.items())
     without = len(library) - library.with_mesh
-    return f"{len(library)} models: {listed}" + (f"; {without} without a mesh" if without else "")
+    text = f"{len(library)} models: {listed}" + (f"; {without} without a mesh" if without else "")
+    return f"{text}\nKeypoints: {', '.join(library.names)}" if library.names else text
 
 
 LibraryCommand = group_of(

@@ -16,8 +16,9 @@ from cadalign.io.documents import read_json
 from cadalign.io.files import keeping
 from cadalign.io.images import read_image
 from cadalign.io.kinds import is_of_many
+from cadalign.io.observation import Observation
 from cadalign.retrieval.options import RetrievalOptions
-from cadalign.retrieval.query import ObservationRetrieval, read_query
+from cadalign.retrieval.query import ObservationRetrieval
 
 if TYPE_CHECKING:
     from cadalign.retrieval.match import Match
@@ -38,7 +39,8 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
     """Find the models of a library that explain an image's keypoints best.
 
     Each model is posed and stretched. The observation is a file as for `cadalign fit`; its
-    keypoints need a semantic_id and no xyz. With --out, writes matches.json, an overlay of each
+    keypoints need a semantic_id, or the name that the library has for it, and no xyz. A detector's
+    file needs no --model. With --out, writes matches.json, an overlay of each
     match, its observation and fit, and index.html, which shows them side by side.
     Many observations are a run, as of `cadalign fit`: it writes results.parquet and results.csv
     with a row for each, and report.html.
@@ -83,7 +85,8 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
         """Retrieve the models of one observation; returns the exit code."""
         from cadalign.retrieval.page import none_text, write_retrieval
 
-        query = self.of_camera.applied_to(read_query(path), str(path))
+        query = self.with_ids(Observation.load(path, needs_xyz=False), str(path))
+        query = self.of_camera.applied_to(query, str(path))
         library, _ = self.opened()
         camera = query.camera
         # The table needs no photo, which may have been moved.
@@ -124,7 +127,7 @@ def _print_table(matches: Sequence[Match]) -> None:
     from cadalign.retrieval.page import score_text
 
     labels = ("", "category", "model")
-    heads = ("score", "log-lik.", "rms px", "kpts", "s_y", "s_z")
+    heads = ("score", "log-lik.", "rms px", "kpts", "s_y", "s_z", "uncertain")
     rows: list[tuple[str, ...]] = [
         (
             str(rank).rjust(len(str(len(matches)))),
@@ -134,8 +137,8 @@ def _print_table(matches: Sequence[Match]) -> None:
             f"{match.log_likelihood:.1f}",
             f"{match.rms:.2f}",
             f"{match.shared}/{match.observed}",
-            f"{match.alignment.scale[1]:.3f}",
-            f"{match.alignment.scale[2]:.3f}",
+            *match.stretch_texts,
+            ", ".join(match.result.uncertain),
         )
         for rank, match in enumerate(matches, start=1)
     ]

@@ -134,8 +134,10 @@ def run_command(command: ManyCommand, options: ManyOptions, *, done: str) -> int
 
     ``done`` is what was done to those that have not. The reasons of failures are said.
     """
+    import pyarrow.parquet as pq
+
     from cadalign.batch.fits import run_many
-    from cadalign.batch.outputs import read_rows
+    from cadalign.batch.outputs import WARNED, read_rows, warnings_text
 
     folder = run_folder(command, options)
     with run_progress(options.experiment) as on_progress:
@@ -152,6 +154,8 @@ def run_command(command: ManyCommand, options: ManyOptions, *, done: str) -> int
     failed = sum(count for _, count in reasons)
     _say_reasons([(_as_typed(reason, command), count) for reason, count in reasons])
     table = folder.path / "results.csv"
+    if said := warnings_text(pq.read_table(folder.results, columns=list(WARNED))):
+        say(said)
     say(f"{total - failed:,} of {total:,} {done}, {failed:,} failed: {table}")
     if command.picture and total <= _ON_PAGE:
         write_run_report(folder)

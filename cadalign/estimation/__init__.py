@@ -18,12 +18,12 @@ if TYPE_CHECKING:
         Alternative,
         EvidenceSummary,
         FitStats,
-        Uncertainty,
         ViewResult,
     )
     from cadalign.estimation.results import Results
     from cadalign.estimation.view import View
     from cadalign.estimation.warning import EstimateWarning
+    from cadalign.geometry.alignment import Uncertainty
     from cadalign.io.evidence import Size
     from cadalign.io.focal import FocalPrior
 

@@ -54,7 +54,6 @@ from cadalign.estimation.uncertainty.doubts import (
     another_pose,
     outside_image,
     unexplained,
-    weaknesses,
 )
 from cadalign.estimation.uncertainty.residuals import summaries_of
 from cadalign.estimation.view import View
@@ -134,7 +133,6 @@ def result_of(
         points_covariance=of_points[:-2],
         points_cam_covariance=of_seen[:-2],
         warnings=(
-            *weaknesses(pose, covariances[0], lengths=best.lengths),
             *another_pose(
                 pose,
                 others,

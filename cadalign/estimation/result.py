@@ -21,13 +21,18 @@ from cadalign.estimation.result_parts import (
     Alternative,
     FitStats,
     Posterior,
-    Uncertainty,
     ViewResult,
     points_covariances,
     rms_of,
+)
+from cadalign.geometry.alignment import (
+    Alignment,
+    Box,
+    Uncertainty,
+    extent,
+    uncertain_of,
     uncertainty_of,
 )
-from cadalign.geometry.alignment import Alignment, Box, extent
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.files import as_path, write_json
@@ -209,6 +214,14 @@ class Result:
         return None if self.covariance is None else uncertainty_of(self.covariance)
 
     @property
+    def uncertain(self) -> tuple[str, ...]:
+        """Names of what has a standard deviation beyond 25 %, or 30 degrees; they are no warnings.
+
+        Of "s_x", "s_y", "s_z", "distance" (to the model's origin), "focal length", "rotation".
+        """
+        return () if self.covariance is None else uncertain_of(self.alignment, self.covariance)
+
+    @property
     def degrees_of_freedom(self) -> float | None:
         """Tails of the t distribution of the errors, whose covariance the stated ones are.
 
@@ -238,7 +251,8 @@ class Result:
     def warnings(self) -> tuple[EstimateWarning, ...]:
         """Warnings about what `std` does not say: contradictions, other poses, nothing to test.
 
-        Each has a ``kind``, a ``text``, and the ``view`` and ``keypoints`` that it is about.
+        What is merely ``uncertain`` has none. Each has a ``kind``, a ``text``, and the ``view`` and
+        ``keypoints`` that it is about.
         """
         return self.posterior.warnings
 

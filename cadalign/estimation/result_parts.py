@@ -16,7 +16,7 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.options import FitOptions, RansacOptions, pixel_information
 from cadalign.estimation.warning import EstimateWarning, Warnings
-from cadalign.geometry.alignment import Alignment, extent
+from cadalign.geometry.alignment import Alignment, Uncertainty, extent, uncertainty_of
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import by_rotation
 from cadalign.geometry.symmetry import Symmetry
@@ -25,7 +25,6 @@ T = TypeVar("T")
 
 LEAST_LIKELIHOOD = 1e-3
 """Relative likelihood above which another minimum is reported as an alternative."""
-_ROUNDING = 1e-12  # relative standard deviation below which a length is known
 _FIELDS = {
     "keypoints": "points_2d",
     "photo": "image",
@@ -151,33 +150,6 @@ Diagnosis = Callable[[FittedKeypoints], EstimateWarning | None]
 
 
 @dataclass(frozen=True)
-class Uncertainty:
-    """Predicted standard deviations of an alignment."""
-
-    rotation_deg: float
-    """Rotation [degrees]: the root of the sum of the variances about three axes."""
-    translation: tuple[float, float, float]
-    """Along the camera's axes [model units]."""
-    scale: tuple[float, float, float]
-    """Scale along the model's x, y, z, relative (0.02 is 2 %); 0 where it is known."""
-    focal: float
-    """Focal length, relative; 0 where it is known."""
-
-
-def uncertainty_of(covariance: FloatArray) -> Uncertainty:
-    """Standard deviations from a covariance (9, 9) or (10, 10)."""
-    variance = np.maximum(covariance.diagonal(), 0.0)
-    variance[6:9][variance[6:9] < _ROUNDING**2] = 0.0
-    x, y, z, sx, sy, sz = np.sqrt(variance[3:9]).tolist()
-    return Uncertainty(
-        rotation_deg=float(np.degrees(np.sqrt(variance[:3].sum()))),
-        translation=(x, y, z),
-        scale=(sx, sy, sz),
-        focal=float(np.sqrt(variance[9:].sum())),
-    )
-
-
-@dataclass(frozen=True)
 class EvidenceSummary:
     """Agreement of one piece of evidence with a joint estimate."""
 
@@ -278,13 +250,19 @@ def points_covariances(
 ) -> tuple[FloatArray, FloatArray]:
     """Covariances (m, 3, 3) of stretched points in the model's frame and in the camera's."""
     covariance = covariance[:9, :9]
-    stretched = points * alignment.scale
-    by_logs = stretched[:, :, None] * np.eye(3)
+    by_logs = (points * alignment.scale)[:, :, None] * np.eye(3)
     of_points = by_logs @ covariance[6:, 6:] @ by_logs.swapaxes(1, 2)
-    turned = stretched @ alignment.rotation.T
-    shifts = np.broadcast_to(np.eye(3), by_logs.shape)
-    rows = np.concatenate([by_rotation(turned), shifts, alignment.rotation @ by_logs], axis=2)
+    rows = point_slopes(points, alignment)
     return of_points, rows @ covariance @ rows.swapaxes(1, 2)
+
+
+def point_slopes(points: FloatArray, alignment: Alignment) -> FloatArray:
+    """Derivatives (m, 3, 9) of points in the camera's frame by the unknowns of a covariance."""
+    stretched = points * alignment.scale
+    by_logs = alignment.rotation * stretched[:, None]
+    shifts = np.broadcast_to(np.eye(3), by_logs.shape)
+    by_turns = by_rotation(stretched @ alignment.rotation.T)
+    return np.concatenate([by_turns, shifts, by_logs], axis=2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import CadalignError, DataError
 from cadalign.estimation.result import Result
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.rotations import quat_wxyz_from_rotation
 from cadalign.io.documents import in_file, parse_json
 from cadalign.io.files import as_path
 from cadalign.solvers.constants import POSE_SIZE
@@ -22,6 +23,20 @@ if TYPE_CHECKING:
 
 COLUMNS = POSE_SIZE + 2
 """Columns of a table of results: a packed alignment, rms and focal length."""
+RESULT_COLUMNS: tuple[tuple[str, type], ...] = (
+    *(("status", str), ("reason", str), ("method", str)),
+    *(("views", int), ("keypoints", int), ("inliers", int)),
+    *((f"q{axis}", float) for axis in "wxyz"),
+    *((f"t{axis}", float) for axis in "xyz"),
+    *((f"scale_{axis}", float) for axis in "xyz"),
+    *(("focal_length", float), ("sigma", float), ("rotation_std_deg", float)),
+    *((f"t{axis}_std", float) for axis in "xyz"),
+    *((f"scale_{axis}_std", float) for axis in "xyz"),
+    *(("focal_length_std", float), ("rms_px", float), ("cost", float)),
+    *(("alternatives", int), ("uncertain", str)),
+    *(("warning_count", int), ("warning_kinds", str), ("warnings", str)),
+)
+"""Names and types of the cells of a result in every table."""
 _TABLE, _RECORDS = "results.parquet", "records.parquet"  # of a run, see `cadalign.batch.outputs`
 _FIX = "give a folder that `cadalign fit` or `cadalign.fit_many` has written"
 
@@ -124,12 +139,11 @@ class Results(Sequence[Result | CadalignError]):
         return Alignment.from_packed(self._table[problem, :POSE_SIZE].copy())
 
     def to_dataframe(self) -> pd.DataFrame:
-        """One row for each view of each problem, as a pandas DataFrame.
+        """One row for each problem, as a pandas DataFrame with the columns of ``results.csv``.
 
-        Columns: ``result`` and ``view``, numbers from 0; ``solved``; of the view ``rms`` of the
-        inliers' residuals [px], ``keypoints``, ``inliers``, ``rotation_x`` to ``rotation_z``
-        (rotation vector [degrees]), ``translation_x`` to ``_z`` [model units], ``scale_x`` to
-        ``_z``, ``focal_length`` [px]; and ``error``, the reason where there is no solution.
+        docs/how_to/many_photos.md describes them; those that name files are left out. Pose, camera
+        and their deviations are the first view's. A problem without solution has the ``status``
+        "failed", and the ``reason``.
 
         Examples
         --------
@@ -138,27 +152,16 @@ class Results(Sequence[Result | CadalignError]):
         >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
         >>> seen = camera.project(corners + [0.1, 0.2, 5.0])
         >>> frame = fit_batch([corners, corners], [seen, seen], camera).to_dataframe()
-        >>> frame[["result", "view", "solved", "keypoints"]].to_numpy().tolist()
-        [[0, 0, True, 8], [1, 0, True, 8]]
+        >>> frame[["row", "status", "keypoints", "uncertain"]].to_numpy().tolist()
+        [[0, 'ok', 8, ''], [1, 'ok', 8, '']]
         """
         import pandas as pd
-        from scipy.spatial.transform import Rotation
 
-        numbers = ["result", "view", "solved", "rms", "keypoints", "inliers"]
-        by_axis = ("rotation", "translation", "scale")
-        names = [*numbers, *(f"{name}_{axis}" for name in by_axis for axis in "xyz")]
-        rows: list[list[Any]] = []
-        for k, each in enumerate(self):
-            if isinstance(each, CadalignError):
-                lacking = [np.nan] * (len(names) - len(numbers) + 1)
-                rows.append([k, 0, False, np.nan, 0, 0, *lacking, str(each)])
-                continue
-            for number, view in enumerate(each.views):
-                pose, counts = view.alignment, (len(view.inliers), int(view.inliers.sum()))
-                turn = Rotation.from_matrix(pose.rotation).as_rotvec(degrees=True)
-                axes = (*turn, *pose.translation, *pose.scale)
-                rows.append([k, number, True, view.rms, *counts, *axes, view.camera.fx, ""])
-        return pd.DataFrame(rows, columns=[*names, "focal_length", "error"])
+        rows = (
+            {"row": number} | (row_of(each) if isinstance(each, Result) else failed_row(str(each)))
+            for number, each in enumerate(self)
+        )
+        return pd.DataFrame(rows, columns=["row", *(name for name, _ in RESULT_COLUMNS)])
 
     @classmethod
     def open(cls, folder: str | os.PathLike[str]) -> Results:
@@ -206,6 +209,46 @@ class Results(Sequence[Result | CadalignError]):
             else DataError(reasons[row])
             for row, state in enumerate(states)
         )
+
+
+def failed_row(reason: str) -> dict[str, Any]:
+    """The cells of a problem without solution."""
+    texts = ("method", "uncertain", "warning_kinds", "warnings")
+    return {"status": "failed", "reason": reason, **dict.fromkeys(texts, "")}
+
+
+def row_of(result: Result) -> dict[str, Any]:
+    """The cells of a result, by the names of `RESULT_COLUMNS`."""
+    pose, std, warnings = result.alignment, result.std, result.warnings
+    sigma: Any = result.sigma
+    if sigma is None and result.options is not None:
+        sigma = result.options.sigma
+    row: dict[str, Any] = {
+        "status": "ok",
+        "reason": "",
+        "method": result.method,
+        "views": len(result.views),
+        "keypoints": len(result.inliers),
+        "inliers": int(result.inliers.sum()),
+        "focal_length": result.camera.fx,
+        "sigma": None if sigma is None or np.ndim(sigma) else float(sigma),
+        "rms_px": result.rms,
+        "cost": result.cost,
+        "alternatives": len(result.alternatives),
+        "uncertain": "; ".join(result.uncertain),
+        "warning_count": len(warnings),
+        "warning_kinds": "; ".join(each.kind for each in warnings),
+        "warnings": "; ".join(each.text for each in warnings),
+    }
+    by_axis: dict[str, Any] = {"t{}": pose.translation, "scale_{}": pose.scale}
+    if std is not None:
+        by_axis |= {"t{}_std": std.translation, "scale_{}_std": std.scale}
+        row |= {"rotation_std_deg": std.rotation_deg, "focal_length_std": std.focal}
+    for name, values in by_axis.items():
+        row |= {name.format(axis): float(each) for axis, each in zip("xyz", values, strict=True)}
+    quaternion = quat_wxyz_from_rotation(pose.rotation).tolist()
+    row |= {f"q{axis}": value for axis, value in zip("wxyz", quaternion, strict=True)}
+    return row
 
 
 def _read_result(texts: Any, row: int, where: str) -> Result:

@@ -23,9 +23,6 @@ Kind = Literal[
     "mask",
     "photo",
     "left-out",
-    "scale",
-    "translation",
-    "rotation",
     "focal",
     "alternative",
 ]
@@ -56,7 +53,7 @@ class EstimateWarning:
         - "unit": depths or distances are in another unit;
         - "mask", "photo": it is left out, or agrees in part;
         - "left-out": a view is;
-        - "scale", "translation", "rotation", "focal": it is hardly determined;
+        - "focal": the estimated focal length contradicts its prior;
         - "alternative": another pose is likely, too.
     text : str
         A sentence for the user.
@@ -67,9 +64,9 @@ class EstimateWarning:
 
     Examples
     --------
-    >>> warning = EstimateWarning("rotation", "the rotation is known only to +-40 deg")
+    >>> warning = EstimateWarning("left-out", "views[1] is left out", view=1)
     >>> print(warning)
-    the rotation is known only to +-40 deg
+    views[1] is left out
     """
 
     kind: Kind
@@ -85,9 +82,6 @@ class EstimateWarning:
 
 
 Warnings = tuple[EstimateWarning, ...]
-
-UNDETERMINED_KINDS: frozenset[Kind] = frozenset({"scale", "translation", "rotation", "focal"})
-"""Kinds about what is hardly determined."""
 
 MISFIT_KINDS: frozenset[Kind] = frozenset({"misfit", "outlier", "stretch", "camera", "mistake"})
 """Kinds about keypoints that do not fit."""

@@ -13,7 +13,16 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
 from cadalign.export.aligned_object import AlignedObject, ExportView
-from cadalign.geometry.alignment import BOX_EDGES, Alignment, Box
+from cadalign.geometry.alignment import (
+    BOX_EDGES,
+    NOT_DETERMINED,
+    NOT_DETERMINED_ROTATION_DEG,
+    Alignment,
+    Box,
+    deviation_text,
+    distance_deviation,
+    why_open,
+)
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.pixels import rescaled_pixels
@@ -32,7 +41,7 @@ _LINE_POINTS = 17  # lens distortion bends the edges of a box
 
 
 def result_text(result: Any) -> str:
-    """Keypoints, rotation, translation, stretch, focal length, alternatives, warnings."""
+    """Keypoints, rotation, translation, stretch, focal length, what is uncertain, warnings."""
     count, of = int(result.inliers.sum()), len(result.inliers)
     some = f"{count}" if count == of else f"{count} of {of}"
     views = "" if len(result.views) == 1 else f" in {len(result.views)} views"
@@ -43,13 +52,13 @@ def result_text(result: Any) -> str:
     stretch = [f"{value:.4g}" for value in result.stretch]
     known_to = ""
     if std is not None:
-        rotation += f", +- {std.rotation_deg:.2g} deg"
-        translation += f" +- ({', '.join(f'{value:.2g}' for value in std.translation)})"
-        stretch = [
-            text if deviation == 0 else f"{text} +- {100 * deviation:.2g} %"
-            for text, deviation in zip(stretch, std.scale, strict=True)
-        ]
-        known_to = f" +- {100 * std.focal:.2g} %"
+        is_known = std.rotation_deg <= NOT_DETERMINED_ROTATION_DEG
+        rotation += f", +- {std.rotation_deg:.2g} deg" if is_known else ", not determined"
+        is_known = distance_deviation(pose, result.covariance) <= NOT_DETERMINED
+        deviations = ", ".join(f"{value:.2g}" for value in std.translation)
+        translation += f" +- ({deviations})" if is_known else " (not determined)"
+        stretch = [f"{text}{deviation_text(std.scale[k])}" for k, text in enumerate(stretch)]
+        known_to = deviation_text(std.focal)
     lines = [
         f"{result.method}: {some} keypoints{views}, rms {result.rms:.3g} px",
         f"  rotation     {rotation}",
@@ -64,6 +73,12 @@ def result_text(result: Any) -> str:
         f"({', '.join(f'{value:.4g}' for value in other.alignment.scale)})"
         for other in result.alternatives
     )
+    if result.uncertain:
+        # The reason follows from the keypoints where all of them are seen, and are the evidence.
+        is_plain = len(result.evidence) < 2 and len(result.points_3d) == len(result.inliers)
+        exact = result.points_3d[result.inliers] if is_plain else result.points_3d[:0]
+        names = [name + why_open(name, exact, pose) for name in result.uncertain]
+        lines.append(f"  uncertain    {', '.join(names)}")
     if len(result.evidence) > 1:
         lines.extend(f"  evidence     {each}" for each in result.evidence)
     lines.extend(f"  warning      {text}" for text in result.warnings)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
         translation_error,
         translation_error_up_to_scale,
     )
-    from cadalign.geometry.symmetry import Symmetry, SymmetryAxis, symmetric_rotation_error
+    from cadalign.geometry.symmetry import Symmetry, SymmetryAxis
 
 __all__ = [
     "Alignment",
@@ -44,7 +44,6 @@ __all__ = [
     "reprojection_error",
     "rotation_error",
     "scale_error",
-    "symmetric_rotation_error",
     "translation_error",
     "translation_error_up_to_scale",
     "up_from_gravity",

@@ -12,8 +12,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_floats, is_whole, read_only
 from cadalign.errors import InputError, quote
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.rotations import angle_between, nearest_rigid, rotation_from_vector
+from cadalign.geometry.rotations import nearest_rigid, rotation_from_vector
 
 _UP = (0.0, 1.0, 0.0)
 SCAN2CAD_FOLDS: dict[str, int | None] = {
@@ -181,31 +180,6 @@ class Symmetry:
         ]
         discrete = [np.eye(4), *self.motions]
         return np.array([turn @ motion for motion, turn in product(discrete, about or [np.eye(4)])])
-
-
-def symmetric_rotation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry) -> float:
-    """Smallest rotation error over the truths that look the same [degrees].
-
-    The least over angles about an axis is taken in closed form: the trace of B A(angle), with A
-    the rotation about the axis, is a + b sin(angle) + c cos(angle).
-
-    Examples
-    --------
-    >>> turned = Alignment(rotation_from_vector(np.array([0, 2.0, 0])), [0, 0, 1], [1, 1, 1])
-    >>> gt = Alignment(np.eye(3), [0, 0, 1], [1, 1, 1])
-    >>> round(symmetric_rotation_error(
-    ...     est=turned, gt=gt, symmetry=Symmetry.around((0, 1, 0), fold=None)), 6)
-    0.0
-    """
-    discrete = [np.eye(3), *symmetry.motions[:, :3, :3]]
-    candidates = [gt.rotation @ motion for motion in discrete]
-    for axis, motion in product(symmetry.axes, discrete):
-        x, y, z = axis.direction
-        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        between = motion @ est.rotation.T @ gt.rotation
-        angle = np.arctan2(np.trace(between @ cross), -np.trace(between @ cross @ cross))
-        candidates.append(gt.rotation @ axis.turned(float(angle))[:3, :3] @ motion)
-    return min(angle_between(est.rotation, each) for each in candidates)
 
 
 def _check_fold(fold: Any, where: str) -> None:

@@ -33,6 +33,7 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets.models.shapenet import require_category
 from cadalign.errors import DegenerateError, InputError, require_kind
 from cadalign.estimation.align import align
+from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, turned_alignment
@@ -124,7 +125,7 @@ def rank_by_shape(
         If a shape model cannot be aligned with the keypoints, or no model lies in front of the
         camera.
     """
-    parts = []
+    parts, estimated = [], dict[str, Result]()
     for category, shape, view, gains in _shown(observed, options, shapes):
         own = table.rows_of(category)
         chosen = (candidates.models >= own.start) & (candidates.models < own.stop)
@@ -132,7 +133,8 @@ def rank_by_shape(
             rows, known = np.flatnonzero(chosen), _shapes_of(table, category, shape)
             models = candidates.models[rows] - own.start
             turn = observed.facing.lens_from_camera.T
-            logs, poses, kept = _rank_category(models, known, view, gains, options, shape, turn)
+            given = models, known, view, gains, options, shape, turn
+            logs, poses, kept, estimated[category] = _rank_category(*given)
             parts.append((rows[kept], logs[kept], poses[kept]))
     if not parts:
         raise _no_shape()
@@ -143,7 +145,8 @@ def rank_by_shape(
         raise DegenerateError(what, where="points_2d", fix=fix)
     order = np.argsort(-logs, kind="stable")
     weights = np.exp(logs[order] - logs.max())
-    return Ranking(ranked[order], poses[order], logs[order], weights / weights.sum(), 0)
+    scores = weights / weights.sum()
+    return Ranking(ranked[order], poses[order], logs[order], scores, 0, estimated)
 
 
 def camera_by_shape(
@@ -203,8 +206,8 @@ def _rank_category(
     options: RetrievalOptions,
     shape: ShapeModel,
     turn: FloatArray,
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Log probabilities (c,) of a category's models, their poses (c, 15), and which are ahead.
+) -> tuple[FloatArray, FloatArray, BoolArray, Result]:
+    """Log probabilities (c,) of models, their poses (c, 15), which are ahead, and the estimate.
 
     The ``turn`` (3, 3) leads from the camera's frame to that of the poses.
     """
@@ -235,7 +238,8 @@ def _rank_category(
     logs += posterior.log_evidence + gains - np.logaddexp.reduce(logs)
     across = poses[:, 6:9] * poses[:, 12:]  # the last row of the linear part
     depths = np.einsum("nka,na->nk", centred[:, :-BOX_ROWS], across).min(axis=1)
-    return logs, poses, np.asarray(depths + (centres * across).sum(axis=1) + poses[:, 11] > 0)
+    ahead = np.asarray(depths + (centres * across).sum(axis=1) + poses[:, 11] > 0)
+    return logs, poses, ahead, result
 
 
 def _widened(posterior: ShapePosterior, estimate: FloatArray, deviation: float) -> Gaussians:

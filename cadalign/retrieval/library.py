@@ -5,13 +5,17 @@ from __future__ import annotations
 import logging
 import os
 from bisect import bisect_left
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
+from cadalign.arrays import IntArray
 from cadalign.datasets import AnnotatedModel, KeypointNet
+from cadalign.datasets.detections.image_keypoints import plain_name, some_of
+from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.camera import Camera
 from cadalign.io.files import as_path, checksum
@@ -117,6 +121,44 @@ class Library:
         return cls.from_models(models)
 
     @classmethod
+    def from_folder(
+        cls,
+        folder: str | os.PathLike[str],
+        *,
+        categories: Iterable[str] | None = None,
+        on_model: Callable[[], object] = lambda: None,
+    ) -> Library:
+        """Make a library of own models: a folder of files ``NAME.keypoints.json`` and meshes.
+
+        The folder that a file lies in is its category, NAME the model's id. The mesh is the one
+        that the file names, or else that of the same NAME beside it; without one the bounds are
+        those of the keypoints. Keypoints of the same name are the same on all models.
+
+        Parameters
+        ----------
+        folder : str or path-like
+            It, and those below it, are looked through.
+        categories : iterable of str, optional
+            By default all.
+        on_model : callable
+            Called after every model, for progress.
+
+        Raises
+        ------
+        DataError
+            If there are no models with keypoints, a file of keypoints cannot be read, or a name
+            has two semantic ids.
+
+        Examples
+        --------
+        >>> library = Library.from_folder("chairs")  # doctest: +SKIP
+        >>> library.retrieve(points_2d, ["seat", "back"], camera)  # doctest: +SKIP
+        """
+        from cadalign.retrieval.own_models import read_own_models
+
+        return cls(read_own_models(as_path(folder), categories=categories, on_model=on_model))
+
+    @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Library:
         """Map a saved library into memory.
 
@@ -162,6 +204,39 @@ class Library:
         return tuple(self._table.keys)
 
     @property
+    def names(self) -> Mapping[str, int]:
+        """Semantic ids by the keypoints' names; empty where a data set has no names."""
+        return self._table.names
+
+    @property
+    def keypoints(self) -> ModelKeypoints:
+        """Names and semantic ids of the models' keypoints, without places.
+
+        A detector's keypoints are paired with them. Those of a data set without names are called
+        "keypoint 3" by their id.
+        """
+        names = {number: name for name, number in self.names.items()}
+        return ModelKeypoints(
+            tuple(
+                ModelKeypoint(names.get(number, f"keypoint {number}"), (0.0, 0.0, 0.0), number)
+                for number in self._table.all_ids.tolist()
+            )
+        )
+
+    def ids_of(self, names: Sequence[str]) -> IntArray:
+        """The semantic ids (n,) of keypoints by their names.
+
+        Capitals, and spaces for ``_`` and ``-``, don't count. Raises InputError if there is no
+        such name.
+        """
+        known = {plain_name(each.name): each.semantic_id for each in self.keypoints.keypoints}
+        unknown = [name for name in names if plain_name(name) not in known]
+        if unknown:
+            what = f"no model of the library has a keypoint {unknown[0]!r}"
+            raise InputError(what, where="ids", fix=f"it has {some_of(self.keypoints.names)}")
+        return np.array([known[plain_name(name)] for name in names], dtype=np.int64)
+
+    @property
     def with_mesh(self) -> int:
         """Number of models that have a mesh."""
         return len(self) - int(self._table.table["mesh"].null_count)
@@ -200,9 +275,10 @@ class Library:
         ----------
         points_2d : (n, 2) float
             Keypoints in the image [px]; integers are pixel centres.
-        ids : (n,) int
-            Semantic ids of the keypoints, without repetition. Ids differ by category: without
-            ``category`` each model reads them in its own category's sense.
+        ids : (n,) int or str
+            Semantic ids of the keypoints, or the library's names of them, without repetition. Ids
+            differ by category: without ``category`` each model reads them in its own category's
+            sense.
         camera : Camera
             The calibrated camera. Lens distortion is honoured. With ``shape`` it may lack a focal
             length, which is then estimated: ``match.camera`` has it.
@@ -241,6 +317,8 @@ class Library:
             chosen = RetrievalOptions(**options)
         except TypeError as error:
             raise InputError(f"unknown option ({error})", where="options") from None
+        if (labels := np.asarray(ids)).dtype.kind == "U":
+            ids = self.ids_of(labels.ravel().tolist())
         is_calibrated = not isinstance(camera, Camera) or camera.focal_known
         absent = None
         if shape is None:
@@ -264,4 +342,4 @@ class Library:
             observed = observe(points_2d, ids, camera, plain)
             candidates = gather_candidates(self._table, observed, plain, exclude, workers)
             ranking = rank_by_shape(self._table, candidates, observed, chosen, shapes)
-        return make_matches(self._table, candidates, observed, ranking, chosen.top, absent)
+        return make_matches(self._table, candidates, observed, ranking, chosen, absent)

@@ -14,7 +14,7 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Posterior, ViewResult
-from cadalign.geometry.alignment import Alignment, Box
+from cadalign.geometry.alignment import Alignment, Box, Uncertainty, deviation_text, uncertainty_of
 from cadalign.geometry.camera import Camera
 from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
@@ -66,6 +66,8 @@ class Match:
     takes the object for none of them."""
     camera: Camera | None = field(default=None, repr=False)
     """The camera of the image."""
+    posterior: Posterior = field(default_factory=Posterior, repr=False)
+    """The uncertainty of the pose and stretch, if this is the model; see `result`."""
 
     @classmethod
     def of(cls, model: LibraryModel, alignment: Alignment, **fit: Any) -> Match:
@@ -98,10 +100,24 @@ class Match:
         )
 
     @property
+    def std(self) -> Uncertainty | None:
+        """Standard deviations of pose and stretch; see `result`."""
+        found = self.posterior.covariance
+        return None if found is None else uncertainty_of(found)
+
+    @property
+    def stretch_texts(self) -> tuple[str, str]:
+        """The stretches along y and z with their standard deviations, as tables show them."""
+        std = (0.0, 0.0, 0.0) if self.std is None else self.std.scale
+        _, y, z = map("{:.3f}{}".format, self.alignment.scale, map(deviation_text, std))
+        return y, z
+
+    @property
     def result(self) -> Result:
         """The match in the form of every estimate: its pose, residuals, box, and JSON form.
 
-        It states no uncertainty; `cadalign.fit` of the keypoints does.
+        Its ``std`` is that of `cadalign.fit` of the keypoints or, in a ranking by shape, that of
+        the estimated shape, in the model's unit. A match by OpenCV's EPnP has none.
 
         Raises
         ------
@@ -110,11 +126,11 @@ class Match:
         """
         if self.camera is None:
             raise InputError("the match has no camera", where="camera", fix="retrieve it again")
-        ids, none = tuple(self.ids.tolist()), Posterior()
+        ids, own = tuple(self.ids.tolist()), self.posterior
         inliers = np.ones(self.shared, dtype=bool)
-        seen = (self.camera, self.alignment, ids, self.points_2d, self.residuals, inliers, none)
+        seen = (self.camera, self.alignment, ids, self.points_2d, self.residuals, inliers, own)
         return Result(
-            (ViewResult(*seen),), ids, self.points_3d, METHOD, none, own_bounds=self.bounds
+            (ViewResult(*seen),), ids, self.points_3d, METHOD, own, own_bounds=self.bounds
         )
 
     def observation(self, seen: Observation) -> Observation:
@@ -174,4 +190,6 @@ class Match:
             "mesh": None if self.mesh_path is None else str(self.mesh_path),
             "camera": None if self.camera is None else self.camera.to_dict(),
             "none_probability": self.none_probability,
+            "std": self.std
+            and {name: np.asarray(each).tolist() for name, each in vars(self.std).items()},
         }

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -17,6 +17,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
@@ -34,6 +35,7 @@ ModelKey = tuple[str, str]
 """Category name and model id."""
 
 _LARGEST = 1e50  # coordinate
+_NAMES = b"names"  # of the schema's metadata
 _AGAIN = "build it with: cadalign library build"
 SEAL = Seal(magic=b"cadalign library", version=1, noun="library file", fix=_AGAIN)
 SCHEMA = pa.schema(
@@ -125,10 +127,12 @@ class ModelTable:
         self.table = table.combine_chunks()
 
     @classmethod
-    def of(cls, models: Iterable[LibraryModel | AnnotatedModel]) -> ModelTable:
+    def of(
+        cls, models: Iterable[LibraryModel | AnnotatedModel], names: Mapping[str, int] | None = None
+    ) -> ModelTable:
         """Make a table; raises InputError if two models have the same category and id.
 
-        Models of a data set are read.
+        Models of a data set are read. The ``names`` are semantic ids by the keypoints' names.
         """
 
         def checked(model: object) -> LibraryModel:
@@ -139,7 +143,8 @@ class ModelTable:
             what = f"expected a LibraryModel or a data set's model, got {type(model).__name__}"
             raise InputError(what, where="models", fix="give the models of `cadalign.datasets`")
 
-        return cls.of_rows(row_of(checked(model)) for model in models)
+        made = cls.of_rows(row_of(checked(model)) for model in models)
+        return made if names is None else cls(made.table.replace_schema_metadata(_stored(names)))
 
     @classmethod
     def of_rows(cls, rows: Iterable[dict[str, Any]]) -> ModelTable:
@@ -188,6 +193,12 @@ class ModelTable:
         return _numbers(self._column("bounds").flatten()).reshape(-1, 2, 3)
 
     @cached_property
+    def names(self) -> dict[str, int]:
+        """Semantic ids by the keypoints' names; empty where they have none."""
+        stored = (self.table.schema.metadata or {}).get(_NAMES, b"{}")
+        return msgspec.json.decode(stored, type=dict[str, int])
+
+    @cached_property
     def all_ids(self) -> IntArray:
         """Semantic ids of all models, ascending."""
         return np.unique(self.ids)
@@ -226,7 +237,7 @@ class ModelTable:
     def payload(self) -> pa.Buffer:
         """All content, as the file of a library has it."""
         sink = pa.BufferOutputStream()
-        with pa.ipc.new_file(sink, SCHEMA) as writer:
+        with pa.ipc.new_file(sink, self.table.schema) as writer:
             writer.write_table(self.table)
         return sink.getvalue()
 
@@ -254,6 +265,10 @@ def row_of(model: LibraryModel) -> dict[str, Any]:
         "keypoints": model.xyz[order].tolist(),
         "semantic_ids": model.ids[order].tolist(),
     }
+
+
+def _stored(names: Mapping[str, int]) -> dict[bytes, bytes]:
+    return {_NAMES: msgspec.json.encode(names, order="deterministic")}
 
 
 def _numbers(array: Any) -> npt.NDArray[Any]:
@@ -290,7 +305,8 @@ def read_library(path: str | os.PathLike[str]) -> ModelTable:
         with pa.ipc.open_file(pa.BufferReader(pa.py_buffer(payload))) as reader:
             table = reader.read_all()
         _check_table(table)
-    except (pa.ArrowException, OSError, ValueError) as error:
+        _ = ModelTable(table).names
+    except (pa.ArrowException, OSError, ValueError, msgspec.MsgspecError) as error:
         raise SEAL.error(f"is invalid: {str(error)[:200]}", where) from None
     return ModelTable(table)
 

@@ -111,9 +111,9 @@ def none_text(matches: Sequence[Match]) -> str | None:
 
 
 def _card(rank: int, match: Match) -> str:
-    scale = match.alignment.scale
+    y, z = match.stretch_texts
     values = {
-        "stretch": f"y {scale[1]:.2f}, z {scale[2]:.2f}",
+        "stretch": f"y {y}, z {z}",
         "residuals": f"{match.rms:.2f} px",
         "shared keypoints": f"{match.shared} of {match.observed}",
         "log-likelihood": f"{match.log_likelihood:.1f}",

@@ -9,7 +9,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cadalign.arrays import IntArray
 from cadalign.errors import DataError, InputError
 from cadalign.io.documents import in_file
 from cadalign.io.files import once_per_file, time_of
@@ -53,6 +52,26 @@ class ObservationRetrieval:
         shapes = tuple((path, time_of(path)) for path in self.shape)
         return _opened_library(self.library), _opened_shapes(shapes)
 
+    def with_ids(self, seen: Observation, where: str) -> Observation:
+        """The observation with the library's semantic ids, by names where it has none itself.
+
+        Raises
+        ------
+        DataError
+            If the keypoints have neither, or there are none.
+        InputError
+            If the library has no such names.
+        """
+        if seen.ids is not None and len(seen.points_2d):
+            return seen
+        with in_file(where):
+            if not len(seen.points_2d):
+                raise DataError("there are no keypoints")
+            if seen.names is None:
+                fix = "give each the id, or the name, of the library's models for it"
+                raise DataError("the keypoints have no semantic_id and no name", fix=fix)
+            return replace(seen, ids=self.opened()[0].ids_of(seen.names))
+
     def retrieve(self, seen: Observation, where: str, *, workers: int = -1) -> list[Match]:
         """Rank the library's models by an observation, which messages call ``where``.
 
@@ -61,13 +80,14 @@ class ObservationRetrieval:
         Raises
         ------
         CadalignError
-            As for `Library.retrieve`; or if the keypoints have no semantic ids.
+            As for `Library.retrieve`; or if the keypoints have neither semantic ids nor names.
         """
         if seen.others:
             said = "%s: models are ranked by the first of its %d photos alone"
             logger.warning(said, where, len(seen.views))
         library, shape = self.opened()
-        camera, ids = seen.camera, _semantic_ids(seen, where)
+        camera, ids = seen.camera, self.with_ids(seen, where).ids
+        assert ids is not None
         if shape is None and not camera.focal_known:
             what = "the focal length is unknown, without which no model's pose is searched"
             fix = "rank by --shape, which estimates it, or give a calibrated camera"
@@ -111,25 +131,3 @@ def _opened_shapes(
         twice = next(name for name in names if names.count(name) > 1)
         raise InputError(f"two files of the category {twice!r}", where="--shape")
     return by_category
-
-
-def read_query(path: Path) -> Observation:
-    """Read an observation file for retrieval.
-
-    The format is that of `cadalign.io.observation`, but keypoints must have a ``semantic_id`` and
-    may lack ``xyz``, which is zero in the returned observation and not used.
-    """
-    query = Observation.load(path, needs_xyz=False)
-    _semantic_ids(query, str(path))
-    return query
-
-
-def _semantic_ids(query: Observation, where: str) -> IntArray:
-    if not len(query.points_2d):
-        with in_file(where):
-            raise DataError("there are no keypoints")
-    if query.ids is None:
-        fix = "give each the id of the library's models for it"
-        with in_file(where):
-            raise DataError("the keypoints have no semantic_id", fix=fix)
-    return query.ids

@@ -14,9 +14,9 @@ the number of threads.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import cast
 
@@ -29,6 +29,8 @@ from cadalign.errors import DegenerateError, InputError, quote, require_kind
 from cadalign.estimation.fit import fit_batch
 from cadalign.estimation.options import LOSSES, Sigma
 from cadalign.estimation.problems import rays_of, whitening_of
+from cadalign.estimation.result import Result
+from cadalign.estimation.result_parts import Posterior
 from cadalign.estimation.uncertainty.residuals import bent
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, faced, turned_alignment
@@ -37,6 +39,7 @@ from cadalign.retrieval.kernels import LEAST_SHARED, Candidates, Query, bound_al
 from cadalign.retrieval.match import Match
 from cadalign.retrieval.models import ModelKey, ModelTable, check_semantic_ids
 from cadalign.retrieval.options import RetrievalOptions
+from cadalign.retrieval.precision import posterior_by_shape, posterior_of_keypoints
 from cadalign.solvers.constants import POSE_SIZE
 
 _BOUNDED_AT_ONCE = 1024  # candidates that a thread bounds at a time
@@ -95,6 +98,7 @@ class Ranking:
     log_likelihoods: FloatArray  # (m,)
     scores: FloatArray  # (m,), probabilities of the models
     searched: int  # number of candidates that were searched for a pose
+    shapes: Mapping[str, Result] = field(default_factory=dict)  # estimated ones, by category
 
 
 def observe(
@@ -355,17 +359,26 @@ def make_matches(
     candidates: CandidateSet,
     observed: Observed,
     ranking: Ranking,
-    top: int,
+    options: RetrievalOptions,
     none_probability: float | None,
 ) -> list[Match]:
     """Make matches of the first models of a ranking."""
     matches = []
-    for place, candidate in enumerate(ranking.candidates[:top].tolist()):
+    for place, candidate in enumerate(ranking.candidates[: options.top].tolist()):
         points_3d, rows = shared_keypoints(candidates, observed, candidate)
         model = table.model(int(candidates.models[candidate]))
         found = Alignment.from_packed(ranking.poses[place])
         alignment = turned_alignment(found, observed.facing.lens_from_camera)
         residuals = observed.camera.project(alignment.apply(points_3d)) - observed.points_2d[rows]
+        if model.category in ranking.shapes:
+            shape = ranking.shapes[model.category]
+            posterior = posterior_by_shape(shape, alignment, options.fitting)
+        elif options.method == "optimal":
+            fitting = replace(options.fitting, sigma=observed.covariances[rows])
+            given = points_3d, residuals, alignment, observed.camera
+            posterior = posterior_of_keypoints(*given, fitting)
+        else:
+            posterior = Posterior()
         match = Match.of(
             model,
             alignment,
@@ -379,6 +392,7 @@ def make_matches(
             missing_ids=tuple(np.delete(observed.query.ids, rows).tolist()),
             none_probability=none_probability,
             camera=observed.camera,
+            posterior=posterior,
         )
         matches.append(match)
     return matches

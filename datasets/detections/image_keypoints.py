@@ -234,7 +234,7 @@ def join_keypoints(
     if unknown and not ignore_unknown:
         labels = found.names or found.ids or range(len(found))
         what = f"the model has no keypoint {labels[unknown[0]]!r}"
-        fix = f"it has {_some(model.names)}; ignore_unknown leaves out what it has not"
+        fix = f"it has {some_of(model.names)}; ignore_unknown leaves out what it has not"
         raise DataError(what, where=found.source, fix=fix)
     if sigma_from_scores is not None and not 0 < sigma_from_scores < np.inf:
         raise InputError(f"{sigma_from_scores} is not positive", where="sigma_from_scores")
@@ -246,7 +246,7 @@ def join_keypoints(
             raise DataError(what, where=found.source, fix="leave one of them out")
     if not pairs:
         what = f"none of {len(found)} keypoints is found in the image and on the model"
-        raise DataError(what, where=found.source, fix=f"the model has {_some(model.names)}")
+        raise DataError(what, where=found.source, fix=f"the model has {some_of(model.names)}")
     rows, columns = [row for row, _ in pairs], [place for _, place in pairs]
     ids = [model.ids[place] for place in columns]
     scores = None if found.scores is None else found.scores[rows]
@@ -289,5 +289,6 @@ def plain_name(name: str) -> str:
     return " ".join(name.casefold().replace("_", " ").replace("-", " ").split())
 
 
-def _some(names: Sequence[str]) -> str:
+def some_of(names: Sequence[str]) -> str:
+    """The first of some names, for a message."""
     return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")

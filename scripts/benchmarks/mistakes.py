@@ -11,7 +11,6 @@ from benchmarks.section import BenchmarkData, Row, Tables, percent, seen_in
 from cadalign import CadalignError, Model, RansacOptions, Result, View, align, fit
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
-from cadalign.estimation.warning import UNDETERMINED_KINDS
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.geometry.pixels import PIXEL_CENTRE
 from cadalign.geometry.rotations import angle_between
@@ -121,7 +120,7 @@ def _said(seen: SeenModel, shape_sigma: float) -> tuple[bool, bool, bool, bool]:
         found = _estimate(seen, shape_sigma)
     except CadalignError as error:
         return False, any(each in str(error) for each in _CLAUSES), True, False
-    kinds = {warning.kind for warning in found.warnings} - UNDETERMINED_KINDS
+    kinds = {warning.kind for warning in found.warnings} - {"focal"}
     turn = angle_between(found.alignment.rotation, seen.rotation)
     square, count = (found.residuals**2).sum() / _NOISE_PX**2, found.residuals.size
     fits = found.inliers.all() and square < chi2.isf(0.01, max(count - UNKNOWNS, 1))

@@ -65,7 +65,9 @@ def test_a_generator_becomes_results_in_its_order(tmp_path: Path) -> None:
             np.testing.assert_allclose(found.rms[number], expected.rms)
             assert single.warnings == expected.warnings
     frame = again.to_dataframe()
-    assert frame["solved"].all()
+    assert (frame["status"] == "ok").all()
+    table = pq.read_table(tmp_path / "run" / "results.parquet")
+    assert frame.columns.tolist() == [name for name in table.column_names if name in frame]
     assert frame["keypoints"].tolist() == [8] * 5
 
 

@@ -88,16 +88,21 @@ def test_a_folder_that_cannot_be_written_is_one_line(
     )
 
 
-def test_a_photo_that_cannot_be_read_is_a_warning_of_its_row(tmp_path: Path) -> None:
+def test_a_photo_that_cannot_be_read_is_a_warning_of_its_row(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "broken.png").write_bytes(b"no photo")
     source = lines(tmp_path / "o.jsonl", 2, image="broken.png")
     assert main(["fit", str(source), "--out", str(tmp_path / "run")]) == 0
+    said, counted = capsys.readouterr().err.splitlines()[:2]
+    assert said == "2 with warnings: picture 2"
+    assert counted.startswith("2 of 2 aligned, 0 failed: ")
     for row in rows_of(tmp_path / "run"):
         assert (row["warning_count"], row["warning_kinds"]) == (1, "picture")
         assert "the photo is not shown: " in row["warnings"]
         assert "broken.png" in row["warnings"]
     page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
-    assert "; warnings: 2 picture" in page
+    assert "; 2 with warnings: picture 2" in page
 
 
 def test_a_mask_that_cannot_be_read_fails_its_row_alone(tmp_path: Path) -> None:

@@ -12,7 +12,18 @@ import pytest
 from cadalign.cli import main
 
 PATHS = (
-    *("demo", "fit", "observe", "annotate", "retrieve", "report", "export", "render", "doctor"),
+    *(
+        "demo",
+        "sample",
+        "fit",
+        "observe",
+        "annotate",
+        "retrieve",
+        "report",
+        "export",
+        "render",
+        "doctor",
+    ),
     *("library build", "library show", "shape learn", "shape show"),
     *("evaluate keypointnet", "evaluate unseen", "evaluate photos"),
     *("evaluate correspondences", "evaluate retrieval"),

@@ -7,10 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cadalign.errors import InputError
+from cadalign.evaluation.metrics.photos import degree_cm
+from cadalign.evaluation.metrics.scan2cad import scan2cad_errors
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.metrics import rotation_error
 from cadalign.geometry.rotations import nearest_rotation
-from cadalign.geometry.symmetry import Symmetry, SymmetryAxis, symmetric_rotation_error
+from cadalign.geometry.symmetry import Symmetry, SymmetryAxis
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -50,11 +52,11 @@ def test_axes_are_taken_in_steps_with_every_discrete_motion():
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(5))
 def test_the_error_about_an_axis_is_the_least_over_all_angles(seed):
-    rng = np.random.default_rng(seed)
-    direction = rng.normal(size=3)
-    symmetry = Symmetry(FLIP[None], (SymmetryAxis(direction, rng.normal(size=3)),))
+    """Flips turn the axis round, so that all motions are those about it, after a flip or none."""
+    direction = np.array([0.0, *np.random.default_rng(seed).normal(size=2)])
+    symmetry = Symmetry(FLIP[None], (SymmetryAxis(direction, np.zeros(3)),))
     est, gt = pose(Rotation.random(random_state=seed)), pose(Rotation.random(random_state=seed + 9))
-    exact = symmetric_rotation_error(est=est, gt=gt, symmetry=symmetry)
+    exact = rotation_error(est=est, gt=gt, symmetry=symmetry)
     tried = [
         rotation_error(est=est, gt=Alignment(gt.rotation @ motion[:3, :3], [0, 0, 1], [1, 1, 1]))
         for motion in symmetry.poses(max_step=0.002)
@@ -63,12 +65,22 @@ def test_the_error_about_an_axis_is_the_least_over_all_angles(seed):
     assert exact == pytest.approx(min(tried), abs=0.01)
 
 
-def test_without_symmetry_it_is_the_rotation_error():
+def test_the_error_is_the_least_over_all_turns():
     est, gt = pose(Rotation.from_euler("y", 25, degrees=True)), pose(Rotation.identity())
-    assert symmetric_rotation_error(est=est, gt=gt, symmetry=Symmetry.none()) == pytest.approx(25)
+    assert rotation_error(est=est, gt=gt, symmetry=Symmetry.none()) == pytest.approx(25)
     # 25 deg is 25 from 0 and 20 from 45, of the rotations by 0, 45, 90, ... deg.
     eight = Symmetry.around((0, 1, 0), fold=8)
-    assert symmetric_rotation_error(est=est, gt=gt, symmetry=eight) == pytest.approx(20)
+    assert rotation_error(est=est, gt=gt, symmetry=eight) == pytest.approx(20)
+
+
+def test_no_turn_of_a_ball_is_an_error_by_any_metric():
+    """Two axes make every rotation, also those that no turn about one of them reaches."""
+    axes = tuple(SymmetryAxis(np.eye(3)[row], np.zeros(3)) for row in (0, 1))
+    turned = {"est": pose(Rotation.random(random_state=1)), "gt": pose(Rotation.identity())}
+    ball = Symmetry(np.empty((0, 4, 4)), axes)
+    assert rotation_error(**turned, symmetry=ball) == pytest.approx(0, abs=1e-5)
+    assert scan2cad_errors(**turned, symmetry=ball).rotation_deg == pytest.approx(0, abs=1e-5)
+    assert degree_cm(**turned, symmetry=ball, metres=1)[0] == pytest.approx(0, abs=1e-5)
 
 
 def test_what_is_no_motion_is_refused():

@@ -114,6 +114,18 @@ def test_the_alignment_is_the_optimum_that_fit_finds() -> None:
         np.testing.assert_allclose(best.alignment.scale, fitted.alignment.scale, rtol=1e-6)
 
 
+@pytest.mark.parametrize("camera", [CAMERA, FISHEYE], ids=["pinhole", "fisheye"])
+@pytest.mark.parametrize("loss", ["linear", "cauchy"])
+def test_a_match_states_the_deviations_that_a_fit_does(camera: Camera, loss: str) -> None:
+    pixels = view(MODELS[1], pose_of(1), noise_px=2.0, camera=camera)
+    options: dict[str, Any] = {"sigma": 2.0, "loss": loss}
+    best = LIBRARY.retrieve(pixels, IDS, camera, **options)[0]
+    fitted = fit(MODELS[1].xyz, pixels, camera, stretch_sigma=0.4, **options)
+    np.testing.assert_allclose(best.result.covariance, fitted.covariance, rtol=0.01, atol=1e-7)
+    assert best.result.uncertain == fitted.uncertain
+    assert best.stretch_texts[0].endswith(f" +- {100 * fitted.std.scale[1]:.2g} %")
+
+
 def test_the_log_likelihood_is_what_the_documentation_says() -> None:
     """Of a model that lacks keypoints of the image, and has some which the image lacks."""
     model = make_model(5, ids=(0, 1, 2, 3, 4, 5, 8, 9))

@@ -66,6 +66,19 @@ def first(model: LibraryModel, library: Library = LIBRARY, **options: Any) -> An
     return library.retrieve(seen(model, 1.0), model.ids, CAMERA, **options)[0]
 
 
+def test_a_match_by_shape_has_the_deviations_of_the_shape() -> None:
+    """In the unit of the matched model, whose length along x is held."""
+    model, options = OBJECTS[0], {"ids": OBJECTS[0].ids.tolist(), "sigma": 1.0}
+    of_shape = align(SHAPE, View(CAMERA, seen(model, 1.0), **options))
+    best = first(model)
+    assert of_shape.covariance is not None
+    x, y = of_shape.covariance[6:8, 6:8]
+    assert best.std.scale[0] == 0
+    assert best.std.scale[1] == pytest.approx(np.sqrt(x[0] + y[1] - 2 * x[1]), rel=1e-6)
+    assert best.std.rotation_deg == pytest.approx(of_shape.std.rotation_deg, rel=1e-6)
+    assert 0 < best.std.translation[2] < 0.2 * best.alignment.translation[2]
+
+
 def test_a_wide_lens_ranks_what_is_beside_it() -> None:
     camera = Camera(900, 900, 250.0, 250.0, 449.5, 449.5, (0.01, -0.003, 0, 0), lens="fisheye")
     pose = Alignment(POSE.rotation, [1.2, 0.2, -0.1], POSE.scale)

@@ -22,7 +22,6 @@ from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA as CAMERA
 from cadalign.io.observation import Observation
 from cadalign.render import Frame, RaycastRenderer, Scene, look_at
 from cadalign.retrieval.page import draw_match, write_retrieval
-from cadalign.retrieval.query import read_query
 
 
 @dataclass(frozen=True)
@@ -132,7 +131,8 @@ def test_a_table_of_the_matches_is_printed(case: Case, capsys: pytest.CaptureFix
     assert lines[0].split()[:3] == ["category", "model", "score"]
     assert len(lines) == 5
     assert lines[2].split()[:4] == ["1", "chair", case.model_id, "100.0"]
-    assert lines[2].split()[-4:-2] == [f"{matches[0].rms:.2f}", "13/13"]
+    assert f"{matches[0].rms:.2f}  13/13" in lines[2].replace("   ", "  ")
+    assert all(text in lines[2] for text in matches[0].stretch_texts)
     assert not any("IoU" in line for line in lines)
 
 
@@ -308,20 +308,28 @@ def test_names_are_escaped(case: Case, tmp_path: Path) -> None:
 # --- refusals --------------------------------------------------------------------------------
 
 
-def test_a_query_needs_no_model_points_but_semantic_ids(case: Case, tmp_path: Path) -> None:
+def test_a_query_needs_no_model_points_but_ids_or_names(
+    case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     data = json.loads((case.folder / "seen.json").read_text())
     for keypoint in data["keypoints"]:
         del keypoint["xyz"]
     data["image"] = None if "image" not in data else str(case.folder / "photo.png")
-    query = read_query(Path(write_json(tmp_path / "bare.json", data)))
-    np.testing.assert_array_equal(query.points_2d, case.observation.points_2d)
-    np.testing.assert_array_equal(query.ids, case.observation.ids)
+    path, options = str(write_json(tmp_path / "bare.json", data)), case.arguments[1:]
+    assert main(["retrieve", path, *options]) == 0
+    whole = capsys.readouterr().out
+    assert main(["retrieve", *case.arguments]) == 0
+    assert capsys.readouterr().out == whole
     for keypoint in data["keypoints"]:
-        del keypoint["semantic_id"]
-    with pytest.raises(
-        DataError, match=r"bare\.json: the keypoints have no semantic_id; give each"
-    ):
-        read_query(Path(write_json(tmp_path / "bare.json", data)))
+        keypoint["name"] = f"Keypoint_{keypoint.pop('semantic_id')}"
+    write_json(Path(path), data)
+    assert main(["retrieve", path, *options]) == 0
+    assert capsys.readouterr().out == whole
+    for keypoint in data["keypoints"]:
+        del keypoint["name"]
+    write_json(Path(path), data)
+    line = refusal_line(capsys, "retrieve", path, *options)
+    assert f"{path}: the keypoints have no semantic_id and no name; give each" in line
 
 
 def test_malformed_queries_are_refused(

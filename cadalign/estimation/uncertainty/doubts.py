@@ -1,4 +1,4 @@
-"""Warnings of an estimate: what its evidence leaves open, other poses, keypoints off the image."""
+"""Warnings of an estimate: nothing that tests it, other poses, keypoints off the image."""
 
 from __future__ import annotations
 
@@ -9,18 +9,15 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.estimation.focal import focal_doubt
-from cadalign.estimation.result_parts import Diagnosis, FittedKeypoints, uncertainty_of
+from cadalign.estimation.result_parts import Diagnosis, FittedKeypoints
 from cadalign.estimation.uncertainty.residuals import chance_of
-from cadalign.estimation.warning import EstimateWarning, Kind, Warnings
+from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PIXEL_CENTRE
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.shapes.parts import probability_within
 
-UNDETERMINED = 1.0
-"""Relative standard deviation beyond which a length, distance or focal length is undetermined."""
-UNDETERMINED_ROTATION_DEG = 30.0
 OTHER_SIZES = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2.0, 3.0, 4.0)
 """Usual sizes of other images of a photo, over that of its camera."""
 FALSE_ALARMS = 0.004
@@ -29,10 +26,8 @@ _LARGE = 0.02  # estimated sigma, over the keypoints' extent, that is large
 _LARGEST_SHARE = 0.45  # of the keypoints' spread, of an estimated sigma
 _FAR_FROM_MIDDLE = 0.3  # of an image's size, from its middle to a principal point
 _SAME_MIDDLE = 0.02  # of an image's size, from its middle to a principal point taken for it
-_LEAST_GAIN = 0.9  # of a standard deviation, relative to that of the prior alone
+_LEAST_GAIN = 0.9  # of a standard deviation, relative to that of any rotation
 _ANY_ROTATION = math.sqrt(math.pi**2 / 3 + 2)  # standard deviation of uniform rotations [rad]
-_THIN = 0.1  # spread along an axis over the largest that counts as nearly a plane
-_END_ON = math.cos(math.radians(15.0))
 _ANOTHER_DEG = 10.0
 _LEAST_TURN = 1e-12  # [rad], and of a relative variance
 _REGION = 0.95  # probability of the stated region, which alternatives outside of it contradict
@@ -41,7 +36,7 @@ _REGION = 0.95  # probability of the stated region, which alternatives outside o
 def keypoint_warnings(
     fitted: FittedKeypoints, covariance: FloatArray | None, diagnosis: Diagnosis | None
 ) -> Warnings:
-    """Warnings about the cause of a misfit, and what the keypoints do not determine."""
+    """Warnings about the cause of a misfit, and what deviations do not say."""
     cause = None if diagnosis is None or _fit(fitted) else diagnosis(fitted)
     observed = fitted.observed[np.isfinite(fitted.residuals).all(axis=1)]
     fits = cause is None
@@ -65,8 +60,6 @@ def keypoint_warnings(
     if options.focal == "estimate":
         doubt = focal_doubt(fitted.camera, options.focal_prior)
         found += () if doubt is None else (doubt,)
-    prior = options.stretch_sigma
-    found += weaknesses(fitted.alignment, covariance, keypoints=kept, stretch_sigma=prior)
     # Likelihoods tell nothing where keypoints do not fit, or others than these were rejected.
     if fits and fitted.search is None:
         poses = [(each.alignment, each.relative_likelihood) for each in fitted.alternatives]
@@ -80,65 +73,6 @@ def _fit(fitted: FittedKeypoints) -> bool:
     if fitted.options.sigma is None:
         return not is_large_sigma(fitted.sigma or 0.0, [fitted.observed[fitted.inliers]])
     return chance_of(fitted.cost, fitted.redundancy) >= FALSE_ALARMS
-
-
-@np.errstate(all="ignore")  # lengths that overflow are of translations known well enough
-def weaknesses(
-    alignment: Alignment,
-    covariance: FloatArray,
-    *,
-    lengths: FloatArray | None = None,
-    keypoints: FloatArray | None = None,
-    stretch_sigma: float | None = None,
-) -> Warnings:
-    """Warn about lengths, motion and focal length that are not determined.
-
-    What is open of one of the object's ``lengths`` (3,) counts relative to all. If ``keypoints``
-    (n, 3) are all evidence, the reason is said, and the rotation counts. Two scales that are open
-    together, whose ratio is not, are none then: one image leaves size and distance open, and the
-    deviations of both say so. Beside a prior on the scales keypoints must determine them better
-    than it does.
-    """
-    warnings, std = [], uncertainty_of(covariance)
-
-    def warn(kind: Kind, what: str, to: str) -> None:
-        warnings.append(EstimateWarning(kind, f"{what} is known only to +-{to}"))
-
-    if std.focal > UNDETERMINED:
-        warn("focal", "the focal length", percent(std.focal))
-    most = min(UNDETERMINED, _LEAST_GAIN * (stretch_sigma or math.inf))
-    shares = np.ones(3) if lengths is None else lengths / np.linalg.norm(lengths)
-    is_open = np.flatnonzero(np.multiply(std.scale, shares) > most).tolist()
-    if keypoints is None or len(is_open) == 1 or _ratio_deviation(covariance, is_open) > most:
-        for axis in is_open:
-            name, to = "xyz"[axis], percent(std.scale[axis])
-            if keypoints is None:
-                warn("scale", f"the length along {name}", to)
-            else:
-                warn("scale", f"s_{name}", to + _why_scale_is_open(keypoints, alignment, axis))
-    if keypoints is not None and std.rotation_deg > UNDETERMINED_ROTATION_DEG:
-        warn("rotation", "the rotation", f"{std.rotation_deg:.2g} deg")
-    share = float(np.linalg.norm(std.translation) / np.linalg.norm(alignment.translation))
-    if share > UNDETERMINED and not is_open and std.focal <= UNDETERMINED:
-        warn("translation", "the distance", percent(share))
-    return tuple(warnings)
-
-
-def _ratio_deviation(covariance: FloatArray, axes: Sequence[int]) -> float:
-    if len(axes) < 2:
-        return 0.0
-    logs = np.zeros(len(covariance))
-    logs[[6 + axes[0], 6 + axes[1]]] = 1.0, -1.0
-    return math.sqrt(max(float(logs @ covariance @ logs), 0.0))
-
-
-def _why_scale_is_open(points_3d: FloatArray, alignment: Alignment, axis: int) -> str:
-    name, spread, center = "xyz"[axis], points_3d.std(axis=0), points_3d.mean(axis=0)
-    if spread[axis] < _THIN * spread.max():
-        return f": the keypoints lie nearly in the plane {name} = {center[axis]:.3g}"
-    ray = alignment.apply(center[None])[0]
-    cosine = abs(ray @ alignment.rotation[:, axis]) / np.linalg.norm(ray)
-    return f": the model's {name} axis is seen nearly end-on" if cosine > _END_ON else ""
 
 
 def percent(fraction: float) -> str:

@@ -16,10 +16,9 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import Uncertainty
 from cadalign.estimation.warning import Warnings
 from cadalign.evaluation.runs.work import Columns, Outcome
-from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.alignment import Alignment, Uncertainty
 from cadalign.geometry.camera import Camera
 
 RECORD_COLUMNS: Columns = (("category", str), ("model_id", str), ("view", int), ("exhibit", str))

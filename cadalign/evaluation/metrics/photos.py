@@ -25,8 +25,8 @@ from cadalign.evaluation.metrics.errors import overlap_up_to_scale
 from cadalign.evaluation.runs.work import Columns, Row
 from cadalign.evaluation.summary import Group, known, medians
 from cadalign.geometry.alignment import Alignment, Box
-from cadalign.geometry.metrics import box_iou
-from cadalign.geometry.symmetry import Symmetry, symmetric_rotation_error
+from cadalign.geometry.metrics import box_iou, rotation_error
+from cadalign.geometry.symmetry import Symmetry
 
 if TYPE_CHECKING:
     from cadalign.evaluation.photos.target import PhotoTarget
@@ -114,6 +114,11 @@ def numbers(cells: Cells, metric: Metric) -> Any:
     return cells[metric.key].astype(float)
 
 
+def model_rotation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry) -> float:
+    """Rotation error [degrees] over all of a model's symmetries: protocols know no stretch."""
+    return rotation_error(est=est, gt=replace(gt, scale=np.ones(3)), symmetry=symmetry)
+
+
 # PASCAL3D+ ----------------------------------------------------------------------------------------
 
 ACCURACY_DEG = 30.0
@@ -125,7 +130,7 @@ ACCURACY = metrics.rate("accuracy_pi_6", "accuracy at pi/6", "Acc pi/6")
 
 
 def _measure_viewpoint(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
-    error = symmetric_rotation_error(est=est, gt=gt, symmetry=target.found.symmetry)
+    error = model_rotation_error(est=est, gt=gt, symmetry=target.found.symmetry)
     return {ROTATION.key: error}
 
 
@@ -168,7 +173,7 @@ def degree_cm(
     ``metres`` is the length of one unit of the camera frame [m].
     """
     gap = float(np.linalg.norm(est.translation - gt.translation))
-    degrees = symmetric_rotation_error(est=est, gt=gt, symmetry=symmetry)
+    degrees = model_rotation_error(est=est, gt=gt, symmetry=symmetry)
     return degrees, 100 * metres * gap
 
 

@@ -14,11 +14,11 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.evaluation import metrics
 from cadalign.evaluation.metrics import Metric
-from cadalign.evaluation.metrics.photos import MetricSet
+from cadalign.evaluation.metrics.photos import MetricSet, model_rotation_error
 from cadalign.evaluation.runs.work import Row
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.metrics import scale_error
-from cadalign.geometry.symmetry import Symmetry, symmetric_rotation_error
+from cadalign.geometry.symmetry import Symmetry
 
 if TYPE_CHECKING:
     from cadalign.evaluation.photos.target import PhotoTarget
@@ -74,7 +74,7 @@ def scan2cad_errors(
     gap = est.apply([point])[0] - gt.apply([point])[0]
     return Scan2CadErrors(
         translation=float(np.linalg.norm(gap)),
-        rotation_deg=symmetric_rotation_error(est=est, gt=gt, symmetry=symmetry),
+        rotation_deg=model_rotation_error(est=est, gt=gt, symmetry=symmetry),
         scale=float(np.abs(np.mean(est.scale / gt.scale) - 1)),
         scale_axes=scale_error(est=est, gt=gt),
     )

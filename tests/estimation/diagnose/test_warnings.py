@@ -15,10 +15,7 @@ from support.problems import problem_of
 
 from cadalign import Alignment, Camera, Model, Result, ShapeModel, View, align, fit
 from cadalign.datasets import KeypointNet
-from cadalign.estimation.uncertainty.doubts import (
-    another_pose,
-    weaknesses,
-)
+from cadalign.estimation.uncertainty.doubts import another_pose
 from cadalign.estimation.warning import Warnings
 from cadalign.geometry.rotations import angle_between, rotation_from_vector
 from cadalign.shapes.examples import Example
@@ -36,13 +33,6 @@ def with_other(angle_deg: float, share: float, own_deg: float = 2.0) -> Warnings
     covariance = np.zeros((9, 9))
     covariance[:3, :3] = np.radians(own_deg) ** 2 * np.eye(3) + share * np.outer(turn, turn)
     return another_pose(POSE, [(other, share / (1 - share))], covariance)
-
-
-def deviations(logs: np.ndarray) -> np.ndarray:
-    """A covariance (9, 9) with that of the log lengths (3, 3)."""
-    covariance = 1e-6 * np.eye(9)
-    covariance[6:, 6:] += logs
-    return covariance
 
 
 def test_a_warning_prints_as_its_text_and_is_stored_with_its_kind() -> None:
@@ -79,24 +69,6 @@ def test_poses_that_are_concealed_together_are_one_warning() -> None:
     (found,) = another_pose(POSE, [(poses[0], 0.04), (poses[1], 0.04)], covariance)
     assert found.text.startswith("other poses, the likeliest 1")
     assert "7 %" in found.text
-
-
-def test_the_thickness_of_a_flat_object_is_not_warned_of() -> None:
-    covariance = deviations(np.diag([0.01, 0.01, 2.0**2]))
-    assert weaknesses(POSE, covariance, lengths=np.array([0.4, 0.9, 0.02])) == ()
-    (found,) = weaknesses(POSE, covariance, lengths=np.array([0.4, 0.9, 0.8]))
-    assert found.text == "the length along z is known only to +-200 %"
-
-
-def test_a_size_that_one_image_leaves_open_is_not_warned_of() -> None:
-    """Scales that are open together, as those of a knife whose known axis is thin."""
-    points = np.random.default_rng(0).normal(size=(8, 3)) * [0.01, 1, 1]
-    common = np.array([0.0, 1.5, 1.5])
-    together = deviations(np.outer(common, common))
-    assert weaknesses(POSE, together, keypoints=points) == ()
-    apart = deviations(np.diag(common**2))
-    found = weaknesses(POSE, apart, keypoints=points)
-    assert [each.text[:3] for each in found] == ["s_y", "s_z"]
 
 
 def test_keypoints_beyond_their_sigma_are_warned_of_beside_other_evidence() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,25 +13,21 @@ from support.problems import fit_problem, problem_of
 
 from cadalign import Alignment, FocalPrior, Result
 from cadalign.errors import InputError
-from cadalign.estimation.assemble import KeypointPosterior
-from cadalign.estimation.options import FitOptions
 from cadalign.estimation.result_parts import (
     Alternative,
     FitStats,
-    FittedKeypoints,
     Posterior,
     ViewResult,
-    quickly,
 )
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.evaluation.simulation import SIMULATION_CAMERA
 
 COVARIANCE = np.diag([1e-4, 1e-4, 1e-4, 0.0004, 0.0009, 0.01, 0, 0.0001, 0.0225])
-WARNING = "s_z is known only to +-15 %"
+WARNING = "another pose is likely"
 STATED = Posterior(
     COVARIANCE,
     fisher_covariance=COVARIANCE,
-    warnings=(EstimateWarning("scale", WARNING),),
+    warnings=(EstimateWarning("alternative", WARNING),),
 )
 POINTS = np.array([[0.0, 0, 1], [1, 0, -1], [0, 1, 1], [1, 1, 1], [1, 0, 1], [0, 0, -1]])
 POSE = Alignment(
@@ -69,7 +66,7 @@ def test_text_of_a_result() -> None:
         "  translation  (0.5, -0.25, 6) +- (0.02, 0.03, 0.1)\n"
         "  stretch      (1, 0.75 +- 1 %, 1.25 +- 15 %)\n"
         "  also likely  (0.12 x): scale (1, 2, 0.5)\n"
-        "  warning      s_z is known only to +-15 %"
+        "  warning      another pose is likely"
     )
 
 
@@ -155,14 +152,21 @@ def test_malformed_json_is_refused(text: str, expected: str) -> None:
     assert str(caught.value).startswith(expected)
 
 
-def test_warnings_look_at_the_inliers_alone() -> None:
+def test_what_is_uncertain_has_a_line_with_its_reason_and_no_warning() -> None:
+    """Standard deviations of 1.5 and of 1.7 in 6; the reason is that of the inliers alone."""
     in_plane = POINTS * [1, 1, 0] + [0, 0, 0.25]
-    points, inliers = np.vstack([in_plane, [[0.5, 0.5, 3.0]]]), np.array([True] * 6 + [False])
-    options = FitOptions()
-    fitted = FittedKeypoints(
-        points, np.zeros((7, 2)), inliers, POSE, SIMULATION_CAMERA, options, 1.0, COVARIANCE
-    )
-    known = {"keypoints": fitted, "diagnosis": None, "covariance": 100 * COVARIANCE}
-    posterior = quickly(KeypointPosterior, known)
-    text = "s_z is known only to +-150 %: the keypoints lie nearly in the plane z = 0.25"
-    assert posterior.warnings == (EstimateWarning("scale", text),)
+    off = np.vstack([in_plane[:5], [[0.5, 0.5, 3.0]]])
+    stated = Posterior(100 * COVARIANCE)
+    near: list[list[float]] = [[0.0, 0.0]] * 6
+    result = replace(made(near, [True] * 5 + [False], stated), points_3d=off)
+    assert result.uncertain == ("s_z",)
+    assert result.warnings == ()
+    text = str(result)
+    assert "  stretch      (1, 0.75 +- 10 %, 1.25 (not determined))\n" in text
+    assert "  uncertain    s_z (the keypoints lie nearly in the plane z = 0.25)" in text
+    rough = replace(result, posterior=Posterior(1e7 * COVARIANCE))
+    rough = replace(rough, views=(replace(rough.views[0], posterior=rough.posterior),))
+    assert rough.uncertain == ("s_y", "s_z", "distance", "rotation")
+    assert "  rotation     60 deg from the camera's axes, not determined\n" in str(rough)
+    assert "  translation  (0.5, -0.25, 6) (not determined)\n" in str(rough)
+    assert "e+" not in str(rough)

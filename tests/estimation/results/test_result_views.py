@@ -88,14 +88,30 @@ def test_batch_as_data_frame_has_a_row_for_each_problem() -> None:
     flat = CORNERS * [1.0, 1.0, 0.0]
     batch = cadalign.fit_batch([CORNERS, flat[:4]], [SEEN, SEEN[:4]], CAMERA, method="aepnp")
     frame = batch.to_dataframe()
-    assert frame.solved.tolist() == [True, False]
-    assert frame.keypoints.tolist() == [8, 0]
-    assert frame.inliers.tolist() == [8, 0]
-    assert frame.error[0] == ""
-    assert "6" in frame.error[1]
-    rotation = frame.loc[0, ["rotation_x", "rotation_y", "rotation_z"]].to_numpy(dtype=float)
-    assert abs(np.linalg.norm(rotation) - 180) < 10
+    assert frame.status.tolist() == ["ok", "failed"]
+    assert (frame.keypoints[0], frame.inliers[0]) == (8, 8)
+    assert frame.reason[0] == ""
+    assert "6" in frame.reason[1]
+    assert abs(frame.qw[0]) < 0.1  # half a turn
     assert np.isnan(frame.scale_y[1])
+
+
+def test_data_frame_states_deviations_and_what_is_warned_of() -> None:
+    """Of 4 keypoints nothing tests the fit; of a plane across the ray a stretch is open."""
+    flat = CORNERS * [1, 1, 1e-3]
+    seen = CAMERA.project(POSE.apply(flat))
+    results = cadalign.fit_batch([CORNERS[[0, 1, 2, 4]], flat], [SEEN[[0, 1, 2, 4]], seen], CAMERA)
+    frame = results.to_dataframe()
+    for number, single in enumerate(results):
+        assert isinstance(single, Result)
+        assert single.std is not None
+        assert frame.scale_z_std[number] == single.std.scale[2]
+        assert frame.rotation_std_deg[number] == single.std.rotation_deg
+        assert frame.warnings[number] == "; ".join(map(str, single.warnings))
+        assert frame.uncertain[number] == "; ".join(single.uncertain)
+    assert frame.warning_count[0] == 1
+    assert frame.warning_kinds[0] == "untested"
+    assert "s_z" in frame.uncertain[1].split("; ")
 
 
 def test_results_of_both_batches_have_the_same_columns() -> None:
@@ -106,33 +122,30 @@ def test_results_of_both_batches_have_the_same_columns() -> None:
     frames = [results.to_dataframe() for results in (aligned, fitted)]
     for frame in frames:
         assert frame.columns.tolist() == frames[0].columns.tolist()
-        assert frame.solved.tolist() == [True, False]
-        assert frame.error[0] == ""
-        assert frame.error[1]
-    for column in ("rms", "rotation_x", "translation_z", "scale_y", "focal_length", "inliers"):
+        assert frame.status.tolist() == ["ok", "failed"]
+        assert frame.reason[0] == ""
+        assert frame.reason[1]
+    for column in ("rms_px", "qx", "tz", "scale_y", "focal_length", "inliers"):
         assert frames[0][column][0] == pytest.approx(frames[1][column][0], rel=1e-3, abs=1e-3)
     single = cadalign.Results([cadalign.fit(CORNERS, SEEN, CAMERA)]).to_dataframe()
-    numbers = single.columns.drop(["solved", "error"])
+    numbers = single.select_dtypes("number").columns
     expected = frames[1].loc[0, numbers].to_numpy(dtype=float)
     np.testing.assert_allclose(single.loc[0, numbers].to_numpy(dtype=float), expected, atol=1e-6)
     one = cadalign.fit(CORNERS, SEEN, CAMERA)
     assert cadalign.Results(iter([one])).to_dataframe().equals(single)
 
 
-def test_every_view_has_a_row() -> None:
+def test_of_several_views_a_row_has_the_first() -> None:
     few = View(CAMERA, SEEN[:6], ids=range(6))
     model = cadalign.Model(points_3d=CORNERS)
     results = cadalign.align_batch(model, [[View(CAMERA, SEEN), few], View(CAMERA, SEEN), few, []])
     frame = results.to_dataframe()
-    assert frame["result"].tolist() == [0, 0, 1, 2, 3]
-    assert frame["view"].tolist() == [0, 1, 0, 0, 0]
-    assert frame.keypoints.tolist() == [8, 6, 8, 6, 0]
-    assert frame.solved.tolist() == [True] * 4 + [False]
+    assert frame["row"].tolist() == [0, 1, 2, 3]
+    assert frame.views.tolist()[:3] == [2, 1, 1]
+    assert frame.keypoints.tolist()[:3] == [14, 8, 6]
     joint = results[0]
     assert isinstance(joint, Result)
-    for row, (view, pose) in enumerate(zip(joint.views, joint.poses, strict=True)):
-        assert frame.rms[row] == view.rms
-        assert frame.translation_z[row] == pose.translation[2]
+    assert frame.tz[0] == joint.alignment.translation[2]
     assert isinstance(results[3], InputError)
     assert len(results[:2]) == 2
     with pytest.raises(InputError):

@@ -4,12 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
-
-import tyro
-
-LOOPBACK = "127.0.0.1"
-"""Address that only this machine reaches."""
+from typing import Literal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,11 +24,6 @@ class FileOptions:
     """Horizontal field of view of the photos [degrees], in the place of the focal length."""
     keypoints: Path | None = None
     """The model's keypoints: model.keypoints.json, or KeypointNet's annotations."""
-    mask: Path | None = None
-    """Mask of the object in a single photo: a grey PNG of its size, not 0 on the object."""
-    size: Annotated[dict[str, float] | None, tyro.conf.arg(metavar="NAME LENGTH ...")] = None
-    """Known lengths of a single photo's object: width, height, length (along the model's x, y, z)
-    and sigma, their relative standard deviation, as in --size height 0.91 sigma 0.005."""
     up_axis: Literal["x", "y", "z"] | None = None
     """The model's axis that points up, for its view and for gravity; by default the observation
     file's, or y."""

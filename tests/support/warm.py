@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-import cadalign.annotate.opening
 import cadalign.annotate.server
+import cadalign.annotate.session
 import cadalign.batch.fits
 import cadalign.cli.annotate
 import cadalign.cli.evaluate

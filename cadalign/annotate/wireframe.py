@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,9 +15,6 @@ from cadalign.render.raycast.surface import coincident_faces
 from cadalign.render.scene import Scene
 from cadalign.render.viewpoints import visible_keypoints
 from cadalign.shapes.warp import warp_mesh
-
-if TYPE_CHECKING:
-    from cadalign.annotate.model import ClickableModel
 
 _MOST_FACES = 30_000
 _MOST_CREASES = 1500
@@ -40,9 +36,9 @@ class Wireframe:
     _piece: float  # length of a line [model units]
 
     @classmethod
-    def of_model(cls, model: ClickableModel) -> Wireframe:
+    def of_scene(cls, scene: Scene) -> Wireframe:
         """The lines of a model as it is."""
-        small = simplify(model.scene.mesh, max_faces=_MOST_FACES)
+        small = simplify(scene.mesh, max_faces=_MOST_FACES)
         # Faces of real models seldom share vertices: weld those in one place.
         welded = cluster(Mesh(small.vertices, small.faces), cells=1e6)
         # A face that is written twice would make a crease of each of its sides.
@@ -53,8 +49,8 @@ class Wireframe:
         creases, smooth = edges.ends[edges.creased], ~edges.creased
         length = np.linalg.norm(np.diff(mesh.vertices[creases], axis=1)[:, 0], axis=1)
         longest = np.sort(np.argsort(-length, kind="stable")[:_MOST_CREASES])
-        ends, beside, piece = edges.ends[smooth], edges.opposite[smooth], _LONGEST * model.diagonal
-        return cls(model.scene, mesh, creases[longest], ends, beside, piece)
+        ends, beside, piece = edges.ends[smooth], edges.opposite[smooth], _LONGEST * scene.diagonal
+        return cls(scene, mesh, creases[longest], ends, beside, piece)
 
     @property
     def creases(self) -> FloatArray:

@@ -1,11 +1,10 @@
-"""Evidence of a photo beside its pairs that is marked in the page: a mask, the photo itself."""
+"""Masks of objects: files, and what is cut out of a box of the photo."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -14,8 +13,6 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray
 from cadalign.errors import DataError, InputError
 from cadalign.io.images import open_picture, read_mask
-from cadalign.io.observation import Observation
-from cadalign.io.observation_file import StartFields
 
 _LONGEST_CUT = 800  # side of the photo in which a box is cut out [px]
 _LEAST_BOX = 4.0  # [px]
@@ -26,7 +23,7 @@ _CUT_ROUNDS = 5
 class MarkedMask:
     """A mask: that of a file, or a drawn one, as the bytes of a PNG file."""
 
-    file: str | None = None
+    file: Path | None = None
     sigma: float | None = None  # of its contour [px]
     png: bytes = b""
 
@@ -40,45 +37,25 @@ class MarkedMask:
         if self.file is None:
             with open_picture(BytesIO(self.png), len(self.png), where="mask") as image:
                 return np.asarray(image) > 0
-        mask = read_mask(Path(self.file))
+        mask = read_mask(self.file)
         if mask.shape != (height, width):
             raise DataError(
                 f"the mask has {mask.shape[1]} x {mask.shape[0]} pixels, the photo "
                 f"{width} x {height}",
-                where=self.file,
+                where=str(self.file),
                 fix="give a mask of the photo's size",
             )
         return mask
 
 
-@dataclass(frozen=True)
-class MarkedEvidence:
-    """Marks in a photo beside its pairs.
-
-    ``photo`` says that the photo itself counts, ``start`` is where the search begins while there
-    are few pairs.
-    """
-
-    mask: MarkedMask | None = None
-    photo: bool = False
-    start: StartFields | None = None
-
-    @classmethod
-    def of(cls, observation: Observation) -> Self:
-        """The marks that stand for the evidence of an observation."""
-        known, start = observation.evidence, observation.init
-        return cls(
-            mask=None if known.mask is None else MarkedMask(str(known.mask), known.mask_sigma),
-            photo=bool(observation.fit_options.get("image")),
-            start=None if start is None else StartFields.of(start),
-        )
-
-
 def cut_out(photo: npt.NDArray[np.uint8], corners: npt.NDArray[np.float64]) -> BoolArray:
-    """Segment the object in a box of the photo (h, w, 3) by its colours; see `grab_cut`.
+    """Segment the object in a box of the photo (h, w, 3) by its colours, by GrabCut.
 
     ``corners`` (2, 2) are two of the box [px]. Raises InputError if the box is too small, fills the
     photo, or holds nothing that differs.
+
+    Rother, Kolmogorov, Blake, "GrabCut: interactive foreground extraction using iterated graph
+    cuts" (2004).
     """
     height, width = photo.shape[:2]
     scale = min(1.0, _LONGEST_CUT / max(width, height))
@@ -92,29 +69,15 @@ def cut_out(photo: npt.NDArray[np.uint8], corners: npt.NDArray[np.float64]) -> B
     labels = np.full(small.shape[:2], cv2.GC_BGD, dtype=np.uint8)
     labels[top : bottom + 1, left : right + 1] = cv2.GC_PR_FGD
     if not (labels == cv2.GC_BGD).any():
-        raise InputError(
-            "the box fills the photo", where="box", fix="draw it close around the object"
-        )
-    found = grab_cut(small, labels).astype(np.uint8)
-    if not found.any():
-        raise InputError(
-            "nothing in the box differs from what is around it",
-            where="box",
-            fix="draw it closer around the object",
-        )
-    whole = cv2.resize(255 * found, (width, height), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(whole >= 128)
-
-
-def grab_cut(pixels: npt.NDArray[Any], labels: npt.NDArray[Any]) -> BoolArray:
-    """Segment an image (h, w, 3) by its colours, from OpenCV's labels (h, w) of a part of it.
-
-    Rother, Kolmogorov, Blake, "GrabCut: interactive foreground extraction using iterated graph
-    cuts" (2004).
-    """
+        fix = "draw it close around the object"
+        raise InputError("the box fills the photo", where="box", fix=fix)
     cv2.setRNGSeed(0)
-    bgr = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+    bgr = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
     colors = np.zeros((2, 1, 65))
     whole = (0, 0, 1, 1)  # not used with labels
     cv2.grabCut(bgr, labels, whole, colors[0], colors[1], _CUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
-    return np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))
+    found = (255 * np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))).astype(np.uint8)
+    if not found.any():
+        what = "nothing in the box differs from what is around it"
+        raise InputError(what, where="box", fix="draw it closer around the object")
+    return np.asarray(cv2.resize(found, (width, height), interpolation=cv2.INTER_LINEAR) >= 128)

@@ -11,7 +11,7 @@ from typing import Any, get_type_hints
 import msgspec
 import numpy as np
 
-from cadalign.annotate.masks import MarkedMask, cut_out
+from cadalign.annotate.photos import MarkedMask, cut_out
 from cadalign.annotate.session import Annotation, Session
 from cadalign.errors import InputError, quote
 from cadalign.geometry.camera import Camera
@@ -93,11 +93,10 @@ def pick(
     near: Index | None = None,
     pair: Index | None = None,
 ) -> ActionOutcome:
-    """Place a model half by a ray: at the keypoint ``near`` it if that is visible."""
+    """Place a model half: the keypoint ``near`` a ray, or else where that meets the surface."""
     model, registry = state.model.cad, state.model.registry
-    start = model.from_display(origin)
-    if near is None or not model.is_seen(start, registry[near].xyz):
-        point = model.pick(start, direction)
+    if near is None:
+        point = model.pick(model.from_display(origin), direction)
         if point is None:
             return ActionOutcome(message="That click missed the model.")
         near = registry.find(point.xyz)

@@ -1,6 +1,6 @@
 """Files of an annotator: their names, their lock, and what others have changed.
 
-The observation of `photo.jpg` is `photo.json`, or `photo.jpg.json` where the shorter name may be
+The observation of `photo.jpg` is `photo.json`, or `photo.jpg.json` where the shorter name is
 another photo's. An observation of an earlier session is found under either name.
 """
 
@@ -18,7 +18,6 @@ from cadalign.datasets.models.model_keypoints import SUFFIX
 from cadalign.errors import DataError, InputError
 from cadalign.io.documents import path_from, read_json
 from cadalign.io.files import checksum, locked, read_bytes
-from cadalign.io.images import PHOTO_ENDINGS
 
 logger = logging.getLogger("cadalign")
 
@@ -73,8 +72,9 @@ def observation_file(photo: Path, folder: Path, others: Iterable[Path] = ()) -> 
     for path, named in owners.items():
         if any(other.samefile(photo) for other in named):
             return path
+    taken = {_key(path) for path in others}
     for path, named in owners.items():
-        if path not in others and not named and not (path == short and _has_namesake(photo)):
+        if _key(path) not in taken and not named:
             return path
     what = f"{full.name} belongs to another photo, not {photo}"
     raise DataError(what, where=str(folder), fix=_OTHER_FOLDER)
@@ -120,8 +120,9 @@ def refuse_other_photo(named: Path | None, photo: Path, *, where: Path) -> None:
         raise DataError(what, where=str(where), fix=fix)
 
 
-def _key(path: Path) -> Path:
-    return path.parent.resolve() / path.name
+def _key(path: Path) -> str:
+    """The path as file systems compare it that ignore case."""
+    return str(path.parent.resolve() / path.name).casefold()
 
 
 def _named_photos(path: Path) -> list[Path]:
@@ -136,17 +137,3 @@ def _named_photos(path: Path) -> list[Path]:
     images = [view.get("image") for view in views if isinstance(view, dict)]
     named = [path_from(each, path.parent) for each in images if isinstance(each, str) and each]
     return [photo for photo in named if os.path.exists(photo)]
-
-
-def _has_namesake(photo: Path) -> bool:
-    """True if another photo of the folder has the same name but for ending and case."""
-    try:
-        names = [Path(name) for name in os.listdir(photo.parent)]
-    except OSError:  # a folder whose files can be opened, but not listed
-        return False
-    return any(
-        other.name != photo.name
-        and other.stem.casefold() == photo.stem.casefold()
-        and other.suffix.lower() in PHOTO_ENDINGS
-        for other in names
-    )

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from cadalign.annotate.keypoints import KeypointRegistry, ObjectShape, positions_of
+from cadalign.annotate.model import Wireframe
 from cadalign.annotate.observations import LEAST_JOINT_PAIRS
 from cadalign.annotate.problem import Estimate
-from cadalign.annotate.wireframe import Wireframe
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.estimation.result import Result

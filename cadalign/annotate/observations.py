@@ -7,6 +7,7 @@ and those whose keypoint the category's shape lacks.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import chain, count
@@ -19,9 +20,8 @@ import numpy as np
 from cadalign.annotate.files import LastContent, refuse_other_model, refuse_other_photo
 from cadalign.annotate.keypoints import KeypointRegistry, ObjectShape, positions_of
 from cadalign.annotate.marks import Marks, Pair
-from cadalign.annotate.masks import MarkedMask
 from cadalign.annotate.model import OpenedModel
-from cadalign.annotate.photos import PhotoFile, camera_of
+from cadalign.annotate.photos import MarkedMask, PhotoFile, camera_of
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import DataError, InputError
@@ -79,7 +79,7 @@ class ObservationFile:
     photo: PhotoFile
     model: OpenedModel
     shape: ObjectShape
-    stored: Observation | None = None
+    stored: Observation = field(init=False)
     """Content of the file when it was opened, of which marks take the place."""
     _content: LastContent = field(default_factory=LastContent, repr=False)
     _drawn: tuple[MarkedMask, Path] | None = None  # the mask that was written last, and its file
@@ -128,20 +128,17 @@ class ObservationFile:
     @property
     def up_axis(self) -> str:
         """The model's axis that points up."""
-        assert self.stored is not None
         return self.stored.up_axis or "y"
 
     @property
     def focal_prior(self) -> FocalPrior | None:
         """Prior on an estimated focal length, as `cadalign fit` has it."""
-        assert self.stored is not None
         stored = self.stored.fit_options.get("focal_prior", self.photo.likely_focal)
         return FocalPrior(**stored) if isinstance(stored, Mapping) else stored
 
     @property
     def stretch_sigma(self) -> float | None:
         """Prior on the stretch; None for a shape, which has its own."""
-        assert self.stored is not None
         if self.shape.is_estimated:
             return None
         return self.stored.fit_options.get("stretch_sigma") or LIKELY_STRETCH
@@ -164,7 +161,6 @@ class ObservationFile:
 
         ``sigma`` is the option for the noise that the pairs show.
         """
-        assert self.stored is not None
         pairs = self.counting(marks)
         points = self.model.points_of(pairs)
         options = {**(sigma or {})}
@@ -280,19 +276,15 @@ def _with_halves(marks: Marks, halves: Sequence[_Half], registry: KeypointRegist
 def _with_pairs(marks: Marks, observation: Observation, registry: KeypointRegistry) -> Marks:
     ids, names = observation.ids, observation.names
     columns = (observation.sigma, observation.scores, observation.depths)
-    for row, (xyz, uv) in enumerate(
-        zip(observation.points_3d.tolist(), observation.points_2d.tolist(), strict=True)
-    ):
+    for row, (x, y, z) in enumerate(observation.points_3d.tolist()):
         number = None if ids is None else int(ids[row])
-        point = ModelKeypoint("" if names is None else names[row], tuple(xyz), number)
+        point = ModelKeypoint("" if names is None else names[row], (x, y, z), number)
         keypoint = _registered(point, registry, marks.keypoints)
-        known = (_entry(values, row) for values in columns)
-        marks = marks.append(Pair(marks.next_number, tuple(uv), keypoint, *known))
+        known = [None if each is None else float(each[row]) for each in columns]
+        known = [None if each is None or math.isnan(each) else each for each in known]
+        u, v = observation.points_2d[row].tolist()
+        marks = marks.append(Pair(marks.next_number, (u, v), keypoint, *known))
     return marks
-
-
-def _entry(values: FloatArray | None, row: int) -> float | None:
-    return None if values is None or np.isnan(values[row]) else float(values[row])
 
 
 def _registered(point: ModelKeypoint, registry: KeypointRegistry, taken: frozenset[int]) -> int:

@@ -10,8 +10,8 @@ import numpy as np
 from cadalign.annotate.actions import ActionOutcome
 from cadalign.annotate.keypoints import ObjectShape
 from cadalign.annotate.live import LiveAlignment, short
+from cadalign.annotate.model import box_lines
 from cadalign.annotate.session import Annotation, Session
-from cadalign.annotate.wireframe import box_lines
 from cadalign.arrays import FloatArray
 from cadalign.estimation.result import Result
 from cadalign.io.evidence import LENGTHS

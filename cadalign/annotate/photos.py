@@ -1,4 +1,4 @@
-"""Photos to annotate: upright pixels, and the cameras that took them."""
+"""Photos to annotate: upright pixels, the cameras that took them, and masks of objects."""
 
 from __future__ import annotations
 
@@ -8,22 +8,34 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+import cv2
+import numpy as np
+import numpy.typing as npt
 from PIL import Image
 
-from cadalign.datasets.sfm.colmap import Colmap
+from cadalign.arrays import BoolArray
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.geometry.camera import Camera, require_perspective
 from cadalign.io.documents import in_file
 from cadalign.io.files import listed, read_bytes, reading, require_utf8
-from cadalign.io.images import PHOTO_ENDINGS, open_photo, photo_size, upright_pixels
-from cadalign.io.observation import read_camera as read_camera_file
+from cadalign.io.images import (
+    PHOTO_ENDINGS,
+    open_photo,
+    open_picture,
+    photo_size,
+    read_mask,
+    upright_pixels,
+)
 
 _MASK = re.compile(r"\.mask(-[0-9]+)?\.png$")  # at the end of the name of a mask's file
 _SHOWN_AS_IS = {"JPEG": "image/jpeg", "PNG": "image/png", "WEBP": "image/webp"}
 _ORIENTATION = 0x0112  # the EXIF tag
 _TURNED = range(2, 9)  # its values for photos that are not stored upright
 _QUALITY = 95
+_LONGEST_CUT = 800  # side of the photo in which a box is cut out [px]
+_LEAST_BOX = 4.0  # [px]
+_CUT_ROUNDS = 5
 
 
 @dataclass(frozen=True)
@@ -82,16 +94,6 @@ def find_photos(path: Path) -> list[Path]:
     return [path]
 
 
-def read_camera(path: Path, size: tuple[int, int] | None = None) -> Camera:
-    """Read a camera as `cadalign.io.read_camera` does, or the first one of a COLMAP model's folder.
-
-    ``size`` is the photos', for a file that holds a calibration matrix alone.
-    """
-    with reading(path):
-        in_folder = path.is_dir()
-    return Colmap(path)[0].camera if in_folder else read_camera_file(path, size=size)
-
-
 def camera_of(photo: PhotoFile, camera: Camera | None) -> Camera:
     """The camera that took a photo, by default one without a focal length; raises DataError."""
     if camera is None:
@@ -118,3 +120,67 @@ def natural_key(name: str) -> tuple[tuple[str, int], ...]:
     """
     parts = re.findall(r"\d+|\D+", name)
     return tuple(("", int(p)) if p.isdecimal() else (p.casefold(), 0) for p in parts)
+
+
+@dataclass(frozen=True)
+class MarkedMask:
+    """A mask: that of a file, or a drawn one, as the bytes of a PNG file."""
+
+    file: Path | None = None
+    sigma: float | None = None  # of its contour [px]
+    png: bytes = b""
+
+    @classmethod
+    def of(cls, inside: BoolArray) -> MarkedMask:
+        """A drawn mask of pixels (h, w)."""
+        return cls(png=cv2.imencode(".png", 255 * inside.astype(np.uint8))[1].tobytes())
+
+    def pixels(self, width: int, height: int) -> BoolArray:
+        """The mask (h, w); raises DataError if its file is none of that size."""
+        if self.file is None:
+            with open_picture(io.BytesIO(self.png), len(self.png), where="mask") as image:
+                return np.asarray(image) > 0
+        mask = read_mask(self.file)
+        if mask.shape != (height, width):
+            raise DataError(
+                f"the mask has {mask.shape[1]} x {mask.shape[0]} pixels, the photo "
+                f"{width} x {height}",
+                where=str(self.file),
+                fix="give a mask of the photo's size",
+            )
+        return mask
+
+
+def cut_out(photo: npt.NDArray[np.uint8], corners: npt.NDArray[np.float64]) -> BoolArray:
+    """Segment the object in a box of the photo (h, w, 3) by its colours, by GrabCut.
+
+    ``corners`` (2, 2) are two of the box [px]. Raises InputError if the box is too small, fills the
+    photo, or holds nothing that differs.
+
+    Rother, Kolmogorov, Blake, "GrabCut: interactive foreground extraction using iterated graph
+    cuts" (2004).
+    """
+    height, width = photo.shape[:2]
+    scale = min(1.0, _LONGEST_CUT / max(width, height))
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
+    low, high = np.clip(np.sort(corners, axis=0), 0, (width - 1, height - 1))
+    if (high - low).min() < _LEAST_BOX:
+        raise InputError("the box is too small", where="box", fix="draw it around the object")
+    left, top = np.floor(low * scale).astype(int).tolist()
+    right, bottom = np.ceil(high * scale).astype(int).tolist()
+    labels = np.full(small.shape[:2], cv2.GC_BGD, dtype=np.uint8)
+    labels[top : bottom + 1, left : right + 1] = cv2.GC_PR_FGD
+    if not (labels == cv2.GC_BGD).any():
+        fix = "draw it close around the object"
+        raise InputError("the box fills the photo", where="box", fix=fix)
+    cv2.setRNGSeed(0)
+    bgr = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
+    colors = np.zeros((2, 1, 65))
+    whole = (0, 0, 1, 1)  # not used with labels
+    cv2.grabCut(bgr, labels, whole, colors[0], colors[1], _CUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
+    found = (255 * np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))).astype(np.uint8)
+    if not found.any():
+        what = "nothing in the box differs from what is around it"
+        raise InputError(what, where="box", fix="draw it closer around the object")
+    return np.asarray(cv2.resize(found, (width, height), interpolation=cv2.INTER_LINEAR) >= 128)

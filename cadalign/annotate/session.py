@@ -6,7 +6,6 @@ import json
 import logging
 import threading
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +18,12 @@ from cadalign.annotate.marks import History, Marks, Pixel
 from cadalign.annotate.model import OpenedModel, open_model
 from cadalign.annotate.observations import ObservationFile
 from cadalign.annotate.options import SessionOptions
-from cadalign.annotate.photos import PhotoFile, camera_of, find_photos, read_camera
+from cadalign.annotate.photos import PhotoFile, camera_of, find_photos
 from cadalign.annotate.problem import Estimate, Known, LiveProblem, warm_up
 from cadalign.arrays import BoolArray
 from cadalign.errors import CadalignError, DataError, DegenerateError, InputError
-from cadalign.evaluation.simulation import simulate_problem
 from cadalign.geometry.camera import Camera
-from cadalign.io.observation import Observation, with_lens
+from cadalign.io.observation import Observation, read_camera, with_lens
 
 logger = logging.getLogger("cadalign")
 
@@ -142,7 +140,7 @@ class Session:
                 for each in self.photos
                 if each.marks.complete_pairs
             )
-            _load_solvers(joint=joint)
+            warm_up(joint=joint)
             if not self.ended.is_set():
                 _ = self.model.cad.scene.caster, self.model.cad.wireframe
         finally:  # an error here occurs again, and is reported, when the user aligns
@@ -237,7 +235,7 @@ def open_session(options: SessionOptions, files: SessionFiles | None = None) -> 
     folder = files.keypoints.parent
     model = open_model(options.model, folder, keypoints=options.keypoints, shape=shape)
     size = files.photos[0].width, files.photos[0].height
-    camera = None if options.camera is None else read_camera(options.camera, size)
+    camera = None if options.camera is None else read_camera(options.camera, size=size)
     session = Session(model, shape)
     for photo, path in zip(files.photos, files.observations, strict=True):
         file = ObservationFile(path, photo, model, shape)
@@ -262,10 +260,3 @@ def _readable(paths: list[Path]) -> list[PhotoFile]:
     if not photos:
         raise DataError("none of the photos in this folder can be read", where=str(paths[0].parent))
     return photos
-
-
-@cache
-def _load_solvers(*, joint: bool) -> None:
-    """Compile or load the solvers, once in a process, by aligning a synthetic problem."""
-    problem = simulate_problem(np.random.default_rng(0), points=8, noise_px=1.0)
-    warm_up(problem.points_3d, problem.points_2d, problem.camera, joint=joint)

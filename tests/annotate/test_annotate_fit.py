@@ -15,10 +15,10 @@ from support.problems import problem_of
 from cadalign import Alignment, Camera, fit
 from cadalign.annotate.keypoints import KeypointRegistry, ObjectShape
 from cadalign.annotate.live import LiveAlignment, Suggestion, live_alignment, missing_text, suggest
+from cadalign.annotate.model import Wireframe
 from cadalign.annotate.observations import LIKELY_STRETCH
 from cadalign.annotate.page_state import facts_of
 from cadalign.annotate.problem import Estimate, Known, LiveProblem
-from cadalign.annotate.wireframe import Wireframe
 from cadalign.datasets import ModelKeypoint
 from cadalign.errors import DegenerateError, InputError
 from cadalign.evaluation.simulation import SimulatedProblem

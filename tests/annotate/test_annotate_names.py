@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Callable
@@ -69,15 +70,15 @@ def test_names_with_no_room_for_an_ending_are_refused(case: Case, option: str) -
     )
 
 
-def test_photo_alone_or_among_others_has_its_usual_name(tmp_path: Path) -> None:
-    photo = tmp_path / "x.jpg"
+def test_a_photo_has_its_usual_name_unless_another_photo_has_it(tmp_path: Path) -> None:
+    photo, other = tmp_path / "x.jpg", tmp_path / "X.png"
     photo.write_text("")
-    assert observation_file(photo, tmp_path).name == "x.json"
-    (tmp_path / "x.png").write_text("")
-    assert observation_file(photo, tmp_path).name == "x.jpg.json"
-    (tmp_path / "x.obj").write_text("")
-    (tmp_path / "x.png").unlink()
-    assert observation_file(photo, tmp_path).name == "x.json"
+    other.write_text("")
+    first = observation_file(photo, tmp_path)
+    assert first.name == "x.json"
+    assert observation_file(other, tmp_path, [first]).name == "X.png.json"
+    (tmp_path / "X.json").write_text(json.dumps({"image": "x.jpg"}))
+    assert observation_file(other, tmp_path).name == "X.png.json"
 
 
 @pytest.mark.long

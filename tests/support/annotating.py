@@ -18,9 +18,9 @@ from playwright.sync_api import Browser, Page
 
 from cadalign import Result, View, align
 from cadalign.annotate.actions import perform
-from cadalign.annotate.masks import MarkedMask
 from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.page_state import page_state
+from cadalign.annotate.photos import MarkedMask
 from cadalign.annotate.server import Access, listen, make_app, make_server
 from cadalign.annotate.session import Session, open_session
 from cadalign.cli import main

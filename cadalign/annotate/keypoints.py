@@ -143,6 +143,12 @@ class ObjectShape:
         return bool(self.ids) and isinstance(self.ids[0], str)
 
     @property
+    def has_outline(self) -> bool:
+        """True if masks and photos say something of the shape, which then has meshes."""
+        training = None if self.learned is None else self.learned.training
+        return self.learned is None or bool(training and training.rows_with_mesh)
+
+    @property
     def average(self) -> str:
         """The noun that the object is compared with in a sentence."""
         return "the model" if self.learned is None else f"the average {self.learned.category}"

@@ -66,6 +66,7 @@ def page_state(
             "evidence": {
                 "mask": None if marks.mask is None else f"{hash(marks.mask) & 0xFFFFFFFF:x}",
                 "photo": marks.photo,
+                "outline": state.shape.has_outline,
             },
             "pairs": _pairs(state, live),
             "keypoints": [
@@ -221,12 +222,12 @@ def facts_of(
     if result.std is not None:
         sigma = result.std.rotation_deg
         is_open = sigma > _UNCERTAIN_DEG
-        facts["Rotation"] = _UNDETERMINED if is_open else (f"known to ± {short(sigma)}°", "")
+        facts["Rotation"] = _UNDETERMINED if is_open else (f"± {short(sigma)}°", "")
     facts["Distance"] = _distance(result, shape)
     facts["Focal length"] = _focal(result, is_assumed="focal length" in live.estimate.message)
     if 2 * live.counts.sum() > 6 + len(result.stretched_axes):
         note = f"rms, at ± {short(live.estimate.sigma)} px a point"
-        facts["Pairs agree to"] = f"{short(result.rms)} px", note
+        facts["Residuals"] = f"{short(result.rms)} px", note
     return [{"label": k, "value": value, "note": note} for k, (value, note) in facts.items()]
 
 

@@ -57,6 +57,7 @@ export class Layout {
     this.undo.disabled = !state.can_undo;
     this.redo.disabled = !state.can_redo;
     this.asPhoto.disabled = alignment.status !== "done";
+    this.box.hidden = !state.evidence.outline;
     this.suggestion.hidden = !suggestion;
     this.suggestion.textContent = suggestion ? `Next: ${suggestion.text}` : "";
     this.saved.classList.toggle("wrong", Boolean(saved.trouble));

@@ -17,7 +17,7 @@ export class Panel {
       "section",
       { class: "panel", "aria-label": "Results" },
       h("section", { class: "card" }, h("h2", {}, "Alignment"), this.facts, this.notes),
-      h("section", { class: "card" }, h("h2", {}, "Camera and evidence"), this.makeEvidence()),
+      h("section", { class: "card" }, h("h2", {}, "Evidence"), this.makeEvidence()),
       h("section", { class: "card" }, this.title, this.rows),
     );
   }
@@ -46,6 +46,12 @@ export class Panel {
     this.photo = h("input", { type: "checkbox", onchange: () => act({ do: "use_photo", on: this.photo.checked }) });
     this.mask = h("p", {}, "A mask is drawn. ", button("Clear", () => act({ do: "mask_clear" }), { "aria-label": "Clear the mask" }));
     this.also = h("p", { class: "soft" });
+    this.outline = h(
+      "label",
+      { title: "The model's outline is sought in the photo, by the colours about it (I)" },
+      this.photo,
+      " Fit to the photo itself",
+    );
     return [
       h(
         "fieldset",
@@ -54,7 +60,7 @@ export class Panel {
         h("label", {}, this.known, " known: ", this.pixels, " px"),
         h("label", {}, this.estimated, " estimated; at first ", this.about),
       ),
-      h("label", { title: "The model's outline is sought in the photo, by the colours about it (I)" }, this.photo, " Fit to the photo itself"),
+      this.outline,
       this.mask,
       this.also,
     ];
@@ -67,6 +73,7 @@ export class Panel {
     this.pixels.disabled = !focal.known;
     this.about.textContent = focal.prior;
     this.photo.checked = evidence.photo;
+    this.outline.hidden = !evidence.outline;
     this.mask.hidden = evidence.mask === null;
     this.also.textContent = alignment.also_used ? `Also used: ${alignment.also_used}` : "";
   }

@@ -162,7 +162,7 @@ def annotator(*, files: Path) -> None:
     options = SessionOptions(image=files / "photo.png", model=model, observation=observation)
     session = open_session(options)
     session.warm_up()
-    with chromium() as browser, opened_page(browser, session, width=1280, height=960) as page:
+    with chromium() as browser, opened_page(browser, session, width=1280, height=800) as page:
         wait(page, f"{IDLE} && annotator.state.alignment.status === 'done'")
         page.keyboard.press("v")
         page.wait_for_timeout(1000)  # until everything is drawn

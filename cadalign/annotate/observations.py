@@ -52,7 +52,7 @@ _OTHER_FILE = "give another --observation or --out"
 _OF_THE_OBJECT = (
     *("init", "model", "object", "shape", "size", "symmetry", "up_axis", "fit", "unfinished"),
 )
-_OWN_OPTIONS = {"sigma", "stretch_sigma", "focal_prior", "image"}
+_OWN_OPTIONS = {"stretch_sigma", "focal_prior", "image"}
 
 
 class _Half(SeenKeypoint, kw_only=True):
@@ -237,9 +237,9 @@ class ObservationFile:
         options = dict(stored.fit_options)
         if options.get("shape_sigma") == self.shape.sigma:
             options.pop("shape_sigma", None)
-        # Beside a prior on the stretch the noise is the annotator's own.
-        own = _OWN_OPTIONS if "stretch_sigma" in options else _OWN_OPTIONS - {"sigma"}
-        others = [name for name in options if name not in own]
+        if "stretch_sigma" in options or options.get("sigma") is None:
+            options.pop("sigma", None)  # found by the annotator, or not stated
+        others = [name for name in options if name not in _OWN_OPTIONS]
         if stored.shape is not None and self.shape.path is None:
             others.append(f"shape {stored.shape}")
         if others:

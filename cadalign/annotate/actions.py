@@ -30,10 +30,7 @@ class ActionOutcome:
 
 
 def perform(session: Session, number: int, action: Mapping[str, Any]) -> ActionOutcome:
-    """Do an action of the page, its name ``do`` and its arguments, and save its changes.
-
-    It is done on the annotation of a number.
-    """
+    """Do an action of the page, its name ``do`` and its arguments, on a photo, and save it."""
     with session.lock:
         state = session.annotation(number)
         name = action.get("do")

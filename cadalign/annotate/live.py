@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -58,11 +57,6 @@ class LiveAlignment:
     def result(self) -> Result | None:
         """The result of the estimate."""
         return None if self.estimate is None else self.estimate.result
-
-    @property
-    def fit_options(self) -> Mapping[str, Any]:
-        """Options with which `cadalign fit` finds the result."""
-        return {} if self.estimate is None else self.estimate.fit_options
 
 
 def live_alignment(

@@ -126,11 +126,6 @@ class ObservationFile:
         self._content.note(self.path)
 
     @property
-    def up_axis(self) -> str:
-        """The model's axis that points up."""
-        return self.stored.up_axis or "y"
-
-    @property
     def focal_prior(self) -> FocalPrior | None:
         """Prior on an estimated focal length, as `cadalign fit` has it."""
         stored = self.stored.fit_options.get("focal_prior", self.photo.likely_focal)

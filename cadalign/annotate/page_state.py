@@ -18,13 +18,7 @@ from cadalign.io.evidence import LENGTHS
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.layers import confidence_regions
 
-_LABELS = {
-    "mask": "mask",
-    "depth": "depth",
-    "up": "gravity",
-    "camera_height": "camera height",
-    "cam_from_rig": "known camera poses",
-}
+_LABELS = {"up": "gravity", "camera_height": "camera height", "cam_from_rig": "camera pose"}
 _UNCERTAIN = 1.0  # relative standard deviation beyond which a number is not shown
 _LEFT_OPEN = 0.8  # share of a prior's standard deviation beyond which the pairs say nothing
 _UNCERTAIN_DEG = 60.0
@@ -34,10 +28,7 @@ _UNDETERMINED = "not determined", "these pairs leave it open"
 def page_state(
     session: Session, number: int, outcome: ActionOutcome | None = None
 ) -> dict[str, Any]:
-    """Collect everything that the page shows of an annotation, after an action of that outcome.
-
-    It is the one of a number.
-    """
+    """Collect everything that the page shows of a photo, after an action of that outcome."""
     outcome = outcome or ActionOutcome()
     with session.lock:
         state = session.annotation(number)
@@ -51,7 +42,7 @@ def page_state(
                 "name": photo.path.name,
                 "width": photo.width,
                 "height": photo.height,
-                "up_axis": state.file.up_axis,
+                "up_axis": state.file.stored.up_axis or "y",
             },
             "saved": {"path": state.file.path.name, "trouble": state.save_error},
             "selected": outcome.selected,
@@ -189,19 +180,17 @@ def _closed(region: FloatArray) -> list[float]:
     return _rounded(np.concatenate([region, region[:1]])[None])[0]
 
 
-def evidence_labels(observation: Observation) -> tuple[str, ...]:
+def evidence_labels(observation: Observation) -> list[str]:
     """Name what an observation holds beyond keypoints, for the page."""
-    given = set(observation.evidence.given)
+    names = dict.fromkeys(observation.evidence.sources)
     if observation.depths is not None:
-        given.add("depth")
-    labels = [label for name, label in _LABELS.items() if name in given]
+        names["depth"] = None
     if observation.fit_options.get("image") and not observation.evidence.mask:
-        labels.append("photo")
-    size = observation.size
-    if size is not None:
-        known = [name for name in LENGTHS if getattr(size, name) is not None]
-        labels.append(f"known {' and '.join(known)}")
-    return tuple(labels)
+        names["photo"] = None
+    known = [name for name in LENGTHS if getattr(observation.size, name, None) is not None]
+    if known:
+        names[f"known {' and '.join(known)}"] = None
+    return [_LABELS.get(name, name) for name in names]
 
 
 def facts_of(

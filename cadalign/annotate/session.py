@@ -22,7 +22,6 @@ from cadalign.annotate.photos import PhotoFile, camera_of, find_photos
 from cadalign.annotate.problem import Estimate, Known, LiveProblem, warm_up
 from cadalign.arrays import BoolArray
 from cadalign.errors import CadalignError, DataError, DegenerateError, InputError
-from cadalign.geometry.camera import Camera
 from cadalign.io.observation import Observation, read_camera, with_lens
 
 logger = logging.getLogger("cadalign")
@@ -184,7 +183,8 @@ class Session:
 
     def _write(self, annotation: Annotation) -> None:
         annotation.is_pending = not self.ready  # asked first: it may become so at any time
-        options = self.live(annotation).fit_options
+        estimate = self.live(annotation).estimate
+        options = {} if estimate is None else estimate.fit_options
         used = (each.marks.keypoints for each in self.photos)
         try:
             # First the keypoints, which the observation names.
@@ -197,17 +197,12 @@ class Session:
             annotation.save_error = ""
 
 
-@dataclass(frozen=True)
-class SessionFiles:
-    """Photos of a session, and the files that it writes."""
-
-    photos: tuple[PhotoFile, ...]
-    observations: tuple[Path, ...]  # one for each photo, in one folder
-    keypoints: Path  # of the model
+SessionFiles = list[tuple[PhotoFile, Path]]
+"""Photos of a session, and the observation file of each, all in one folder."""
 
 
 def find_session_files(options: SessionOptions) -> SessionFiles:
-    """Find the photos and name the session's files; raises an error where files would collide."""
+    """Find the photos and name their files; raises an error where files would collide."""
     image, given = options.image, options.observation
     paths = find_photos(image)
     if given is not None and (image.is_dir() or options.out is not None):
@@ -225,28 +220,23 @@ def find_session_files(options: SessionOptions) -> SessionFiles:
     if options.keypoints != keypoints:
         read.append(options.keypoints)
     refuse_collisions([keypoints, *observations], [path for path in read if path is not None])
-    return SessionFiles(tuple(photos), tuple(observations), keypoints)
+    return list(zip(photos, observations, strict=True))
 
 
 def open_session(options: SessionOptions, files: SessionFiles | None = None) -> Session:
     """Open an annotation session: read photos, model, camera and earlier annotations."""
     files = files or find_session_files(options)
-    shape = ObjectShape.open(options)
-    folder = files.keypoints.parent
-    model = open_model(options.model, folder, keypoints=options.keypoints, shape=shape)
-    size = files.photos[0].width, files.photos[0].height
-    camera = None if options.camera is None else read_camera(options.camera, size=size)
+    shape, (first, path) = ObjectShape.open(options), files[0]
+    model = open_model(options.model, path.parent, keypoints=options.keypoints, shape=shape)
+    size = first.width, first.height
+    given = None if options.camera is None else read_camera(options.camera, size=size)
     session = Session(model, shape)
-    for photo, path in zip(files.photos, files.observations, strict=True):
+    for photo, path in files:
+        camera = with_lens(camera_of(photo, given), options.focal, fov=options.fov)
         file = ObservationFile(path, photo, model, shape)
-        marks = file.read(_given(camera, photo, options), up_axis=options.up_axis)
+        marks = file.read(camera, up_axis=options.up_axis)
         session.photos.append(Annotation(file, History(marks)))
     return session
-
-
-def _given(camera: Camera | None, photo: PhotoFile, options: SessionOptions) -> Camera:
-    """The camera of a photo by the options."""
-    return with_lens(camera_of(photo, camera), options.focal, fov=options.fov)
 
 
 def _readable(paths: list[Path]) -> list[PhotoFile]:

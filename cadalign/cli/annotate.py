@@ -86,7 +86,7 @@ class Annotate(FileOptions):
                     self.observation.parent.mkdir(parents=True, exist_ok=True)
             access = Access(listener.getsockname()[1])
             files = find_session_files(options)
-            opened.enter_context(only_annotator(files.keypoints.parent))
+            opened.enter_context(only_annotator(files[0][1].parent))
             with waiting("reading photos and model"):
                 session = open_session(options, files)
             warming = threading.Thread(target=session.warm_up, daemon=True)

@@ -152,9 +152,7 @@ def test_files_are_compared_by_place(tmp_path: Path) -> None:
 
 def test_written_files_are_named_before_anything_is_read(case: Case) -> None:
     options = SessionOptions(image=case.photo, model=case.folder / "nowhere.obj")
-    files = find_session_files(options)
-    assert files.keypoints.name == "nowhere.keypoints.json"
-    assert [path.name for path in files.observations] == ["photo.json"]
+    assert [path.name for _, path in find_session_files(options)] == ["photo.json"]
 
 
 @pytest.mark.long

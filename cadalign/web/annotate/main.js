@@ -108,8 +108,11 @@ class App {
 
   async listPhotos() {
     const { number } = this.state.image;
-    const photos = await (await fetched("photos")).json();
-    this.layout.listPhotos(photos, number);
+    try {
+      this.layout.listPhotos(await (await fetched("photos")).json(), number);
+    } catch (error) {
+      this.layout.say(error.message);
+    }
   }
 
   /** Do an action; the time until its result is drawn is kept in `redrawn` [ms]. */

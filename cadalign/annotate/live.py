@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -65,11 +65,12 @@ def live_alignment(
     registry: KeypointRegistry,
     wireframe: Wireframe,
     pairs: tuple[Sequence[ModelKeypoint], FloatArray, BoolArray],
+    used: Collection[int],
 ) -> LiveAlignment:
     """An estimate as the page shows it.
 
     The ``pairs`` are the model points and photo points (n, 2) [px] of all complete ones, and which
-    of them count; the wireframe is the model's.
+    of them count; ``used`` are the keypoints of all pairs, and the wireframe is the model's.
     """
     result, (points, uv, counts) = estimate.result, pairs
     lines, carried = wireframe, positions_of(points)[~counts]
@@ -85,7 +86,6 @@ def live_alignment(
     residuals[~counts] = result.camera.project_where_ahead(placed) - uv[~counts]
     rows = np.flatnonzero(counts).tolist()
     outliers = {rows[row]: off for row, off in estimate.outliers.items()}
-    used = {point.semantic_id for point in points}
     free = [point for number, point in registry if number not in used]
     suggestion = suggest(estimate, lines, free, shape)
     return LiveAlignment(estimate, "", counts, residuals, outliers, lines, suggestion)
@@ -104,7 +104,7 @@ def missing_text(counts: BoolArray, shape: ObjectShape, observation: Observation
         return ""
     text = f"{missing} more pair{'s' if missing > 1 else ''} to the first alignment"
     if not counts.all() and shape.learned is not None:
-        text += f": keypoints that {shape.learned.category} has, marked by rings on the model"
+        text += f": keypoints that {shape.learned.category} has, the white points on the model"
     return text
 
 

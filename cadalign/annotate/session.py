@@ -103,6 +103,7 @@ class Annotation:
             self.model.registry,
             self.model.cad.wireframe,
             (points, uv, counts),
+            marks.keypoints,
         )
 
     def _estimate(self, observation: Observation) -> Estimate:

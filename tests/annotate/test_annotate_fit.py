@@ -67,7 +67,8 @@ def live_of(problem: SimulatedProblem, **options: Any) -> LiveAlignment:
     registry = KeypointRegistry()
     registry.merge(points)
     pairs = points, problem.points_2d, counts
-    return live_alignment(estimate_of(problem, **options), STRETCHED, registry, lines, pairs)
+    estimate = estimate_of(problem, **options)
+    return live_alignment(estimate, STRETCHED, registry, lines, pairs, range(len(points)))
 
 
 # --- the alignment ---------------------------------------------------------------------------

@@ -260,6 +260,14 @@ def test_what_an_observation_says_of_its_keypoints_is_kept(case: Case) -> None:
 # --- actions ---------------------------------------------------------------------------------
 
 
+def test_no_keypoint_is_suggested_that_a_pair_has(case: Case) -> None:
+    session = case.open()
+    suggestion = place_all(session, case, count=6)["suggestion"]
+    perform(session, 0, {"do": "place_keypoint", "keypoint": suggestion["keypoint"]})
+    state = page_state(session, 0)
+    assert state["suggestion"]["keypoint"] not in {p["keypoint"] for p in state["pairs"]}
+
+
 def test_click_near_a_keypoint_takes_it(case: Case) -> None:
     session = case.open(prepared=False)
     perform(session, 0, {"do": "pick", **FROM_ABOVE, "near": 4})

@@ -20,10 +20,9 @@ import numpy as np
 import tyro
 
 from cadalign import Alignment, Box, Camera, Observation, fit
-from cadalign.annotate.lines import Wireframe
 from cadalign.annotate.model import ClickableModel
-from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
+from cadalign.annotate.session import open_session
 from cadalign.datasets import AnnotatedModel, KeypointNet, ModelKeypoints, write_sample_dataset
 from cadalign.evaluation.instances.instance import load_scene, make_instance
 from cadalign.io.images import read_image, write_image
@@ -139,7 +138,7 @@ def still(scene: Scene) -> ByteImage:
 def with_wireframe(image: ByteImage, model: ClickableModel, alignment: Alignment) -> ByteImage:
     """The photo with the lines of the stretched model."""
     drawn = image.copy()
-    for start, end in Wireframe.of_model(model).seen_in(CHAIR_CAMERA, alignment):
+    for start, end in model.wireframe.seen_in(CHAIR_CAMERA, alignment):
         ends = [tuple(np.round(16 * point).astype(int).tolist()) for point in (start, end)]
         cv2.line(drawn, *ends, LINE, 1, cv2.LINE_AA, shift=4)
     return drawn
@@ -163,7 +162,7 @@ def annotator(*, files: Path) -> None:
     options = SessionOptions(image=files / "photo.png", model=model, observation=observation)
     session = open_session(options)
     session.warm_up()
-    with chromium() as browser, opened_page(browser, session, width=1280, height=960) as page:
+    with chromium() as browser, opened_page(browser, session, width=1280, height=800) as page:
         wait(page, f"{IDLE} && annotator.state.alignment.status === 'done'")
         page.keyboard.press("v")
         page.wait_for_timeout(1000)  # until everything is drawn

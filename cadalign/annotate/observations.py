@@ -25,7 +25,6 @@ from cadalign.annotate.photos import MarkedMask, PhotoFile, camera_of
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import DataError, InputError
-from cadalign.io.focal import FocalPrior
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import (
     Document,
@@ -37,6 +36,7 @@ from cadalign.io.documents import (
     read_json,
     within,
 )
+from cadalign.io.focal import FocalPrior
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 from cadalign.io.observation_file import SeenKeypoint

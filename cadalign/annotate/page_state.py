@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -14,14 +13,17 @@ from cadalign.annotate.model import box_lines
 from cadalign.annotate.session import Annotation, Session
 from cadalign.arrays import FloatArray
 from cadalign.estimation.result import Result
+from cadalign.geometry.alignment import (
+    NOT_DETERMINED,
+    NOT_DETERMINED_ROTATION_DEG,
+    distance_deviation,
+)
 from cadalign.io.evidence import LENGTHS
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.layers import confidence_regions
 
 _LABELS = {"up": "gravity", "camera_height": "camera height", "cam_from_rig": "camera pose"}
-_UNCERTAIN = 1.0  # relative standard deviation beyond which a number is not shown
 _LEFT_OPEN = 0.8  # share of a prior's standard deviation beyond which the pairs say nothing
-_UNCERTAIN_DEG = 60.0
 _UNDETERMINED = "not determined", "these pairs leave it open"
 
 
@@ -210,7 +212,7 @@ def facts_of(
         facts[label] = _extent(result, axis, shape, prior=None if in_lengths else prior)
     if result.std is not None:
         sigma = result.std.rotation_deg
-        is_open = sigma > _UNCERTAIN_DEG
+        is_open = sigma > NOT_DETERMINED_ROTATION_DEG
         facts["Rotation"] = _UNDETERMINED if is_open else (f"± {short(sigma)}°", "")
     facts["Distance"] = _distance(result, shape)
     facts["Focal length"] = _focal(result, is_assumed="focal length" in live.estimate.message)
@@ -254,7 +256,7 @@ def _extent(
     relative = 0.0 if result.std is None else float(result.std.scale[row])
     if prior is None:
         value = float(np.ptp(result.bounds, axis=0)[row] * result.alignment.scale[row])
-    if not value > 0 or relative > _UNCERTAIN:
+    if not value > 0 or relative > NOT_DETERMINED:
         return _UNDETERMINED
     if relative == 0:
         return f"{value:.3g}", "taken as known"
@@ -268,15 +270,13 @@ def _extent(
 
 
 def _distance(result: Result, shape: ObjectShape) -> tuple[str, str]:
-    translation, covariance = result.alignment.translation, result.covariance
-    distance = float(np.linalg.norm(translation))
+    covariance, distance = result.covariance, float(np.linalg.norm(result.alignment.translation))
     if covariance is None or not distance > 0:
         return f"{distance:.3g}", shape.unit
-    along = translation / distance
-    sigma = math.sqrt(max(float(along @ covariance[3:6, 3:6] @ along), 0.0))
-    if sigma > _UNCERTAIN * distance:
+    relative = distance_deviation(result.alignment, covariance)
+    if relative > NOT_DETERMINED:
         return _UNDETERMINED
-    return f"{distance:.3g} ± {short(sigma)}", shape.unit
+    return f"{distance:.3g} ± {short(relative * distance)}", shape.unit
 
 
 def _focal(result: Result, *, is_assumed: bool) -> tuple[str, str]:
@@ -284,6 +284,6 @@ def _focal(result: Result, *, is_assumed: bool) -> tuple[str, str]:
     if result.std is None or result.focal == "known":
         return f"{focal:.0f} px", "assumed" if is_assumed else "taken as known"
     relative = result.std.focal
-    if relative > _UNCERTAIN:
+    if relative > NOT_DETERMINED:
         return _UNDETERMINED
     return f"{focal:.0f} ± {short(focal * relative)} px", "estimated"

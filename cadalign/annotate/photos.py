@@ -18,6 +18,7 @@ from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera, require_perspective
 from cadalign.io.documents import in_file
 from cadalign.io.files import listed, read_bytes, reading, require_utf8
+from cadalign.io.focal import FocalPrior
 from cadalign.io.images import (
     PHOTO_ENDINGS,
     open_photo,

@@ -13,7 +13,13 @@ import numba
 import platformdirs
 
 _PACKAGE = Path(__file__).parents[1]
-_SOURCES = ("solvers", "compile", "retrieval/kernels.py", "shapes/gaussians.py")
+_SOURCES = (
+    "solvers",
+    "compile",
+    "retrieval/kernels.py",
+    "shapes/gaussians.py",
+    "geometry/clipping.py",
+)
 """Folders and files of all kernels, and of what compiles them."""
 _UNUSED_DAYS = 60
 

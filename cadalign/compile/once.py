@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import io
 import logging
 import os
 import pickle
@@ -20,6 +21,7 @@ from llvmlite import binding
 from numba.core import compiler, types
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.core.codegen import JITCodeLibrary
+from numba.core.environment import Environment, lookup_environment
 from numba.core.registry import CPUDispatcher
 from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
@@ -166,7 +168,26 @@ class _Code(CompileResultCacheImpl):
         checksum, content = payload
         if hashlib.sha256(content).digest() != checksum:
             raise ValueError("damaged")
-        return super().rebuild(target_context, pickle.loads(content))
+        return super().rebuild(target_context, _CodeReader(io.BytesIO(content)).load())
+
+
+class _CodeReader(pickle.Unpickler):
+    """A reader that imports nothing: Numba imports the module of every function in the code."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) == ("numba.core.environment", "_rebuild_env"):
+            return _environment
+        return super().find_class(module, name)
+
+
+def _environment(module: str, constants: list[Any], name: str) -> Any:
+    """Constants of a compiled function; only code in object mode reads its module's variables."""
+    found = lookup_environment(name)
+    if found is None:
+        found = Environment({"__name__": module})
+        found.consts[:], found.env_name = constants, name
+        Environment._memo[name] = found
+    return found
 
 
 class KernelCache(FunctionCache):

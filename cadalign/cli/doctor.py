@@ -164,7 +164,7 @@ def examine() -> Health:
 
 def compiled_cache() -> str:
     """Describe the cache of compiled solvers: its folder, and how many functions it holds."""
-    from cadalign.compile.files import can_write, kernel_folder
+    from cadalign.compile.folder import can_write, kernel_folder
 
     folder = kernel_folder()
     count = sum(1 for _ in folder.rglob("*.nbi")) if folder.is_dir() else 0
@@ -178,7 +178,7 @@ def compiled_cache() -> str:
 
 def require_cache() -> None:
     """Refuse to compile ahead where nothing of it could be kept."""
-    from cadalign.compile.files import can_write, kernel_folder
+    from cadalign.compile.folder import can_write, kernel_folder
 
     folder = kernel_folder()
     if not can_write(folder):

@@ -155,7 +155,7 @@ def test_wrong_stored_options_name_the_file(
 ) -> None:
     path = write_observation(tmp_path / "chair.json", fit_options={"stretch": "x"})
     message = refusal_line(capsys, "fit", str(path))
-    assert message.startswith(f"{path}: fit.stretch: 'x' are not axes that can stretch")
+    assert message.startswith(f"{path}: fit.stretch: unknown stretch 'x'")
 
 
 def test_options_of_ransac_need_no_prefix(

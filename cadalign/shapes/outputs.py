@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
 
@@ -71,7 +71,6 @@ def read_shape(path: str | os.PathLike[str], kind: type[Kind]) -> Kind:
     try:
         document = msgspec.msgpack.decode(payload)
         model = msgspec.convert(document, kind, dec_hook=_read)
-        _check_known(document, model)
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         cause = error.__cause__
         if isinstance(cause, InputError) and str(cause) == str(error):  # of the model as a whole
@@ -105,19 +104,6 @@ def _read(kind: Any, value: Any) -> Any:
     return numbers.reshape(array.shape).astype(dtype.newbyteorder("="))
 
 
-def _check_known(document: Any, made: Any) -> None:
-    """Refuse fields of a document that what was made of it does not have."""
-    if isinstance(made, tuple):
-        for entry, part in zip(document, made, strict=True):
-            _check_known(entry, part)
-    elif is_dataclass(made):
-        unknown = document.keys() - {each.name for each in fields(made)}
-        if unknown:
-            raise InputError(f"unknown field {min(unknown)!r}")
-        for name, entry in document.items():
-            _check_known(entry, getattr(made, name))
-
-
 def draw_shape(path: Path, model: ShapeModel) -> None:
     """Draw a row for each component: the mean with its box and ids, then the first modes.
 
@@ -144,25 +130,13 @@ def draw_shape(path: Path, model: ShapeModel) -> None:
     write_whole(path, lambda unfinished: figure.savefig(unfinished, dpi=110))
 
 
-def neighbour_pairs(points: FloatArray) -> list[tuple[int, int]]:
-    """Pairs of points that have no third point nearer to both: a skeleton of the shape.
+def _skeleton(points: FloatArray) -> list[tuple[int, int]]:
+    """Pairs of points that lines join: the shortest tree that holds all."""
+    from scipy.sparse.csgraph import minimum_spanning_tree
+    from scipy.spatial.distance import pdist, squareform
 
-    The relative neighbourhood graph, which holds the minimum spanning tree: Toussaint, "The
-    relative neighbourhood graph of a finite planar set", 1980.
-
-    Examples
-    --------
-    >>> neighbour_pairs(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]))
-    [(0, 1), (1, 2)]
-    """
-    gaps = np.linalg.norm(points[:, None] - points, axis=2)
-    blocked = (np.maximum(gaps[:, None, :], gaps[None, :, :]) < gaps[..., None]).any(axis=2)
-    return [
-        (first, second)
-        for first in range(len(points))
-        for second in range(first + 1, len(points))
-        if not blocked[first, second]
-    ]
+    tree = minimum_spanning_tree(squareform(pdist(points))).tocoo()
+    return list(zip(tree.row.tolist(), tree.col.tolist(), strict=True))
 
 
 def _draw_component(row: Sequence[Axes], model: ShapeModel, component: ShapeComponent) -> None:
@@ -170,7 +144,7 @@ def _draw_component(row: Sequence[Axes], model: ShapeModel, component: ShapeComp
     points = component.mean[:-BOX_ROWS]
     common = _common(model)
     chosen = np.flatnonzero(common)
-    pairs = [(int(chosen[a]), int(chosen[b])) for a, b in neighbour_pairs(points[chosen])]
+    pairs = [(int(chosen[a]), int(chosen[b])) for a, b in _skeleton(points[chosen])]
     for axes in row:
         axes.set_aspect("equal")
         axes.set_axis_off()

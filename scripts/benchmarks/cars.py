@@ -125,7 +125,7 @@ def _car_shape(folder: Path) -> cadalign.ShapeModel:
         points,
         modes,
         np.full(len(modes), _MODE_DEVIATION),
-        names=names,
+        ids=names,
         box=box,
         residual_sigma=_REST,
         size_sigma=_LENGTH_SIGMAS,

@@ -1,4 +1,4 @@
-"""The picture of a shape model: any model is drawn."""
+"""The picture of a shape model: the skeleton holds the spanning tree, any model is drawn."""
 
 from __future__ import annotations
 
@@ -6,11 +6,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from cadalign.errors import DataError
 from cadalign.shapes.model import ShapeModel
-from cadalign.shapes.outputs import draw_shape
+from cadalign.shapes.outputs import draw_shape, neighbour_pairs
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 25))
+def test_the_skeleton_holds_the_minimum_spanning_tree(seed: int, count: int) -> None:
+    points = np.random.default_rng(seed).normal(size=(count, 3))
+    gaps = np.linalg.norm(points[:, None] - points, axis=2)
+    tree = np.argwhere(minimum_spanning_tree(gaps).toarray() > 0)
+    pairs = set(map(tuple, neighbour_pairs(points).tolist()))
+    assert {(min(a, b), max(a, b)) for a, b in tree.tolist()} <= pairs
+    graph = np.zeros((count, count))
+    graph[tuple(np.transpose(sorted(pairs)))] = 1
+    assert connected_components(graph)[0] == 1
 
 
 @pytest.mark.parametrize("name", ["picture.xyz", "picture"])

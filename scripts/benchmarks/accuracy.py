@@ -79,7 +79,7 @@ def _wide_lenses(given: BenchmarkData) -> Tables:
             camera = Camera(*size, focal, focal, half, half, coefficients, lens=lens)
             draw, name = partial(_wide_problem, camera, reach), f"{lens}, {field} degrees"
             rows.append(_over_bound(name, draw, 1.0, given.count or 1000, given.seed))
-    yield _TITLE, rows
+    yield f"Wide lenses. {_TITLE}", rows
 
 
 def _over_bound(name: str, draw: Draw, noise: float, count: int, seed: int) -> Row:

@@ -1,4 +1,4 @@
-"""What estimates say of mistakes, and of right data."""
+"""Mistakes, and right data: what estimates say of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""GLB files: what three.js, trimesh and Open3D make of them."""
+"""GLB files: what three.js and trimesh make of them."""
 
 from __future__ import annotations
 
@@ -160,17 +160,6 @@ def test_vertex_colors_take_the_place_of_the_material_s(tmp_path: Path) -> None:
     found = load_mesh(path)
     assert found.vertex_colors is not None
     assert np.abs(found.vertex_colors[:, :3] - [0.5, 0.25, 1.0]).max(axis=1).min() < 0.01
-
-
-def test_open3d_reads_the_object(tmp_path: Path) -> None:
-    open3d = pytest.importorskip("open3d", reason="open3d is not installed")
-    exported = aligned(tmp_path)
-    without_photo = replace(exported, views=(replace(exported.views[0], image=None),))
-    path = export_object(tmp_path / "wedge.glb", without_photo)
-    mesh = open3d.io.read_triangle_mesh(str(path))
-    expected = np.sort(exported.placed_mesh("camera").bounds * [1, -1, -1], axis=0)
-    np.testing.assert_allclose(mesh.get_min_bound(), expected[0], atol=1e-6)
-    np.testing.assert_allclose(mesh.get_max_bound(), expected[1], atol=1e-6)
 
 
 def test_every_view_has_a_camera_where_it_stands(tmp_path: Path) -> None:

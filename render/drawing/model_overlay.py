@@ -122,6 +122,7 @@ def draw_result(
         reprojected=camera.project_where_ahead(own),
         unseen=camera.project(in_camera[unseen]) if unseen.any() else None,
         regions=regions,
+        outliers=view.points_2d[~view.inliers],
     )
 
 

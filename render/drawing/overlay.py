@@ -58,6 +58,7 @@ def draw_overlay(
     reprojected: npt.ArrayLike | None = None,
     unseen: npt.ArrayLike | None = None,
     regions: npt.ArrayLike | None = None,
+    outliers: npt.ArrayLike | None = None,
     axes: bool = True,
     legend: bool = True,
 ) -> ByteImage:
@@ -89,6 +90,8 @@ def draw_overlay(
     regions : (r, j, 2) float, optional
         Outlines of regions that hold keypoints [px]; see
         `cadalign.render.drawing.layers.confidence_regions`.
+    outliers : (n, 2) float, optional
+        Observed keypoints that the estimate left out [px]: their rings are grey.
     axes : bool
         Whether to draw the axes.
     legend : bool
@@ -119,7 +122,7 @@ def draw_overlay(
     canvas = Canvas(pixels)
     if est_frame is not None:
         draw_lines(canvas, est_frame, EST_COLOR)
-    marks = KeypointMarks.checked(observed, reprojected, unseen, regions)
+    marks = KeypointMarks.checked(observed, reprojected, unseen, regions, outliers)
     strokes: list[_Stroke] = []
     for box, color in ((gt_box, GT_COLOR), (est_box, EST_COLOR)):
         if box is not None:

@@ -16,7 +16,7 @@ from cadalign.render import (
     draw_overlay,
     look_at,
 )
-from cadalign.render.drawing.layers import OBSERVED_COLOR, REPROJECTED_COLOR
+from cadalign.render.drawing.layers import OBSERVED_COLOR, OUTLIER_COLOR, REPROJECTED_COLOR
 from cadalign.render.drawing.overlay import AXIS_COLORS, EST_COLOR, GT_COLOR
 
 CAMERA = Camera.from_fov(640, 480, fov_x=50)
@@ -119,6 +119,15 @@ def test_keypoints_and_residuals_are_drawn(background):
         assert _has_color_near(image, other, REPROJECTED_COLOR)
         assert _has_color_near(image, (point + other) / 2, REPROJECTED_COLOR)
         assert _has_color_near(image, point + np.array([0, 5.0]), OBSERVED_COLOR)
+
+
+def test_keypoints_that_were_left_out_have_grey_rings():
+    seen = np.array([[100.0, 100.0], [300.0, 200.0]])
+    image = draw_overlay(_blank(), CAMERA, observed=seen, outliers=seen[1:], legend=False)
+    for point, is_left_out in zip(seen, (False, True), strict=True):
+        ring = point + np.array([0, 5.0])
+        assert _has_color_near(image, ring, OUTLIER_COLOR) == is_left_out
+        assert _has_color_near(image, ring, OBSERVED_COLOR) != is_left_out
 
 
 def test_reprojections_behind_the_camera_are_left_out():

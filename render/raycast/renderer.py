@@ -104,18 +104,8 @@ class RaycastRenderer:
         return scene.caster
 
     def _antialias(self, color: ByteImage, posed: PosedScene, samples: int) -> None:
-        part = color[posed.block.slices]
-        unlike = _unlike_neighbours(part)
-        if posed.scene.surface.opaque:
-            self._sample(color, unlike, posed, samples)
-            return
-        # What shows through is softer than an outline, and costs a ray for each layer.
-        outline = _unlike_neighbours(part[:, :, 3:])
-        self._sample(color, unlike & outline, posed, samples)
-        self._sample(color, unlike & ~outline, posed, -(-samples // 2))
-
-    def _sample(self, color: ByteImage, chosen: BoolArray, posed: PosedScene, samples: int) -> None:
-        rows, columns = np.nonzero(chosen)
+        """Cast more rays through pixels that differ from their neighbours."""
+        rows, columns = np.nonzero(_unlike_neighbours(color[posed.block.slices]))
         pixels = np.column_stack([columns + posed.block.left, rows + posed.block.top])
         offsets = _subpixel_offsets(samples)
         step = max(1, _RAYS_AT_ONCE // samples)

@@ -159,20 +159,19 @@ class _CrossValidation:
         Few models tell nothing but how strongly covariances are to be drawn to equal entries, and
         how far from the truth estimates are.
         """
-        if len(self._models.rows) < _LEAST_TO_CHOOSE:
-            return self._choose_of_few(components or 1)
-        best = max((self._try(_Recipe(each)) for each in _STRENGTHS), key=_total)
-        best = self._with_components(self._with_reflection(best), components)
-        modes = self._modes(best)
-        return Choice(best.recipe, modes, self._calibration(best, modes), self._margins(best))
-
-    def _choose_of_few(self, components: int) -> Choice:
-        best = max((self._try(_Recipe(each)) for each in _STRENGTHS_OF_FEW), key=_total)
-        recipe = replace(best.recipe, components=components)
-        if components > 1:  # but for one model each
-            most = len(self._models.rows) - 1
-            best = self._try(replace(recipe, components=min(components, most)))
-        return Choice(recipe, None, self._calibration(best, None), self._margins(best))
+        count = len(self._models.rows)
+        is_few, modes = count < _LEAST_TO_CHOOSE, None
+        strengths = _STRENGTHS_OF_FEW if is_few else _STRENGTHS
+        best = max((self._try(_Recipe(each)) for each in strengths), key=_total)
+        if is_few:
+            recipe = replace(best.recipe, components=components or 1)
+            if recipe.components > 1:  # but for one model each
+                most = min(recipe.components, count - 1)
+                best = self._try(replace(recipe, components=most))
+        else:
+            best = self._with_components(self._with_reflection(best), components)
+            recipe, modes = best.recipe, self._modes(best)
+        return Choice(recipe, modes, self._calibration(best, modes), self._margins(best))
 
     def _with_reflection(self, best: _Trial) -> _Trial:
         completed = self._models.completed()

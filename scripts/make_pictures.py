@@ -19,8 +19,7 @@ import cv2
 import numpy as np
 import tyro
 
-from cadalign import Alignment, Box, Camera, Observation, fit
-from cadalign.annotate.model import ClickableModel
+from cadalign import Box, Camera, Observation, fit
 from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.session import open_session
 from cadalign.datasets import AnnotatedModel, KeypointNet, ModelKeypoints, write_sample_dataset
@@ -31,6 +30,7 @@ from cadalign.render import (
     RaycastRenderer,
     Scene,
     draw_overlay,
+    overlay_model,
     pose_in_view,
     visible_keypoints,
 )
@@ -42,7 +42,6 @@ MODELS = (("chair", "000"), ("car", "002"), ("bottle", "002"), ("vessel", "003")
 CHAIR_CAMERA = Camera.from_fov(640, 720, fov_x=33.0)
 CHAIR_VIEW = Angles(azimuth=143.0, elevation=24.0)
 PHOTO_GROUND = (206, 208, 212)
-LINE = (35, 208, 255)
 
 
 def overview() -> None:
@@ -96,9 +95,8 @@ def chairs(*, files: Path | None = None) -> None:
         scene = Scene(own.load_mesh())
         image = read_image(photo, CHAIR_CAMERA)
         aligned = draw_overlay(
-            with_wireframe(image, ClickableModel(scene.mesh), result.alignment),
+            overlay_model(image, CHAIR_CAMERA, scene, result.alignment),
             CHAIR_CAMERA,
-            est_box=Box.from_model(scene.bounds, result.alignment),
             observed=observation.points_2d,
             reprojected=CHAIR_CAMERA.project(result.alignment.apply(observation.points_3d)),
             legend=False,
@@ -133,15 +131,6 @@ def still(scene: Scene) -> ByteImage:
     pose = pose_in_view(scene, CHAIR_CAMERA, CHAIR_VIEW)
     frame = RaycastRenderer().render(scene, CHAIR_CAMERA, pose, samples=16)
     return frame.composite(PHOTO_GROUND)
-
-
-def with_wireframe(image: ByteImage, model: ClickableModel, alignment: Alignment) -> ByteImage:
-    """The photo with the lines of the stretched model."""
-    drawn = image.copy()
-    for start, end in model.wireframe.seen_in(CHAIR_CAMERA, alignment):
-        ends = [tuple(np.round(16 * point).astype(int).tolist()) for point in (start, end)]
-        cv2.line(drawn, *ends, LINE, 1, cv2.LINE_AA, shift=4)
-    return drawn
 
 
 def write_row(path: Path, pictures: Sequence[np.ndarray], *, width: int) -> None:

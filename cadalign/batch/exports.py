@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import numpy as np
-
 from cadalign.batch.exported import exported_object
 from cadalign.batch.outputs import RECORD_COLUMNS
 from cadalign.errors import CadalignError, DataError, InputError, all_left_out, brief, quote
@@ -20,7 +18,7 @@ from cadalign.io.files import keeping, listed, made_folder, write_json
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 from cadalign.render import Scene, overlay_model
-from cadalign.render.scene import LIGHT_GREY
+from cadalign.render.drawing.model_overlay import photo_of
 
 _FIX = "do the run again"
 
@@ -113,13 +111,9 @@ def _write_glb(path: Path, exported: AlignedObject) -> None:
 
 def _write_overlays(path: Path, exported: AlignedObject) -> None:
     """Draw a model over its photos, grey where there is none."""
-    if exported.mesh is None:
-        raise InputError("no mesh of the object is known")
     scene = Scene(exported.mesh)
     for number, view in enumerate(exported.views):
-        camera, photo = view.camera, view.read_image()
-        if photo is None:
-            photo = np.full((camera.height, camera.width, 3), LIGHT_GREY, dtype=np.uint8)
-        drawn = overlay_model(photo, camera, scene, view.cam_from_model)
+        photo = photo_of(view.image, view.camera)
+        drawn = overlay_model(photo, view.camera, scene, view.cam_from_model)
         name = f"{path.name}_{number}.png" if number else f"{path.name}.png"
         write_image(path.with_name(name), drawn)

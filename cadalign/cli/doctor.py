@@ -23,7 +23,7 @@ _SHOWN = 10
 
 @dataclass(frozen=True)
 class Doctor(JsonOption):
-    """Check the renderers and their speed, and show how to enable missing ones.
+    """Check the renderers, and show how to enable missing ones.
 
     Also shows the processor cores and the cache of compiled solvers. With --data, lists what lies
     in a folder of photos instead: its format, and how many photos and objects can be read. With
@@ -77,23 +77,13 @@ class Doctor(JsonOption):
 
 
 def _print(health: Health) -> None:
-    from rich.table import Column, Table
+    from rich.table import Table
 
-    heads = (
-        "renderer",
-        "works",
-        Column("ms", justify="right"),
-        "versions",
-        "drawn by / what is wrong",
-    )
-    caption = "ms: a frame of 640 x 480 px, 20,480 triangles"
-    table = Table(*heads, title="Renderers", caption=caption)
+    table = Table("renderer", "works", "drawn by / what is wrong", title="Renderers")
     for renderer in health.renderers:
         table.add_row(
             renderer.name,
             "yes" if renderer.works else "no",
-            "" if renderer.milliseconds is None else f"{renderer.milliseconds:.0f}",
-            renderer.versions,
             renderer.detail,
         )
     new_console(stderr=False).print(table)
@@ -148,7 +138,7 @@ def examine() -> Health:
     """Try every renderer in a process of its own and collect the rest; takes some seconds."""
     from cadalign.render.probe import REMEDIES, RENDERERS, best_renderer, probe_renderer
 
-    renderers = tuple(probe_renderer(name, timed=True) for name in RENDERERS)
+    renderers = tuple(probe_renderer(name) for name in RENDERERS)
     return Health(
         renderers=renderers,
         best=best_renderer(),

@@ -76,7 +76,7 @@ class FittedFile:
 
         result = self.result
         seen = list(zip(observation.views, result.views, strict=True))
-        photos = [photo_of(image, view.camera) for image, view in seen]
+        photos = [photo_of(image.image, view.camera) for image, view in seen]
         mesh = shown = bounds = None
         masks: list[FloatArray | BoolArray | None] = [None]
         if views is not None:
@@ -87,12 +87,10 @@ class FittedFile:
             bounds = mesh.bounds
         found = self
         if picture:
-            of_views = enumerate(zip(observation.views, photos, masks, strict=True))
+            of_views = enumerate(zip(photos, masks, strict=True))
             pictures = (
-                draw_result(
-                    image, result, photo=photo, mesh=shown, bounds=bounds, mask=mask, number=number
-                )
-                for number, (image, photo, mask) in of_views
+                draw_result(photo, result, mesh=shown, bounds=bounds, mask=mask, number=number)
+                for number, (photo, mask) in of_views
             )
             found = replace(found, pictures=tuple(pictures))
         if not overlay:

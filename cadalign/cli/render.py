@@ -55,6 +55,5 @@ class Render:
 
         make_folder_of(self.out)
         write_image(self.out, job.picture())
-        drawn_by = job.renderer.drawn_by(job.scene, samples=self.samples)
-        say(f"Written: {self.out} (drawn by {drawn_by})")
+        say(f"Written: {self.out}")
         return 0

@@ -23,7 +23,7 @@ from cadalign.render.drawing.pictures import (
     pose_in_view,
 )
 from cadalign.render.probe import make_renderer
-from cadalign.render.scene import LIGHT_GREY, Renderer, Scene, check_image_size
+from cadalign.render.scene import Renderer, Scene, check_image_size
 from cadalign.render.viewpoints import visible_keypoints
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class RenderJob:
         images = [self._draw(view) for view in self.views.values()]
         if len(images) == 1:
             return images[0]
-        return contact_sheet(images, list(self.views), background=LIGHT_GREY)
+        return contact_sheet(images, list(self.views))
 
 
 def parse_size(text: str) -> tuple[int, int]:

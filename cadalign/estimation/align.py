@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -145,15 +146,14 @@ def align(
         return _estimate(compile_problem(model, views, size, some, own, ransac), start)
 
     seen = [given[number] for number in problem.numbers]
-    case = DiagnosisCase(model, seen, again, ransac, size)
+    case = DiagnosisCase(model, seen, again, ransac, size, is_tolerant=loss != FitOptions.loss)
     try:
         result = _estimate(problem, start)
     except (NoConsensusError, DegenerateError) as error:
         named = diagnose_refusal(case, with_keypoints=isinstance(error, NoConsensusError))
         error.fix = named or error.fix
         raise
-    cause = diagnose(case, result=result) if loss == FitOptions.loss else None
-    return with_cause(result, cause, problem.views)
+    return with_cause(result, partial(diagnose, case, result=result), problem.views)
 
 
 def _estimate(problem: Problem, start: float) -> Result:

@@ -17,7 +17,13 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import quote
-from cadalign.estimation.agreement import Agreement, AnyModel, DiagnosisCase, Rule
+from cadalign.estimation.agreement import (
+    AS_MANY_AGREE,
+    Agreement,
+    AnyModel,
+    DiagnosisCase,
+    Rule,
+)
 from cadalign.estimation.assemble import result_of_keypoints
 from cadalign.estimation.fit import fit_once
 from cadalign.estimation.model import Model
@@ -69,11 +75,11 @@ def diagnose(case: DiagnosisCase, *, result: Result | None = None) -> EstimateWa
 
 
 def _likeliest(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
-    rules = list(_rules_for(case, given))
+    rules = list(_mistakes_in(case)) if case.is_tolerant else list(_rules_for(case, given))
     found = [(rule, each) for rule in rules if (each := case.without(rule)) is not None]
     explaining = [each for each in found if case.explains(*each, given)]
     if not explaining:
-        return None if case.has_chance(given) else _warning(case, MISFIT, given, given)
+        return None if case.is_tolerant or case.has_chance(given) else _warning(case, MISFIT, given, given)
     rule, best = max(explaining, key=lambda each: case.gain(each[0], each[1], given))
     least = case.gain(rule, best, given) - _AS_LIKELY
     alike = [each for each in found if each[0].kind == rule.kind]
@@ -244,14 +250,15 @@ MISFIT = Rule("misfit")
 def _rules_for(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
     model, fails = case.model, not case.has_chance(given)
     yield from _mistakes_in(case)
-    yield from _other_sizes(case)
+    yield from _other_sizes(case) if case.is_exact or fails else ()
     if case.is_plain and isinstance(model, Model) and fails:
         if model.stretch is not None or model.stretch_sigma is not None:
             yield HELD
         if given.result.focal == "known":
             yield ANOTHER_FOCAL
     if fails or case.has_contradiction(given):
-        yield from () if case.ransac else (OUTLIERS,)
+        least = OUTLIERS.gain if case.is_exact else AS_MANY_AGREE
+        yield from () if case.ransac else (OUTLIERS._replace(gain=least),)
         yield from _pieces_of(case, given)
 
 
@@ -321,7 +328,7 @@ def _pieces_of(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
 
 UNIT = "in another unit (millimetres for metres)?"
 _TEXTS = {
-    "mistake": "{named}: corrected, {compared}",
+    "mistake": "{posture}{named}{asked} corrected, {compared}",
     "unit": "{named}: is it " + UNIT + " Corrected, {compared}",
     "contradiction": "{named} contradicts the other evidence: without it, {compared}",
     "stretch": "the keypoints contradict the constraint on the stretch: without it they fit "
@@ -339,8 +346,12 @@ def _warning(
     case: DiagnosisCase, rule: Rule, best: Agreement, given: Agreement, *, named: str = ""
 ) -> EstimateWarning:
     scale = ", ".join(f"{value:.3g}" for value in best.result.alignment.scale.tolist())
-    wrong, view, keypoints = _outliers_of(case, best) if rule is OUTLIERS else ("", None, ())
+    posture, asked = "", ":"
+    if given.posture and not (best.posture or case.is_exact):
+        posture, asked = f"the object {given.posture}: is it so, or is it that ", "?"
+    wrong, view, keypoints = _outliers_of(case, best) if rule.kind == "outlier" else ("", None, ())
     words = {"named": named, "compared": _compared(best, given), "scale": scale, "wrong": wrong}
+    words |= {"posture": posture, "asked": asked}
     text = _TEXTS[rule.kind].format(best=best, given=given, **words)
     return EstimateWarning(rule.kind, text, 0 if rule is ANOTHER_FOCAL else view, keypoints)
 
@@ -363,7 +374,7 @@ def _outliers_of(case: DiagnosisCase, best: Agreement) -> tuple[str, int | None,
 
 def _named(likely: Sequence[tuple[Rule, Agreement]]) -> str:
     """Names of rules that are as likely; first those of an upright object."""
-    upright = {rule.clause: None for rule, each in likely if each.is_upright}
+    upright = {rule.clause: None for rule, each in likely if not each.posture}
     others = {rule.clause: None for rule, each in likely if rule.clause not in upright}
     named = listed(list(upright or others)) if likely else ""
     if upright and others:

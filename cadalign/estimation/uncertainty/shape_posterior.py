@@ -138,7 +138,7 @@ def single_posterior(
         own = np.append(np.arange(3 * m - 6), 3 * faces + np.arange(3))
         prior = prior[np.ix_(own, own)]
     boxed, still = widened_boxes(points, seen.points), np.ones(3)
-    errors, rows, jacobian = _linearised(points[seen.points], pose, seen)
+    _, rows, jacobian = _linearised(points[seen.points], pose, seen)
     # Behind the points, the difference of the box's corners.
     prior = np.concatenate([prior, prior[-3:] - prior[-6:-3]])
     prior = np.concatenate([prior, prior[:, -3:] - prior[:, -6:-3]], axis=1)
@@ -165,17 +165,4 @@ def single_posterior(
     logs = np.concatenate([np.eye(_POSE), relative[:, None] * by_steps[m]])
     covariance = logs @ of_pose @ logs.T
     covariance[_POSE:, _POSE:] += relative[:, None] * relative * left[m]
-    moved = (points - mixture.means[component])[seen.points].ravel()
-    misses = _misses(errors - rows @ moved, inverse - weight.T @ of_pose @ weight)
-    return Estimate(boxed, still, (pose,), (covariance,), whole[:m], of_seen, misses=misses)
-
-
-def _misses(errors: FloatArray, weight: FloatArray) -> tuple[float, float] | None:
-    """Largest squared miss of a keypoint, and that of all; ``weight`` is inverse covariance."""
-    count = len(errors) // 2
-    forces = (weight @ errors).reshape(count, 2)
-    blocks = np.einsum("iaib->iab", weight.reshape(count, 2, count, 2))
-    if np.linalg.eigvalsh(blocks).min() <= 0:
-        return None
-    squares = forces * np.linalg.solve(blocks, forces[:, :, None])[:, :, 0]
-    return float(squares.sum(axis=1).max()), float(errors @ weight @ errors)
+    return Estimate(boxed, still, (pose,), (covariance,), whole[:m], of_seen)

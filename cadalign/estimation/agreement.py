@@ -41,7 +41,7 @@ _MOST_REJECTED = 1 / 3  # share of the keypoints that are outliers; more are non
 _CHANCE_OF_RATIO = 1e-3  # that residuals of an unknown noise differ by as much
 _UPRIGHT = 0.5  # cosine between the model's up axis and the photo's upwards, at least
 _SEEN_ALONG = 0.3  # of the up axis in the photo, which is seen end-on
-_BELOW_DEG, _LOW_DEG = -10.0, 0.0  # elevations of cameras below the ground, and on it
+_BELOW_DEG, _LOW_DEG = -7.0, 0.0  # elevations of cameras below the ground, and on it
 
 
 class Rule(NamedTuple):

@@ -153,7 +153,7 @@ def align(
         named = diagnose_refusal(case, with_keypoints=isinstance(error, NoConsensusError))
         error.fix = named or error.fix
         raise
-    return with_cause(result, partial(diagnose, case, result=result), problem.views)
+    return with_cause(result, partial(diagnose, case, result=result), problem.views, ransac)
 
 
 def _estimate(problem: Problem, start: float) -> Result:

@@ -54,7 +54,10 @@ from cadalign.estimation.search import Minimum, search
 from cadalign.estimation.symmetry import SAME_SQUARES, stretched_axes
 from cadalign.estimation.uncertainty.doubts import (
     another_pose,
+    first_of_camera,
     outside_image,
+    rejections,
+    stretch_doubts,
     unexplained,
     weaknesses,
 )
@@ -256,35 +259,47 @@ class DiagnosedPosterior(Posterior):
 
 
 def with_cause(
-    result: Result, diagnosis: Callable[[], EstimateWarning | None], views: Sequence[View]
+    result: Result,
+    diagnosis: Callable[[], EstimateWarning | None],
+    views: Sequence[View],
+    ransac: RansacOptions | None,
 ) -> Result:
     """The result with the cause of a misfit, and warnings about noise and keypoints' places."""
-    causes = partial(_causes, result.sigma, diagnosis, views)
+    causes = partial(_causes, result, diagnosis, views, ransac)
     known = vars(result.posterior) | {"causes": causes, "stated": result.warnings}
     known.pop("warnings")
     return replace(result, posterior=quickly(DiagnosedPosterior, known))
 
 
 def _causes(
-    sigma: float | None, diagnosis: Callable[[], EstimateWarning | None], views: Sequence[View]
+    result: Result,
+    diagnosis: Callable[[], EstimateWarning | None],
+    views: Sequence[View],
+    ransac: RansacOptions | None,
 ) -> Warnings:
-    cause = diagnosis()
-    causes: Warnings = () if cause is None else (cause,)
+    cause, sigma = diagnosis(), result.sigma
+    causes: Warnings = ()
     lacking = [view.pixels for view in views if view.sigma is None and len(view.keypoint_ids)]
-    if lacking and sigma is not None and not any(c.kind == "mistake" for c in causes):
-        causes = (*unexplained(sigma, lacking), *causes)
-    placed = (
+    if lacking and sigma is not None and not (cause and cause.kind == "mistake"):
+        causes = unexplained(sigma, lacking)
+    placed = tuple(
         warning
         for view in views
         for warning in outside_image(
             view.pixels,
             view.camera,
-            agree=not causes,
+            agree=cause is None and not causes,
+            sigma=view.sigma,
             view=view.number,
             where=f"views[{view.number}]: " if len(views) > 1 else "",
         )
     )
-    return (*causes, *placed)
+    found = (*causes, *first_of_camera(placed, cause))
+    if result.std is not None and isinstance(result.model, Model):
+        found += stretch_doubts(result.alignment, result.std, result.model.fit_options())
+    if ransac is None or (cause is not None and cause.kind == "mistake"):
+        return found
+    return (*found, *rejections(result.views, ransac, common_sigma(views)))
 
 
 def common_sigma(views: Sequence[View]) -> float | None:

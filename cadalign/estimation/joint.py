@@ -288,7 +288,7 @@ def _causes(
         for warning in outside_image(
             view.pixels,
             view.camera,
-            agree=cause is None and not causes,
+            cause=cause or next(iter(causes), None),
             sigma=view.sigma,
             view=view.number,
             where=f"views[{view.number}]: " if len(views) > 1 else "",

@@ -55,13 +55,12 @@ def keypoint_warnings(
     """Warnings about the cause of a misfit, and what the keypoints do not determine."""
     cause = None if diagnosis is None or _fit(fitted) else diagnosis(fitted)
     observed = fitted.observed[np.isfinite(fitted.residuals).all(axis=1)]
-    fits = cause is None
     is_mistake = cause is not None and cause.kind == "mistake"
     sigma = fitted.options.sigma
-    placed = outside_image(observed, fitted.camera, agree=fits or is_mistake, sigma=sigma)
+    placed = outside_image(observed, fitted.camera, cause=cause, sigma=sigma)
     found = first_of_camera(placed, cause)
     for row, first in enumerate(repeated(fitted.points_3d, fitted.observed)):
-        if row != first:
+        if row != first and not fitted.inliers[row]:
             text = f"keypoint {row} is keypoint {first} again, and counts once"
             found.append(EstimateWarning("left-out", text, 0, (row,)))
     if covariance is None or is_mistake:  # of the alignment nothing else can be said
@@ -86,7 +85,7 @@ def keypoint_warnings(
     found += stretch_doubts(fitted.alignment, uncertainty_of(covariance), options)
     found += weaknesses(fitted.alignment, covariance, keypoints=kept, stretch_sigma=prior)
     # Likelihoods tell nothing where keypoints do not fit, or others than these were rejected.
-    if fits and fitted.search is None:
+    if cause is None and fitted.search is None:
         poses = [(each.alignment, each.relative_likelihood) for each in fitted.alternatives]
         found += another_pose(fitted.alignment, poses, covariance)
     return tuple(found)
@@ -244,18 +243,20 @@ def outside_image(
     points_2d: FloatArray,
     camera: Camera,
     *,
-    agree: bool,
+    cause: EstimateWarning | None,
     sigma: Any = None,
     view: int = 0,
     where: str = "",
 ) -> Warnings:
     """Warn about an implausible camera, and about keypoints (n, 2) that are none of the image's.
 
-    All keypoints lie beyond one side or, where they do not ``agree``, most outside; or they span
-    hardly more than ``sigma`` [px]. ``where`` begins the texts.
+    All keypoints lie beyond one side or, where they do not agree, by some ``cause``, most outside;
+    or they span hardly more than ``sigma`` [px]. ``where`` begins the texts.
     """
+    agree, confirm = cause is None or cause.kind == "mistake", len(points_2d) > LEAST_POINTS
+    confirm &= cause is None or cause.kind not in ("misfit", "camera", "noise")
     own, size = np.array([camera.width, camera.height]), f"{camera.width} x {camera.height} px"
-    doubts = camera_doubts(camera, is_tested=agree and len(points_2d) > LEAST_POINTS)
+    doubts = camera_doubts(camera, is_tested=confirm)
     found = [EstimateWarning("camera", where + text, view) for text in doubts]
     extent = float(np.ptp(points_2d, axis=0).max()) if len(points_2d) > 1 else math.inf
     if np.ndim(sigma) == 0 and sigma is not None and extent < _LEAST_EXTENT * sigma:

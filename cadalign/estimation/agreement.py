@@ -28,7 +28,7 @@ AnyModel = Model | ShapeModel
 
 AS_MANY_AGREE = 12.0
 """Gain of -2 log likelihood without a cause, at least."""
-_OF_UNCERTAIN = 0.5  # share of it that suffices for a mistake in keypoints of an uncertain shape
+_OF_UNCERTAIN = 0.5  # share of it that suffices for a mistake, where shape or noise are uncertain
 _UNLIKELY = 8.0  # -2 log of the share of objects that are not upright, or seen from below
 _AS_EXPECTED = 1.3  # squares of uncertain shapes, over those expected, up to which none is doubted
 _MOST_CORRECTED = 1.6  # residuals of uncertain shapes without a mistake, over their deviations
@@ -247,11 +247,14 @@ class DiagnosisCase:
             return more and gain > _MORE_AGREE
         rejected = found.keypoints - found.inliers
         least = (_AS_MANY_ARE_FOUND if is_robust else rule.gain) * self.inflation**2
-        if rule.kind == "mistake" and not self.is_exact and rule.gain <= AS_MANY_AGREE:
+        is_correction = rule.kind == "mistake" and rule.gain <= AS_MANY_AGREE
+        if is_correction and not (self.is_exact and given.sigma is None):
             least = _OF_UNCERTAIN * rule.gain
         if not gain > least * (max(rejected, 1) if "ransac" in rule.changes else 1):
             return False
         if found.sigma is not None and given.sigma is not None:
+            if is_correction:
+                return 2 * found.redundancy * math.log(given.sigma / found.sigma) > least
             ratio = f_quantile(found.redundancy, found.redundancy, _CHANCE_OF_RATIO)
             return found.sigma < given.sigma / math.sqrt(ratio)
         fits = self.has_chance(found)

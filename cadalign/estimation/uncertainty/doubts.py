@@ -34,7 +34,7 @@ UNDETERMINED = 1.0
 UNDETERMINED_ROTATION_DEG = 30.0
 FALSE_ALARMS = 0.004
 """Probability of residuals by chance, below which they fail their test."""
-_LARGE = 0.02  # estimated sigma, over the keypoints' extent, that is large
+_LARGE = 0.005  # estimated sigma, over the keypoints' extent, that is large
 _LARGEST_SHARE = 0.45  # of the keypoints' spread, of an estimated sigma
 _LEAST_EXTENT = 5.0  # of keypoints [sigma]
 _MOST_REJECTED = 0.3  # share of the keypoints that a robust search rejects without a word

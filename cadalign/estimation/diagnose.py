@@ -81,7 +81,11 @@ def _likeliest(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
     found = [(rule, each) for rule in rules if (each := case.without(rule)) is not None]
     explaining = [each for each in found if case.explains(*each, given)]
     if not explaining:
-        return None if case.is_tolerant or case.has_chance(given) else _warning(case, MISFIT, given, given)
+        return (
+            None
+            if case.is_tolerant or case.has_chance(given)
+            else _warning(case, MISFIT, given, given)
+        )
     rule, best = max(explaining, key=lambda each: case.gain(each[0], each[1], given))
     least = case.gain(rule, best, given) - _AS_LIKELY
     alike = [each for each in found if each[0].kind == rule.kind]
@@ -221,7 +225,7 @@ def _without_rows(view: View, *, number: int, rows: tuple[int, ...]) -> View:
     kept = np.delete(np.arange(len(view.pixels)), rows)
     ids = [view.keypoint_ids[row] for row in kept.tolist()]
     each = {name: getattr(view, name) for name in ("sigma", "scores", "depth")}
-    some = {name: np.asarray(v)[kept] for name, v in each.items() if np.ndim(v) > 0}
+    some: dict[str, Any] = {name: np.asarray(v)[kept] for name, v in each.items() if np.ndim(v) > 0}
     return replace(view, points_2d=view.pixels[kept], ids=ids, **some)
 
 

@@ -244,8 +244,8 @@ def _fit_distinct(
     inliers[rows] = found.inliers
     residuals = found.camera.project_where_ahead(found.alignment.apply(points)) - pixels
     others = tuple(replace(each, points_3d=points) for each in found.alternatives)
-    changed = {"points_3d": points, "residuals": residuals, "alternatives": others}
-    return replace(found, inliers=inliers, **changed)
+    found = replace(found, points_3d=points, alternatives=others)
+    return replace(found, residuals=residuals, inliers=inliers)
 
 
 # Checking options takes as long as solving a small problem linearly, and calls repeat them.

@@ -31,6 +31,7 @@ AS_MANY_AGREE = 12.0
 _OF_UNCERTAIN = 0.5  # share of it that suffices for a mistake, where shape or noise are uncertain
 _UNLIKELY = 8.0  # -2 log of the share of objects that are not upright, or seen from below
 _AS_EXPECTED = 1.3  # squares of uncertain shapes, over those expected, up to which none is doubted
+_LEFT = 0.5  # of the squares that are expected, that right data leave at least
 _MOST_CORRECTED = 1.6  # residuals of uncertain shapes without a mistake, over their deviations
 _LEAST_RATIO = 1.7  # of the residuals with and without it
 _MUCH_LESS = 5.0  # the same, where those without it are of a wrong sigma
@@ -207,7 +208,8 @@ class DiagnosisCase:
         """
         pieces = found.result.evidence
         if not self.is_exact and found.sigma is None:
-            return found.chi_square > _AS_EXPECTED * found.redundancy > 0
+            most = found.chi_square - _LEFT * found.redundancy  # that its removal could gain
+            return most > AS_MANY_AGREE * self.inflation**2
         counts = [_equations_of(each) for each in pieces]
         return len(pieces) > 1 and any(
             chance_of(count * each.rms_sigmas**2, count) * len(pieces) < FALSE_ALARMS
@@ -225,8 +227,9 @@ class DiagnosisCase:
         if self.ransac is not None and (self.is_exact or given.ratio >= 1):
             return True
         if given.sigma is None:
-            is_odd = bool(given.posture or given.is_low) and not self.is_exact
-            return is_odd or not self.has_chance(given) or self.has_contradiction(given)
+            is_odd = bool(given.posture or given.is_low)
+            is_odd |= given.chi_square > _AS_EXPECTED * given.redundancy > 0
+            return (is_odd and not self.is_exact) or not self.has_chance(given) or self.has_contradiction(given)
         pixels = [view.pixels for view in self.views]
         return given.redundancy > 0 and is_large_sigma(given.sigma, pixels)
 

@@ -229,7 +229,11 @@ class DiagnosisCase:
         if given.sigma is None:
             is_odd = bool(given.posture or given.is_low)
             is_odd |= given.chi_square > _AS_EXPECTED * given.redundancy > 0
-            return (is_odd and not self.is_exact) or not self.has_chance(given) or self.has_contradiction(given)
+            return (
+                (is_odd and not self.is_exact)
+                or not self.has_chance(given)
+                or self.has_contradiction(given)
+            )
         pixels = [view.pixels for view in self.views]
         return given.redundancy > 0 and is_large_sigma(given.sigma, pixels)
 

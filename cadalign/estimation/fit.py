@@ -32,7 +32,7 @@ from cadalign.estimation.solve import are_solved_at_once, fit_keypoints, solve
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.solvers.constants import POSE_SIZE
+from cadalign.solvers.constants import LEAST_POINTS, POSE_SIZE
 
 
 @np.errstate(all="ignore")  # what is not finite is refused
@@ -222,7 +222,7 @@ def _firsts(problems: Problems) -> list[int]:
     if len(set(u)) == len(u):
         return []
     rows = sorted(set(repeated(problems.points_3d, problems.points_2d)))
-    return rows if len(rows) < len(u) else []
+    return rows if LEAST_POINTS < len(rows) < len(u) else []  # of fewer, errors say why
 
 
 def _fit_distinct(

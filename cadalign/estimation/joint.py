@@ -295,7 +295,7 @@ def _causes(
         )
     )
     found = (*causes, *first_of_camera(placed, cause))
-    if result.std is not None and isinstance(result.model, Model):
+    if cause is None and result.std is not None and isinstance(result.model, Model):
         found += stretch_doubts(result.alignment, result.std, result.model.fit_options())
     if ransac is None or (cause is not None and cause.kind == "mistake"):
         return found

@@ -82,7 +82,8 @@ def keypoint_warnings(
         doubt = focal_doubt(fitted.camera, options.focal_prior)
         found += () if doubt is None else (doubt,)
     prior = options.stretch_sigma
-    found += stretch_doubts(fitted.alignment, uncertainty_of(covariance), options)
+    if cause is None:
+        found += stretch_doubts(fitted.alignment, uncertainty_of(covariance), options)
     found += weaknesses(fitted.alignment, covariance, keypoints=kept, stretch_sigma=prior)
     # Likelihoods tell nothing where keypoints do not fit, or others than these were rejected.
     if cause is None and fitted.search is None:

@@ -149,9 +149,7 @@ class Estimate(NamedTuple):
 
     Poses, covariances (9, 9) and cameras are those of every view that takes part, in the frames of
     the given cameras; ``of_points`` (m, 3, 3) are in the model's frame, ``of_seen``, with the pose,
-    in the first camera's. ``misses`` are squared distances in deviations, the largest of a keypoint
-    from what the others predict and that of all from the mean shape; None where nothing predicts a
-    keypoint.
+    in the first camera's.
     """
 
     points: FloatArray
@@ -163,7 +161,6 @@ class Estimate(NamedTuple):
     likelihood: float = 1.0
     cameras: tuple[Camera, ...] = ()
     is_optimum: bool = False
-    misses: tuple[float, float] | None = None
 
     @property
     def lengths(self) -> FloatArray:

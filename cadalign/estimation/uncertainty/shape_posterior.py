@@ -41,13 +41,11 @@ def single_posterior(
     state: FloatArray,
     inflation: float,
     model: ShapeModel | None = None,
-    *,
-    is_best: bool = True,
 ) -> Estimate:
     """The estimate at a state (D,) of a component, with its posterior; infinite without a pose.
 
     The prior's deviations are widened by the ``inflation``. The box holds the keypoints that are
-    seen. Misses are those of the best estimate alone.
+    seen.
     """
     count, m = len(seen.points), mixture.means.shape[1]
     rotation = state[:9].reshape(3, 3)
@@ -59,7 +57,7 @@ def single_posterior(
         own = np.append(np.arange(3 * m - 6), 3 * faces + np.arange(3))
         prior = prior[np.ix_(own, own)]
     boxed, still = widened_boxes(points, seen.points), np.ones(3)
-    errors, rows, jacobian = linearised(points[seen.points], pose, seen)
+    _, rows, jacobian = linearised(points[seen.points], pose, seen)
     # Behind the points, the difference of the box's corners.
     prior = np.concatenate([prior, prior[-3:] - prior[-6:-3]])
     prior = np.concatenate([prior, prior[:, -3:] - prior[:, -6:-3]], axis=1)
@@ -86,19 +84,4 @@ def single_posterior(
     logs = np.concatenate([np.eye(_POSE), relative[:, None] * by_steps[m]])
     covariance = logs @ of_pose @ logs.T
     covariance[_POSE:, _POSE:] += relative[:, None] * relative * left[m]
-    if not is_best:
-        return Estimate(boxed, still, (pose,), (covariance,), whole[:m], of_seen)
-    moved = (points - mixture.means[component])[seen.points].ravel()
-    misses = _misses(errors - rows @ moved, inverse - weight.T @ of_pose @ weight)
-    return Estimate(boxed, still, (pose,), (covariance,), whole[:m], of_seen, misses=misses)
-
-
-def _misses(errors: FloatArray, weight: FloatArray) -> tuple[float, float] | None:
-    """Largest squared miss of a keypoint, and that of all; ``weight`` is inverse covariance."""
-    count = len(errors) // 2
-    forces = (weight @ errors).reshape(count, 2)
-    blocks = np.einsum("iaib->iab", weight.reshape(count, 2, count, 2))
-    if np.linalg.eigvalsh(blocks).min() <= 0:
-        return None
-    squares = forces * np.linalg.solve(blocks, forces[:, :, None])[:, :, 0]
-    return float(squares.sum(axis=1).max()), float(errors @ weight @ errors)
+    return Estimate(boxed, still, (pose,), (covariance,), whole[:m], of_seen)

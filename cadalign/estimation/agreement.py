@@ -32,6 +32,7 @@ _OF_UNCERTAIN = 0.5  # share of it that suffices for a mistake, where shape or n
 _UNLIKELY = 8.0  # -2 log of the share of objects that are not upright, or seen from below
 _AS_EXPECTED = 1.3  # squares of uncertain shapes, over those expected, up to which none is doubted
 _LEFT = 0.5  # of the squares that are expected, that right data leave at least
+_TWICE = 2.0  # squares with a mistake, over those without, where the noise is unknown
 _MOST_CORRECTED = 1.6  # residuals of uncertain shapes without a mistake, over their deviations
 _LEAST_RATIO = 1.7  # of the residuals with and without it
 _MUCH_LESS = 5.0  # the same, where those without it are of a wrong sigma
@@ -262,7 +263,8 @@ class DiagnosisCase:
             return False
         if found.sigma is not None and given.sigma is not None:
             if is_correction:
-                return 2 * found.redundancy * math.log(given.sigma / found.sigma) > least
+                squares = (given.sigma / found.sigma) ** 2
+                return squares > _TWICE and found.redundancy * math.log(squares) > least
             ratio = f_quantile(found.redundancy, found.redundancy, _CHANCE_OF_RATIO)
             return found.sigma < given.sigma / math.sqrt(ratio)
         fits = self.has_chance(found)

@@ -24,7 +24,6 @@ from cadalign.datasets.detections.image_keypoints import (
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.estimation.result import Result
-from cadalign.estimation.results import failed_row
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.evaluation.options import ExperimentOptions, absolute_paths
 from cadalign.evaluation.runs.folder import RunFolder
@@ -35,6 +34,7 @@ from cadalign.evaluation.runs.work import (
     fingerprint,
     fingerprint_of_files,
 )
+from cadalign.export.tables import failed_row
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file, parse_json
 from cadalign.io.evidence import ObservedImage

@@ -29,11 +29,11 @@ from cadalign.cli.options import (
     named_as_flags,
 )
 from cadalign.errors import InputError, refuse_unused
-from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import read_json
 from cadalign.io.files import keeping
+from cadalign.io.focal import PriorOption
 from cadalign.io.kinds import OBSERVATION, is_of_many
 from cadalign.io.observation import Observation, ObservationChanges
 

@@ -23,9 +23,8 @@ from cadalign.errors import (
 from cadalign.estimation.agreement import DiagnosisCase
 from cadalign.estimation.contours import refine
 from cadalign.estimation.diagnose import diagnose, diagnose_refusal
-from cadalign.estimation.estimates import as_given
+from cadalign.estimation.estimates import as_given, single_posterior
 from cadalign.estimation.fit import fit_one
-from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.joint import result_of, result_of_minima, with_cause
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions, RansacOptions
@@ -37,11 +36,11 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import LEAST_LIKELIHOOD, FitStats
 from cadalign.estimation.results import Results
 from cadalign.estimation.search import search, widened_by_noise
-from cadalign.estimation.uncertainty.shape_posterior import single_posterior
 from cadalign.estimation.view import View, numbered
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import turned_alignment
 from cadalign.io.evidence import Size
+from cadalign.io.focal import PriorOption
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import inflation_with
 from cadalign.solvers.constants import LEAST_POINTS

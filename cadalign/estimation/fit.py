@@ -14,7 +14,6 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, copied
 from cadalign.errors import CadalignError, InputError, NoConsensusError, require_kind
 from cadalign.estimation.assemble import result_of_keypoints
-from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma, pixel_information
 from cadalign.estimation.problems import (
     Problems,
@@ -32,6 +31,7 @@ from cadalign.estimation.solve import are_solved_at_once, fit_keypoints, solve
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
+from cadalign.io.focal import PriorOption
 from cadalign.solvers.constants import LEAST_POINTS, POSE_SIZE
 
 

@@ -29,7 +29,6 @@ from cadalign.estimation.estimates import (
     widened_boxes,
     with_box,
 )
-from cadalign.estimation.focal import prior_of_camera
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.prior import camera_like, is_exact, redundancy_of, widened
@@ -65,6 +64,7 @@ from cadalign.estimation.view import View
 from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment, describe_plane
 from cadalign.geometry.rotations import nearest_rotation
+from cadalign.io.focal import prior_of_camera
 from cadalign.shapes.parts import inflation_with
 from cadalign.solvers.joint.covariance import joint_covariance, pose_and_border
 from cadalign.solvers.joint.evidence import points_of

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.focal import focal_doubt
 from cadalign.estimation.options import USUAL_STRETCH, FitOptions, RansacOptions, Sigma
 from cadalign.estimation.problems import repeated
 from cadalign.estimation.result_parts import Diagnosis, FittedKeypoints, ViewResult
@@ -20,6 +19,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PIXEL_CENTRE
 from cadalign.geometry.plausible_camera import camera_doubts
 from cadalign.geometry.rotations import vector_from_rotation
+from cadalign.io.focal import PriorOption, prior_of_camera
 from cadalign.shapes.parts import probability_within
 from cadalign.solvers.constants import LEAST_POINTS
 
@@ -30,6 +30,7 @@ _LARGEST_SHARE = 0.45  # of the keypoints' spread, of an estimated sigma
 _LEAST_EXTENT = 5.0  # of keypoints [sigma]
 _MOST_REJECTED = 0.3  # share of the keypoints that a robust search rejects without a word
 _NEAR = 3.0  # errors of rejected keypoints, over the largest of inliers, that tell of sigma
+_CONTRADICTING_SIGMAS = 3.0  # of an estimated focal length from its prior
 _BEYOND_PRIOR = 3.5  # stretch, in standard deviations of its prior
 _LEAST_GAIN = 0.9  # of a standard deviation, relative to that of any rotation
 _ANY_ROTATION = math.sqrt(math.pi**2 / 3 + 2)  # standard deviation of uniform rotations [rad]
@@ -77,6 +78,19 @@ def keypoint_warnings(
         poses = [(each.alignment, each.relative_likelihood) for each in fitted.alternatives]
         found += another_pose(fitted.alignment, poses, covariance)
     return tuple(found)
+
+
+def focal_doubt(camera: Camera, prior: PriorOption) -> EstimateWarning | None:
+    """Warning about a camera whose estimated focal length contradicts its prior, or None."""
+    prior = prior_of_camera(prior, camera)
+    if prior is None:
+        return None
+    if abs(math.log(camera.fx / prior.focal)) <= _CONTRADICTING_SIGMAS * prior.relative_sigma:
+        return None
+    return EstimateWarning(
+        "focal",
+        f"the keypoints contradict the focal length's prior: {camera.fx:.4g} px instead of {prior}",
+    )
 
 
 def first_of_camera(placed: Warnings, cause: EstimateWarning | None) -> list[EstimateWarning]:

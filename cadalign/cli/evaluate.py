@@ -61,8 +61,8 @@ class RunCommand(JsonOption, RunOptions):
     def do_run(self) -> tuple[Spec, Run]:
         """Do the run, showing its progress; gives its specification and its tables."""
         from cadalign.evaluation.api import prepared
+        from cadalign.evaluation.runs.engine import execute
         from cadalign.evaluation.runs.folder import RunFolder
-        from cadalign.evaluation.runs.run import execute
 
         kind = self.options_type
         # What modules of users print is not the command's output.

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from cadalign.batch.experiment import ManyOptions
     from cadalign.cli.options import ManyCommand
     from cadalign.evaluation.registry import Spec
+    from cadalign.evaluation.runs.engine import Progress as RunProgress
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.run import Progress as RunProgress
     from cadalign.evaluation.runs.tables import Run
     from cadalign.io.observation import ObservationChanges
 

@@ -23,8 +23,8 @@ from cadalign.evaluation.experiments.correspondences import CorrespondenceOption
 from cadalign.evaluation.experiments.keypointnet import KeypointNetOptions
 from cadalign.evaluation.experiments.retrieval import RetrievalRunOptions
 from cadalign.evaluation.experiments.simulation import SweepOptions
+from cadalign.evaluation.runs.engine import Progress
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import read_table
 
 SWEEP = SweepOptions("points", values=(8, 10), runs=40, methods=("aepnp",))

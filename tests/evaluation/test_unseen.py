@@ -21,8 +21,8 @@ from cadalign.evaluation.experiments.unseen import METHODS, SPEC, UnseenOptions
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.unseen import UnseenTasks, observe_object
 from cadalign.evaluation.metrics.cramer_rao import probability_level
+from cadalign.evaluation.runs.engine import Progress
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import Run, read_table
 from cadalign.geometry.metrics import box_iou
 from cadalign.report import headline_text, write_report

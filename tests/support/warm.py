@@ -11,7 +11,7 @@ import cadalign.cli.annotate
 import cadalign.cli.evaluate
 import cadalign.evaluation.instances.views
 import cadalign.evaluation.plots
-import cadalign.evaluation.runs.run  # noqa: F401
+import cadalign.evaluation.runs.engine  # noqa: F401
 from cadalign.annotate.problem import warm_up
 from cadalign.evaluation.simulation import simulate_problem
 

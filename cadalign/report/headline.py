@@ -11,7 +11,7 @@ from typing import Any
 from cadalign.errors import InputError
 from cadalign.evaluation.methods import LIMIT
 from cadalign.evaluation.metrics import HIGH, Metric
-from cadalign.evaluation.photos.protocols import TRUTH
+from cadalign.evaluation.photos.options import TRUTH
 from cadalign.evaluation.plots import look_of
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.tables import Run

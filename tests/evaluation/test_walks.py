@@ -101,8 +101,7 @@ def test_columns_scores_and_summaries_follow_from_the_line_of_a_metric() -> None
     extended = replace(
         metrics.VIEWPOINT,
         measure=lambda target, est, gt, box: {depth.key: abs(float((est - gt).sum()))},
-        columns=(*metrics.VIEWPOINT.columns, depth.key),
-        medians=(depth,),
+        medians=(*metrics.VIEWPOINT.medians, depth),
     )
     assert score_columns([extended])[-1] == (depth.key, float)
     target: Any = SimpleNamespace(gt=np.array([0.0, 0.0, 2.0]))

@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
 
-from cadalign.arrays import BoolArray, FloatArray, instance_rng
+from cadalign.arrays import FloatArray
 from cadalign.datasets.photos.photo import NamedPoints, PhotoKeypoints
 from cadalign.estimation.align import align
 from cadalign.estimation.fit import fit
@@ -19,23 +18,32 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.instances.record import box_alignment
 from cadalign.evaluation.methods import SHAPE
-from cadalign.evaluation.photos import protocols
-from cadalign.evaluation.photos.options import PhotosOptions
-from cadalign.evaluation.photos.protocols import Protocol
-from cadalign.evaluation.photos.target import Cad, PhotoTarget, rectangle_of
+from cadalign.evaluation.photos.options import (
+    EPNP,
+    GRAVITY,
+    IMAGE,
+    MASK,
+    PRIOR,
+    RIGID,
+    SIMILAR,
+    STRETCHED,
+    TRUTH,
+    PhotosOptions,
+    Protocol,
+    parts_of,
+)
+from cadalign.evaluation.photos.target import PhotoTarget, rectangle_of
 from cadalign.evaluation.runs.work import LeftOutError
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.render.viewpoints import visible_keypoints
 from cadalign.shapes.model import ShapeModel
 
 ANNOTATED, DETECTED = "annotated", "detected"
 _LEAST_SCORE = 0.4  # of a detected keypoint that methods are given
 _LEAST_PX = 0.5  # a standard deviation that keypoints are given at least
 # Evidence about the model's outline, which needs a mesh.
-_OUTLINED = frozenset({protocols.MASK, protocols.IMAGE})
-_RIM = 2  # width of a mask's rim [px]
+_OUTLINED = frozenset({MASK, IMAGE})
 _FOCAL_PRIOR = 0.2  # of the logs of scales, while the focal length is estimated
 
 
@@ -45,7 +53,7 @@ class Sighting:
 
     target: PhotoTarget
     camera: Camera  # with a focal length
-    source: str  # annotated or detected or simulated, where the keypoints come from
+    source: str  # annotated or detected: where the keypoints come from
     names: tuple[str, ...]  # (n,), the given keypoints
     points_2d: FloatArray  # (n, 2), [px]
     sigma: float  # their standard deviation [px]
@@ -74,12 +82,9 @@ def sight(target: PhotoTarget, protocol: Protocol, options: PhotosOptions) -> Si
         raise LeftOutError("no model is annotated for the object")
     model = cad.model.load_keypoints()
     marks = target.found.keypoints
-    if marks is not None and model is not None:
-        source = ANNOTATED if marks.scores is None else DETECTED
-        names, pixels = _marked(marks, model)
-    else:
-        source = protocols.SIMULATED
-        model, names, pixels = _simulated(target, camera, cad, model, options)
+    if marks is None or model is None:
+        raise LeftOutError("there are no keypoints")
+    names, pixels = _marked(marks, model)
     if len(names) < options.min_keypoints:
         raise LeftOutError(f"{len(names)} keypoints are fewer than {options.min_keypoints}")
     bounds, gt = target.bounds, target.gt
@@ -87,10 +92,10 @@ def sight(target: PhotoTarget, protocol: Protocol, options: PhotosOptions) -> Si
     sighting = Sighting(
         target=target,
         camera=camera,
-        source=source,
+        source=ANNOTATED if marks.scores is None else DETECTED,
         names=names,
         points_2d=pixels,
-        sigma=_sigma(target, protocol, options, source),
+        sigma=_sigma(target, protocol, options),
         model=model,
         bounds=bounds,
         width=1.0 if gt is None else float(gt.scale[0]),
@@ -107,52 +112,8 @@ def _marked(marks: PhotoKeypoints, model: NamedPoints) -> tuple[tuple[str, ...],
     return tuple(np.array(marks.names)[good].tolist()), marks.points_2d[good]
 
 
-def _simulated(
-    target: PhotoTarget,
-    camera: Camera,
-    cad: Cad,
-    model: NamedPoints | None,
-    options: PhotosOptions,
-) -> tuple[NamedPoints, tuple[str, ...], FloatArray]:
-    """Points of the model, those that the photo shows, and their pixels with noise.
-
-    For a model without a mesh they are its keypoints, whatever hides them.
-    """
-    gt = target.found.truth.cam_from_model
-    if gt is None:
-        raise LeftOutError("there are no keypoints, nor a pose to simulate them with")
-    if not camera.focal_known:
-        raise LeftOutError("there are no keypoints, nor a focal length to simulate them with")
-    if cad.has_mesh:
-        model = cad.spread_points(options.simulated_points)
-        seen = visible_keypoints(cad.scene, model.xyz, camera, gt)
-        if target.found.mask_path is not None and seen.any():
-            seen[seen] = _in_mask(
-                target.found.read_mask(), camera.project(gt.apply(model.xyz[seen]))
-            )
-    elif model is not None:
-        pixels = camera.project_where_ahead(gt.apply(model.xyz))
-        seen = np.isfinite(pixels).all(axis=1) & camera.contains(pixels)
-    else:
-        raise LeftOutError("there are neither keypoints nor a mesh to simulate them on")
-    name = target.names["model_id"]
-    noise = instance_rng(options.seed, name, "keypoints").standard_normal((len(model), 2))
-    pixels = camera.project_where_ahead(gt.apply(model.xyz)) + options.simulated_noise_px * noise
-    return model, tuple(np.array(model.names)[seen].tolist()), pixels[seen]
-
-
-def _in_mask(mask: BoolArray, pixels: FloatArray) -> BoolArray:
-    """True for pixels (n, 2) in a mask or at its rim, where silhouettes have their corners."""
-    near = ndimage.binary_dilation(mask, iterations=_RIM)
-    columns, rows = np.round(pixels).astype(int).T
-    height, width = mask.shape
-    return np.asarray(near[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)])
-
-
-def _sigma(target: PhotoTarget, protocol: Protocol, options: PhotosOptions, source: str) -> float:
+def _sigma(target: PhotoTarget, protocol: Protocol, options: PhotosOptions) -> float:
     """The standard deviation of keypoints [px] that methods are given."""
-    if source == protocols.SIMULATED:
-        return max(options.simulated_noise_px, _LEAST_PX)
     if options.sigma is not None:
         return options.sigma
     if protocol.sigma_of_width is not None and target.photo.camera is not None:
@@ -192,20 +153,20 @@ class PhotoEstimate:
 def estimate_object(
     sighting: Sighting, *, method: str, shapes: Collection[ShapeModel], similar_sigma: float
 ) -> PhotoEstimate:
-    """The estimate of a method by name; see `cadalign.evaluation.photos.protocols`.
+    """The estimate of a method by name; see `PhotosOptions.methods`.
 
     ``shapes`` are models of the categories that they name, ``similar_sigma`` is the standard
     deviation of the object's keypoints from the model's [diagonals of the model]. Raises
     LeftOutError if the object lacks what the method needs; and CadalignError if there is no
     estimate.
     """
-    base, evidence = protocols.parts_of(method)
-    if base == protocols.TRUTH:
+    base, evidence = parts_of(method)
+    if base == TRUTH:
         gt, box = sighting.target.gt, sighting.target.gt_box
         if gt is None or box is None:
             raise LeftOutError("the true pose is not known")
         return PhotoEstimate(gt, box)
-    if base == protocols.EPNP:
+    if base == EPNP:
         points = sighting.points_3d * sighting.width
         found = fit(points, sighting.points_2d, sighting.camera, method="epnp")
         return estimate_of_model(found.alignment, sighting)
@@ -221,22 +182,22 @@ def with_all_evidence(sighting: Sighting) -> tuple[Model, list[View]]:
     target = sighting.target
     has_mesh = target.cad is not None and target.cad.has_mesh
     kinds = {
-        protocols.MASK: has_mesh and target.found.mask_path is not None,
-        protocols.GRAVITY: target.photo.up is not None,
+        MASK: has_mesh and target.found.mask_path is not None,
+        GRAVITY: target.photo.up is not None,
     }
     evidence = [kind for kind, is_there in kinds.items() if is_there]
-    model = _model(protocols.STRETCHED, sighting, 0.0, with_mesh=has_mesh)
+    model = _model(STRETCHED, sighting, 0.0, with_mesh=has_mesh)
     return model, [_view(sighting, evidence)]
 
 
 def _model(base: str, sighting: Sighting, similar_sigma: float, *, with_mesh: bool) -> Model:
     width, bounds = sighting.width, sighting.bounds * sighting.width
     kind: dict[str, Any] = {}
-    if base == protocols.RIGID:
+    if base == RIGID:
         kind = {"stretch": "none"}
-    elif base == protocols.PRIOR:
+    elif base == PRIOR:
         kind = {"stretch_sigma": SIMILAR_SCALE_SIGMA}
-    elif base == protocols.SIMILAR:
+    elif base == SIMILAR:
         diagonal = float(np.linalg.norm(np.ptp(bounds, axis=0)))
         kind = {"shape_sigma": similar_sigma * diagonal}
     if with_mesh:
@@ -257,15 +218,15 @@ def _model(base: str, sighting: Sighting, similar_sigma: float, *, with_mesh: bo
 def _view(sighting: Sighting, evidence: Collection[str], *, rows: Any = slice(None)) -> View:
     photo, found = sighting.target.photo, sighting.target.found
     given: dict[str, Any] = {}
-    if protocols.MASK in evidence:
+    if MASK in evidence:
         if found.mask_path is None:
             raise LeftOutError("the object has no mask")
         given["mask"] = found.read_mask()
-    if protocols.GRAVITY in evidence:
+    if GRAVITY in evidence:
         if photo.up is None:
             raise LeftOutError("the direction of gravity is not known")
         given |= {"up": photo.up, "up_sigma_deg": _UP_SIGMA_DEG}
-    if protocols.IMAGE in evidence:
+    if IMAGE in evidence:
         if photo.image is None:
             raise LeftOutError("the image is not there")
         given["image"] = photo.read_image()
@@ -293,7 +254,7 @@ def _of_shape(
         raise LeftOutError(f"there is no shape model of {category}")
     if _OUTLINED & frozenset(evidence):
         raise LeftOutError("a shape model has no mesh for the mask")
-    if protocols.GRAVITY in evidence and shape.up_axis is None:
+    if GRAVITY in evidence and shape.up_axis is None:
         raise LeftOutError("the shape model has no up axis for gravity")
     known = np.isin(sighting.names, [str(name) for name in shape.ids])
     if not known.any():

@@ -41,8 +41,7 @@ from cadalign.evaluation.photos.methods import (
     sight,
     with_all_evidence,
 )
-from cadalign.evaluation.photos.options import PhotosOptions
-from cadalign.evaluation.photos.protocols import TRUTH, protocol_of
+from cadalign.evaluation.photos.options import TRUTH, PhotosOptions, protocol_of
 from cadalign.evaluation.photos.target import PhotoTarget, PhotoTask, opened, targets_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import Outcome, Row

@@ -79,8 +79,7 @@ def write_run_report(folder: RunFolder) -> None:
     """Write a run's page at its end, and say where it is."""
     from cadalign.report import write_report
 
-    report = write_report([folder.path], folder.report)
-    say(f"Report: {report.path}")
+    say(f"Report: {write_report([folder.path], folder.report)}")
 
 
 @contextmanager

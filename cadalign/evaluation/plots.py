@@ -57,9 +57,8 @@ _NAMES = (
 
 @dataclass(frozen=True)
 class Look:
-    """Label and line of a method; the marker and the dash are matplotlib's."""
+    """Line of a method; the marker and the dash are matplotlib's."""
 
-    label: str
     color: str
     marker: str
     dash: str
@@ -68,14 +67,14 @@ class Look:
 def look_of(method: str) -> Look:
     """The look of a method; that of the Cramer-Rao bound is a dashed line without markers."""
     if method == LIMIT:
-        return Look("Cramer-Rao bound", "black", "", "--")
+        return Look("black", "", "--")
     names = [name for name in (*fit_methods(), *_NAMES) if name != LIMIT]
     if method in names:
         place = mark = names.index(method)
     else:  # of a function by its name, wherever it is drawn
         place = crc32(method.encode())
         mark = place // len(COLORS)
-    return Look(method, COLORS[place % len(COLORS)], _MARKERS[mark % len(_MARKERS)], "-")
+    return Look(COLORS[place % len(COLORS)], _MARKERS[mark % len(_MARKERS)], "-")
 
 
 STYLE: dict[Any, Any] = {
@@ -178,7 +177,6 @@ class Plot:
         return {
             "id": self.id,
             "title": f"{title[0].upper()}{title[1:]}",
-            "kind": "lines",
             **axes,
             "traces": [trace.to_dict() for trace in self.traces],
             "note": self.note,
@@ -255,7 +253,7 @@ def _draw_lines(axes: Axes, plot: Plot) -> list[tuple[Any, Any, Any, str]]:
             color=look.color,
             linestyle=look.dash,
             marker=look.marker if len(trace.x) <= _MOST_TICKS else "",
-            label=look.label,
+            label=trace.method,
         )
         # The Cramer-Rao bound, without markers, is a floor whose band would hide the others.
         if trace.low is not None and trace.high is not None and look.marker:

@@ -12,7 +12,6 @@ from cadalign.errors import InputError
 from cadalign.evaluation.methods import LIMIT
 from cadalign.evaluation.metrics import HIGH, Metric
 from cadalign.evaluation.photos.options import TRUTH
-from cadalign.evaluation.plots import look_of
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.runs.work import FAILED, SKIPPED
@@ -198,7 +197,7 @@ def table_text(headline: Headline, names: Sequence[str], *, format: str) -> str:
     marks = ["---"] * (len(head) - len(headline.columns)) + ["---:"] * len(headline.columns)
     lines = [[text.translate(_MARKDOWN) for text in head], marks]
     for row, names_of_row in rows:
-        labels = [*names_of_row, look_of(row.method).label]
+        labels = [*names_of_row, row.method]
         line = [label.translate(_MARKDOWN) for label in labels]
         for column in headline.columns:
             text = column.rounded(row.cells[column.key]).translate(_MARKDOWN)

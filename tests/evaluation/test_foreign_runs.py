@@ -265,13 +265,11 @@ def test_records_that_are_no_objects_are_refused(
     for record in ("", "alert(1)", "[1]", "[" * 100_000, "{} alert(1)"):
         cells = pa.array([record] * len(table), pa.string())
         pq.write_table(table.set_column(index, "exhibit", cells), run / "records.parquet")
-        for assets in ([], ["--assets"]):
-            line = refusal_line(capsys, "report", run, *assets)
-            assert "is not an object of JSON; remove it: the run is shown without it" in line
-            assert len(line) < 600
+        line = refusal_line(capsys, "report", run)
+        assert "is not an object of JSON; remove it: the run is shown without it" in line
+        assert len(line) < 600
     (run / "records.parquet").unlink()
     assert main(["report", str(run)]) == 0
-    assert main(["report", str(run), "--assets"]) == 0
 
 
 def test_column_name_that_is_no_text_is_refused(tmp_path: Path) -> None:

@@ -108,7 +108,7 @@ class TestRecords:
     @pytest.mark.slow
     def test_are_on_the_page(self, finished: RunFolder, tmp_path: Path) -> None:
         written = write_report([finished.path], tmp_path / "report.html")
-        page = embedded_payload(written.path)
+        page = embedded_payload(written)
         assert len(page["exhibits"]) == OBJECTS
         assert "keypoint_error" in [metric["key"] for metric in page["metrics"]]
 

@@ -50,7 +50,7 @@ def test_markdown_has_best_values_bold() -> None:
         "| chair | optimal | 3 | **0.123** |\n"
         "| chair | epnp | 3 | 10.000 |\n"
         "| chair | stated | - | 0.998 |\n"
-        "| all | Cramer-Rao bound | 3 | - |\n"
+        "| all | limit | 3 | - |\n"
         "\n"
         "Medians, in %.\n"
     )
@@ -143,7 +143,6 @@ def test_commands_write_the_page_at_their_end(
     ("options", "message"),
     [
         ([], "runs: none is given; give a folder that cadalign demo, evaluate or simulate has"),
-        (["RUN", "--format", "md", "--assets"], "--assets: a table has no pictures (--format md)"),
         (["/nowhere"], "/nowhere: no such folder"),
         (["/nowhere", "--format", "csv"], "/nowhere: no such folder"),
     ],

@@ -62,7 +62,7 @@ class Metric:
 
     def page(self) -> dict[str, Any]:
         """The metric for the page."""
-        names = ("key", "label", "unit", "factor", "digits", "better", "log", "limit")
+        names = ("key", "label", "unit", "factor", "digits", "better", "log")
         return {name: getattr(self, name) for name in names}
 
     def column(self) -> dict[str, Any]:

@@ -15,14 +15,16 @@ from cadalign.cli import main
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.experiments.keypointnet import (
+    COLUMNS,
     TABLE,
     KeypointNetOptions,
+    KeypointTasks,
+    keypointnet_benchmark,
     summarize_views,
 )
 from cadalign.evaluation.instances.instance import load_scene, make_instance
 from cadalign.evaluation.instances.pictures import draw_instance
 from cadalign.evaluation.instances.record import record_stem
-from cadalign.evaluation.instances.views import COLUMNS, KeypointTasks, keypointnet_benchmark
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import FAILED, OK, SKIPPED
 from cadalign.evaluation.summary import Summary, summary_csv

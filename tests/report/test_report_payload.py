@@ -23,11 +23,14 @@ from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.api import run as do_run
 from cadalign.evaluation.experiments.correspondences import CorrespondenceOptions
-from cadalign.evaluation.experiments.keypointnet import KeypointNetOptions
+from cadalign.evaluation.experiments.keypointnet import (
+    KeypointNetOptions,
+    KeypointTasks,
+    keypointnet_benchmark,
+)
 from cadalign.evaluation.experiments.retrieval import RetrievalRunOptions
 from cadalign.evaluation.experiments.simulation import SweepOptions
 from cadalign.evaluation.instances.record import record_stem
-from cadalign.evaluation.instances.views import KeypointTasks, keypointnet_benchmark
 from cadalign.evaluation.methods import fit_options
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import read_table

@@ -62,7 +62,7 @@ class DemoOptions(ExperimentOptions):
 def plan(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
     """Plan one view of the first models with a mesh of every category."""
     from cadalign.datasets import KeypointNet, write_sample_dataset
-    from cadalign.evaluation.instances.views import KeypointTasks, keypointnet_benchmark
+    from cadalign.evaluation.experiments.keypointnet import KeypointTasks, keypointnet_benchmark
 
     root = options.root
     if root is None:

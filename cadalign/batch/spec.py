@@ -46,9 +46,9 @@ DISTANCE_STD = Metric(
     "distance_std", "distance uncertainty", "%", factor=100.0, head="distance std. dev."
 )
 """Standard deviation of the translation's depth over that depth."""
-WARNINGS = Metric("warning_count", "warnings", digits=1, log=False, limit=5.0)
+WARNINGS = Metric("warning_count", "warnings", digits=1, log=False)
 MATCHED = Metric("matched", "keypoints kept", "%", 0, better="high", factor=100.0, log=False)
-_GALLERY = (replace(metrics.RMS, limit=20.0), ROTATION_STD, DISTANCE_STD, WARNINGS, MATCHED)
+_GALLERY = (metrics.RMS, ROTATION_STD, DISTANCE_STD, WARNINGS, MATCHED)
 _HEADLINE = (
     *(metrics.INSTANCES, metrics.FAILED, metrics.KEYPOINTS),
     *_GALLERY,

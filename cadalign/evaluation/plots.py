@@ -9,14 +9,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from zlib import crc32
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
 from cadalign.evaluation import metrics
-from cadalign.evaluation.methods import LIMIT, fit_methods
+from cadalign.evaluation.methods import LIMIT
 from cadalign.evaluation.metrics import HIGH, Metric
 from cadalign.evaluation.runs.work import FAILED, OK
 from cadalign.evaluation.summary import Quartiles, Summary, known
@@ -46,13 +45,6 @@ COLORS = (
 )
 """Colours of lines, in their order."""
 _MARKERS = "os^DvP<X>phd"
-_NAMES = (
-    *("optimal-unstretched", "shape", "random-rigid", "random-stretched", "nearest"),
-    *("mean-rigid", "mean-stretched", "exact", "rigid", "stretched", "prior", "similar"),
-    *("rigid+mask", "rigid+gravity", "similar+gravity", "stretched+gravity", "shape+gravity"),
-    "truth",
-)
-"""Methods beside those of `cadalign.fit`, whose looks differ."""
 
 
 @dataclass(frozen=True)
@@ -64,17 +56,11 @@ class Look:
     dash: str
 
 
-def look_of(method: str) -> Look:
-    """The look of a method; that of the Cramer-Rao bound is a dashed line without markers."""
+def look_of(method: str, place: int) -> Look:
+    """The look of a method by its place; that of the Cramer-Rao bound is without markers."""
     if method == LIMIT:
         return Look("black", "", "--")
-    names = [name for name in (*fit_methods(), *_NAMES) if name != LIMIT]
-    if method in names:
-        place = mark = names.index(method)
-    else:  # of a function by its name, wherever it is drawn
-        place = crc32(method.encode())
-        mark = place // len(COLORS)
-    return Look(COLORS[place % len(COLORS)], _MARKERS[mark % len(_MARKERS)], "-")
+    return Look(COLORS[place % len(COLORS)], _MARKERS[place % len(_MARKERS)], "-")
 
 
 STYLE: dict[Any, Any] = {
@@ -242,8 +228,9 @@ def draw_plot(path: Path, plot: Plot) -> list[Path]:
 def _draw_lines(axes: Axes, plot: Plot) -> list[tuple[Any, Any, Any, str]]:
     """Draw lines; returns their bands."""
     bands = []
+    methods = list(dict.fromkeys(trace.method for trace in plot.traces))
     for trace in plot.traces:
-        look = look_of(trace.method)
+        look = look_of(trace.method, methods.index(trace.method))
         middle = np.array(trace.y, dtype=float)
         if not np.isfinite(middle).any():
             continue

@@ -27,9 +27,6 @@ if TYPE_CHECKING:
 
     Summaries = Sequence[Summary]
 
-Reference = tuple[tuple[Summary, ...], str]
-"""Published numbers beside a headline table, and a note on them."""
-
 
 @dataclass(frozen=True)
 class Spec:
@@ -69,8 +66,6 @@ class Spec:
     """Says what the methods were run on, in place of the subject and the dataset."""
     about: str = ""  # explains the pictures
     note: str = ""  # explains the numbers of the headline table
-    reference: Callable[[Sequence[Run], set[str]], Reference] = lambda *_: ((), "")
-    """Published numbers for the groups of some runs."""
 
     @property
     def name(self) -> str:

@@ -12,8 +12,7 @@ Its payload is one JSON object, which ``cadalign/web/report`` reads ::
       "headline": {"group", "columns": [{"key", "label", "unit", "digits", "better"}],
                    "rows": [{"run", "category", "method", "cells": {key: number}, "best": [key]}],
                    "failures": [{"run", "category", "method", "reason", "count"}],
-                   "skipped": likewise,
-                   "paper": [{"category", "method", "cells"}], "note"},
+                   "skipped": likewise, "note"},
       "tables": {
         "strings": [...],
         "instances": {"id", "run", "category", "model", "view", "keypoints", "exhibit", "thumb"},
@@ -124,7 +123,7 @@ def write_report(
         "title": title or title_of(found),
         "summary": summary,
         "runs": [_run_dict(run) for run in found],
-        "methods": [method_dict(name) for name in all_methods(found)],
+        "methods": [method_dict(name, k) for k, name in enumerate(all_methods(found))],
         "metrics": [metric.page() for metric in metrics],
         "headline": headline_of(found).to_dict(),
         "tables": None if table is None else table.to_dict(),
@@ -169,9 +168,9 @@ def _plots(runs: Sequence[Run]) -> list[Plot]:
     return list(found.values())
 
 
-def method_dict(name: str) -> dict[str, Any]:
-    """A method for the page."""
-    is_limit, color = name == LIMIT, look_of(name).color
+def method_dict(name: str, place: int) -> dict[str, Any]:
+    """A method for the page, by its place among all."""
+    is_limit, color = name == LIMIT, look_of(name, place).color
     return {
         "key": name,
         "color": _INK if is_limit else color,

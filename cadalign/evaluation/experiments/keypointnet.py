@@ -37,7 +37,7 @@ from cadalign.evaluation.metrics import INSTANCE_METRICS
 from cadalign.evaluation.metrics.errors import estimate_errors
 from cadalign.evaluation.options import ViewOptions
 from cadalign.evaluation.plots import cumulative_curves
-from cadalign.evaluation.registry import Reference, Spec
+from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Columns, Outcome, Plan, Row, fingerprint_of_files
 from cadalign.evaluation.summary import Group, Summary, mean, medians, share, summarize
 
@@ -270,8 +270,12 @@ def summarize_views(run: Run) -> list[Summary]:
 
 
 _CURVES = tuple(
-    (metric, np.linspace(0, metric.limit / metric.factor, 41))
-    for metric in (metrics.SYM_ROTATION, metrics.SYM_TRANSLATION, metrics.SCALE_Y)
+    (metric, np.linspace(0, end, 41))
+    for metric, end in (
+        (metrics.SYM_ROTATION, 20.0),
+        (metrics.SYM_TRANSLATION, 0.2),
+        (metrics.SCALE_Y, 0.2),
+    )
 )
 
 
@@ -304,35 +308,6 @@ def _check_drawable(dataset: KeypointNet, options: KeypointNetOptions) -> None:
         )
 
 
-# The AEPnP paper's Table 1 as printed: 1 px noise, medians [degrees, model units], mean keypoints.
-# It prints the scale errors under "%"; by the numbers in its own source they are fractions.
-PAPER_TABLE = {
-    "chair": (0.998, 0.004, 0.008, 0.012, 7),
-    "bottle": (7.004, 0.100, 0.089, 0.107, 7),
-    "car": (1.599, 0.011, 0.029, 0.011, 10),
-    "vessel": (4.592, 0.046, 0.063, 0.041, 7),
-}
-"""Rotation error, translation error, errors of s_y and s_z, number of keypoints."""
-STATED = "AEPnP, stated in the paper"
-PERCENT_NOTE = (
-    'The paper\'s columns s1 and s2 are headed "%", but by the numbers in its own source they are '
-    "fractions: 0.008 means 0.8 %. They are shown here as such, times 100."
-)
-
-
-def reference(runs: Sequence[Run], groups: set[str]) -> Reference:
-    """The paper's numbers on the same categories; all of them are about 1 px of noise."""
-    if 1.0 not in {run.noise_px for run in runs}:
-        return (), ""
-    keys = (*(metric.key for metric in TABLE[1:5]), metrics.KEYPOINTS.key)
-    stated = tuple(
-        Summary(name, {"category": name, "method": STATED}, dict(zip(keys, row, strict=True)))
-        for name, row in PAPER_TABLE.items()
-        if name in groups
-    )
-    return stated, f"{PERCENT_NOTE} Its models and views are others." if stated else ""
-
-
 ON_INSTANCES: dict[str, Any] = {
     "columns": (
         *(*_COUNTS, *TABLE, metrics.TRANSLATION_UP_TO_SCALE, metrics.SYM_ROTATION),
@@ -358,7 +333,6 @@ ON_INSTANCES: dict[str, Any] = {
         "rate counts instances whose symmetry-aware rotation, translation in diagonals of the "
         "model and both scales are that good."
     ),
-    "reference": reference,
 }
 """Members of the specification of every experiment on views of models."""
 

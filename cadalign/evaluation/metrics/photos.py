@@ -132,7 +132,7 @@ VIEWPOINT = MetricSet(_measure_viewpoint, (ROTATION,), (Rate(ACCURACY, ROTATION,
 
 # NOCS tries 20 rotations about an axis of symmetry.
 _MAX_STEP = np.pi / 20
-TRANSLATION = Metric("translation_cm", "translation error", "cm", symbol="t cm", limit=50.0)
+TRANSLATION = Metric("translation_cm", "translation error", "cm", symbol="t cm")
 
 
 def symmetric_box_iou(*, est: Box, gt: Box, symmetry: Symmetry) -> float:

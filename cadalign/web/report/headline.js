@@ -67,7 +67,7 @@ const legend = ({ group }) => [
   ` is the best of its ${group}. `,
 ];
 
-function resultTable(report, { columns, rows, paper, group }) {
+function resultTable(report, { columns, rows, group }) {
   const several = report.runs.length > 1;
   // What holds for all comes first.
   const first = (name) => (name === "all" ? 0 : 1);
@@ -92,9 +92,6 @@ function resultTable(report, { columns, rows, paper, group }) {
         report,
         rows.filter((row) => row.category === name),
       ).map((row) => bodyRow(report, columns, row, several)),
-      paper
-        .filter((row) => row.category === name)
-        .map((row) => paperRow(columns, row, several)),
     ),
   );
   return h(
@@ -150,16 +147,6 @@ function bodyRow(report, columns, row, several) {
           : text,
       );
     }),
-  );
-}
-
-function paperRow(columns, row, several) {
-  return h(
-    "tr",
-    { class: "paper" },
-    h("th", { scope: "row" }, row.method),
-    several && h("td"),
-    columns.map((column) => h("td", {}, shown(column, row.cells[column.key]))),
   );
 }
 

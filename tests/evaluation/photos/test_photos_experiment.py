@@ -32,8 +32,8 @@ from cadalign.evaluation.benchmark import Benchmark
 from cadalign.evaluation.experiments.photos import COLUMNS, SPEC, PhotosOptions, summarize_objects
 from cadalign.evaluation.instances.pictures import cut_out
 from cadalign.evaluation.methods import Method
-from cadalign.evaluation.photos.methods import PhotoEstimate, Sighting
-from cadalign.evaluation.photos.objects import PhotoObjects
+from cadalign.evaluation.photos.objects import PhotoEstimate, PhotoObjects
+from cadalign.evaluation.photos.sighting import Sighting
 from cadalign.evaluation.photos.target import PhotoTasks, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run

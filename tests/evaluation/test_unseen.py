@@ -336,7 +336,7 @@ class TestCommand:
             *("within_rotation_error_deg", "within_box_iou_up_to_scale"),
             *("calibration_rotation", "calibration_stretch"),
         ]
-        assert "Cramer-Rao bound" in headline_text([finished.path], format="md")
+        assert "| limit |" in headline_text([finished.path], format="md")
 
 
 @pytest.mark.long

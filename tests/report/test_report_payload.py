@@ -286,9 +286,9 @@ def test_meshes_are_light_and_in_the_coordinates_of_the_dataset(
         assert np.abs([vertices.min(axis=0), vertices.max(axis=0)] - full).max() < 0.02 * size
 
 
-def test_overlays_that_are_gone_leave_the_page_right(drawn: Path, tmp_path: Path) -> None:
+def test_pictures_that_are_gone_leave_the_page_right(drawn: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(drawn, tmp_path / "copy"))
-    for name in ("overlays", "pictures", "thumbs", "previews"):
+    for name in ("pictures", "thumbs", "previews"):
         shutil.rmtree(copy / name)
     found = report(tmp_path, copy)
     assert found["pictures"] == found["thumbs"] == found["meshes"] == {}
@@ -455,7 +455,7 @@ def test_a_simulation_has_lines_and_no_gallery(tmp_path: Path) -> None:
     do_run(options, RunFolder(tmp_path / "run"), workers=0, dask=None)
     found = report(tmp_path, tmp_path / "run")
     assert found["tables"] is None
-    assert found["title"] == "Simulation: noise"
+    assert found["title"] == "Simulation of noise"
     assert found["headline"]["group"] == "noise of the keypoints [px]"
     assert [row["category"] for row in found["headline"]["rows"]] == ["1"] * 3 + ["4"] * 3
     plot = found["plots"][0]
@@ -585,9 +585,9 @@ def test_runs_that_do_not_go_together_are_refused(drawn: Path, tmp_path: Path) -
         write_report([], page)
     with pytest.raises(InputError, match="the run is given twice"):
         write_report([drawn, drawn / ".." / drawn.name], page)
-    with pytest.raises(InputError, match=r"noise is a run of cadalign simulate noise, .* views"):
+    with pytest.raises(InputError, match=r"noise is a run of simulation of noise, .* views"):
         write_report([drawn, tmp_path / "noise"], page)
-    with pytest.raises(InputError, match=r"simulate points, .* simulate noise; write a report"):
+    with pytest.raises(InputError, match=r"of points, .* of noise; write a report"):
         write_report([tmp_path / "noise", tmp_path / "points"], page)
 
 

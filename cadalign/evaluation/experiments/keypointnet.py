@@ -52,7 +52,7 @@ class KeypointNetOptions(ViewOptions):
 
     Each view shows a model as it is; methods get its visible keypoints, with noise, and the model
     stretched by factors from 0.5 to 2 along y and z. The run's folder gets results.parquet with a
-    row per model, view and method, summary.csv, figures, report.html and, if asked for, overlays.
+    row per model, view and method, summary.csv, figures, report.html and, if asked for, pictures.
     A killed run continues when the same command is started again.
     """
 

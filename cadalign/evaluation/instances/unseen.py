@@ -256,7 +256,6 @@ class UnseenObjects(Setting):
             self.options.sigma,
             bounds=shape.mean[-2:],
             gt=seen.gt,
-            make_views=lambda: (shape, [seen.view_of(shape)]),
         )
 
     def answered(

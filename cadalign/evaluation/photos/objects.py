@@ -44,7 +44,6 @@ from cadalign.evaluation.photos.options import (
     PRIOR,
     RIGID,
     SIMILAR,
-    STRETCHED,
     TRUTH,
     PhotosOptions,
     parts_of,
@@ -61,7 +60,6 @@ from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import LeftOutError, Outcome, Row
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.mesh import Mesh
-from cadalign.render.raycast.renderer import cast_geometry
 from cadalign.shapes.model import ShapeModel
 
 # Evidence about the model's outline, which needs a mesh.
@@ -108,19 +106,6 @@ def estimate_object(
     model = _model(base, sighting, similar_sigma, with_mesh=bool(_OUTLINED & evidence))
     result = align(model, _view(sighting, evidence))
     return estimate_of_model(result.alignment, sighting, result)
-
-
-def with_all_evidence(sighting: Sighting) -> tuple[Model, list[View]]:
-    """The model to be stretched, and the view with all evidence that there is for it."""
-    target = sighting.target
-    has_mesh = target.cad is not None and target.cad.has_mesh
-    kinds = {
-        MASK: has_mesh and target.found.mask_path is not None,
-        GRAVITY: target.photo.up is not None,
-    }
-    evidence = [kind for kind, is_there in kinds.items() if is_there]
-    model = _model(STRETCHED, sighting, 0.0, with_mesh=has_mesh)
-    return model, [_view(sighting, evidence)]
 
 
 def _model(base: str, sighting: Sighting, similar_sigma: float, *, with_mesh: bool) -> Model:
@@ -249,7 +234,6 @@ class PhotoObjects(Setting):
             sighting.sigma,
             bounds=sighting.bounds * sighting.width,
             gt=sighting.target.gt,
-            make_views=partial(with_all_evidence, sighting),
         )
 
     def answered(
@@ -339,18 +323,14 @@ def draw_sighting(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate
     """
     names, camera, cad = sighting.target.names, sighting.camera, sighting.target.cad
     stem = record_stem(names["category"], names["model_id"])
-    has_mesh = cad is not None and cad.has_mesh
     try:
         photo = sighting.target.photo.read_image()
     except DataError:
         photo = np.full((camera.height, camera.width, 3), NO_PHOTO, dtype=np.uint8)
-    more: dict[str, Any] = {}
-    if estimate is not None:
-        predicted = camera.project_where_ahead(estimate.alignment.apply(sighting.points_3d))
-        more = {"reprojected": predicted, "est_box": estimate.box}
-        if cad is not None and has_mesh:
-            more["est_frame"] = lambda near: cast_geometry(cad.scene, near, estimate.alignment)
-    gt_box = sighting.target.gt_box
-    write_pictures(folder, stem, photo, camera, observed=sighting.points_2d, gt_box=gt_box, **more)
-    if cad is not None and has_mesh:
+    boxes = {
+        "gt_box": sighting.target.gt_box,
+        "est_box": None if estimate is None else estimate.box,
+    }
+    write_pictures(folder, stem, photo, camera, observed=sighting.points_2d, **boxes)
+    if cad is not None and cad.has_mesh:
         write_preview(folder.previews / f"{stem}.json", cad.scene.mesh)

@@ -123,6 +123,7 @@ export class Viewer {
   }
 
   left() {
+    if (this.dialog.open) return; // another instance was opened meanwhile
     this.instance = null;
     if (this.state.get("open")) this.state.set({ open: "", openrun: "0", alt: "" });
   }

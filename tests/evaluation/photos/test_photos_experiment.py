@@ -340,7 +340,7 @@ class TestPage:
         assert records[0]["mesh"] is not None
         gt = pose(0)
         np.testing.assert_allclose(records[0]["gt"]["translation"], gt.translation, atol=1e-6)
-        files = {path.name for path in (out / "overlays").iterdir()}
+        files = {path.name for path in (out / "thumbs").iterdir()}
         assert len(files) == 2
         assert (out / "summary.csv").read_text().startswith("category,method,instances")
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import msgspec
 import numpy as np
@@ -131,9 +131,9 @@ _STATISTICS = {
 }
 
 
-def summarize_by(further: Statistics) -> Callable[[Run], list[Summary]]:
-    """Medians for every category, and for all, with further statistics."""
-    return partial(summarize, statistics={**_STATISTICS, **further})
+def summarize_by(further: Statistics, **groups: Any) -> Callable[[Run], list[Summary]]:
+    """Medians for every category, and for all, or for other groups, with further statistics."""
+    return partial(summarize, statistics={**_STATISTICS, **further}, **groups)
 
 
 def _plots(runs: Sequence[Run]) -> list[Plot]:

@@ -154,7 +154,7 @@ def draw_fit(
     box = None if result is None else Box.from_model(result.bounds, result.alignment)
     try:
         if photo is not None:
-            how = partial(write_pictures, observed=seen.points_2d, est_box=box, with_overlay=False)
+            how = partial(write_pictures, observed=seen.points_2d, est_box=box)
             write_picture(how, folder, stem, photo, camera)
         if mesh is not None:
             write_picture(write_preview, folder.previews / f"{stem}.json", mesh)

@@ -91,8 +91,8 @@ SPEC = replace(
     options=RetrieveRunOptions,
     plan=plan_run,
     columns=(*FIT_SPEC.columns[:3], *_SHOWN, *FIT_SPEC.columns[3:]),
-    summarize=summarize_by({metric.key: median(metric.key) for metric in _SHOWN}),
+    summarize=summarize_by({metric.key: median(metric.key) for metric in _SHOWN}, by=()),
     metrics=(*_SHOWN, *FIT_SPEC.metrics),
-    title=lambda runs: "retrieved models",
+    topic="retrieved models",
     about="Red is the best match: its box and model, posed and stretched.",
 )

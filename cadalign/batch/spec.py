@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import msgspec
 import numpy as np
@@ -45,9 +45,9 @@ DISTANCE_STD = Metric(
     "distance_std", "distance uncertainty", "%", factor=100.0, head="distance std. dev."
 )
 """Standard deviation of the translation's depth over that depth."""
-WARNINGS = Metric("warning_count", "warnings", digits=1, log=False, limit=5.0)
+WARNINGS = Metric("warning_count", "warnings", digits=1, log=False)
 MATCHED = Metric("matched", "keypoints kept", "%", 0, better="high", factor=100.0, log=False)
-_GALLERY = (replace(metrics.RMS, limit=20.0), ROTATION_STD, DISTANCE_STD, WARNINGS, MATCHED)
+_GALLERY = (metrics.RMS, ROTATION_STD, DISTANCE_STD, WARNINGS, MATCHED)
 _HEADLINE = (
     *(metrics.INSTANCES, metrics.FAILED, metrics.KEYPOINTS),
     *_GALLERY,
@@ -130,9 +130,9 @@ _STATISTICS = {
 }
 
 
-def summarize_by(further: Statistics) -> Callable[[Run], list[Summary]]:
-    """Medians for every category, and for all, with further statistics."""
-    return partial(summarize, statistics={**_STATISTICS, **further})
+def summarize_by(further: Statistics, **groups: Any) -> Callable[[Run], list[Summary]]:
+    """Medians for every category, and for all, or for other groups, with further statistics."""
+    return partial(summarize, statistics={**_STATISTICS, **further}, **groups)
 
 
 def _plots(runs: Sequence[Run]) -> list[Plot]:
@@ -155,7 +155,7 @@ SPEC = Spec(
     columns=_HEADLINE,
     summarize=summarize_by({}),
     plots=_plots,
-    title=lambda runs: "alignments",
+    topic="alignments",
     joins=True,
     describe=_describe,
     metrics=_GALLERY,

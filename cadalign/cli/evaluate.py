@@ -17,7 +17,6 @@ import tyro
 from cadalign.cli.common import NOTHING_WORKED, SUCCESS, JsonOption, group_of, say
 from cadalign.cli.options import named_as_flags
 from cadalign.cli.runs import conclude, run_progress, write_run_report
-from cadalign.errors import InputError
 from cadalign.evaluation.experiments.demo import DemoOptions
 from cadalign.evaluation.options import ExperimentOptions, RunOptions
 from cadalign.evaluation.registry import Spec, known_options, spec_named
@@ -61,8 +60,8 @@ class RunCommand(JsonOption, RunOptions):
     def do_run(self) -> tuple[Spec, Run]:
         """Do the run, showing its progress; gives its specification and its tables."""
         from cadalign.evaluation.api import prepared
+        from cadalign.evaluation.runs.engine import execute
         from cadalign.evaluation.runs.folder import RunFolder
-        from cadalign.evaluation.runs.run import execute
 
         kind = self.options_type
         # What modules of users print is not the command's output.
@@ -152,7 +151,7 @@ class ReportCommand:
     """Show the result of one or more runs.
 
     The page holds the headline table, plots, and a gallery whose instances open with their numbers
-    and in 3D. It needs no network. Several runs of one kind are compared, instance by instance. A
+    and in 3D. It needs no network. Several runs of one kind stand beside each other. A
     run may be unfinished: the page shows what there is.
     """
 
@@ -163,9 +162,6 @@ class ReportCommand:
     standard output."""
     format: Literal["html", "md", "csv"] = "html"
     """The page, or the headline table alone."""
-    assets: bool = False
-    """Put pictures into a folder beside the page, which then stays small. Pages that would exceed
-    60 MB have one in any case."""
 
     def run(self) -> int:
         """Write the report; returns the exit code."""
@@ -173,14 +169,8 @@ class ReportCommand:
 
         if self.format == "html":
             page = self.runs[0] / "report.html" if len(self.runs) == 1 else Path("report.html")
-            report = write_report(self.runs, self.out or page, assets=self.assets)
-            say(f"Report: {report.path}")
-            if report.assets is not None:
-                say(f"Its pictures: {report.assets}, to be kept beside it")
+            say(f"Report: {write_report(self.runs, self.out or page)}")
             return 0
-        if self.assets:
-            what = f"a table has no pictures (--format {self.format})"
-            raise InputError(what, where="--assets", fix="leave one of them out")
         text = headline_text(self.runs, format=self.format)
         if self.out is None:
             sys.stdout.write(text)

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from cadalign.batch.experiment import ManyOptions
     from cadalign.cli.options import ManyCommand
     from cadalign.evaluation.registry import Spec
+    from cadalign.evaluation.runs.engine import Progress as RunProgress
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.run import Progress as RunProgress
     from cadalign.evaluation.runs.tables import Run
     from cadalign.io.observation import ObservationChanges
 
@@ -79,8 +79,7 @@ def write_run_report(folder: RunFolder) -> None:
     """Write a run's page at its end, and say where it is."""
     from cadalign.report import write_report
 
-    report = write_report([folder.path], folder.report)
-    say(f"Report: {report.path}")
+    say(f"Report: {write_report([folder.path], folder.report)}")
 
 
 @contextmanager

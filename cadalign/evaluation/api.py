@@ -13,9 +13,8 @@ from cadalign.errors import InputError, unknown
 from cadalign.evaluation.functions import check_metric_names
 from cadalign.evaluation.options import ExperimentOptions, absolute_paths, tuples
 from cadalign.evaluation.registry import spec_named
+from cadalign.evaluation.runs.engine import OnProgress, Workers, execute, workers_of
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.parallel import Workers
-from cadalign.evaluation.runs.run import OnProgress, execute, workers_of
 from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.runs.work import Plan
 from cadalign.io.files import as_path

@@ -1,8 +1,7 @@
 """Functions of users as methods and metrics: callables, or ``module:function`` to be imported.
 
-A function of ``(points_3d, points_2d, camera)`` or of ``(model, views)`` that returns an alignment
-or a result is a method, a function of keywords such as ``est`` and ``gt`` that returns a number a
-metric::
+A function of ``(points_3d, points_2d, camera)`` that returns an alignment or a result is a method,
+one of keywords such as ``est`` and ``gt`` that returns a number a metric::
 
     cadalign.evaluate("keypointnet", methods=[my_function, "my_module:solve", "optimal"])
 
@@ -83,20 +82,16 @@ def _check_names(functions: Iterable[Function], taken: Container[str], where: st
 
 @dataclass(frozen=True)
 class FunctionMethod:
-    """A function as the estimate of a general method; one of two required arguments takes views."""
+    """A function as the estimate of a general method."""
 
     function: Function
 
     def __call__(self, given: MethodInput) -> Alignment | Result:
         """The function's answer, checked."""
         function = _loaded(self.function, "methods")
-        required, takes_sigma = _positional(function)
-        told = {"sigma": given.sigma} if takes_sigma else {}
-        arguments: tuple[Any, ...]
-        if required == 2:
-            arguments = given.model_and_views()
-        else:  # copies: what the function does to them must not reach other methods
-            arguments = given.points_3d.copy(), given.points_2d.copy(), given.camera
+        told = {"sigma": given.sigma} if _takes_sigma(function) else {}
+        # Copies: what the function does to them must not reach other methods.
+        arguments = given.points_3d.copy(), given.points_2d.copy(), given.camera
         try:
             return _checked_answer(function(*arguments, **told))
         except SystemExit as error:
@@ -117,20 +112,11 @@ def _checked_answer(answer: object) -> Alignment | Result:
 
 
 @lru_cache(maxsize=64)
-def _positional(function: Callable[..., Any]) -> tuple[int, bool]:
-    """Number of required arguments besides ``sigma``, and whether there is such a parameter."""
+def _takes_sigma(function: Callable[..., Any]) -> bool:
     try:
-        parameters = inspect.signature(function).parameters
+        return "sigma" in inspect.signature(function).parameters
     except (TypeError, ValueError):  # of some functions that are not written in Python
-        return 3, False
-    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    required = [
-        name
-        for name, each in parameters.items()
-        if each.kind in positional and each.default is each.empty and name != "sigma"
-    ]
-    takes_sigma = "sigma" in parameters and parameters["sigma"].kind is not positional[0]
-    return len(required), takes_sigma
+        return False
 
 
 def choose_methods(

@@ -15,10 +15,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 
 if TYPE_CHECKING:
-    from cadalign.estimation.model import Model
     from cadalign.estimation.result import Result
-    from cadalign.estimation.view import View
-    from cadalign.shapes.model import ShapeModel
 
 
 LIMIT = "limit"
@@ -40,19 +37,6 @@ class MethodInput:
     gt: Alignment | None = None
     """The truth, for metrics and for the Cramer-Rao bound; no method is given it."""
     inliers: BoolArray | None = None  # (n,), the true inliers, for the bound
-    make_views: Callable[[], tuple[Model | ShapeModel, Sequence[View]]] | None = None
-    """Makes the model and its views where they hold more than the keypoints."""
-
-    def model_and_views(self) -> tuple[Model | ShapeModel, list[View]]:
-        """The arguments of `cadalign.align`."""
-        if self.make_views is not None:
-            model, views = self.make_views()
-            return model, list(views)
-        from cadalign.estimation.model import Model
-        from cadalign.estimation.view import View
-
-        view = View(self.camera, self.points_2d, sigma=self.sigma)
-        return Model(points_3d=self.points_3d, bounds=self.bounds), [view]
 
 
 @dataclass(frozen=True)
@@ -62,7 +46,7 @@ class Method:
     name: str
     solve: Callable[[Any], Any]
     """Makes an estimate; raises where it has none. A general method takes a `MethodInput` and
-    returns an alignment or a result of `cadalign.fit` or `cadalign.align`; another one takes an
+    returns an alignment or a result of `cadalign.fit`; another one takes an
     instance of its benchmark, and returns what that measures."""
     solve_many: Callable[[Sequence[Any]], list[Any]] | None = None
     """Makes estimates of a sequence, with an error in the place of one that there is not."""

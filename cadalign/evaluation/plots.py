@@ -9,14 +9,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from zlib import crc32
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
 from cadalign.evaluation import metrics
-from cadalign.evaluation.methods import LIMIT, fit_methods
+from cadalign.evaluation.methods import LIMIT
 from cadalign.evaluation.metrics import HIGH, Metric
 from cadalign.evaluation.runs.work import FAILED, OK
 from cadalign.evaluation.summary import Quartiles, Summary, known
@@ -46,36 +45,22 @@ COLORS = (
 )
 """Colours of lines, in their order."""
 _MARKERS = "os^DvP<X>phd"
-_NAMES = (
-    *("optimal-unstretched", "shape", "random-rigid", "random-stretched", "nearest"),
-    *("mean-rigid", "mean-stretched", "exact", "rigid", "stretched", "prior", "similar"),
-    *("rigid+mask", "rigid+gravity", "similar+gravity", "stretched+gravity", "shape+gravity"),
-    "truth",
-)
-"""Methods beside those of `cadalign.fit`, whose looks differ."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """Label and line of a method; the marker and the dash are matplotlib's."""
+    """Line of a method; the marker and the dash are matplotlib's."""
 
-    label: str
     color: str
     marker: str
     dash: str
 
 
-def look_of(method: str) -> Look:
-    """The look of a method; that of the Cramer-Rao bound is a dashed line without markers."""
+def look_of(method: str, place: int) -> Look:
+    """The look of a method by its place; that of the Cramer-Rao bound is without markers."""
     if method == LIMIT:
-        return Look("Cramer-Rao bound", "black", "", "--")
-    names = [name for name in (*fit_methods(), *_NAMES) if name != LIMIT]
-    if method in names:
-        place = mark = names.index(method)
-    else:  # of a function by its name, wherever it is drawn
-        place = crc32(method.encode())
-        mark = place // len(COLORS)
-    return Look(method, COLORS[place % len(COLORS)], _MARKERS[mark % len(_MARKERS)], "-")
+        return Look("black", "", "--")
+    return Look(COLORS[place % len(COLORS)], _MARKERS[place % len(_MARKERS)], "-")
 
 
 STYLE: dict[Any, Any] = {
@@ -178,7 +163,6 @@ class Plot:
         return {
             "id": self.id,
             "title": f"{title[0].upper()}{title[1:]}",
-            "kind": "lines",
             **axes,
             "traces": [trace.to_dict() for trace in self.traces],
             "note": self.note,
@@ -244,8 +228,9 @@ def draw_plot(path: Path, plot: Plot) -> list[Path]:
 def _draw_lines(axes: Axes, plot: Plot) -> list[tuple[Any, Any, Any, str]]:
     """Draw lines; returns their bands."""
     bands = []
+    methods = list(dict.fromkeys(trace.method for trace in plot.traces))
     for trace in plot.traces:
-        look = look_of(trace.method)
+        look = look_of(trace.method, methods.index(trace.method))
         middle = np.array(trace.y, dtype=float)
         if not np.isfinite(middle).any():
             continue
@@ -255,7 +240,7 @@ def _draw_lines(axes: Axes, plot: Plot) -> list[tuple[Any, Any, Any, str]]:
             color=look.color,
             linestyle=look.dash,
             marker=look.marker if len(trace.x) <= _MOST_TICKS else "",
-            label=look.label,
+            label=trace.method,
         )
         # The Cramer-Rao bound, without markers, is a floor whose band would hide the others.
         if trace.low is not None and trace.high is not None and look.marker:

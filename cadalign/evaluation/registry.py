@@ -27,9 +27,6 @@ if TYPE_CHECKING:
 
     Summaries = Sequence[Summary]
 
-Reference = tuple[tuple[Summary, ...], str]
-"""Published numbers beside a headline table, and a note on them."""
-
 
 @dataclass(frozen=True)
 class Spec:
@@ -62,15 +59,12 @@ class Spec:
     kind: Callable[[Run], str] = lambda run: run.experiment
     joins: bool = False
     """Runs of one kind, whose name this gives, can be compared."""
-    title: Callable[[Sequence[Run]], str] | None = None  # names runs of one kind in a few words
-    topic: str = ""  # what is evaluated, in place of a title: ``topic on dataset``
+    topic: str = ""  # what is evaluated, by default the experiment: ``topic on dataset``
     subject: str = "tasks"  # what the tasks are, in the plural
     describe: Callable[[Run], str] | None = None
     """Says what the methods were run on, in place of the subject and the dataset."""
     about: str = ""  # explains the pictures
     note: str = ""  # explains the numbers of the headline table
-    reference: Callable[[Sequence[Run], set[str]], Reference] = lambda *_: ((), "")
-    """Published numbers for the groups of some runs."""
 
     @property
     def name(self) -> str:
@@ -85,16 +79,16 @@ class Spec:
 
     def title_of(self, runs: Sequence[Run]) -> str:
         """A few words that name runs of one kind, such as ``alignment on keypointnet``."""
-        if self.title is not None:
-            return self.title(runs)
-        datasets = dict.fromkeys(run.dataset for run in runs)
-        return f"{self.topic or runs[0].experiment} on {', '.join(datasets)}"
+        topic = self.topic or self.kind(runs[0])
+        datasets = dict.fromkeys(filter(None, (run.dataset for run in runs)))
+        return f"{topic} on {', '.join(datasets)}" if datasets else topic
 
     def description_of(self, run: Run) -> str:
         """Says what the methods were run on."""
         if self.describe is not None:
             return self.describe(run)
-        return f"on {self.subject} of {run.dataset} ({run.total:,})"
+        dataset = f" of {run.dataset}" if run.dataset else ""
+        return f"on {self.subject}{dataset} ({run.total:,})"
 
     def console_table(self, run: Run, summaries: Summaries) -> ConsoleTable:
         """The table for the console."""

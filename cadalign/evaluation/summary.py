@@ -145,14 +145,14 @@ def summarize(
 ) -> list[Summary]:
     """Statistics of every method on every group of tasks, and on all categories together.
 
-    Tasks of a group share the cells of the columns ``by``, of which ``name`` makes its name. Rows
-    of the status ``apart`` do not count. Medians of the run's further metrics are added. ``cells``
-    take the place of the run's.
+    Tasks of a group share the cells of the columns ``by``, of which ``name`` makes its name;
+    without columns there is one group. Rows of the status ``apart`` do not count. Medians of the
+    run's further metrics are added. ``cells`` take the place of the run's.
     """
     cells = run.cells if cells is None else cells
     statistics = {**statistics, **{each.key: median(each.key) for each in run.metrics}}
     choices: list[list[Any]] = [sorted(set(cells[key].tolist())) for key in by]
-    if by[0] == CATEGORY.key and len(choices[0]) > 1:
+    if by[:1] == (CATEGORY.key,) and len(choices[0]) > 1:
         choices[0].append(None)
     found = []
     for values in product(*choices):
@@ -172,7 +172,7 @@ def summarize(
             numbers = {"instances": counts[1], "failed": counts[1] - counts[2]}
             numbers |= {key: statistic(group) for key, statistic in statistics.items()}
             numbers[apart.replace(" ", "_")] = counts[0] - counts[1]
-            found.append(Summary(name(*labels), names, numbers))
+            found.append(Summary(name(*labels) if labels else ALL, names, numbers))
     return found
 
 

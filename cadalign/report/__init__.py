@@ -1,6 +1,6 @@
 """The result of runs as one page, and as tables for papers."""
 
 from cadalign.report.headline import FORMATS, headline_text
-from cadalign.report.page import Report, write_report
+from cadalign.report.page import write_report
 
-__all__ = ["FORMATS", "Report", "headline_text", "write_report"]
+__all__ = ["FORMATS", "headline_text", "write_report"]

@@ -11,8 +11,7 @@ from typing import Any
 from cadalign.errors import InputError
 from cadalign.evaluation.methods import LIMIT
 from cadalign.evaluation.metrics import HIGH, Metric
-from cadalign.evaluation.photos.protocols import TRUTH
-from cadalign.evaluation.plots import look_of
+from cadalign.evaluation.photos.options import TRUTH
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.runs.work import FAILED, SKIPPED
@@ -53,26 +52,23 @@ _FAILURE = ("run", "category", "method", "reason", "count")
 
 @dataclass(frozen=True)
 class Headline:
-    """The headline table; ``paper`` are published numbers on the same groups."""
+    """The headline table."""
 
     group: str
     columns: tuple[Metric, ...]
     rows: list[HeadlineRow]
     failures: list[Failure] = field(default_factory=list)
     skipped: list[Failure] = field(default_factory=list)
-    paper: list[HeadlineRow] = field(default_factory=list)
     note: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """The table for the page."""
-        names = ("category", "method", "cells")
         return {
             "rows": list(map(asdict, self.rows)),
             "failures": self.failures,
             "skipped": self.skipped,
             "columns": [column.column() for column in self.columns],
             "group": self.group,
-            "paper": [{name: getattr(row, name) for name in names} for row in self.paper],
             "note": self.note,
         }
 
@@ -84,14 +80,12 @@ def headline_of(runs: Sequence[Run]) -> Headline:
         found = spec_of(run).summarize(run)
         # Those of all groups together come first.
         lines.append(sorted(found, key=lambda line: line.group.split(", ")[0] != ALL))
-    columns, notes, stated = dict[str, Metric](), list[str](), list[Summary]()
+    columns, notes = dict[str, Metric](), list[str]()
     for spec, places in by_spec(runs):
         own = [runs[k] for k in places]
         of_spec = [line for k in places for line in lines[k]]
         columns |= {each.key: each for each in spec.shown_columns(of_spec, own)}
-        published, note = spec.reference(own, {line.group for line in of_spec})
-        stated += published
-        notes += [spec.note, note]
+        notes.append(spec.note)
     shown = tuple(columns.values())
     rows, failures, skipped = [], [], []
     for index, run in enumerate(runs):
@@ -105,7 +99,6 @@ def headline_of(runs: Sequence[Run]) -> Headline:
         rows=rows,
         failures=failures,
         skipped=skipped,
-        paper=[HeadlineRow.of(0, line, shown) for line in stated],
         note=" ".join(filter(None, dict.fromkeys(notes))),
     )
 
@@ -198,7 +191,7 @@ def table_text(headline: Headline, names: Sequence[str], *, format: str) -> str:
     marks = ["---"] * (len(head) - len(headline.columns)) + ["---:"] * len(headline.columns)
     lines = [[text.translate(_MARKDOWN) for text in head], marks]
     for row, names_of_row in rows:
-        labels = [*names_of_row, look_of(row.method).label]
+        labels = [*names_of_row, row.method]
         line = [label.translate(_MARKDOWN) for label in labels]
         for column in headline.columns:
             text = column.rounded(row.cells[column.key]).translate(_MARKDOWN)
@@ -210,8 +203,5 @@ def table_text(headline: Headline, names: Sequence[str], *, format: str) -> str:
 
 def _rows(headline: Headline, names: Sequence[str]) -> list[tuple[HeadlineRow, list[str]]]:
     """The rows with run, where there are several, and category."""
-    rows = [(row, names[row.run]) for row in headline.rows]
-    for stated in headline.paper:
-        place = max(k for k, (row, _) in enumerate(rows) if row.category == stated.category)
-        rows.insert(place + 1, (stated, ""))
-    return [(row, [*([name] if len(names) > 1 else []), row.category]) for row, name in rows]
+    several = len(names) > 1
+    return [(r, [*([names[r.run]] if several else []), r.category]) for r in headline.rows]

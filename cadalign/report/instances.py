@@ -5,14 +5,12 @@ Instances of several runs are joined by what names them.
 
 from __future__ import annotations
 
-import base64
 import hashlib
-import os
+from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
-from urllib.parse import quote as url_quote
+from typing import Any
 
 import msgspec
 import pyarrow as pa
@@ -25,26 +23,13 @@ from cadalign.evaluation.plots import compact
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.runs.work import LEFT_OUT, OK, SKIPPED
-from cadalign.io.files import (
-    dense_json,
-    made_folder,
-    read_bytes,
-    reading,
-    write_text,
-    write_whole,
-    writing,
-)
+from cadalign.io.files import listed, read_bytes
 
 InstanceName = tuple[str, str, int]
 """Category, model id, view."""
-INLINE_LIMIT = 60_000_000
-"""A page that would be larger has its pictures in files beside it [bytes]."""
-_OURS = ("picture_*.webp", "thumb_*.webp", "exhibits_*.js", "mesh_*.js")
-_PER_FILE = 64
-_COLUMNS = (
-    *("id", "run", "category", "model", "view", "keypoints", "true_y", "true_z", "noise"),
-    *("exhibit", "thumb"),
-)
+MEDIA_LIMIT = 60_000_000
+"""Pictures and records of instances that a page has at most [bytes]."""
+_COLUMNS = ("id", "run", "category", "model", "view", "keypoints", "exhibit", "thumb")
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,9 +80,6 @@ def instance_table(
                     "model": place_of(name[1]),
                     "view": name[2],
                     "keypoints": cells["keypoints"][row],
-                    "true_y": cells["stretch_y"][row],
-                    "true_z": cells["stretch_z"][row],
-                    "noise": run.noise_px,
                     "exhibit": -1,
                     "thumb": -1,
                 }
@@ -120,7 +102,7 @@ def _cells(run: Run, metrics: Sequence[Metric]) -> dict[str, list[Any]]:
     cells: dict[str, list[Any]] = {}
     for name in ("category", "model_id", "view", "method", "status", "reason", "keypoints"):
         cells[name] = table[name].to_pylist()
-    for name in ("stretch_y", "stretch_z", *(metric.key for metric in metrics)):
+    for name in (metric.key for metric in metrics):
         cells[name] = [None] * len(table)
         if name in table.column_names:
             cells[name] = compact(table[name].to_numpy(zero_copy_only=False))
@@ -130,142 +112,70 @@ def _cells(run: Run, metrics: Sequence[Metric]) -> dict[str, list[Any]]:
 # Media --------------------------------------------------------------------------------------------
 
 
-def inline_bytes(runs: Sequence[Run]) -> int:
-    """Rough size of a page with everything inside [bytes]."""
-    files = [
-        path
-        for run in runs
-        for folder in (run.folder.pictures, run.folder.thumbs, run.folder.previews)
-        if folder.is_dir()
-        for path in folder.iterdir()
-        if path.is_file()
-    ]
-    pictures = sum(path.stat().st_size for path in files)
-    return sum(run.record_bytes() for run in runs) + pictures * 4 // 3
-
-
 @dataclass
-class AssetStore:
-    """Pictures, mesh previews and instance records: inside the page, or in a folder ``assets``."""
+class Media:
+    """Pictures, mesh previews and instance records of a page, of the same content once."""
 
-    page: Path
-    assets: Path | None
     pictures: dict[str, str] = field(default_factory=dict)
     thumbs: dict[str, str] = field(default_factory=dict)
     meshes: dict[str, Any] = field(default_factory=dict)
-    records: dict[str, Any] = field(default_factory=dict)
-    _known: dict[tuple[str, bytes], str] = field(default_factory=dict)
-    _calls: dict[int, list[str]] = field(default_factory=dict)
-    _files: dict[int, str] = field(default_factory=dict)
+    exhibits: dict[str, Any] = field(default_factory=dict)
+    left_out: int = 0
+    """Number of the instances for which there was no room."""
+    _known: dict[bytes, str] = field(default_factory=dict)
+    _size: int = 0
 
     def fill(self, runs: Sequence[Run], table: InstanceTable) -> None:
         """Take in the pictures and records of runs, and enter their keys in the table."""
-        if self.assets is not None:
-            with writing(made_folder(self.assets)):
-                for pattern in _OURS:
-                    for old in self.assets.glob(pattern):
-                        old.unlink()
         for index, run in enumerate(runs):
-            pictures, thumbs = _Files.of(run.folder.pictures), _Files.of(run.folder.thumbs)
-            previews, records = _Files.of(run.folder.previews), run.folder.records
+            folder = run.folder
+            names = {
+                path: _names(path) for path in (folder.pictures, folder.thumbs, folder.previews)
+            }
             for row in run.records(RECORD_COLUMNS):
                 name = (row["category"], row["model_id"], row["view"])
                 place = table.places.get((index, name))
                 if place is None:
                     continue
+                if self._size > MEDIA_LIMIT:
+                    self.left_out += 1
+                    continue
                 view, model = f"{record_stem(*name)}.webp", f"{record_stem(*name[:2])}.json"
-                picture = self._key_of(view, pictures, self.pictures)
-                thumb = self._key_of(view, thumbs, self.thumbs)
-                mesh = self._key_of(model, previews, self.meshes)
+                picture, thumb, mesh = (
+                    self._key_of(path / file, store) if file in names[path] else None
+                    for path, file, store in (
+                        (folder.pictures, view, self.pictures),
+                        (folder.thumbs, view, self.thumbs),
+                        (folder.previews, model, self.meshes),
+                    )
+                )
                 table.instances["thumb"][place] = -1 if thumb is None else int(thumb)
                 table.instances["exhibit"][place] = place
-                record = _object(row["exhibit"], records)
-                self._keep(place, {"picture": picture, "mesh": mesh, **record})
+                record = _object(row["exhibit"], folder.records)
+                self.exhibits[str(place)] = {"picture": picture, "mesh": mesh, **record}
+                self._size += len(row["exhibit"])
 
     def to_dict(self) -> dict[str, Any]:
-        """The page's part of it; writes the files that are beside the page."""
-        found: dict[str, Any] = {"pictures": self.pictures, "thumbs": self.thumbs}
-        if self.assets is None:
-            return {**found, "exhibits": self.records, "meshes": self.meshes}
-        count = 1 + max([*self._calls, *self._files], default=-1)
-        for index in range(count):
-            if index in self._calls or index not in self._files:
-                self._write_records(index)
-        return {
-            **found,
-            "exhibit_files": [self._files[index] for index in range(count)],
-            "exhibits_per_file": _PER_FILE,
-            "mesh_files": {
-                key: self._write_script(
-                    f"mesh_{key}.js", [f"cadalignMesh({dense_json(key)}, {dense_json(mesh)})"]
-                )
-                for key, mesh in self.meshes.items()
-            },
-        }
+        """The page's part of it."""
+        names = ("pictures", "thumbs", "exhibits", "meshes")
+        return {name: getattr(self, name) for name in names}
 
-    def _key_of(self, name: str, files: _Files, store: dict[str, Any]) -> str | None:
-        """Store a file, once for all with its content; returns its key, None if it is not there."""
-        if name not in files.names:
-            return None
-        path = files.folder / name
-        data, kind = read_bytes(path), files.folder.name
-        digest = (kind, hashlib.sha256(data).digest())  # compared runs show the same ones
+    def _key_of(self, path: Path, store: dict[str, Any]) -> str:
+        """Store a file, once for all with its content; returns its key."""
+        data = read_bytes(path)
+        digest = hashlib.sha256(path.parent.name.encode() + data).digest()
         if digest not in self._known:
-            if store is self.meshes:
-                key = f"m{len(store)}"
-                store[key] = _object(data, path)
-            else:
-                key = str(len(store))
-                store[key] = self._address_of(data, f"{kind[:-1]}_{len(store):06d}.webp")
-            self._known[digest] = key
+            self._size += len(data) * 4 // 3
+            self._known[digest] = key = str(len(store))
+            code = "data:image/webp;base64,"
+            is_mesh = store is self.meshes
+            store[key] = _object(data, path) if is_mesh else code + b64encode(data).decode()
         return self._known[digest]
 
-    def _address_of(self, data: bytes, name: str) -> str:
-        """The address of a picture: its own data, or a file's."""
-        if self.assets is None:
-            return "data:image/webp;base64," + base64.b64encode(data).decode("ascii")
-        write_whole(self.assets / name, lambda path: path.write_bytes(data))
-        return self._address(name)
 
-    def _keep(self, place: int, record: dict[str, Any]) -> None:
-        """Keep an instance's record; beside a page as text, whose file is written once full."""
-        if self.assets is None:
-            self.records[str(place)] = record
-            return
-        index = place // _PER_FILE
-        text = msgspec.json.encode(record).decode()
-        calls = self._calls.setdefault(index, [])
-        calls.append(f"cadalignExhibit({place}, {text})")
-        if len(calls) == _PER_FILE:
-            self._write_records(index)
-
-    def _write_records(self, index: int) -> None:
-        calls = self._calls.pop(index, [])
-        self._files[index] = self._write_script(f"exhibits_{index:04d}.js", calls)
-
-    def _write_script(self, name: str, calls: Sequence[str]) -> str:
-        assert self.assets is not None
-        write_text(self.assets / name, ";\n".join(calls) + ";\n")
-        return self._address(name)
-
-    def _address(self, name: str) -> str:
-        assert self.assets is not None
-        folder = os.path.relpath(self.assets, self.page.parent)
-        return url_quote(f"{Path(folder).as_posix()}/{name}")
-
-
-class _Files(NamedTuple):
-    """A folder and the names of its files, read once: asking for thousands takes seconds."""
-
-    folder: Path
-    names: frozenset[str]
-
-    @classmethod
-    def of(cls, folder: Path) -> _Files:
-        if not folder.is_dir():
-            return cls(folder, frozenset())
-        with reading(folder), os.scandir(folder) as entries:
-            return cls(folder, frozenset(entry.name for entry in entries if entry.is_file()))
+def _names(folder: Path) -> set[str]:
+    """The names in a folder, read once: asking for thousands takes seconds."""
+    return {path.name for path in listed(folder)} if folder.is_dir() else set()
 
 
 def _object(text: str | bytes, path: Path) -> dict[str, Any]:

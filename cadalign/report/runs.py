@@ -26,13 +26,11 @@ _LABELS = {
     "min_visible": "least visible keypoints",
     "max_models": "most models per category",
     "render": "pictures",
-    "simulated_noise_px": "noise of simulated keypoints",
     "max_reproj_error": "inliers within",
     "max_iterations": "most samples",
 }
 _UNITS = {
     "noise_px": " px",
-    "simulated_noise_px": " px",
     "noises_px": " px",
     "max_reproj_error": " px",
 }

@@ -18,13 +18,13 @@ from benchmarks import section
 from benchmarks.section import COMMAND, BenchmarkData, Row, Table, Tables
 from cadalign import Box, Library, Observation, ShapeModel
 from cadalign.datasets import KeypointNet
-from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.instances.queries import (
+from cadalign.evaluation.experiments.retrieval import (
     RetrievalQuery,
     RetrievalTask,
     observe_model,
     same_shapes,
 )
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.metrics import box_iou_up_to_scale
 from cadalign.retrieval import LibraryModel, Match
 

@@ -17,7 +17,7 @@ from benchmarks import section
 from benchmarks.section import COMMAND, BenchmarkData, Row, Table, Tables
 from cadalign import Camera, RansacOptions
 from cadalign.datasets import Colmap, Correspondences, KeypointNet, write_sample_dataset
-from cadalign.evaluation.instances.correspondences import errors_of, spoil
+from cadalign.evaluation.experiments.correspondences import errors_of, spoil
 
 _POINTS = 8
 _CAMERA = Camera(640, 480, 700.0, 700.0, 319.5, 239.5)

@@ -20,8 +20,8 @@ from cadalign import Camera, Observation
 from cadalign.batch.experiment import FitRunOptions
 from cadalign.cli import main
 from cadalign.datasets import ModelKeypoint, ModelKeypoints
+from cadalign.evaluation.runs.engine import Progress
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.simulation import simulate_problem
 from cadalign.io.images import write_image
 

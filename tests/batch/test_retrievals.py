@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from support.pages import embedded_payload
 
 import cadalign
 from cadalign import Camera, Library, Observation, Result, Results
@@ -92,9 +93,11 @@ def test_the_table_holds_the_best_match_of_each(
         np.testing.assert_allclose(
             single.alignment.packed, expected[0].alignment.packed, rtol=1e-12
         )
-    page = (run / "report.html").read_text()
-    assert "Retrieved models" in page
-    assert "none of these" in page
+    page = embedded_payload(run / "report.html")
+    assert page["title"] == "Retrieved models"
+    (line,) = page["headline"]["rows"]  # no section for each category or model
+    assert (line["category"], line["cells"]["instances"]) == ("all", 20)
+    assert "none_probability" in line["cells"]
 
 
 def test_matches_of_a_run_are_exported_as_fits_are(case: Case, tmp_path: Path) -> None:

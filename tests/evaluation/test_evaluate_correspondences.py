@@ -22,17 +22,16 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Posterior, ViewResult
 from cadalign.evaluation import plots
 from cadalign.evaluation.api import run as do_run
+from cadalign.evaluation.benchmark import Benchmark
 from cadalign.evaluation.experiments.correspondences import (
     SPEC,
     CorrespondenceOptions,
-    summarize_shares,
-)
-from cadalign.evaluation.instances.correspondences import (
     CorrespondenceTask,
     CorrespondenceTasks,
-    correspondence_benchmark,
+    SpoiledImages,
     errors_of,
     spoil,
+    summarize_shares,
 )
 from cadalign.evaluation.methods import fit_options
 from cadalign.evaluation.runs.folder import RunFolder
@@ -296,7 +295,8 @@ class TestRows:
         few = replace(seen, points_3d=seen.points_3d[:5], points_2d=seen.points_2d[:5])
         task = CorrespondenceTask("a", 0.0, 0, few)
         options = CorrespondenceOptions(ANY, methods=("aepnp-paper", "epnp"))
-        paper, epnp = correspondence_benchmark(options).evaluate([task])
+        benchmark = Benchmark.chosen(SpoiledImages(options), options.methods)
+        paper, epnp = benchmark.evaluate([task])
         assert (paper["status"], epnp["status"]) == ("failed", "ok")
         assert "5" in paper["reason"]
         assert (paper["points"], paper["success"], paper.get("rotation_error_deg")) == (

@@ -15,14 +15,16 @@ from cadalign.cli import main
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.experiments.keypointnet import (
+    COLUMNS,
     TABLE,
     KeypointNetOptions,
+    KeypointTasks,
+    keypointnet_benchmark,
     summarize_views,
 )
 from cadalign.evaluation.instances.instance import load_scene, make_instance
 from cadalign.evaluation.instances.pictures import draw_instance
 from cadalign.evaluation.instances.record import record_stem
-from cadalign.evaluation.instances.views import COLUMNS, KeypointTasks, keypointnet_benchmark
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import FAILED, OK, SKIPPED
 from cadalign.evaluation.summary import Summary, summary_csv
@@ -157,14 +159,14 @@ def test_bad_options_are_named(sample_root: Path, options: dict[str, Any], messa
 
 
 @pytest.mark.long
-def test_overlays_are_drawn_and_no_half_files_left(sample_root: Path, tmp_path: Path) -> None:
+def test_pictures_are_drawn_and_no_half_files_left(sample_root: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     options = ["--render", "overlay", "--workers", "0", "--methods", "optimal"]
     arguments = ["evaluate", "keypointnet", str(sample_root), "--out", str(out), *options]
     assert main([*arguments, "--categories", "chair", "car"]) == 0
     models = KeypointNet(sample_root).subset(categories=["chair", "car"])
     wanted = {record_stem(*key) for key in models.ids()}
-    endings = {"overlays": ".png", "thumbs": ".webp", "pictures": ".webp", "previews": ".json"}
+    endings = {"thumbs": ".webp", "pictures": ".webp", "previews": ".json"}
     for folder, ending in endings.items():
         files = {path.name for path in (out / folder).iterdir()}
         assert files == {f"{name}{ending}" for name in wanted}
@@ -180,7 +182,7 @@ def test_an_estimate_behind_the_camera_is_drawn(sample_root: Path, tmp_path: Pat
     behind = Alignment(instance.gt.rotation, -instance.gt.translation, instance.gt.scale)
     folder = RunFolder(tmp_path / "run").made_for_pictures()
     draw_instance(folder, instance, behind, "chair", "behind")
-    assert (folder.overlays / "chair_behind.png").is_file()
+    assert (folder.thumbs / "chair_behind.webp").is_file()
 
 
 @pytest.mark.long

@@ -23,8 +23,8 @@ from cadalign.evaluation.experiments.correspondences import CorrespondenceOption
 from cadalign.evaluation.experiments.keypointnet import KeypointNetOptions
 from cadalign.evaluation.experiments.retrieval import RetrievalRunOptions
 from cadalign.evaluation.experiments.simulation import SweepOptions
+from cadalign.evaluation.runs.engine import Progress
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import read_table
 
 SWEEP = SweepOptions("points", values=(8, 10), runs=40, methods=("aepnp",))
@@ -265,13 +265,11 @@ def test_records_that_are_no_objects_are_refused(
     for record in ("", "alert(1)", "[1]", "[" * 100_000, "{} alert(1)"):
         cells = pa.array([record] * len(table), pa.string())
         pq.write_table(table.set_column(index, "exhibit", cells), run / "records.parquet")
-        for assets in ([], ["--assets"]):
-            line = refusal_line(capsys, "report", run, *assets)
-            assert "is not an object of JSON; remove it: the run is shown without it" in line
-            assert len(line) < 600
+        line = refusal_line(capsys, "report", run)
+        assert "is not an object of JSON; remove it: the run is shown without it" in line
+        assert len(line) < 600
     (run / "records.parquet").unlink()
     assert main(["report", str(run)]) == 0
-    assert main(["report", str(run), "--assets"]) == 0
 
 
 def test_column_name_that_is_no_text_is_refused(tmp_path: Path) -> None:

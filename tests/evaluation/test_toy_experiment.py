@@ -172,7 +172,7 @@ def test_it_has_a_table_a_page_figures_and_a_data_frame(root: Path, tmp_path: Pa
         "| category | method | instances | failed | error of the middle \\[mm\\] |"
     )
     assert "Medians of toys." in text
-    page = write_report([out], tmp_path / "page.html").path.read_text()
+    page = write_report([out], tmp_path / "page.html").read_text()
     payload = json.loads(page.split('id="payload">')[1].split("</script>")[0])
     assert payload["title"] == "Middle on categories"
     assert payload["headline"]["failures"][0]["reason"] == "ValueError: no numbers"

@@ -25,8 +25,8 @@ from cadalign.evaluation.methods import MethodInput
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics import photos as metrics
 from cadalign.evaluation.metrics.photos import score_alignment, score_columns, statistics_of
-from cadalign.evaluation.photos.methods import Sighting
 from cadalign.evaluation.photos.objects import PhotoObjects
+from cadalign.evaluation.photos.sighting import Sighting
 from cadalign.evaluation.photos.target import PhotoTask, PhotoTasks, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import Plan
@@ -101,8 +101,7 @@ def test_columns_scores_and_summaries_follow_from_the_line_of_a_metric() -> None
     extended = replace(
         metrics.VIEWPOINT,
         measure=lambda target, est, gt, box: {depth.key: abs(float((est - gt).sum()))},
-        columns=(*metrics.VIEWPOINT.columns, depth.key),
-        medians=(depth,),
+        medians=(*metrics.VIEWPOINT.medians, depth),
     )
     assert score_columns([extended])[-1] == (depth.key, float)
     target: Any = SimpleNamespace(gt=np.array([0.0, 0.0, 2.0]))

@@ -26,7 +26,7 @@ _COMMANDS: dict[str, list[str]] = {
     "observe": ["--image", "--model", "--out", "--object", "--min-score", "--sigma"],
     "retrieve": ["--library", "--out", "--top", "--category", "--json", "--loss"],
     "render": ["--out", "--width", "--height", "--view", "--keypoints"],
-    "report": ["--out", "--format", "--assets"],
+    "report": ["--out", "--format"],
     "library": ["build", "show", "--out", "--categories"],
     "evaluate": ["keypointnet", "correspondences", "retrieval", "unseen", "--methods",
                  "--noise-px", "--shape"],

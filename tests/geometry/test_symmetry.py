@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cadalign.errors import InputError
-from cadalign.evaluation.metrics.photos import degree_cm
-from cadalign.evaluation.metrics.scan2cad import scan2cad_errors
+from cadalign.evaluation.metrics.photos import scan2cad_errors
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.metrics import rotation_error
 from cadalign.geometry.rotations import nearest_rotation
@@ -80,7 +79,6 @@ def test_no_turn_of_a_ball_is_an_error_by_any_metric():
     ball = Symmetry(np.empty((0, 4, 4)), axes)
     assert rotation_error(**turned, symmetry=ball) == pytest.approx(0, abs=1e-5)
     assert scan2cad_errors(**turned, symmetry=ball).rotation_deg == pytest.approx(0, abs=1e-5)
-    assert degree_cm(**turned, symmetry=ball, metres=1)[0] == pytest.approx(0, abs=1e-5)
 
 
 def test_what_is_no_motion_is_refused():

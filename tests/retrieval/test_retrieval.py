@@ -20,8 +20,8 @@ from cadalign.datasets import KeypointNet
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.options import LOSSES
 from cadalign.estimation.uncertainty.residuals import bent
+from cadalign.evaluation.experiments.retrieval import RetrievalTask, observe_model
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.instances.queries import RetrievalTask, observe_model
 from cadalign.evaluation.simulation import random_rotation
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.absence import SAME_SHAPE, shape_distance

@@ -146,14 +146,3 @@ def open_first(page: Page) -> Locator:
     dialog = page.locator("dialog[open]")
     expect(dialog.locator(".overlay")).to_be_visible()
     return dialog
-
-
-def cut_off(page: Page) -> list[str]:
-    """Heads of the tables that are wider than the place they have, details opened."""
-    page.evaluate("document.querySelectorAll('details').forEach((each) => (each.open = true))")
-    found: list[str] = page.evaluate(
-        """() => [document.documentElement, ...document.querySelectorAll(".scroller")]
-            .filter((each) => each.scrollWidth > each.clientWidth)
-            .map((each) => each.innerText.slice(0, 200))"""
-    )
-    return found

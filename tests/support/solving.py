@@ -7,15 +7,11 @@ from typing import Any
 import numpy as np
 
 import cadalign
-from cadalign import Alignment, Camera, Result, View
+from cadalign import Alignment, Camera, Result
 
 
 def linear(points_3d: Any, points_2d: Any, camera: Camera) -> Alignment:
     return cadalign.fit(points_3d, points_2d, camera, method="aepnp").alignment
-
-
-def joint(model: Any, views: list[View]) -> Result:
-    return cadalign.align(model, views)
 
 
 def weighted(points_3d: Any, points_2d: Any, camera: Camera, *, sigma: float) -> Result:

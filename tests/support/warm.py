@@ -7,9 +7,9 @@ import cadalign.annotate.session
 import cadalign.batch.fits
 import cadalign.cli.annotate
 import cadalign.cli.evaluate
-import cadalign.evaluation.instances.views
+import cadalign.evaluation.experiments.keypointnet
 import cadalign.evaluation.plots
-import cadalign.evaluation.runs.run  # noqa: F401
+import cadalign.evaluation.runs.engine  # noqa: F401
 from cadalign.annotate.problem import warm_up
 
 warm_up(joint=True)

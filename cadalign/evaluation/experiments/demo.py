@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 METHOD = "optimal"
 _LEAST_SAMPLE = 12  # models of each category of a sample dataset
-_THREADS = 2
 
 
 @dataclass(frozen=True)
@@ -27,7 +26,7 @@ class DemoOptions(ExperimentOptions):
 
     For each model: choose a view, render it, stretch the model by factors from 0.5 to 2 along y
     and z, add noise to its visible keypoints, fit, and draw true (green) and predicted (red) box.
-    Writes results.parquet, overlays/*.png and index.html.
+    Writes results.parquet and index.html.
     """
 
     experiment = "demo"
@@ -53,16 +52,11 @@ class DemoOptions(ExperimentOptions):
         """A demonstration is over before worker processes have started."""
         return 0
 
-    @property
-    def threads(self) -> int:
-        """Drawing, most of the work, lets go of the interpreter lock."""
-        return _THREADS
-
 
 def plan(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
     """Plan one view of the first models with a mesh of every category."""
     from cadalign.datasets import KeypointNet, write_sample_dataset
-    from cadalign.evaluation.instances.views import KeypointTasks, keypointnet_benchmark
+    from cadalign.evaluation.experiments.keypointnet import KeypointTasks, keypointnet_benchmark
 
     root = options.root
     if root is None:

@@ -1,29 +1,47 @@
-"""The KeypointNet experiment: methods on views of annotated models."""
+"""The experiment on KeypointNet: methods on views of annotated models, their errors, pictures."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from cadalign.arrays import BoolArray
 from cadalign.datasets import KeypointNet
-from cadalign.errors import InputError
+from cadalign.errors import DataError, InputError
 from cadalign.evaluation import metrics
-from cadalign.evaluation.benchmark import VIEW_NAMES
-from cadalign.evaluation.methods import LIMIT
+from cadalign.evaluation.benchmark import (
+    VIEW_NAMES,
+    Benchmark,
+    Case,
+    Pair,
+    Setting,
+    Tasks,
+    attempt,
+    write_picture,
+)
+from cadalign.evaluation.instances.instance import (
+    Instance,
+    KeypointTask,
+    make_hull_instances,
+    make_instance,
+    scene_of,
+)
+from cadalign.evaluation.instances.record import RECORD_COLUMNS, pose_of, record_of
+from cadalign.evaluation.methods import LIMIT, Method, MethodInput
 from cadalign.evaluation.metrics import INSTANCE_METRICS
+from cadalign.evaluation.metrics.errors import estimate_errors
 from cadalign.evaluation.options import ViewOptions
 from cadalign.evaluation.plots import cumulative_curves
-from cadalign.evaluation.registry import Reference, Spec
-from cadalign.evaluation.runs.work import Columns, Plan
+from cadalign.evaluation.registry import Spec
+from cadalign.evaluation.runs.work import Columns, Outcome, Plan, Row, fingerprint_of_files
 from cadalign.evaluation.summary import Group, Summary, mean, medians, share, summarize
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.instances.instance import KeypointTask
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.tables import Cells, Run
 
@@ -34,7 +52,7 @@ class KeypointNetOptions(ViewOptions):
 
     Each view shows a model as it is; methods get its visible keypoints, with noise, and the model
     stretched by factors from 0.5 to 2 along y and z. The run's folder gets results.parquet with a
-    row per model, view and method, summary.csv, figures, report.html and, if asked for, overlays.
+    row per model, view and method, summary.csv, figures, report.html and, if asked for, pictures.
     A killed run continues when the same command is started again.
     """
 
@@ -73,6 +91,146 @@ COLUMNS: Columns = (
     ("translation_error_up_to_scale", float),
 )
 """Columns of every run; see docs/formats/runs.md."""
+
+logger = logging.getLogger("cadalign")
+
+KeypointView = tuple[KeypointTask, Instance]
+"""A view of a model as an instance of the benchmark: its task, and what it shows."""
+
+
+class KeypointTasks(Tasks[KeypointTask]):
+    """All views of all models of a dataset in the order of their names.
+
+    ``options`` are an experiment's, with ``visibility``, ``views_per_model`` and ``max_models``.
+    """
+
+    def __init__(self, dataset: KeypointNet, options: Any) -> None:
+        self.dataset, self._visibility = dataset, options.visibility
+        self._views: int = options.views_per_model
+        self.keys = [
+            key
+            for category in dataset.categories
+            for key in sorted(dataset.ids(category))[: options.max_models]
+        ]
+        if not self.keys:
+            raise DataError("there are no models to evaluate", where=str(dataset.root))
+        self._first = lru_cache(maxsize=4)(
+            lambda key: KeypointTask.of_model(dataset, *key, visibility=options.visibility)
+        )
+
+    def __len__(self) -> int:
+        return len(self.keys) * self._views
+
+    def task(self, index: int) -> KeypointTask:
+        """A view of a model."""
+        place, view = divmod(index, self._views)
+        first = self._first(self.keys[place])
+        return first if view == 0 else replace(first, view=view)
+
+    def fingerprint(self) -> str:
+        """Hash of the annotations: a run must not go on with others."""
+        return fingerprint_of_files(self.dataset.files)
+
+
+@dataclass(frozen=True)
+class KeypointViews(Setting):
+    """Views of annotated models: the setting of the KeypointNet experiment.
+
+    The first method's alignment of every instance with a mesh is drawn in the folder ``drawn_in``,
+    if one is given; its folders for pictures must exist.
+    """
+
+    columns = COLUMNS
+    record_columns = RECORD_COLUMNS
+
+    options: KeypointNetOptions
+    drawn_in: RunFolder | None
+
+    def cases(self, tasks: Sequence[KeypointTask]) -> list[Case]:
+        return [
+            replace(self.failed(task)[0], error=instance)
+            if isinstance(instance, Exception)
+            else self._case(task, instance)
+            for task, instance in zip(tasks, self._instances(tasks), strict=True)
+        ]
+
+    def _case(self, task: KeypointTask, instance: Instance) -> Case:
+        _, stretch_y, stretch_z = (1 / instance.gt.scale).tolist()
+        facts = {
+            "visibility": instance.visibility,
+            "keypoints": len(instance.points_3d),
+            "stretch_y": stretch_y,
+            "stretch_z": stretch_z,
+            "symmetry": str(task.symmetry),
+        }
+        return Case(task.names, facts, (task, instance))
+
+    def failed(self, task: KeypointTask) -> list[Case]:
+        facts = {"visibility": "", "symmetry": "" if task.problem else str(task.symmetry)}
+        return [Case(task.names, facts)]
+
+    def _instances(self, tasks: Sequence[KeypointTask]) -> list[Instance | Exception]:
+        names = ("noise_px", "min_visible", "seed")
+        how = {name: getattr(self.options, name) for name in names}
+        plain = [task for task in tasks if not task.problem and task.model is None]
+        of_hulls = iter(make_hull_instances(plain, **how))
+        instances: list[Instance | Exception] = []
+        for task in tasks:
+            if task.problem:
+                instances.append(DataError(task.problem))
+            elif task.model is None:
+                instances.append(next(of_hulls))
+            else:
+                instances.append(attempt(partial(_with_mesh, task, **how)))
+        return instances
+
+    def given(self, view: KeypointView) -> MethodInput:
+        _, found = view
+        keypoints = found.points_3d, found.points_2d, found.camera
+        return MethodInput(*keypoints, self.options.sigma, bounds=found.bounds, gt=found.gt)
+
+    def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
+        poses = [pose_of(estimate) for _, estimate in pairs]
+        tasks, instances = zip(*(view for view, _ in pairs), strict=True)
+        return [*estimate_errors(poses, instances, [task.symmetry for task in tasks])]
+
+    def finish(self, case: Case, outcomes: list[Outcome], estimates: list[Any]) -> str:
+        _, instance = case.instance
+        if self.drawn_in is not None and outcomes[0].is_ok and instance.scene is not None:
+            problem = attempt(_draw, self.drawn_in, case.instance, pose_of(estimates[0]))
+            if problem is not None:
+                logger.warning("%s: not drawn: %s", case.names["model_id"], problem)
+        names = ("camera", "gt", "bounds", "points_3d", "points_2d", "ids")
+        parts = {name: getattr(instance, name) for name in names}
+        return record_of(outcomes, estimates, **parts)
+
+
+def _draw(folder: RunFolder, view: KeypointView, estimate: Any) -> None:
+    # Only here: runs on annotations alone are not to load the renderer.
+    from cadalign.evaluation.instances.pictures import draw_instance
+
+    task, instance = view
+    write_picture(draw_instance, folder, instance, estimate, *task.names.values())
+
+
+def _with_mesh(task: KeypointTask, **how: Any) -> Instance:
+    assert task.model is not None
+    return make_instance(task.model, scene=scene_of(task.model), view_index=task.view, **how)
+
+
+def keypointnet_benchmark(
+    options: KeypointNetOptions, drawn_in: RunFolder | None = None
+) -> Benchmark:
+    """The methods of the options on views of models."""
+    found = Benchmark.chosen(
+        KeypointViews(options, drawn_in), options.methods, metrics=options.metrics
+    )
+    batched = frozenset(each.name for each in found.methods if not each.has_statistics)
+    return replace(found, batched=batched)
+
+
+# Summary ------------------------------------------------------------------------------------------
+
 TABLE = (
     *(metrics.KEYPOINTS, metrics.ROTATION, metrics.TRANSLATION),
     *(metrics.SCALE_Y, metrics.SCALE_Z, metrics.BOX_IOU),
@@ -112,8 +270,12 @@ def summarize_views(run: Run) -> list[Summary]:
 
 
 _CURVES = tuple(
-    (metric, np.linspace(0, metric.limit / metric.factor, 41))
-    for metric in (metrics.SYM_ROTATION, metrics.SYM_TRANSLATION, metrics.SCALE_Y)
+    (metric, np.linspace(0, end, 41))
+    for metric, end in (
+        (metrics.SYM_ROTATION, 20.0),
+        (metrics.SYM_TRANSLATION, 0.2),
+        (metrics.SCALE_Y, 0.2),
+    )
 )
 
 
@@ -124,8 +286,6 @@ _LARGE = 5_000  # views
 
 def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
     """Plan a run over the views of a dataset's models."""
-    from cadalign.evaluation.instances.views import KeypointTasks, keypointnet_benchmark
-
     dataset = KeypointNet(options.root, shapenet_root=options.shapenet).subset(
         categories=options.categories, split=options.split
     )
@@ -146,35 +306,6 @@ def _check_drawable(dataset: KeypointNet, options: KeypointNetOptions) -> None:
             where="render",
             fix="name ShapeNet's folder by shapenet, leave out visibility hull, or draw nothing",
         )
-
-
-# The AEPnP paper's Table 1 as printed: 1 px noise, medians [degrees, model units], mean keypoints.
-# It prints the scale errors under "%"; by the numbers in its own source they are fractions.
-PAPER_TABLE = {
-    "chair": (0.998, 0.004, 0.008, 0.012, 7),
-    "bottle": (7.004, 0.100, 0.089, 0.107, 7),
-    "car": (1.599, 0.011, 0.029, 0.011, 10),
-    "vessel": (4.592, 0.046, 0.063, 0.041, 7),
-}
-"""Rotation error, translation error, errors of s_y and s_z, number of keypoints."""
-STATED = "AEPnP, stated in the paper"
-PERCENT_NOTE = (
-    'The paper\'s columns s1 and s2 are headed "%", but by the numbers in its own source they are '
-    "fractions: 0.008 means 0.8 %. They are shown here as such, times 100."
-)
-
-
-def reference(runs: Sequence[Run], groups: set[str]) -> Reference:
-    """The paper's numbers on the same categories; all of them are about 1 px of noise."""
-    if 1.0 not in {run.noise_px for run in runs}:
-        return (), ""
-    keys = (*(metric.key for metric in TABLE[1:5]), metrics.KEYPOINTS.key)
-    stated = tuple(
-        Summary(name, {"category": name, "method": STATED}, dict(zip(keys, row, strict=True)))
-        for name, row in PAPER_TABLE.items()
-        if name in groups
-    )
-    return stated, f"{PERCENT_NOTE} Its models and views are others." if stated else ""
 
 
 ON_INSTANCES: dict[str, Any] = {
@@ -202,7 +333,6 @@ ON_INSTANCES: dict[str, Any] = {
         "rate counts instances whose symmetry-aware rotation, translation in diagonals of the "
         "model and both scales are that good."
     ),
-    "reference": reference,
 }
 """Members of the specification of every experiment on views of models."""
 

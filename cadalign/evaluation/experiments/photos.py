@@ -8,23 +8,19 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
-from cadalign.datasets.photos.dataset import PhotoDataset
-from cadalign.errors import DataError
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import VIEW_NAMES
 from cadalign.evaluation.metrics import BOX_IOU
 from cadalign.evaluation.metrics.photos import (
-    NINE_DOF,
+    BOX,
     ROTATION,
+    SCAN2CAD,
     VIEWPOINT,
     score_columns,
     statistics_of,
 )
-from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
-from cadalign.evaluation.photos import protocols
-from cadalign.evaluation.photos.options import PhotosOptions
+from cadalign.evaluation.photos.options import SETS, PhotosOptions
 from cadalign.evaluation.plots import cumulative_curves
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import LEFT_OUT, UNREADABLE, Columns, Plan, fingerprint
@@ -43,31 +39,30 @@ from cadalign.io.files import read_bytes
 if TYPE_CHECKING:
     from cadalign.evaluation.photos.target import PhotoTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.tables import Cells, Run
+    from cadalign.evaluation.runs.tables import Run
 
 COLUMNS: Columns = (
     *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int), ("source", str)),
-    *(("rms_px", float), *score_columns(protocols.SETS)),
+    *(("rms_px", float), *score_columns(SETS)),
 )
 """Columns of the result table; see docs/formats/runs.md."""
 
 
 GALLERY = (
-    *(metric for each in protocols.SETS for metric in each.medians),
+    *(metric for each in SETS for metric in each.medians),
     metrics.RMS,
 )
 """Errors of single objects."""
 # The data sets' own first.
-_OWN_FIRST = (SCAN2CAD, VIEWPOINT, NINE_DOF)
+_OWN_FIRST = (SCAN2CAD, VIEWPOINT, BOX)
+_COUNTS = (metrics.INSTANCES, metrics.FAILED, metrics.LEFT_OUT)
 HEADLINE = (
-    *(metrics.INSTANCES, metrics.FAILED, metrics.LEFT_OUT, metrics.KEYPOINTS),
-    *(metric for each in _OWN_FIRST for metric in each.headline),
-    *(metric for each in _OWN_FIRST for metric in each.details),
+    *(*_COUNTS, metrics.KEYPOINTS),
+    *(metric for each in _OWN_FIRST for metric in each.shown),
     *(metrics.RMS, metrics.QUERY_MILLISECONDS),
 )
 _CONSOLE = (
-    *(metrics.INSTANCES, metrics.FAILED, metrics.LEFT_OUT),
-    *(metric for each in _OWN_FIRST for metric in each.console),
+    *(*_COUNTS, *SCAN2CAD.shown[:1], *VIEWPOINT.shown, *BOX.shown[:2]),
     *(replace(metrics.RMS, symbol="rms px"), metrics.QUERY_MILLISECONDS),
 )
 
@@ -77,12 +72,11 @@ def summarize_objects(run: Run) -> list[Summary]:
     cells = run.cells
     statistics = {
         "keypoints": mean("keypoints"),
-        **statistics_of(protocols.SETS, cells),
+        **statistics_of(SETS, cells),
         metrics.RMS.key: median(metrics.RMS.key),
         "milliseconds": milliseconds,
     }
-    marked = {**cells, "category": _categories(cells)}
-    found = summarize(run, statistics, apart=LEFT_OUT, cells=marked)
+    found = summarize(run, statistics, apart=LEFT_OUT)
     single = [each for each in found if each.group not in (ALL, UNREADABLE)]
     if len({each.group for each in single}) < 2:
         return found
@@ -100,19 +94,6 @@ def _mean(every: Summary, single: Sequence[Summary]) -> Summary:
     return Summary(MEAN, {"category": MEAN, "method": every.method}, values)
 
 
-def _categories(cells: Cells) -> npt.NDArray[np.object_]:
-    """The rows' categories, those of objects with simulated keypoints marked."""
-    categories, is_simulated = cells["category"], cells["source"] == protocols.SIMULATED
-    known_otherwise = set(categories[(cells["status"] != LEFT_OUT) & ~is_simulated].tolist())
-    only = set(categories[is_simulated].tolist()) - known_otherwise
-    marked = is_simulated | np.isin(categories.astype(str), sorted(only))
-    names = [
-        f"{name}, {protocols.SIMULATED}" if mark else name
-        for name, mark in zip(categories.tolist(), marked.tolist(), strict=True)
-    ]
-    return np.array(names, dtype=object)
-
-
 _CURVES = (
     (ROTATION, np.array([0.2, 0.5, 1, 2, 3, 5, 7.5, 10, 15, 20, 30, 45, 90])),
     (replace(BOX_IOU, log=False), np.arange(0, 1.01, 0.05)),
@@ -124,7 +105,6 @@ plots = partial(cumulative_curves, curves=_CURVES, of="on photos")
 
 _CHUNK, _LARGE_CHUNK = 4, 32
 _LARGE = 500  # photos
-_LOOKED_AT = 20  # photos that say which evidence the data set has
 
 
 def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
@@ -134,15 +114,7 @@ def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
     from cadalign.evaluation.shape_files import shapes_of
 
     dataset = reopened(options.root)
-    protocol = protocols.protocol_of(dataset.kind)
     shapes = shapes_of(options.shape)
-    if not options.methods:
-        methods = protocols.default_methods(
-            with_evidence=tuple(dict.fromkeys((protocols.RIGID, protocol.best))),
-            evidence=_evidence(dataset),
-            has_shape=bool(shapes),
-        )
-        options = replace(options, methods=methods)
     tasks = PhotoTasks(dataset, options.max_photos)
     pictures = folder.made_for_pictures()
     chunk = _CHUNK if len(tasks) < _LARGE else _LARGE_CHUNK
@@ -156,21 +128,6 @@ def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
     )
 
 
-def _evidence(dataset: PhotoDataset) -> set[str]:
-    found: set[str] = set()
-    for index in range(min(_LOOKED_AT, len(dataset))):
-        try:
-            photo = dataset[index]
-        except DataError:
-            continue
-        has = {
-            protocols.MASK: any(each.mask_path is not None for each in photo.objects),
-            protocols.GRAVITY: photo.up is not None,
-        }
-        found |= {name for name, is_there in has.items() if is_there}
-    return found
-
-
 SPEC = Spec(
     options=PhotosOptions,
     plan=plan,
@@ -178,10 +135,7 @@ SPEC = Spec(
     columns=HEADLINE,
     summarize=summarize_objects,
     console=_CONSOLE,
-    console_note=(
-        f"shares count failures; {protocols.SIMULATED}: keypoints projected with the true pose, "
-        "with noise"
-    ),
+    console_note="shares count failures",
     plots=plots,
     apart=LEFT_OUT,
     topic="alignment to photos",
@@ -195,7 +149,6 @@ SPEC = Spec(
         "Medians over the objects that did not fail, and shares of all, of which failures count as "
         "misses; objects without camera, model or enough keypoints are left out. The model's width "
         "is the object's, as one image leaves size open, where no shape model in metres "
-        "determines it. Simulated: the data set has no keypoints, so that visible points "
-        "of the model were projected with the true pose, with noise; all methods get the same."
+        "determines it."
     ),
 )

@@ -1,25 +1,39 @@
-"""The retrieval experiment: views of a library's models, to be found again in it."""
+"""The experiment on retrieval: views of a library's models, to be found again in it.
+
+Every model of the library is stretched by factors from 0.5 to 2 along y and z, seen from a random
+view, and some of its visible keypoints are handed over with noise. Models whose keypoints are the
+same after a stretch, to within 1 % of their extent and with the same set of keypoints, count as the
+true model. Two protocols: ``leave-in``, where the library holds the model, and ``leave-out``, where
+it and all that count as it are taken out. All methods get the same keypoints.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, asdict, dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import FloatArray, IntArray, instance_rng
 from cadalign.datasets import KeypointNet
-from cadalign.errors import InputError
+from cadalign.datasets.models.shapenet import require_category
+from cadalign.errors import DegenerateError, InputError, unknown
 from cadalign.evaluation import metrics
+from cadalign.evaluation.benchmark import Benchmark, Case, Setting
+from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
+from cadalign.evaluation.methods import Method
 from cadalign.evaluation.metrics import QUERIES
+from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
 from cadalign.evaluation.options import ModelOptions
 from cadalign.evaluation.plots import Plot, plot_against
 from cadalign.evaluation.registry import Spec
-from cadalign.evaluation.runs.work import Columns, Plan
+from cadalign.evaluation.runs.work import Columns, Plan, Row
 from cadalign.evaluation.summary import (
     ALL,
     Group,
@@ -32,12 +46,16 @@ from cadalign.evaluation.summary import (
     milliseconds,
     summarize,
 )
+from cadalign.geometry.alignment import Alignment, Box
+from cadalign.geometry.metrics import rotation_error
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.instances.queries import RetrievalTask
+    # Only where a run needs them: they load the compiled solvers.
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.tables import Run
     from cadalign.retrieval.library import Library
+    from cadalign.retrieval.match import Match
+    from cadalign.retrieval.models import LibraryModel, ModelKey
 
 NO_VIEW = "no view"
 """Status of a model of which no view shows as many keypoints as are to be handed over."""
@@ -46,7 +64,12 @@ LEAVE_IN = "leave-in"
 LEAVE_OUT = "leave-out"
 """It doesn't."""
 PROTOCOLS = (LEAVE_IN, LEAVE_OUT)
-METHODS = ("optimal", "optimal-unstretched", "epnp")
+_METHODS: dict[str, dict[str, Any]] = {
+    "optimal": {},
+    "optimal-unstretched": {"stretch": "none"},
+    "epnp": {"method": "epnp"},
+}
+"""Options of `cadalign.Library.retrieve` by method."""
 
 
 @dataclass(frozen=True)
@@ -69,25 +92,15 @@ class RetrievalRunOptions(ModelOptions):
     """Standard deviations of the keypoints' noise, in pixels."""
     keypoints: tuple[int, ...] = (6, 7, 8, 9, 10)
     """Numbers of visible keypoints that are given."""
-    protocols: tuple[str, ...] = PROTOCOLS
-    """leave-in, leave-out."""
     methods: tuple[str, ...] = ("optimal", "epnp")
     """optimal, optimal-unstretched, epnp."""
-    whole_library: bool = False
-    """Compare with the models of all categories, not only with those of the right one."""
-    shape_sigma: float = 0.02
-    """Standard deviation of the keypoints of the best model where the library lacks the right one,
-    as a share of their extent."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, choices in (("methods", METHODS), ("protocols", PROTOCOLS)):
-            chosen = tuple(dict.fromkeys(getattr(self, name)))
-            self.replace_values(**{name: chosen})
-            unknown = [value for value in chosen if value not in choices]
-            if unknown or not chosen:
-                what = f"unknown: {unknown[0]!r}" if unknown else "none is given"
-                raise InputError(what, where=name, fix=f"known are {', '.join(choices)}")
+        for method in self.methods or ("",):
+            if method not in _METHODS:
+                raise unknown("method", method, _METHODS, where="methods")
+        self.replace_values(methods=tuple(dict.fromkeys(self.methods)))
         for name, least in (("noises_px", 0), ("keypoints", 4)):
             values = tuple(sorted(set(getattr(self, name))))
             self.replace_values(**{name: values})
@@ -95,7 +108,6 @@ class RetrievalRunOptions(ModelOptions):
                 raise InputError("none is given", where=name)
             if not least <= values[0] or not values[-1] < math.inf:
                 raise InputError(f"{values[0]:g} is less than {least}", where=name)
-        self.check_least(shape_sigma=0)
 
 
 NAMES: Columns = (
@@ -109,6 +121,197 @@ COLUMNS: Columns = (
     *(("rms_px", float), ("shape_distance", float), ("box_iou", float)),
     *(("box_iou_up_to_scale", float), ("rotation_error_deg", float)),
 )
+
+TOP = 50
+"""Ranks beyond this are one."""
+_SHAPE_SIGMA = 0.02  # of the keypoints of the best model where the right one lacks, of their extent
+_LEAST_SIGMA = 0.5  # keypoints without noise would leave no other model any chance
+_NO_MATCH: Row = {"matched_category": "", "matched_id": ""}
+
+
+@dataclass(frozen=True)
+class RetrievalTask:
+    """One view of one model, with a level of noise and a number of keypoints."""
+
+    category: str
+    model_id: str
+    noise_px: float
+    keypoints: int
+
+    def names(self, protocol: str) -> Row:
+        """The cells that name the rows of a protocol, but for the method."""
+        return {**asdict(self), "protocol": protocol}
+
+
+def retrieval_tasks(library: Library, options: RetrievalRunOptions) -> list[RetrievalTask]:
+    """Every model with every noise and number of keypoints that it has, model by model."""
+    names = library.categories
+    if options.categories is not None:
+        chosen = {require_category(name, names, where="categories") for name in options.categories}
+        names = tuple(sorted(chosen))
+    tasks = []
+    for name in names:
+        own = [key for key in library.keys if key[0] == name]
+        count = min(len(own), options.max_models or len(own))
+        for key in (own[i * len(own) // count] for i in range(count)):
+            most = len(library[key].xyz)
+            tasks += [
+                RetrievalTask(*key, noise, keypoints)
+                for noise in options.noises_px
+                for keypoints in options.keypoints
+                if keypoints <= most
+            ]
+    if not tasks:
+        raise InputError(f"no model has {options.keypoints[0]} keypoints", where="keypoints")
+    return tasks
+
+
+@dataclass(frozen=True, eq=False)
+class RetrievalQuery:
+    """View of a stretched model: noisy keypoints [px], and its true pose and stretch."""
+
+    points_2d: FloatArray
+    ids: IntArray
+    gt: Alignment
+
+
+def observe_model(model: LibraryModel, task: RetrievalTask, *, seed: int) -> RetrievalQuery:
+    """Stretch a model, draw a view of it, and hand over some of its visible keypoints.
+
+    Everything random follows from the seed and the task. Visibility follows from the
+    keypoints alone; see `cadalign.evaluation.instances.hull`.
+    """
+    rng = instance_rng(seed, task.category, task.model_id, repr(task.noise_px), str(task.keypoints))
+    stretch = np.array([1.0, *rng.uniform(*STRETCH_RANGE, 2)])
+    hull = KeypointHull(model.xyz * stretch)
+    pose, visible = sample_hull_view(hull, KEYPOINT_CAMERA, rng=rng, min_visible=task.keypoints)
+    chosen = np.sort(rng.choice(np.flatnonzero(visible), task.keypoints, replace=False))
+    pixels = KEYPOINT_CAMERA.project(pose.apply(hull.xyz[chosen]))
+    return RetrievalQuery(
+        points_2d=pixels + task.noise_px * rng.standard_normal(pixels.shape),
+        ids=model.ids[chosen],
+        gt=Alignment(pose.rotation, pose.translation, stretch),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class RetrievalInstance:
+    """A query of a library's file, with the models that count as the true one."""
+
+    task: RetrievalTask
+    query: RetrievalQuery
+    gt: LibraryModel
+    alike: frozenset[ModelKey]
+    protocol: str
+
+
+@dataclass(frozen=True)
+class RetrievalQueries(Setting):
+    """Queries of a library's file, which all workers map into memory: the experiment's setting."""
+
+    columns = COLUMNS
+
+    library: str
+    options: RetrievalRunOptions
+
+    def failed(self, task: RetrievalTask) -> list[Case]:
+        return [Case(task.names(protocol), _NO_MATCH) for protocol in PROTOCOLS]
+
+    def _cases(self, task: RetrievalTask) -> list[Case]:
+        library, cases = _opened(self.library), self.failed(task)
+        gt = library[task.category, task.model_id]
+        try:
+            query = observe_model(gt, task, seed=self.options.seed)
+        except DegenerateError as error:
+            return [replace(case, error=error, status=NO_VIEW) for case in cases]
+        seen = task, query, gt, same_shapes(library, gt.key)
+        return [
+            replace(case, instance=RetrievalInstance(*seen, protocol))
+            for case, protocol in zip(cases, PROTOCOLS, strict=True)
+        ]
+
+    def row(self, method: Method, instance: RetrievalInstance, matches: Sequence[Match]) -> Row:
+        """Compare matches with the true model; errors are those of the first match."""
+        from cadalign.retrieval.absence import shape_distance
+
+        first, gt, placed = matches[0], instance.gt, instance.query.gt
+        best = _opened(self.library)[first.category, first.model_id]
+        boxes = {"est": first.box, "gt": Box.from_model(gt.bounds, placed)}
+        keys = [(match.category, match.model_id) for match in matches]
+        ranks = (rank for rank, key in enumerate(keys, start=1) if key in instance.alike)
+        return {
+            "alike": len(instance.alike),
+            "rank": next(ranks, None),
+            "matched_category": first.category,
+            "matched_id": first.model_id,
+            "score": first.score,
+            "none_probability": first.none_probability,
+            "shared": first.shared,
+            "rms_px": first.rms,
+            "shape_distance": shape_distance(best, gt) if best.category == gt.category else None,
+            "box_iou": overlap(**boxes),
+            "box_iou_up_to_scale": overlap_up_to_scale(**boxes),
+            "rotation_error_deg": rotation_error(est=first.alignment, gt=placed),
+        }
+
+
+def retrieval_benchmark(library: str, options: RetrievalRunOptions) -> Benchmark:
+    """The methods of the options on queries of a library's file."""
+    how: dict[str, Any] = {"library": library, "options": options}
+    methods = (Method(name, partial(_retrieve, method=name, **how)) for name in options.methods)
+    return Benchmark(RetrievalQueries(library, options), tuple(methods))
+
+
+def _retrieve(
+    instance: RetrievalInstance, *, method: str, library: str, options: RetrievalRunOptions
+) -> list[Match]:
+    task = instance.task
+    is_exact = instance.protocol == LEAVE_IN and method == "optimal"
+    return _opened(library).retrieve(
+        instance.query.points_2d,
+        instance.query.ids,
+        KEYPOINT_CAMERA,
+        top=TOP,
+        category=task.category,
+        sigma=max(task.noise_px, _LEAST_SIGMA),
+        shape_sigma=0.0 if is_exact else _SHAPE_SIGMA,
+        exclude=instance.alike if instance.protocol == LEAVE_OUT else (),
+        workers=1,
+        **_METHODS[method],
+    )
+
+
+@lru_cache(maxsize=2)
+def _opened(path: str) -> Library:
+    from cadalign.retrieval.library import Library
+
+    return Library.open(path)
+
+
+@lru_cache(maxsize=64)
+def same_shapes(library: Library, key: ModelKey) -> frozenset[ModelKey]:
+    """The models of a library that count as the given one, itself among them."""
+    from cadalign.retrieval.absence import SAME_SHAPE, distances
+
+    gt = library[key]
+    keys, xyz = _by_keypoints(library)[gt.category, tuple(gt.ids.tolist())]
+    near = distances(xyz, gt.xyz) <= SAME_SHAPE
+    return frozenset([key, *(keys[k] for k in np.flatnonzero(near).tolist())])
+
+
+@lru_cache(maxsize=2)
+def _by_keypoints(library: Library) -> dict[Any, tuple[list[ModelKey], FloatArray]]:
+    groups: dict[Any, list[LibraryModel]] = {}
+    for model in library:
+        groups.setdefault((model.category, tuple(model.ids.tolist())), []).append(model)
+    return {
+        ids: ([model.key for model in models], np.array([model.xyz for model in models]))
+        for ids, models in groups.items()
+    }
+
+
+# Summary ------------------------------------------------------------------------------------------
+
 HEADLINE = (
     *(metrics.INSTANCES, metrics.FAILED, metrics.RANK_1, metrics.RANK_5, metrics.RECIPROCAL_RANK),
     *(metrics.NONE, metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
@@ -187,8 +390,6 @@ _CHUNK = 16
 
 def plan(options: RetrievalRunOptions, folder: RunFolder) -> Plan[RetrievalTask]:
     """Plan a run over the models of a library, which the folder gets as ``library.cadalign``."""
-    from cadalign.evaluation.instances.queries import retrieval_benchmark, retrieval_tasks
-
     library = _library_of(options)
     tasks = retrieval_tasks(library, options)
     folder.make()
@@ -209,9 +410,8 @@ def _library_of(options: RetrievalRunOptions) -> Library:
 
     if options.root.is_file():
         return Library.open(options.root)
-    categories = None if options.whole_library else options.categories
     dataset = KeypointNet(options.root, shapenet_root=options.shapenet)
-    return Library.from_dataset(dataset, categories=categories)
+    return Library.from_dataset(dataset, categories=options.categories)
 
 
 SPEC = Spec(

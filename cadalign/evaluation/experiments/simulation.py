@@ -281,8 +281,7 @@ SPEC = Spec(
     summarize=summarize_sweep,
     group=varied,
     plots=plots,
-    kind=lambda run: f"cadalign simulate {kind_of(run).name}",
-    title=lambda runs: f"simulation: {kind_of(runs[0]).name}",
-    describe=lambda run: f"on {run.total:,} problems of the AEPnP paper's simulation",
+    kind=lambda run: f"simulation of {kind_of(run).name}",
+    subject="problems of the AEPnP paper's simulation",
     note="Medians over the problems that did not fail.",
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -25,10 +24,8 @@ from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.pixels import rescaled_pixels
 from cadalign.geometry.simplify import cluster, mesh_edges, simplify
 from cadalign.io.files import dense_json, write_text, write_whole
-from cadalign.io.images import write_image
 from cadalign.render import RaycastRenderer, draw_overlay
 from cadalign.render.drawing.canvas import ByteImage
-from cadalign.render.scene import Geometry
 
 NO_PHOTO = 225
 """Grey of a photo that is not there."""
@@ -46,39 +43,23 @@ def write_pictures(
     camera: Camera,
     *,
     observed: FloatArray,
-    reprojected: FloatArray | None = None,
     gt_box: Box | None = None,
     est_box: Box | None = None,
-    est_frame: Callable[[Camera], Geometry] | None = None,
-    with_overlay: bool = True,
 ) -> None:
     """Write the pictures of an instance, named ``stem``, to a run's folder.
 
-    ``overlays`` gets the photo with the boxes of truth and estimate, the estimated model and the
-    keypoints (n, 2) [px]; ``thumbs`` the part around the object with the boxes; ``pictures`` the
-    photo alone. ``est_frame`` casts the estimated model for a camera.
+    ``pictures`` gets the photo; ``thumbs`` the part around the object and its
+    keypoints ``observed`` (n, 2) [px], with the boxes of truth and estimate.
     """
     small, near = shown_photo(photo, camera)
-    scale = near.width / camera.width
-    observed = rescaled_pixels(observed, scale)
-    boxes: dict[str, Any] = {"gt_box": gt_box, "est_box": est_box}
-    if with_overlay:
-        image = draw_overlay(
-            small,
-            near,
-            est_frame=None if est_frame is None else est_frame(near),
-            observed=observed,
-            reprojected=None if reprojected is None else rescaled_pixels(reprojected, scale),
-            **boxes,
-        )
-        write_image(folder.overlays / f"{stem}.png", image)
     box = gt_box or est_box
     corners = np.empty((0, 2)) if box is None else near.project_where_ahead(box.corners)
-    points = np.concatenate([observed, corners])
+    points = np.concatenate([rescaled_pixels(observed, near.width / camera.width), corners])
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         points = np.array([[0, 0], [near.width, near.height]], dtype=float)
     crop, crop_camera = cut_out(small, near, points)
+    boxes: dict[str, Any] = {"gt_box": gt_box, "est_box": est_box}
     thumb = draw_overlay(crop, crop_camera, axes=False, legend=False, **boxes)
     write_webp(folder.pictures / f"{stem}.webp", small)
     write_webp(folder.thumbs / f"{stem}.webp", thumb, quality=_THUMB_QUALITY)
@@ -103,7 +84,6 @@ def draw_instance(
         frame.composite(),
         instance.camera,
         observed=instance.points_2d,
-        reprojected=instance.camera.project_where_ahead(estimate.apply(instance.points_3d)),
         gt_box=instance.gt_box,
         est_box=Box.from_model(instance.bounds, estimate),
     )

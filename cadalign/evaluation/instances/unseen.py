@@ -18,6 +18,7 @@ from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
+from cadalign.evaluation.experiments.keypointnet import KeypointTasks
 from cadalign.evaluation.experiments.unseen import COLUMNS, METHODS, UnseenOptions
 from cadalign.evaluation.instances.hull import sample_hull_view
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, KeypointTask
@@ -27,7 +28,6 @@ from cadalign.evaluation.instances.record import (
     aligned_shape,
     record_of,
 )
-from cadalign.evaluation.instances.views import KeypointTasks
 from cadalign.evaluation.methods import LIMIT, SHAPE, Method, MethodInput
 from cadalign.evaluation.metrics.cramer_rao import limit_estimate, probability_level
 from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
@@ -256,7 +256,6 @@ class UnseenObjects(Setting):
             self.options.sigma,
             bounds=shape.mean[-2:],
             gt=seen.gt,
-            make_views=lambda: (shape, [seen.view_of(shape)]),
         )
 
     def answered(

@@ -30,7 +30,6 @@ class Metric:
     symbol: str = ""
     """Name, with unit, at the head of the console's narrow tables; the head by default."""
     log: bool = True  # best seen on a logarithmic axis
-    limit: float = 1.0  # end of cumulative curves, as shown
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "head", self.head or self.label)
@@ -62,7 +61,7 @@ class Metric:
 
     def page(self) -> dict[str, Any]:
         """The metric for the page."""
-        names = ("key", "label", "unit", "factor", "digits", "better", "log", "limit")
+        names = ("key", "label", "unit", "factor", "digits", "better", "log")
         return {name: getattr(self, name) for name in names}
 
     def column(self) -> dict[str, Any]:
@@ -100,11 +99,9 @@ SKIPPED = Metric("skipped", "skipped", digits=0, better=None, symbol="skip")
 LEFT_OUT = _like(FAILED, "left_out", "left out", symbol="out")
 KEYPOINTS = Metric("keypoints", "keypoints", digits=1, better=None, symbol="kpts")
 
-ROTATION = Metric(
-    "rotation_error_deg", "rotation error", "deg", 3, head="R error", symbol="R deg", limit=20.0
-)
+ROTATION = Metric("rotation_error_deg", "rotation error", "deg", 3, head="R error", symbol="R deg")
 TRANSLATION = Metric(
-    "translation_error", "translation error", "diagonals", 4, head="t error", symbol="t", limit=0.2
+    "translation_error", "translation error", "diagonals", 4, head="t error", symbol="t"
 )
 """In diagonals of the model's bounding box."""
 TRANSLATION_IN_UNITS = replace(TRANSLATION, unit="model units")
@@ -114,7 +111,7 @@ TRANSLATION_OF_DISTANCE = replace(
 )
 """Over the distance from the camera to the mean of the points."""
 SCALE_Y = Metric(
-    "scale_y_error", "error of s_y", "%", factor=100.0, head="s_y error", symbol="s_y %", limit=20.0
+    "scale_y_error", "error of s_y", "%", factor=100.0, head="s_y error", symbol="s_y %"
 )
 SCALE_Z = _like(SCALE_Y, "scale_z_error", "error of s_z", "s_z error", "s_z %")
 BOX_IOU = Metric("box_iou", "box IoU", digits=3, better=HIGH, symbol="IoU", log=False)
@@ -136,7 +133,7 @@ STATED_BOX_IOU_UP_TO_SCALE = _like(
     "stated box IoU, up to scale",
     "IoU scaled",
 )
-RMS = Metric("rms_px", "reprojection error", "px", limit=5.0)
+RMS = Metric("rms_px", "reprojection error", "px")
 
 # From the nearest truth that looks the same.
 SYM_ROTATION = _like(

@@ -1,12 +1,13 @@
-"""Metrics of photos: sets of them, and those of PASCAL3D+ and of boxes with nine degrees.
+"""Metrics of photos: sets of them, those of PASCAL3D+, of boxes, and of Scan2CAD.
 
 A set is what a data set's protocol measures of each object, and shows of many. A new metric of
-photos is a column and a line of one set, in the module with its formula; a new set is a module, and
-its place in `cadalign.evaluation.photos.protocols`.
+photos is a line of one set; a new set has its place in `cadalign.evaluation.photos.options`.
 
 Tulsiani, Malik, "Viewpoints and Keypoints", CVPR 2015, section 4.1: accuracy at pi/6, median error.
 Wang et al., "Normalized Object Coordinate Space for Category-Level 6D Object Pose and Size
-Estimation" (NOCS), CVPR 2019, section 5: IoU at 25, 50 and 75 %, and degrees and cm.
+Estimation" (NOCS), CVPR 2019, section 5: IoU of boxes over an object's symmetries.
+Avetisyan et al., "Scan2CAD: Learning CAD Model Alignment in RGB-D Scans", CVPR 2019, section 8, and
+the benchmark's script: 20 cm, 20 degrees and 20 % of scale.
 """
 
 from __future__ import annotations
@@ -14,18 +15,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cadalign.arrays import BoolArray
+from cadalign.arrays import FloatArray
 from cadalign.evaluation import metrics
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics.errors import overlap_up_to_scale
 from cadalign.evaluation.runs.work import Columns, Row
 from cadalign.evaluation.summary import Group, known, medians
 from cadalign.geometry.alignment import Alignment, Box
-from cadalign.geometry.metrics import box_iou, rotation_error
+from cadalign.geometry.metrics import box_iou, rotation_error, scale_error
 from cadalign.geometry.symmetry import Symmetry
 
 if TYPE_CHECKING:
@@ -36,11 +37,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Rate:
-    """A share of objects within thresholds, of those that have a value of a column."""
+    """A share of objects, of those that have a value of a column."""
 
     metric: Metric
     column: Metric
-    is_within: Callable[[Cells], BoolArray]
+    limit: float | None = None
+    """Values below it count; without one, those that are not 0."""
+
+    def count(self, values: FloatArray) -> int:
+        """Number of the values (n,) that count."""
+        within = values > 0 if self.limit is None else values < self.limit
+        return int(within.sum())
 
 
 @dataclass(frozen=True)
@@ -50,19 +57,19 @@ class MetricSet:
     measure: Callable[[PhotoTarget, Alignment, Alignment, Box], Row]
     """Errors by column, some of which may be None: of an object, an estimate of the data set's
     model, the true one, and the estimated box."""
-    columns: tuple[str, ...]  # columns of the result table, numbers
     medians: tuple[Metric, ...]  # columns whose medians are shown
     rates: tuple[Rate, ...] = ()
-    shares: tuple[Metric, ...] = ()
-    """Columns between 0 and 1 whose means over all objects are shown."""
-    headline: tuple[Metric, ...] = ()  # first columns of the headline table
-    details: tuple[Metric, ...] = ()  # its last columns
-    console: tuple[Metric, ...] = ()  # columns of the console's table
+
+    @property
+    def shown(self) -> tuple[Metric, ...]:
+        """The columns of its summary."""
+        return (*(rate.metric for rate in self.rates), *self.medians)
 
 
 def score_columns(sets: Iterable[MetricSet]) -> Columns:
     """The columns of some sets in the result table."""
-    return tuple((name, float) for each in sets for name in each.columns)
+    found = (m for each in sets for m in (*each.medians, *(rate.column for rate in each.rates)))
+    return tuple(dict.fromkeys((metric.key, float) for metric in found))
 
 
 def score_alignment(
@@ -90,28 +97,20 @@ def statistics_of(sets: Sequence[MetricSet], cells: Cells) -> Statistics:
     Failures count as misses. Shares of a column that has no value in a whole table, of ``cells``,
     are left out.
     """
-    measured = {name for name, _ in score_columns(sets) if len(known(cells[name]))}
     found = medians(*(metric for each in sets for metric in each.medians))
-    rates = (rate for each in sets for rate in (*each.rates, *map(_share_of, each.shares)))
+    rates = (rate for each in sets for rate in each.rates)
     shares = {
-        each.metric.key: partial(_rate, each) for each in rates if each.column.key in measured
+        rate.metric.key: partial(_rate, rate)
+        for rate in rates
+        if len(known(cells[rate.column.key]))
     }
     return {**found, **shares}
 
 
-def _share_of(metric: Metric) -> Rate:
-    return Rate(metric, metric, lambda cells: np.nan_to_num(numbers(cells, metric)))
-
-
 def _rate(rate: Rate, group: Group) -> float:
-    failures = len(group.rows["method"]) - len(group.solved["method"])
-    count = len(known(group.solved[rate.column.key])) + failures
-    return float(rate.is_within(group.solved).sum()) / count if count else np.nan
-
-
-def numbers(cells: Cells, metric: Metric) -> Any:
-    """A column of numbers, NaN where one is missing."""
-    return cells[metric.key].astype(float)
+    values = known(group.solved[rate.column.key])
+    count = len(values) + len(group.rows["method"]) - len(group.solved["method"])
+    return rate.count(values) / count if count else np.nan
 
 
 def model_rotation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry) -> float:
@@ -123,8 +122,6 @@ def model_rotation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry) -
 
 ACCURACY_DEG = 30.0
 """pi/6 [degrees]."""
-
-
 ROTATION = replace(metrics.ROTATION, digits=2)
 ACCURACY = metrics.rate("accuracy_pi_6", "accuracy at pi/6", "Acc pi/6")
 
@@ -134,25 +131,16 @@ def _measure_viewpoint(target: PhotoTarget, est: Alignment, gt: Alignment, box: 
     return {ROTATION.key: error}
 
 
-VIEWPOINT = MetricSet(
-    _measure_viewpoint,
-    columns=(ROTATION.key,),
-    medians=(ROTATION,),
-    rates=(Rate(ACCURACY, ROTATION, lambda cells: numbers(cells, ROTATION) < ACCURACY_DEG),),
-    headline=(ROTATION, ACCURACY),
-    console=(ROTATION, ACCURACY),
-)
+VIEWPOINT = MetricSet(_measure_viewpoint, (ROTATION,), (Rate(ACCURACY, ROTATION, ACCURACY_DEG),))
 
-# Nine degrees of freedom --------------------------------------------------------------------------
+# Boxes --------------------------------------------------------------------------------------------
 
-IOU_THRESHOLDS = (0.25, 0.5, 0.75)
-DEGREE_CM = ((5.0, 2.0), (5.0, 5.0), (10.0, 2.0), (10.0, 5.0), (10.0, 10.0))
-"""Thresholds [degrees, cm]."""
 # NOCS tries 20 rotations about an axis of symmetry.
 _MAX_STEP = np.pi / 20
+TRANSLATION = Metric("translation_cm", "translation error", "cm", symbol="t cm")
 
 
-def nine_dof_iou(*, est: Box, gt: Box, symmetry: Symmetry) -> float:
+def symmetric_box_iou(*, est: Box, gt: Box, symmetry: Symmetry) -> float:
     """Largest IoU of the true box and the estimated one over the object's symmetries.
 
     As in NOCS, the estimate is turned about its own centre by the symmetries' rotations, those
@@ -165,74 +153,100 @@ def nine_dof_iou(*, est: Box, gt: Box, symmetry: Symmetry) -> float:
     )
 
 
-def degree_cm(
-    *, est: Alignment, gt: Alignment, symmetry: Symmetry, metres: float
-) -> tuple[float, float]:
-    """Rotation error [degrees], symmetry-aware, and translation error [cm].
-
-    ``metres`` is the length of one unit of the camera frame [m].
-    """
-    gap = float(np.linalg.norm(est.translation - gt.translation))
-    degrees = model_rotation_error(est=est, gt=gt, symmetry=symmetry)
-    return degrees, 100 * metres * gap
-
-
-TRANSLATION = Metric("translation_cm", "translation error", "cm", symbol="t cm", limit=50.0)
-_IOUS = {
-    limit: metrics.rate(
-        f"iou_{100 * limit:.0f}", f"IoU over {100 * limit:.0f} %", f"IoU{100 * limit:.0f}"
-    )
-    for limit in IOU_THRESHOLDS
-}
-_DEGREE_CM = {
-    (deg, cm): metrics.rate(
-        f"deg_{deg:.0f}_cm_{cm:.0f}",
-        f"within {deg:.0f} deg, {cm:.0f} cm",
-        f"{deg:.0f}deg{cm:.0f}cm",
-    )
-    for deg, cm in DEGREE_CM
-}
-
-
-def _measure_nine_dof(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
+def _measure_box(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
     found, gt_box = target.found, target.gt_box
     values: Row = {}
     if found.truth.metres is not None:
-        how: dict[str, Any] = {"symmetry": found.symmetry, "metres": found.truth.metres}
-        values[TRANSLATION.key] = degree_cm(est=est, gt=gt, **how)[1]
+        gap = float(np.linalg.norm(est.translation - gt.translation))
+        values[TRANSLATION.key] = 100 * found.truth.metres * gap
     if gt_box is not None and min(box.volume, gt_box.volume) > 0:
-        iou = nine_dof_iou(est=box, gt=gt_box, symmetry=found.symmetry)
+        iou = symmetric_box_iou(est=box, gt=gt_box, symmetry=found.symmetry)
         values[metrics.BOX_IOU.key] = iou
         values[metrics.BOX_IOU_UP_TO_SCALE.key] = overlap_up_to_scale(est=box, gt=gt_box)
     return values
 
 
-def _is_over(cells: Cells, *, limit: float) -> BoolArray:
-    return np.asarray(numbers(cells, metrics.BOX_IOU) > limit)
+BOX = MetricSet(_measure_box, (TRANSLATION, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE))
+
+# Scan2CAD -----------------------------------------------------------------------------------------
+
+MAX_TRANSLATION = 0.2
+"""[m]"""
+MAX_ROTATION_DEG = 20.0
+MAX_SCALE = 0.2
+"""Fraction."""
 
 
-def _is_within(cells: Cells, *, limits: tuple[float, float]) -> BoolArray:
-    rotation, translation = numbers(cells, ROTATION), numbers(cells, TRANSLATION)
-    return np.asarray((rotation <= limits[0]) & (translation <= limits[1]))
+@dataclass(frozen=True)
+class Scan2CadErrors:
+    """Errors of one alignment."""
+
+    translation: float  # distance of the positions [m]
+    rotation_deg: float  # angle to the nearest rotation that looks the same [degrees]
+    scale: float
+    """The benchmark's: the mean over the axes of the ratio to the truth, less 1; a fraction. Errors
+    of opposite sign cancel in it."""
+    scale_axes: FloatArray  # (3,), relative error along each axis
+
+    @property
+    def is_aligned(self) -> bool:
+        """True if no error is over its threshold."""
+        return (
+            self.translation <= MAX_TRANSLATION
+            and self.rotation_deg <= MAX_ROTATION_DEG
+            and self.scale <= MAX_SCALE
+        )
+
+    @property
+    def is_aligned_on_each_axis(self) -> bool:
+        """True if neither is the scale along any axis."""
+        return self.is_aligned and bool((self.scale_axes <= MAX_SCALE).all())
 
 
-NINE_DOF = MetricSet(
-    _measure_nine_dof,
-    columns=(TRANSLATION.key, metrics.BOX_IOU.key, metrics.BOX_IOU_UP_TO_SCALE.key),
-    medians=(TRANSLATION, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
-    rates=(
-        *(
-            Rate(metric, metrics.BOX_IOU, partial(_is_over, limit=limit))
-            for limit, metric in _IOUS.items()
-        ),
-        *(
-            Rate(metric, TRANSLATION, partial(_is_within, limits=limits))
-            for limits, metric in _DEGREE_CM.items()
-        ),
-    ),
-    headline=(
-        *(*_IOUS.values(), TRANSLATION, *_DEGREE_CM.values()),
-        *(metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
-    ),
-    console=(TRANSLATION, _DEGREE_CM[10.0, 10.0], _IOUS[0.5]),
+def scan2cad_errors(
+    *,
+    est: Alignment,
+    gt: Alignment,
+    symmetry: Symmetry | None = None,
+    center: FloatArray | None = None,
+) -> Scan2CadErrors:
+    """Errors of an estimate of a true alignment, in metres.
+
+    Positions of the point ``center`` (3,) of the model are compared, by default of its origin.
+    Rotations about an axis of symmetry are compared exactly; the benchmark's script takes steps of
+    10 degrees there, so that its errors are larger by up to 5 degrees.
+    """
+    symmetry = symmetry or Symmetry.none()
+    point = np.zeros(3) if center is None else center
+    gap = est.apply([point])[0] - gt.apply([point])[0]
+    return Scan2CadErrors(
+        translation=float(np.linalg.norm(gap)),
+        rotation_deg=model_rotation_error(est=est, gt=gt, symmetry=symmetry),
+        scale=float(np.abs(np.mean(est.scale / gt.scale) - 1)),
+        scale_axes=scale_error(est=est, gt=gt),
+    )
+
+
+_TRANSLATION_M = Metric("scan2cad_translation_m", "translation error", "m", 3, symbol="t m")
+_SCALE = Metric("scan2cad_scale", "mean scale error", "%", 1, factor=100.0, symbol="s %")
+_ALIGNED = metrics.rate("scan2cad_aligned", "Scan2CAD accuracy", "acc %")
+_ALIGNED_AXES = metrics.rate("scan2cad_aligned_axes", "Scan2CAD accuracy, each axis", "acc xyz %")
+
+
+def _measure_scan2cad(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
+    # The benchmark's script takes minus the centre of the model's box.
+    center = None if target.bounds is None else -target.bounds.mean(axis=0)
+    errors = scan2cad_errors(est=est, gt=gt, symmetry=target.found.symmetry, center=center)
+    return {
+        _TRANSLATION_M.key: errors.translation,
+        _SCALE.key: errors.scale,
+        _ALIGNED.key: float(errors.is_aligned),
+        _ALIGNED_AXES.key: float(errors.is_aligned_on_each_axis),
+    }
+
+
+SCAN2CAD = MetricSet(
+    _measure_scan2cad,
+    (_TRANSLATION_M, _SCALE),
+    (Rate(_ALIGNED, _ALIGNED), Rate(_ALIGNED_AXES, _ALIGNED_AXES)),
 )

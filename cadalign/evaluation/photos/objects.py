@@ -1,7 +1,8 @@
-"""Objects in photos: errors of methods, records and pictures."""
+"""Objects in photos as methods get them, their estimates, errors, records and pictures."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -9,7 +10,12 @@ from typing import Any
 import numpy as np
 
 from cadalign.errors import DataError
+from cadalign.estimation.align import align
+from cadalign.estimation.fit import fit
+from cadalign.estimation.model import Model
+from cadalign.estimation.options import SIMILAR_SCALE_SIGMA
 from cadalign.estimation.result import Result
+from cadalign.estimation.view import View
 from cadalign.evaluation.benchmark import (
     Benchmark,
     Case,
@@ -18,37 +24,173 @@ from cadalign.evaluation.benchmark import (
     write_picture,
 )
 from cadalign.evaluation.experiments.photos import COLUMNS
-from cadalign.evaluation.instances.pictures import (
-    NO_PHOTO,
-    write_pictures,
-    write_preview,
-)
+from cadalign.evaluation.instances.pictures import NO_PHOTO, write_pictures, write_preview
 from cadalign.evaluation.instances.record import (
     RECORD_COLUMNS,
     Estimate,
     aligned_shape,
+    box_alignment,
     record_of,
     record_stem,
 )
-from cadalign.evaluation.methods import Method, MethodInput
+from cadalign.evaluation.methods import SHAPE, Method, MethodInput
 from cadalign.evaluation.metrics.photos import score_alignment
 from cadalign.evaluation.options import is_function
-from cadalign.evaluation.photos.methods import (
-    PhotoEstimate,
-    Sighting,
-    estimate_object,
-    estimate_of_model,
-    sight,
-    with_all_evidence,
+from cadalign.evaluation.photos.options import (
+    EPNP,
+    GRAVITY,
+    IMAGE,
+    MASK,
+    PRIOR,
+    RIGID,
+    SIMILAR,
+    TRUTH,
+    PhotosOptions,
+    parts_of,
+    protocol_of,
 )
-from cadalign.evaluation.photos.options import PhotosOptions
-from cadalign.evaluation.photos.protocols import TRUTH, protocol_of
-from cadalign.evaluation.photos.target import PhotoTarget, PhotoTask, opened, targets_of
+from cadalign.evaluation.photos.sighting import Sighting, sight
+from cadalign.evaluation.photos.target import (
+    PhotoTarget,
+    PhotoTask,
+    opened,
+    targets_of,
+)
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.work import Outcome, Row
-from cadalign.geometry.alignment import Alignment
-from cadalign.render.raycast.renderer import cast_geometry
+from cadalign.evaluation.runs.work import LeftOutError, Outcome, Row
+from cadalign.geometry.alignment import Alignment, Box
+from cadalign.geometry.mesh import Mesh
 from cadalign.shapes.model import ShapeModel
+
+# Evidence about the model's outline, which needs a mesh.
+_OUTLINED = frozenset({MASK, IMAGE})
+
+# Methods ------------------------------------------------------------------------------------------
+
+
+_UP_SIGMA_DEG = 3.0  # of rigs and phones, and of objects that stand upright
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoEstimate:
+    """An estimate of an object."""
+
+    alignment: Alignment
+    """Takes the box of the data set's model, in its own unit, to the estimated one."""
+    box: Box  # the object's box in the camera's frame
+    result: Result | None = None  # with shape and covariances
+
+
+def estimate_object(
+    sighting: Sighting, *, method: str, shapes: Collection[ShapeModel], similar_sigma: float
+) -> PhotoEstimate:
+    """The estimate of a method by name; see `PhotosOptions.methods`.
+
+    ``shapes`` are models of the categories that they name, ``similar_sigma`` is the standard
+    deviation of the object's keypoints from the model's [diagonals of the model]. Raises
+    LeftOutError if the object lacks what the method needs; and CadalignError if there is no
+    estimate.
+    """
+    base, evidence = parts_of(method)
+    if base == TRUTH:
+        gt, box = sighting.target.gt, sighting.target.gt_box
+        if gt is None or box is None:
+            raise LeftOutError("the true pose is not known")
+        return PhotoEstimate(gt, box)
+    if base == EPNP:
+        points = sighting.points_3d * sighting.width
+        found = fit(points, sighting.points_2d, sighting.camera, method="epnp")
+        return estimate_of_model(found.alignment, sighting)
+    if base == SHAPE:
+        return _of_shape(sighting, shapes, evidence)
+    model = _model(base, sighting, similar_sigma, with_mesh=bool(_OUTLINED & evidence))
+    result = align(model, _view(sighting, evidence))
+    return estimate_of_model(result.alignment, sighting, result)
+
+
+def _model(base: str, sighting: Sighting, similar_sigma: float, *, with_mesh: bool) -> Model:
+    width, bounds = sighting.width, sighting.bounds * sighting.width
+    kind: dict[str, Any] = {}
+    if base == RIGID:
+        kind = {"stretch": "none"}
+    elif base == PRIOR:
+        kind = {"stretch_sigma": SIMILAR_SCALE_SIGMA}
+    elif base == SIMILAR:
+        diagonal = float(np.linalg.norm(np.ptp(bounds, axis=0)))
+        kind = {"shape_sigma": similar_sigma * diagonal}
+    if with_mesh:
+        cad = sighting.target.cad
+        if cad is None or not cad.has_mesh:
+            raise LeftOutError("the model has no mesh for the mask")
+        mesh = cad.scene.mesh
+        kind["mesh"] = Mesh(mesh.vertices * width, mesh.faces)
+    return Model(
+        points_3d=sighting.model.xyz * width,
+        ids=sighting.model.names,
+        bounds=bounds,
+        up_axis=sighting.protocol.up_axis,
+        **kind,
+    )
+
+
+def _view(sighting: Sighting, evidence: Collection[str], *, rows: Any = slice(None)) -> View:
+    photo, found = sighting.target.photo, sighting.target.found
+    given: dict[str, Any] = {}
+    if MASK in evidence:
+        if found.mask_path is None:
+            raise LeftOutError("the object has no mask")
+        given["mask"] = found.read_mask()
+    if GRAVITY in evidence:
+        if photo.up is None:
+            raise LeftOutError("the direction of gravity is not known")
+        given |= {"up": photo.up, "up_sigma_deg": _UP_SIGMA_DEG}
+    if IMAGE in evidence:
+        if photo.image is None:
+            raise LeftOutError("the image is not there")
+        given["image"] = photo.read_image()
+    names = tuple(np.array(sighting.names)[rows].tolist())
+    pixels = sighting.points_2d[rows]
+    return View(sighting.camera, pixels, ids=names, sigma=sighting.sigma, **given)
+
+
+def estimate_of_model(
+    found: Alignment, sighting: Sighting, result: Result | None = None
+) -> PhotoEstimate:
+    """The estimate of the data set's model, from that of the model with the object's width."""
+    bounds = sighting.bounds * sighting.width if result is None else result.bounds
+    box = Box.from_model(bounds, found)
+    alignment = Alignment(found.rotation, found.translation, found.scale * sighting.width)
+    return PhotoEstimate(alignment, box, result)
+
+
+def _of_shape(
+    sighting: Sighting, shapes: Collection[ShapeModel], evidence: Collection[str]
+) -> PhotoEstimate:
+    category = sighting.target.found.category
+    shape = next((each for each in shapes if each.category == category), None)
+    if shape is None:
+        raise LeftOutError(f"there is no shape model of {category}")
+    if _OUTLINED & frozenset(evidence):
+        raise LeftOutError("a shape model has no mesh for the mask")
+    if GRAVITY in evidence and shape.up_axis is None:
+        raise LeftOutError("the shape model has no up axis for gravity")
+    known = np.isin(sighting.names, [str(name) for name in shape.ids])
+    if not known.any():
+        raise LeftOutError("the shape model has none of the keypoints")
+    view = _view(sighting, evidence, rows=known)
+    result = align(shape, view)
+    factor = 1.0
+    if shape.unit != "m" and sighting.target.gt is not None:  # the object's width is known
+        wanted = float(np.ptp(sighting.bounds[:, 0])) * sighting.width
+        factor = wanted / float(result.box.extents[0])
+    # Scaled about the camera centre.
+    found, shift = result.alignment, result.alignment.translation * factor
+    moved = Alignment(found.rotation, shift, found.scale * factor)
+    alignment = box_alignment(moved, result.bounds, model_bounds=sighting.bounds)
+    return PhotoEstimate(alignment, Box.from_model(result.bounds, moved), result)
+
+
+# Setting ------------------------------------------------------------------------------------------
 
 _NO_SOURCE: Row = {"source": ""}
 
@@ -92,7 +234,6 @@ class PhotoObjects(Setting):
             sighting.sigma,
             bounds=sighting.bounds * sighting.width,
             gt=sighting.target.gt,
-            make_views=partial(with_all_evidence, sighting),
         )
 
     def answered(
@@ -182,18 +323,14 @@ def draw_sighting(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate
     """
     names, camera, cad = sighting.target.names, sighting.camera, sighting.target.cad
     stem = record_stem(names["category"], names["model_id"])
-    has_mesh = cad is not None and cad.has_mesh
     try:
         photo = sighting.target.photo.read_image()
     except DataError:
         photo = np.full((camera.height, camera.width, 3), NO_PHOTO, dtype=np.uint8)
-    more: dict[str, Any] = {}
-    if estimate is not None:
-        predicted = camera.project_where_ahead(estimate.alignment.apply(sighting.points_3d))
-        more = {"reprojected": predicted, "est_box": estimate.box}
-        if cad is not None and has_mesh:
-            more["est_frame"] = lambda near: cast_geometry(cad.scene, near, estimate.alignment)
-    gt_box = sighting.target.gt_box
-    write_pictures(folder, stem, photo, camera, observed=sighting.points_2d, gt_box=gt_box, **more)
-    if cad is not None and has_mesh:
+    boxes = {
+        "gt_box": sighting.target.gt_box,
+        "est_box": None if estimate is None else estimate.box,
+    }
+    write_pictures(folder, stem, photo, camera, observed=sighting.points_2d, **boxes)
+    if cad is not None and cad.has_mesh:
         write_preview(folder.previews / f"{stem}.json", cad.scene.mesh)

@@ -11,7 +11,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.datasets.formats import open_photos
 from cadalign.datasets.photos.dataset import PhotoDataset
-from cadalign.datasets.photos.photo import CadModel, NamedPoints, Photo, PhotoObject
+from cadalign.datasets.photos.photo import CadModel, Photo, PhotoObject
 from cadalign.errors import DataError
 from cadalign.evaluation.benchmark import Case, Tasks
 from cadalign.evaluation.runs.work import (
@@ -23,11 +23,9 @@ from cadalign.evaluation.runs.work import (
 )
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.mesh import farthest_rows, random_points
 from cadalign.render.scene import Scene
 
 _KEPT = 16
-_ON_SURFACE = 2000  # points among which farthest ones are sought, beside the vertices
 
 
 @dataclass(frozen=True)
@@ -112,30 +110,10 @@ class Cad:
             None if points is None else np.array([points.xyz.min(axis=0), points.xyz.max(axis=0)])
         )
 
-    def spread_points(self, count: int) -> NamedPoints:
-        """Farthest-point samples of the mesh's surface, named by their numbers."""
-        return _spread(self, count)
-
 
 @lru_cache(maxsize=_KEPT)
 def _scene(cad: Cad) -> Scene:
     return Scene(cad.model.load_mesh())
-
-
-@lru_cache(maxsize=_KEPT)
-def _spread(cad: Cad, count: int) -> NamedPoints:
-    _, on_surface = random_points(cad.scene.mesh, _ON_SURFACE)
-    points = np.vstack([cad.scene.used_vertices, on_surface])
-    xyz = farthest_points(points, count)
-    return NamedPoints(tuple(str(row) for row in range(len(xyz))), xyz)
-
-
-def farthest_points(points: FloatArray, count: int) -> FloatArray:
-    """At most so many points (n, 3), each the farthest from those before it.
-
-    The first is the farthest from the mean. Points that coincide with an earlier one are left out.
-    """
-    return np.asarray(points[farthest_rows(points, count, center=points.mean(axis=0))])
 
 
 @dataclass(frozen=True, eq=False)

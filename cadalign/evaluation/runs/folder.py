@@ -54,7 +54,6 @@ class RunFolder:
     records = _Inside("records.parquet")
     summary = _Inside("summary.csv")
     figures = _Inside("figures")
-    overlays = _Inside("overlays")
     pictures = _Inside("pictures")
     thumbs = _Inside("thumbs")
     previews = _Inside("previews")
@@ -89,7 +88,7 @@ class RunFolder:
     def made_for_pictures(self) -> RunFolder:
         """Make the folder and those in it that pictures go to; returns it by its full path."""
         self.make()
-        for path in (self.overlays, self.thumbs, self.pictures, self.previews):
+        for path in (self.thumbs, self.pictures, self.previews):
             made_folder(path)
         return RunFolder(self.path.absolute())
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cadalign.arrays import FloatArray, is_number
+from cadalign.arrays import FloatArray
 from cadalign.errors import DataError, quote
 from cadalign.evaluation.metrics import Metric, metric_named
 from cadalign.evaluation.options import name_of
@@ -235,16 +235,9 @@ class Run:
         return tuple(metric_named(name_of(each)) for each in functions)
 
     @property
-    def noise_px(self) -> float | None:
-        """Standard deviation of the keypoints' noise [px], if it is one number."""
-        noise: Any = self.config.get("noise_px")
-        return float(noise) if is_number(noise) else None
-
-    @property
     def dataset(self) -> str:
-        """Name of the dataset's folder."""
-        path = PurePath(str(self.config.get("root") or self.config.get("path") or ""))
-        return path.name or "an unknown dataset"
+        """Name of the dataset's folder; empty where there is none."""
+        return PurePath(str(self.config.get("root") or self.config.get("path") or "")).name
 
     @property
     def day(self) -> str:

@@ -21,7 +21,7 @@ export function errorTable(report, instance, exhibit) {
       return h(
         "tr",
         {},
-        h("th", { scope: "row" }, swatch(report, method), method.label),
+        h("th", { scope: "row" }, swatch(report, method), method.key),
         failed
           ? h("td", { class: "words failed", colspan: metrics.length + 1 }, `failed: ${reason}`)
           : [

@@ -1,126 +1,79 @@
 // The switches that all parts of the page obey (methods, runs) and the gallery's form.
 import { button, debounced, field, h } from "../common/dom.js";
-import { named, plural } from "./format.js";
+import { named } from "./format.js";
 import { EVERY, FILTERS } from "./selection.js";
 import { runSwatch, swatch } from "./swatch.js";
 
 /** Buttons that take methods and runs in and out everywhere. */
 export function switches(report, state) {
-  const buttons = [];
-  const add = (list, word, ...words) => {
-    const chip = button(words, () => state.toggle(list, word), { class: "chip" });
-    buttons.push({ chip, list, word });
-    return chip;
-  };
-  const update = () => {
-    for (const { chip, list, word } of buttons) {
-      chip.setAttribute("aria-pressed", String(!state.words(list).has(word)));
-    }
-  };
-  state.listen(update);
+  const update = [];
+  const chips = (label, list, things) =>
+    h(
+      "div",
+      { role: "group", "aria-label": label, class: "chips" },
+      things.map(([word, ...words]) => {
+        const chip = button(words, () => state.toggle(list, word), { class: "chip" });
+        update.push(() => chip.setAttribute("aria-pressed", String(!state.words(list).has(word))));
+        return chip;
+      }),
+    );
+  const methods = report.methods.map((method) => [
+    method.key,
+    swatch(report, method),
+    method.key,
+  ]);
+  const runs = report.runs.map(({ name }, index) => [String(index), runSwatch(index), name]);
   const element = h(
     "div",
     { class: "switches" },
-    h(
-      "div",
-      { role: "group", "aria-label": "methods shown", class: "chips" },
-      report.methods.map((method) => add("hide", method.key, swatch(report, method), method.label)),
-    ),
-    report.runs.length > 1 &&
-      h(
-        "div",
-        { role: "group", "aria-label": "runs shown", class: "chips" },
-        report.runs.map((run, index) => add("hideruns", String(index), runSwatch(index), run.name)),
-      ),
+    chips("methods shown", "hide", methods),
+    runs.length > 1 && chips("runs shown", "hideruns", runs),
   );
-  update();
+  const all = () => update.forEach((one) => one());
+  state.listen(all);
+  all();
   return element;
 }
 
-/** A field bound to a value of the state. */
-function bound(state, name, control, { event = "change", wait = 0, also = {} } = {}) {
-  const write = () => state.set({ [name]: control.value, ...also });
-  control.addEventListener(event, wait ? debounced(write, wait) : write);
+/** A choice among [value, label] pairs, bound to a value of the state; else the first is shown. */
+function choice(state, name, options) {
+  const control = h(
+    "select",
+    { onchange: () => state.set({ [name]: control.value }) },
+    options.map(([value, label]) => h("option", { value }, label)),
+  );
   const read = () => {
-    if (document.activeElement !== control || control.tagName === "SELECT")
-      control.value = state.get(name);
+    const known = options.some(([value]) => value === state.get(name));
+    control.value = known ? state.get(name) : (options[0]?.[0] ?? "");
   };
-  state.listen((names) => names.has(name) && read());
+  state.listen(read);
   read();
   return control;
 }
 
-export function select(state, name, options, { fallback } = {}) {
-  const control = h(
-    "select",
-    {},
-    options.map(([value, label]) => h("option", { value }, label)),
-  );
-  bound(state, name, control);
-  const known = () => options.some(([value]) => value === state.get(name));
-  const settle = () => {
-    if (!known()) control.value = fallback ?? options[0]?.[0] ?? "";
+function search(state) {
+  const control = h("input", {
+    type: "search",
+    placeholder: "search",
+    autocomplete: "off",
+    spellcheck: "false",
+    oninput: debounced(() => state.set({ q: control.value }), 150),
+  });
+  const read = () => {
+    if (document.activeElement !== control) control.value = state.get("q");
   };
-  state.listen(settle);
-  settle();
+  state.listen(read);
+  read();
   return control;
 }
 
-/** Values and names of what fields choose among. */
-export const metricOptions = ({ metrics }) => metrics.map((metric) => [metric.key, named(metric)]);
-export const methodOptions = ({ fitted }) => fitted.map(({ key, label }) => [key, label]);
-export const runOptions = ({ runs }) => runs.map(({ name }, index) => [String(index), name]);
-
-function numbers(state, title, low, high) {
-  const box = (name, words) =>
-    bound(
-      state,
-      name,
-      h("input", {
-        type: "number",
-        step: "any",
-        min: 0,
-        placeholder: words,
-        "aria-label": `${title}, ${words}`,
-      }),
-      { event: "input", wait: 200 },
-    );
-  return h(
-    "fieldset",
-    { class: "field range" },
-    h("legend", {}, title),
-    box(low, "from"),
-    h("span", { "aria-hidden": "true" }, "\u2013"),
-    box(high, "to"),
-  );
-}
-
-/** The gallery's form: sorting, filters, search, and the three picks. */
+/** The gallery's form: order, filters, search. */
 export function galleryForm(report, state) {
-  const metrics = metricOptions(report);
-  const seed = () => String(1 + Math.floor(Math.random() * 1e6));
-  const pick = (order, words) =>
-    button(words, () => state.set(order === "random" ? { order, seed: seed() } : { order }), {
-      class: "pick",
-      "data-order": order,
-    });
-  const picks = [pick("worst", "Worst"), pick("best", "Best"), pick("random", "Random")];
-  const mark = () => {
-    for (const one of picks)
-      one.setAttribute("aria-pressed", String(one.dataset.order === state.get("order")));
-  };
-  state.listen(mark);
-  mark();
-  const error = h("div", { class: "slot" });
-  const retitle = () => {
-    const metric = report.metric.get(state.get("sort")) ?? report.metrics[0];
-    if (metric && error.dataset.metric !== metric.key) {
-      error.dataset.metric = metric.key;
-      error.replaceChildren(numbers(state, named(metric), "emin", "emax"));
-    }
-  };
-  state.listen(retitle);
-  retitle();
+  const metrics = report.metrics.map((metric) => [metric.key, named(metric)]);
+  const methods = report.fitted.map(({ key }) => [key, key]);
+  const categories = report.categories.map((name) => [name, name]);
+  const runs = report.runs.map(({ name }, index) => [String(index), name]);
+  const all = ["", "all"];
   const clear = () => state.set(Object.fromEntries(FILTERS.map((name) => [name, ""])));
   return h(
     "form",
@@ -130,45 +83,16 @@ export function galleryForm(report, state) {
       "aria-label": "filter the gallery",
       onsubmit: (event) => event.preventDefault(),
     },
-    h("div", { class: "picks", role: "group", "aria-label": "order" }, picks),
-    metrics.length > 0 && field("by", select(state, "sort", metrics)),
     field(
-      "of",
-      select(state, "method", [...methodOptions(report), [EVERY, "all methods shown"]], {
-        fallback: report.best?.key,
-      }),
+      "order",
+      choice(state, "order", [["worst", "worst first"], ["best", "best first"], ["listed", "as listed"]]),
     ),
-    report.categories.length > 1 &&
-      field(
-        "category",
-        select(state, "category", [["", "all"], ...report.categories.map((name) => [name, name])]),
-      ),
-    report.runs.length > 1 &&
-      field("run", select(state, "run", [["", "all"], ...runOptions(report)])),
-    field(
-      "status",
-      select(state, "status", [
-        ["", "all"],
-        ["ok", "succeeded"],
-        ["failed", "failed"],
-      ]),
-    ),
-    numbers(state, "keypoints", "kmin", "kmax"),
-    metrics.length > 0 && error,
-    field(
-      "model id",
-      bound(
-        state,
-        "q",
-        h("input", { type: "search", placeholder: "search", autocomplete: "off", spellcheck: "false" }),
-        { event: "input", wait: 150 },
-      ),
-    ),
+    metrics.length > 0 && field("by", choice(state, "sort", metrics)),
+    field("of", choice(state, "method", [...methods, [EVERY, "all methods shown"]])),
+    categories.length > 1 && field("category", choice(state, "category", [all, ...categories])),
+    runs.length > 1 && field("run", choice(state, "run", [all, ...runs])),
+    field("status", choice(state, "status", [all, ["ok", "succeeded"], ["failed", "failed"]])),
+    field("model id", search(state)),
     button("Clear filters", clear, { class: "quiet" }),
   );
 }
-
-export const foundWords = (found, all) =>
-  found === all
-    ? plural(all, "instance")
-    : `${plural(found, "instance")} of ${all.toLocaleString("en-US")}`;

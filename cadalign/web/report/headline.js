@@ -50,7 +50,11 @@ export function headline(report) {
     "section",
     { id: "results", "aria-labelledby": "results-title" },
     h("h2", { id: "results-title" }, "Results"),
-    tables(report, given),
+    h(
+      "div",
+      { class: "scroller", tabindex: 0, role: "region", "aria-labelledby": "results-title" },
+      resultTable(report, given),
+    ),
     h("p", { class: "note" }, given.rows.some(({ best }) => best.length) && legend(given), given.note),
     reasons(report, given.failures, "failed"),
     reasons(report, given.skipped, "skipped"),
@@ -63,64 +67,7 @@ const legend = ({ group }) => [
   ` is the best of its ${group}. `,
 ];
 
-const PHONE = 700; // pixels: below, a table is scrolled, its first column staying in view
-
-/** The headline table, its columns in as many tables below each other as show them all. */
-function tables(report, given) {
-  const scroller = h("div", {
-    class: "scroller",
-    tabindex: 0,
-    role: "region",
-    "aria-labelledby": "results-title",
-  });
-  let width = 0;
-  new ResizeObserver(() => {
-    const room = scroller.clientWidth;
-    if (room === width) return;
-    width = room;
-    const whole = resultTable(report, given);
-    scroller.replaceChildren(whole);
-    if (room < PHONE || whole.offsetWidth <= room) return;
-    const widths = [...whole.tHead.rows[0].cells].map((cell) => cell.offsetWidth);
-    const names = widths.length - given.columns.length;
-    const free = room - sum(widths.slice(0, names));
-    // A column without any number only takes room.
-    const kept = given.columns.filter((column) => told(given.rows, [column]).length);
-    const own = kept.map((column) => widths[names + given.columns.indexOf(column)]);
-    scroller.replaceChildren(
-      ...shared(kept, own, free).map((columns) =>
-        resultTable(report, { ...given, columns, rows: told(given.rows, columns) }),
-      ),
-    );
-  }).observe(scroller);
-  scroller.append(resultTable(report, given));
-  return scroller;
-}
-
-/** The rows that have a number in some of the columns. */
-const told = (rows, columns) =>
-  rows.filter(({ cells }) => columns.some(({ key }) => cells[key] != null));
-
-const sum = (widths) => widths.reduce((total, next) => total + next, 0);
-
-/** Columns in parts of about equal width, none wider than there is room. */
-function shared(columns, widths, free) {
-  const fair = sum(widths) / Math.ceil(sum(widths) / free);
-  const found = [[]];
-  let used = 0;
-  columns.forEach((column, index) => {
-    const width = widths[index];
-    if (found.at(-1).length && (used + width > free || used + width / 2 > fair)) {
-      found.push([]);
-      used = 0;
-    }
-    found.at(-1).push(column);
-    used += width;
-  });
-  return found;
-}
-
-function resultTable(report, { columns, rows, paper, group }) {
+function resultTable(report, { columns, rows, group }) {
   const several = report.runs.length > 1;
   // What holds for all comes first.
   const first = (name) => (name === "all" ? 0 : 1);
@@ -145,9 +92,6 @@ function resultTable(report, { columns, rows, paper, group }) {
         report,
         rows.filter((row) => row.category === name),
       ).map((row) => bodyRow(report, columns, row, several)),
-      paper
-        .filter((row) => row.category === name)
-        .map((row) => paperRow(columns, row, several)),
     ),
   );
   return h(
@@ -190,7 +134,7 @@ function bodyRow(report, columns, row, several) {
   return h(
     "tr",
     {},
-    h("th", { scope: "row" }, swatch(report, method), method?.label ?? row.method),
+    h("th", { scope: "row" }, swatch(report, method), row.method),
     several && h("td", { class: "words" }, report.runs[row.run]?.name),
     columns.map((column) => {
       const text = shown(column, row.cells[column.key]);
@@ -203,16 +147,6 @@ function bodyRow(report, columns, row, several) {
           : text,
       );
     }),
-  );
-}
-
-function paperRow(columns, row, several) {
-  return h(
-    "tr",
-    { class: "paper" },
-    h("th", { scope: "row" }, row.method),
-    several && h("td"),
-    columns.map((column) => h("td", {}, shown(column, row.cells[column.key]))),
   );
 }
 
@@ -232,7 +166,7 @@ function reasons(report, list, what) {
         {},
         h("td", { class: "words" }, failure.reason),
         h("td", {}, count(failure.count)),
-        h("td", { class: "words" }, report.method.get(failure.method)?.label ?? failure.method),
+        h("td", { class: "words" }, failure.method),
         h("td", { class: "words" }, failure.category),
         several && h("td", { class: "words" }, report.runs[failure.run]?.name),
       ),

@@ -1,13 +1,10 @@
 import "../common/theme.css";
 import "./page.css";
 import "./results.css";
-import "./forms.css";
-import "./narrow.css";
 import "./gallery.css";
 import "./viewer.css";
 import "./print.css";
 import { button, h } from "../common/dom.js";
-import { Comparison } from "./compare.js";
 import { switches } from "./filters.js";
 import { Gallery } from "./gallery.js";
 import { heading, headline } from "./headline.js";
@@ -20,26 +17,20 @@ const report = new Report(readPayload());
 const state = new State();
 document.title = report.title;
 
-let viewer = null;
-const open = (instance, extra) => viewer.open(instance, extra);
+const open = (instance) => viewer.open(instance);
 const gallery = report.instances.length ? new Gallery(report, state, { open }) : null;
-const comparison =
-  report.runs.length > 1 && report.rows.count ? new Comparison(report, state, { open }) : null;
 const plots = plotSection(report, state);
 
 // A demonstration is looked at first, an evaluation read.
 const showsPictures = report.runs.every(({ what }) => what === "demo");
-const results = [headline(report), plots, comparison?.element];
+const results = [headline(report), plots];
 const sections = (
   showsPictures ? [gallery?.element, ...results] : [...results, gallery?.element]
 ).filter(Boolean);
-const links = sections
-  .filter(({ id }) => id)
-  .map((section) => {
-    const words = section.dataset.short ?? section.querySelector("h2").textContent;
-    // The fragment holds the state, so these are not links to one.
-    return button(words, () => section.scrollIntoView());
-  });
+const links = sections.map((section) =>
+  // The fragment holds the state, so these are not links to one.
+  button(section.querySelector("h2").textContent, () => section.scrollIntoView()),
+);
 const bar = h(
   "nav",
   { class: "bar", "aria-label": "sections and what they show" },
@@ -52,15 +43,5 @@ new ResizeObserver(() => {
   document.documentElement.style.setProperty("--bar", `${bar.offsetHeight}px`);
 }).observe(bar);
 
-// An instance opened from the comparison is walked through by the comparison's order.
-const list = (instance) => {
-  if (gallery.found.includes(instance)) return gallery.found;
-  return report.instances.filter(({ run }) => run === instance.run);
-};
-if (gallery) {
-  viewer = new Viewer(report, state, {
-    list,
-    closed: (instance) => gallery.focus(gallery.found.indexOf(instance)),
-  });
-}
+const viewer = gallery && new Viewer(report, state, { list: () => gallery.found });
 document.documentElement.dataset.ready = "";

@@ -1,147 +1,130 @@
 // The section of plots: each is drawn when it comes into view, and again when what it shows changes.
-import { isPrinting, onThemeChange } from "../common/colors.js";
-import { field, h, table } from "../common/dom.js";
-import { CONFIG, layoutOf, plotly, tracesOf } from "./chart.js";
-import { plotsOf } from "./curves.js";
-import { metricOptions, select } from "./filters.js";
-import { count, number } from "./format.js";
+import { isPrinting, onThemeChange, themeColor } from "../common/colors.js";
+import { h } from "../common/dom.js";
+import { named } from "./format.js";
+import { DASHES, SYMBOLS, colorOf, placeOf, runDash } from "./swatch.js";
 
 const PAPER = 330; // width of a plot on paper [CSS px]: two beside each other on A4 and letter
-const ROWS = 12; // lines of a plot's table at most
-
-const whenIdle = window.requestIdleCallback ?? ((action) => setTimeout(action, 50));
-
-/** A chart that draws itself once it is seen. */
-export class Panel {
-  constructor(host, draw, { square = false } = {}) {
-    this.host = host;
-    this.square = square;
-    this.draw = draw;
-    this.seen = false;
-    new IntersectionObserver(
-      (entries) => {
-        if (this.seen || !entries.some((entry) => entry.isIntersecting)) return;
-        this.seen = true;
-        // One at a time, so that scrolling past many does not halt.
-        whenIdle(() => this.show());
-      },
-      { rootMargin: "300px" },
-    ).observe(host);
-    onThemeChange(() => this.refresh());
-    addEventListener("beforeprint", () => this.show());
-  }
-
-  async show() {
-    this.seen = true;
-    const library = await plotly();
-    const { traces, layout, click } = this.draw();
-    // The page is laid out for paper only after this.
-    if (isPrinting())
-      Object.assign(layout, { width: PAPER, height: this.square ? PAPER : 0.72 * PAPER });
-    await library.react(this.host, traces, layout, CONFIG);
-    if (click && !this.clicks) {
-      this.clicks = true;
-      this.host.on("plotly_click", click);
-    }
-    this.host.dataset.drawn = String(1 + Number(this.host.dataset.drawn ?? 0));
-  }
-
-  refresh() {
-    if (this.seen) this.show();
-  }
-}
+const MARKERS = 16; // on a line at most
+// A finger that lands on a plot is to scroll the page.
+const COARSE = matchMedia("(pointer: coarse)").matches;
+const CONFIG = {
+  displaylogo: false,
+  responsive: true,
+  modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"],
+};
 
 export function plotSection(report, state) {
-  const plots = plotsOf(report);
-  if (!plots.length) return null;
-  const metricNow = () => report.metric.get(state.get("metric")) ?? report.metrics[0];
-  const choosable = plots.some((plot) => !plot.fixed) && report.metrics.length > 1;
+  if (!report.plots.length) return null;
   return h(
     "section",
     { id: "plots", "aria-labelledby": "plots-title" },
     h("h2", { id: "plots-title" }, "Plots"),
-    choosable &&
-      field("metric", select(state, "metric", metricOptions(report))),
     h(
       "div",
       { class: "plots" },
-      plots.map((plot) => figure(report, state, plot, metricNow)),
+      report.plots.map((plot) => figure(report, state, plot)),
     ),
   );
 }
 
-function figure(report, state, plot, metricNow) {
-  const host = h("div", { class: "plot", id: `plot-${plot.id}`, role: "img" });
-  const title = h("h3");
-  const numbers = h("details", { class: "numbers" });
-  let cached = null;
-  const linesNow = () => {
-    const metric = metricNow();
-    if (!cached || cached.metric !== metric) cached = { metric, lines: plot.lines(metric) };
+function figure(report, state, plot) {
+  const host = h("div", {
+    class: "plot",
+    id: `plot-${plot.id}`,
+    role: "img",
+    "aria-label": plot.title,
+  });
+  let seen = false;
+  const show = async () => {
+    seen = true;
+    const { default: library } = await import("plotly.js-basic-dist-min");
     const [methods, runs] = [state.words("hide"), state.words("hideruns")];
-    return cached.lines.filter(
-      ({ method, run }) => !methods.has(method) && !(run !== null && runs.has(String(run))),
+    const lines = plot.traces.filter(
+      ({ method, run }) => !methods.has(method) && !runs.has(String(run)),
     );
+    const layout = layoutOf(plot, lines);
+    // The page is laid out for paper only after this.
+    if (isPrinting()) Object.assign(layout, { width: PAPER, height: 0.72 * PAPER });
+    await library.react(host, tracesOf(report, lines), layout, CONFIG);
+    host.dataset.drawn = "1";
   };
-  const panel = new Panel(host, () => {
-    const lines = linesNow();
-    const { x, y } = plot.axes(metricNow());
-    const values = (name) => lines.flatMap((line) => line[name] ?? []);
-    return {
-      traces: tracesOf(report, lines),
-      layout: layoutOf({
-        x: { ...x, values: values("x") },
-        y: { ...y, values: [...values("y"), ...values("low"), ...values("high")] },
-      }),
-    };
-  });
-  const retitle = () => {
-    title.textContent = plot.title(metricNow());
-    host.setAttribute("aria-label", `${title.textContent}. Its numbers follow as a table.`);
-    numbers.open = false;
-  };
-  numbers.append(h("summary", {}, "Numbers"));
-  numbers.addEventListener("toggle", () => {
-    while (numbers.children.length > 1) numbers.lastElementChild.remove();
-    if (numbers.open)
-      numbers.append(numberTable(report, plot.axes(metricNow()), linesNow(), title.textContent));
-  });
-  state.listen((names) => {
-    const isOther = names.has("metric") && !plot.fixed;
-    if (isOther) retitle();
-    if (isOther || names.has("hide") || names.has("hideruns")) panel.refresh();
-  });
-  retitle();
+  const refresh = () => seen && show();
+  const inView = (entries) => !seen && entries.some((entry) => entry.isIntersecting) && show();
+  new IntersectionObserver(inView, { rootMargin: "300px" }).observe(host);
+  state.listen((names) => (names.has("hide") || names.has("hideruns")) && refresh());
+  onThemeChange(refresh);
+  addEventListener("beforeprint", show);
   return h(
     "figure",
     { class: "panel" },
-    title,
+    h("h3", {}, plot.title),
     host,
     plot.note && h("figcaption", {}, plot.note),
-    numbers,
   );
 }
 
-/** A plot as a table, for those who can't see it. */
-function numberTable(report, { x, y }, lines, title) {
-  const several = report.runs.length > 1;
-  const rows = lines.flatMap((line) => {
-    const each = Math.max(1, Math.ceil(line.x.length / ROWS));
-    const places = line.x.map((_, index) => index).filter((index) => index % each === 0);
-    return places.map((index) =>
-      h(
-        "tr",
-        {},
-        h("th", { scope: "row" }, report.method.get(line.method)?.label ?? line.method),
-        several &&
-          h("td", { class: "words" }, line.run === null ? "all" : report.runs[line.run].name),
-        h("td", {}, number(line.x[index])),
-        h("td", {}, number(line.y[index])),
-        line.counts && h("td", {}, count(line.counts[index])),
-      ),
-    );
+/** A name as text: Plotly reads some tags and `%{...}` in what it is given. */
+const plain = (text) =>
+  String(text)
+    .replaceAll("&", "&amp;")
+    .replaceAll("<", "&lt;")
+    .replaceAll(">", "&gt;")
+    .replaceAll("%{", "%\u200b{");
+
+/** The traces of some lines: a band where there are quartiles, then the line. */
+function tracesOf(report, lines) {
+  return lines.flatMap(({ run, method: key, x, y, low, high }) => {
+    const method = report.method.get(key);
+    const color = colorOf(method);
+    const several = report.runs.length > 1;
+    const edge = { x, mode: "lines", hoverinfo: "skip", line: { width: 0, color } };
+    const fill = { fill: "tonexty", fillcolor: `${color}1f` };
+    const band = low && high ? [{ ...edge, y: low }, { ...edge, y: high, ...fill }] : [];
+    const line = {
+      x,
+      y,
+      name: plain(several ? `${key}, ${report.runs[run].name}` : key),
+      mode: "lines+markers",
+      line: { color, width: 2.5, dash: several ? runDash(run) : (method?.dash ?? "solid") },
+      marker: { color, size: 6, symbol: SYMBOLS[placeOf(report, key)][0], maxdisplayed: MARKERS },
+      hovertemplate: "%{y:.3~g}",
+    };
+    return [...band, line];
   });
-  const counted = lines.some((line) => line.counts);
-  const heads = ["method", several && "run", x.label, y.label, counted && "fits"];
-  return table(title, heads, rows, { hidden: true });
+}
+
+/** How many powers of ten positive values reach over. */
+function decades(values) {
+  const positive = values.filter((value) => value > 0).map(Math.log10);
+  const bound = (pick, start) => positive.reduce((a, b) => pick(a, b), start);
+  return positive.length ? bound(Math.max, -Infinity) - bound(Math.min, Infinity) : 0;
+}
+
+/** The layout of a plot: no title and no legend, as the page has them. */
+function layoutOf({ x, y }, lines) {
+  const [ink, soft, line, card] = ["ink", "soft", "line", "card"].map(themeColor);
+  const values = (...names) => lines.flatMap((one) => names.flatMap((name) => one[name] ?? []));
+  const axis = (metric, all) => ({
+    title: { text: plain(named(metric)), standoff: 8, font: { size: 13 } },
+    type: metric.log ? "log" : "linear",
+    ...(metric.log ? { tickformat: "~g", dtick: decades(all) > 3 ? 1 : "D2" } : {}),
+    gridcolor: line,
+    zerolinecolor: line,
+    linecolor: line,
+    tickfont: { size: 12, color: soft },
+    automargin: true,
+  });
+  return {
+    font: { family: getComputedStyle(document.body).fontFamily, color: ink, size: 13 },
+    paper_bgcolor: "rgba(0,0,0,0)",
+    plot_bgcolor: "rgba(0,0,0,0)",
+    margin: { l: 52, r: 12, t: 10, b: 44 },
+    xaxis: axis(x, values("x")),
+    yaxis: axis(y, values("y", "low", "high")),
+    showlegend: false,
+    hovermode: "x unified",
+    hoverlabel: { bgcolor: card, bordercolor: line, font: { color: ink, size: 12 } },
+    dragmode: COARSE ? false : "zoom",
+  };
 }

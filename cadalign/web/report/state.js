@@ -1,22 +1,15 @@
 // What is shown, kept in the URL's fragment: a link shows the same view.
 
 const DEFAULTS = {
-  // plots
-  metric: "", // the metric of the plots
   hide: "", // methods not shown, by key, separated by blanks
   hideruns: "", // runs not shown, by index
   // gallery
   run: "",
-  sort: "", // the metric to sort and to filter by
-  order: "worst", // worst | best | random | listed
-  seed: "1",
+  sort: "", // the metric to sort by
+  order: "worst", // worst | best | listed
   category: "",
   method: "",
   status: "", // ok | failed
-  kmin: "",
-  kmax: "",
-  emin: "",
-  emax: "",
   q: "",
   // the instance that is open
   open: "",
@@ -24,12 +17,6 @@ const DEFAULTS = {
   show: "", // the method whose prediction is drawn
   alt: "", // the alternative drawn in its place
   layers: "gpk", // g: truth, p: prediction, k: keypoints, w: wireframe
-  beside: "", // the run drawn beside the open one
-  // comparison
-  a: "0",
-  b: "1",
-  by: "", // the metric compared
-  with: "", // the method compared
 };
 
 export class State {
@@ -48,11 +35,10 @@ export class State {
     return this.#values[name];
   }
 
-  /** A number, or null where the state names none. */
+  /** A whole number, or null where the state names none. */
   number(name) {
-    const text = this.#values[name];
-    const value = Number(text);
-    return text === "" || !Number.isFinite(value) ? null : value;
+    const value = Number.parseInt(this.#values[name], 10);
+    return Number.isNaN(value) ? null : value;
   }
 
   /** The words of a value that is a list of them. */

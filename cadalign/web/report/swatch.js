@@ -2,7 +2,7 @@
 import { svg } from "../common/dom.js";
 import { isDark } from "../common/colors.js";
 
-export const DASHES = { solid: "", dash: "6 4", dot: "2 3", dashdot: "7 3 2 3" };
+const DASHES = { solid: "", dash: "6 4", dot: "2 3", dashdot: "7 3 2 3" };
 
 /** Plotly's names of symbols, and the same as paths about the middle of a swatch. */
 export const SYMBOLS = [
@@ -16,9 +16,7 @@ export const SYMBOLS = [
 ];
 
 /** How the lines of each run are drawn where there are several. */
-const RUN_DASHES = ["solid", "dash", "dot", "dashdot"];
-
-export const runDash = (run) => RUN_DASHES[run % RUN_DASHES.length];
+export const runDash = (run) => Object.keys(DASHES)[run % 4];
 
 /** A method's place among the symbols. */
 export const placeOf = (report, key) =>
@@ -29,43 +27,24 @@ export const placeOf = (report, key) =>
 
 /** A method's colour in the page's present light. */
 export const colorOf = (method, dark = isDark()) =>
-  (dark ? method?.color_dark : method?.color) ?? method?.color ?? "gray";
+  (dark ? method?.color_dark : method?.color) ?? "#808080";
 
-/** A short piece of a run's line. */
-export function runSwatch(run) {
-  const line = {
-    d: "M1 5H25",
-    stroke: "currentColor",
-    "stroke-width": 2,
-    "stroke-dasharray": DASHES[runDash(run)],
-  };
+function lineMark(dash, style, symbol) {
+  const line = { d: "M1 5H25", stroke: "currentColor", "stroke-width": 2.5 };
   return svg(
     "svg",
-    { class: "swatch", viewBox: "0 0 26 10", width: 26, height: 10, "aria-hidden": "true" },
-    svg("path", line),
+    { class: "swatch", viewBox: "0 0 26 10", width: 26, height: 10, "aria-hidden": "true", style },
+    svg("path", { ...line, "stroke-dasharray": DASHES[dash] ?? "" }),
+    symbol && svg("path", { d: symbol, fill: "currentColor" }),
   );
 }
+
+/** A short piece of a run's line. */
+export const runSwatch = (run) => lineMark(runDash(run));
 
 /** A short piece of a method's line. Both colours are given, so that CSS picks with the theme. */
 export function swatch(report, method) {
   if (!method) return null;
-  const color = `light-dark(${colorOf(method, false)}, ${colorOf(method, true)})`;
-  return svg(
-    "svg",
-    {
-      class: "swatch",
-      viewBox: "0 0 26 10",
-      width: 26,
-      height: 10,
-      "aria-hidden": "true",
-      style: `color: ${color}`,
-    },
-    svg("path", {
-      d: "M1 5H25",
-      stroke: "currentColor",
-      "stroke-width": 2.5,
-      "stroke-dasharray": DASHES[method.dash] ?? "",
-    }),
-    svg("path", { d: SYMBOLS[placeOf(report, method.key)][1], fill: "currentColor" }),
-  );
+  const color = `color: light-dark(${colorOf(method, false)}, ${colorOf(method, true)})`;
+  return lineMark(method.dash, color, SYMBOLS[placeOf(report, method.key)][1]);
 }

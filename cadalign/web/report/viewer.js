@@ -17,7 +17,7 @@ import { radios, refill } from "./choices.js";
 import { criteria } from "./selection.js";
 import { swatch } from "./swatch.js";
 
-const DRAWN = ["open", "openrun", "show", "alt", "layers", "beside"];
+const DRAWN = ["open", "openrun", "show", "alt", "layers"];
 
 export class Viewer {
   /**
@@ -25,13 +25,11 @@ export class Viewer {
    * @param {State} state
    * @param {object} options
    * @param {function} options.list - the instances to walk through by the arrow keys
-   * @param {function} options.closed - called with the instance that was open
    */
-  constructor(report, state, { list, closed }) {
+  constructor(report, state, { list }) {
     this.report = report;
     this.state = state;
     this.list = list;
-    this.closed = closed;
     this.meshes = new Map();
     this.build();
     state.listen((names) => DRAWN.some((name) => names.has(name)) && this.sync());
@@ -100,10 +98,9 @@ export class Viewer {
     this.state.set({ layers: wanted.map((layer) => layer.key).join("") });
   }
 
-  open(instance, extra = {}) {
-    this.first = instance;
+  open(instance) {
     this.state.set(
-      { open: keyOf(instance), openrun: String(instance.run), alt: "", ...extra },
+      { open: keyOf(instance), openrun: String(instance.run), alt: "" },
       { remember: true },
     );
   }
@@ -126,15 +123,13 @@ export class Viewer {
   }
 
   left() {
-    const instance = this.instance;
+    if (this.dialog.open) return; // another instance was opened meanwhile
     this.instance = null;
-    if (this.state.get("open")) this.state.set({ open: "", openrun: "0", alt: "", beside: "" });
-    // The browser puts the focus back to what was clicked; after a walk another card has it.
-    if (instance && instance !== this.first) this.closed(instance);
+    if (this.state.get("open")) this.state.set({ open: "", openrun: "0", alt: "" });
   }
 
   walk(step) {
-    const list = this.list(this.instance);
+    const list = this.list();
     const at = list.indexOf(this.instance);
     const to = list[at + step];
     if (to && at >= 0) this.state.set({ open: keyOf(to), openrun: String(to.run), alt: "" });
@@ -159,9 +154,9 @@ export class Viewer {
     return { tried, method };
   }
 
-  async draw({ fresh = false } = {}) {
+  draw({ fresh = false } = {}) {
     const { instance } = this;
-    const list = this.list(instance);
+    const list = this.list();
     const at = list.indexOf(instance);
     const { tried, method } = this.shown();
     this.title.textContent = instance.model;
@@ -172,20 +167,11 @@ export class Viewer {
     for (const box of this.layers.querySelectorAll("input"))
       box.checked = this.state.get("layers").includes(box.value);
 
-    const beside = this.state.number("beside");
-    const other = beside === null ? null : this.report.sibling(instance, beside);
-    const [exhibit, otherExhibit] = await Promise.all(
-      [instance, other].map((one) => (one ? this.report.exhibit(one) : null)),
-    );
-    const mesh = await this.mesh(exhibit?.mesh);
-    const otherMesh = await this.mesh(otherExhibit?.mesh);
-    if (this.instance !== instance) return; // another one was opened meanwhile
-    const flats = [this.flatFigure(instance, exhibit, mesh, method)];
-    if (other) flats.push(this.flatFigure(other, otherExhibit, otherMesh, method));
-    this.flat.replaceChildren(...flats);
+    const exhibit = this.report.exhibit(instance);
+    const mesh = this.mesh(exhibit?.mesh);
+    this.flat.replaceChildren(this.flatFigure(instance, exhibit, mesh, method));
     this.drawSolid(exhibit, mesh, method, fresh);
     this.drawNumbers(exhibit, method);
-    for (const near of [list[at - 1], list[at + 1]]) if (near) this.report.exhibit(near);
   }
 
   words(instance, at, all) {
@@ -193,7 +179,6 @@ export class Viewer {
       instance.category,
       instance.view !== null && `view ${number(instance.view)}`,
       instance.keypoints !== null && `${instance.keypoints} keypoints`,
-      instance.noise !== null && `noise ${number(instance.noise)} px`,
       this.report.runs.length > 1 && this.report.runs[instance.run]?.name,
       at >= 0 && `${count(at + 1)} of ${count(all)}`,
     ];
@@ -204,7 +189,7 @@ export class Viewer {
     if (tried.length < 2) return null;
     return radios("prediction of", tried, {
       checked: (one) => one === method,
-      words: (one) => [swatch(this.report, one), one.label],
+      words: (one) => [swatch(this.report, one), one.key],
       choose: (one) => this.state.set({ show: one.key, alt: "" }),
     });
   }
@@ -212,11 +197,7 @@ export class Viewer {
   runChoice(instance) {
     const there = this.report.siblings.get(instance.id) ?? [];
     if (there.length < 2) return null;
-    const choose = ({ run }) => {
-      const beside = this.state.get("beside");
-      const other = beside === String(run) ? String(instance.run) : beside;
-      this.state.set({ openrun: String(run), beside: other, alt: "" });
-    };
+    const choose = ({ run }) => this.state.set({ openrun: String(run), alt: "" });
     return radios("run", there, {
       checked: (one) => one === instance,
       words: (one) => [this.report.runs[one.run].name],
@@ -225,12 +206,11 @@ export class Viewer {
   }
 
   /** The unpacked model; kept, as several instances share one. */
-  async mesh(key) {
+  mesh(key) {
     if (key == null) return null;
     if (!this.meshes.has(key)) {
-      const packed = await this.report.meshes.get(key);
-      const mesh = packed && unpackMesh(packed);
-      this.meshes.set(key, mesh && { ...mesh, wire: wireOf(mesh) }); // points and edges for lines
+      const mesh = unpackMesh(this.report.meshes[key]);
+      this.meshes.set(key, { ...mesh, wire: wireOf(mesh) }); // points and edges for lines
     }
     return this.meshes.get(key);
   }
@@ -249,7 +229,7 @@ export class Viewer {
     const isWarped = mesh && this.pose(exhibit, method)?.warp;
     const caption = [
       run,
-      method?.label,
+      method?.key,
       failed && "failed: no prediction to draw",
       isWarped && "the model is warped to the estimated shape",
     ]
@@ -313,7 +293,7 @@ export class Viewer {
       parts.push(
         warningList(estimate),
         alternativeChoice(estimate, this.state.number("alt") ?? 0, choose),
-        estimateTable(exhibit, estimate, method.label),
+        estimateTable(exhibit, estimate, method.key),
       );
     }
     refill(this.numbers, parts);

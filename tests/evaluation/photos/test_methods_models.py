@@ -12,8 +12,8 @@ from support.photo_sets import write_pascal3d
 
 import cadalign.datasets
 from cadalign import Model
-from cadalign.evaluation.photos import protocols
-from cadalign.evaluation.photos.methods import _model
+from cadalign.evaluation.photos import options
+from cadalign.evaluation.photos.objects import _model
 from cadalign.evaluation.photos.target import PhotoTarget
 
 BOUNDS = np.array([[-1.0, -0.5, -1.0], [1.0, 0.5, 1.0]])  # of a diagonal of 3
@@ -30,17 +30,17 @@ def model_of(base: str) -> Model:
 
 
 def test_a_similar_model_alone_deviates_by_a_share_of_its_diagonal() -> None:
-    assert model_of(protocols.SIMILAR).shape_sigma == pytest.approx(0.1 * 3 * 2)
-    for base in (protocols.RIGID, protocols.STRETCHED, protocols.PRIOR):
+    assert model_of(options.SIMILAR).shape_sigma == pytest.approx(0.1 * 3 * 2)
+    for base in (options.RIGID, options.STRETCHED, options.PRIOR):
         assert model_of(base).shape_sigma is None
 
 
 def test_a_rigid_model_is_not_stretched_and_a_prior_holds_the_stretch() -> None:
-    stretches = {base: model_of(base).stretch for base in protocols.BASES[1:5]}
-    assert [base for base, each in stretches.items() if each == "none"] == [protocols.RIGID]
-    assert model_of(protocols.PRIOR).stretch_sigma is not None
-    assert model_of(protocols.STRETCHED).stretch_sigma is None
-    assert model_of(protocols.RIGID).points_3d == pytest.approx(BOUNDS)  # in units of the width
+    stretches = {base: model_of(base).stretch for base in options.BASES[1:5]}
+    assert [base for base, each in stretches.items() if each == "none"] == [options.RIGID]
+    assert model_of(options.PRIOR).stretch_sigma is not None
+    assert model_of(options.STRETCHED).stretch_sigma is None
+    assert model_of(options.RIGID).points_3d == pytest.approx(BOUNDS)  # in units of the width
 
 
 def test_a_photo_of_unknown_focal_length_has_the_annotations_at_the_middle_of_the_object(

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cadalign import Alignment, Symmetry
-from cadalign.evaluation.metrics.scan2cad import scan2cad_errors
+from cadalign.evaluation.metrics.photos import scan2cad_errors
 from cadalign.geometry.rotations import rotation_from_vector
 
 pytestmark = pytest.mark.slow

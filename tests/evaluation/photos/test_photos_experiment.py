@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from support.files import replaced, write_json
 from support.pages import embedded_payload
 from support.photo_sets import (
-    POINTS,
     WRITERS,
     pose,
     write_pix3d,
@@ -33,9 +32,9 @@ from cadalign.evaluation.benchmark import Benchmark
 from cadalign.evaluation.experiments.photos import COLUMNS, SPEC, PhotosOptions, summarize_objects
 from cadalign.evaluation.instances.pictures import cut_out
 from cadalign.evaluation.methods import Method
-from cadalign.evaluation.photos.methods import PhotoEstimate, Sighting
-from cadalign.evaluation.photos.objects import PhotoObjects
-from cadalign.evaluation.photos.target import PhotoTasks, farthest_points, opened
+from cadalign.evaluation.photos.objects import PhotoEstimate, PhotoObjects
+from cadalign.evaluation.photos.sighting import Sighting
+from cadalign.evaluation.photos.target import PhotoTasks, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.summary import Summary
@@ -93,7 +92,7 @@ class TestTruth:
         """Where models are exact, keypoints too: what methods are given fits the truth."""
         WRITERS[kind](tmp_path / "data")
         method = "stretched" if kind == "Scan2CAD" else "rigid"
-        found = done(tmp_path / "data", tmp_path / "run", methods=(method,), simulated_noise_px=0.0)
+        found = done(tmp_path / "data", tmp_path / "run", methods=(method,))
         for row in rows_of(found, method):
             assert row["status"] == "ok", row["reason"]
             assert row["rotation_error_deg"] < 1.0
@@ -143,7 +142,6 @@ class TestMadeUpErrors:
         assert b["rotation_error_deg"] == pytest.approx(90.0)
         (line,) = summarize_rows([a, b])
         assert line.values["accuracy_pi_6"] == 0.5
-        assert line.values["deg_5_cm_5"] == 0.5
 
     def test_missing_estimates_count(self, tmp_path: Path) -> None:
         dataset = cadalign.datasets.open(write_scan2cad(tmp_path / "data"))
@@ -179,9 +177,9 @@ class TestMadeUpErrors:
 
 
 class TestMethods:
-    def test_evidence_that_the_data_have_is_used_and_helps(self, tmp_path: Path) -> None:
-        found = done(write_pix3d(tmp_path / "data", noise=2.0), tmp_path / "run")
-        assert found.methods[5:] == ["rigid+mask"]
+    def test_a_mask_helps(self, tmp_path: Path) -> None:
+        root = write_pix3d(tmp_path / "data", noise=2.0)
+        found = done(root, tmp_path / "run", methods=("rigid", "rigid+mask"))
         error = {
             name: np.median([row["rotation_error_deg"] for row in rows_of(found, name)])
             for name in found.methods
@@ -211,13 +209,6 @@ class TestMethods:
             "there is no shape model of table",
         ]
 
-    def test_noise_is_the_same_for_all_methods_and_runs(self, tmp_path: Path) -> None:
-        root = write_pix3d(tmp_path / "data", photos=2)
-        (root / "model" / "k.txt").unlink()  # without keypoints they are simulated
-        one = done(root, tmp_path / "one", methods=("rigid", "stretched"))
-        other = done(root, tmp_path / "other", methods=("rigid",), max_photos=1)
-        assert rows_of(one, "rigid")[:1] == rows_of(other, "rigid")
-
     def test_few_keypoints_are_left_out(self, tmp_path: Path) -> None:
         root = write_pix3d(tmp_path / "data", photos=3)
         entries = json.loads((root / "pix3d.json").read_text())
@@ -227,11 +218,6 @@ class TestMethods:
         found = done(root, tmp_path / "run", methods=("rigid",))
         assert [row["status"] for row in found.results.to_pylist()] == ["ok", "left out", "ok"]
         assert rows_of(found, "rigid")[1]["reason"] == "5 keypoints are fewer than 6"
-
-    def test_farthest_points_are_spread(self) -> None:
-        found = farthest_points(np.vstack([POINTS] * 3), 8)
-        assert len(np.unique(found, axis=0)) == 8
-        assert len(farthest_points(np.zeros((4, 3)), 3)) == 0
 
 
 class TestBadRecords:
@@ -245,20 +231,16 @@ class TestBadRecords:
         write_json(root / "pix3d.json", [*entries, 7])
         found = done(root, tmp_path / "run", methods=("rigid", "rigid+mask"))
         rows = rows_of(found, "rigid")
-        # Keypoints are simulated on the mesh where their file is missing.
         assert [row["category"] for row in rows] == [
             "unreadable", "table", "chair", "unreadable", "chair", "unreadable",
         ]  # fmt: skip
-        assert [row["status"] for row in rows] == ["failed", "ok", "ok", "failed", "ok", "failed"]
-        assert [row["source"] for row in rows] == [
-            "", "annotated", "simulated", "", "annotated", "",
+        assert [row["status"] for row in rows] == [
+            "failed", "ok", "left out", "failed", "ok", "failed",
         ]  # fmt: skip
         assert "focal_length" in rows[0]["reason"]
         assert rows_of(found, "rigid+mask")[1]["status"] == "left out"  # without the mesh
         groups = [line.group for line in SPEC.summarize(found) if line.method == "rigid"]
-        assert groups == [
-            "chair", "chair, simulated", "table", "unreadable", "all", "mean of categories",
-        ]  # fmt: skip
+        assert groups == ["chair", "table", "unreadable", "all", "mean of categories"]
 
     def test_objects_and_scans_are_counted(self, tmp_path: Path) -> None:
         root = write_scan2cad(tmp_path / "data", frames=3)
@@ -358,7 +340,7 @@ class TestPage:
         assert records[0]["mesh"] is not None
         gt = pose(0)
         np.testing.assert_allclose(records[0]["gt"]["translation"], gt.translation, atol=1e-6)
-        files = {path.name for path in (out / "overlays").iterdir()}
+        files = {path.name for path in (out / "thumbs").iterdir()}
         assert len(files) == 2
         assert (out / "summary.csv").read_text().startswith("category,method,instances")
 
@@ -395,14 +377,6 @@ class TestPage:
             "mean of categories": 3,
         }  # fmt: skip
 
-    def test_simulated_keypoints_are_named_so(self, tmp_path: Path) -> None:
-        root = write_pix3d(tmp_path / "data", photos=2)
-        (root / "model" / "k.txt").unlink()
-        found = done(root, tmp_path / "run", methods=("rigid",))
-        assert SPEC.summarize(found)[0].group == "chair, simulated"
-        table = SPEC.console_table(found, SPEC.summarize(found))
-        assert table.note.endswith("projected with the true pose, with noise")
-
 
 @pytest.mark.parametrize(
     ("options", "text"),
@@ -411,7 +385,6 @@ class TestPage:
         (("--methods", "rigid+mask+mask"), "--methods: unknown method 'rigid+mask+mask'"),
         (("--methods", "truth+mask"), "--methods: truth takes keypoints alone"),
         (("--sigma", "0"), "--sigma: 0.0 is not positive"),
-        (("--simulated-points", "3"), "--simulated-points: 3 is less than 4"),
         (("--shape", "nowhere.shape"), "nowhere.shape: no such file"),
     ],
 )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cadalign.evaluation.metrics.scan2cad import scan2cad_errors
+from cadalign.evaluation.metrics.photos import scan2cad_errors
 from cadalign.geometry import Alignment
 from cadalign.geometry.symmetry import Symmetry
 

@@ -1,0 +1,392 @@
+"""Engine of runs: chunks of tasks on an executor, in a folder, killed and started again.
+
+One loop serves every executor of the standard library's interface: threads of this process,
+processes of this machine, a Dask cluster. A finished chunk is a file in ``parts`` of the run's
+folder (`cadalign.evaluation.runs.folder`), which appears whole or not at all. Started again, a run
+does the chunks that have none, or whose tables are damaged. Chunks are the same whatever the number
+of workers, and their rows follow from the run's seed and the tasks' names, so nothing in
+``results.parquet`` shows how often the run was interrupted or who did the work.
+"""
+
+from __future__ import annotations
+
+import copy
+import logging
+import multiprocessing
+import os
+import pickle
+import shutil
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any, TypeVar
+
+from cadalign.arrays import is_whole as is_integer
+from cadalign.arrays import worker_count
+from cadalign.errors import CadalignError, DataError, InputError, quote
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.tables import SECONDS, is_whole, read_cells, write_rows, write_tables
+from cadalign.evaluation.runs.work import AbortError, Columns, Experiment, Plan, Row, reason_of
+from cadalign.io.files import made_folder, printable
+
+logger = logging.getLogger("cadalign")
+
+T = TypeVar("T")
+Chunk = tuple[int, Sequence[Any]]
+"""Number of a chunk, and its tasks."""
+
+KILLED_REASON = "its chunk killed a worker process twice (a crash, or out of memory)"
+# Sums that several threads share are rounded in another order than those of one.
+_ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+_MOST_DEATHS = 3  # of executors in succession that finish nothing
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Number of tasks that are done, and of all."""
+
+    done: int
+    total: int
+
+
+OnProgress = Callable[[Progress], object]
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Place where chunks are evaluated."""
+
+    open: Callable[[], AbstractContextManager[tuple[Executor, int]]]
+    """Opens an executor, and says how many chunks it is given at a time."""
+    deaths: tuple[type[Exception], ...] = ()
+    """Errors of a future whose worker has died; none of threads, which experiments are not sent
+    to."""
+
+
+def workers_of(count: int, dask: str | None, *, threads: int = 1) -> Workers:
+    """Choose workers by options; see `cadalign.evaluation.options.RunOptions`.
+
+    ``threads`` share the work of a run without workers.
+    """
+    if dask is not None:
+        try:
+            from distributed import KilledWorker
+        except ImportError:
+            fix = "pip install 'cadalign[dask]'"
+            raise CadalignError("Dask is not installed", where="--dask", fix=fix) from None
+        return Workers(partial(_cluster, dask), (KilledWorker,))
+    if not is_integer(count) or count < -1:
+        raise InputError(
+            f"{quote(count)} is not a number of processes",
+            where="workers",
+            fix="give 1 or more, -1 for one for each core, 0 for none",
+        )
+    if count:
+        return Workers(partial(_processes, worker_count(count)), (BrokenProcessPool,))
+    return Workers(partial(_threads, threads))
+
+
+def execute(
+    plan: Plan[T],
+    folder: RunFolder,
+    *,
+    workers: Workers,
+    on_progress: OnProgress = lambda progress: None,
+) -> None:
+    """Do a run, or what is left of it; ``on_progress`` is told of every chunk."""
+    folder.make()
+    experiment, total = plan.experiment, len(plan.tasks)
+    with folder.locked():
+        folder.claim({**plan.config, "tasks": total, "chunk_size": plan.chunk_size})
+        _sweep(folder.path)
+        if not folder.is_finished:
+            _do_chunks(plan, folder, workers, on_progress)
+            parts = [folder.part(k) for k in range(-(-total // plan.chunk_size))]
+            tables = {folder.timings: SECONDS, folder.records: experiment.record_columns}
+            # The results last: they say that the run is done.
+            for path, columns in {**tables, folder.results: experiment.columns}.items():
+                if columns:
+                    is_record = path == folder.records
+                    found = (read_cells(part, columns, is_record=is_record) for part in parts)
+                    write_tables(path, columns, found)
+        on_progress(Progress(total, total))
+        shutil.rmtree(folder.parts, ignore_errors=True)
+
+
+def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: OnProgress) -> None:
+    _sweep(made_folder(folder.parts))
+    experiment, tasks, size = plan.experiment, plan.tasks, plan.chunk_size
+    own = [each for each in experiment.record_columns if each not in experiment.columns]
+    columns: Columns = (*experiment.columns, *SECONDS, *own)
+    starts = range(0, len(tasks), size)
+    missing = [k for k in range(len(starts)) if not _is_done(folder.part(k), columns)]
+    done = len(tasks) - sum(min(size, len(tasks) - starts[index]) for index in missing)
+    on_progress(Progress(done, len(tasks)))
+    chunks = ((index, tasks[starts[index] : starts[index] + size]) for index in missing)
+    for (index, some), rows in evaluated(workers, experiment, chunks):
+        write_rows(folder.part(index), columns, rows)
+        done += len(some)
+        on_progress(Progress(done, len(tasks)))
+
+
+def _is_done(part: Path, columns: Columns) -> bool:
+    """True if a chunk can be read; one that was done, but is damaged, is told of."""
+    if not part.is_file() or is_whole(part, columns):
+        return part.is_file()
+    logger.warning("%s: damaged; its tasks are done again", part)
+    return False
+
+
+def _sweep(path: Path) -> None:
+    """Remove what a killed process left half written."""
+    for unfinished in path.glob(".unfinished-*"):
+        unfinished.unlink(missing_ok=True)
+
+
+# Chunks -------------------------------------------------------------------------------------------
+
+
+def evaluated(
+    workers: Workers, experiment: Experiment[Any], chunks: Iterable[Chunk]
+) -> Iterator[tuple[Chunk, list[Row]]]:
+    """Evaluate chunks, each of which is yielded with its rows, in any order.
+
+    The chunks of a worker that died are done again in the end, one at a time; one that kills its
+    worker then, too, becomes failed rows.
+    """
+    call = partial(evaluate_chunk, experiment)
+    if workers.deaths:
+        call = partial(_evaluate_pickled, _pickled(experiment))
+    lost: list[Chunk] = []
+    yield from _pass(workers, call, chunks, lost)
+    for chunk in lost:
+        lost_again: list[Chunk] = []
+        yield from _pass(workers, call, [chunk], lost_again)
+        if lost_again:
+            failures = [experiment.failure(task, KILLED_REASON) for task in chunk[1]]
+            yield chunk, [row for rows in failures for row in rows]
+
+
+def _pass(
+    workers: Workers, call: Callable[..., Any], chunks: Iterable[Chunk], lost: list[Chunk]
+) -> Iterator[tuple[Chunk, list[Row]]]:
+    """Evaluate chunks as fast as their rows are taken; those of dead workers are appended."""
+    source, deaths = iter(chunks), 0
+    running: dict[Future[list[Row]], Chunk] = {}
+    window = 1  # the first chunk alone: it compiles the kernels that all workers need
+    while True:
+        with workers.open() as (executor, size):
+            is_broken = False
+            while True:
+                while not is_broken and len(running) < window:
+                    chunk = next(source, None)
+                    if chunk is None:
+                        break
+                    running[_submitted(executor, workers, call, chunk[1])] = chunk
+                if not running:
+                    break
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    chunk = running.pop(future)
+                    try:
+                        rows = _rows_of(future, workers)
+                    except workers.deaths as error:
+                        is_broken, reason = True, reason_of(error)
+                        lost.append(chunk)
+                        continue
+                    window, deaths = size, 0
+                    yield chunk, rows
+        if not is_broken:
+            return
+        deaths += 1
+        if deaths == _MOST_DEATHS:
+            fix = "is there enough memory? Try fewer workers, or none (0) to see the error"
+            what = f"worker processes die before they finish anything: {reason}"
+            raise CadalignError(what, where="workers", fix=fix)
+
+
+def _submitted(
+    executor: Executor, workers: Workers, call: Callable[..., Any], tasks: Sequence[Any]
+) -> Future[Any]:
+    """Hand out a call; the future of a dead executor has the error that says so."""
+    try:
+        return executor.submit(call, tasks)
+    except workers.deaths as error:
+        future: Future[Any] = Future()
+        future.set_exception(error)
+        return future
+
+
+def _rows_of(future: Future[list[Row]], workers: Workers) -> list[Row]:
+    known: tuple[type[BaseException], ...] = (CadalignError, CancelledError, *workers.deaths)
+    try:
+        return future.result()
+    except known:
+        raise
+    except Exception as error:
+        raise CadalignError(
+            f"a worker cannot work: {reason_of(error)}",
+            where="workers",
+            fix="cadalign must be installed there, in the same version as here, and modules of "
+            "your functions, too",
+        ) from error
+
+
+def evaluate_chunk(experiment: Experiment[T], tasks: Sequence[T]) -> list[Row]:
+    """Evaluate tasks; one that raises becomes failed rows and does not stop the others."""
+    try:
+        return experiment.evaluate(tasks)
+    except AbortError as error:
+        raise copy.copy(error) from None
+    except Exception as error:
+        if len(tasks) == 1:
+            return experiment.failure(tasks[0], reason_of(error))
+    return [row for task in tasks for row in evaluate_chunk(experiment, [task])]
+
+
+def _pickled(experiment: Experiment[Any]) -> bytes:
+    """The experiment for other processes; raises InputError for functions they cannot import."""
+    try:
+        pickled = pickle.dumps(experiment)
+        reason = "it is defined in a script or a notebook" if b"__main__" in pickled else ""
+    except Exception as error:
+        reason = reason_of(error)[:200]
+    if reason:
+        raise InputError(
+            f"a function cannot be sent to worker processes ({reason})",
+            where="workers",
+            fix="define it in a module that they can import, or name it module:function; or do "
+            "without them (0)",
+        )
+    return pickled
+
+
+# One object for all chunks of a process: what it keeps at hand is not made anew.
+_unpickled = lru_cache(maxsize=1)(pickle.loads)
+
+
+def _evaluate_pickled(pickled: bytes, tasks: Sequence[Any]) -> list[Row]:
+    return evaluate_chunk(_unpickled(pickled), tasks)
+
+
+# Executors ----------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[tuple[Executor, int]]:
+    """Threads of this process, for what lets go of the interpreter lock."""
+    with _cancelling(ThreadPoolExecutor(count)) as executor:
+        yield executor, count
+
+
+@contextmanager
+def _processes(count: int) -> Iterator[tuple[Executor, int]]:
+    """Processes of one thread each, which do not run this one's script again."""
+    main, kept = sys.modules["__main__"], {name: os.environ.get(name) for name in _ENVIRONMENT}
+    sys.modules["__main__"] = ModuleType("__main__")
+    os.environ.update(_ENVIRONMENT)
+    try:
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
+        with _cancelling(pool) as executor:
+            yield executor, count + 1
+    finally:
+        sys.modules["__main__"] = main
+        for name, value in kept.items():
+            os.environ.pop(name)
+            if value is not None:
+                os.environ[name] = value
+
+
+@contextmanager
+def _cancelling(executor: Executor) -> Iterator[Executor]:
+    """The executor; at the end it finishes what it is doing, and does not begin anything else."""
+    try:
+        yield executor
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+def _start_worker() -> None:
+    sys.stdout = sys.stderr  # what functions print is not the command's output
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # without a traceback from each
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+@contextmanager
+def _cluster(address: str, *, timeout: float = 15.0) -> Iterator[tuple[Executor, int]]:
+    """The Dask cluster of a scheduler's address, such as tcp://10.0.0.1:8786.
+
+    Its workers need the same version of cadalign, and the same folders under the same names. Dask
+    itself hands a chunk whose worker dies to others, until its ``allowed-failures`` are exceeded.
+    ``timeout`` is that of the scheduler, and of its first worker [s].
+    """
+    from distributed import Client
+
+    with _quiet():
+        try:
+            # `distributed` is not typed throughout.
+            client: Any = Client(  # type: ignore[no-untyped-call]
+                address, timeout=timeout, set_as_default=False
+            )
+        except (OSError, ValueError) as error:
+            raise DataError(
+                f"no Dask scheduler answers ({str(error)[:200]})",
+                where=printable(address),
+                fix="start one with `dask scheduler`, and give its address, tcp://host:8786",
+            ) from None
+        with client:
+            try:
+                client.wait_for_workers(1, timeout=timeout)
+            except TimeoutError:
+                fix = "start some with `dask worker ADDRESS`"
+                raise DataError("the Dask cluster has no workers", where=address, fix=fix) from None
+            # Named by chance: to name a chunk by its content takes longer than to evaluate it.
+            executor = client.get_executor(pure=False)
+            try:
+                # Clusters grow, and a round trip may cost more than a chunk.
+                yield executor, 2 * sum(client.nthreads().values()) + 2
+            except Exception as error:
+                if client.status == "running" and not isinstance(error, CancelledError):
+                    raise
+                fix = "start the same command again with a cluster: the run goes on"
+                what = "the Dask cluster has gone away"
+                raise CadalignError(what, where=address, fix=fix) from None
+            finally:
+                executor.shutdown(wait=False)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep the client's tracebacks about lost connections from the user, who gets an error."""
+    loggers = [logging.getLogger(f"distributed.{name}") for name in ("client", "utils")]
+    levels = [logger.level for logger in loggers]
+    try:
+        for logger in loggers:
+            logger.setLevel(logging.CRITICAL)
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)

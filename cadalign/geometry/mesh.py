@@ -13,6 +13,7 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import DataError, InputError
 
 GREY = (0.7, 0.7, 0.7, 1.0)
+_DAMAGED = "the file is cut short or damaged"
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +71,7 @@ class Mesh:
         if faces.min() < 0 or faces.max() >= len(vertices):
             named = faces.min() if faces.min() < 0 else faces.max()
             what = f"a face names vertex {named}, but there are {len(vertices)}"
-            raise DataError(what, where=self.source, fix="the file is cut short or damaged")
+            raise DataError(what, where=self.source, fix=_DAMAGED)
         count = len(faces)
         polygon = self.polygon if len(self.polygon) else np.arange(count)
         material = self.face_material if len(self.face_material) else np.zeros(count, dtype=int)
@@ -86,6 +87,53 @@ class Mesh:
                 raise DataError(f"{name} has shape {array.shape}, not {shape}", where=self.source)
         for name, value in own.items():
             object.__setattr__(self, name, value)
+
+    @classmethod
+    def from_polygons(
+        cls,
+        vertices: FloatArray,
+        corners: IntArray,
+        sizes: IntArray,
+        *,
+        corner_uv: FloatArray | None = None,
+        polygon_material: IntArray | None = None,
+        **fields: Any,
+    ) -> Mesh:
+        """Make a mesh of polygons, each cut into a fan of triangles.
+
+        Parameters
+        ----------
+        vertices : (n, 3) float
+            Positions [model units].
+        corners : (c,) int
+            Vertex numbers of all polygons' corners, one polygon after the other.
+        sizes : (p,) int
+            Numbers of corners of the polygons, at least 3.
+        corner_uv : (c, 2) float, optional
+            Texture coordinates of the corners.
+        polygon_material : (p,) int, optional
+            Which material a polygon has.
+        **fields
+            Further fields of the mesh.
+
+        Raises
+        ------
+        DataError
+            As `Mesh`, or if a polygon has fewer than 3 corners.
+        """
+        if len(sizes) and sizes.min() < 3:
+            what = f"face {int(sizes.argmin())} has {sizes.min()} corners"
+            raise DataError(what, where=fields.get("source"), fix=_DAMAGED)
+        counts = sizes - 2
+        polygon = np.repeat(np.arange(len(sizes)), counts)
+        step = np.arange(len(polygon)) - np.repeat(np.cumsum(counts) - counts, counts)
+        first = (np.cumsum(sizes) - sizes)[polygon]
+        triangles = np.stack([first, first + step + 1, first + step + 2], axis=1)
+        if corner_uv is not None:
+            fields["corner_uv"] = corner_uv[triangles]
+        if polygon_material is not None:
+            fields["face_material"] = polygon_material[polygon]
+        return cls(vertices, corners[triangles], polygon, **fields)
 
     @property
     def bounds(self) -> FloatArray:
@@ -211,20 +259,6 @@ def join(pieces: Sequence[Mesh], source: str) -> Mesh:
         ),
         source=source,
     )
-
-
-def fan_triangles(sizes: IntArray) -> tuple[IntArray, IntArray]:
-    """Cut polygons, whose corners are listed one after the other, into fans of triangles.
-
-    From the polygons' numbers of corners (p,), at least 3, follow the triangles (m, 3) as positions
-    in the list of all corners, and the polygons (m,), ascending, that they were cut from.
-    """
-    first_corner = np.cumsum(sizes) - sizes
-    counts = sizes - 2
-    polygon = np.repeat(np.arange(len(sizes)), counts)
-    step = np.arange(len(polygon)) - np.repeat(np.cumsum(counts) - counts, counts)
-    first = first_corner[polygon]
-    return np.stack([first, first + step + 1, first + step + 2], axis=1), polygon
 
 
 def spread_colors(mesh: Mesh, palette: FloatArray | None = None) -> FloatArray:

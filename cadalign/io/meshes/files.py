@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from codecs import BOM_UTF8
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,13 +13,14 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import CadalignError, DataError, InputError, brief
 from cadalign.geometry.mesh import Mesh, face_normals, spread_colors
 from cadalign.geometry.units import check_near
+from cadalign.io.documents import in_file
 from cadalign.io.files import (
     as_path,
     damaged,
     keep,
     made_folder,
     once_per_file,
-    reading,
+    read_bytes,
     refuse_folder,
     write_text,
     write_whole,
@@ -27,8 +29,7 @@ from cadalign.io.images import write_image
 from cadalign.io.kinds import MESH, refuse_other_file
 from cadalign.io.meshes.gltf import read_gltf
 from cadalign.io.meshes.obj import read_obj
-from cadalign.io.meshes.ply import read_ply
-from cadalign.io.meshes.solids import read_off, read_stl
+from cadalign.io.meshes.polygons import read_off, read_ply, read_stl
 
 # Coordinates in ShapeNet's files have 6 decimals; less than ten of these steps is rounding.
 FLAT_TOLERANCE = 1e-5
@@ -93,28 +94,23 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
             where=str(path),
             fix=f"known are {', '.join(_READERS)}",
         )
-    with reading(path):
-        is_empty = path.is_file() and not path.stat().st_size
-    if is_empty:
-        raise DataError("the mesh file is empty", where=str(path), fix="get it again")
     keep(path)
     try:
-        with np.errstate(all="ignore"):  # what is not finite, Mesh refuses
-            mesh = reader(path)
-            has_area = np.linalg.norm(face_normals(mesh.triangles), axis=1).any()
-    except CadalignError as error:
+        data = read_bytes(path)
+        if not data:
+            raise DataError("the mesh file is empty", where=str(path), fix="get it again")
+        with in_file(path), np.errstate(all="ignore"):  # what is not finite, Mesh refuses
+            mesh = reader(data.removeprefix(BOM_UTF8), path)
+            if not np.linalg.norm(face_normals(mesh.triangles), axis=1).any():
+                raise DataError("no face of the mesh has an area")
+    except CadalignError:
         refuse_other_file(path, MESH)
-        where = str(path) if error.where is None else error.where
-        if str(path) not in where:
-            where = f"{path}: {where}"
-        raise DataError(error.what, where=where, fix=error.fix) from None
+        raise
     except Exception as error:  # of damaged content any kind
         refuse_other_file(path, MESH)
         reason = f"{type(error).__name__}: {brief(error)}"
         kind = path.suffix[1:].upper()
         raise damaged(f"cannot be read as a {kind} file ({reason})", path) from None
-    if not has_area:
-        raise DataError("no face of the mesh has an area", where=str(path))
     return mesh
 
 

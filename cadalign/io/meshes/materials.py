@@ -148,7 +148,7 @@ class Textures:
     What is missing or cannot be read is warned of (logger "cadalign") and becomes None.
     """
 
-    _known: dict[Path, Texture | None] = field(default_factory=dict)
+    _known: dict[Path | str, Texture | None] = field(default_factory=dict)
     _bytes_left: int = _MOST_BYTES
 
     def read(self, beside: Path, name: str) -> Texture | None:
@@ -172,9 +172,11 @@ class Textures:
 
     def decode(self, data: bytes, *, within: Path, name: str) -> Texture | None:
         """Decode a picture that is a part of a file, (h, w, 3 or 4) uint8."""
-        file = io.BytesIO(data)
-        with _left_out(within, name), open_picture(file, len(data), where=str(within)) as image:
-            return self._pixels(image)
+        if name not in self._known:
+            file, self._known[name] = io.BytesIO(data), None
+            with _left_out(within, name), open_picture(file, len(data), where=str(within)) as image:
+                self._known[name] = self._pixels(image)
+        return self._known[name]
 
     def _pixels(self, image: Image) -> Texture:
         transparent = "A" in image.getbands() or "transparency" in image.info

@@ -1,14 +1,14 @@
-"""PLY files, text or binary, with their faces in file order.
+"""PLY, STL and OFF files, with their faces in file order.
 
-The format: Greg Turk, "The PLY polygon file format", 1994. Text is read as binary data whose
-numbers are all double.
+PLY is read after Greg Turk, "The PLY polygon file format", 1994; its text as binary data whose
+numbers are all double. trimesh reads no binary PLY whose faces differ in their numbers of corners,
+and puts the quads of text and of OFF files behind the triangles.
 """
 
 from __future__ import annotations
 
-import io
+import re
 import struct
-from codecs import BOM_UTF8
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import FloatArray, parse_numbers
-from cadalign.errors import DataError
-from cadalign.geometry.mesh import GREY, Material, Mesh, fan_triangles
-from cadalign.io.files import damaged, read_bytes, require_count
+from cadalign.errors import DataError, brief
+from cadalign.geometry.mesh import GREY, Material, Mesh
+from cadalign.io.files import damaged, require_count
 from cadalign.io.meshes.materials import WHITE, Textures
 
-_MAX_HEADER_LINES = 1000
+_HEADER_END = re.compile(rb"^end_header[ \t]*(?:\r?\n|\Z)", re.MULTILINE)
 _INDICES = ("vertex_indices", "vertex_index")
 _COORDINATES = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
 _ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
@@ -32,6 +32,12 @@ _CODES = {
     "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I",
     "float": "f", "double": "d", "float32": "f", "float64": "d",
 }  # fmt: skip
+
+_STL_HEADER = 84
+_STL_FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
+_STL_FACET = re.compile(rb"\bfacet\s+normal\b", re.IGNORECASE)
+_STL_CORNER = re.compile(rb"\bvertex\s+(\S+\s+\S+\s+\S+)", re.IGNORECASE)
+_OFF_WORD = re.compile(rb"(?:ST)?C?N?(4?n?)OFF(.*)", re.IGNORECASE)
 
 
 @dataclass
@@ -43,12 +49,16 @@ class _Element:
     properties: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
 
-def read_ply(path: Path) -> Mesh:
-    """Read a PLY file; `cadalign.load_mesh` is the public way to it."""
-    file = io.BytesIO(read_bytes(path).removeprefix(BOM_UTF8))
-    form, elements, texture_name = _header(file, path)
+def read_ply(data: bytes, path: Path) -> Mesh:
+    """Read the content of a PLY file; `cadalign.load_mesh` is the public way to it."""
+    if data[:100].split(maxsplit=1)[:1] not in ([b"ply"], [b"PLY"]):
+        raise DataError("not a PLY file", fix="does it begin with 'ply'?")
+    end = _HEADER_END.search(data)
+    if end is None:
+        raise damaged("the PLY header has no end")
+    form, elements, texture_name = _header(data[: end.start()].decode("utf-8", errors="replace"))
     kinds = {each.name: each.properties for each in elements}
-    data, place = file.read(), 0
+    data, place = data[end.end() :], 0
     if form == "ascii":
         data = parse_numbers(data, len(data.split())).tobytes()
         for each in elements:
@@ -60,47 +70,39 @@ def read_ply(path: Path) -> Mesh:
     vertex, face = read.get("vertex", {}), read.get("face", {})
     polygons = next((face[name] for name in _INDICES if name in face), ())
     if not len(polygons):
-        raise DataError("the PLY file has no faces", where=str(path))
+        raise DataError("the PLY file has no faces")
     sizes = np.fromiter(map(len, polygons), np.int64, len(polygons))
-    if sizes.min() < 3:
-        raise damaged(f"face {int(sizes.argmin())} has {sizes.min()} corners", path)
     corners = np.array([*chain(*polygons)] if isinstance(polygons, list) else polygons)
     corners = corners.ravel().astype(np.int64)
-    triangles, polygon = fan_triangles(sizes)
     texture = Textures().read(path, texture_name) if texture_name else None
     uv = None if texture is None else _texture_coordinates(vertex, face, corners)
     colors = _colors(vertex, kinds["vertex"])
     face_colors = None if colors is not None else _colors(face, kinds["face"])
     materials: tuple[Material, ...] = (Material(color=GREY if colors is None else WHITE),)
-    face_material = np.empty(0, dtype=np.int64)
+    material = None
     if uv is not None:
         materials = (Material(color=WHITE, texture=texture),)
     elif face_colors is not None:
         distinct, rows = np.unique(face_colors, axis=0, return_inverse=True)
         materials = tuple(Material(color=tuple(color.tolist())) for color in distinct)
-        face_material = rows.reshape(-1)[polygon]
-    return Mesh(
+        material = rows.reshape(-1)
+    return Mesh.from_polygons(
         np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float64),
-        corners[triangles],
-        polygon=polygon,
+        corners,
+        sizes,
+        corner_uv=uv,
+        polygon_material=material,
         vertex_colors=colors,
-        corner_uv=None if uv is None else uv[triangles],
         materials=materials,
-        face_material=face_material,
         source=str(path),
     )
 
 
-def _header(file: io.BytesIO, path: Path) -> tuple[str, list[_Element], str]:
+def _header(text: str) -> tuple[str, list[_Element], str]:
     """The format, the elements, and the name of a texture."""
-    if file.readline(100).strip().lower() != b"ply":
-        raise DataError("not a PLY file", where=str(path), fix="does it begin with 'ply'?")
     form, elements, texture = "", list[_Element](), ""
-    for _ in range(_MAX_HEADER_LINES):
-        line = file.readline(10_000).decode("utf-8", errors="replace")
+    for line in text.splitlines():
         match line.split():
-            case ["end_header"]:
-                return form, elements, texture
             case ["format", name, *_]:
                 form = name
             case ["element", name, count]:
@@ -111,7 +113,7 @@ def _header(file: io.BytesIO, path: Path) -> tuple[str, list[_Element], str]:
                 elements[-1].properties[name] = (_CODES[kind],)
             case [comment, word, *_] if (comment, word.lower()) == ("comment", "texturefile"):
                 texture = line.split(maxsplit=2)[2].strip()
-    raise damaged("the PLY header has no end", path)
+    return form, elements, texture
 
 
 def _columns(
@@ -196,3 +198,66 @@ def _texture_coordinates(
             points = np.stack([vertex[name] for name in names], axis=1)
             return np.asarray(points[corners], dtype=float)
     return None
+
+
+def read_stl(data: bytes, path: Path) -> Mesh:
+    """Read the content of an STL file, text or binary; each face has vertices of its own."""
+    found = _STL_CORNER.findall(data) if data.lstrip()[:5].lower() == b"solid" else []
+    if found:
+        announced = len(_STL_FACET.findall(data))
+        require_count("faces", announced, len(found) // 3, 0, path)
+        end = data.lower().rfind(b"endsolid")
+        if end < 0 or len(found) != 3 * announced:
+            raise damaged(f"the text ends before 'endsolid', after {announced} faces")
+        behind = data[end:].partition(b"\n")[2].strip()
+        require_count("faces", announced, announced, len(behind), path)
+        corners = parse_numbers(b" ".join(found), 3 * len(found))
+    else:
+        if len(data) < _STL_HEADER:
+            raise damaged(f"{len(data)} bytes, but the header alone has {_STL_HEADER}")
+        announced = int.from_bytes(data[80:_STL_HEADER], "little")
+        if not announced:
+            raise DataError("the file has no faces", fix="is it whole?")
+        size = announced * _STL_FACE.itemsize
+        there = (len(data) - _STL_HEADER) // _STL_FACE.itemsize
+        require_count("faces", announced, there, len(data) - _STL_HEADER - size, path)
+        corners = np.frombuffer(data, _STL_FACE, announced, _STL_HEADER)["corners"]
+    vertices = corners.reshape(-1, 3).astype(np.float64)
+    return Mesh(vertices, np.arange(len(vertices)).reshape(-1, 3), source=str(path))
+
+
+def read_off(data: bytes, path: Path) -> Mesh:
+    """Read the content of an OFF file; colours of its vertices and faces are not read."""
+    rows = [row for line in data.splitlines() if (row := line.partition(b"#")[0].split())]
+    found = _OFF_WORD.fullmatch(rows[0][0]) if rows else None
+    if found is None:
+        raise DataError("not an OFF file", fix="does it begin with 'OFF'?")
+    if found[1] or rows[0][1:2] == [b"BINARY"]:
+        kind = "of more than three dimensions" if found[1] else "binary"
+        fix = "save it as text of three dimensions"
+        raise DataError(f"an OFF file that is {kind} is not read", fix=fix)
+    # Some files have the counts in the first line, even without a blank before them.
+    counts = [each for each in (found[2], *rows[0][1:]) if each]
+    if not counts:
+        counts, rows = rows[1], rows[1:]
+    vertices, faces = int(counts[0]), int(counts[1])
+    if min(vertices, faces) < 1:
+        raise damaged(f"the header announces {vertices} vertices and {faces} faces")
+    lines, last = rows[1:], vertices + faces
+    require_count("vertices", vertices, len(lines), 0, path)
+    surplus = sum(map(len, chain(*lines[last:])))
+    require_count("faces", faces, len(lines) - vertices, surplus, path)
+    points, polygons = lines[:vertices], lines[vertices:last]
+    for number, row in enumerate(polygons):
+        if not row[0].isdigit() or len(row) <= int(row[0]):
+            what = f"face {number} is {brief(b' '.join(row).decode('ascii', 'replace'))!r}"
+            raise damaged(f"{what}, behind the {vertices} vertices announced")
+    sizes = np.array([int(row[0]) for row in polygons], dtype=np.int64)
+    corners = b" ".join(b" ".join(row[1 : 1 + int(row[0])]) for row in polygons)
+    coordinates = b" ".join(b" ".join(row[:3]) for row in points)
+    return Mesh.from_polygons(
+        parse_numbers(coordinates, 3 * vertices).reshape(-1, 3),
+        parse_numbers(corners, int(sizes.sum()), np.int64),
+        sizes,
+        source=str(path),
+    )

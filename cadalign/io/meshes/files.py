@@ -44,8 +44,6 @@ _READERS = {
     ".stl": read_stl,
     ".off": read_off,
 }
-SUFFIXES = tuple(_READERS)
-"""Endings of the files that `load_mesh` reads."""
 
 
 def load_mesh(path: str | os.PathLike[str]) -> Mesh:

@@ -8,7 +8,6 @@ and puts the quads of text and of OFF files behind the triangles.
 from __future__ import annotations
 
 import re
-import struct
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -23,10 +22,11 @@ from cadalign.io.files import damaged, require_count
 from cadalign.io.meshes.materials import WHITE, Textures
 
 _HEADER_END = re.compile(rb"^end_header[ \t]*(?:\r?\n|\Z)", re.MULTILINE)
+_LENGTH = "length of "  # of a list, a field beside it
 _INDICES = ("vertex_indices", "vertex_index")
 _COORDINATES = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
 _ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
-# PLY's names of numbers, as NumPy and `struct` have them.
+# PLY's names of numbers, as NumPy has them.
 _CODES = {
     "char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I",
     "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I",
@@ -72,8 +72,7 @@ def read_ply(data: bytes, path: Path) -> Mesh:
     if not len(polygons):
         raise DataError("the PLY file has no faces")
     sizes = np.fromiter(map(len, polygons), np.int64, len(polygons))
-    corners = np.array([*chain(*polygons)] if isinstance(polygons, list) else polygons)
-    corners = corners.ravel().astype(np.int64)
+    corners = np.concatenate(polygons).astype(np.int64)
     texture = Textures().read(path, texture_name) if texture_name else None
     uv = None if texture is None else _texture_coordinates(vertex, face, corners)
     colors = _colors(vertex, kinds["vertex"])
@@ -122,55 +121,34 @@ def _columns(
     """The values of an element's properties (n,), lists as rows, and the place of their end."""
     if not element.count or not element.properties:
         return {}, place
-    rows: list[list[Any]] = []
-    start = place
-    try:
-        row, place = _row(data, place, element, order)
-        even = _even_columns(data, start, element, order, row)
-        if even is not None:
-            return even, start + element.count * (place - start)
-        rows.append(row)
-        while len(rows) < element.count:
-            row, place = _row(data, place, element, order)
-            rows.append(row)
-    except struct.error:
-        what = {"vertex": "vertices", "face": "faces"}.get(element.name, element.name)
-        require_count(what, element.count, len(rows), 0, path)
-    return dict(zip(element.properties, map(list, zip(*rows, strict=True)), strict=True)), place
+    kind, rows = _row_type(data, place, element, order), list[Any]()
+    if kind is not None and place + element.count * kind.itemsize <= len(data):
+        read = np.frombuffer(data, kind, element.count, place)
+        lengths = [read[name] for name in read.dtype.names or () if name.startswith(_LENGTH)]
+        if all((each == each[0]).all() for each in lengths):
+            return {name: read[name] for name in element.properties}, place + read.nbytes
+    while len(rows) < element.count and kind is not None and place + kind.itemsize <= len(data):
+        rows.append(np.frombuffer(data, kind, 1, place)[0])
+        place += kind.itemsize
+        kind = _row_type(data, place, element, order)
+    what = {"vertex": "vertices", "face": "faces"}.get(element.name, element.name)
+    require_count(what, element.count, len(rows), 0, path)
+    return {name: [row[name] for row in rows] for name in element.properties}, place
 
 
-def _row(data: bytes, place: int, element: _Element, order: str) -> tuple[list[Any], int]:
-    """The values of one row of an element, and the place of its end."""
-    row: list[Any] = []
-    for *counted, code in element.properties.values():
-        count = 1
-        if counted:
-            (number,) = struct.unpack_from(order + counted[0], data, place)
-            count, place = int(number), place + struct.calcsize(counted[0])
-        values = struct.unpack_from(f"{order}{count}{code}", data, place)
-        place += count * struct.calcsize(code)
-        row.append(values if counted else values[0])
-    return row, place
-
-
-def _even_columns(
-    data: bytes, place: int, element: _Element, order: str, first: list[Any]
-) -> dict[str, Any] | None:
-    """The columns of an element whose lists are all as long as those of its first row."""
+def _row_type(data: bytes, place: int, element: _Element, order: str) -> np.dtype[Any] | None:
+    """The type of the row at a place, by the lengths of its lists; None where the data end."""
     fields: list[tuple[Any, ...]] = []
-    for (name, (*counted, code)), values in zip(element.properties.items(), first, strict=True):
+    for name, (*counted, code) in element.properties.items():
         if counted:
-            fields += [(f"{name} count", order + counted[0]), (name, order + code, (len(values),))]
+            length, start = np.dtype(order + counted[0]), place + np.dtype(fields).itemsize
+            if start + length.itemsize > len(data):
+                return None
+            count = int(np.frombuffer(data, length, 1, start)[0])
+            fields += [(_LENGTH + name, length), (name, order + code, (count,))]
         else:
             fields.append((name, order + code))
-    dtype = np.dtype(fields)
-    if place + element.count * dtype.itemsize > len(data):
-        return None
-    rows = np.frombuffer(data, dtype, element.count, place)
-    for name, values in zip(element.properties, first, strict=True):
-        if isinstance(values, tuple) and (rows[f"{name} count"] != len(values)).any():
-            return None
-    return {name: rows[name] for name in element.properties}
+    return np.dtype(fields)
 
 
 def _colors(columns: dict[str, Any], kinds: dict[str, tuple[str, ...]]) -> FloatArray | None:
@@ -191,7 +169,7 @@ def _texture_coordinates(
 ) -> FloatArray | None:
     """Texture coordinates of all corners of faces (c, 2)."""
     if "texcoord" in face:
-        uv = np.array([*chain(*face["texcoord"])], dtype=float).reshape(-1, 2)
+        uv = np.concatenate(face["texcoord"]).astype(float).reshape(-1, 2)
         return uv if len(uv) == len(corners) else None
     for names in _COORDINATES:
         if set(names) <= vertex.keys():

@@ -221,21 +221,6 @@ class Mesh:
         size = f"{len(self.vertices)} vertices, {len(self.faces)} faces"
         return f"Mesh({self.source!r}, {size}{materials})"
 
-    def to_trimesh(self) -> Any:
-        """The mesh as a `trimesh.Trimesh` with its colours, without textures; needs trimesh.
-
-        Faces and vertices keep their order.
-        """
-        import trimesh
-
-        if self.vertex_colors is not None:
-            colors: dict[str, Any] = {"vertex_colors": np.rint(255 * self.vertex_colors)}
-        else:
-            of_materials = np.array([material.color for material in self.materials])
-            colors = {"face_colors": np.rint(255 * of_materials[self.face_material])}
-        colors = {name: each.clip(0, 255).astype(np.uint8) for name, each in colors.items()}
-        return trimesh.Trimesh(self.vertices, self.faces, process=False, **colors)
-
 
 def join(pieces: Sequence[Mesh], source: str) -> Mesh:
     """Put meshes together, such as those of a file, faces one after the other."""

@@ -32,7 +32,7 @@ from cadalign.io.meshes.obj import read_obj
 from cadalign.io.meshes.polygons import read_off, read_ply, read_stl
 
 # Coordinates in ShapeNet's files have 6 decimals; less than ten of these steps is rounding.
-FLAT_TOLERANCE = 1e-5
+_FLAT = 1e-5
 _DIGITS = 9  # of coordinates in OBJ files
 
 
@@ -141,8 +141,8 @@ def as_mesh(given: object, *, where: str) -> Mesh:
     raise InputError(what, where=where, fix="read it with cadalign.load_mesh")
 
 
-def flat_axes(mesh: Mesh, *, tolerance: float = FLAT_TOLERANCE) -> tuple[str, ...]:
-    """Name the axes along which a mesh has no thickness.
+def flat_axes(mesh: Mesh) -> tuple[str, ...]:
+    """Name the axes along which a mesh has no thickness: less than 1e-5 of its box's diagonal.
 
     Such a model has no volume, no stretch along that axis can be told, and boxes around it have no
     overlap to measure.
@@ -151,8 +151,6 @@ def flat_axes(mesh: Mesh, *, tolerance: float = FLAT_TOLERANCE) -> tuple[str, ..
     ----------
     mesh : Mesh
         The model.
-    tolerance : float
-        The thickness that counts as none, as a share of the bounding box's diagonal.
 
     Returns
     -------
@@ -167,11 +165,11 @@ def flat_axes(mesh: Mesh, *, tolerance: float = FLAT_TOLERANCE) -> tuple[str, ..
     """
     low, high = mesh.bounds
     extents = np.asarray(high - low)
-    flat = extents <= tolerance * np.linalg.norm(extents)
+    flat = extents <= _FLAT * np.linalg.norm(extents)
     return tuple(axis for axis, thin in zip("xyz", flat, strict=True) if thin)
 
 
-def check_solid(mesh: Mesh, *, tolerance: float = FLAT_TOLERANCE) -> None:
+def check_solid(mesh: Mesh) -> None:
     """Refuse a mesh that has no thickness along an axis; see `flat_axes`.
 
     Raises
@@ -185,7 +183,7 @@ def check_solid(mesh: Mesh, *, tolerance: float = FLAT_TOLERANCE) -> None:
     Traceback (most recent call last):
     cadalign.errors.DataError: square.obj: the model has zero thickness along z; leave it out
     """
-    flat = flat_axes(mesh, tolerance=tolerance)
+    flat = flat_axes(mesh)
     if flat:
         raise DataError(
             f"the model has zero thickness along {' and '.join(flat)}",

@@ -265,27 +265,24 @@ def _palette(mesh: Mesh) -> FloatArray:
 
 
 def _vertex_lines(mesh: Mesh) -> list[str]:
-    digits = _digits(mesh)
-    rows = mesh.vertices.tolist()
-    lines = [f"v {x:.{digits}g} {y:.{digits}g} {z:.{digits}g}" for x, y, z in rows]
-    if mesh.vertex_colors is None:
-        return lines
-    colors = [f"{r:.9g} {g:.9g} {b:.9g}" for r, g, b in mesh.vertex_colors[:, :3].tolist()]
-    return [f"{line} {color}" for line, color in zip(lines, colors, strict=True)]
+    form, rows = "v" + 3 * f" {{:.{_digits(mesh)}g}}", mesh.vertices
+    if mesh.vertex_colors is not None:
+        form, rows = form + 3 * " {:.9g}", np.hstack([rows, mesh.vertex_colors[:, :3]])
+    return [form.format(*row) for row in rows.tolist()]
 
 
 def _face_lines(mesh: Mesh, names: list[str], uv_rows: IntArray | None) -> list[str]:
     """Faces in file order, with the material's name where it changes."""
     lines, current = [], -1
-    for row, face in enumerate((mesh.faces + 1).tolist()):
-        material = int(mesh.face_material[row])
+    form, rows = "f {} {} {}", mesh.faces + 1
+    if uv_rows is not None:
+        rows = np.stack([rows, uv_rows], axis=2).reshape(-1, 6)
+        form = "f {}/{} {}/{} {}/{}"
+    for row, material in zip(rows.tolist(), mesh.face_material.tolist(), strict=True):
         if material != current:
             lines.append(f"usemtl {names[material]}")
             current = material
-        corners = [str(vertex) for vertex in face]
-        if uv_rows is not None:
-            corners = [f"{a}/{b}" for a, b in zip(face, uv_rows[row], strict=True)]
-        lines.append(f"f {' '.join(corners)}")
+        lines.append(form.format(*row))
     return lines
 
 

@@ -56,19 +56,14 @@ def load_materials(
     return found
 
 
-def _paths(obj_path: Path, library: str) -> list[Path]:
+def _paths(obj_path: Path, library: str) -> Iterator[Path]:
     """The files that an ``mtllib`` line names: one with blanks in its name, or several."""
     whole = find_file(obj_path.parent, library)
-    if whole is not None:
-        return [whole]
-    paths = []
-    for word in library.split():
-        path = find_file(obj_path.parent, word)
-        if path is None:
-            logger.warning("%s: no material library %s beside it", obj_path, brief(word))
+    for name in library.split() if whole is None else [library]:
+        if path := find_file(obj_path.parent, name):
+            yield path
         else:
-            paths.append(path)
-    return paths
+            logger.warning("%s: no material library %s beside it", obj_path, brief(name))
 
 
 def _parse_library(path: Path) -> dict[str, _Entry]:

@@ -222,13 +222,6 @@ def write_ply_mesh(path: Path, mesh: Mesh) -> None:
 
     Raises DataError if the file cannot be written.
     """
-    data = ply_mesh(mesh)
-    made_folder(path.parent)
-    write_whole(path, lambda unfinished: unfinished.write_bytes(data))
-
-
-def ply_mesh(mesh: Mesh) -> bytes:
-    """The content of a file of `write_ply_mesh`."""
     number, kind = ("float", "<f4") if _digits(mesh) <= _DIGITS else ("double", "<f8")
     vertices = np.empty(len(mesh.vertices), [("place", kind, 3), ("color", "u1", 4)])
     vertices["place"] = mesh.vertices
@@ -245,7 +238,9 @@ def ply_mesh(mesh: Mesh) -> bytes:
         "property list uchar int vertex_indices",
         "end_header\n",
     ]
-    return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
+    data = "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
+    made_folder(path.parent)
+    write_whole(path, lambda unfinished: unfinished.write_bytes(data))
 
 
 def _digits(mesh: Mesh) -> int:

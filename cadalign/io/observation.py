@@ -178,10 +178,7 @@ class Observation(ObservedImage):
         written = [
             write_image_fields(view, folder, states_origins=states_origins) for view in self.views
         ]
-        # Files of one image without keypoints were refused earlier; lists of views were not.
-        is_of_mask = not len(self.points_2d) and self.evidence.mask is not None
-        listed = bool(self.others) or is_of_mask
-        data: dict[str, Any] = {"views": written} if listed else written[0]
+        data: dict[str, Any] = {"views": written} if self.others else written[0]
         further = {
             "model": self.model and written_path(self.model, folder=folder),
             "shape": self.shape and written_path(self.shape, folder=folder),

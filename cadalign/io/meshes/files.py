@@ -11,8 +11,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import CadalignError, DataError, InputError, brief
-from cadalign.geometry.mesh import Mesh, face_normals, spread_colors
-from cadalign.geometry.units import check_near
+from cadalign.geometry.mesh import Mesh, check_near, face_normals, spread_colors
 from cadalign.io.documents import in_file
 from cadalign.io.files import (
     as_path,

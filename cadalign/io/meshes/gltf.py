@@ -3,6 +3,10 @@
 After the Khronos Group's specification of glTF 2.0 and of the extensions that are named. A part
 that is missing or of another type ends in one of Python's errors, which `cadalign.load_mesh` turns
 into a DataError.
+
+trimesh takes normalized integers as they stand and sparse values without their changes, makes room
+for arrays without data, leaves out fans, and knows neither transforms of textures nor what a file
+says that it requires.
 """
 
 from __future__ import annotations

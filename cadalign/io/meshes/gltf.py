@@ -83,15 +83,14 @@ class _GltfFile:
         self.path, self.document, self.size = path, document, size
         self._textures = Textures()
         self._looks: dict[int | None, tuple[Material, _Part]] = {None: (Material(), {})}
-        named: dict[str, bytes] = {}
-        for uri in (each["uri"] for each in document.get("buffers", []) if "uri" in each):
+        uris = [each.get("uri") for each in document.get("buffers", [])]
+        named: dict[str | None, bytes] = {None: binary}
+        for uri in uris:
             if uri not in named:
                 data = _embedded(uri)
                 named[uri] = read_bytes(path.parent / unquote(uri)) if data is None else data
                 self.size += len(named[uri]) if data is None else 0
-        self._buffers = [
-            named[each["uri"]] if "uri" in each else binary for each in document.get("buffers", [])
-        ]
+        self._buffers = [named[uri] for uri in uris]
 
     def view(self, number: int) -> memoryview:
         """The bytes of a buffer view."""

@@ -72,7 +72,7 @@ def read_ply(data: bytes, path: Path) -> Mesh:
     if not len(polygons):
         raise DataError("the PLY file has no faces")
     sizes = np.fromiter(map(len, polygons), np.int64, len(polygons))
-    corners = np.concatenate(polygons).astype(np.int64)
+    corners = _flat(polygons).astype(np.int64)
     texture = Textures().read(path, texture_name) if texture_name else None
     uv = None if texture is None else _texture_coordinates(vertex, face, corners)
     colors = _colors(vertex, kinds["vertex"])
@@ -151,6 +151,11 @@ def _row_type(data: bytes, place: int, element: _Element, order: str) -> np.dtyp
     return np.dtype(fields)
 
 
+def _flat(lists: Any) -> Any:
+    """The values of all lists of a column, one after the other."""
+    return lists.ravel() if isinstance(lists, np.ndarray) else np.concatenate(lists)
+
+
 def _colors(columns: dict[str, Any], kinds: dict[str, tuple[str, ...]]) -> FloatArray | None:
     """Colours (n, 4) from 0 to 1."""
     if not columns or not {"red", "green", "blue"} <= columns.keys():
@@ -169,7 +174,7 @@ def _texture_coordinates(
 ) -> FloatArray | None:
     """Texture coordinates of all corners of faces (c, 2)."""
     if "texcoord" in face:
-        uv = np.concatenate(face["texcoord"]).astype(float).reshape(-1, 2)
+        uv = _flat(face["texcoord"]).astype(float).reshape(-1, 2)
         return uv if len(uv) == len(corners) else None
     for names in _COORDINATES:
         if set(names) <= vertex.keys():

@@ -14,9 +14,8 @@ from cadalign.errors import InputError, quote, require_kind
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions
 from cadalign.estimation.symmetry import check_symmetry
 from cadalign.geometry.alignment import extent
-from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.mesh import Mesh, check_near
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.geometry.units import check_near
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -48,7 +48,6 @@ _WRITTEN: dict[tuple[LensKind, int], str] = {
 }
 _NO_SKEW = 1e-9  # relative to the focal length
 _FORM_FIX = 'give {"model", "width", "height", "params"} as COLMAP does'
-_SIZE_FIX = "give the image size in whole pixels"
 
 
 @dataclass(frozen=True)
@@ -166,9 +165,7 @@ class Calibration:
         >>> camera.with_focal(700).fy
         700.0
         """
-        if not is_number(width) or not is_number(height) or min(width, height) < 1:
-            what = f"{quote(width)} x {quote(height)} is not a size"
-            raise InputError(what, where="camera.width", fix=_SIZE_FIX)
+        width, height = _whole_size(width, "width"), _whole_size(height, "height")
         focal = float(max(width, height))
         cx = (width - 1) / 2 if cx is None else cx
         cy = (height - 1) / 2 if cy is None else cy
@@ -318,8 +315,8 @@ def _listed(distortion: Any) -> tuple[float, ...]:
 
 def _whole_size(size: Any, name: str) -> int:
     if not is_number(size) or int(size) != size or size < 1:
-        what = f"{quote(size)} is not a size"
-        raise InputError(what, where=f"camera.{name}", fix=_SIZE_FIX)
+        what, fix = f"{quote(size)} is not a size", "give the image size in whole pixels"
+        raise InputError(what, where=f"camera.{name}", fix=fix)
     return int(size)
 
 

@@ -13,6 +13,22 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import DataError, InputError
 
 GREY = (0.7, 0.7, 0.7, 1.0)
+_DAMAGED = "the file is cut short or damaged"
+
+# Units of a model's keypoints and of its mesh: both are in the model's coordinates.
+_MARGIN = 0.3  # by which keypoints may lie outside of the mesh's box [its diagonals]
+_FAR = 1.0  # from which on they are another model's
+_LEAST_SHARE = 0.3  # of the mesh's diagonal that keypoints span once they are in its unit
+_SMALL = 0.05  # share from which down they may be in a larger unit
+_UNITS = {
+    1000.0: "in millimetres beside a mesh in metres",
+    100.0: "in centimetres beside a mesh in metres",
+    25.4: "in millimetres beside a mesh in inches",
+    10.0: "in millimetres beside a mesh in centimetres",
+    0.01: "in metres beside a mesh in centimetres",
+    0.001: "in metres beside a mesh in millimetres",
+}
+"""By how many times larger keypoints are than the mesh: the likely units."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +86,7 @@ class Mesh:
         if faces.min() < 0 or faces.max() >= len(vertices):
             named = faces.min() if faces.min() < 0 else faces.max()
             what = f"a face names vertex {named}, but there are {len(vertices)}"
-            raise DataError(what, where=self.source, fix="the file is cut short or damaged")
+            raise DataError(what, where=self.source, fix=_DAMAGED)
         count = len(faces)
         polygon = self.polygon if len(self.polygon) else np.arange(count)
         material = self.face_material if len(self.face_material) else np.zeros(count, dtype=int)
@@ -86,6 +102,53 @@ class Mesh:
                 raise DataError(f"{name} has shape {array.shape}, not {shape}", where=self.source)
         for name, value in own.items():
             object.__setattr__(self, name, value)
+
+    @classmethod
+    def from_polygons(
+        cls,
+        vertices: FloatArray,
+        corners: IntArray,
+        sizes: IntArray,
+        *,
+        corner_uv: FloatArray | None = None,
+        polygon_material: IntArray | None = None,
+        **fields: Any,
+    ) -> Mesh:
+        """Make a mesh of polygons, each cut into a fan of triangles.
+
+        Parameters
+        ----------
+        vertices : (n, 3) float
+            Positions [model units].
+        corners : (c,) int
+            Vertex numbers of all polygons' corners, one polygon after the other.
+        sizes : (p,) int
+            Numbers of corners of the polygons, at least 3.
+        corner_uv : (c, 2) float, optional
+            Texture coordinates of the corners.
+        polygon_material : (p,) int, optional
+            Which material a polygon has.
+        **fields
+            Further fields of the mesh.
+
+        Raises
+        ------
+        DataError
+            As `Mesh`, or if a polygon has fewer than 3 corners.
+        """
+        if len(sizes) and sizes.min() < 3:
+            what = f"face {int(sizes.argmin())} has {sizes.min()} corners"
+            raise DataError(what, where=fields.get("source"), fix=_DAMAGED)
+        counts = sizes - 2
+        polygon = np.repeat(np.arange(len(sizes)), counts)
+        step = np.arange(len(polygon)) - np.repeat(np.cumsum(counts) - counts, counts)
+        first = (np.cumsum(sizes) - sizes)[polygon]
+        triangles = np.stack([first, first + step + 1, first + step + 2], axis=1)
+        if corner_uv is not None:
+            fields["corner_uv"] = corner_uv[triangles]
+        if polygon_material is not None:
+            fields["face_material"] = polygon_material[polygon]
+        return cls(vertices, corners[triangles], polygon, **fields)
 
     @property
     def bounds(self) -> FloatArray:
@@ -173,21 +236,6 @@ class Mesh:
         size = f"{len(self.vertices)} vertices, {len(self.faces)} faces"
         return f"Mesh({self.source!r}, {size}{materials})"
 
-    def to_trimesh(self) -> Any:
-        """The mesh as a `trimesh.Trimesh` with its colours, without textures; needs trimesh.
-
-        Faces and vertices keep their order.
-        """
-        import trimesh
-
-        if self.vertex_colors is not None:
-            colors: dict[str, Any] = {"vertex_colors": np.rint(255 * self.vertex_colors)}
-        else:
-            of_materials = np.array([material.color for material in self.materials])
-            colors = {"face_colors": np.rint(255 * of_materials[self.face_material])}
-        colors = {name: each.clip(0, 255).astype(np.uint8) for name, each in colors.items()}
-        return trimesh.Trimesh(self.vertices, self.faces, process=False, **colors)
-
 
 def join(pieces: Sequence[Mesh], source: str) -> Mesh:
     """Put meshes together, such as those of a file, faces one after the other."""
@@ -211,20 +259,6 @@ def join(pieces: Sequence[Mesh], source: str) -> Mesh:
         ),
         source=source,
     )
-
-
-def fan_triangles(sizes: IntArray) -> tuple[IntArray, IntArray]:
-    """Cut polygons, whose corners are listed one after the other, into fans of triangles.
-
-    From the polygons' numbers of corners (p,), at least 3, follow the triangles (m, 3) as positions
-    in the list of all corners, and the polygons (m,), ascending, that they were cut from.
-    """
-    first_corner = np.cumsum(sizes) - sizes
-    counts = sizes - 2
-    polygon = np.repeat(np.arange(len(sizes)), counts)
-    step = np.arange(len(polygon)) - np.repeat(np.cumsum(counts) - counts, counts)
-    first = first_corner[polygon]
-    return np.stack([first, first + step + 1, first + step + 2], axis=1), polygon
 
 
 def spread_colors(mesh: Mesh, palette: FloatArray | None = None) -> FloatArray:
@@ -285,3 +319,61 @@ def farthest_rows(
         gaps = np.linalg.norm(points - points[chosen[-1]], axis=1)
         nearest = distance = np.minimum(nearest, gaps)
     return np.array(chosen, dtype=np.int64)
+
+
+def check_near(points_3d: FloatArray, bounds: FloatArray, *, where: str) -> None:
+    """Refuse keypoints (k, 3) that lie far from their mesh, with the factor if it is a unit's.
+
+    Parameters
+    ----------
+    points_3d : (k, 3) float
+        Keypoints of the model [model units].
+    bounds : (2, 3) float
+        Least and greatest coordinates of its mesh [model units].
+    where : str
+        Name of the keypoints, for the message.
+
+    Raises
+    ------
+    InputError
+        If the keypoints fit the mesh in another unit only, or one lies more than a diagonal from
+        the mesh's box.
+
+    Examples
+    --------
+    >>> corners = np.array([[x, y, z] for x in (0, 800) for y in (0, 900) for z in (0, 500.0)])
+    >>> check_near(corners, np.array([[0, 0, 0], [0.8, 0.9, 0.5]]), where="points_3d")
+    Traceback (most recent call last):
+    cadalign.errors.InputError: points_3d: the keypoints span 1.31e+03 model units, the mesh 1.31...
+    """
+    diagonal = float(np.linalg.norm(bounds[1] - bounds[0]))
+    if not len(points_3d) or not diagonal > 0:
+        return
+    span = float(np.linalg.norm(np.ptp(points_3d, axis=0)))
+    outside = _outside(points_3d, bounds)
+    if outside.max() > _MARGIN * diagonal or span < _SMALL * diagonal:
+        fitting = [
+            factor
+            for factor in _UNITS
+            if span >= _LEAST_SHARE * factor * diagonal
+            and _outside(points_3d / factor, bounds).max() <= _MARGIN * diagonal
+        ]
+        if fitting and span > 0:
+            factor = min(fitting, key=lambda each: abs(np.log(span / (each * diagonal))))
+            raise InputError(
+                f"the keypoints span {span:.3g} model units, the mesh {diagonal:.3g}: they fit it "
+                f"divided by {factor:g}, as keypoints {_UNITS[factor]}",
+                where=where,
+                fix=f"give both in one unit: multiply the keypoints by {1 / factor:g}",
+            )
+    if outside.max() > _FAR * diagonal:
+        row = int(outside.argmax())
+        what = f"keypoint {row} lies {outside[row] / diagonal:.3g} diagonals of the mesh from it"
+        fix = "give the keypoints and the mesh of one model, in the same coordinates"
+        raise InputError(what, where=where, fix=fix)
+
+
+def _outside(points: FloatArray, bounds: FloatArray) -> FloatArray:
+    """Distances (k,) of points (k, 3) from a box, 0 inside."""
+    beyond = np.maximum(bounds[0] - points, points - bounds[1]).clip(0)
+    return np.asarray(np.linalg.norm(beyond, axis=1))

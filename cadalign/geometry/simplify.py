@@ -68,15 +68,6 @@ def number_rows(rows: npt.NDArray[np.float64] | npt.NDArray[np.int64]) -> IntArr
     return np.asarray(np.unique(packed, return_inverse=True)[1].ravel(), dtype=np.int64)
 
 
-def first_of_each(rows: IntArray) -> IntArray:
-    """Find the first occurrence of each distinct row (m, 3), in order of occurrence."""
-    order = np.lexsort(rows.T)  # stable, and 10 times as fast as np.unique
-    ordered = rows[order]
-    new = np.ones(len(rows), dtype=bool)
-    new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
-    return np.sort(order[new])
-
-
 @dataclass(frozen=True, eq=False)
 class Simplified:
     """A mesh with fewer triangles.
@@ -119,7 +110,8 @@ def cluster(mesh: Mesh, *, cells: float) -> Simplified:
     ordered = np.sort(faces, axis=1)
     solid = (ordered[:, 0] != ordered[:, 1]) & (ordered[:, 1] != ordered[:, 2])
     kept = np.flatnonzero(solid)
-    kept = kept[first_of_each(ordered[kept])]
+    _, first = np.unique(number_rows(ordered[kept]), return_index=True)
+    kept = kept[np.sort(first)]
     # Pairs of vertices as one number each.
     thin = np.unique(ordered[~solid][:, [0, 2]] @ [len(number), 1])
     thin = thin[thin // len(number) != thin % len(number)]

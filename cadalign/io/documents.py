@@ -10,7 +10,6 @@ What the types cannot express is checked in ``__post_init__``, which raises
 from __future__ import annotations
 
 import json
-import operator
 import os
 import re
 import sys
@@ -143,11 +142,13 @@ def convert(data: Any, kind: type[T] | Any, where: str = "") -> T | Any:
     ``keypoints[3].uv``.
     """
     try:
+        try:
+            return msgspec.convert(data, kind)
+        except msgspec.ValidationError:  # perhaps of NumPy's arrays and numbers
+            with suppress(TypeError, RecursionError):
+                data = msgspec.to_builtins(data, enc_hook=_plain)
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
-        plain = _plain(data)
-        if plain is not data:
-            return convert(plain, kind, where)
         raise _located(error, data, kind, where) from None
     except UnicodeEncodeError:
         raise DataError(_HALF_REASON, where=where or None) from None
@@ -218,19 +219,10 @@ _PATTERN_WORDS = {repr(_PATH): "a path", repr(_FILE_NAME): "an id"}
 
 
 def _plain(value: Any) -> Any:
-    """The value with NumPy's arrays and numbers as Python's; itself where it holds none."""
+    """NumPy's array or number as Python's."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
-    try:
-        if isinstance(value, dict):
-            fields = {name: _plain(each) for name, each in value.items()}
-            return fields if any(fields[name] is not value[name] for name in value) else value
-        if isinstance(value, list | tuple):
-            items = [_plain(each) for each in value]
-            return items if any(map(operator.is_not, items, value)) else value
-    except RecursionError:  # nested deeper than any declared type
-        pass
-    return value
+    raise TypeError(type(value))
 
 
 def _located(error: msgspec.ValidationError, data: Any, kind: Any, where: str) -> DataError:

@@ -138,12 +138,6 @@ class Size:
             as_one_or_each(self.sigma, name="size.sigma", count=3, entries="lengths")
 
     @property
-    def relative(self) -> FloatArray:
-        """Relative standard deviation, one or (3,)."""
-        sigma = _LENGTH_SIGMA if self.sigma is None else self.sigma
-        return np.asarray(sigma, dtype=np.float64)
-
-    @property
     def given(self) -> dict[str, Any]:
         """The arguments that are given, by name."""
         return {name: value for name, value in vars(self).items() if value is not None}
@@ -156,7 +150,8 @@ class Size:
     @property
     def deviations(self) -> FloatArray:
         """Standard deviations (3,) of the lengths; NaN where unknown."""
-        return np.asarray(self.lengths * self.relative)
+        relative = np.asarray(_LENGTH_SIGMA if self.sigma is None else self.sigma, dtype=float)
+        return np.asarray(self.lengths * relative)
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,11 +247,6 @@ class ObservedImage:
             f"{count} of {count + len(self.points_2d)} keypoints are not found and left out "
             f"(rows {rows}): their pixels are missing, (0, 0), or one and the same"
         )
-
-    @property
-    def has_more(self) -> bool:
-        """True where more than keypoints is known."""
-        return self.depths is not None or bool(self.evidence.given)
 
 
 def _keep_paths(given: object, *names: str) -> None:

@@ -166,10 +166,10 @@ def finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def damaged(what: str, where: object) -> DataError:
+def damaged(what: str, where: object = None) -> DataError:
     """The error of a file whose content cannot be that of a whole file."""
     fix = "the file is cut short or damaged; get it again"
-    return DataError(what, where=str(where), fix=fix)
+    return DataError(what, where=None if where is None else str(where), fix=fix)
 
 
 def require_count(what: str, announced: int, found: int, surplus: int, path: Path) -> None:

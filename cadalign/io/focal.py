@@ -129,8 +129,16 @@ class FocalPrior:
         DataError
             If the file is missing or not an image.
         """
-        focal = read_focal(path)
-        return None if focal is None else cls(focal, relative_sigma, "the photo's EXIF data")
+        from cadalign.io.images import open_photo  # a known focal length needs no reader of images
+
+        with open_photo(path) as image:
+            tags, size = image.getexif().get_ifd(_EXIF_IFD), image.size
+        focal, side = _focal_in_pixels(tags, *size), max(size)
+        if focal is None or SHORTEST * side < focal < LONGEST * side:
+            return None if focal is None else cls(focal, relative_sigma, "the photo's EXIF data")
+        text = "%s: the EXIF data state a focal length of %.4g px, which no camera has; ignored"
+        logger.warning(text, path, focal)
+        return None
 
 
 PriorOption = FocalPrior | Literal["usual"] | None
@@ -158,24 +166,6 @@ def check_prior(prior: object, *, focal: str) -> None:
             where="focal_prior",
             fix='give focal="estimate" with it',
         )
-
-
-def read_focal(path: str | os.PathLike[str]) -> float | None:
-    """Read the focal length [px]; None where the photo does not say.
-
-    One that no camera has is ignored with a warning. Raises DataError if the file is missing or not
-    an image.
-    """
-    from cadalign.io.images import open_photo  # a known focal length needs no reader of images
-
-    with open_photo(path) as image:
-        tags, size = image.getexif().get_ifd(_EXIF_IFD), image.size
-    focal, side = _focal_in_pixels(tags, *size), max(size)
-    if focal is None or SHORTEST * side < focal < LONGEST * side:
-        return focal
-    text = "%s: the EXIF data state a focal length of %.4g px, which no camera has; ignored"
-    logger.warning(text, path, focal)
-    return None
 
 
 def _focal_in_pixels(tags: Mapping[int, Any], width: int, height: int) -> float | None:

@@ -58,7 +58,7 @@ def open_picture(file: BinaryIO, size: int, *, where: str) -> Iterator[Image]:
     such as EPS, it starts other programs.
 
     Raises DataError if it is of another format, damaged, or has far more pixels than its bytes can
-    describe.
+    describe: more than 64 MB and 1032 times the bytes, the most that PNG compresses.
     """
     from PIL import Image, UnidentifiedImageError
 
@@ -66,7 +66,8 @@ def open_picture(file: BinaryIO, size: int, *, where: str) -> Iterator[Image]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow's about EXIF data of which it skips a part
             with Image.open(file, formats=FORMATS) as image:
-                _check_pixels(image, size)
+                if 3 * image.width * image.height > _FREE_BYTES + _COMPRESSION * size:
+                    raise ValueError(f"{image.width} x {image.height} pixels in {size} bytes")
                 yield image
     except Image.DecompressionBombError:
         most = 2 * (Image.MAX_IMAGE_PIXELS or 0) // 10**6
@@ -79,17 +80,6 @@ def open_picture(file: BinaryIO, size: int, *, where: str) -> Iterator[Image]:
     except (OSError, ValueError, SyntaxError, TypeError, struct.error) as error:
         what = f"not an image that can be read ({brief(error)})"
         raise DataError(what, where=where) from None
-
-
-def _check_pixels(image: Image, file_size: int) -> None:
-    """Refuse an image whose pixels take far more memory than its file can describe.
-
-    Raises ValueError if they are more than 64 MB and 1032 times the file's bytes, the most that PNG
-    compresses.
-    """
-    width, height = image.size
-    if 3 * width * height > _FREE_BYTES + _COMPRESSION * file_size:
-        raise ValueError(f"{width} x {height} pixels in {file_size} bytes")
 
 
 def read_photo(path: str | os.PathLike[str]) -> ByteImage:

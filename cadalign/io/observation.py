@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -103,21 +104,8 @@ class Observation(ObservedImage):
     @property
     def is_plain(self) -> bool:
         """True where nothing but keypoints in one image is known."""
-        return not (self.others or self.size or self.init or self.has_more)
-
-    def with_lens(self, focal: float | None = None, *, fov: float | None = None) -> Observation:
-        """The observation with a known focal length or field of view of all its cameras.
-
-        As `with_lens`; options of the fit about it are left out.
-        """
-        if focal is None and fov is None:
-            return self
-        kept = {key: self.fit_options[key] for key in self.fit_options if "focal" not in key}
-        others = tuple(
-            replace(view, camera=with_lens(view.camera, focal, fov=fov)) for view in self.others
-        )
-        camera = with_lens(self.camera, focal, fov=fov)
-        return replace(self, camera=camera, others=others, fit_options=kept)
+        further = self.others, self.size, self.init, self.evidence.given
+        return self.depths is None and not any(map(bool, further))
 
     def __repr__(self) -> str:
         counts = ", ".join(str(len(view.points_2d)) for view in self.views)
@@ -190,10 +178,7 @@ class Observation(ObservedImage):
         written = [
             write_image_fields(view, folder, states_origins=states_origins) for view in self.views
         ]
-        # Files of one image without keypoints were refused earlier; lists of views were not.
-        is_of_mask = not len(self.points_2d) and self.evidence.mask is not None
-        listed = bool(self.others) or is_of_mask
-        data: dict[str, Any] = {"views": written} if listed else written[0]
+        data: dict[str, Any] = {"views": written} if self.others else written[0]
         further = {
             "model": self.model and written_path(self.model, folder=folder),
             "shape": self.shape and written_path(self.shape, folder=folder),
@@ -264,7 +249,13 @@ class ObservationChanges:
                 fix="write camera, masks and other evidence into its `views`",
             )
         changed = replace(observation, **changes) if changes else observation
-        return changed.with_lens(self.focal, fov=self.fov)
+        if self.focal is None and self.fov is None:
+            return changed
+        # Options of the fit about the focal length are left out.
+        kept = {key: given for key, given in changed.fit_options.items() if "focal" not in key}
+        lens = partial(with_lens, focal=self.focal, fov=self.fov)
+        views = tuple(replace(view, camera=lens(view.camera)) for view in changed.others)
+        return replace(changed, camera=lens(changed.camera), others=views, fit_options=kept)
 
 
 @once_per_file(64)

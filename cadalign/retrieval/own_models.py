@@ -12,7 +12,8 @@ from cadalign.datasets.models.model_keypoints import SUFFIX, ModelKeypoints
 from cadalign.errors import CadalignError, DataError
 from cadalign.geometry.alignment import extent
 from cadalign.io.files import listed
-from cadalign.io.meshes.files import SUFFIXES, load_mesh
+from cadalign.io.kinds import MESH_ENDINGS
+from cadalign.io.meshes.files import load_mesh
 from cadalign.retrieval.models import LibraryModel, ModelTable
 
 logger = logging.getLogger("cadalign")
@@ -49,7 +50,7 @@ def read_own_models(
     for path, found in read:
         models.append(_model(path, found, names))
         on_model()
-    meshes = [path for path in listed(folder, "**/*") if path.suffix.lower() in SUFFIXES]
+    meshes = [path for path in listed(folder, "**/*") if path.suffix.lower() in MESH_ENDINGS]
     used = {model.mesh_path for model in models}
     unused = [path for path in meshes if path.absolute() not in used]
     if unused and chosen is None:
@@ -80,7 +81,7 @@ def _numbers(read: Sequence[tuple[Path, ModelKeypoints]]) -> dict[str, int]:
 def _model(path: Path, found: ModelKeypoints, names: dict[str, int]) -> LibraryModel:
     stem, mesh = path.name.removesuffix(SUFFIX), found.model
     if mesh is None:
-        beside = (path.with_name(stem + suffix) for suffix in SUFFIXES)
+        beside = (path.with_name(stem + suffix) for suffix in MESH_ENDINGS)
         mesh = next((each for each in beside if each.is_file()), None)
     bounds = extent(found.xyz) if len(found) else np.zeros((2, 3))
     try:

@@ -15,6 +15,7 @@ from support.timing import reference_seconds, timed
 
 from cadalign.datasets import KeypointNet, load_mesh
 from cadalign.errors import DataError, InputError
+from cadalign.io.meshes.files import write_ply_mesh
 
 CHAIR, MUG = "03001627", "03797390"
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
@@ -174,8 +175,7 @@ def test_model_without_mesh_says_so(root):
 
 def test_meshes_of_every_layout_are_found(root, tmp_path):
     ply = tmp_path / f"ShapeNetCore.v2.ply/{CHAIR}/a.ply"
-    ply.parent.mkdir(parents=True)
-    load_mesh(KeypointNet(root)["chair", "a"].mesh_path).to_trimesh().export(ply)
+    write_ply_mesh(ply, load_mesh(KeypointNet(root)["chair", "a"].mesh_path))
     other = write_obj(tmp_path / f"elsewhere/{CHAIR}/a/model.obj")
     below = root / f"models/{CHAIR}/a/models/model_normalized.obj"
     assert KeypointNet(root).mesh_paths("chair", "a") == (ply, below)

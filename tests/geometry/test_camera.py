@@ -474,8 +474,8 @@ def test_camera_without_focal_length_is_not_used_as_if_it_had_one(use: str) -> N
 @pytest.mark.parametrize(
     ("size", "text"),
     [
-        ((0, 480), "camera.width: 0 x 480 is not a size; give the image size in whole pixels"),
-        ((640, "high"), "camera.width: 640 x 'high' is not a size; "),
+        ((0, 480), "camera.width: 0 is not a size; give the image size in whole pixels"),
+        ((640, "high"), "camera.height: 'high' is not a size; "),
         ((640.5, 480), "camera.width: 640.5 is not a size; "),
     ],
 )

@@ -87,12 +87,6 @@ def test_the_closest_point_beats_all_others() -> None:
         assert (found >= best - 0.3).all()
 
 
-def test_trimesh_gets_the_faces_in_the_same_order() -> None:
-    made = MESH.to_trimesh()
-    assert made.faces.tolist() == FACES.tolist()
-    assert made.vertices.tolist() == VERTICES.tolist()
-
-
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from cadalign import Mesh
-from cadalign.geometry.simplify import cluster, first_of_each, mesh_edges, number_rows, simplify
+from cadalign.geometry.simplify import cluster, mesh_edges, number_rows, simplify
 
 
 def soup(mesh: trimesh.Trimesh, *, seed: int = 0) -> Mesh:
@@ -85,9 +85,8 @@ def test_a_fan_that_no_grid_divides_keeps_its_largest_triangles() -> None:
     assert len(faces) - 1 in small.source
 
 
-def test_rows_are_numbered_and_found_alike() -> None:
+def test_equal_rows_have_one_number() -> None:
     rows = np.array([[0.0, 1, 2], [3, 4, 5], [-0.0, 1, 2], [3, 4, 6]])
     numbers = number_rows(rows)
     assert numbers[0] == numbers[2]
     assert len(set(numbers.tolist())) == 3
-    assert first_of_each(rows.astype(np.int64)).tolist() == [0, 1, 3]

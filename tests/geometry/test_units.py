@@ -7,8 +7,7 @@ import pytest
 
 from cadalign import Model
 from cadalign.errors import InputError
-from cadalign.geometry.mesh import Mesh
-from cadalign.geometry.units import check_near
+from cadalign.geometry.mesh import Mesh, check_near
 
 CORNERS = np.array([[x, y, z] for x in (-0.3, 0.3) for y in (0, 0.8) for z in (-0.4, 0.4)])
 BOUNDS = np.array([CORNERS[0], CORNERS[-1]])

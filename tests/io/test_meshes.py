@@ -313,7 +313,7 @@ def test_glb_nodes_are_placed_and_colored(write):
     colors = np.array([material.color for material in mesh.materials])[mesh.face_material]
     np.testing.assert_allclose(colors, np.tile([1.0, 0, 0, 1], (len(mesh.faces), 1)))
     # Outward normals, of the mirrored box too: both volumes count positive.
-    assert mesh.to_trimesh().volume == pytest.approx(8 + 1)
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces).volume == pytest.approx(8 + 1)
 
 
 def test_glb_texture_is_kept(write):
@@ -350,30 +350,11 @@ def test_stl_and_off(write, colored_sphere, kind):
     np.testing.assert_allclose(mesh.triangles, colored_sphere.triangles, atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["glb", "stl", "off"])
-def test_scenes_cut_short_are_noticed(write, colored_sphere, kind):
-    source = trimesh.Scene(colored_sphere) if kind == "glb" else colored_sphere
-    content = source.export(file_type=kind)
-    # At the end of a line, where this makes a difference.
-    end = content.index("\n", len(content) * 3 // 4) if kind == "off" else len(content) // 2
-    with pytest.raises(DataError, match=rf"a\.{kind}"):
-        load_mesh(write(content[:end], f"a.{kind}"))
-
-
-@pytest.mark.parametrize("kind", ["ply", "stl"])
-def test_bytes_behind_binary_data_are_warned_of(write, colored_sphere, kind, caplog):
-    mesh = load_mesh(write(colored_sphere.export(file_type=kind) + b"\n", f"a.{kind}"))
-    np.testing.assert_allclose(mesh.triangles, colored_sphere.triangles, atol=1e-6)
-    assert "1 bytes behind its data are left out" in caplog.text
-
-
-def test_off_counts_are_compared_and_comments_left_out(write):
+def test_comments_of_off_are_left_out(write):
     text = "OFF # a square\n# b\n4 2 0\n0 0 0 # c\n1 0 0\n1 1 0\n0 1 0\n# d\n3 0 1 2\n4 0 1 2 3\n"
     mesh = load_mesh(write(text, "a.off"))
     assert mesh.faces.tolist() == [[0, 1, 2], [0, 1, 2], [0, 2, 3]]
     assert mesh.polygon.tolist() == [0, 1, 1]
-    with pytest.raises(DataError, match="the header announces 2 faces, but only 1 are there"):
-        load_mesh(write(text.replace("3 0 1 2\n", ""), "a.off"))
 
 
 def test_faces_without_area_are_refused(write):
@@ -444,11 +425,11 @@ def test_counts_of_off_that_lie_are_named(write, text, message):
     assert refusal_text(lambda: load_mesh(path)).startswith(f"{path}: {message}")
 
 
-@pytest.mark.parametrize("kind", ["off", "stl_ascii", "glb"])
+@pytest.mark.parametrize("kind", ["off", "stl", "stl_ascii", "glb", "ply"])
 def test_surplus_behind_a_mesh_is_warned_of(write, kind, caplog):
     content = CUBE.export(file_type=kind)
     content = content if isinstance(content, bytes) else content.encode()
-    surplus = {"off": b"\n3 0 1 2\n", "stl_ascii": b"\nmore\n", "glb": b"\n"}[kind]
+    surplus = {"off": b"\n3 0 1 2\n", "stl_ascii": b"\nmore\n"}.get(kind, b"\n")
     mesh = load_mesh(write(content + surplus, f"a.{kind.removesuffix('_ascii')}"))
     np.testing.assert_allclose(mesh.triangles, CUBE.triangles)
     assert "bytes behind its data are left out" in caplog.text

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from codecs import BOM_UTF8
 from contextlib import suppress
 from pathlib import Path
 
@@ -10,15 +11,15 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import CadalignError, DataError, InputError, brief
-from cadalign.geometry.mesh import Mesh, face_normals, spread_colors
-from cadalign.geometry.units import check_near
+from cadalign.geometry.mesh import Mesh, check_near, face_normals, spread_colors
+from cadalign.io.documents import in_file
 from cadalign.io.files import (
     as_path,
     damaged,
     keep,
     made_folder,
     once_per_file,
-    reading,
+    read_bytes,
     refuse_folder,
     write_text,
     write_whole,
@@ -27,11 +28,10 @@ from cadalign.io.images import write_image
 from cadalign.io.kinds import MESH, refuse_other_file
 from cadalign.io.meshes.gltf import read_gltf
 from cadalign.io.meshes.obj import read_obj
-from cadalign.io.meshes.ply import read_ply
-from cadalign.io.meshes.solids import read_off, read_stl
+from cadalign.io.meshes.polygons import read_off, read_ply, read_stl
 
 # Coordinates in ShapeNet's files have 6 decimals; less than ten of these steps is rounding.
-FLAT_TOLERANCE = 1e-5
+_FLAT = 1e-5
 _DIGITS = 9  # of coordinates in OBJ files
 
 
@@ -43,8 +43,6 @@ _READERS = {
     ".stl": read_stl,
     ".off": read_off,
 }
-SUFFIXES = tuple(_READERS)
-"""Endings of the files that `load_mesh` reads."""
 
 
 def load_mesh(path: str | os.PathLike[str]) -> Mesh:
@@ -93,28 +91,23 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
             where=str(path),
             fix=f"known are {', '.join(_READERS)}",
         )
-    with reading(path):
-        is_empty = path.is_file() and not path.stat().st_size
-    if is_empty:
-        raise DataError("the mesh file is empty", where=str(path), fix="get it again")
     keep(path)
     try:
-        with np.errstate(all="ignore"):  # what is not finite, Mesh refuses
-            mesh = reader(path)
-            has_area = np.linalg.norm(face_normals(mesh.triangles), axis=1).any()
-    except CadalignError as error:
+        data = read_bytes(path)
+        if not data:
+            raise DataError("the mesh file is empty", where=str(path), fix="get it again")
+        with in_file(path), np.errstate(all="ignore"):  # what is not finite, Mesh refuses
+            mesh = reader(data.removeprefix(BOM_UTF8), path)
+            if not np.linalg.norm(face_normals(mesh.triangles), axis=1).any():
+                raise DataError("no face of the mesh has an area")
+    except CadalignError:
         refuse_other_file(path, MESH)
-        where = str(path) if error.where is None else error.where
-        if str(path) not in where:
-            where = f"{path}: {where}"
-        raise DataError(error.what, where=where, fix=error.fix) from None
+        raise
     except Exception as error:  # of damaged content any kind
         refuse_other_file(path, MESH)
         reason = f"{type(error).__name__}: {brief(error)}"
         kind = path.suffix[1:].upper()
         raise damaged(f"cannot be read as a {kind} file ({reason})", path) from None
-    if not has_area:
-        raise DataError("no face of the mesh has an area", where=str(path))
     return mesh
 
 
@@ -147,8 +140,8 @@ def as_mesh(given: object, *, where: str) -> Mesh:
     raise InputError(what, where=where, fix="read it with cadalign.load_mesh")
 
 
-def flat_axes(mesh: Mesh, *, tolerance: float = FLAT_TOLERANCE) -> tuple[str, ...]:
-    """Name the axes along which a mesh has no thickness.
+def flat_axes(mesh: Mesh) -> tuple[str, ...]:
+    """Name the axes along which a mesh has no thickness: less than 1e-5 of its box's diagonal.
 
     Such a model has no volume, no stretch along that axis can be told, and boxes around it have no
     overlap to measure.
@@ -157,8 +150,6 @@ def flat_axes(mesh: Mesh, *, tolerance: float = FLAT_TOLERANCE) -> tuple[str, ..
     ----------
     mesh : Mesh
         The model.
-    tolerance : float
-        The thickness that counts as none, as a share of the bounding box's diagonal.
 
     Returns
     -------
@@ -173,11 +164,11 @@ def flat_axes(mesh: Mesh, *, tolerance: float = FLAT_TOLERANCE) -> tuple[str, ..
     """
     low, high = mesh.bounds
     extents = np.asarray(high - low)
-    flat = extents <= tolerance * np.linalg.norm(extents)
+    flat = extents <= _FLAT * np.linalg.norm(extents)
     return tuple(axis for axis, thin in zip("xyz", flat, strict=True) if thin)
 
 
-def check_solid(mesh: Mesh, *, tolerance: float = FLAT_TOLERANCE) -> None:
+def check_solid(mesh: Mesh) -> None:
     """Refuse a mesh that has no thickness along an axis; see `flat_axes`.
 
     Raises
@@ -191,7 +182,7 @@ def check_solid(mesh: Mesh, *, tolerance: float = FLAT_TOLERANCE) -> None:
     Traceback (most recent call last):
     cadalign.errors.DataError: square.obj: the model has zero thickness along z; leave it out
     """
-    flat = flat_axes(mesh, tolerance=tolerance)
+    flat = flat_axes(mesh)
     if flat:
         raise DataError(
             f"the model has zero thickness along {' and '.join(flat)}",
@@ -230,13 +221,6 @@ def write_ply_mesh(path: Path, mesh: Mesh) -> None:
 
     Raises DataError if the file cannot be written.
     """
-    data = ply_mesh(mesh)
-    made_folder(path.parent)
-    write_whole(path, lambda unfinished: unfinished.write_bytes(data))
-
-
-def ply_mesh(mesh: Mesh) -> bytes:
-    """The content of a file of `write_ply_mesh`."""
     number, kind = ("float", "<f4") if _digits(mesh) <= _DIGITS else ("double", "<f8")
     vertices = np.empty(len(mesh.vertices), [("place", kind, 3), ("color", "u1", 4)])
     vertices["place"] = mesh.vertices
@@ -253,7 +237,9 @@ def ply_mesh(mesh: Mesh) -> bytes:
         "property list uchar int vertex_indices",
         "end_header\n",
     ]
-    return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
+    data = "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
+    made_folder(path.parent)
+    write_whole(path, lambda unfinished: unfinished.write_bytes(data))
 
 
 def _digits(mesh: Mesh) -> int:
@@ -273,27 +259,24 @@ def _palette(mesh: Mesh) -> FloatArray:
 
 
 def _vertex_lines(mesh: Mesh) -> list[str]:
-    digits = _digits(mesh)
-    rows = mesh.vertices.tolist()
-    lines = [f"v {x:.{digits}g} {y:.{digits}g} {z:.{digits}g}" for x, y, z in rows]
-    if mesh.vertex_colors is None:
-        return lines
-    colors = [f"{r:.9g} {g:.9g} {b:.9g}" for r, g, b in mesh.vertex_colors[:, :3].tolist()]
-    return [f"{line} {color}" for line, color in zip(lines, colors, strict=True)]
+    form, rows = "v" + 3 * f" {{:.{_digits(mesh)}g}}", mesh.vertices
+    if mesh.vertex_colors is not None:
+        form, rows = form + 3 * " {:.9g}", np.hstack([rows, mesh.vertex_colors[:, :3]])
+    return [form.format(*row) for row in rows.tolist()]
 
 
 def _face_lines(mesh: Mesh, names: list[str], uv_rows: IntArray | None) -> list[str]:
     """Faces in file order, with the material's name where it changes."""
     lines, current = [], -1
-    for row, face in enumerate((mesh.faces + 1).tolist()):
-        material = int(mesh.face_material[row])
+    form, rows = "f {} {} {}", mesh.faces + 1
+    if uv_rows is not None:
+        rows = np.stack([rows, uv_rows], axis=2).reshape(-1, 6)
+        form = "f {}/{} {}/{} {}/{}"
+    for row, material in zip(rows.tolist(), mesh.face_material.tolist(), strict=True):
         if material != current:
             lines.append(f"usemtl {names[material]}")
             current = material
-        corners = [str(vertex) for vertex in face]
-        if uv_rows is not None:
-            corners = [f"{a}/{b}" for a, b in zip(face, uv_rows[row], strict=True)]
-        lines.append(f"f {' '.join(corners)}")
+        lines.append(form.format(*row))
     return lines
 
 

@@ -3,6 +3,10 @@
 After the Khronos Group's specification of glTF 2.0 and of the extensions that are named. A part
 that is missing or of another type ends in one of Python's errors, which `cadalign.load_mesh` turns
 into a DataError.
+
+trimesh takes normalized integers as they stand and sparse values without their changes, makes room
+for arrays without data, leaves out fans, and knows neither transforms of textures nor what a file
+says that it requires.
 """
 
 from __future__ import annotations
@@ -44,63 +48,60 @@ _FREE_BYTES, _EXPANSION = 2**27, 64
 _VERTEX_BYTES, _FACE_BYTES = 24 + 32, 24 + 48 + 8 + 8  # colours, texture coordinates included
 
 
-def read_gltf(path: Path) -> Mesh:
-    """Read a glTF or GLB file as one mesh, each node placed by its transform.
+def read_gltf(data: bytes, path: Path) -> Mesh:
+    """Read the content of a glTF or GLB file as one mesh, each node placed by its transform.
 
     Raises DataError if it is no glTF 2.0 file, has no faces, is no tree of nodes, needs an
     extension that is not read, or repeats its meshes to more than 128 MB and 64 times its bytes.
     """
-    file = _GltfFile(path)
+    text, binary = _chunks(data, path) if data[:4] == b"glTF" else (data, b"")
+    with reading(path):
+        document = parse_json(str(text, "utf-8-sig"), str(path))
+    _check(document)
+    file = _GltfFile(path, document, len(data), binary)
     placed = [
         (primitive, transform)
-        for number, transform in _placements(file.document)
-        for primitive in nth(file.document, "meshes", number)["primitives"]
-        if _count_faces(file.document, primitive)
+        for number, transform in _placements(document)
+        for primitive in nth(document, "meshes", number)["primitives"]
+        if _count_faces(document, primitive)
     ]
     if not placed:
         raise DataError("the file has no faces", fix="is it whole?")
-    _check_size(file, placed)
+    _check_size(file, [primitive for primitive, _ in placed])
     _warn_of_what_moves(file)
-    looks, surfaces = _Looks(file), dict[int, Mesh]()
+    surfaces = dict[int, Mesh]()
     for primitive, _ in placed:
         if id(primitive) not in surfaces:
-            surfaces[id(primitive)] = _surface(file, primitive, looks)
+            surfaces[id(primitive)] = _surface(file, primitive)
     return join([_moved(surfaces[id(primitive)], at) for primitive, at in placed], str(path))
 
 
 class _GltfFile:
-    """The document of a file, and the arrays of its buffers; ``size`` is the bytes of all."""
+    """The document of a file, and what its buffers hold; ``size`` is the bytes of all files."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        data = read_bytes(path)
-        self.size = len(data)
-        text, self._binary = _chunks(data, path) if data[:4] == b"glTF" else (data, b"")
-        with reading(path):
-            self.document: _Part = parse_json(str(text, "utf-8-sig"), str(path))
-        _check(self.document)
-        self._buffers: dict[str, bytes] = {}
+    def __init__(self, path: Path, document: _Part, size: int, binary: bytes) -> None:
+        self.path, self.document, self.size = path, document, size
+        self._textures = Textures()
+        self._looks: dict[int | None, tuple[Material, _Part]] = {None: (Material(), {})}
+        uris = [each.get("uri") for each in document.get("buffers", [])]
+        named: dict[str | None, bytes] = {None: binary}
+        for uri in uris:
+            if uri not in named:
+                data = _embedded(uri)
+                named[uri] = read_bytes(path.parent / unquote(uri)) if data is None else data
+                self.size += len(named[uri]) if data is None else 0
+        self._buffers = [named[uri] for uri in uris]
 
     def view(self, number: int) -> memoryview:
         """The bytes of a buffer view."""
         part = nth(self.document, "bufferViews", number)
-        buffer = nth(self.document, "buffers", part["buffer"])
-        data = self._binary if "uri" not in buffer else self._named(buffer["uri"])
+        announced = nth(self.document, "buffers", part["buffer"])["byteLength"]
+        data = self._buffers[part["buffer"]]
         start, length = part.get("byteOffset", 0), part["byteLength"]
-        if len(data) < buffer["byteLength"] or not 0 <= start <= start + length <= len(data):
-            announced = max(buffer["byteLength"], start + length)
-            what = f"{len(data)} bytes in its buffer, {announced} announced"
+        if len(data) < announced or not 0 <= start <= start + length <= len(data):
+            what = f"{len(data)} bytes in its buffer, {max(announced, start + length)} announced"
             raise damaged(what, f"bufferViews[{number}]")
         return memoryview(data)[start : start + length]
-
-    def _named(self, uri: str) -> bytes:
-        if uri not in self._buffers:
-            data = _embedded(uri)
-            if data is None:
-                data = read_bytes(self.path.parent / unquote(uri))
-                self.size += len(data)
-            self._buffers[uri] = data
-        return self._buffers[uri]
 
     def array(self, number: int) -> npt.NDArray[Any]:
         """The array (n, width) of an accessor; of normalized integers as fractions."""
@@ -130,6 +131,35 @@ class _GltfFile:
             what = f"{values.shape} values of {name} for {count} vertices"
             raise damaged(what, f"accessors[{numbers[name]}]")
         return values
+
+    def look(self, number: int | None) -> tuple[Material, _Part]:
+        """A material, and its reference to a texture, empty if it has none."""
+        if number not in self._looks:
+            part = nth(self.document, "materials", number or 0)
+            metallic = part.get("pbrMetallicRoughness", {})
+            older = part.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
+            factor = metallic.get("baseColorFactor") or older.get("diffuseFactor")
+            use = metallic.get("baseColorTexture") or older.get("diffuseTexture") or {}
+            texture = self._texture(use["index"]) if use else None
+            color = GREY if texture is None else WHITE
+            if factor is not None:
+                red, green, blue, opacity = _encoded(np.clip(factor, 0, 1)).tolist()
+                color = (red, green, blue, opacity)
+            material = Material(str(part.get("name", "")), color, texture)
+            self._looks[number] = material, use if texture is not None else {}
+        return self._looks[number]
+
+    def _texture(self, number: int) -> Texture | None:
+        part = nth(self.document, "textures", number)
+        part = {**part, **part.get("extensions", {}).get("EXT_texture_webp", {})}
+        if "source" not in part:
+            return None
+        image = nth(self.document, "images", part["source"])
+        uri = image.get("uri", "")
+        data = _embedded(uri) if uri else bytes(self.view(image["bufferView"]))
+        if data is None:
+            return self._textures.read(self.path, unquote(uri))
+        return self._textures.decode(data, within=self.path, name=f"images[{part['source']}]")
 
 
 def nth(document: _Part, name: str, number: int) -> _Part:
@@ -189,18 +219,15 @@ def _check(document: _Part) -> None:
 def _warn_of_what_moves(file: _GltfFile) -> None:
     """Warn of what places vertices elsewhere in viewers, and is not read."""
     document = file.document
-    left_out = [
-        name
-        for name, is_there in (
-            ("skins", any("skin" in node for node in document["nodes"])),
-            ("morph targets", any(any(each.get("weights", [])) for each in document["meshes"])),
-            (_INSTANCES, _INSTANCES in document.get("extensionsUsed", [])),
-        )
-        if is_there
-    ]
-    if left_out:
+    found = {
+        "skins": any("skin" in node for node in document["nodes"]),
+        "morph targets": any(any(each.get("weights", [])) for each in document["meshes"]),
+        _INSTANCES: _INSTANCES in document.get("extensionsUsed", []),
+    }
+    if any(found.values()):
+        names = " and ".join(name for name, is_there in found.items() if is_there)
         said = "%s: not read are %s, by which its vertices lie elsewhere; export it with them"
-        logger.warning(f"{said} applied", file.path, " and ".join(left_out))
+        logger.warning(f"{said} applied", file.path, names)
 
 
 def _placements(document: _Part) -> Iterator[tuple[int, FloatArray]]:
@@ -247,71 +274,23 @@ def _count_faces(document: _Part, primitive: _Part) -> int:
     return count // 3 if mode == _TRIANGLES else max(count - 2, 0)
 
 
-def _check_size(file: _GltfFile, placed: list[tuple[_Part, FloatArray]]) -> None:
+def _check_size(file: _GltfFile, primitives: list[_Part]) -> None:
     """Refuse a scene that repeats its meshes to far more than its file."""
-    distinct = {id(primitive): primitive for primitive, _ in placed}
-    vertices = {key: len(file.attribute(each, "POSITION")) for key, each in distinct.items()}
     faces = size = 0
-    for primitive, _ in placed:
+    for primitive in primitives:
         count = _count_faces(file.document, primitive)
+        vertices = nth(file.document, "accessors", primitive["attributes"]["POSITION"])["count"]
         faces += count
         # Many primitives may share one array; files that are named count as well.
-        size += _VERTEX_BYTES * min(vertices[id(primitive)], 3 * count)
-    size += _FACE_BYTES * faces
+        size += _VERTEX_BYTES * min(vertices, 3 * count) + _FACE_BYTES * count
     if size > _FREE_BYTES + _EXPANSION * file.size:
         what = f"its nodes repeat meshes to {faces} faces, from {file.size} bytes"
         raise DataError(what, fix="simplify it, or leave copies out")
 
 
-class _Looks:
-    """The materials of a file with the use of their textures, each made once."""
-
-    def __init__(self, file: _GltfFile) -> None:
-        self._file = file
-        self._textures = Textures()
-        self._images: dict[int, Texture | None] = {}
-        self._looks: dict[int | None, tuple[Material, _Part]] = {None: (Material(), {})}
-
-    def of(self, number: int | None) -> tuple[Material, _Part]:
-        """A material, and its reference to a texture, empty if it has none."""
-        if number not in self._looks:
-            self._looks[number] = self._make(nth(self._file.document, "materials", number or 0))
-        return self._looks[number]
-
-    def _make(self, part: _Part) -> tuple[Material, _Part]:
-        metallic = part.get("pbrMetallicRoughness", {})
-        older = part.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
-        factor = metallic.get("baseColorFactor") or older.get("diffuseFactor")
-        use = metallic.get("baseColorTexture") or older.get("diffuseTexture") or {}
-        texture = self._texture(use["index"]) if use else None
-        color = GREY if texture is None else WHITE
-        if factor is not None:
-            red, green, blue, opacity = _encoded(np.clip(factor, 0, 1)).tolist()
-            color = (red, green, blue, opacity)
-        name = str(part.get("name", ""))
-        return Material(name, color, texture), use if texture is not None else {}
-
-    def _texture(self, number: int) -> Texture | None:
-        part = nth(self._file.document, "textures", number)
-        part = {**part, **part.get("extensions", {}).get("EXT_texture_webp", {})}
-        if "source" not in part:
-            return None
-        if part["source"] not in self._images:
-            self._images[part["source"]] = self._read(part["source"])
-        return self._images[part["source"]]
-
-    def _read(self, number: int) -> Texture | None:
-        image, path = nth(self._file.document, "images", number), self._file.path
-        uri = image.get("uri", "")
-        data = bytes(self._file.view(image["bufferView"])) if not uri else _embedded(uri)
-        if data is None:
-            return self._textures.read(path, unquote(uri))
-        return self._textures.decode(data, within=path, name=f"images[{number}]")
-
-
-def _surface(file: _GltfFile, primitive: _Part, looks: _Looks) -> Mesh:
+def _surface(file: _GltfFile, primitive: _Part) -> Mesh:
     """The mesh of a primitive in its own frame."""
-    material, use = looks.of(primitive.get("material"))
+    material, use = file.look(primitive.get("material"))
     vertices = file.attribute(primitive, "POSITION", 3).astype(np.float64)
     corners = np.arange(len(vertices))
     if "indices" in primitive:

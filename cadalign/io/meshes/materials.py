@@ -56,19 +56,14 @@ def load_materials(
     return found
 
 
-def _paths(obj_path: Path, library: str) -> list[Path]:
+def _paths(obj_path: Path, library: str) -> Iterator[Path]:
     """The files that an ``mtllib`` line names: one with blanks in its name, or several."""
     whole = find_file(obj_path.parent, library)
-    if whole is not None:
-        return [whole]
-    paths = []
-    for word in library.split():
-        path = find_file(obj_path.parent, word)
-        if path is None:
-            logger.warning("%s: no material library %s beside it", obj_path, brief(word))
+    for name in library.split() if whole is None else [library]:
+        if path := find_file(obj_path.parent, name):
+            yield path
         else:
-            paths.append(path)
-    return paths
+            logger.warning("%s: no material library %s beside it", obj_path, brief(name))
 
 
 def _parse_library(path: Path) -> dict[str, _Entry]:
@@ -148,7 +143,7 @@ class Textures:
     What is missing or cannot be read is warned of (logger "cadalign") and becomes None.
     """
 
-    _known: dict[Path, Texture | None] = field(default_factory=dict)
+    _known: dict[Path | str, Texture | None] = field(default_factory=dict)
     _bytes_left: int = _MOST_BYTES
 
     def read(self, beside: Path, name: str) -> Texture | None:
@@ -172,9 +167,11 @@ class Textures:
 
     def decode(self, data: bytes, *, within: Path, name: str) -> Texture | None:
         """Decode a picture that is a part of a file, (h, w, 3 or 4) uint8."""
-        file = io.BytesIO(data)
-        with _left_out(within, name), open_picture(file, len(data), where=str(within)) as image:
-            return self._pixels(image)
+        if name not in self._known:
+            file, self._known[name] = io.BytesIO(data), None
+            with _left_out(within, name), open_picture(file, len(data), where=str(within)) as image:
+                self._known[name] = self._pixels(image)
+        return self._known[name]
 
     def _pixels(self, image: Image) -> Texture:
         transparent = "A" in image.getbands() or "transparency" in image.info

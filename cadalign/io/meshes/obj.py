@@ -7,7 +7,6 @@ appendix B1 of the Advanced Visualizer manual.
 
 from __future__ import annotations
 
-from codecs import BOM_UTF8
 from collections.abc import Callable, Iterator
 from itertools import chain
 from pathlib import Path
@@ -16,8 +15,8 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray, parse_numbers
 from cadalign.errors import DataError
-from cadalign.geometry.mesh import Material, Mesh, fan_triangles
-from cadalign.io.files import damaged, read_bytes
+from cadalign.geometry.mesh import Material, Mesh
+from cadalign.io.files import damaged
 from cadalign.io.meshes.materials import WHITE, load_materials
 
 _DIGITS = b"0123456789+-"
@@ -25,43 +24,44 @@ _MAX_VALUES = 16  # of a vertex; the format has at most 7
 _Rows = list[list[bytes]]
 
 
-def read_obj(path: Path) -> Mesh:
-    """Read an OBJ file; `cadalign.load_mesh` is the public way to it.
+def read_obj(data: bytes, path: Path) -> Mesh:
+    """Read the content of an OBJ file; `cadalign.load_mesh` is the public way to it.
 
     Polygons are cut into fans of triangles, and `Mesh.polygon` holds the number of the ``f`` line
     that a triangle comes from. Lines and points (``l``, ``p``) have no number. Normals, groups,
     curves and surfaces are not read.
     """
-    data = read_bytes(path)
     rows: dict[bytes, _Rows] = {b"v": [], b"vt": [], b"f": []}
-    counts: list[tuple[int, int]] = []  # before each face, from which negative indices count back
+    # Of each face: vertices and texture coordinates before it, from which negative indices count
+    # back, and the number of its material.
+    before: list[tuple[int, int, int]] = []
     libraries: list[str] = []
-    blocks = [(0, "")]  # first face, name of its material
+    numbers, material = {"": 0}, 0
     for number, line in _logical_lines(data):
         key, _, body = line.partition(b" ")
         if key in rows:
             if key == b"f":
-                counts.append((len(rows[b"v"]), len(rows[b"vt"])))
+                before.append((len(rows[b"v"]), len(rows[b"vt"]), material))
             rows[key].append(_words(body))
         elif key == b"usemtl":
-            blocks.append((len(counts), _text(body)))
+            material = numbers.setdefault(_text(body), len(numbers))
         elif key == b"mtllib":
             libraries.append(_text(body))
         elif b"\0" in line:
-            what = "holds binary data, not the text of an OBJ file"
-            raise damaged(what, f"{path}, line {number}")
-    if not counts:
+            raise damaged("holds binary data, not the text of an OBJ file", f"line {number}")
+    if not before:
         what = f"no faces; {len(rows[b'v'])} vertices were found"
-        raise DataError(what, where=str(path), fix="is it an OBJ file, and whole?")
+        raise DataError(what, fix="is it an OBJ file, and whole?")
     if not rows[b"v"]:
-        raise damaged(f"{len(counts)} faces, but no vertices", path)
+        raise damaged(f"{len(before)} faces, but no vertices")
     try:
         vertices, colors = _parse_vertices(rows[b"v"])
         coordinates = _parse_rows(rows[b"vt"])
         corners, sizes = _parse_faces(rows[b"f"])
     except (ValueError, OverflowError):
-        raise _first_malformed(data, path) from None
-    seen = np.repeat(np.array(counts), sizes, axis=0)
+        raise _first_malformed(data) from None
+    counts, looks = np.split(np.array(before), [2], axis=1)
+    seen = np.repeat(counts, sizes, axis=0)
     has_uv = corners[:, 1] != 0
     indices = np.where(corners < 0, seen + corners, corners - 1)
     for kind, name, count, used in (
@@ -72,27 +72,23 @@ def read_obj(path: Path) -> Mesh:
         if len(wrong):
             face = np.repeat(np.arange(len(sizes)), sizes)[wrong[0]]
             what = f"face {face} (counted from 0) names {name} {corners[wrong[0], kind]}"
-            raise damaged(f"{what}, but there are {count}", path)
+            raise damaged(f"{what}, but there are {count}")
     corner_uv = np.zeros((len(corners), 2))  # where a corner names no texture coordinate
     if has_uv.any():
         width = min(coordinates.shape[1], 2)
         corner_uv[has_uv, :width] = coordinates[indices[has_uv, 1], :width]
-    triangles, polygon = fan_triangles(sizes)
-    # Of blocks that start at the same face only the last one colours it: the others are empty.
-    block_of = np.searchsorted([first for first, _ in blocks], polygon, side="right") - 1
-    used_blocks, rows_of = np.unique(block_of, return_inverse=True)
-    names = list(dict.fromkeys(blocks[block][1] for block in used_blocks))
-    number_of = {name: number for number, name in enumerate(names)}
+    used, rows_of = np.unique(looks, return_inverse=True)
+    names = np.array([*numbers], dtype=object)[used].tolist()
     known = load_materials(path, libraries, [name for name in names if name])
     plain = Material(color=WHITE) if colors is not None else Material()
-    return Mesh(
-        vertices=vertices,
-        faces=indices[triangles, 0],
-        polygon=polygon,
+    return Mesh.from_polygons(
+        vertices,
+        indices[:, 0],
+        sizes,
+        corner_uv=corner_uv if has_uv.any() else None,
+        polygon_material=rows_of.reshape(-1),
         vertex_colors=colors,
-        corner_uv=corner_uv[triangles] if has_uv.any() else None,
         materials=tuple(known.get(name, plain) for name in names),
-        face_material=np.array([number_of[blocks[block][1]] for block in used_blocks])[rows_of],
         source=str(path),
     )
 
@@ -100,7 +96,7 @@ def read_obj(path: Path) -> Mesh:
 def _logical_lines(data: bytes) -> Iterator[tuple[int, bytes]]:
     """The lines with their numbers, stripped; a line that ends in a backslash goes on."""
     # A tab may separate the keyword too.
-    lines = data.removeprefix(BOM_UTF8).replace(b"\t", b" ").split(b"\n")
+    lines = data.replace(b"\t", b" ").split(b"\n")
     parts: list[bytes] = []
     for number, line in enumerate(map(bytes.strip, lines), start=1):
         if line[-1:] == b"\\" and number < len(lines):
@@ -167,7 +163,7 @@ def _parse_corner(corner: bytes) -> tuple[int, int]:
     return int(vertex), values[0] if values else 0
 
 
-def _first_malformed(data: bytes, path: Path) -> DataError:
+def _first_malformed(data: bytes) -> DataError:
     """Read the statements again, one by one, to name the line that is wrong."""
     parsers: dict[bytes, Callable[[_Rows], object]] = {
         b"v": _parse_vertices,
@@ -177,12 +173,11 @@ def _first_malformed(data: bytes, path: Path) -> DataError:
     for number, line in _logical_lines(data):
         key, _, body = line.partition(b" ")
         try:
-            if key in parsers:
-                parsers[key]([_words(body)])
+            parsers.get(key, len)([_words(body)])
         except (ValueError, OverflowError):
             shown = line[:60].decode("ascii", errors="replace")
-            return damaged(f"cannot read {shown!r}", f"{path}, line {number}")
-    return damaged("cannot be read as an OBJ file", path)
+            return damaged(f"cannot read {shown!r}", f"line {number}")
+    return damaged("cannot be read as an OBJ file")
 
 
 def _text(body: bytes) -> str:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from cadalign import Alignment
 from cadalign.evaluation.metrics.photos import scan2cad_errors
-from cadalign.geometry import Alignment
 from cadalign.geometry.symmetry import Symmetry
 
 

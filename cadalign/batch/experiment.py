@@ -15,7 +15,7 @@ import numpy as np
 
 from cadalign.batch.observation_fit import ObservationFit
 from cadalign.batch.outputs import COLUMNS, RECORD_COLUMNS, naming_row, result_row
-from cadalign.batch.sources import ObservationTask, read_sources
+from cadalign.batch.sources import ObservationTask, ObservationTasks
 from cadalign.datasets.detections.image_keypoints import (
     ImageKeypoints,
     join_keypoints,
@@ -273,7 +273,7 @@ def plan_run(options: ManyOptions, folder: RunFolder) -> Plan[ObservationTask]:
     is missing.
     """
     options.changes.read_camera((1, 1))  # whatever the size: else every row would say its error
-    tasks = read_sources(options.inputs)
+    tasks = ObservationTasks(options.inputs)
     photos = options.detector.images
     if photos is not None and not photos.is_dir():
         what = f"{photos} is not a folder of photos"
@@ -284,7 +284,7 @@ def plan_run(options: ManyOptions, folder: RunFolder) -> Plan[ObservationTask]:
         "contents": tasks.fingerprint(),
         **options.contents(),
     }
-    if files := tasks.named_files():
+    if files := tasks.named_files:
         config["files"] = fingerprint_of_files(files)
     drawn_in = folder.made_for_pictures() if options.pictures else None
     chunk = max(1, min(LARGEST_CHUNK, len(tasks) // _LEAST_CHUNKS))

@@ -1,4 +1,4 @@
-"""The aligned object of a fit's file and the observation that it was fitted to."""
+"""The aligned objects of a fit's file or of a run, with the observations that were fitted."""
 
 from __future__ import annotations
 
@@ -9,11 +9,16 @@ from typing import Any
 
 from cadalign.arrays import FloatArray
 from cadalign.batch.observed import own_ids
-from cadalign.errors import DataError, InputError
+from cadalign.errors import CadalignError, DataError, InputError, all_left_out, unknown
 from cadalign.estimation.result import Result
+from cadalign.estimation.results import Results
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.tables import read_groups
 from cadalign.export.aligned_object import AlignedObject
+from cadalign.export.formats import FORMATS, export_object
 from cadalign.export.results import object_of
-from cadalign.io.documents import in_file, read_json
+from cadalign.io.documents import in_file, parse_json, read_json
+from cadalign.io.files import keeping
 from cadalign.io.kinds import FIT
 from cadalign.io.meshes.files import mesh_at
 from cadalign.io.observation import Observation
@@ -74,6 +79,48 @@ def exported_object(
     name = "model" if seen.model is None else seen.model.stem
     images = [view.image for view in seen.views]
     return object_of(result, mesh=mesh, images=images, name=name, **how)
+
+
+def export_run(
+    run: Path, to: Path, *, format: str | None = None, metres: float = 1.0
+) -> tuple[int, list[CadalignError]]:
+    """Write a file of every alignment of a finished run to a folder, named by their rows.
+
+    ``format`` is one of `cadalign.export.formats.FORMATS`, by default the folder's name; ``metres``
+    the length of one unit of the model [m]. Returns the number of objects, and why others are left
+    out.
+
+    Raises InputError if the format is not known, or no object of the run can be written; and
+    DataError if the run cannot be read.
+    """
+    name = format or to.name
+    if name not in FORMATS:
+        raise unknown("format", name, FORMATS)
+    Results.open(run)  # which refuses what is no finished run
+    config = RunFolder(run).read_config() or {}
+    inputs = [Path(str(each)) for each in config.get("inputs", ())]
+    left_out: list[CadalignError] = []
+    count = 0
+    for table in read_groups(RunFolder(run).records, fix="do the run again"):
+        for record in table.to_pylist():
+            if not record["result"]:
+                continue
+            where = f"{run}, row {record['row']}"
+            seen = Observation.from_dict(parse_json(record["observation"], where))
+            result = Result.from_dict(parse_json(record["result"], where))
+            try:
+                with keeping([*inputs, *seen.files]):
+                    exported = exported_object(result, seen, Path(where), metres=metres)
+                    export_object(to / f"{record['row']:06d}.{name}", exported, format=name)
+                count += 1
+            except CadalignError as error:
+                place = error.where or where
+                left_out.append(type(error)(error.what, where=place, fix=error.fix))
+    if left_out and not count:
+        raise all_left_out(left_out)
+    if not count:
+        raise InputError("no observation of the run is aligned", where=str(run))
+    return count, left_out
 
 
 def _labels(seen: Observation) -> tuple[Hashable, ...]:

@@ -12,7 +12,6 @@ import tyro
 
 from cadalign.batch.observation_fit import ObservationFit
 from cadalign.cli.common import (
-    NOTHING_WORKED,
     answer,
     beside,
     make_folder,
@@ -73,7 +72,7 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
     """Folder to write to; by default <observation>_fit beside the file or folder."""
     overlay: Path | None = None
     """Draw the aligned model over the photo, too, and write it to this picture; further views to
-    FILE_1 and so on. The observation names the model. For many observations, a folder."""
+    FILE_1 and so on. The observation names the model."""
     # A group's own text: without it, tyro reads the documentation of all options for every fit.
     fitting: Annotated[
         _FitOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(help=_FitOptions.__doc__)
@@ -150,14 +149,12 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
     def _fit_many(self) -> int:
         """Align all observations; returns the exit code."""
         from cadalign.batch.experiment import FitRunOptions
-        from cadalign.cli.runs import inputs_of, run_command, run_folder, write_overlays
+        from cadalign.cli.runs import inputs_of, run_command
 
         with named_as_flags(self, self.fitting, self.ransac):
+            refuse_unused(self, ["overlay"], "on many observations")
             options = FitRunOptions(estimate=self.estimate, **inputs_of(self, self.changes))
-            code = run_command(self, options, done="aligned")
-        if self.overlay is not None and code != NOTHING_WORKED:
-            write_overlays(run_folder(self, options), self.overlay)
-        return code
+            return run_command(self, options, done="aligned")
 
     @property
     def changes(self) -> ObservationChanges:

@@ -24,7 +24,6 @@ from cadalign.io.observation import DetectorOptions
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
-    from pathlib import Path
 
     from cadalign.batch.experiment import ManyOptions
     from cadalign.cli.options import ManyCommand
@@ -211,12 +210,3 @@ def run_folder(command: ManyCommand, options: ManyOptions) -> RunFolder:
     if len(command.observations) > 1 or not first.exists():
         return RunFolder(first.parent / kind)
     return RunFolder(beside(first, f"_{kind}"))
-
-
-def write_overlays(run: RunFolder, to: Path) -> None:
-    """Draw all aligned models of a run over their photos, in a folder."""
-    from cadalign.batch.exports import export_run
-
-    count, left_out = export_run(run.path, to, format="overlay")
-    left = f", {len(left_out):,} left out" if left_out else ""
-    say(f"Overlays: {count:,} in {to}{left}")

@@ -18,7 +18,7 @@ from cadalign.batch.outputs import COLUMNS, RECORD_COLUMNS, naming_row, result_r
 from cadalign.batch.sources import ObservationTask, ObservationTasks
 from cadalign.datasets.detections.image_keypoints import (
     ImageKeypoints,
-    join_keypoints,
+    observed_in,
     photo_in,
 )
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
@@ -35,11 +35,10 @@ from cadalign.evaluation.runs.work import (
     fingerprint,
     fingerprint_of_files,
 )
-from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file, parse_json
 from cadalign.io.evidence import ObservedImage
 from cadalign.io.files import read_bytes, read_text
-from cadalign.io.images import exif_note, photo_size, require_one_size
+from cadalign.io.images import photo_size, require_one_size
 from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
 from cadalign.shapes.model import ShapeModel
 
@@ -145,18 +144,17 @@ def _photo_doubt(view: ObservedImage) -> str:
     """Warning about a photo, if it is there, of another size than its camera's images."""
     if view.image is None or not view.image.is_file():
         return ""
+    camera = view.camera
     try:
-        width, height = photo_size(view.image)
+        size = photo_size(view.image)
     except DataError:  # which whoever draws it will name
         return ""
-    if (width, height) == (view.camera.width, view.camera.height):
-        return ""
-    note = exif_note(view.image, (view.camera.width, view.camera.height))
-    return (
-        f"{view.image.name} is {width} x {height} px, the camera {view.camera.width} x "
-        f"{view.camera.height}{note}: give camera and keypoints of its resolution "
-        "(`Camera.resized`, `Camera.cropped`)"
-    )
+    try:
+        named = {"its camera": (camera.width, camera.height), view.image.name: size}
+        require_one_size(named, view.image)
+    except DataError as error:
+        return f"{error} (`Camera.resized`, `Camera.cropped`)"
+    return ""
 
 
 def _paths(value: Any) -> Iterator[Path]:
@@ -238,32 +236,20 @@ class ManyEstimates:
         return seen if shape is None else replace(seen, shape=shape.absolute())
 
     def _detected(self, found: ImageKeypoints, folder: Path) -> Observation:
-        detector, changes = self.options.detector, self.options.changes
+        detector = self.options.detector
         assert self.model is not None
         photo = None
         if found.image is not None:
             photo = _photo_in(detector.images or folder, found.image)
-        sizes = {} if photo is None else {str(photo): photo_size(photo)}
-        if found.size is not None:
-            sizes[found.source] = found.size
-        if sizes:
-            require_one_size(sizes, photo)
-        size = next(iter(sizes.values()), None)
         with in_file(found.source):
-            camera = changes.read_camera(size)
-            if camera is None and size is None:
-                fix = "give --camera, or the folder of the photos (--images)"
-                raise InputError("neither camera nor photo is known", where="camera", fix=fix)
-        joined = join_keypoints(
-            replace(found, size=size),
-            self.model,
-            camera or Camera.without_focal(*size),  # type: ignore[misc]
-            image=photo,
-            min_score=detector.min_score,
-            ignore_unknown=detector.ignore_unknown,
-        )
-        with in_file(found.source):
-            return replace(changes, camera=None).applied_to(joined)
+            return observed_in(
+                found,
+                self.model,
+                self.options.changes,
+                image=photo,
+                min_score=detector.min_score,
+                ignore_unknown=detector.ignore_unknown,
+            )
 
 
 def plan_run(options: ManyOptions, folder: RunFolder) -> Plan[ObservationTask]:

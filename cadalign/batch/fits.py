@@ -145,9 +145,6 @@ def options_of(given: dict[str, Any]) -> FitRunOptions:
     names = [(field.name, kind) for kind in kinds for field in fields(kind)]
     owners = {name: kind for name, kind in reversed(names) if name != "fitting"}
     parts: dict[Any, dict[str, Any]] = {kind: {} for kind in kinds}
-    prior = given.get("focal_prior")
-    if isinstance(prior, FocalPrior):
-        given = {"focal_prior_sigma": prior.relative_sigma} | given | {"focal_prior": prior.focal}
     for name, value in given.items():
         if name not in owners:
             listed = ", ".join(dict.fromkeys(each for each, _ in names if each != "fitting"))
@@ -171,7 +168,7 @@ def _as_declared(value: Any, kind: type, name: str) -> Any:
 
     Raises InputError if it is of another one.
     """
-    if kind is FitOptions:  # which checks its values itself
+    if kind is FitOptions or isinstance(value, FocalPrior):  # which check their values themselves
         return value
     if name == "size":  # whose lengths are arrays, too
         require_kind(value, Size, name)

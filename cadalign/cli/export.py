@@ -56,7 +56,7 @@ class Export:
             fit = fit / "fit.json"
         if fit.is_dir():
             return self._export_run()
-        with named_as_flags(self, others={"world_from_cam": "--world"}):
+        with named_as_flags(self, world_from_cam="--world"):
             if self.frame != "world":
                 refuse_unused(self, ["world"], "without --frame world")
             name = self.format or format_of(self.to)

@@ -47,7 +47,7 @@ class Render:
         """Draw and write; returns the exit code."""
         from cadalign.cli.render_job import RenderJob
 
-        with named_as_flags(self, others={"fov_x": "--fov", "elevation": "--view"}):
+        with named_as_flags(self, elevation="--view"):
             return self._draw(RenderJob.of(self))
 
     def _draw(self, job: RenderJob) -> int:

@@ -23,7 +23,7 @@ from cadalign.errors import DataError
 from cadalign.io.observation import DetectorOptions
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable
 
     from cadalign.batch.experiment import ManyOptions
     from cadalign.cli.options import ManyCommand
@@ -31,10 +31,11 @@ if TYPE_CHECKING:
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.run import Progress as RunProgress
     from cadalign.evaluation.runs.tables import Run
-    from cadalign.io.observation import ObservationChanges
 
 T = TypeVar("T")
 _MOST_REASONS, _MOST_OF_EVALUATIONS = 10, 3
+_SHOWN = 100
+"""Observations, the first ones, whose photos the page shows."""
 _ON_PAGE = 5000
 """Observations beyond which the page is left to `cadalign report`."""
 
@@ -109,22 +110,14 @@ def run_progress(label: str) -> Iterator[Callable[[RunProgress], None]]:
         yield lambda state: show(state.done, state.total)
 
 
-def tracked(items: Iterable[T], label: str, *, total: int) -> Iterator[T]:
-    """The items one after the other, while a progress bar is shown."""
-    with progress_bar(label) as show:
-        for done, item in enumerate(items):
-            show(done, total)
-            yield item
-
-
-def inputs_of(command: ManyCommand, changes: ObservationChanges) -> dict[str, Any]:
+def inputs_of(command: Any) -> dict[str, Any]:
     """The fields of `ManyOptions` that a command states."""
     names = DetectorOptions.__dataclass_fields__
     return {
         "inputs": command.observations,
-        "changes": changes,
+        "changes": command.changes,
         "detector": DetectorOptions(**{name: getattr(command, name) for name in names}),
-        "pictures": command.pictures if command.picture else 0,
+        "pictures": _SHOWN if command.picture else 0,
     }
 
 

@@ -280,4 +280,6 @@ def test_photo_of_another_size_than_its_camera_is_warned_of(tmp_path: Path) -> N
     seen = Observation(problem.points_3d, problem.points_2d, problem.camera, image=photo)
     options = FitRunOptions(inputs=(tmp_path,))
     (warning,) = options.estimate_of(seen, "seen.json").result.warnings
-    assert warning.text.startswith("photo.png is 1280 x 960 px, the camera 640 x 480: give camera")
+    assert warning.text.startswith(
+        "photo.png: the image has 1280 x 960 pixels, that of its camera 640 x"
+    )

@@ -45,7 +45,7 @@ def test_the_renderer_that_really_drew_is_named(tmp_path, capsys):
         path = tmp_path / f"box{opacity}.ply"
         box.export(path)
         out = tmp_path / f"box{opacity}.png"
-        assert _run(path, "--out", out, "--size", "64x48", renderer="pyrender") == 0
+        assert _run(path, "--out", out, "--resolution", "64x48", renderer="pyrender") == 0
         names[opacity] = capsys.readouterr().err.split("drawn by ")[1].strip(")\n")
     assert names == {255: "pyrender", 90: "raycast"}
 
@@ -57,7 +57,7 @@ def _pixels(path):
 
 def test_one_view_gives_a_still(model, tmp_path):
     out = tmp_path / "new" / "still.png"
-    assert _run(model, "--out", out, "--size", "200x150") == 0
+    assert _run(model, "--out", out, "--resolution", "200x150") == 0
     pixels = _pixels(out)
     assert pixels.shape == (150, 200, 3)
     assert tuple(pixels[0, 0]) == (228, 230, 233)
@@ -67,7 +67,7 @@ def test_one_view_gives_a_still(model, tmp_path):
 
 @pytest.mark.parametrize("views", [["front", "top"], ["30,20", "-30,20,10", "left"], ["all"]])
 def test_several_views_give_a_contact_sheet(model, tmp_path, views):
-    _run(model, "--out", tmp_path / "s.png", "--size", "80x60", "--view", *views)
+    _run(model, "--out", tmp_path / "s.png", "--resolution", "80x60", "--view", *views)
     height, width = _pixels(tmp_path / "s.png").shape[:2]
     assert width > 160
     assert height > 60 * (1 if len(views) == 2 else 2)
@@ -75,7 +75,7 @@ def test_several_views_give_a_contact_sheet(model, tmp_path, views):
 
 def test_a_jpg_is_a_still(model, tmp_path):
     out = tmp_path / "s.jpg"
-    _run(model, "--out", out, "--size", "80x60")
+    _run(model, "--out", out, "--resolution", "80x60")
     assert out.read_bytes()[:2] == b"\xff\xd8"
     assert _pixels(out).shape[:2] == (60, 80)
 
@@ -120,7 +120,7 @@ def test_keypoints_from_a_list_and_from_annotations(model, tmp_path):
     drawn = []
     for name in ("points.json", "chair.json"):
         out = tmp_path / "k.png"
-        _run(model, "--out", out, "--keypoints", tmp_path / name, "--size", "160x120")
+        _run(model, "--out", out, "--keypoints", tmp_path / name, "--resolution", "160x120")
         drawn.append(_pixels(out).astype(int))
     np.testing.assert_array_equal(*drawn)
     assert ((drawn[0][:, :, 0] - drawn[0][:, :, 2]) > 100).sum() > 10
@@ -135,10 +135,10 @@ def test_keypoints_from_a_list_and_from_annotations(model, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        (["--size", "0x0"], InputError, "'0x0' is not an image size"),
-        (["--size", "640"], InputError, "give WIDTHxHEIGHT"),
-        (["--size", "20000x20000"], RenderError, "the limits are 16384 px a side"),
-        (["--size", "999999999x1"], RenderError, "the limits are"),
+        (["--resolution", "0x0"], InputError, "'0x0' is no resolution"),
+        (["--resolution", "640"], InputError, "give WIDTHxHEIGHT"),
+        (["--resolution", "20000x20000"], RenderError, "the limits are 16384 px a side"),
+        (["--resolution", "999999999x1"], RenderError, "the limits are"),
         (["--view", "sideways"], InputError, "is not a view"),
         (["--view", "nothing.json"], InputError, "is not a view"),
         (["--out", "picture.jpeg"], InputError, "neither a PNG nor a JPEG"),
@@ -174,7 +174,7 @@ def test_a_million_faces_are_drawn(tmp_path):
     assert len(faces) > 1_000_000
     path = tmp_path / "fine.ply"
     trimesh.Trimesh(waves, faces, process=False).export(path)
-    _run(path, "--out", tmp_path / "x.png", "--size", "160x120")
+    _run(path, "--out", tmp_path / "x.png", "--resolution", "160x120")
     assert (_pixels(tmp_path / "x.png") != (228, 230, 233)).any(axis=2).mean() > 0.1
 
 
@@ -266,6 +266,6 @@ def test_textures_of_the_model_are_not_written_over(model, capsys) -> None:
     texture = model.with_name("box.png")
     Image.new("RGB", (4, 4), (200, 30, 30)).save(texture)
     before = texture.read_bytes()
-    line = refusal_line(capsys, "render", model, "--out", texture, "--size", "32x24")
+    line = refusal_line(capsys, "render", model, "--out", texture, "--resolution", "32x24")
     assert line == f"{texture}: what is to be written is made from this file; give another name"
     assert texture.read_bytes() == before

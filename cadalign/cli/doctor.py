@@ -8,14 +8,13 @@ import time
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from cadalign.cli.common import JsonOption, answer, new_console, print_json, waiting
+from cadalign.cli.common import JsonOption, answer, print_json, waiting
 from cadalign.errors import InputError
 
 if TYPE_CHECKING:
     from cadalign.datasets import PhotoSummary
-    from cadalign.render.probe import Probe
 
 # Problems of a data set that are printed; JSON has all.
 _SHOWN = 10
@@ -44,10 +43,10 @@ class Doctor(JsonOption):
         with waiting("trying the renderers, each in a process of its own ..."):
             health = examine()
         if self.json:
-            print_json(asdict(health))
+            print_json(health)
         else:
             _print(health)
-        return 0 if health.renderers[-1].works else 1
+        return 0 if health["renderers"][-1]["works"] else 1
 
     def _compile(self) -> int:
         from cadalign.cli.compile_ahead import compile_ahead
@@ -76,90 +75,56 @@ class Doctor(JsonOption):
         return 0 if summary.photos else 1
 
 
-def _print(health: Health) -> None:
-    from rich.table import Column, Table
-
-    heads = (
-        "renderer",
-        "works",
-        Column("ms", justify="right"),
-        "versions",
-        "drawn by / what is wrong",
-    )
-    caption = "ms: a frame of 640 x 480 px, 20,480 triangles"
-    table = Table(*heads, title="Renderers", caption=caption)
-    for renderer in health.renderers:
-        table.add_row(
-            renderer.name,
-            "yes" if renderer.works else "no",
-            "" if renderer.milliseconds is None else f"{renderer.milliseconds:.0f}",
-            renderer.versions,
-            renderer.detail,
+def _print(health: dict[str, Any]) -> None:
+    for each in health["renderers"]:
+        state = (
+            "does not work" if each["milliseconds"] is None else f"{each['milliseconds']:.0f} ms"
         )
-    new_console(stderr=False).print(table)
-    answer(f"--renderer auto takes: {health.best}")
-    for name, command in health.remedies.items():
+        answer(f"{each['name']:9} {state:13} {each['versions']}; {each['detail']}")
+    answer("(a frame of 640 x 480 px, 20,480 triangles)")
+    answer(f"--renderer auto takes: {health['best']}")
+    for name, command in health["remedies"].items():
         answer(f"To enable {name}: {command}")
-    answer(f"Python {health.python}, NumPy {health.numpy}, Numba {health.numba}")
-    answer(f"Cores: {health.cores}, of which this process may use {health.usable_cores}")
-    answer(f"Compiled solvers: {health.cache}")
+    answer(f"Python {health['python']}, NumPy {health['numpy']}, Numba {health['numba']}")
+    answer(f"Cores: {health['cores']}, of which this process may use {health['usable_cores']}")
+    answer(f"Compiled solvers: {health['cache']}")
 
 
 def _print_data(summary: PhotoSummary) -> None:
-    from rich.table import Column, Table
-
     answer(f"{summary.root}: {summary.kind}")
     answer(f"{summary.photos} of {summary.records} photos can be read, {summary.images} with image")
-    table = Table("category", Column("objects", justify="right"), title="Objects")
-    for category, count in summary.categories.items():
-        table.add_row(category, str(count))
-    new_console(stderr=False).print(table)
     answer(
         f"{summary.objects} objects: {summary.with_pose} with pose, {summary.with_keypoints} with "
         f"keypoints, {summary.with_model} with CAD model, {summary.with_mask} with mask"
     )
+    answer(", ".join(f"{count} {category}" for category, count in summary.categories.items()))
     for problem in summary.problems[:_SHOWN]:
         answer(f"Left out: {problem}")
     if len(summary.problems) > _SHOWN:
         answer(f"... and {len(summary.problems) - _SHOWN} more problems; --json has all")
 
 
-@dataclass(frozen=True)
-class Health:
-    """Findings of `examine`."""
+def examine() -> dict[str, Any]:
+    """Try every renderer in a process of its own and collect the rest; takes some seconds.
 
-    renderers: tuple[Probe, ...]
-    """All of them, ray casting last."""
-    best: str
-    """The renderer that "auto" selects."""
-    remedies: dict[str, str]
-    """For each renderer that does not work, the commands that would enable it."""
-    cores: int
-    usable_cores: int
-    """Those that this process may use."""
-    cache: str
-    """Location and state of the cache of compiled solvers."""
-    python: str
-    numpy: str
-    numba: str
-
-
-def examine() -> Health:
-    """Try every renderer in a process of its own and collect the rest; takes some seconds."""
+    ``renderers`` are all of them, ray casting last; ``best`` is what "auto" selects, ``remedies``
+    are the commands that would enable what does not work.
+    """
     from cadalign.render.probe import REMEDIES, RENDERERS, best_renderer, probe_renderer
 
-    renderers = tuple(probe_renderer(name, timed=True) for name in RENDERERS)
-    return Health(
-        renderers=renderers,
-        best=best_renderer(),
-        remedies={each.name: REMEDIES[each.name] for each in renderers if not each.works},
-        cores=os.cpu_count() or 1,
-        usable_cores=_usable_cores(),
-        cache=compiled_cache(),
-        python=platform.python_version(),
-        numpy=version("numpy"),
-        numba=version("numba"),
-    )
+    renderers = [asdict(probe_renderer(name, timed=True)) for name in RENDERERS]
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    names = [each["name"] for each in renderers if not each["works"]]
+    return {
+        "renderers": renderers,
+        "best": best_renderer(),
+        "remedies": {name: REMEDIES[name] for name in names},
+        "cores": os.cpu_count() or 1,
+        "usable_cores": usable or 1,
+        "cache": compiled_cache(),
+        "python": platform.python_version(),
+        **{name: version(name) for name in ("numpy", "numba")},
+    }
 
 
 def compiled_cache() -> str:
@@ -184,9 +149,3 @@ def require_cache() -> None:
     if not can_write(folder):
         fix = "set NUMBA_CACHE_DIR to a folder that can be"
         raise InputError(f"{folder} cannot be written to", where="--compile", fix=fix)
-
-
-def _usable_cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

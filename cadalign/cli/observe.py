@@ -36,8 +36,8 @@ class Observe(EvidenceOptions):
 
     keypoints: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="KEYPOINTS")]
     """COCO keypoint JSON (MMPose, Detectron2, ultralytics), or CSV with the columns name, u, v."""
-    model_keypoints: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL_KEYPOINTS")]
-    """The model's keypoints: model.keypoints.json."""
+    model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
+    """The model: its keypoints, NAME.keypoints.json, or the mesh that these lie beside."""
     image: Path | None = None
     """The photo; its name selects among the file's images."""
     out: Path | None = None
@@ -57,8 +57,8 @@ class Observe(EvidenceOptions):
     def run(self) -> int:
         """Write the observation; returns the exit code."""
         objects = read_image_keypoints(self.keypoints)
-        model = ModelKeypoints.load(self.model_keypoints)
-        with in_file(self.model_keypoints):
+        model = ModelKeypoints.load(self.model)
+        with in_file(self.model):
             check_keypoints(model.xyz, model.model, where="keypoints.xyz")
         name = None if self.image is None else str(self.image)
         with named_as_flags(self):
@@ -73,7 +73,7 @@ class Observe(EvidenceOptions):
                 sigma_from_scores=self.weigh,
             )
         out = self.out or self.keypoints.with_suffix(".observation.json")
-        inputs = [self.keypoints, self.model_keypoints, model.model, self.camera, self.image]
+        inputs = [self.keypoints, self.model, model.model, self.camera, self.image]
         with keeping([*inputs, self.mask]):
             make_folder_of(out)
             if self.mask is None and found.segmentation is not None and self.segmentation:
@@ -96,7 +96,7 @@ class Observe(EvidenceOptions):
         """Write the mask beside the keypoints, if a fit can use it; its path."""
         camera = observation.camera
         if not camera.focal_known or observation.model is None:
-            missing = "--camera" if not camera.focal_known else "a model in MODEL_KEYPOINTS"
+            missing = "--camera" if not camera.focal_known else "the mesh of MODEL"
             say(f"The mask is left out: a fit to it needs {missing}.")
             return None
         size = {"width": camera.width, "height": camera.height}

@@ -88,7 +88,7 @@ def test_every_observation_of_a_folder_is_fitted(
 def test_a_detectors_file_needs_no_observations(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    camera, model = ["--camera", str(folder / "K.txt")], str(folder / "model.keypoints.json")
+    camera, model = ["--camera", str(folder / "K.txt")], str(folder / "model.obj")  # beside it
     out = ["--out", str(folder / "out"), "--no-picture"]
     assert main(["fit", str(folder / "found.json"), *camera, "--model", model, *out]) == 0
     results = Results.open(folder / "out")

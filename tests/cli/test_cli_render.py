@@ -13,7 +13,7 @@ import tyro
 from PIL import Image
 from support.refusals import refusal_line
 
-from cadalign.cli.doctor import Doctor, Health, compiled_cache
+from cadalign.cli.doctor import Doctor, compiled_cache
 from cadalign.cli.render import Render
 from cadalign.datasets import load_mesh
 from cadalign.errors import DataError, InputError, RenderError
@@ -191,7 +191,7 @@ def _health(**changes):
     good = Probe("raycast", True, "processor", "trimesh 5, embreex 4", 80.0)
     bad = Probe("pyrender", False, "OpenGL does not start", "pyrender2 0.2")
     values = {
-        "renderers": (bad, good),
+        "renderers": [vars(bad), vars(good)],
         "best": "raycast",
         "remedies": {"pyrender": "sudo apt-get install libegl1 libgl1"},
         "cores": 8,
@@ -201,7 +201,7 @@ def _health(**changes):
         "numpy": "2.4",
         "numba": "0.68",
     }
-    return Health(**{**values, **changes})
+    return {**values, **changes}
 
 
 def test_doctor_tells_what_works_and_how_to_enable_the_rest(monkeypatch, capsys):
@@ -219,7 +219,7 @@ def test_doctor_tells_what_works_and_how_to_enable_the_rest(monkeypatch, capsys)
 
 def test_doctor_fails_where_not_even_ray_casting_works(monkeypatch, capsys):
     broken = Probe("raycast", False, "embreex is gone", "")
-    monkeypatch.setattr("cadalign.cli.doctor.examine", lambda: _health(renderers=(broken,)))
+    monkeypatch.setattr("cadalign.cli.doctor.examine", lambda: _health(renderers=[vars(broken)]))
     assert Doctor().run() == 1
 
 

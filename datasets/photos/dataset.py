@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from codecs import BOM_UTF8
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, MutableMapping
 from contextlib import contextmanager
@@ -10,16 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-import msgspec
-from msgspec import Raw
-
 from cadalign.datasets.photos.photo import Photo, PhotoObject
 from cadalign.datasets.records import RecordSet
-from cadalign.errors import CadalignError, DataError, brief
-from cadalign.io.documents import convert, in_file
-from cadalign.io.files import damaged, read_bytes
+from cadalign.errors import CadalignError, DataError, quote
+from cadalign.io.documents import read_json
+from cadalign.io.files import damaged
 
-T = TypeVar("T")
 K = TypeVar("K", bound=Hashable)
 _Record = TypeVar("_Record")
 
@@ -154,34 +149,15 @@ def read_each(
     return tuple(found), tuple(problems)
 
 
-def read_list(path: Path) -> list[Raw]:
-    """Read a JSON file that holds a list, its entries not yet parsed.
+def read_list(path: Path) -> list[Any]:
+    """Read a JSON file that holds a list.
 
     Raises DataError if it cannot be read, is no valid JSON (cut short, say), or holds no list.
     """
-    return list(_decode(read_bytes(path), list[Raw], "a list", path))
-
-
-def parse(raw: Raw, kind: type[T] | Any, *, path: Path, where: str) -> T | Any:
-    """Parse an entry as a declared type; errors name the file and the place in it.
-
-    Raises DataError if it is not of this type, or no valid JSON.
-    """
-    data = _decode(raw, Any, "", f"{path}: {where}")
-    with in_file(path):
-        return convert(data, kind, where)
-
-
-def _decode(data: bytes | Raw, kind: Any, name: str, where: Path | str) -> Any:
-    if isinstance(data, bytes):
-        data = data.removeprefix(BOM_UTF8)
     try:
-        return msgspec.json.decode(data, type=kind)
-    except msgspec.ValidationError:
-        raise DataError(f"expected {name}", where=str(where)) from None
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        what = f"not valid JSON: {brief(error)}"
-        raise damaged(what, where) if name else DataError(what, where=str(where)) from None
-    except RecursionError:
-        what = "not valid JSON: nested too deeply" if name else "nested too deeply"
-        raise DataError(what, where=str(where)) from None
+        found = read_json(path)
+    except DataError as error:
+        raise damaged(error.what, error.where) from None
+    if not isinstance(found, list):
+        raise DataError(f"{quote(found)} is not a list", where=str(path))
+    return found

@@ -28,13 +28,7 @@ from cadalign.estimation.results import failed_row
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.evaluation.options import ExperimentOptions, absolute_paths
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.work import (
-    Columns,
-    Plan,
-    Row,
-    fingerprint,
-    fingerprint_of_files,
-)
+from cadalign.evaluation.runs.work import Columns, Plan, Row, fingerprint
 from cadalign.io.documents import in_file, parse_json
 from cadalign.io.evidence import ObservedImage
 from cadalign.io.files import read_bytes, read_text
@@ -265,13 +259,7 @@ def plan_run(options: ManyOptions, folder: RunFolder) -> Plan[ObservationTask]:
         what = f"{photos} is not a folder of photos"
         raise InputError(what, where="images", fix="give the photos' folder, or leave it out")
     model = _model_keypoints(options) if tasks.has_detections else None
-    config = {
-        **options.as_config(),
-        "contents": tasks.fingerprint(),
-        **options.contents(),
-    }
-    if files := tasks.named_files:
-        config["files"] = fingerprint_of_files(files)
+    config = options.as_config() | {"contents": tasks.fingerprint()} | options.contents()
     drawn_in = folder.made_for_pictures() if options.pictures else None
     chunk = max(1, min(LARGEST_CHUNK, len(tasks) // _LEAST_CHUNKS))
     estimates = ManyEstimates(absolute_paths(options), model, drawn_in)

@@ -20,7 +20,6 @@ from cadalign.export.results import object_of
 from cadalign.io.documents import in_file, parse_json, read_json
 from cadalign.io.files import keeping
 from cadalign.io.kinds import FIT
-from cadalign.io.meshes.files import mesh_at
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.model_overlay import mesh_of
 from cadalign.shapes.model import ShapeModel
@@ -65,7 +64,6 @@ def exported_object(
     for view, image in zip(result.views, seen.views, strict=True):
         _require_same(len(view.residuals), len(image.points_2d), path, "keypoints")
     if result.method != "align":
-        mesh = None if seen.model is None else mesh_at(seen.model)
         own = _labels(seen)  # a fit of pairs knows rows, of which a photo may lack some
         views = tuple(replace(view, ids=own) for view in result.views)
         result = replace(result, ids=own, views=views)
@@ -75,7 +73,8 @@ def exported_object(
         if model is None and any(tuple(view.ids) != own for view, own in pairs):
             what, fix = "its keypoints are not the fit's", "give the observation that was fitted"
             raise DataError(what, where=str(path), fix=fix)
-        mesh = mesh_of(seen, replace(result, model=model))
+        result = replace(result, model=model)
+    mesh = mesh_of(seen, result)
     name = "model" if seen.model is None else seen.model.stem
     images = [view.image for view in seen.views]
     return object_of(result, mesh=mesh, images=images, name=name, **how)

@@ -23,7 +23,6 @@ from cadalign.errors import DataError, InputError, require_kind
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.results import Results
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.parallel import Workers
 from cadalign.evaluation.runs.run import OnProgress, execute, workers_of
 from cadalign.io.documents import convert
 from cadalign.io.evidence import Size
@@ -125,18 +124,16 @@ def run_many(
     dask: str | None,
     on_progress: OnProgress = lambda progress: None,
 ) -> None:
-    """Do the run that the options describe, or what is left of it; see `fit_many`."""
+    """Do the run that the options describe, or what is left of it; see `fit_many`.
+
+    By default processes do it, but few observations.
+    """
     plan = plan_run(options, folder)
-    pool = pool_of(len(plan.tasks), workers, dask, threads=options.threads)
+    if workers is None:
+        workers = 0 if len(plan.tasks) < _FEW else -1
+    pool = workers_of(workers, dask, threads=options.threads)
     execute(plan, folder, workers=pool, on_progress=on_progress)
     write_csv(folder)
-
-
-def pool_of(count: int, workers: int | None, dask: str | None, *, threads: int = 1) -> Workers:
-    """The workers of a run of so many tasks; by default processes, for few tasks none."""
-    if workers is None:
-        workers = 0 if count < _FEW else -1
-    return workers_of(workers, dask, threads=threads)
 
 
 def options_of(given: dict[str, Any]) -> FitRunOptions:

@@ -74,14 +74,9 @@ class ObservationTasks(Sequence[ObservationTask]):
         """True where an input is a detector's file."""
         return bool(self._objects)
 
-    @property
-    def named_files(self) -> tuple[Path, ...]:
-        """Photos, masks and meshes that the observations name, each once."""
-        return tuple(self._named)
-
     def fingerprint(self) -> str:
-        """A text that changes with the content of the inputs."""
-        return fingerprint("\n".join(self._marks))
+        """A text that changes with the inputs, and with the photos, masks and meshes they name."""
+        return fingerprint("\n".join((*self._marks, fingerprint_of_files(self._named))))
 
     def __len__(self) -> int:
         return len(self._cells) // _CELLS

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cadalign.errors import InputError
 from cadalign.io.documents import written_path
 
 if TYPE_CHECKING:
-    from cadalign.arrays import BoolArray, FloatArray
     from cadalign.estimation.result import Result
     from cadalign.estimation.view import View
     from cadalign.io.observation import Observation
@@ -42,19 +41,14 @@ def drawn(
     """
     if not picture and not overlay:
         return [], []
-    from cadalign.io.meshes.files import mesh_at
     from cadalign.render.drawing.model_overlay import draw_result, mesh_of, photo_of
 
     seen = list(zip(observation.views, result.views, strict=True))
     photos = [photo_of(image, view.camera) for image, view in seen]
-    mesh = shown = bounds = None
-    masks: list[FloatArray | BoolArray | None] = [None]
-    if views is not None:
-        mesh = shown = mesh_of(observation, result)
-        masks = [view.mask_image for view in views]
-    elif observation.model is not None:
-        mesh = mesh_at(observation.model)
-        bounds = mesh.bounds
+    mesh = mesh_of(observation, result)
+    masks: list[Any] = [None] if views is None else [view.mask_image for view in views]
+    shown = mesh if views is not None else None
+    bounds = mesh.bounds if views is None and mesh is not None else None
     pictures = [
         draw_result(image, result, photo=photo, mesh=shown, bounds=bounds, mask=mask, number=number)
         for number, (image, photo, mask) in enumerate(

@@ -345,7 +345,7 @@ def _decode_runs(runs: _Runs, width: int, height: int) -> BoolArray:
         if inside is None or coco.encode(np.asfortranarray(inside))["counts"] != coded["counts"]:
             what = "is not the text of a whole mask of this image"
             raise DataError(what, where=where, fix=_MASK_FIX)
-        return inside != 0
+        return np.asarray(inside != 0)
     if sum(runs.counts) != width * height:
         what = f"the runs have {sum(runs.counts)} pixels, the image {width * height}"
         raise DataError(what, where=where, fix=_MASK_FIX)

@@ -1,4 +1,4 @@
-"""`cadalign doctor`: check this machine, or a data set of photos."""
+"""`cadalign doctor`: check this machine, and compile ahead for it."""
 
 from __future__ import annotations
 
@@ -7,37 +7,25 @@ import platform
 import time
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from cadalign.cli.common import JsonOption, answer, print_json, waiting
 from cadalign.errors import InputError
-
-if TYPE_CHECKING:
-    from cadalign.datasets import PhotoSummary
-
-# Problems of a data set that are printed; JSON has all.
-_SHOWN = 10
 
 
 @dataclass(frozen=True)
 class Doctor(JsonOption):
     """Check the renderers and their speed, and show how to enable missing ones.
 
-    Also shows the processor cores and the cache of compiled solvers. With --data, lists what lies
-    in a folder of photos instead: its format, and how many photos and objects can be read. With
-    --compile, compiles the solvers ahead.
+    Also shows the processor cores and the cache of compiled solvers. With --compile, compiles the
+    solvers ahead.
     """
 
-    data: Path | None = None
-    """Folder of a data set of photos, in any known format (see cadalign.datasets.open)."""
     compile: bool = False
     """Compile all solvers now, as for a Docker image, in place of when they are first called."""
 
     def run(self) -> int:
-        """Run the checks; returns the exit code, 0 if ray casting works or photos can be read."""
-        if self.data is not None:
-            return self._check_data(self.data)
+        """Run the checks; returns the exit code, 0 if ray casting works."""
         if self.compile:
             return self._compile()
         with waiting("trying the renderers, each in a process of its own ..."):
@@ -62,18 +50,6 @@ class Doctor(JsonOption):
             answer(f"Compiled in {found['seconds']} s: {found['cache']}")
         return 0
 
-    def _check_data(self, folder: Path) -> int:
-        from cadalign.datasets import open_photos
-
-        with waiting("reading the annotations ...") as show:
-            dataset = open_photos(folder)
-            summary = dataset.summary(progress=lambda count: show(f"{count} photos read ..."))
-        if self.json:
-            print_json({**asdict(summary), "root": str(summary.root)})
-        else:
-            _print_data(summary)
-        return 0 if summary.photos else 1
-
 
 def _print(health: dict[str, Any]) -> None:
     for each in health["renderers"]:
@@ -88,20 +64,6 @@ def _print(health: dict[str, Any]) -> None:
     answer(f"Python {health['python']}, NumPy {health['numpy']}, Numba {health['numba']}")
     answer(f"Cores: {health['cores']}, of which this process may use {health['usable_cores']}")
     answer(f"Compiled solvers: {health['cache']}")
-
-
-def _print_data(summary: PhotoSummary) -> None:
-    answer(f"{summary.root}: {summary.kind}")
-    answer(f"{summary.photos} of {summary.records} photos can be read, {summary.images} with image")
-    answer(
-        f"{summary.objects} objects: {summary.with_pose} with pose, {summary.with_keypoints} with "
-        f"keypoints, {summary.with_model} with CAD model, {summary.with_mask} with mask"
-    )
-    answer(", ".join(f"{count} {category}" for category, count in summary.categories.items()))
-    for problem in summary.problems[:_SHOWN]:
-        answer(f"Left out: {problem}")
-    if len(summary.problems) > _SHOWN:
-        answer(f"... and {len(summary.problems) - _SHOWN} more problems; --json has all")
 
 
 def examine() -> dict[str, Any]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, MutableMapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,36 +15,6 @@ from cadalign.io.files import damaged
 
 K = TypeVar("K", bound=Hashable)
 _Record = TypeVar("_Record")
-
-
-@dataclass(frozen=True)
-class PhotoSummary:
-    """Counts of what a data set of photos holds."""
-
-    kind: str
-    """The data set's format."""
-    root: Path
-    """Its folder."""
-    records: int
-    """Photos that its annotations list."""
-    photos: int
-    """Those that can be read."""
-    images: int
-    """Those whose image is there."""
-    objects: int
-    """Objects in them."""
-    categories: dict[str, int]
-    """Number of objects of each category, the most frequent first."""
-    with_keypoints: int
-    """Objects with keypoints."""
-    with_model: int
-    """Objects with a CAD model."""
-    with_pose: int
-    """Objects with a pose."""
-    with_mask: int
-    """Objects with a mask."""
-    problems: tuple[str, ...]
-    """Why records or objects could not be read."""
 
 
 class PhotoDataset(RecordSet[Photo]):
@@ -76,38 +44,6 @@ class PhotoDataset(RecordSet[Photo]):
         """List the files of the annotations, by which a run knows those that it began with."""
         found = (path for pattern in self.patterns for path in self.root.glob(pattern))
         return sorted({path for path in found if path.is_file()})
-
-    def summary(self, *, progress: Callable[[int], object] | None = None) -> PhotoSummary:
-        """Read all records, not the images, and count what there is.
-
-        ``progress`` is called with the number of photos read after each.
-        """
-        photos = images = 0
-        objects: Counter[str] = Counter()
-        having = dict.fromkeys(("keypoints", "model", "pose", "mask"), 0)
-        for photo in self:
-            photos += 1
-            images += photo.image is not None
-            for found in photo.objects:
-                objects[found.category] += 1
-                truth = found.truth
-                having["keypoints"] += found.keypoints is not None
-                having["model"] += found.model is not None
-                having["pose"] += truth.cam_from_model is not None
-                having["mask"] += found.mask_path is not None
-            if progress is not None:
-                progress(photos)
-        return PhotoSummary(
-            kind=self.kind,
-            root=self.root,
-            records=len(self),
-            photos=photos,
-            images=images,
-            objects=objects.total(),
-            categories=dict(objects.most_common()),
-            **{f"with_{name}": count for name, count in having.items()},
-            problems=tuple(str(problem) for problem in self.problems.values()),
-        )
 
 
 @contextmanager

@@ -25,7 +25,6 @@ from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoin
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.estimation.result import Result
 from cadalign.estimation.results import failed_row
-from cadalign.estimation.warning import EstimateWarning
 from cadalign.evaluation.options import ExperimentOptions, absolute_paths
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import Columns, Plan, Row, fingerprint
@@ -44,12 +43,11 @@ _ENCODER = msgspec.json.Encoder(enc_hook=np.generic.item)
 
 
 class Estimated(NamedTuple):
-    """Result of an observation, what it is the alignment of, and cells that the tables add."""
+    """Result of an observation, what it is the alignment of, and further cells of the tables."""
 
     observation: Observation
     result: Result
     cells: Row
-    record: Row
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,12 +119,7 @@ class FitRunOptions(ManyOptions):
 
     def estimate_of(self, seen: Observation, where: str) -> Estimated:
         result, _ = self.estimate.fit(seen, where)
-        texts = [(number, _photo_doubt(view)) for number, view in enumerate(seen.views)]
-        doubts = [EstimateWarning("camera", text, number) for number, text in texts if text]
-        if doubts:
-            posterior = result.posterior.stating(warnings=(*doubts, *result.warnings))
-            result = replace(result, posterior=posterior)
-        return Estimated(seen, result, {}, {})
+        return Estimated(seen, result, {})
 
     def contents(self) -> dict[str, Any]:
         shape = self.estimate.shape
@@ -199,14 +192,16 @@ class ManyEstimates:
             return _failed(task, str(error), seen)
         seen, result = found.observation, found.result
         row = naming_row(task.row, task.name, seen) | result_row(result) | found.cells
-        troubles = [("picture", text) for text in self._draw(task, row, seen, result)]
-        lost = [view.text_of_not_found for view in seen.views]
-        troubles += [("left-out", text) for text in lost if text]
-        row["warning_count"] += len(troubles)
+        troubles = {
+            "picture": self._draw(task, row, seen, result),
+            "camera": [_photo_doubt(view) for view in seen.views],
+            "left-out": [view.text_of_not_found for view in seen.views],
+        }
+        told = [(kind, text) for kind, texts in troubles.items() for text in texts if text]
+        row["warning_count"] += len(told)
         for column, name in enumerate(("warning_kinds", "warnings")):
-            more = [trouble[column] for trouble in troubles]
-            row[name] = "; ".join(filter(None, (row[name], *more)))
-        return row | _record(seen, found) | {"seconds": time.perf_counter() - start}
+            row[name] = "; ".join(filter(None, (row[name], *(each[column] for each in told))))
+        return row | _record(seen, result) | {"seconds": time.perf_counter() - start}
 
     def _draw(
         self, task: ObservationTask, row: Row, seen: Observation, result: Result | None
@@ -303,13 +298,13 @@ def _failed(task: ObservationTask, reason: str, seen: Observation | None) -> Row
     return naming_row(task.row, task.name, seen) | failed_row(reason) | _record(seen, None)
 
 
-def _record(seen: Observation | None, found: Estimated | None) -> Row:
+def _record(seen: Observation | None, result: Result | None) -> Row:
     """Observation and result as JSON, but for its time, on which no two runs agree."""
     record: Row = {"observation": "", "result": ""}
     if seen is not None:
         record["observation"] = _ENCODER.encode(seen.to_dict(states_origins=True)).decode()
-    if found is not None:
-        data = found.result.to_dict()
+    if result is not None:
+        data = result.to_dict()
         data["stats"]["seconds"] = 0.0
-        record |= {"result": _ENCODER.encode(data).decode(), **found.record}
+        record["result"] = _ENCODER.encode(data).decode()
     return record

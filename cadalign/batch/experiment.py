@@ -262,7 +262,7 @@ def plan_run(options: ManyOptions, folder: RunFolder) -> Plan[ObservationTask]:
 
 
 def _model_keypoints(options: ManyOptions) -> ModelKeypoints:
-    """The keypoints that a detector's are paired with: those of --model, or else the options'."""
+    """The keypoints that a detector's are paired with: the model's, or else the options'."""
     if options.detector.model is not None:
         return ModelKeypoints.load(options.detector.model)
     if (found := options.keypoints) is None:

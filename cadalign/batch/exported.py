@@ -146,7 +146,7 @@ def _observation_of(fit: Path, data: Mapping[str, Any]) -> Path:
         return beside
     raise InputError(
         f"{fit} does not tell which observation it is the fit of",
-        where="--observation",
+        where="observation",
         fix="give the observation file that was fitted",
     )
 

@@ -101,8 +101,14 @@ class Fit(ManyCommand, EvidenceOptions):
 
     def _fit_mask(self, mask: Path, model: Path) -> int:
         """Align the model to a mask alone; returns the exit code."""
+        from cadalign.datasets.models.model_keypoints import ModelKeypoints
         from cadalign.io.images import photo_size
 
+        if model.suffix.lower() == ".json":
+            mesh = ModelKeypoints.load(model).model
+            if mesh is None:
+                raise InputError(f"{model} names no mesh", where="--model", fix="give the mesh")
+            model = mesh
         nothing, camera = np.empty((0, 3)), Camera.without_focal(*photo_size(mask))
         with named_as_flags(self):
             self.refuse_of_many("model")

@@ -18,7 +18,6 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 from msgspec import field
-from pycocotools import mask as coco
 
 from cadalign.arrays import BoolArray, FloatArray, is_number
 from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
@@ -333,6 +332,8 @@ def _polygons(segmentation: Any) -> list[list[float]]:
 
 
 def _decode_runs(runs: _Runs, width: int, height: int) -> BoolArray:
+    from pycocotools import mask as coco  # takes a while to import
+
     if runs.size != (height, width):
         what = f"the mask is {runs.size[1]} x {runs.size[0]}, the image {width} x {height}"
         raise DataError(what, where="segmentation.size", fix=_MASK_FIX)
@@ -356,6 +357,8 @@ def _decode_runs(runs: _Runs, width: int, height: int) -> BoolArray:
 
 def _decoded(coded: dict[str, Any]) -> npt.NDArray[np.uint8] | None:
     """The pixels of compressed run lengths; None where these are of more than there are."""
+    from pycocotools import mask as coco  # takes a while to import
+
     with suppress(ValueError), warnings.catch_warnings(action="ignore"):  # of NumPy's conventions
         return np.asarray(coco.decode(coded))
     return None
@@ -363,6 +366,8 @@ def _decoded(coded: dict[str, Any]) -> npt.NDArray[np.uint8] | None:
 
 def _fill(polygons: Sequence[Sequence[float]], width: int, height: int) -> BoolArray:
     """Pixels (height, width) inside any of the polygons."""
+    from pycocotools import mask as coco  # takes a while to import
+
     for number, polygon in enumerate(polygons):
         where = f"segmentation[{number}]"
         if len(polygon) % 2:

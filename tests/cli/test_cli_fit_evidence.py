@@ -387,6 +387,11 @@ class TestPhotoAndMaskAlone:
         overlap = cast_geometry(Scene(load_mesh(mesh)), CAMERA, result.alignment).mask
         assert (overlap & shown).sum() > 0.95 * (overlap | shown).sum()
         assert (tmp_path / "a_fit" / "overlay.png").exists()
+        points = {"format": "cadalign model keypoints", "version": 1, "keypoints": []}
+        (tmp_path / "k.json").write_text(json.dumps(points | {"model": mesh.name}))
+        named = ["--model", str(tmp_path / "k.json"), *given[2:], "--out", str(tmp_path / "named")]
+        assert main(["fit", "--mask", str(tmp_path / "a.png"), *named]) == 0
+        assert Result.load(tmp_path / "named" / "fit.json").alignment == result.alignment
         # The other commands go on from it.
         assert main(["export", str(tmp_path / "a_fit"), "--to", str(tmp_path / "a.obj")]) == 0
         placed = result.alignment.apply(load_mesh(mesh).vertices)

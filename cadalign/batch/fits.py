@@ -74,7 +74,7 @@ def fit_many(
         a camera for all. A number as ``focal`` is the focal length [px] of all images. What an
         observation stores holds where an option is at its default or None: unlike those of
         `cadalign.fit`, ``sigma=None`` and ``focal_prior=None`` mean the observation's, or the
-        default; ``similar=True`` estimates sigma, ``focal_prior="none"`` takes no prior.
+        default; ``sigma="none"`` estimates it, ``focal_prior="none"`` takes no prior.
 
     Returns
     -------

@@ -11,7 +11,7 @@ import tyro
 
 from cadalign.cli.common import make_folder_of, say
 from cadalign.cli.options import named_as_flags
-from cadalign.errors import DataError, InputError
+from cadalign.errors import InputError
 from cadalign.io.images import JPEG_ENDING
 
 if TYPE_CHECKING:
@@ -40,8 +40,7 @@ class Render:
     resolution: str = "640x480"
     """Width and height in pixels; of a contact sheet, each picture's."""
     keypoints: Path | None = None
-    """JSON file with keypoints to draw: a list of [x, y, z], a model's .keypoints.json, or
-    KeypointNet's annotations."""
+    """Keypoints to draw: the model's NAME.keypoints.json, or KeypointNet's annotations."""
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Stretch along the model's axes."""
     fov: float = 35.0
@@ -53,6 +52,7 @@ class Render:
 
     def run(self) -> int:
         """Draw and write; returns the exit code."""
+        from cadalign.datasets.models.model_keypoints import ModelKeypoints
         from cadalign.io.images import write_image
         from cadalign.io.meshes.files import load_mesh
         from cadalign.render.drawing.pictures import contact_sheet
@@ -64,7 +64,7 @@ class Render:
             scene, renderer = Scene(load_mesh(self.model)), make_renderer(self.renderer)
             keypoints = None
             if self.keypoints is not None:
-                keypoints = _read_keypoints(self.keypoints, self.model)
+                keypoints = ModelKeypoints.load(self.keypoints, model=self.model).xyz
             images = [
                 self._draw(scene, renderer, camera, each, keypoints) for each in views.values()
             ]
@@ -125,18 +125,3 @@ class Render:
             return image
         visible = visible_keypoints(scene, keypoints, camera, pose)
         return keypoint_picture(image, camera, keypoints, pose, visible=visible)
-
-
-def _read_keypoints(path: Path, model: Path) -> FloatArray:
-    """Read keypoints (k, 3) from a list of [x, y, z] or as `ModelKeypoints.load` does."""
-    from cadalign.arrays import as_points
-    from cadalign.datasets.models.model_keypoints import ModelKeypoints
-    from cadalign.io.documents import read_json
-
-    data = read_json(path)
-    if isinstance(data, dict) or (isinstance(data, list) and data and isinstance(data[0], dict)):
-        return ModelKeypoints.load(path, model=model).xyz
-    try:
-        return as_points(data, name="keypoints", dimension=3)
-    except InputError as error:
-        raise DataError(error.what, where=str(path), fix="give a list of [x, y, z]") from None

@@ -15,7 +15,6 @@ from support.refusals import refusal_line
 
 from cadalign.cli.doctor import Doctor, compiled_cache
 from cadalign.cli.render import Render
-from cadalign.datasets import load_mesh
 from cadalign.errors import DataError, InputError, RenderError
 from cadalign.render.probe import RENDERERS, Probe, probe_renderer
 
@@ -92,33 +91,17 @@ def test_the_stretch_shows(model, tmp_path):
 
 
 @pytest.mark.long
-def test_keypoints_from_a_list_and_from_annotations(model, tmp_path):
+def test_keypoints_from_their_file_and_from_annotations(model, tmp_path):
     corner = [0.2, 0.4, -0.3]
-    (tmp_path / "points.json").write_text(json.dumps([corner]))
-    entry = {
-        "class_id": "03001627",
-        "model_id": "parts",
-        "keypoints": [
-            {
-                "xyz": corner,
-                "semantic_id": 0,
-                "mesh_info": {"face_index": 0, "face_uv": [1, 0, 0]},
-            }
-        ],
-    }
+    mesh_info = {"face_index": 0, "face_uv": [1, 0, 0]}
+    keypoint = {"xyz": corner, "semantic_id": 0, "mesh_info": mesh_info}
+    entry = {"class_id": "03001627", "model_id": "parts", "keypoints": [keypoint]}
     (tmp_path / "chair.json").write_text(json.dumps([{"model_id": "other"}, entry]))
-    xyz = load_mesh(model).surface_points([0], [[0.5, 0.25, 0.25]])[0].tolist()
-    named = {"name": "corner", "xyz": xyz}
+    named = {"name": "corner", "xyz": corner}
     own = {"format": "cadalign model keypoints", "version": 1, "keypoints": [named]}
     (tmp_path / "parts.keypoints.json").write_text(json.dumps(own))
-    (tmp_path / "same.json").write_text(json.dumps([xyz]))
-    pictures = []
-    for name in ("parts.keypoints.json", "same.json"):
-        _run(model, "--out", tmp_path / "k.png", "--keypoints", tmp_path / name)
-        pictures.append(_pixels(tmp_path / "k.png").astype(int))
-    np.testing.assert_array_equal(*pictures)
     drawn = []
-    for name in ("points.json", "chair.json"):
+    for name in ("parts.keypoints.json", "chair.json"):
         out = tmp_path / "k.png"
         _run(model, "--out", out, "--keypoints", tmp_path / name, "--resolution", "160x120")
         drawn.append(_pixels(out).astype(int))
@@ -127,9 +110,6 @@ def test_keypoints_from_a_list_and_from_annotations(model, tmp_path):
     (tmp_path / "chair.json").write_text(json.dumps([{"model_id": "other"}]))
     with pytest.raises(DataError, match="no annotations of a model whose id"):
         _run(model, "--out", out, "--keypoints", tmp_path / "chair.json")
-    (tmp_path / "points.json").write_text("[[1, 2]]")
-    with pytest.raises(DataError, match="give a list of"):
-        _run(model, "--out", out, "--keypoints", tmp_path / "points.json")
 
 
 @pytest.mark.parametrize(

@@ -163,8 +163,9 @@ class ModelKeypoints:
             file and field.
         """
         path = as_path(path)
-        if path.suffix.lower() in MESH_ENDINGS:
-            path = path.with_suffix(SUFFIX)
+        beside = path.with_suffix(SUFFIX)
+        if path.suffix.lower() in MESH_ENDINGS and os.path.isfile(beside):
+            path = beside
         data = read_json(path, MODEL_KEYPOINTS)
         if isinstance(data, list):
             return cls._from_annotations(data, path, model)

@@ -8,6 +8,7 @@ every line, ``.jsonl`` or ``.ndjson``), or a detector's file of keypoints
 from __future__ import annotations
 
 import hashlib
+import os
 from array import array
 from codecs import BOM_UTF8
 from collections.abc import Iterable, Iterator, Sequence
@@ -140,7 +141,7 @@ class ObservationTasks(Sequence[ObservationTask]):
 def _files_of(path: Path) -> Iterator[tuple[Path, Any]]:
     """The files of an input; with those of JSON their content, None if it is damaged."""
     suffix = path.suffix.lower()
-    if path.is_dir():
+    if os.path.isdir(path):  # also of a name that no file can have
         yield from _files_in(path)
     elif is_pattern(path):
         found = [Path(name) for name in sorted(glob(str(path), recursive=True))]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,7 +89,7 @@ class Fit(ManyCommand, EvidenceOptions):
         if not self.observations and self.mask is not None and self.model is not None:
             return self._fit_mask(self.mask, self.model)
         path = self.first()
-        is_file = path.suffix.lower() == ".json" and path.is_file()
+        is_file = path.suffix.lower() == ".json" and os.path.isfile(path)
         data = read_json(path) if is_file else None
         if len(self.observations) > 1 or is_of_many(path, data):
             return self._fit_many()

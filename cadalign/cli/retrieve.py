@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,7 +65,7 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
     def run(self) -> int:
         """Run the retrieval, or the retrievals; returns the exit code."""
         path = self.first()
-        is_file = path.suffix.lower() == ".json" and path.is_file()
+        is_file = path.suffix.lower() == ".json" and os.path.isfile(path)
         is_many = is_of_many(path, read_json(path) if is_file else None)
         with named_as_flags(self, self.ranking):
             how = ObservationRetrieval(

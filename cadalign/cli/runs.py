@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -200,6 +201,6 @@ def run_folder(command: ManyCommand, options: ManyOptions) -> RunFolder:
     kind, first = options.experiment, command.observations[0]
     if command.out is not None:
         return RunFolder(command.out)
-    if len(command.observations) > 1 or not first.exists():
+    if len(command.observations) > 1 or not os.path.exists(first):
         return RunFolder(first.parent / kind)
     return RunFolder(beside(first, f"_{kind}"))

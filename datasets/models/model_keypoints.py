@@ -163,9 +163,9 @@ class ModelKeypoints:
             file and field.
         """
         path = as_path(path)
-        beside = path.with_suffix(SUFFIX)
-        if path.suffix.lower() in MESH_ENDINGS and os.path.isfile(beside):
-            path = beside
+        if path.suffix.lower() in MESH_ENDINGS:
+            beside = path.with_suffix(SUFFIX)
+            path = beside if os.path.isfile(beside) else path
         data = read_json(path, MODEL_KEYPOINTS)
         if isinstance(data, list):
             return cls._from_annotations(data, path, model)

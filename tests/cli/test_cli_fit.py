@@ -227,6 +227,9 @@ def test_the_photo_is_not_drawn_over(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "nothing.json"
     assert refusal_line(capsys, "fit", str(path)) == f"{path}: no such file"
+    for name in ("a" * 300, "a" * 300 + ".json", "a" * 300 + ".jsonl"):
+        line = refusal_line(capsys, "fit", name)
+        assert line == f"{name}: cannot be read (File name too long)"
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ fuzz: $(VENV)/.installed-dev  ## call fit, every reader and the commands with ra
 	for what in fits batches readers; do PYTHONPATH=tests $(BIN)/python -m fuzz $$what $(or $(COUNT),20000) || exit 1; done
 	PYTHONPATH=tests $(BIN)/python -m fuzz commands $$(($(or $(COUNT),20000) / 20))
 
-bench: $(VENV)/.installed-dev  ## measure accuracy and speed; fail where a ratio is 20 % worse than stored (SECTIONS="cold calls")
+bench: $(VENV)/.installed-dev  ## measure accuracy and speed; fail where a ratio is 20 % worse than stored (SECTIONS="cold speed")
 	$(BIN)/python -m pytest tests/estimation/search/test_benchmarks.py --benchmark-enable --benchmark-columns=median,iqr
 	$(BIN)/python scripts/bench.py $(SECTIONS)
 

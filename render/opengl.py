@@ -1,4 +1,7 @@
-"""Colour by OpenGL, by way of pyrender; geometry, which OpenGL blurs, by ray casting."""
+"""Colour by OpenGL, by way of pyrender; geometry, which OpenGL blurs, by ray casting.
+
+Importing this module loads pyrender, which may fail in many ways: `cadalign.render.probe` does.
+"""
 
 from __future__ import annotations
 
@@ -8,19 +11,37 @@ import threading
 from contextlib import suppress
 from functools import cache, partial
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
+import numpy.typing as npt
 
+from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import RenderError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.render.drawing.canvas import ByteImage
+from cadalign.geometry.conventions import OPENGL_AXES, opengl_from_model, opengl_projection
+from cadalign.geometry.mesh import Material
+from cadalign.render.drawing.canvas import ByteImage, LinearArray, linear_from_srgb
 from cadalign.render.raycast.occlusion import darken_corners
 from cadalign.render.raycast.posed import Rectangle, pose_scene
 from cadalign.render.raycast.renderer import RaycastRenderer, check_samples, geometry_of
-from cadalign.render.raycast.surface import Studio
+from cadalign.render.raycast.surface import DARKEST, Studio, color_channels
 from cadalign.render.scene import Frame, Scene, check_image_size
 
+# pyrender and PyOpenGL read these when they are imported.
+os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
+os.environ.setdefault("PYGLET_HEADLESS", "True")
+import pyrender
+
+_ROUGHNESS = 0.55
+# OpenGL's own number; pyrender exports no name for it.
+_TRIANGLES = 4
+_NEAR_SHARE = 1e-4
+# The clipping planes stand this far off the model, in diagonals.
+_CLEARANCE = 0.01
+# Half of the sky's light comes from above; the shader gives the ground's to all sides alike.
+_SKY_SHARE = 0.5
 _LARGEST = 4096  # side of an image that OpenGL draws [px]; larger ones are ray cast
 # Sizes of what is drawn are rounded up, so that buffers are not made anew for every frame.
 _SIZE_STEP = 64
@@ -42,9 +63,6 @@ class PyrenderRenderer:
         self.studio = studio or Studio()
         self._context = shared_context()
         self._context.check_process()
-        # It imports pyrender, which reads the environment that the context has set.
-        from cadalign.render.opengl_stage import GlStage
-
         self._stage = GlStage(self.studio)
         self._fallback = RaycastRenderer(studio=self.studio)
 
@@ -66,11 +84,11 @@ class PyrenderRenderer:
         """
         is_bent = camera.is_wide or bool(camera.distortion)
         is_large = max(camera.width, camera.height) > _LARGEST
-        if is_bent or is_large or self.drawn_by(scene, samples=samples) != self.name:
+        if is_bent or is_large or samples == 1 or not scene.surface.opaque:
             return self._fallback.render(scene, camera, cam_from_model, samples=samples)
         check_samples(samples)
         check_image_size(camera)
-        posed = pose_scene(scene, camera, cam_from_model, caster=None)
+        posed = pose_scene(scene, camera, cam_from_model)
         geometry = geometry_of(camera, posed)
         color: ByteImage = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
         if posed is not None:
@@ -79,10 +97,6 @@ class PyrenderRenderer:
             color[block] = straight_color(self._draw(camera, posed.block))
             darken_corners(color, geometry, posed, self.studio)
         return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
-
-    def drawn_by(self, scene: Scene, *, samples: int) -> str:
-        """ "pyrender", or "raycast" for transparent models and frames without antialiasing."""
-        return self.name if scene.surface.opaque and samples > 1 else self._fallback.name
 
     def _draw(self, camera: Camera, block: Rectangle) -> ByteImage:
         """Draw a block of an image, premultiplied (h, w, 4)."""
@@ -100,12 +114,7 @@ class GlContext:
     """
 
     def __init__(self) -> None:
-        # pyrender and PyOpenGL read these when they are imported.
-        os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
-        os.environ.setdefault("PYGLET_HEADLESS", "True")
         try:
-            import pyrender
-
             self._renderer = pyrender.OffscreenRenderer(64, 64)
         except Exception as error:  # PyOpenGL and ctypes raise what they like
             raise RenderError(
@@ -180,3 +189,159 @@ def straight_color(premultiplied: ByteImage) -> ByteImage:
 def _beginning(error: Exception) -> str:
     """The beginning of a message on one line; PyOpenGL's go on for dozens."""
     return " ".join(str(error).split())[:160] or "no reason given"
+
+
+# Meshes, lights and the camera --------------------------------------------------------------------
+
+
+def gl_meshes(scene: Scene) -> tuple[Any, Any]:
+    """Make the `pyrender.Mesh` pair of an opaque scene.
+
+    Its shader lights one side of a triangle only. So every triangle is given twice, in one mesh as
+    it is and in the other turned round with its normals, and OpenGL culls what is turned away: the
+    two sides look alike, as with ray casting. Where triangles coincide, the one wound towards
+    the viewer is kept.
+    """
+    alike, opposite = scene.coincident_faces
+    own = np.arange(len(alike))
+    first = alike == own
+    sides = (np.flatnonzero(first), np.flatnonzero(first & (opposite == own)))
+    return _mesh(scene, sides[0], turned=False), _mesh(scene, sides[1], turned=True)
+
+
+def _mesh(scene: Scene, faces: IntArray, *, turned: bool) -> Any:
+    primitives = []
+    for number, material in enumerate(scene.mesh.materials):
+        chosen = faces[scene.mesh.face_material[faces] == number]
+        if len(chosen):
+            primitives.append(_primitive(scene, material, chosen, turned=turned))
+    return pyrender.Mesh(primitives=primitives)
+
+
+def _primitive(scene: Scene, material: Material, faces: IntArray, *, turned: bool) -> Any:
+    mesh = scene.mesh
+    textured = material.texture is not None and mesh.corner_uv is not None
+    factor = np.asarray(material.color, dtype=np.float32)
+    factor[:3] = linear_from_srgb(factor[:3])
+    attributes: list[FloatArray | LinearArray] = [
+        scene.triangles[faces],
+        scene.corner_normals[faces] * (-1 if turned else 1),
+    ]
+    if textured and mesh.corner_uv is not None:
+        attributes.append(mesh.corner_uv[faces])
+    if mesh.vertex_colors is not None:
+        colors = mesh.vertex_colors.astype(np.float32)
+        colors[:, :3] = _lifted(linear_from_srgb(colors[:, :3]))
+        attributes.append(colors[mesh.faces[faces]])
+        # Vertex colours take the place of the material's.
+        factor = np.ones(4, dtype=np.float32)
+    elif not textured:
+        factor[:3] = _lifted(factor[:3])
+    rows = iter([_corners(attribute, turned=turned) for attribute in attributes])
+    return pyrender.Primitive(
+        positions=next(rows),
+        normals=next(rows),
+        texcoord_0=next(rows) if textured else None,
+        color_0=next(rows) if mesh.vertex_colors is not None else None,
+        material=pyrender.MetallicRoughnessMaterial(
+            alphaMode="OPAQUE",
+            baseColorFactor=factor,
+            metallicFactor=0.0,
+            roughnessFactor=_ROUGHNESS,
+            baseColorTexture=_texture(material.texture) if textured else None,
+        ),
+        mode=_TRIANGLES,
+    )
+
+
+def _corners(values: FloatArray | LinearArray, *, turned: bool) -> LinearArray:
+    """Values (f, 3, k) of triangles' corners one after the other, (3 f, k) float32."""
+    ordered = values[:, ::-1] if turned else values
+    return np.ascontiguousarray(ordered.reshape(-1, values.shape[2]), dtype=np.float32)
+
+
+def _lifted(color: LinearArray) -> LinearArray:
+    return np.asarray(DARKEST + (1 - DARKEST) * color, dtype=np.float32)
+
+
+def _texture(image: npt.NDArray[np.uint8] | None) -> Any:
+    """An opaque RGBA texture: rows of other widths than 4 bytes a pixel would be misread."""
+    if image is None:
+        return None
+    rgba = np.full((*image.shape[:2], 4), 255, dtype=np.uint8)
+    rgba[:, :, :3] = color_channels(image)
+    return pyrender.Texture(source=rgba, source_channels="RGBA")
+
+
+class WindowCamera(pyrender.Camera):  # type: ignore[misc]
+    """A camera with a projection matrix of ours."""
+
+    def __init__(self) -> None:
+        super().__init__(znear=0.1, zfar=1.0)
+        self.near, self.far = 0.1, 1.0
+        self.projection: FloatArray = np.eye(4)
+
+    def get_projection_matrix(self, width: object = None, height: object = None) -> FloatArray:
+        """The projection matrix, in pyrender's terms."""
+        return self.projection
+
+
+class GlStage:
+    """A `pyrender.Scene`: lights and camera that stand still, a mesh that stays loaded.
+
+    OpenGL's lights have no size, so shadows' edges are harder than in ray-cast frames.
+    """
+
+    def __init__(self, studio: Studio) -> None:
+        sky = studio.sky_power - studio.ground_power
+        # A light of some size reaches round the object; here that part comes from everywhere.
+        around = 0.5 * studio.wrap * (studio.key_power + studio.fill_power)
+        ambient = np.full(3, studio.ground_power + (1 - _SKY_SHARE) * sky + around)
+        self.scene: Any = pyrender.Scene(bg_color=np.zeros(4), ambient_light=ambient)
+        for direction, power in ((studio.key, studio.key_power), (studio.fill, studio.fill_power)):
+            self._add_light(power, _pose_towards(OPENGL_AXES * direction))
+        self._sky = self._add_light(_SKY_SHARE * sky, np.eye(4))
+        self._camera = WindowCamera()
+        self.scene.add(self._camera, pose=np.eye(4))
+        self._meshes: WeakKeyDictionary[Scene, tuple[Any, Any]] = WeakKeyDictionary()
+        self._nodes: tuple[Any, ...] = ()
+
+    def place(self, scene: Scene, cam_from_model: Alignment, sides: tuple[bool, bool]) -> None:
+        """Put a scene's mesh where it is seen; ``sides``: draw front faces, draw back faces."""
+        if scene not in self._meshes:
+            self._meshes[scene] = gl_meshes(scene)
+        meshes = self._meshes[scene]
+        if tuple(node.mesh for node in self._nodes) != meshes:
+            for node in self._nodes:
+                self.scene.remove_node(node)
+            self._nodes = tuple(self.scene.add(mesh) for mesh in meshes)
+        for node, drawn in zip(self._nodes, sides, strict=True):
+            self.scene.set_pose(node, opengl_from_model(cam_from_model))
+            node.mesh.is_visible = drawn
+        up = opengl_from_model(cam_from_model)[:3, 1]
+        self.scene.set_pose(self._sky, _pose_towards(up))
+        depth = scene.used_vertices @ cam_from_model.linear[2] + cam_from_model.translation[2]
+        slack = _CLEARANCE * scene.diagonal * float(cam_from_model.scale.max())
+        self._camera.far = float(depth.max()) + slack
+        self._camera.near = max(float(depth.min()) - slack, _NEAR_SHARE * self._camera.far)
+
+    def look(self, camera: Camera, window: tuple[int, int, int, int]) -> None:
+        """Choose the part of an image that is drawn: left, top, width, height [px]."""
+        self._camera.projection = opengl_projection(
+            camera, near=self._camera.near, far=self._camera.far, window=window
+        )
+
+    def _add_light(self, power: float, pose: FloatArray) -> Any:
+        # The shader divides by pi, as a surface spreads its light over the hemisphere.
+        light = pyrender.DirectionalLight(color=np.ones(3), intensity=np.pi * power)
+        return self.scene.add(light, pose=pose)
+
+
+def _pose_towards(direction: npt.NDArray[np.float64]) -> FloatArray:
+    """A pose (4, 4) whose +z axis, from where pyrender's lights shine, has this direction."""
+    axis = direction / np.linalg.norm(direction)
+    aside = np.cross([0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0], axis)
+    aside /= np.linalg.norm(aside)
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack([aside, np.cross(axis, aside), axis])
+    return pose

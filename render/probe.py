@@ -6,11 +6,9 @@ import json
 import logging
 import subprocess
 import sys
-import time
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
 
@@ -29,12 +27,6 @@ RENDERERS: dict[str, str] = {
 """Module and class of each renderer."""
 
 _TIMEOUT = 120
-_TIMED_FRAMES = 5
-_PACKAGES = {
-    "pyrender": ("pyrender2", "PyOpenGL"),
-    "open3d": ("open3d",),
-    "raycast": ("trimesh", "embreex"),
-}
 REMEDIES = {
     "pyrender": "pip install pyrender2; apt-get install libegl1 libgl1 libgl1-mesa-dri",
     "open3d": "pip install 'cadalign[open3d]'; apt-get install libx11-6 libgl1 libgomp1",
@@ -45,7 +37,7 @@ REMEDIES = {
 _MARK = "cadalign-probe "
 _CHILD = (
     "import sys, json; sys.path[:] = json.loads(sys.argv[1]); "
-    "from cadalign.render.probe import report; report(sys.argv[2], timed=sys.argv[3] == 'timed')"
+    "from cadalign.render.probe import report; report(sys.argv[2])"
 )
 
 
@@ -58,21 +50,16 @@ class Probe:
     works: bool
     detail: str
     """Device that draws, or the reason of the failure."""
-    versions: str
-    """Versions of the packages that it needs."""
-    milliseconds: float | None = None
-    """The median time of a frame, 640 x 480 px with 20,480 triangles."""
 
 
-def probe_renderer(name: str, *, timed: bool = False) -> Probe:
+@cache
+def probe_renderer(name: str) -> Probe:
     """Try a renderer in a process of its own; the result is kept for the life of this one.
 
     Parameters
     ----------
     name : str
         One of `RENDERERS`.
-    timed : bool
-        Measure the time of a frame too, which takes some seconds.
 
     Raises
     ------
@@ -81,12 +68,7 @@ def probe_renderer(name: str, *, timed: bool = False) -> Probe:
     """
     if name not in RENDERERS:
         raise unknown("renderer", name, RENDERERS)
-    return _probe(name, timed)
-
-
-@cache
-def _probe(name: str, timed: bool) -> Probe:
-    arguments = [json.dumps(sys.path), name, "timed" if timed else "untimed"]
+    arguments = [json.dumps(sys.path), name]
     try:
         child = subprocess.run(
             [sys.executable, "-c", _CHILD, *arguments],
@@ -97,9 +79,9 @@ def _probe(name: str, timed: bool) -> Probe:
             check=False,
         )
     except subprocess.TimeoutExpired:
-        return Probe(name, False, f"no frame within {_TIMEOUT} seconds", _versions(name))
+        return Probe(name, False, f"no frame within {_TIMEOUT} seconds")
     except OSError as error:
-        return Probe(name, False, f"no process to try it in ({error})", _versions(name))
+        return Probe(name, False, f"no process to try it in ({error})")
     for line in reversed(child.stdout.splitlines()):
         if line.startswith(_MARK):
             return Probe(**json.loads(line.removeprefix(_MARK)))
@@ -107,16 +89,16 @@ def _probe(name: str, timed: bool) -> Probe:
         reason = f"the process was killed by signal {-child.returncode}"
     else:
         reason = (child.stderr.strip().splitlines() or ["no message"])[-1]
-    return Probe(name, False, reason, _versions(name))
+    return Probe(name, False, reason)
 
 
-def report(name: str, *, timed: bool) -> None:
+def report(name: str) -> None:
     """Try a renderer in this process and write the result to standard output, for the parent."""
     try:
-        result = _try(name, timed=timed)
+        result = _try(name)
     except Exception as error:  # whatever it is, the parent wants to know
         reason = error.what if isinstance(error, CadalignError) else str(error)
-        result = Probe(name, False, reason or type(error).__name__, _versions(name))
+        result = Probe(name, False, reason or type(error).__name__)
     sys.stdout.write(f"\n{_MARK}{json.dumps(asdict(result))}\n")
     sys.stdout.flush()
 
@@ -128,25 +110,14 @@ def load_renderer(name: str, studio: Studio | None) -> Renderer:
     return renderer
 
 
-def _try(name: str, *, timed: bool) -> Probe:
+def _try(name: str) -> Probe:
     renderer = load_renderer(name, None)
-    mesh = ball(5 if timed else 1)
-    camera = Camera.from_fov(*((640, 480) if timed else (64, 48)), fov_x=50.0)
-    scene, pose = Scene(mesh), Alignment(np.eye(3), np.array([0, 0, 4.5]), np.ones(3))
-    frame = renderer.render(scene, camera, pose)
+    scene, camera = Scene(ball(1)), Camera.from_fov(64, 48, fov_x=50.0)
+    frame = renderer.render(scene, camera, Alignment(np.eye(3), np.array([0, 0, 4.5]), np.ones(3)))
     seen = float((frame.color[:, :, 3] > 127).mean())
     if not (frame.mask.any() and abs(seen - frame.mask.mean()) < 0.1):
-        return Probe(name, False, "it draws a ball wrongly", _versions(name))
-    milliseconds = None
-    if timed:
-        times = []
-        for _ in range(_TIMED_FRAMES):
-            begin = time.perf_counter()
-            renderer.render(scene, camera, pose)
-            times.append(time.perf_counter() - begin)
-        milliseconds = 1000 * float(np.median(times))
-    device = str(getattr(renderer, "device", "processor"))
-    return Probe(name, True, device, _versions(name), milliseconds)
+        return Probe(name, False, "it draws a ball wrongly")
+    return Probe(name, True, str(getattr(renderer, "device", "processor")))
 
 
 def ball(subdivisions: int) -> Mesh:
@@ -155,16 +126,6 @@ def ball(subdivisions: int) -> Mesh:
 
     shape = trimesh.creation.icosphere(subdivisions=subdivisions)
     return Mesh(np.array(shape.vertices), np.array(shape.faces))
-
-
-def _versions(name: str) -> str:
-    found = []
-    for package in _PACKAGES[name]:
-        try:
-            found.append(f"{package} {version(package)}")
-        except PackageNotFoundError:
-            found.append(f"{package} missing")
-    return ", ".join(found)
 
 
 logger = logging.getLogger("cadalign")

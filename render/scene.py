@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, Protocol, TypeVar
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +17,6 @@ from cadalign.geometry.mesh import Mesh, face_normals
 from cadalign.geometry.raycaster import Open3DEngine, RayCaster
 from cadalign.render.drawing.canvas import ByteImage, composite
 from cadalign.render.raycast.surface import SurfaceColors, coincident_faces, corner_normals
-
-T = TypeVar("T")
 
 
 class Scene:
@@ -48,7 +45,6 @@ class Scene:
     def __init__(self, mesh: Mesh, *, crease_angle: float = 40.0) -> None:
         self.mesh = mesh
         self.crease_angle = float(crease_angle)
-        self._derived: dict[Callable[[Scene], Any], Any] = {}
 
     def __reduce__(self) -> tuple[object, ...]:
         # The ray hierarchy cannot be pickled; worker processes build their own.
@@ -77,13 +73,6 @@ class Scene:
     def open3d_caster(self) -> RayCaster:
         """The same built by Open3D, which must be importable."""
         return RayCaster(self.mesh, self.face_normals, engine=Open3DEngine)
-
-    def derived(self, make: Callable[[Scene], T]) -> T:
-        """Make of the scene what a renderer draws, once; ``make`` is a function of its module."""
-        if make not in self._derived:
-            self._derived[make] = make(self)
-        made: T = self._derived[make]
-        return made
 
     @cached_property
     def used_vertices(self) -> FloatArray:
@@ -210,9 +199,6 @@ class Renderer(Protocol):
         self, scene: Scene, camera: Camera, cam_from_model: Alignment, *, samples: int = 8
     ) -> Frame:
         """Draw one frame; see `RaycastRenderer.render`."""
-
-    def drawn_by(self, scene: Scene, *, samples: int) -> str:
-        """Name of the renderer that draws a scene's frames: another where this one cannot."""
 
 
 def check_image_size(camera: Camera) -> None:

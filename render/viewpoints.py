@@ -14,6 +14,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.render.raycast.posed import within_lens_field
 from cadalign.render.scene import Scene
 
+_ATTEMPTS = 100
 _DISTANCE_STEPS = 50
 _FILL_TOLERANCE = 1e-3
 
@@ -33,7 +34,6 @@ def look_at(
     azimuth: float,
     elevation: float,
     distance: float,
-    target: npt.ArrayLike = (0.0, 0.0, 0.0),
     roll: float = 0.0,
     scale: npt.ArrayLike = (1.0, 1.0, 1.0),
 ) -> Alignment:
@@ -46,9 +46,8 @@ def look_at(
     elevation : float
         Height above the model's xz plane [degrees], -90 to 90.
     distance : float
-        From the camera to the target [model units], positive.
-    target : (3,) float
-        The model point, before the stretch, that appears at the principal point.
+        From the camera to the model's origin, which appears at the principal point [model units],
+        positive.
     roll : float
         Turn of the camera about its line of sight [degrees]; positive turns the object
         counterclockwise in the image.
@@ -78,8 +77,7 @@ def look_at(
         raise InputError(f"{distance:g} is not positive", where="distance")
     rotation = _looking_rotation(*values[[0, 1, 3]])
     stretch = as_floats(scale, name="scale", shape=(3,))
-    stretched = as_floats(target, name="target", shape=(3,)) * stretch
-    return Alignment(rotation, np.array([0, 0, distance]) - rotation @ stretched, stretch)
+    return Alignment(rotation, np.array([0, 0, distance]), stretch)
 
 
 def sample_view(
@@ -93,7 +91,6 @@ def sample_view(
     fill: tuple[float, float] = (0.7, 0.95),
     roll: float = 0.0,
     scale: npt.ArrayLike = (1.0, 1.0, 1.0),
-    max_attempts: int = 100,
 ) -> Viewpoint:
     """Draw a view, evenly over the sphere, in which enough keypoints are seen.
 
@@ -119,8 +116,6 @@ def sample_view(
         Largest turn of the camera about its line of sight [degrees].
     scale : (3,) float
         The stretch along the model's axes.
-    max_attempts : int
-        Views to try.
 
     Returns
     -------
@@ -136,10 +131,8 @@ def sample_view(
     points = as_points(keypoints, name="keypoints", dimension=3)
     _check_range(elevation, name="elevation", low=-90.0, high=90.0)
     _check_range(fill, name="fill", low=0.01, high=1.0)
-    if max_attempts < 1:
-        raise InputError(f"{max_attempts} is not positive", where="max_attempts")
     best = 0
-    attempts = max_attempts if len(points) >= min_visible else 0
+    attempts = _ATTEMPTS if len(points) >= min_visible else 0
     for _ in range(attempts):
         azimuth = rng.uniform(-180.0, 180.0)
         low, high = np.sin(np.radians(elevation))

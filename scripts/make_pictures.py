@@ -19,11 +19,9 @@ import cv2
 import numpy as np
 import tyro
 
-from cadalign import Alignment, Box, Camera, Observation, fit
-from cadalign.annotate.lines import Wireframe
-from cadalign.annotate.model import ClickableModel
-from cadalign.annotate.opening import open_session
+from cadalign import Box, Camera, Observation, fit
 from cadalign.annotate.options import SessionOptions
+from cadalign.annotate.session import open_session
 from cadalign.datasets import AnnotatedModel, KeypointNet, ModelKeypoints, write_sample_dataset
 from cadalign.evaluation.instances.instance import load_scene, make_instance
 from cadalign.io.images import read_image, write_image
@@ -32,6 +30,7 @@ from cadalign.render import (
     RaycastRenderer,
     Scene,
     draw_overlay,
+    overlay_model,
     pose_in_view,
     visible_keypoints,
 )
@@ -43,7 +42,6 @@ MODELS = (("chair", "000"), ("car", "002"), ("bottle", "002"), ("vessel", "003")
 CHAIR_CAMERA = Camera.from_fov(640, 720, fov_x=33.0)
 CHAIR_VIEW = Angles(azimuth=143.0, elevation=24.0)
 PHOTO_GROUND = (206, 208, 212)
-LINE = (35, 208, 255)
 
 
 def overview() -> None:
@@ -97,9 +95,8 @@ def chairs(*, files: Path | None = None) -> None:
         scene = Scene(own.load_mesh())
         image = read_image(photo, CHAIR_CAMERA)
         aligned = draw_overlay(
-            with_wireframe(image, ClickableModel(scene.mesh), result.alignment),
+            overlay_model(image, CHAIR_CAMERA, scene, result.alignment),
             CHAIR_CAMERA,
-            est_box=Box.from_model(scene.bounds, result.alignment),
             observed=observation.points_2d,
             reprojected=CHAIR_CAMERA.project(result.alignment.apply(observation.points_3d)),
             legend=False,
@@ -136,15 +133,6 @@ def still(scene: Scene) -> ByteImage:
     return frame.composite(PHOTO_GROUND)
 
 
-def with_wireframe(image: ByteImage, model: ClickableModel, alignment: Alignment) -> ByteImage:
-    """The photo with the lines of the stretched model."""
-    drawn = image.copy()
-    for start, end in Wireframe.of_model(model).seen_in(CHAIR_CAMERA, alignment):
-        ends = [tuple(np.round(16 * point).astype(int).tolist()) for point in (start, end)]
-        cv2.line(drawn, *ends, LINE, 1, cv2.LINE_AA, shift=4)
-    return drawn
-
-
 def write_row(path: Path, pictures: Sequence[np.ndarray], *, width: int) -> None:
     """Write pictures of one height side by side, shrunk to a width [px] in all."""
     row = np.hstack(pictures)
@@ -163,7 +151,7 @@ def annotator(*, files: Path) -> None:
     options = SessionOptions(image=files / "photo.png", model=model, observation=observation)
     session = open_session(options)
     session.warm_up()
-    with chromium() as browser, opened_page(browser, session, width=1280, height=960) as page:
+    with chromium() as browser, opened_page(browser, session, width=1280, height=800) as page:
         wait(page, f"{IDLE} && annotator.state.alignment.status === 'done'")
         page.keyboard.press("v")
         page.wait_for_timeout(1000)  # until everything is drawn

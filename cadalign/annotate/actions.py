@@ -4,26 +4,33 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, get_type_hints
 
 import msgspec
+import numpy as np
 
-from cadalign.annotate.annotation import Annotation
-from cadalign.annotate.evidence_actions import EVIDENCE_ACTIONS, ActionOutcome
-from cadalign.annotate.session import Session
+from cadalign.annotate.photos import MarkedMask, cut_out
+from cadalign.annotate.session import Annotation, Session
 from cadalign.errors import InputError, quote
-from cadalign.io.documents import ForeignDocument, Index, NotNegative, Point2, Point3, Text, convert
+from cadalign.geometry.camera import Camera
+from cadalign.io.documents import Finite, ForeignDocument, Index, Point2, Point3, Text, convert
+from cadalign.io.images import read_photo
 
-_MISSED = "That click missed the model."
+_FOCAL_RANGE = (0.05, 200.0)  # of a focal length [image widths]
+
+
+@dataclass(frozen=True)
+class ActionOutcome:
+    """Outcome of an action beside the changed marks, for the user."""
+
+    selected: int | None = None  # number of the pair that was placed or changed
+    message: str = ""  # such as that the click missed the model
 
 
 def perform(session: Session, number: int, action: Mapping[str, Any]) -> ActionOutcome:
-    """Do an action of the page, its name ``do`` and its arguments, and save its changes.
-
-    It is done on the annotation of a number.
-    """
+    """Do an action of the page, its name ``do`` and its arguments, on a photo, and save it."""
     with session.lock:
         state = session.annotation(number)
         name = action.get("do")
@@ -31,11 +38,18 @@ def perform(session: Session, number: int, action: Mapping[str, Any]) -> ActionO
         if function is None:
             fix = f"known are {', '.join(ACTIONS)}"
             raise InputError(f"{quote(name)} is not an action", where="do", fix=fix)
-        before = state.document
+        before = state.marks
         arguments = msgspec.structs.asdict(convert(action, _arguments_of(function)))
         outcome = function(state, **arguments) or ActionOutcome()
-        if state.document is not before or name in _RENAMING:
+        if state.marks is not before:
             session.save(state)
+        elif name in _RENAMING:
+            # Every photo that shows the keypoint has its name.
+            keypoint = state.marks.pair(arguments["pair"]).keypoint
+            for each in session.photos:
+                if keypoint in each.marks.keypoints:
+                    each.live = None
+                    session.save(each)
         return outcome
 
 
@@ -53,8 +67,8 @@ def _arguments_of(function: Callable[..., ActionOutcome | None]) -> type[msgspec
 def place_uv(state: Annotation, *, uv: Point2, pair: Index | None = None) -> ActionOutcome:
     """Place a photo half, by preference of the given pair."""
     state.require_inside(uv)
-    document, number = state.document.place_uv(uv, pair)
-    state.record(document)
+    marks, number = state.marks.place_uv(uv, pair)
+    state.record(marks)
     return ActionOutcome(number)
 
 
@@ -63,8 +77,8 @@ def place_keypoint(
 ) -> ActionOutcome:
     """Place a model half, a keypoint of the registry, by preference of the given pair."""
     state.model.registry[keypoint]  # refuses an unknown one
-    document, number = state.document.place_keypoint(keypoint, pair)
-    state.record(document)
+    marks, number = state.marks.place_keypoint(keypoint, pair)
+    state.record(marks)
     return ActionOutcome(number)
 
 
@@ -74,68 +88,40 @@ def pick(
     origin: Point3,
     direction: Point3,
     near: Index | None = None,
-    snap: NotNegative = 0.0,
     pair: Index | None = None,
 ) -> ActionOutcome:
-    """Place a model half by a ray; see `_aimed_at`."""
-    keypoint = _aimed_at(state, origin, direction, near, snap)
-    if keypoint is None:
-        return ActionOutcome(message=_MISSED)
-    return place_keypoint(state, keypoint=keypoint, pair=pair)
+    """Place a model half: the keypoint ``near`` a ray, or else where that meets the surface."""
+    model, registry = state.model.cad, state.model.registry
+    if near is None:
+        point = model.pick(model.from_display(origin), direction)
+        if point is None:
+            return ActionOutcome(message="That click missed the model.")
+        near = registry.find(point.xyz)
+        near = registry.add(point) if near is None else near
+    return place_keypoint(state, keypoint=near, pair=pair)
 
 
-def repick(
-    state: Annotation,
-    *,
-    pair: Index,
-    origin: Point3,
-    direction: Point3,
-    near: Index | None = None,
-    snap: NotNegative = 0.0,
-) -> ActionOutcome:
-    """Move the model half of a pair by a ray; see `_aimed_at`."""
-    keypoint = _aimed_at(state, origin, direction, near, snap)
-    if keypoint is None:
-        return ActionOutcome(pair, _MISSED)
-    state.record(state.document.exchange_keypoint(pair, keypoint))
-    return ActionOutcome(pair)
-
-
-def suggested(state: Annotation, *, pair: Index | None = None) -> ActionOutcome:
-    """Place the model half at the suggested keypoint, by preference of the given pair."""
-    _, suggestion = state.session.live(state)
-    if suggestion is None:
-        what = "there is no suggested keypoint yet"
-        raise InputError(what, where="suggestion", fix="place more pairs")
-    keypoint = suggestion.point.semantic_id
-    assert keypoint is not None  # of the registry
-    return place_keypoint(state, keypoint=keypoint, pair=pair)
-
-
-def move(
-    state: Annotation, *, pair: Index, uv: Point2, gesture: Index | None = None
-) -> ActionOutcome:
-    """Move a photo half; moves of one gesture are undone together."""
+def move(state: Annotation, *, pair: Index, uv: Point2) -> ActionOutcome:
+    """Move a photo half."""
     state.require_inside(uv)
-    step = None if gesture is None else (pair, gesture)
-    state.record(state.document.move(pair, uv), step=step)
+    state.record(state.marks.move(pair, uv))
     return ActionOutcome(pair)
 
 
 def release(state: Annotation, *, pair: Index) -> ActionOutcome:
     """Remove the model half of a pair."""
-    state.record(state.document.release_keypoint(pair))
+    state.record(state.marks.release_keypoint(pair))
     return ActionOutcome(pair)
 
 
 def delete(state: Annotation, *, pair: Index) -> None:
     """Delete a pair."""
-    state.record(state.document.delete(pair))
+    state.record(state.marks.delete(pair))
 
 
 def rename(state: Annotation, *, pair: Index, name: Text) -> ActionOutcome:
     """Rename the keypoint of a pair."""
-    keypoint = state.document.pair(pair).keypoint
+    keypoint = state.marks.pair(pair).keypoint
     if keypoint is None:
         what = "this pair has no model point yet"
         raise InputError(what, where="pair", fix="click on the model first")
@@ -145,19 +131,66 @@ def rename(state: Annotation, *, pair: Index, name: Text) -> ActionOutcome:
 
 def identify(state: Annotation, *, pair: Index, label: Index | Text) -> ActionOutcome:
     """Say which keypoint of the category's shape the model point of a pair is."""
-    keypoint, shape = state.document.pair(pair).keypoint, state.session.shape
-    if keypoint is None or label not in shape.ids:
-        what = f"{quote(label)} is no keypoint of the shape"
-        raise InputError(what, where="label", fix="choose one")
-    registry = state.model.registry
-    if shape.is_named:
+    keypoint, registry = state.marks.pair(pair).keypoint, state.model.registry
+    if keypoint is None or label not in state.shape.ids:
+        raise InputError(f"{quote(label)} is no keypoint of the shape", where="label")
+    if state.shape.is_named:
         registry.rename(keypoint, str(label))
         return ActionOutcome(pair)
+    if label in registry:
+        what = f"the model has its keypoint {label} already"
+        raise InputError(what, where="label", fix="click on that one")
     point = registry[keypoint]
     own = point.name if point.name != f"point {keypoint}" else f"keypoint {label}"
-    known = registry.add_as(int(label), replace(point, name=own))
-    state.record(state.document.exchange_keypoint(pair, known))
+    known = registry.add(replace(point, name=own, semantic_id=int(label)))
+    state.record(state.marks.exchange_keypoint(pair, known))
     return ActionOutcome(pair)
+
+
+def focal(state: Annotation, *, pixels: Finite | None = None) -> None:
+    """Choose a known focal length, or without pixels an estimated one."""
+    camera = state.marks.camera
+    low, high = (bound * camera.width for bound in _FOCAL_RANGE)
+    if pixels is None:
+        camera = Camera.without_focal(
+            camera.width,
+            camera.height,
+            cx=camera.cx,
+            cy=camera.cy,
+            distortion=camera.distortion,
+        )
+    elif low <= pixels <= high:
+        camera = camera.with_focal(pixels)
+    else:
+        what = f"{pixels:g} px is no focal length of this photo"
+        raise InputError(what, where="pixels", fix=f"give {low:.0f} to {high:.0f} px")
+    state.record(replace(state.marks, camera=camera))
+
+
+def mask_cut(state: Annotation, *, corners: tuple[Point2, Point2]) -> None:
+    """Add what GrabCut finds in a box to the mask."""
+    found = cut_out(read_photo(state.photo.path), np.array(corners, dtype=float))
+    state.record(replace(state.marks, mask=MarkedMask.of(found | state.mask)))
+
+
+def mask_clear(state: Annotation) -> None:
+    """Remove the mask."""
+    state.record(replace(state.marks, mask=None))
+
+
+def use_photo(state: Annotation, *, on: bool) -> ActionOutcome | None:
+    """Choose whether the photo itself counts, which takes the place of the mask.
+
+    What the mask alone has found is where the search in the photo begins.
+    """
+    marks = replace(state.marks, photo=on)
+    if not on or marks.mask is None:
+        state.record(marks)
+        return None
+    live = state.alignment()
+    start = marks.start if live.result is None else live.result.alignment
+    state.record(replace(marks, mask=None, start=start))
+    return ActionOutcome(message="The photo takes the place of the mask; undo brings it back.")
 
 
 def undo(state: Annotation) -> ActionOutcome | None:
@@ -173,25 +206,10 @@ def redo(state: Annotation) -> ActionOutcome | None:
 ACTIONS: dict[str, Callable[..., ActionOutcome | None]] = {
     function.__name__: function
     for function in (
-        *(place_uv, place_keypoint, pick, repick, suggested, move, release, delete),
-        *(rename, identify, *EVIDENCE_ACTIONS, undo, redo),
+        *(place_uv, place_keypoint, pick, move, release, delete, rename, identify),
+        *(focal, mask_cut, mask_clear, use_photo, undo, redo),
     )
 }
 """Actions by the name that the page sends as ``do``."""
 _RENAMING = ("rename", "identify")
-"""Actions that may change the names of keypoints in place of the document."""
-
-
-def _aimed_at(
-    state: Annotation, origin: Point3, direction: Point3, near: int | None, snap: float
-) -> int | None:
-    """The keypoint that a ray points at, registered; None if it misses the model.
-
-    It is the keypoint ``near`` it if that is visible. For ``snap`` see `ClickableModel.pick`.
-    """
-    model = state.model.cad
-    start = model.from_display(origin)
-    if near is not None and model.is_seen(start, state.model.registry[near].xyz):
-        return near
-    point = model.pick(start, direction, snap=snap)
-    return None if point is None else state.model.registry.placed(point)
+"""Actions that may change the names of keypoints in place of the marks."""

@@ -1,37 +1,148 @@
-"""CAD model in the annotator: exact points on its mesh that clicks go to, and its display."""
+"""CAD model in the annotator: exact points that clicks go to, its display, and its lines."""
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from cadalign.annotate.files import LastContent, keypoints_file, refuse_other_model
+from cadalign.annotate.keypoints import KeypointRegistry, ObjectShape
+from cadalign.annotate.marks import Pair
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats
-from cadalign.datasets.models.model_keypoints import ModelKeypoint
+from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import InputError
+from cadalign.geometry.alignment import BOX_EDGES, Alignment, Box
+from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.geometry.raycaster import FaceArray, RayCaster
-from cadalign.geometry.simplify import mesh_edges, simplify
-from cadalign.render.drawing.canvas import bytes_from_linear
+from cadalign.geometry.raycaster import FaceArray
+from cadalign.geometry.simplify import cluster, mesh_edges, simplify
+from cadalign.io.files import require_utf8
+from cadalign.io.meshes.files import load_mesh
 from cadalign.render.raycast.surface import coincident_faces
 from cadalign.render.scene import Scene
+from cadalign.render.viewpoints import visible_keypoints
+from cadalign.shapes.warp import warp_mesh
 
-MOST_FACES = 150_000  # that are displayed
-# Depth beneath the surface at which markers can still be clicked [diagonals]: keypoints sit in
-# corners, where rays to them graze other parts. The page uses the same value.
-_BENEATH = 0.02
-_MOST_TRIED = 40  # vertices near a click, of which the first visible one is taken
-CORNER, CREASE, SMOOTH = range(3)
+_MOST_FACES = 150_000  # that are displayed
+_SAME_PLACE = 1e-6  # largest distance of two points that count as one [diagonals]
+_MOST_DRAWN = 30_000
+_MOST_CREASES = 1500
+_MOST_LINES = 3000
 _CREASE_DEG = 30.0
-_BEND = 2 * np.sin(np.radians(_CREASE_DEG / 2))  # length of the sum of unit vectors along a crease
-_MOST_FACES = 400_000  # whose creases are searched for
-_WELD = 1e-6  # distance of vertices in one place [diagonals]
-_JUMP = 0.05  # in depth, that makes a silhouette of one part before another [diagonals]
-_RINGS, _SPOKES = 8, 24
-_BISECTIONS = 14
+_LONGEST = 1 / 24  # of a line [diagonals]: each is drawn or hidden as a whole
+_BOX_PIECES = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Wireframe:
+    """Lines of a model, prepared once; ``scene`` is the surface that hides them."""
+
+    scene: Scene
+    _mesh: Mesh  # simplified, each vertex once
+    _creases: IntArray  # (k, 2) vertices of edges that always show
+    _smooth: IntArray  # (k, 2) of edges that show only on the silhouette
+    _beside: IntArray  # (k, 2) third corners of the triangles beside these
+    _piece: float  # length of a line [model units]
+
+    @classmethod
+    def of_scene(cls, scene: Scene) -> Wireframe:
+        """The lines of a model as it is."""
+        small = simplify(scene.mesh, max_faces=_MOST_DRAWN)
+        # Faces of real models seldom share vertices: weld those in one place.
+        welded = cluster(Mesh(small.vertices, small.faces), cells=1e6)
+        # A face that is written twice would make a crease of each of its sides.
+        alike, opposite = coincident_faces(welded.vertices, welded.faces)
+        single = np.minimum(alike, opposite) == np.arange(len(alike))
+        mesh = Mesh(welded.vertices, welded.faces[single])
+        edges = mesh_edges(mesh.vertices, mesh.faces, crease_angle=_CREASE_DEG)
+        creases, smooth = edges.ends[edges.creased], ~edges.creased
+        length = np.linalg.norm(np.diff(mesh.vertices[creases], axis=1)[:, 0], axis=1)
+        longest = np.sort(np.argsort(-length, kind="stable")[:_MOST_CREASES])
+        ends, beside, piece = edges.ends[smooth], edges.opposite[smooth], _LONGEST * scene.diagonal
+        return cls(scene, mesh, creases[longest], ends, beside, piece)
+
+    @property
+    def creases(self) -> FloatArray:
+        """The lines that always show, (k, 2, 3) float [model units]."""
+        return self._mesh.vertices[self._creases]
+
+    def warped(
+        self, source: FloatArray, target: FloatArray, bounds: FloatArray, *, carried: FloatArray
+    ) -> tuple[Wireframe, FloatArray]:
+        """Warp the lines, and points on the surface (k, 3); see `cadalign.shapes.warp.warp_mesh`.
+
+        The simplified mesh hides the lines.
+        """
+        mesh = self._mesh
+        together = Mesh(np.concatenate([mesh.vertices, carried]), mesh.faces)
+        moved = warp_mesh(together, source, target, bounds=bounds).vertices
+        vertices, points = np.split(moved, [len(mesh.vertices)])
+        warped = Mesh(vertices, mesh.faces)
+        return replace(self, scene=Scene(warped), _mesh=warped), points
+
+    def seen_in(self, camera: Camera, alignment: Alignment) -> FloatArray:
+        """Project the lines of the stretched model that a camera sees, (k, 2, 2) float [px]."""
+        vertices = self._mesh.vertices
+        eye = alignment.inverse(np.zeros((1, 3)))[0]
+        ends = vertices[self._smooth]
+        outline = ends[_is_outline(ends, vertices[self._beside], eye)]
+        lines = np.concatenate([vertices[self._creases], outline])
+        lines = _cut(lines, self._piece)[:_MOST_LINES]
+        if not len(lines):
+            return np.empty((0, 2, 2))
+        seen = visible_keypoints(self.scene, lines.mean(axis=1), camera, alignment)
+        return _project_lines(lines[seen], camera, alignment)
+
+
+def box_lines(bounds: FloatArray, camera: Camera, alignment: Alignment) -> FloatArray:
+    """Project the edges of the stretched model's box, in pieces, (k, 2, 2) float [px]."""
+    corners = Box.from_model(bounds, alignment).corners
+    ends = corners[np.array(BOX_EDGES)]
+    share = np.linspace(0, 1, _BOX_PIECES + 1)[:, None, None]
+    points = (ends[:, 0] * (1 - share) + ends[:, 1] * share).transpose(1, 0, 2)
+    lines = np.stack([points[:, :-1], points[:, 1:]], axis=2).reshape(-1, 2, 3)
+    return _project_lines(lines, camera, Alignment.identity())
+
+
+def _project_lines(lines: FloatArray, camera: Camera, alignment: Alignment) -> FloatArray:
+    """Project lines (k, 2, 3) to (k, 2, 2) [px]; drop those with an end behind the camera."""
+    ends = alignment.apply(lines.reshape(-1, 3)).reshape(-1, 2, 3)
+    near = 1e-6 * np.abs(alignment.translation).max(initial=1.0)
+    ends = ends[(ends[:, :, 2] > near).all(axis=1)]
+    if not len(ends):
+        return np.empty((0, 2, 2))
+    return camera.project(ends.reshape(-1, 3)).reshape(-1, 2, 2)
+
+
+def _is_outline(ends: FloatArray, beside: FloatArray, eye: FloatArray) -> BoolArray:
+    """Find the silhouette edges: both triangles on one side, seen from the eye, (e,) bool.
+
+    ``ends`` (e, 2, 3) and the third corners ``beside`` (e, 2, 3) are compared, not the normals:
+    triangles of real models face either way. Stretching does not change sides, so model coordinates
+    suffice.
+    """
+    start = ends[:, 0]
+    sight = np.cross(start - eye, ends[:, 1] - eye)
+    sides = np.einsum("eck,ek->ec", beside - start[:, None], sight)
+    return np.asarray(sides[:, 0] * sides[:, 1] > 0)
+
+
+def _cut(lines: FloatArray, piece: float) -> FloatArray:
+    if not len(lines):
+        return lines
+    length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
+    parts = np.maximum(1, np.ceil(length / piece)).astype(np.int64)
+    line = np.repeat(np.arange(len(lines)), parts)
+    part = np.arange(len(line)) - np.repeat(np.cumsum(parts) - parts, parts)
+    low = (part / parts[line])[:, None]
+    high = ((part + 1) / parts[line])[:, None]
+    start, along = lines[line, 0], lines[line, 1] - lines[line, 0]
+    return np.stack([start + low * along, start + high * along], axis=1)
 
 
 class ClickableModel:
@@ -45,6 +156,11 @@ class ClickableModel:
         if not self.diagonal > 0:
             raise InputError("all vertices of the mesh coincide", where=mesh.source)
 
+    @cached_property
+    def wireframe(self) -> Wireframe:
+        """The lines of the model."""
+        return Wireframe.of_scene(self.scene)
+
     def to_display(self, xyz: npt.ArrayLike) -> FloatArray:
         """Turn model coordinates (..., 3) into the page's: centred, with a diagonal of 1."""
         return np.asarray((np.asarray(xyz, dtype=float) - self.center) / self.diagonal)
@@ -53,215 +169,85 @@ class ClickableModel:
         """Turn the page's coordinates (..., 3) into model coordinates."""
         return np.asarray(np.asarray(xyz, dtype=float) * self.diagonal + self.center)
 
-    def pick(
-        self, origin: npt.ArrayLike, direction: npt.ArrayLike, *, snap: float = 0.0
-    ) -> ModelKeypoint | None:
-        """Intersect a ray, in model coordinates, with the surface; None if it misses.
-
-        With ``snap``, the tangent of half the angle of a cone about the ray, the point is a visible
-        corner in the cone, else a vertex of a crease, else on the silhouette, else a vertex.
-        """
+    def pick(self, origin: npt.ArrayLike, direction: npt.ArrayLike) -> ModelKeypoint | None:
+        """Intersect a ray, in model coordinates, with the surface; None if it misses."""
         start = as_floats(origin, name="origin", shape=(3,))
         along = as_floats(direction, name="direction", shape=(3,))
         if not along.any():
             raise InputError("the vector is zero", where="direction")
-        if snap > 0:
-            snapped = self._snapped(start, along / np.linalg.norm(along), snap)
-            if snapped is not None:
-                return snapped
         face, distance = self.scene.caster.first_hits(start, along[None])
         if face[0] < 0 or not np.isfinite(distance[0]):
             return None
-        return _placed(start + distance[0] * along)
-
-    def is_seen(self, origin: npt.ArrayLike, xyz: npt.ArrayLike) -> bool:
-        """True if a point on the surface, or slightly beneath it, is visible from ``origin``."""
-        start = as_floats(origin, name="origin", shape=(3,))
-        sight = as_floats(xyz, name="xyz", shape=(3,)) - start
-        length = float(np.linalg.norm(sight))
-        if not length > 0:
-            return True
-        _, distance = self.scene.caster.first_hits(start, sight[None])
-        return bool(distance[0] >= 1 - _BENEATH * self.diagonal / length)
+        x, y, z = (start + distance[0] * along).tolist()
+        return ModelKeypoint(name="", xyz=(x, y, z))
 
     @cached_property
-    def snap_points(self) -> SnapPoints:
-        """Vertices that clicks snap to."""
-        return SnapPoints.of_mesh(self.scene.mesh, self.diagonal)
+    def display_bytes(self) -> bytes:
+        """The model for display, simplified to at most 150,000 triangles.
 
-    @cached_property
-    def displayed(self) -> tuple[Mesh, npt.NDArray[np.float32], BoolArray]:
-        """The triangles that are displayed: simplified, of those in one place one for each side.
-
-        With them linear colours and opacities (m, 4), and those (m,) of which another one shows the
-        back.
+        The numbers of faces and of creases (uint32); positions (faces, 3, 3), normals (faces, 3, 3)
+        and linear colours (faces, 3, 3) of corners, and creases (k, 2, 3), all float32,
+        little-endian, in display coordinates. Of triangles in one place one is shown.
         """
-        small = simplify(self.scene.mesh, max_faces=MOST_FACES)
+        small = simplify(self.scene.mesh, max_faces=_MOST_FACES)
         alike, opposite = coincident_faces(small.vertices, small.faces)
-        first = np.flatnonzero(alike == np.arange(len(alike)))
-        weights = np.full((len(first), 3), 1 / 3, dtype=np.float32)
+        first = np.flatnonzero(np.minimum(alike, opposite) == np.arange(len(alike)))
         triangles: FaceArray = small.source[first].astype(np.int32)
-        color = self.scene.surface.color(triangles, weights)
-        mesh = Mesh(small.vertices, small.faces[first])
-        return mesh, color, opposite[first] != alike[first]
-
-    def _snapped(
-        self, origin: FloatArray, direction: FloatArray, reach: float
-    ) -> ModelKeypoint | None:
-        points = self.snap_points
-        seen = [
-            row
-            for row in points.near(origin, direction, reach)[:_MOST_TRIED].tolist()
-            if self.is_seen(origin, points.xyz[row])
-        ]
-        if not seen or points.kind[seen[0]] > CREASE:
-            rim = find_rim(self.scene.caster, origin, direction, reach, self.diagonal)
-            if rim is not None:
-                return _placed(rim)
-        return _placed(points.xyz[seen[0]]) if seen else None
+        weights = np.full((len(first), 3), 1 / 3, dtype=np.float32)
+        color = self.scene.surface.color(triangles, weights)[:, None, :3]
+        shown = Mesh(self.to_display(small.vertices), small.faces[first])
+        creases = self.to_display(self.wireframe.creases)
+        arrays = (
+            shown.triangles,
+            Scene(shown).corner_normals,
+            np.broadcast_to(color, (len(first), 3, 3)),
+            creases,
+        )
+        counts = np.array([len(first), len(creases)], dtype="<u4")
+        return counts.tobytes() + b"".join(each.astype("<f4").tobytes() for each in arrays)
 
 
-def _placed(xyz: FloatArray) -> ModelKeypoint:
-    """A keypoint without a name."""
-    x, y, z = xyz.tolist()
-    return ModelKeypoint(name="", xyz=(x, y, z))
+@dataclass(eq=False)
+class OpenedModel:
+    """A model that can be clicked on, its keypoints, and the file they are written to."""
+
+    path: Path
+    cad: ClickableModel
+    registry: KeypointRegistry
+    keypoints_path: Path
+    content: LastContent  # of that file
+
+    def points_of(self, pairs: Iterable[Pair]) -> list[ModelKeypoint]:
+        """The model points of pairs that have one."""
+        return [self.registry[pair.keypoint] for pair in pairs if pair.keypoint is not None]
+
+    def write_keypoints(self, used: frozenset[int]) -> None:
+        """Write the given keypoints and those in use; raises DataError on failure."""
+        registry = self.registry
+        self.content.refuse_changed(self.keypoints_path)
+        kept = (point for number, point in registry if number in registry.given | used)
+        ModelKeypoints(tuple(kept), self.path).save(self.keypoints_path)
+        self.content.note(self.keypoints_path)
 
 
-def display_bytes(model: ClickableModel) -> bytes:
-    """Encode the model for display, simplified to at most `MOST_FACES` triangles.
+def open_model(
+    path: Path, folder: Path, *, keypoints: Path | None = None, shape: ObjectShape
+) -> OpenedModel:
+    """Open a model, whose keypoints are written into a folder.
 
-    First the length of a JSON header (uint32, little-endian, a multiple of 4 with padding), and the
-    header with ``shown`` and ``all``, the numbers of faces; then positions (faces, 3, 3) float32 in
-    display coordinates, normals (faces, 3, 3) float32, and sRGB colours (faces, 3) uint8.
+    ``keypoints`` are those given with it, where they are not beside it. New ones don't get the ids
+    of the shape's.
     """
-    mesh, color, _ = model.displayed
-    shown = Mesh(model.to_display(mesh.vertices), mesh.faces)
-    header = json.dumps({"shown": len(mesh.faces), "all": len(model.scene.mesh.faces)}).encode()
-    header += b" " * (-len(header) % 4)
-    return b"".join(
-        [
-            len(header).to_bytes(4, "little"),
-            header,
-            shown.triangles.astype("<f4").tobytes(),
-            Scene(shown).corner_normals.astype("<f4").tobytes(),
-            bytes_from_linear(color[:, :3]).tobytes(),
-        ]
-    )
-
-
-def detail_bytes(model: ClickableModel, creases: FloatArray) -> bytes:
-    """Encode what `display_bytes` leaves out, of the same triangles.
-
-    Creases (k, 2, 3) [model units] as float32 in display coordinates, their number (uint32) before
-    them; opacities (faces,) uint8; and sides (faces,) uint8, which are 1 for a triangle that only
-    its front shows, since another one lies in its place, wound the other way.
-    """
-    _, color, is_doubled = model.displayed
-    opacity = np.round(255 * np.clip(color[:, 3], 0, 1)).astype(np.uint8)
-    return b"".join(
-        [
-            len(creases).to_bytes(4, "little"),
-            model.to_display(creases).astype("<f4").tobytes(),
-            opacity.tobytes(),
-            is_doubled.astype(np.uint8).tobytes(),
-        ]
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class SnapPoints:
-    """Vertices of a mesh (n, 3), and their kinds (n,).
-
-    A corner ends a crease or is where creases meet at an angle.
-    """
-
-    xyz: FloatArray
-    kind: npt.NDArray[np.int8]
-
-    @classmethod
-    def of_mesh(cls, mesh: Mesh, diagonal: float) -> SnapPoints:
-        """Find and sort the vertices; those of very large meshes all count as smooth."""
-        used = np.unique(mesh.faces)
-        grid = np.round((mesh.vertices[used] - mesh.vertices[used[0]]) / (_WELD * diagonal))
-        _, kept, place = np.unique(grid, axis=0, return_index=True, return_inverse=True)
-        xyz = mesh.vertices[used[kept]]
-        kind = np.full(len(xyz), SMOOTH, dtype=np.int8)
-        if len(mesh.faces) <= _MOST_FACES:
-            number = np.zeros(len(mesh.vertices), dtype=np.int64)
-            number[used] = place.ravel()
-            kind = _kinds(xyz, number[mesh.faces])
-        return cls(xyz, kind)
-
-    def near(self, origin: FloatArray, direction: FloatArray, reach: float) -> IntArray:
-        """Vertices in a cone about a ray, best first: by kind, then by angle.
-
-        ``direction`` is a unit vector, ``reach`` the tangent of the cone's half angle.
-        """
-        sight = self.xyz - origin
-        along = sight @ direction
-        beside = np.linalg.norm(sight - along[:, None] * direction, axis=1)
-        inside = np.flatnonzero((along > 0) & (beside <= reach * along))
-        angle = beside[inside] / along[inside]
-        return inside[np.lexsort([angle, self.kind[inside]])]
-
-
-def find_rim(
-    caster: RayCaster, origin: FloatArray, direction: FloatArray, reach: float, diagonal: float
-) -> FloatArray | None:
-    """The silhouette's nearest point (3,) in a cone about a ray.
-
-    That is the border of the surface, or of a part before a farther one. None if there is none.
-    """
-    right = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
-    right /= np.linalg.norm(right)
-    up = np.cross(right, direction)
-    angle = 2 * np.pi * np.arange(_SPOKES) / _SPOKES
-    ring = np.cos(angle)[:, None] * right + np.sin(angle)[:, None] * up
-
-    def cast(offsets: FloatArray) -> FloatArray:
-        face, distance = caster.first_hits(origin, direction + offsets)
-        return np.where(face < 0, np.inf, distance)
-
-    (middle,) = cast(np.zeros((1, 3)))
-    is_outside = bool(np.isinf(middle))
-
-    def crossed(distance: FloatArray) -> BoolArray:
-        return np.isfinite(distance) if is_outside else distance > middle + _JUMP * diagonal
-
-    for radius in reach * np.arange(1, _RINGS + 1) / _RINGS:
-        distance = cast(radius * ring)
-        other = crossed(distance)
-        if not other.any():
-            continue
-        spoke = ring[int(np.argmax(other))]
-        near, far = (0.0, radius)
-        best = None
-        for _ in range(_BISECTIONS):
-            half = (near + far) / 2
-            found = cast(half * spoke[None])
-            beyond = bool(crossed(found)[0])
-            near, far = (near, half) if beyond else (half, far)
-            if beyond == is_outside:  # on the near surface
-                best = origin + found[0] * (direction + half * spoke)
-        return best
-    return None
-
-
-def _kinds(xyz: FloatArray, faces: IntArray) -> npt.NDArray[np.int8]:
-    kind = np.full(len(xyz), SMOOTH, dtype=np.int8)
-    a, b, c = faces.T
-    solid = faces[(a != b) & (b != c) & (a != c)]
-    if not len(solid):
-        return kind
-    edges = mesh_edges(xyz, solid, crease_angle=_CREASE_DEG)
-    ends = edges.ends[edges.creased]
-    along = xyz[ends[:, 1]] - xyz[ends[:, 0]]
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
-    degree = np.bincount(ends.ravel(), minlength=len(xyz))
-    total = np.zeros_like(xyz)
-    np.add.at(total, ends[:, 0], along)
-    np.add.at(total, ends[:, 1], -along)
-    bent = np.linalg.norm(total, axis=1) > _BEND
-    kind[degree > 0] = CREASE
-    kind[(degree == 1) | (degree > 2) | ((degree == 2) & bent)] = CORNER
-    return kind
+    require_utf8(path)
+    cad = ClickableModel(load_mesh(path))
+    own, content = keypoints_file(path, folder), LastContent()
+    content.note(own)
+    reserved = (label for label in shape.ids if isinstance(label, int))
+    registry = KeypointRegistry(reserved=reserved, tolerance=_SAME_PLACE * cad.diagonal)
+    for source in dict.fromkeys((keypoints or keypoints_file(path, path.parent), own)):
+        if source == keypoints or source.exists():
+            read = ModelKeypoints.load(source, model=path)
+            if source == own:
+                refuse_other_model(read.model, path, where=own)
+            registry.merge(read.keypoints)
+    return OpenedModel(path, cad, registry, own, content)

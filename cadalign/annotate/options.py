@@ -4,12 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
-
-import tyro
-
-LOOPBACK = "127.0.0.1"
-"""Address that only this machine reaches."""
+from typing import Literal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,19 +16,14 @@ class FileOptions:
     out: Path | None = None
     """Folder for the observations; by default the photos'."""
     camera: Path | None = None
-    """File of the calibrated camera: a matrix K (text, .npy or JSON), or JSON in COLMAP's form;
-    or the folder of a COLMAP model. Without one the focal length is estimated."""
+    """File of the calibrated camera: a matrix K (text, .npy or JSON), or JSON in COLMAP's form.
+    Without one the focal length is estimated."""
     focal: float | None = None
     """Focal length of the photos [px], where no file has it, or in its place."""
     fov: float | None = None
     """Horizontal field of view of the photos [degrees], in the place of the focal length."""
     keypoints: Path | None = None
     """The model's keypoints: model.keypoints.json, or KeypointNet's annotations."""
-    mask: Path | None = None
-    """Mask of the object in a single photo: a grey PNG of its size, not 0 on the object."""
-    size: Annotated[dict[str, float] | None, tyro.conf.arg(metavar="NAME LENGTH ...")] = None
-    """Known lengths of a single photo's object: width, height, length (along the model's x, y, z)
-    and sigma, their relative standard deviation, as in --size height 0.91 sigma 0.005."""
     up_axis: Literal["x", "y", "z"] | None = None
     """The model's axis that points up, for its view and for gravity; by default the observation
     file's, or y."""

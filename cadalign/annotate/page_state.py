@@ -2,72 +2,77 @@
 
 from __future__ import annotations
 
-import os
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from cadalign.annotate.annotation import Annotation
-from cadalign.annotate.evidence_actions import ActionOutcome
-from cadalign.annotate.live import LiveAlignment, drawing_of, facts_of, notes_of
-from cadalign.annotate.problem import LIKELY_STRETCH
-from cadalign.annotate.session import Session
-from cadalign.errors import CadalignError
-from cadalign.io.documents import read_json
+from cadalign.annotate.actions import ActionOutcome
+from cadalign.annotate.keypoints import ObjectShape
+from cadalign.annotate.live import LiveAlignment, short
+from cadalign.annotate.model import box_lines
+from cadalign.annotate.session import Annotation, Session
+from cadalign.arrays import FloatArray
+from cadalign.estimation.result import Result
+from cadalign.geometry.alignment import (
+    NOT_DETERMINED,
+    NOT_DETERMINED_ROTATION_DEG,
+    distance_deviation,
+)
+from cadalign.io.evidence import LENGTHS
+from cadalign.io.observation import Observation
+from cadalign.render.drawing.layers import confidence_regions
+
+_LABELS = {"up": "gravity", "camera_height": "camera height", "cam_from_rig": "camera pose"}
+_LEFT_OPEN = 0.8  # share of a prior's standard deviation beyond which the pairs say nothing
+_UNDETERMINED = "not determined", "these pairs leave it open"
 
 
 def page_state(
     session: Session, number: int, outcome: ActionOutcome | None = None
 ) -> dict[str, Any]:
-    """Collect everything that the page shows of an annotation, after an action of that outcome.
-
-    It is the one of a number.
-    """
+    """Collect everything that the page shows of a photo, after an action of that outcome."""
     outcome = outcome or ActionOutcome()
     with session.lock:
         state = session.annotation(number)
-        live, suggestion = session.live(state)
-        document, registry, cad = state.document, state.model.registry, state.model.cad
-        history, used = state.history, document.keypoints
+        live, marks, photo = session.live(state), state.marks, state.photo
+        registry, cad, suggestion = state.model.registry, state.model.cad, live.suggestion
+        likely, focal = photo.likely_focal, marks.camera.fx
         return {
             "image": {
-                "number": state.number,
+                "number": number,
                 "count": len(session.photos),
-                "name": state.name,
-                "width": state.photo.width,
-                "height": state.photo.height,
-                "up_axis": state.stored.up_axis or "y",
+                "name": photo.path.name,
+                "width": photo.width,
+                "height": photo.height,
+                "up_axis": state.file.stored.up_axis or "y",
             },
-            "saved": {
-                "path": state.files.observation.name,
-                "at": state.saved_at,
-                "trouble": state.save_error,
-            },
+            "saved": {"path": state.file.path.name, "trouble": state.save_error},
             "selected": outcome.selected,
-            "message": outcome.message or _moved(state),
-            "can_undo": bool(history.before),
-            "can_redo": bool(history.after),
+            "message": outcome.message,
+            "can_undo": bool(state.history.before),
+            "can_redo": bool(state.history.after),
             "focal": {
-                "known": document.focal.known,
-                "pixels": round(state.camera.fx, 2),
-                "typed": document.focal.pixels,
-                "note": state.intrinsics.note,
+                "known": marks.camera.focal_known,
+                "pixels": round(focal if marks.camera.focal_known else likely.focal, 2),
+                "prior": f"about {likely.focal:.0f} px ± {100 * likely.relative_sigma:.0f} %",
             },
-            "evidence": _evidence(state),
-            "priors": _priors(state),
+            "evidence": {
+                "mask": None if marks.mask is None else f"{hash(marks.mask) & 0xFFFFFFFF:x}",
+                "photo": marks.photo,
+                "outline": state.shape.has_outline,
+            },
             "pairs": _pairs(state, live),
             "keypoints": [
                 {
                     "keypoint": keypoint,
                     "name": point.name,
                     "xyz": cad.to_display(point.xyz).tolist(),
-                    "used": keypoint in used,
+                    "used": keypoint in marks.keypoints,
                 }
                 for keypoint, point in registry
             ],
             "shape": _shape(state),
-            "alignment": _alignment(state, live),
+            "alignment": _alignment(state, live, is_ready=session.ready),
             "suggestion": None
             if suggestion is None
             else {
@@ -79,43 +84,18 @@ def page_state(
         }
 
 
-def worklist_state(session: Session) -> list[dict[str, Any]]:
-    """All annotations with their numbers of pairs and residuals [px]."""
+def photos_state(session: Session) -> list[dict[str, Any]]:
+    """All photos with their numbers of pairs."""
     with session.lock:
         return [
-            {
-                "number": number,
-                "name": each.name,
-                "pairs": len(each.document.complete_pairs),
-                "rms": _rms(each),
-            }
-            for number, each in enumerate(session.photos)
+            {"name": each.photo.path.name, "pairs": len(each.marks.complete_pairs)}
+            for each in session.photos
         ]
 
 
-def _evidence(state: Annotation) -> dict[str, Any]:
-    """Marks beside the pairs; ``mask`` changes with the mask, None without one."""
-    mask, photo = state.document.evidence.mask, state.document.evidence.photo
-    return {"mask": None if mask is None else f"{hash(mask) & 0xFFFFFFFF:x}", "photo": photo}
-
-
-def _priors(state: Annotation) -> dict[str, Any]:
-    """Priors on the stretch [%] and on the focal length: chosen ones and likely ones."""
-    priors = state.document.priors
-    likely = priors.focal or state.intrinsics.likely_focal
-    source = "EXIF" if likely == state.intrinsics.prior else "usual lenses"
-    return {
-        "stretch": None if priors.stretch is None else round(100 * priors.stretch, 4),
-        "likely": 100 * LIKELY_STRETCH,
-        "focal": priors.focal is not None,
-        "about": f"{likely.focal:.0f} px ± {100 * likely.relative_sigma:.0f} % ({source})",
-        "has_stretch": not state.session.shape.is_estimated,
-        "has_focal": not state.document.focal.known,
-    }
-
-
 def _shape(state: Annotation) -> dict[str, Any] | None:
-    shape = state.session.shape
+    """The shape's category, and the keypoints of it that the model lacks."""
+    shape = state.shape
     if not shape.is_estimated:
         return None
     known = {shape.id_of(point) for _, point in state.model.registry}
@@ -125,86 +105,185 @@ def _shape(state: Annotation) -> dict[str, Any] | None:
     }
 
 
-def _moved(state: Annotation) -> str:
-    """Say that the photo or the model is no longer where it was; empty while both are."""
-    needed = state.photo.path, state.model.path
-    gone = [path.name for path in needed if not os.path.exists(path)]
-    if not gone:
-        return ""
-    return (
-        f"{' and '.join(gone)}: moved, renamed or deleted. Go on here, or start anew with the new "
-        f"name and --observation {state.files.observation.name}."
-    )
-
-
 def _pairs(state: Annotation, live: LiveAlignment) -> list[dict[str, Any]]:
-    """The pairs with their residuals and, of pairs with one half, the other one's likely place."""
-    session, opened, document = state.session, state.model, state.document
-    cad, pairs, row = opened.cad, [], 0
-    for pair in document.pairs:
+    """The pairs with their residuals; those that contradict the others are ``off`` [px]."""
+    pairs, row = [], 0
+    for pair in state.marks.pairs:
         entry: dict[str, Any] = {
             "pair": pair.number,
             "uv": pair.uv,
             "keypoint": pair.keypoint,
             "name": "",
-            **dict.fromkeys(("xyz", "expected", "residual", "off")),
+            **dict.fromkeys(("xyz", "residual", "off")),
             "counts": True,
         }
         if pair.keypoint is not None:
-            point = opened.registry[pair.keypoint]
-            in_camera = np.array([point.xyz])
-            if not pair.uv and not session.shape.is_estimated and live.result is not None:
-                in_camera = live.alignment.apply(in_camera)
-                if in_camera[0, 2] > 0:
-                    entry["expected"] = live.camera.project(in_camera)[0].tolist()
-            entry["name"], entry["xyz"] = point.name, cad.to_display(point.xyz).tolist()
-            entry["counts"] = session.shape.id_of(point) is not None
-        if pair.complete:
-            if live.result is not None:
-                residual = live.residuals[row]
-                entry["residual"] = residual.tolist() if np.isfinite(residual).all() else None
-                entry["off"] = live.outliers.get(row)
+            point = state.model.registry[pair.keypoint]
+            entry["name"], entry["xyz"] = point.name, state.model.cad.to_display(point.xyz).tolist()
+            entry["counts"] = state.shape.id_of(point) is not None
+        if pair.complete and live.result is not None:
+            residual = live.residuals[row]
+            entry["residual"] = residual.tolist() if np.isfinite(residual).all() else None
+            entry["off"] = live.outliers.get(row)
             row += 1
         pairs.append(entry)
     return pairs
 
 
-def _alignment(state: Annotation, live: LiveAlignment) -> dict[str, Any]:
-    result, cad, session = live.result, state.model.cad, state.session
-    if result is None:
-        status = "none" if session.ready else "preparing"
-        return {"status": status, "message": _named(state, live.message)}
-    camera, alignment = live.camera, live.alignment
-    # The rows of the matrix (4, 4) that places the displayed model; a warped one has none.
-    matrix = np.eye(4)
-    linear = alignment.rotation * alignment.scale
-    matrix[:3, :3] = linear * cad.diagonal
-    matrix[:3, 3] = linear @ cad.center + alignment.translation
+def _alignment(state: Annotation, live: LiveAlignment, *, is_ready: bool) -> dict[str, Any]:
+    if live.estimate is None:
+        status, name = "none" if is_ready else "preparing", state.photo.path.name
+        return {"status": status, "message": live.message.replace("views[0]", name)}
+    alignment = live.estimate.result.alignment
     return {
         "status": "done",
         "message": "",
-        "facts": [asdict(fact) for fact in facts_of(live, session.shape)],
-        "notes": [_named(state, note) for note in notes_of(live, session.shape)],
-        "also_used": ", ".join(live.also_used),
-        "alignment": alignment.to_dict(),
-        "eye": cad.to_display(alignment.inverse(np.zeros((1, 3)))[0]).tolist(),
-        "intrinsics": {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy},
-        "camera_from_page": None if session.shape.is_estimated else matrix.ravel().tolist(),
-        **drawing_of(live, session.shape, state.model.registry, state.document.keypoints),
+        "facts": facts_of(live, state.shape, prior=state.file.stretch_sigma),
+        "notes": [
+            note.replace("views[0]", state.photo.path.name) for note in notes_of(state, live)
+        ],
+        "also_used": ", ".join(evidence_labels(state.file.observation_of(state.marks))),
+        "eye": state.model.cad.to_display(alignment.inverse(np.zeros((1, 3)))[0]).tolist(),
+        **_drawing(state, live),
     }
 
 
-def _named(state: Annotation, text: str) -> str:
-    """A text of the estimate with the photo's name."""
-    return text.replace("views[0]", state.photo.path.name)
+def _drawing(state: Annotation, live: LiveAlignment) -> dict[str, Any]:
+    """Box and edges of the model and, for an own shape, unmarked keypoints with 95 % regions."""
+    assert live.estimate is not None
+    assert live.wireframe is not None
+    result, shape = live.estimate.result, state.shape
+    camera, alignment = result.camera, result.alignment
+    lines = live.wireframe.seen_in(camera, alignment), box_lines(result.bounds, camera, alignment)
+    edges, box = (_rounded(each[(np.abs(each) < 1e6).all(axis=(1, 2))]) for each in lines)
+    unmarked, regions = [], []
+    if shape.is_estimated:
+        registry, used = state.model.registry, state.marks.keypoints
+        free = {shape.id_of(point) for number, point in registry if number not in used}
+        in_camera = alignment.apply(result.points_3d)
+        known = np.array([label in free for label in result.ids], dtype=bool)
+        rows = np.flatnonzero(known & camera.sees(in_camera))
+        pixels, covariances = camera.project(in_camera[rows]), result.points_cam_covariance
+        unmarked = np.round(pixels, 1).tolist()
+        if covariances is not None:
+            places = camera.projected_covariances(in_camera[rows], covariances[rows])
+            regions = [_closed(region) for region in confidence_regions(pixels, places)]
+    return {"lines": edges, "box": box, "unmarked": unmarked, "regions": regions}
 
 
-def _rms(state: Annotation) -> float | None:
-    """Residual of the saved alignment, which is not computed anew for a list of many photos."""
-    if not state.document.complete_pairs or not state.files.fit.exists():
-        return None
-    try:
-        rms = read_json(state.files.fit).get("rms")
-    except CadalignError:
-        return None
-    return rms if isinstance(rms, float) else None
+def _rounded(paths: FloatArray) -> list[list[float]]:
+    """Paths (k, n, 2), each as u1, v1, u2, v2, ... to a tenth of a pixel."""
+    rounded: list[list[float]] = np.round(paths, 1).reshape(len(paths), -1).tolist()
+    return rounded
+
+
+def _closed(region: FloatArray) -> list[float]:
+    """A closed path (n, 2) that ends where it begins."""
+    return _rounded(np.concatenate([region, region[:1]])[None])[0]
+
+
+def evidence_labels(observation: Observation) -> list[str]:
+    """Name what an observation holds beyond keypoints, for the page."""
+    names = dict.fromkeys(observation.evidence.sources)
+    if observation.depths is not None:
+        names["depth"] = None
+    if observation.fit_options.get("image") and not observation.evidence.mask:
+        names["photo"] = None
+    known = [name for name in LENGTHS if getattr(observation.size, name, None) is not None]
+    if known:
+        names[f"known {' and '.join(known)}"] = None
+    return [_LABELS.get(name, name) for name in names]
+
+
+def facts_of(
+    live: LiveAlignment, shape: ObjectShape, *, prior: float | None = None
+) -> list[dict[str, str]]:
+    """Stretch or lengths, pose and residuals: label, value with standard deviation, and a remark.
+
+    ``prior`` is the standard deviation of the stretch before any pair.
+    """
+    assert live.estimate is not None
+    result = live.estimate.result
+    in_lengths = shape.is_estimated or "x" in result.stretched_axes
+    axes = "xyz" if in_lengths else result.stretched_axes
+    facts = {}
+    for axis in axes:
+        label = f"{'Length' if in_lengths else 'Stretch'} {axis}"
+        facts[label] = _extent(result, axis, shape, prior=None if in_lengths else prior)
+    if result.std is not None:
+        sigma = result.std.rotation_deg
+        is_open = sigma > NOT_DETERMINED_ROTATION_DEG
+        facts["Rotation"] = _UNDETERMINED if is_open else (f"± {short(sigma)}°", "")
+    facts["Distance"] = _distance(result, shape)
+    facts["Focal length"] = _focal(result, is_assumed="focal length" in live.estimate.message)
+    if 2 * live.counts.sum() > 6 + len(result.stretched_axes):
+        note = f"rms, at ± {short(live.estimate.sigma)} px a point"
+        facts["Residuals"] = f"{short(result.rms)} px", note
+    return [{"label": k, "value": value, "note": note} for k, (value, note) in facts.items()]
+
+
+def notes_of(state: Annotation, live: LiveAlignment) -> list[str]:
+    """Assumptions, pairs that do not count, alternative alignments and warnings."""
+    assert live.estimate is not None
+    result, shape = live.estimate.result, state.shape
+    notes = [live.estimate.message] if live.estimate.message else []
+    idle = int((~live.counts).sum())
+    if idle:
+        subject = f"{idle} pair{'s do' if idle > 1 else ' does'} not count"
+        known = shape.known(state.model.points_of(state.marks.complete_pairs))
+        reason = "the mask alone aligns until there are 3"
+        if shape.learned is not None and not known.all():
+            reason = f"the shape of {shape.learned.category} has no such keypoint"
+        notes.append(f"{subject}: {reason}.")
+    others = len(result.alternatives)
+    if others and live.counts.any():
+        how = "nearly as well" if shape.is_estimated else "as well"
+        notes.append(
+            f"{others} other alignment{'s explain' if others > 1 else ' explains'} these pairs "
+            f"{how}: one more pair tells them apart."
+        )
+    told = {"outlier"} if live.outliers else set()  # beside the pairs
+    warnings = (each.text for each in result.warnings if each.kind not in told)
+    return notes + [text.replace("+-", "± ") for text in warnings]
+
+
+def _extent(
+    result: Result, axis: str, shape: ObjectShape, *, prior: float | None
+) -> tuple[str, str]:
+    """Length of the object along an axis, or its stretch where that has a prior."""
+    row, average = "xyz".index(axis), shape.average
+    value = stretch = float(result.stretch[row])
+    relative = 0.0 if result.std is None else float(result.std.scale[row])
+    if prior is None:
+        value = float(np.ptp(result.bounds, axis=0)[row] * result.alignment.scale[row])
+    if not value > 0 or relative > NOT_DETERMINED:
+        return _UNDETERMINED
+    if relative == 0:
+        return f"{value:.3g}", "taken as known"
+    if prior is not None and relative > _LEFT_OPEN * prior:
+        return "not determined", f"these pairs leave it open: 1 ± {100 * prior:.0f} % is assumed"
+    percent = 100 * (stretch - 1)
+    note = f"{abs(percent):.0f} % {'longer' if percent > 0 else 'shorter'} than {average}"
+    if abs(percent) < max(100 * relative, 0.5):
+        note = f"like {average}"
+    return f"{value:.3g} ± {short(value * relative)}", note
+
+
+def _distance(result: Result, shape: ObjectShape) -> tuple[str, str]:
+    covariance, distance = result.covariance, float(np.linalg.norm(result.alignment.translation))
+    if covariance is None or not distance > 0:
+        return f"{distance:.3g}", shape.unit
+    relative = distance_deviation(result.alignment, covariance)
+    if relative > NOT_DETERMINED:
+        return _UNDETERMINED
+    return f"{distance:.3g} ± {short(relative * distance)}", shape.unit
+
+
+def _focal(result: Result, *, is_assumed: bool) -> tuple[str, str]:
+    focal = result.camera.fx
+    if result.std is None or result.focal == "known":
+        return f"{focal:.0f} px", "assumed" if is_assumed else "taken as known"
+    relative = result.std.focal
+    if relative > NOT_DETERMINED:
+        return _UNDETERMINED
+    return f"{focal:.0f} ± {short(focal * relative)} px", "estimated"

@@ -1,31 +1,41 @@
-"""Photos to annotate: upright pixels and cameras' intrinsics."""
+"""Photos to annotate: upright pixels, the cameras that took them, and masks of objects."""
 
 from __future__ import annotations
 
 import io
 import re
-from collections.abc import Set
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import cast
 
+import cv2
+import numpy as np
+import numpy.typing as npt
 from PIL import Image
 
-from cadalign.datasets.sfm.colmap import Colmap
+from cadalign.arrays import BoolArray
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera, require_perspective
 from cadalign.io.documents import in_file
 from cadalign.io.files import listed, read_bytes, reading, require_utf8
 from cadalign.io.focal import FocalPrior
-from cadalign.io.images import PHOTO_ENDINGS, open_photo, photo_size, upright_pixels
-from cadalign.io.observation import read_camera as read_camera_file
+from cadalign.io.images import (
+    PHOTO_ENDINGS,
+    open_photo,
+    open_picture,
+    photo_size,
+    read_mask,
+    upright_pixels,
+)
 
 _MASK = re.compile(r"\.mask(-[0-9]+)?\.png$")  # at the end of the name of a mask's file
 _SHOWN_AS_IS = {"JPEG": "image/jpeg", "PNG": "image/png", "WEBP": "image/webp"}
 _ORIENTATION = 0x0112  # the EXIF tag
 _TURNED = range(2, 9)  # its values for photos that are not stored upright
 _QUALITY = 95
-_THUMBNAIL = (240, 180)  # [px]
+_LONGEST_CUT = 800  # side of the photo in which a box is cut out [px]
+_LEAST_BOX = 4.0  # [px]
+_CUT_ROUNDS = 5
 
 
 @dataclass(frozen=True)
@@ -42,15 +52,11 @@ class PhotoFile:
         require_utf8(path)
         return cls(path, *photo_size(path))
 
-    def thumbnail(self) -> bytes:
-        """Encode the upright photo as a small JPEG; raises DataError if it is damaged."""
-        with open_photo(self.path) as image:
-            image.draft("RGB", _THUMBNAIL)
-            small = Image.fromarray(upright_pixels(image))
-        small.thumbnail(_THUMBNAIL)
-        data = io.BytesIO()
-        small.save(data, format="JPEG", quality=80)
-        return data.getvalue()
+    @cached_property
+    def likely_focal(self) -> FocalPrior:
+        """Prior on an unknown focal length: of the EXIF data, or that of usual lenses."""
+        exif = FocalPrior.from_exif(self.path)
+        return exif or FocalPrior.of_usual_lenses(self.width, self.height)
 
     def encoded(self) -> tuple[str, bytes]:
         """Encode the upright photo for a browser: media type and bytes.
@@ -77,95 +83,21 @@ def find_photos(path: Path) -> list[Path]:
     if in_folder:
         photos = [p for p in entries if p.suffix.lower() in PHOTO_ENDINGS and p.is_file()]
         stems = {p.stem for p in photos}
-        own = [p for p in photos if not _is_mask(p, stems)]
-        found = sorted(own, key=lambda p: natural_key(p.name))
-        if not found:
-            raise InputError(
-                "there are no photos in this folder",
-                where=str(path),
-                fix=f"file names of photos end in {', '.join(PHOTO_ENDINGS)}",
-            )
-        return found
+        # Without the masks of photos, as the annotator names them.
+        own = [p for p in photos if p.name == (stem := _MASK.sub("", p.name)) or stem not in stems]
+        if not own:
+            fix = f"file names of photos end in {', '.join(PHOTO_ENDINGS)}"
+            raise InputError("there are no photos in this folder", where=str(path), fix=fix)
+        return sorted(own, key=lambda p: natural_key(p.name))
     if not exists:
         raise DataError("no such file or folder", where=str(path))
     return [path]
 
 
-def _is_mask(path: Path, stems: Set[str]) -> bool:
-    """True for a mask of another photo of the folder, as the annotator names them."""
-    stem = _MASK.sub("", path.name)
-    return stem != path.name and stem in stems
-
-
-@dataclass(frozen=True)
-class FocalChoice:
-    """The user's choice of a known focal length, or of one estimated from the pairs."""
-
-    known: bool
-    pixels: float | None = None  # as typed [px]; None for the camera's
-
-
-@dataclass(frozen=True)
-class Intrinsics:
-    """Intrinsics of the camera that took a photo, and their source.
-
-    Without a calibrated camera it has the photo's size and a likely focal length.
-    """
-
-    camera: Camera
-    calibrated: bool  # True if the focal length was given
-    prior: FocalPrior | None = None  # from the photo's EXIF data
-
-    @property
-    def likely_focal(self) -> FocalPrior:
-        """Prior on an unknown focal length: of the EXIF data, or that of usual lenses."""
-        if self.prior is not None:
-            return self.prior
-        return FocalPrior.of_usual_lenses(self.camera.width, self.camera.height)
-
-    @property
-    def note(self) -> str:
-        """Source of the focal length, for the page."""
-        if self.calibrated or self.prior is None:
-            return ""
-        return f"The photo's EXIF data give about {self.prior.focal:.0f} px, used as a prior."
-
-    def with_focal(self, choice: FocalChoice) -> Camera:
-        """The camera with the focal length that the user typed, if any.
-
-        Where it is estimated, pixels are square, as `cadalign fit` takes them.
-        """
-        own = self.camera
-        if not choice.known:
-            return self.to_write(choice).with_focal(choice.pixels or own.fx)
-        return own if choice.pixels is None else own.with_focal(choice.pixels)
-
-    def to_write(self, choice: FocalChoice) -> Camera:
-        """The camera for an observation file: without a focal length where that is estimated."""
-        if choice.known:
-            return self.with_focal(choice)
-        own = self.camera
-        return Camera.without_focal(
-            own.width, own.height, cx=own.cx, cy=own.cy, distortion=own.distortion
-        )
-
-
-def read_camera(path: Path, size: tuple[int, int] | None = None) -> Camera:
-    """Read a camera as `cadalign.io.read_camera` does, or the first one of a COLMAP model's folder.
-
-    ``size`` is the photos', for a file that holds a calibration matrix alone.
-    """
-    with reading(path):
-        in_folder = path.is_dir()
-    if in_folder:
-        return Colmap(path)[0].camera
-    return read_camera_file(path, size=size)
-
-
-def intrinsics_of(photo: PhotoFile, camera: Camera | None) -> Intrinsics:
-    """Combine a photo's EXIF data with its calibrated camera, which may lack a focal length."""
+def camera_of(photo: PhotoFile, camera: Camera | None) -> Camera:
+    """The camera that took a photo, by default one without a focal length; raises DataError."""
     if camera is None:
-        camera = Camera.without_focal(photo.width, photo.height)
+        return Camera.without_focal(photo.width, photo.height)
     if (camera.width, camera.height) != (photo.width, photo.height):
         raise DataError(
             f"the photo has {photo.width} x {photo.height} pixels, the camera "
@@ -175,14 +107,10 @@ def intrinsics_of(photo: PhotoFile, camera: Camera | None) -> Intrinsics:
         )
     with in_file(photo.path):
         require_perspective(camera, "the annotator")
-    prior = FocalPrior.from_exif(photo.path)
-    if camera.focal_known:
-        return Intrinsics(camera, calibrated=True, prior=prior)
-    likely = prior or FocalPrior.of_usual_lenses(photo.width, photo.height)
-    return Intrinsics(camera.with_focal(likely.focal), calibrated=False, prior=prior)
+    return camera
 
 
-def natural_key(name: str) -> tuple[tuple[str, int, str], ...]:
+def natural_key(name: str) -> tuple[tuple[str, int], ...]:
     """Key that sorts numbers in names by their values.
 
     Examples
@@ -191,7 +119,68 @@ def natural_key(name: str) -> tuple[tuple[str, int, str], ...]:
     ['9.png', '10.png', 'a2.png', 'a10.png']
     """
     parts = re.findall(r"\d+|\D+", name)
-    key = tuple(
-        ("", int(part), part) if part.isdecimal() else (part.casefold(), 0, part) for part in parts
-    )
-    return cast(tuple[tuple[str, int, str], ...], key)
+    return tuple(("", int(p)) if p.isdecimal() else (p.casefold(), 0) for p in parts)
+
+
+@dataclass(frozen=True)
+class MarkedMask:
+    """A mask: that of a file, or a drawn one, as the bytes of a PNG file."""
+
+    file: Path | None = None
+    sigma: float | None = None  # of its contour [px]
+    png: bytes = b""
+
+    @classmethod
+    def of(cls, inside: BoolArray) -> MarkedMask:
+        """A drawn mask of pixels (h, w)."""
+        return cls(png=cv2.imencode(".png", 255 * inside.astype(np.uint8))[1].tobytes())
+
+    def pixels(self, width: int, height: int) -> BoolArray:
+        """The mask (h, w); raises DataError if its file is none of that size."""
+        if self.file is None:
+            with open_picture(io.BytesIO(self.png), len(self.png), where="mask") as image:
+                return np.asarray(image) > 0
+        mask = read_mask(self.file)
+        if mask.shape != (height, width):
+            raise DataError(
+                f"the mask has {mask.shape[1]} x {mask.shape[0]} pixels, the photo "
+                f"{width} x {height}",
+                where=str(self.file),
+                fix="give a mask of the photo's size",
+            )
+        return mask
+
+
+def cut_out(photo: npt.NDArray[np.uint8], corners: npt.NDArray[np.float64]) -> BoolArray:
+    """Segment the object in a box of the photo (h, w, 3) by its colours, by GrabCut.
+
+    ``corners`` (2, 2) are two of the box [px]. Raises InputError if the box is too small, fills the
+    photo, or holds nothing that differs.
+
+    Rother, Kolmogorov, Blake, "GrabCut: interactive foreground extraction using iterated graph
+    cuts" (2004).
+    """
+    height, width = photo.shape[:2]
+    scale = min(1.0, _LONGEST_CUT / max(width, height))
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
+    low, high = np.clip(np.sort(corners, axis=0), 0, (width - 1, height - 1))
+    if (high - low).min() < _LEAST_BOX:
+        raise InputError("the box is too small", where="box", fix="draw it around the object")
+    left, top = np.floor(low * scale).astype(int).tolist()
+    right, bottom = np.ceil(high * scale).astype(int).tolist()
+    labels = np.full(small.shape[:2], cv2.GC_BGD, dtype=np.uint8)
+    labels[top : bottom + 1, left : right + 1] = cv2.GC_PR_FGD
+    if not (labels == cv2.GC_BGD).any():
+        fix = "draw it close around the object"
+        raise InputError("the box fills the photo", where="box", fix=fix)
+    cv2.setRNGSeed(0)
+    bgr = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
+    colors = np.zeros((2, 1, 65))
+    whole = (0, 0, 1, 1)  # not used with labels
+    cv2.grabCut(bgr, labels, whole, colors[0], colors[1], _CUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
+    found = (255 * np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))).astype(np.uint8)
+    if not found.any():
+        what = "nothing in the box differs from what is around it"
+        raise InputError(what, where="box", fix="draw it closer around the object")
+    return np.asarray(cv2.resize(found, (width, height), interpolation=cv2.INTER_LINEAR) >= 128)

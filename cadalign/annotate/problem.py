@@ -7,25 +7,28 @@ is only similar is not stretched to fit clicks.
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any, cast
 
 import numpy as np
+import numpy.typing as npt
 
-from cadalign.annotate.models import ObjectShape
-from cadalign.annotate.outliers import PlacedRows, Rows, find_outliers
+from cadalign.annotate.keypoints import ObjectShape, positions_of
+from cadalign.annotate.observations import LIKELY_STRETCH
 from cadalign.arrays import FloatArray
 from cadalign.batch.observed import model_of, views_of
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
-from cadalign.errors import CadalignError
+from cadalign.errors import CadalignError, DegenerateError
 from cadalign.estimation.align import align
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
+from cadalign.evaluation.simulation import simulate_problem
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
+from cadalign.geometry.camera import Camera, predicted_covariances, projection_jacobian
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.evidence import Size
 from cadalign.io.focal import FocalPrior
@@ -33,10 +36,6 @@ from cadalign.io.observation import Observation
 from cadalign.shapes.model import ShapeModel
 
 LEAST_SIGMA = 1.0  # of clicks [px]
-LEAST_PAIRS, LEAST_JOINT_PAIRS = 4, 3
-"""Pairs of an alignment without evidence beside them, and with it."""
-LIKELY_STRETCH = 0.25
-"""Standard deviation of the logarithm of each scale about 1, until another one is chosen."""
 _ROBUST_ROUNDS = 3
 _ROBUST_SHARE = 2.0  # of the median residual
 # Of clicks on natural points of a model that is not quite the object [longer sides of the photo],
@@ -48,70 +47,97 @@ _MOST_NOISE = 10.0  # the same; what needs more is a mistake, which the residual
 _NOISE_ROUNDS = 12
 _NOISE_TOLERANCE = 0.02
 _UNKNOWNS = 8  # of a pose and a stretch
-_LEAST_JUDGED = 6  # pairs from which on one can contradict the others
+_LEAST_JUDGED = 6  # pairs of an own shape from which on one can contradict the others
 _CONTRADICTS = 5.0  # distance from the others' prediction [sigmas]; hands click to about 2 px
+_FALSE_OUTLIERS = 0.01
+_MOST_ROUNDS = 100  # of a forward search, each of which fits all inliers
+# Hands click to about 2 px, and shapes differ by as much: weight of that, as of so many equations.
+_CLICK, _CLICK_EQUATIONS = 2.0, 4
+_UNSTRETCHED = "The model is shown unstretched: add a pair elsewhere."
 _FOCAL_ASSUMED = "The focal length is assumed: add a pair elsewhere to have it estimated."
+
+Rows = npt.NDArray[np.intp]
+FitRows = Callable[[Rows, bool], Result]
+"""A fit of some rows at a noise of 1 px; with a robust loss if the second argument is True."""
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """Knowledge of an object beside its observation."""
+    """Knowledge of an object beside its observation.
+
+    ``points`` are the model's keypoints that the shape knows, ``focal`` is the likely focal length,
+    at which an unknown one is assumed, and ``focal_prior`` the prior on it.
+    """
 
     shape: ObjectShape
-    mesh: Mesh  # the model's
-    anchors: Mapping[Any, ModelKeypoint] = field(default_factory=dict)
-    """The model's keypoints that the shape knows, by their ids there."""
-    estimates_focal: bool = False
-    focal_prior: FocalPrior | None = None  # on an estimated focal length
-    by_mask: dict[Camera, Result] = field(default_factory=dict)
-    """Estimates by the mask alone, by the camera; kept while nothing but pairs changes."""
+    mesh: Mesh
+    points: Sequence[ModelKeypoint] = ()
+    focal: float = 0.0
+    focal_prior: FocalPrior | None = None
 
     def model_for(self, observation: Observation) -> Model | ShapeModel:
         """The model that `cadalign fit` aligns to the observation.
 
-        A similar one has keypoints that no pair shows, too, where they do not change the estimate.
+        A similar one has keypoints that no pair shows, too, where they do not change the estimate:
+        without mask, photo and depth image, to which every keypoint warps the mesh.
         """
-        shape = self.shape
-        is_similar = shape.sigma is not None
-        if shape.learned is not None or (is_similar and not _shows_surface(observation)):
-            points = self.anchors.values()
-            return shape.model_with(points, self.mesh, up_axis=observation.up_axis)
+        shape, evidence = self.shape, observation.evidence
+        if shape.learned is not None:
+            return shape.learned
+        has_photo = bool(observation.fit_options.get("image"))
+        shows_surface = has_photo or evidence.mask is not None or evidence.depth is not None
+        if shape.sigma is not None and not shows_surface:
+            return Model(
+                points_3d=positions_of(self.points),
+                ids=[point.semantic_id for point in self.points],
+                mesh=self.mesh,
+                shape_sigma=shape.sigma,
+                up_axis=observation.up_axis,
+            )
         options = FitOptions(stretch_sigma=observation.fit_options.get("stretch_sigma"))
         return model_of(observation, options=options, shape_sigma=shape.sigma, mesh=self.mesh)
 
 
 @dataclass(frozen=True, eq=False)
-class LiveProblem:
-    """Arguments of `cadalign.align`, and how the pairs' standard deviation is found.
+class Estimate:
+    """An alignment of what is marked; a ``message`` says what it assumes beyond that.
 
-    ``noise`` is "given", "settled" for one that explains the residuals beside a prior on the
-    stretch, and "scaled" for one that is estimated from them alone.
+    ``sigma`` is the pairs' standard deviation [px], ``fit_options`` are those with which `cadalign
+    fit` finds the result, and ``outliers`` the distances [px] of the pairs that contradict the
+    others, by their rows.
     """
+
+    result: Result
+    message: str = ""
+    sigma: float = LEAST_SIGMA
+    fit_options: Mapping[str, Any] = field(default_factory=dict)
+    outliers: Mapping[int, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class LiveProblem:
+    """Arguments of `cadalign.align`; ``settles`` says that the pairs' noise is to be found."""
 
     model: Model | ShapeModel
     view: View
-    size: Size | None
-    noise: str
-    estimates_focal: bool
-    focal_prior: FocalPrior | None
+    size: Size | None = None
+    settles: bool = False
+    estimates_focal: bool = False
+    focal_prior: FocalPrior | None = None
     init: Alignment | None = None
-    by_mask: dict[Camera, Result] = field(default_factory=dict)
 
     @classmethod
     def of(cls, known: Known, observation: Observation) -> LiveProblem:
         """The problem of an observation, with the options of a fit that it holds."""
-        options, model = observation.fit_options, known.model_for(observation)
-        sigma, has_photos = options.get("sigma"), bool(options.get("image"))
-        (view,) = views_of(observation, model, sigma=sigma, with_photos=has_photos)
-        noise = "given"
-        if not known.shape.is_estimated and sigma is None and len(view.keypoint_ids):
-            has_prior = options.get("stretch_sigma") is not None
-            if has_prior and (observation.is_plain or observation.sigma is None):
-                noise = "settled"
-            elif not has_prior and observation.is_plain:
-                noise = "scaled"
-        focal = known.estimates_focal, known.focal_prior
-        return cls(model, view, observation.size, noise, *focal, observation.init, known.by_mask)
+        model, has_photo = known.model_for(observation), "image" in observation.fit_options
+        estimates_focal = not observation.camera.focal_known
+        if estimates_focal:
+            observation = replace(observation, camera=observation.camera.with_focal(known.focal))
+        (view,) = views_of(observation, model, with_photos=has_photo)
+        states_noise = observation.sigma is not None and not observation.is_plain
+        settles = not (known.shape.is_estimated or states_noise) and bool(len(view.keypoint_ids))
+        focal = estimates_focal, known.focal_prior
+        return cls(model, view, observation.size, settles, *focal, observation.init)
 
     @property
     def exact(self) -> Model | None:
@@ -119,38 +145,31 @@ class LiveProblem:
         model = self.model
         return model if isinstance(model, Model) and model.shape_sigma is None else None
 
-    @property
-    def unsaved(self) -> str:
-        """Says that it is shown and not saved, since `cadalign fit` would not find it; else empty.
+    def estimate(self) -> Estimate:
+        """Align with as few assumptions as the marks need; raises a CadalignError without."""
+        reason: CadalignError | None = None
+        for attempt, message in self._attempts():
+            try:
+                result, sigma, options = attempt.solve()
+            except DegenerateError as error:
+                reason = error
+                continue
+            judged = attempt if attempt.exact else attempt.at_focal(result.camera)
+            outliers = judged.contradicting()
+            return Estimate(result, message, sigma, {} if message else options, outliers)
+        assert reason is not None
+        raise reason
 
-        That does not know a similar model's other keypoints.
-        """
-        is_similar = self.exact is None and isinstance(self.model, Model)
-        if is_similar and not len(self.view.keypoint_ids):
-            return "It is saved from the first pair on."
-        return ""
-
-    def attempts(self) -> Iterator[tuple[LiveProblem, str]]:
-        """Problems to try, the first as it is, down to what is left where marks do not suffice.
-
-        Each comes with what it assumes, where ``{reason}`` stands for why the ones before fail.
-        """
-        problem = self
-        if not (self.is_by_mask and self.estimates_focal):  # which a mask alone leaves open
-            yield problem, ""
+    def _attempts(self) -> Iterator[tuple[LiveProblem, str]]:
+        """Problems to try, the last where marks hardly suffice, and what they assume."""
+        if len(self.view.keypoint_ids) or not self.estimates_focal:  # a mask alone leaves it open
+            yield self, ""
+        problem = self.at_focal(self.view.camera)
         if self.estimates_focal:
-            problem = problem.at_focal(self.view.camera)
             yield problem, _FOCAL_ASSUMED
-        if self.exact is None:
-            return
-        if self.exact.stretch_sigma is None:
-            model = replace(self.exact, stretch_sigma=LIKELY_STRETCH)
-            yield (
-                replace(problem, model=model),
-                "The stretch shown is assumed: {reason}. Add a pair elsewhere.",
-            )
-        rigid = replace(self.exact, stretch_sigma=None, stretch="none")
-        yield replace(problem, model=rigid), "The model is shown unstretched: add a pair elsewhere."
+        if self.exact is not None:
+            rigid = replace(self.exact, stretch_sigma=None, stretch="none")
+            yield replace(problem, model=rigid), _UNSTRETCHED
 
     def at_focal(self, camera: Camera) -> LiveProblem:
         """The problem with the focal length of this camera known."""
@@ -166,63 +185,30 @@ class LiveProblem:
         """Call `cadalign.align`; raises a CadalignError if that is impossible."""
         if self.estimates_focal:
             options |= {"focal": "estimate", "focal_prior": self.focal_prior}
-        init = self.init
-        if self.is_by_mask and len(self.view.keypoint_ids):
-            init = self._start_by_mask()
-        return align(self.model, self.view, size=self.size, init=init, **options)
-
-    @property
-    def is_by_mask(self) -> bool:
-        """True if the search of an exact model begins at what the mask allows."""
-        few = len(self.view.keypoint_ids) < LEAST_JOINT_PAIRS
-        return self.exact is not None and few and self.view.mask is not None and self.init is None
-
-    def _start_by_mask(self) -> Alignment:
-        """The alignment by the mask alone that agrees best with the pairs."""
-        view, model = self.view, self.exact
-        assert model is not None
-        if view.camera not in self.by_mask:
-            alone = replace(view, points_2d=(), ids=None, sigma=1.0, scores=None, image=None)
-            self.by_mask[view.camera] = align(model, alone, size=self.size)
-        result, points = self.by_mask[view.camera], _points_of(model, view.keypoint_ids)
-
-        def gap(alignment: Alignment) -> float:
-            pixels = view.camera.project(alignment.apply(points))
-            return float(np.linalg.norm(pixels - np.asarray(view.points_2d)))
-
-        found = (result.alignment, *(each.alignment for each in result.alternatives))
-        return min(found, key=gap)
+        return align(self.model, self.view, size=self.size, init=self.init, **options)
 
     def solve(self) -> tuple[Result, float, Mapping[str, Any]]:
         """Align at the noise that is due; with its factor [px] and the options of the fit."""
-        if self.noise == "settled":
-            factor = self._explaining_noise()
-            return self.weighted(factor).align(), factor, {"sigma": self._sigmas(factor)}
-        result = self.align()
-        squares, count = self._residuals(result)
-        redundancy = 2 * count - _UNKNOWNS - self.estimates_focal
-        factor = math.sqrt(squares / redundancy) if redundancy > 0 else 0.0
-        if self.noise == "given" or factor <= LEAST_SIGMA:
-            return result, LEAST_SIGMA, {}
-        if np.ndim(np.asarray(self.view.sigma)):
-            options = {"sigma": self._sigmas(factor)}
-            return self.weighted(factor).align(), factor, options
-        estimated = replace(self, view=replace(self.view, sigma=None))
-        return estimated.align(), factor, {"sigma": None}
+        if not self.settles:
+            return self.align(), LEAST_SIGMA, {}
+        factor = self._explaining_noise()
+        sigma = factor * np.asarray(self.view.sigma)
+        options = {"sigma": sigma.tolist() if sigma.ndim else float(sigma)}
+        return self.weighted(factor).align(), factor, options
 
     def contradicting(self) -> dict[int, float]:
         """Distances [px] of the pairs that contradict the others, by their rows."""
         view, model = self.view, self.exact
         alone = View(view.camera, view.points_2d, ids=view.ids, sigma=view.sigma)
-        pairs = replace(self, view=alone, size=None)
+        pairs = replace(self, view=alone, size=None, init=None)
         if model is None:
-            return pairs.left_out()
-        points = _points_of(model, view.keypoint_ids)
+            return pairs._left_out()
+        rows = {each: row for row, each in enumerate(model.ids or ())}
+        points = np.asarray(model.points_3d)[[rows[each] for each in view.keypoint_ids]]
         unknowns = _UNKNOWNS + self.estimates_focal
-        observed = np.asarray(view.points_2d)
-        return find_outliers(points, observed, pairs.fit_rows, unknowns=unknowns)
+        return find_outliers(points, np.asarray(view.points_2d), pairs._fit_rows, unknowns=unknowns)
 
-    def fit_rows(self, rows: Rows, robust: bool) -> PlacedRows:
+    def _fit_rows(self, rows: Rows, robust: bool) -> Result:
         """Align some pairs; see `find_outliers`."""
         view = self.view
         ids = tuple(view.keypoint_ids[row] for row in rows)
@@ -234,9 +220,9 @@ class LiveProblem:
             median = float(np.median(np.linalg.norm(result.residuals, axis=1)))
             sigma = max(LEAST_SIGMA, median / _ROBUST_SHARE)
             result = alone.weighted(sigma).align(loss="cauchy")
-        return result.alignment, result.camera, result.fisher_covariance
+        return result
 
-    def left_out(self) -> dict[int, float]:
+    def _left_out(self) -> dict[int, float]:
         """Distances [px] of the pairs that a robust search leaves out."""
         if len(self.view.keypoint_ids) < _LEAST_JUDGED:
             return {}
@@ -253,22 +239,23 @@ class LiveProblem:
         It is the fixed point of its estimate, reached from above, so that residuals first count as
         noise, and as a stretch only where the noise does not explain them.
         """
-        expected = _EXPECTED_NOISE * max(self.view.camera.width, self.view.camera.height)
+        view = self.view
+        expected = _EXPECTED_NOISE * max(view.camera.width, view.camera.height)
         factor = _FIRST_NOISE * expected
         # Without mask and photo and with the focal length of the first round, which take long.
-        near = replace(self, view=replace(self.view, mask=None, mask_sigma=None, image=None))
+        near = replace(self, view=replace(view, mask=None, mask_sigma=None, image=None))
+        sigma = np.reshape(cast(FloatArray, view.sigma), (-1, 1))
         for _ in range(_NOISE_ROUNDS):
             try:
                 result = near.weighted(factor).align()
             except CadalignError:
-                if self.view.mask is None:
+                if view.mask is None and view.image is None:
                     raise
-                return expected  # it takes the mask
+                return expected  # it takes the outline
             if near.estimates_focal:
                 near = near.at_focal(result.camera)
-            before = factor
-            squares, count = self._residuals(result)
-            redundancy = max(0, 2 * count - _UNKNOWNS)
+            before, redundancy = factor, max(0, 2 * len(result.residuals) - _UNKNOWNS)
+            squares = float(((result.residuals / sigma) ** 2).sum())
             factor = math.sqrt(
                 (squares + _NOISE_EQUATIONS * expected**2) / (redundancy + _NOISE_EQUATIONS)
             )
@@ -276,49 +263,82 @@ class LiveProblem:
                 break
         return max(LEAST_SIGMA, factor if factor < _MOST_NOISE * expected else expected)
 
-    def _residuals(self, result: Result) -> tuple[float, int]:
-        """The sum of the squared residuals over the pairs' own sigmas, and their number."""
-        residuals = result.residuals
-        if not len(residuals):
-            return 0.0, 0
-        sigma = np.reshape(cast(FloatArray, self.view.sigma), (-1, 1))
-        return float(((residuals / sigma) ** 2).sum()), len(residuals)
 
-    def _sigmas(self, factor: float) -> float | list[float]:
-        """The option of the fit for the pairs' standard deviations times a factor."""
-        given = np.asarray(self.view.sigma)
-        return (factor * given).tolist() if given.ndim else factor
+def find_outliers(
+    points_3d: FloatArray, points_2d: FloatArray, fit_rows: FitRows, *, unknowns: int
+) -> dict[int, float]:
+    """Find the keypoints that lie farther from the others' prediction than noise explains.
 
+    A forward search (Hadi, "Identifying multiple outliers in multivariate data", 1992): it begins
+    with the better half of the keypoints in a robust fit and adds all that agree, until nothing
+    changes, so that several outliers do not mask each other. The noise is estimated from the
+    inliers, about that of clicks, since all keypoints of a model that is only similar to the object
+    are some pixels off.
 
-def _shows_surface(observation: Observation) -> bool:
-    """True if a mask, a depth image or the photo bears on the mesh, which every keypoint warps.
-
-    Not without a pair, which is not saved.
+    Returns, by row, the outlier's distance [px] from the prediction of the fit to the inliers; none
+    with too few keypoints: without one, at least two more equations than unknowns must be left.
     """
-    evidence = observation.evidence
-    if not len(observation.points_2d):
-        return False
-    has_photo = bool(observation.fit_options.get("image"))
-    return has_photo or evidence.mask is not None or evidence.depth is not None
+    count, least = len(points_3d), unknowns // 2 + 1
+    if count <= least:
+        return {}
+    start = max(least, count // 2 + 1)
+
+    def residuals_of(result: Result) -> FloatArray:
+        """Projected minus observed (n, 2) [px]; infinite behind the camera."""
+        in_camera = result.alignment.apply(points_3d)
+        return result.camera.project_where_ahead(in_camera) - points_2d
+
+    def statistic(rows: Rows) -> tuple[FloatArray, float]:
+        """Squared residuals (n,) per equation over their expectation, and their quantile.
+
+        For keypoints outside the fit, the covariance of the prediction adds to the noise.
+        """
+        result = fit_rows(rows, False)
+        residuals, covariance = residuals_of(result), result.fisher_covariance
+        equations = 2 * len(rows) - unknowns + _CLICK_EQUATIONS
+        total = float((residuals[rows] ** 2).sum()) + _CLICK_EQUATIONS * _CLICK**2
+        expected = np.tile(np.eye(2), (count, 1, 1))
+        others = np.setdiff1d(np.arange(count), rows)
+        others = others[result.camera.sees(result.alignment.apply(points_3d[others]))]
+        if len(others) and covariance is not None:
+            jacobian = projection_jacobian(points_3d[others], result.camera, result.alignment)
+            expected[others] += predicted_covariances(jacobian, covariance)
+        finite = np.nan_to_num(residuals, posinf=1e9)
+        squares = np.einsum("na,nab,nb->n", finite, np.linalg.inv(expected), finite)
+        # The quantile of an F distribution with 2 degrees of freedom has a closed form.
+        quantile = equations / 2 * (math.pow(_FALSE_OUTLIERS / count, -2 / equations) - 1)
+        return np.asarray(squares / 2 / (total / equations)), quantile
+
+    def nearest(values: FloatArray) -> Rows:
+        return np.sort(np.argsort(values, kind="stable")[:start])
+
+    try:
+        robust = residuals_of(fit_rows(np.arange(count), True))
+        rows, known = nearest((robust**2).sum(axis=1)), set[bytes]()
+        # The search may come back to a set instead of coming to rest.
+        while rows.tobytes() not in known and len(known) < _MOST_ROUNDS:
+            known.add(rows.tobytes())
+            values, quantile = statistic(rows)
+            agreed = np.flatnonzero(values <= quantile)
+            rows = agreed if len(agreed) >= start else nearest(values)
+        outliers = np.setdiff1d(np.arange(count), rows)
+        if not len(outliers):
+            return {}
+        lengths = np.linalg.norm(residuals_of(fit_rows(rows, False)), axis=1)
+    except CadalignError:  # a subset of the keypoints is degenerate, so that none can be judged
+        return {}
+    return {int(row): float(lengths[row]) for row in outliers}
 
 
-def _points_of(model: Model, ids: Sequence[Hashable]) -> FloatArray:
-    """Keypoints (n, 3) of a model by their ids."""
-    rows = {each: row for row, each in enumerate(model.ids or ())}
-    return np.asarray(model.points_3d)[[rows[each] for each in ids]]
-
-
-def warm_up(points_3d: FloatArray, points_2d: FloatArray, camera: Camera, *, joint: bool) -> None:
-    """Compile or load what alignments call, by aligning points (n, 3) with (n, 2) [px]."""
-    view, prior = View(camera, points_2d, sigma=1.0), FocalPrior(camera.fx, 0.4)
-    exact = Model(points_3d=points_3d, stretch_sigma=LIKELY_STRETCH)
+@cache
+def warm_up(*, joint: bool) -> None:
+    """Compile or load what alignments call, once in a process, by aligning synthetic problems."""
+    problem = simulate_problem(np.random.default_rng(0), points=8, noise_px=1.0)
+    view = View(problem.camera, problem.points_2d, sigma=1.0)
+    prior = FocalPrior(problem.camera.fx, 0.4)
     for estimates_focal in (False, True):
-        problem = LiveProblem(exact, view, None, "settled", estimates_focal, prior)
-        problem.solve()
-        problem.contradicting()
-    if joint:
-        similar = Model(points_3d=points_3d, shape_sigma=0.01)
-        for estimates_focal in (False, True):
-            problem = LiveProblem(similar, view, None, "given", estimates_focal, None)
-            problem.solve()
-            problem.left_out()
+        exact = Model(points_3d=problem.points_3d, stretch_sigma=LIKELY_STRETCH)
+        LiveProblem(exact, view, None, True, estimates_focal, prior).estimate()
+        if joint:
+            similar = Model(points_3d=problem.points_3d, shape_sigma=0.01)
+            LiveProblem(similar, view, None, False, estimates_focal).estimate()

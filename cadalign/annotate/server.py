@@ -1,11 +1,14 @@
-"""Web server of the annotator: the page, photos, model and actions."""
+"""Web server of the annotator: page, photos, model and actions, for the session's token alone."""
 
 from __future__ import annotations
 
+import hmac
 import io
 import json
+import secrets
 import socket
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -14,23 +17,95 @@ import uvicorn
 from PIL import Image
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import MutableHeaders
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
+from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
-from starlette.types import ASGIApp
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from cadalign.annotate.actions import perform
-from cadalign.annotate.annotation import Annotation
-from cadalign.annotate.guard import Access, Guard
-from cadalign.annotate.model import detail_bytes, display_bytes
-from cadalign.annotate.options import LOOPBACK
-from cadalign.annotate.page_state import page_state, worklist_state
-from cadalign.annotate.session import Session
+from cadalign.annotate.page_state import page_state, photos_state
+from cadalign.annotate.session import Annotation, Session
 from cadalign.errors import CadalignError, InputError
 from cadalign.web import asset
 
-_BYTES = "application/octet-stream"
+LOOPBACK = "127.0.0.1"
+"""Address that only this machine reaches."""
+TOKEN_HEADER = "x-cadalign-token"
+_NAMES = [LOOPBACK, "localhost"]
 _MOST_CONNECTIONS = 256
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+HEADERS = {
+    "Content-Security-Policy": _POLICY,
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+
+
+@dataclass(frozen=True)
+class Access:
+    """Requirements on requests: origin and the session's secret token."""
+
+    port: int
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)
+
+    @property
+    def url(self) -> str:
+        """Address of the page with the token."""
+        return f"http://{LOOPBACK}:{self.port}/?token={self.token}"
+
+    @property
+    def cookie(self) -> str:
+        """Name of the cookie, by port: browsers send cookies to all ports of a machine."""
+        return f"cadalign-{self.port}"
+
+    def refusal(self, request: Request) -> str | None:
+        """Check a request before its body is read; returns the reason of a refusal."""
+        origin = request.headers.get("origin")
+        if origin is not None and origin not in {f"http://{name}:{self.port}" for name in _NAMES}:
+            return "requests from another origin are refused"
+        if request.headers.get("sec-fetch-site") in ("cross-site", "same-site"):
+            return "requests from another site are refused"
+        given = [request.headers.get(TOKEN_HEADER), request.cookies.get(self.cookie)]
+        if request.url.path == "/":
+            given.append(request.query_params.get("token"))
+        wanted = self.token.encode()
+        tokens = (text.encode("utf-8", "replace") for text in given if text)
+        if not any(hmac.compare_digest(token, wanted) for token in tokens):
+            return "the token is missing or wrong: open the address that cadalign has printed"
+        return None
+
+
+class Guard:
+    """ASGI middleware that enforces `Access` and sends the headers of every answer."""
+
+    def __init__(self, app: ASGIApp, access: Access) -> None:
+        self._app = app
+        self._access = access
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+        if scope["type"] != "http":  # web sockets and lifespan events are not used
+            return
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(HEADERS)
+            await send(message)
+
+        app, reason = self._app, self._access.refusal(Request(scope))
+        if reason is not None:
+            # A body stays unread, so the connection cannot be used again.
+            app = PlainTextResponse(reason, status_code=403, headers={"Connection": "close"})
+        await app(scope, receive, send_with_headers)
 
 
 def make_app(session: Session, access: Access) -> ASGIApp:
@@ -41,43 +116,41 @@ def make_app(session: Session, access: Access) -> ASGIApp:
         "/annotate.js": partial(_asset, "annotate.js", "text/javascript"),
         "/annotate.css": partial(_asset, "annotate.css", "text/css"),
         "/model": routes.model,
-        "/details": routes.details,
+        "/photos": routes.photos,
         "/photo/{number:int}": routes.photo,
-        "/worklist": routes.worklist,
-        "/thumbnail/{number:int}": routes.thumbnail,
         "/mask/{number:int}": routes.mask,
         "/state/{number:int}": routes.state,
     }
-    app = Starlette(
+    return Starlette(
         routes=[
             *(Route(path, answer) for path, answer in answers.items()),
             Route("/act/{number:int}", routes.act, methods=["POST"]),
         ],
+        middleware=[
+            Middleware(Guard, access=access),
+            # Another site's name may resolve to this machine (DNS rebinding).
+            Middleware(TrustedHostMiddleware, allowed_hosts=_NAMES),
+        ],
         exception_handlers={CadalignError: _refused},
     )
-    return Guard(app, access)
 
 
 def listen(port: int) -> socket.socket:
-    """Open a socket that only this machine reaches; port 0 chooses a free one."""
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    """Listen on a port of the loopback interface, 0 for a free one; raises InputError."""
+    listener = socket.socket()
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((LOOPBACK, port))
         listener.listen()  # connections wait until the server runs
     except (OSError, OverflowError) as error:
         listener.close()
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(
-            f"port {port} cannot be opened ({reason})",
-            where="--port",
-            fix="omit --port to use a free one",
-        ) from None
+        what = f"port {port} cannot be opened ({getattr(error, 'strerror', None) or error})"
+        raise InputError(what, where="--port", fix="omit --port to use a free one") from None
     return listener
 
 
 def make_server(app: ASGIApp) -> uvicorn.Server:
-    """Make the server of an application, which `serve` runs."""
+    """Make the server of an application, whose ``run`` serves until interrupted."""
     config = uvicorn.Config(
         app,
         http="h11",
@@ -90,18 +163,12 @@ def make_server(app: ASGIApp) -> uvicorn.Server:
     return uvicorn.Server(config)
 
 
-def serve(app: ASGIApp, listener: socket.socket) -> None:
-    """Serve until interrupted."""
-    make_server(app).run(sockets=[listener])
-
-
 class _Routes:
     """Handlers of the addresses; Starlette runs synchronous ones in threads."""
 
     def __init__(self, session: Session, access: Access) -> None:
         self._session = session
         self._access = access
-        self._model = b""
 
     def page(self, request: Request) -> Response:
         response = Response(asset("annotate.html"), media_type="text/html")
@@ -111,29 +178,19 @@ class _Routes:
 
     def model(self, request: Request) -> Response:
         with self._session.lock:
-            self._model = self._model or display_bytes(self._session.model.cad)
-        return Response(self._model, media_type=_BYTES)
+            data = self._session.model.cad.display_bytes
+        return Response(data, media_type="application/octet-stream")
 
-    def details(self, request: Request) -> Response:
-        opened = self._session.model
-        return Response(detail_bytes(opened.cad, opened.wireframe.creases), media_type=_BYTES)
+    def photos(self, request: Request) -> Response:
+        return JSONResponse(photos_state(self._session))
 
     def photo(self, request: Request) -> Response:
         kind, data = self._annotation(request).photo.encoded()
         return Response(data, media_type=kind)
 
-    def worklist(self, request: Request) -> Response:
-        return JSONResponse(worklist_state(self._session))
-
-    def thumbnail(self, request: Request) -> Response:
-        thumbnail = self._annotation(request).photo.thumbnail()
-        kept = {"Cache-Control": "max-age=3600"}
-        return Response(thumbnail, media_type="image/jpeg", headers=kept)
-
     def mask(self, request: Request) -> Response:
-        mask = self._annotation(request).mask
         # Its opacity is what the page draws, in a colour of its own.
-        opacity = np.where(mask, 255, 0).astype(np.uint8)
+        opacity = np.where(self._annotation(request).mask, 255, 0).astype(np.uint8)
         data = io.BytesIO()
         Image.fromarray(np.stack([np.zeros_like(opacity), opacity], axis=2), "LA").save(data, "PNG")
         return Response(data.getvalue(), media_type="image/png")
@@ -152,10 +209,9 @@ class _Routes:
             raise InputError("not JSON", where="body", fix=fix) from None
         if not isinstance(action, dict):
             raise InputError("not a JSON object", where="body", fix=fix)
-        return await run_in_threadpool(self._acted, request, action)
+        return await run_in_threadpool(self._acted, request.path_params["number"], action)
 
-    def _acted(self, request: Request, action: dict[str, Any]) -> Response:
-        number = request.path_params["number"]
+    def _acted(self, number: int, action: dict[str, Any]) -> Response:
         with self._session.lock:
             outcome = perform(self._session, number, action)
             return JSONResponse(page_state(self._session, number, outcome))
@@ -169,4 +225,4 @@ def _asset(name: str, media_type: str, request: Request) -> Response:
 
 
 async def _refused(request: Request, error: Exception) -> Response:
-    return JSONResponse({"error": str(error)}, status_code=422)
+    return PlainTextResponse(str(error), status_code=422)

@@ -1,25 +1,122 @@
-"""Annotation session: its annotations, their live alignments, and their files."""
+"""Annotation session: its photos, their live alignments, and their observation files."""
 
 from __future__ import annotations
 
+import json
+import logging
 import threading
-import time
-from dataclasses import dataclass, field
-from functools import cache, partial
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from cadalign.annotate.annotation import Annotation
-from cadalign.annotate.files import AnnotationFiles
+from cadalign.annotate.files import keypoints_file, observation_file, refuse_collisions
+from cadalign.annotate.keypoints import ObjectShape
 from cadalign.annotate.live import LiveAlignment, live_alignment, missing_text
-from cadalign.annotate.models import ObjectShape, OpenedModel
-from cadalign.annotate.problem import Known, warm_up
-from cadalign.annotate.suggestion import Suggestion, suggest
-from cadalign.errors import CadalignError, DegenerateError, InputError
-from cadalign.evaluation.simulation import simulate_problem
-from cadalign.io.images import read_photo
+from cadalign.annotate.marks import History, Marks, Pixel
+from cadalign.annotate.model import OpenedModel, open_model
+from cadalign.annotate.observations import ObservationFile
+from cadalign.annotate.options import SessionOptions
+from cadalign.annotate.photos import PhotoFile, camera_of, find_photos
+from cadalign.annotate.problem import Estimate, Known, LiveProblem, warm_up
+from cadalign.arrays import BoolArray
+from cadalign.errors import CadalignError, DataError, DegenerateError, InputError
+from cadalign.io.observation import Observation, read_camera, with_lens
+
+logger = logging.getLogger("cadalign")
+
+
+@dataclass(eq=False)
+class Annotation:
+    """The object in a photo: its file, its marks, and what the last save and alignment gave."""
+
+    file: ObservationFile
+    history: History
+    save_error: str = ""
+    is_pending: bool = False
+    """True if it was saved before the solvers were ready, so without what they find."""
+    live: tuple[Marks, LiveAlignment] | None = None
+    """The last alignment, with its marks."""
+    _estimated: tuple[str, Estimate] | None = None  # with what it depends on
+
+    @property
+    def marks(self) -> Marks:
+        """The current marks."""
+        return self.history.marks
+
+    @property
+    def photo(self) -> PhotoFile:
+        """The photo."""
+        return self.file.photo
+
+    @property
+    def model(self) -> OpenedModel:
+        """The model of the session."""
+        return self.file.model
+
+    @property
+    def shape(self) -> ObjectShape:
+        """The shape of the session's objects."""
+        return self.file.shape
+
+    def record(self, marks: Marks) -> None:
+        """Go on to other marks."""
+        self.history.record(marks)
+
+    @property
+    def mask(self) -> BoolArray:
+        """The mask of the object, (h, w); empty without one."""
+        mask, (width, height) = self.marks.mask, (self.photo.width, self.photo.height)
+        return np.zeros((height, width), bool) if mask is None else mask.pixels(width, height)
+
+    def require_inside(self, uv: Pixel) -> None:
+        """Refuse a place outside the photo."""
+        if not self.marks.camera.contains(np.array([uv]))[0]:
+            what = f"({uv[0]:.1f}, {uv[1]:.1f}) is outside the photo"
+            raise InputError(what, where="uv", fix="place it inside")
+
+    def alignment(self) -> LiveAlignment:
+        """The alignment of the current marks."""
+        marks = self.marks
+        if self.live is None or self.live[0] is not marks:
+            try:
+                live = self._align()
+            except DegenerateError as error:
+                live = LiveAlignment(message=f"No alignment yet: {error.what}.")
+            except CadalignError as error:  # also of a mask that cannot be written or read
+                live = LiveAlignment(message=f"No alignment: {error}.")
+            self.live = marks, live
+        return self.live[1]
+
+    def _align(self) -> LiveAlignment:
+        file, marks, shape = self.file, self.marks, self.shape
+        observation, pairs = file.observation_of(marks), marks.complete_pairs
+        counting, points = file.counting(marks), self.model.points_of(pairs)
+        counts = np.array([pair in counting for pair in pairs], dtype=bool)
+        if missing := missing_text(counts, shape, observation):
+            return LiveAlignment(message=missing)
+        uv = np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2)
+        return live_alignment(
+            self._estimate(observation),
+            shape,
+            self.model.registry,
+            self.model.cad.wireframe,
+            (points, uv, counts),
+            marks.keypoints,
+        )
+
+    def _estimate(self, observation: Observation) -> Estimate:
+        registry, file = self.model.registry, self.file
+        points = [point for _, point in registry if self.shape.id_of(point) is not None]
+        depends = replace(observation, unfinished=None).to_dict()
+        # A drawn mask's file is written anew, and a similar model has all keypoints.
+        key = json.dumps([depends, hash(self.marks.mask), [point.xyz for point in points]])
+        if self._estimated is None or self._estimated[0] != key:
+            mesh, likely = self.model.cad.scene.mesh, self.photo.likely_focal.focal
+            known = Known(self.shape, mesh, points, likely, file.focal_prior)
+            self._estimated = key, LiveProblem.of(known, observation).estimate()
+        return self._estimated[1]
 
 
 @dataclass(eq=False)
@@ -34,24 +131,23 @@ class Session:
     def __post_init__(self) -> None:
         self.lock = threading.RLock()
         self.ended = threading.Event()
-        self._pixels: tuple[Path, npt.NDArray[np.uint8]] | None = None
 
     def warm_up(self) -> None:
         """Compile or load the solvers, and prepare the model, until the session has ``ended``."""
         try:
-            marked = (each for each in self.photos if each.document.complete_pairs)
-            joint = self.shape.is_estimated or not all(
-                each.observation().is_plain for each in marked
+            joint = self.shape.is_estimated or any(
+                not each.file.observation_of(each.marks).is_plain
+                for each in self.photos
+                if each.marks.complete_pairs
             )
-            for step in (partial(_load_solvers, joint=joint), self.model.prepare):
-                if self.ended.is_set():
-                    return
-                step()
+            warm_up(joint=joint)
+            if not self.ended.is_set():
+                _ = self.model.cad.scene.caster, self.model.cad.wireframe
         finally:  # an error here occurs again, and is reported, when the user aligns
             self.ready = True
             with self.lock:
                 for each in self.photos:
-                    if each.fit_pending and not self.ended.is_set():
+                    if each.is_pending and not self.ended.is_set():
                         self.save(each)
 
     def annotation(self, number: int) -> Annotation:
@@ -60,54 +156,11 @@ class Session:
             raise InputError(f"there is no photo {number + 1}", where="image")
         return self.photos[number]
 
-    def pixels(self, annotation: Annotation) -> npt.NDArray[np.uint8]:
-        """The upright photo (h, w, 3); the last one asked for is kept."""
-        path = annotation.photo.path
-        if self._pixels is None or self._pixels[0] != path:
-            self._pixels = (path, read_photo(path))
-        return self._pixels[1]
-
-    def live(self, annotation: Annotation) -> tuple[LiveAlignment, Suggestion | None]:
-        """Compute the alignment and the next keypoint of the current annotation."""
+    def live(self, annotation: Annotation) -> LiveAlignment:
+        """The alignment of an annotation's current marks."""
         if not self.ready:
-            return LiveAlignment(message="Solvers and model are being prepared."), None
-        document, model = annotation.document, self.model
-        if annotation.live is not None and annotation.live[0] is document:
-            return annotation.live[1:]
-        suggestion = None
-        try:
-            live = self._align(annotation)
-            suggestion = suggest(live, model.registry, document.keypoints, self.shape)
-        except DegenerateError as error:
-            live = LiveAlignment(message=f"No alignment yet: {error.what}.")
-        except CadalignError as error:  # also of a mask that cannot be written or read
-            live = LiveAlignment(message=f"No alignment: {error}.")
-        annotation.live = (document, live, suggestion)
-        return live, suggestion
-
-    def _align(self, annotation: Annotation) -> LiveAlignment:
-        observation, shape = annotation.observation(), self.shape
-        pairs, model = annotation.document.complete_pairs, self.model
-        points = model.points_of(pairs)
-        by_mask = observation.evidence.mask is not None and not shape.is_estimated
-        by_photo = observation.init is not None and "image" in observation.fit_options
-        if not (by_mask or (by_photo and shape.has_mesh)):
-            is_plain = observation.is_plain and not shape.is_estimated
-            missing = missing_text(shape.known(points), shape, is_plain=is_plain)
-            if missing:
-                return LiveAlignment(message=missing)
-        own = {shape.id_of(point): point for _, point in model.registry}
-        known = Known(
-            shape,
-            model.cad.scene.mesh,
-            anchors={label: point for label, point in own.items() if label is not None},
-            estimates_focal=not annotation.document.focal.known,
-            focal_prior=annotation.document.priors.focal,
-            by_mask=annotation.estimates_by_mask,
-        )
-        estimate = LiveAlignment.of(known, observation)
-        uv = np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2)
-        return live_alignment(estimate, known, model.wireframe, observation, points, uv)
+            return LiveAlignment(message="Solvers and model are being prepared.")
+        return annotation.alignment()
 
     def save(self, annotation: Annotation) -> None:
         """Write the files of an annotation and of the model; an error is kept for the page.
@@ -116,48 +169,85 @@ class Session:
         """
         self._write(annotation)
         if not annotation.save_error:
-            for other in self.unsaved:
-                self._write(other)
+            self.save_unsaved()
 
     @property
     def unsaved(self) -> list[Annotation]:
         """Annotations whose last change could not be written."""
         return [each for each in self.photos if each.save_error]
 
-    def save_unsaved(self, folder: Path | None = None) -> None:
-        """Write what could not be written, if given into another folder from now on."""
+    def save_unsaved(self) -> None:
+        """Write what could not be written."""
         with self.lock:
-            unsaved = self.unsaved
-            if folder is not None:
-                self.model.keypoints_path = folder / self.model.keypoints_path.name
-                for each in unsaved:
-                    each.files = AnnotationFiles(folder / each.files.observation.name)
-            for each in unsaved:
+            for each in self.unsaved:
                 self._write(each)
 
     def _write(self, annotation: Annotation) -> None:
-        ready = self.ready  # asked first: it may become so at any time
-        annotation.fit_pending = not ready
-        live, _ = self.live(annotation)
-        used = (each.document.keypoints for each in self.photos)
+        annotation.is_pending = not self.ready  # asked first: it may become so at any time
+        estimate = self.live(annotation).estimate
+        options = {} if estimate is None else estimate.fit_options
+        used = (each.marks.keypoints for each in self.photos)
         try:
             # First the keypoints, which the observation names.
             self.model.write_keypoints(frozenset[int]().union(*used))
-            written = annotation.observation(fit_options=live.fit_options, to_write=True)
-            annotation.files.write(written)
-            if ready:
-                # An alignment by assumptions is shown but not written: `cadalign fit` would
-                # refuse it.
-                annotation.files.write_fit(None if live.provisional else live.result)
+            file = annotation.file
+            file.write(file.observation_of(annotation.marks, sigma=options))
         except CadalignError as error:
             annotation.save_error = str(error)
         else:
             annotation.save_error = ""
-            annotation.saved_at = time.time()
 
 
-@cache
-def _load_solvers(*, joint: bool) -> None:
-    """Compile or load the solvers, once in a process, by aligning a synthetic problem."""
-    problem = simulate_problem(np.random.default_rng(0), points=8, noise_px=1.0)
-    warm_up(problem.points_3d, problem.points_2d, problem.camera, joint=joint)
+SessionFiles = list[tuple[PhotoFile, Path]]
+"""Photos of a session, and the observation file of each, all in one folder."""
+
+
+def find_session_files(options: SessionOptions) -> SessionFiles:
+    """Find the photos and name their files; raises an error where files would collide."""
+    image, given = options.image, options.observation
+    paths = find_photos(image)
+    if given is not None and (image.is_dir() or options.out is not None):
+        what = "names the file of a single photo, but a folder is given too"
+        fix = "use --out for a folder of photos, and not both options"
+        raise InputError(what, where="--observation", fix=fix)
+    photos = _readable(paths) if image.is_dir() else [PhotoFile.open(paths[0])]
+    photos[0].encoded()  # refuses a damaged photo now, not when the page asks for it
+    out = options.out or paths[0].parent if given is None else given.parent
+    observations = [] if given is None else [given]
+    for photo in photos[len(observations) :]:
+        observations.append(observation_file(photo.path, out, observations))
+    keypoints = keypoints_file(options.model, out)
+    read: list[Any] = [options.model, options.camera, *(photo.path for photo in photos)]
+    if options.keypoints != keypoints:
+        read.append(options.keypoints)
+    refuse_collisions([keypoints, *observations], [path for path in read if path is not None])
+    return list(zip(photos, observations, strict=True))
+
+
+def open_session(options: SessionOptions, files: SessionFiles | None = None) -> Session:
+    """Open an annotation session: read photos, model, camera and earlier annotations."""
+    files = files or find_session_files(options)
+    shape, (first, path) = ObjectShape.open(options), files[0]
+    model = open_model(options.model, path.parent, keypoints=options.keypoints, shape=shape)
+    size = first.width, first.height
+    given = None if options.camera is None else read_camera(options.camera, size=size)
+    session = Session(model, shape)
+    for photo, path in files:
+        camera = with_lens(camera_of(photo, given), options.focal, fov=options.fov)
+        file = ObservationFile(path, photo, model, shape)
+        marks = file.read(camera, up_axis=options.up_axis)
+        session.photos.append(Annotation(file, History(marks)))
+    return session
+
+
+def _readable(paths: list[Path]) -> list[PhotoFile]:
+    """Open the files that are photos, with a warning about the others."""
+    photos = []
+    for path in paths:
+        try:
+            photos.append(PhotoFile.open(path))
+        except DataError as error:
+            logger.warning("left out: %s", error)
+    if not photos:
+        raise DataError("none of the photos in this folder can be read", where=str(paths[0].parent))
+    return photos

@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from cadalign.errors import InputError
-from cadalign.estimation.focal import USUAL, PriorOption, prior_of_camera
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions, Sigma
 from cadalign.io.documents import in_file, within
 from cadalign.io.files import once_per_file
-from cadalign.io.focal import FocalPrior
+from cadalign.io.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
 from cadalign.io.observation import Observation, ObservationChanges
 from cadalign.io.observation_file import fill_xyz
 

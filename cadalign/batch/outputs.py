@@ -20,13 +20,13 @@ import pyarrow.parquet as pq
 from cadalign.datasets.models.shapenet import name_of_synset
 from cadalign.errors import CadalignError, RenderError
 from cadalign.estimation.result import Result
-from cadalign.estimation.results import RESULT_COLUMNS, row_of
 from cadalign.evaluation.benchmark import write_picture
 from cadalign.evaluation.instances.pictures import write_pictures, write_preview
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
 from cadalign.evaluation.runs.work import Columns, Row
+from cadalign.export.tables import RESULT_COLUMNS, row_of
 from cadalign.geometry.alignment import Box
 from cadalign.io.files import write_whole
 from cadalign.io.images import read_image

@@ -51,7 +51,7 @@ COMMANDS = {  # the class of each in its module, and the first sentence of its d
     ),
     "doctor": (
         "doctor.Doctor",
-        "Check the renderers and their speed, and show how to enable missing ones.",
+        "Check the renderers, and show how to enable missing ones.",
     ),
 }
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import tempfile
 import threading
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, fields
@@ -29,7 +28,7 @@ class Annotate(FileOptions):
     """Mark keypoints on photos and a model in the browser, and see the alignment as you go.
 
     Serves a page on this machine only. Every change is saved at once: an observation beside each
-    photo (photo.json), its alignment (photo_fit/fit.json), and the model's keypoints
+    photo (photo.json), which `cadalign fit` aligns, and the model's keypoints
     (model.keypoints.json).
     """
 
@@ -76,10 +75,9 @@ class Annotate(FileOptions):
         """Serve until interrupted; returns the exit code."""
         import webbrowser
 
-        from cadalign.annotate.guard import Access
-        from cadalign.annotate.names import only_annotator
-        from cadalign.annotate.opening import find_session_files, open_session
-        from cadalign.annotate.server import listen, make_app, serve
+        from cadalign.annotate.files import only_annotator
+        from cadalign.annotate.server import Access, listen, make_app, make_server
+        from cadalign.annotate.session import find_session_files, open_session
 
         options = self.session
         listener = listen(self.port)
@@ -92,7 +90,7 @@ class Annotate(FileOptions):
                     self.observation.parent.mkdir(parents=True, exist_ok=True)
             access = Access(listener.getsockname()[1])
             files = find_session_files(options)
-            opened.enter_context(only_annotator(files.keypoints.parent))
+            opened.enter_context(only_annotator(files[0][1].parent))
             with waiting("reading photos and model"):
                 session = open_session(options, files)
             warming = threading.Thread(target=session.warm_up, daemon=True)
@@ -107,21 +105,15 @@ class Annotate(FileOptions):
                 say("Open this address in a browser of this machine; end with Ctrl+C.")
                 if not self.no_open:
                     webbrowser.open(access.url)
-                serve(make_app(session, access), listener)
+                make_server(make_app(session, access)).run(sockets=[listener])
             return _save_and_say_where(session)
 
 
 def _save_and_say_where(session: Session) -> int:
-    """Save what could not be saved before, elsewhere if need be; returns the exit code."""
-    folder = session.model.keypoints_path.parent.absolute()
+    """Save what could not be saved before; returns the exit code."""
     session.save_unsaved()
-    if not session.unsaved:
-        say(f"Saved in {folder}")
-        return 0
     for trouble in sorted({each.save_error for each in session.unsaved}):
         say(f"Not saved: {trouble}")
-    elsewhere = Path(tempfile.mkdtemp(prefix="cadalign-annotate-"))
-    session.save_unsaved(elsewhere)
     if not session.unsaved:
-        say(f"Saved in {elsewhere} instead")
-    return 1
+        say(f"Saved in {session.model.keypoints_path.parent.absolute()}")
+    return bool(session.unsaved)

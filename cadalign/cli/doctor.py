@@ -15,7 +15,7 @@ from cadalign.errors import InputError
 
 @dataclass(frozen=True)
 class Doctor(JsonOption):
-    """Check the renderers and their speed, and show how to enable missing ones.
+    """Check the renderers, and show how to enable missing ones.
 
     Also shows the processor cores and the cache of compiled solvers. With --compile, compiles the
     solvers ahead.
@@ -53,11 +53,7 @@ class Doctor(JsonOption):
 
 def _print(health: dict[str, Any]) -> None:
     for each in health["renderers"]:
-        state = (
-            "does not work" if each["milliseconds"] is None else f"{each['milliseconds']:.0f} ms"
-        )
-        answer(f"{each['name']:9} {state:13} {each['versions']}; {each['detail']}")
-    answer("(a frame of 640 x 480 px, 20,480 triangles)")
+        answer(f"{each['name']:9} {'works' if each['works'] else 'fails'}: {each['detail']}")
     answer(f"--renderer auto takes: {health['best']}")
     for name, command in health["remedies"].items():
         answer(f"To enable {name}: {command}")
@@ -74,7 +70,7 @@ def examine() -> dict[str, Any]:
     """
     from cadalign.render.probe import REMEDIES, RENDERERS, best_renderer, probe_renderer
 
-    renderers = [asdict(probe_renderer(name, timed=True)) for name in RENDERERS]
+    renderers = [asdict(probe_renderer(name)) for name in RENDERERS]
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     names = [each["name"] for each in renderers if not each["works"]]
     return {
@@ -91,7 +87,7 @@ def examine() -> dict[str, Any]:
 
 def compiled_cache() -> str:
     """Describe the cache of compiled solvers: its folder, and how many functions it holds."""
-    from cadalign.compile.files import can_write, kernel_folder
+    from cadalign.compile.folder import can_write, kernel_folder
 
     folder = kernel_folder()
     count = sum(1 for _ in folder.rglob("*.nbi")) if folder.is_dir() else 0
@@ -105,7 +101,7 @@ def compiled_cache() -> str:
 
 def require_cache() -> None:
     """Refuse to compile ahead where nothing of it could be kept."""
-    from cadalign.compile.files import can_write, kernel_folder
+    from cadalign.compile.folder import can_write, kernel_folder
 
     folder = kernel_folder()
     if not can_write(folder):

@@ -44,16 +44,14 @@ def drawn(
     from cadalign.render.drawing.model_overlay import draw_result, mesh_of, photo_of
 
     seen = list(zip(observation.views, result.views, strict=True))
-    photos = [photo_of(image, view.camera) for image, view in seen]
+    photos = [photo_of(image.image, view.camera) for image, view in seen]
     mesh = mesh_of(observation, result)
     masks: list[Any] = [None] if views is None else [view.mask_image for view in views]
     shown = mesh if views is not None else None
     bounds = mesh.bounds if views is None and mesh is not None else None
     pictures = [
-        draw_result(image, result, photo=photo, mesh=shown, bounds=bounds, mask=mask, number=number)
-        for number, (image, photo, mask) in enumerate(
-            zip(observation.views, photos, masks, strict=True)
-        )
+        draw_result(photo, result, mesh=shown, bounds=bounds, mask=mask, number=number)
+        for number, (photo, mask) in enumerate(zip(photos, masks, strict=True))
         if picture
     ]
     if not overlay:

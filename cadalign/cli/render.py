@@ -57,7 +57,7 @@ class Render:
         from cadalign.io.meshes.files import load_mesh
         from cadalign.render.drawing.pictures import contact_sheet
         from cadalign.render.probe import make_renderer
-        from cadalign.render.scene import LIGHT_GREY, Scene
+        from cadalign.render.scene import Scene
 
         with named_as_flags(self, elevation="--view"):
             camera, views = self._camera(), self._views()
@@ -70,11 +70,10 @@ class Render:
             ]
             picture = images[0]
             if len(images) > 1:
-                picture = contact_sheet(images, list(views), background=LIGHT_GREY)
+                picture = contact_sheet(images, list(views))
             make_folder_of(self.out)
             write_image(self.out, picture)
-            drawn_by = renderer.drawn_by(scene, samples=self.samples)
-        say(f"Written: {self.out} (drawn by {drawn_by})")
+        say(f"Written: {self.out}")
         return 0
 
     def _camera(self) -> Any:

@@ -37,8 +37,6 @@ class ShapeLearn:
     """Folder of ShapeNetCore, for the meshes, if they are not below the root."""
     components: int | None = None
     """Number of Gaussians; chosen by the likelihood of held-out models by default."""
-    modes: int | None = None
-    """Number of modes of each; chosen likewise by default."""
 
     def run(self) -> int:
         """Learn the model; returns the exit code."""
@@ -58,7 +56,6 @@ class ShapeLearn:
                 self.category,
                 split=self.split,
                 components=self.components,
-                modes=self.modes,
                 on_progress=on_progress,
             )
         out = Path(f"{model.category}.shape") if self.out is None else self.out

@@ -7,22 +7,21 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from functools import cached_property
-from typing import Any, TypeVar, cast
+from collections.abc import Callable
+from typing import Any, Protocol, TypeVar, cast
 
-from llvmlite import binding
-from numba import literal_unroll
-from numba.core import compiler, config, event, types
-from numba.core.codegen import JITCodeLibrary
-from numba.core.registry import CPUDispatcher
+import numba
+from numba.core import event
+from numba.extending import overload
 
-from cadalign.compile.files import KernelCache
+try:
+    from cadalign.compile.once import KernelDispatcher
+except (ImportError, AttributeError):  # Numba has no longer what this rests on
+    KernelDispatcher = None  # type: ignore[assignment, misc]
 
-__all__ = ["KernelFamily", "borrowing", "fast_sums", "inlined", "kernel", "unrolled"]
+__all__ = ["borrowing", "fast_sums", "inlined", "kernel", "kernel_family", "unrolled"]
 
-unrolled = literal_unroll
+unrolled = numba.literal_unroll
 """Loop over a tuple of several types; the body is compiled for each."""
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -35,17 +34,17 @@ def kernel(function: F) -> F:
     for one, differs between code just compiled and code read back from disk, and results must be
     the same bit for bit.
     """
-    return _compiled(function, set())
+    return _compiled(function)
 
 
 def fast_sums(function: F) -> F:
     """Like `kernel`, but sums may be reordered, so that they run on vector units."""
-    return _compiled(function, {"reassoc"})
+    return _compiled(function, fastmath={"reassoc"})
 
 
 def inlined(function: F) -> F:
     """Like `borrowing`, for a small function that is always compiled into its callers."""
-    return _compiled(function, set(), forceinline=True, counts=False)
+    return _compiled(function, forceinline=True, counts=False)
 
 
 def borrowing(function: F) -> F:
@@ -54,133 +53,94 @@ def borrowing(function: F) -> F:
     It works on arrays of its callers, and does not count its references to them: Numba counts by
     atomic operations, a hundred of which take as long as an iteration with ten keypoints.
     """
-    return _compiled(function, set(), counts=False)
+    return _compiled(function, counts=False)
 
 
 def _compiled(
-    function: F, fastmath: set[str], *, forceinline: bool = False, counts: bool = True
+    function: F,
+    *,
+    fastmath: set[str] | bool = False,
+    forceinline: bool = False,
+    counts: bool = True,
 ) -> F:
-    if getattr(config, "DISABLE_JIT", False):  # Numba's types do not know it
+    if getattr(numba.config, "DISABLE_JIT", False):  # Numba's types do not know it
         return function
-    options = {
-        "nopython": True,
+    options: Any = {
         "nogil": True,
         "error_model": "numpy",
-        "fastmath": fastmath or False,
+        "fastmath": fastmath,
         "boundscheck": False,
         "forceinline": forceinline,
-        "_nrt": counts,
-        "no_cfunc_wrapper": True,
     }
-    return cast(F, KernelDispatcher(function, options))
+    if KernelDispatcher is None:
+        return cast(F, numba.njit(cache=True, **options)(function))
+    own = {"nopython": True, "_nrt": counts, "no_cfunc_wrapper": True}
+    return cast(F, KernelDispatcher(function, options | own))
 
 
-class KernelFamily:
+class KernelFamily(Protocol):
+    """See `kernel_family`."""
+
+    def of(self, kind: type) -> Callable[[F], F]: ...
+    def __call__(self, first: Any, *others: Any) -> Any: ...
+
+
+def kernel_family(name: str) -> KernelFamily:
     """A kernel of one name with a member for each type of its first argument.
 
-    What calls it is compiled once for each of these types, with the member of that type in it.
-    Members stand in the module of their type, or in one that this module imports: code that was
-    compiled for a type is found by the sources of its module.
+    ``@family.of(kind)`` decorates the member for a type of NamedTuple. What calls the family is
+    compiled once for each of these types, with the member of that type in it.
     """
+    members: dict[type, Any] = {}
 
-    def __init__(self, name: str) -> None:
-        self.__name__ = name
-        self._members: dict[type, Any] = {}
+    def family(first: Any, *others: Any) -> Any:
+        return members[type(first)](first, *others)
 
-    def of(self, kind: type) -> Callable[[F], F]:
-        """Decorate the kernel that is the member for a type of NamedTuple."""
-
+    def of(kind: type) -> Callable[[F], F]:
         def add(member: F) -> F:
-            self._members[kind] = member
+            members[kind] = member
             return member
 
         return add
 
-    is_compiling = False  # members know it of themselves
+    @overload(family)
+    def choose(first, *others):  # type: ignore[no-untyped-def]
+        member = members[first.instance_class]
+        return lambda first, *others: member(first, *others)
 
-    def __call__(self, first: Any, *others: Any) -> Any:
-        return self._members[type(first)](first, *others)
-
-    @property
-    def _numba_type_(self) -> types.Dispatcher:
-        return types.Dispatcher(cast(Any, self))
-
-    def get_call_template(self, arguments: Any, keywords: Any) -> Any:
-        """Types of a call by a kernel."""
-        return self._member(arguments).get_call_template(arguments, keywords)
-
-    def get_overload(self, signature: Any) -> Any:
-        """Code that a kernel calls."""
-        return self._member(signature).get_overload(signature)
-
-    def _member(self, arguments: Any) -> Any:
-        kind = arguments[0].instance_class
-        if kind not in self._members:
-            raise TypeError(f"{self.__name__} has no member for {kind.__name__}")
-        return self._members[kind]
-
-
-class KernelDispatcher(CPUDispatcher):
-    """A function compiled for Python and, apart from that, for the kernels that call it."""
-
-    def __init__(self, function: Any, options: dict[str, Any]) -> None:
-        super().__init__(function, targetoptions=options, pipeline_class=KernelCompiler)
-        self._cache: Any = KernelCache(function, "kernel")
-
-    @cached_property
-    def _part(self) -> Any:
-        """Code that kernels call; where all compiled code is on disk, nothing asks for it."""
-        compiler = FastPartCompiler if self.targetoptions["fastmath"] else PartCompiler
-        bare = {**self.targetoptions, "no_cpython_wrapper": True}
-        part: Any = CPUDispatcher(self.py_func, targetoptions=bare, pipeline_class=compiler)
-        part._cache = KernelCache(self.py_func, "part")
-        return part
-
-    def get_call_template(self, arguments: Any, keywords: Any) -> Any:
-        """Types of a call by a kernel.
-
-        The number 3 takes the code of any integer; Numba compiles one for each.
-        """
-        named = {name: types.unliteral(kind) for name, kind in keywords.items()}
-        return self._part.get_call_template(tuple(map(types.unliteral, arguments)), named)
-
-    def get_overload(self, signature: Any) -> Any:
-        """Code that a kernel calls."""
-        return self._part.get_overload(signature)
+    family.__name__ = name
+    family.of = of  # type: ignore[attr-defined]
+    return cast(KernelFamily, family)
 
 
 class CompileProgress(event.Listener):
-    """A line on a terminal's or a notebook's standard error, written anew for every kernel.
+    """A line on a terminal's or a notebook's standard error, written anew for every function.
 
-    It shows how many of the kernels that the called one needs are compiled; those that are read
-    from disk are not counted. Elsewhere, in a file for one, nothing is written.
+    Elsewhere, in a file for one, nothing is written.
     """
 
     def __init__(self) -> None:
-        self._needed: set[Any] = set()
-        self._total = self._depth = self._width = 0
+        self._count = self._depth = self._width = 0
         self._began = 0.0
 
     def on_start(self, event: Any) -> None:
-        """Count what has to be compiled, if nothing was under way."""
+        """Begin to count, if nothing was under way."""
         if not self._depth:
-            self._needed = kernels_needed(event.data["dispatcher"])
-            self._total, self._began = len(self._needed), time.perf_counter()
+            self._count, self._began = 0, time.perf_counter()
         self._depth += 1
         self._write()
 
     def on_end(self, event: Any) -> None:
         """Count one more; clear the line after the last."""
         self._depth -= 1
-        self._needed.discard(event.data["dispatcher"].py_func)
+        self._count += 1
         if self._depth:
             self._write()
         else:
             self._show("")
 
     def _write(self) -> None:
-        done, seconds = self._total - len(self._needed), time.perf_counter() - self._began
-        counted = f"{done} of {self._total}, {seconds:.0f} s"
+        counted = f"{self._count} functions, {time.perf_counter() - self._began:.0f} s"
         self._show(f"Compiling solvers, once for this version: {counted}")
 
     def _show(self, text: str) -> None:
@@ -192,132 +152,8 @@ class CompileProgress(event.Listener):
         self._width = len(text)
 
 
-def kernels_needed(dispatcher: Any) -> set[Any]:
-    """Functions of a kernel, and of all that it calls, that have no code in this process yet."""
-    found: set[Any] = set()
-    waiting = [dispatcher]
-    while waiting:
-        one = waiting.pop()
-        new = isinstance(one, CPUDispatcher) and one.py_func not in found
-        if new and not _is_compiled(one):
-            found.add(one.py_func)
-            names = one.py_func.__code__.co_names
-            waiting.extend(one.py_func.__globals__.get(name) for name in names)
-    return found
-
-
-def _is_compiled(dispatcher: CPUDispatcher) -> bool:
-    """True if there is code for Python or for other kernels."""
-    part = dispatcher._part if isinstance(dispatcher, KernelDispatcher) else dispatcher
-    return bool(dispatcher.overloads or part.overloads)
-
-
 def _is_notebook() -> bool:
     return "ipykernel" in sys.modules
-
-
-class KernelLibrary(JITCodeLibrary):
-    """Code of a kernel that Python calls.
-
-    LLVM's rewriting of the addresses in loops is left out: it takes more than a quarter of the time
-    of writing machine code, and kernels are as fast without.
-    """
-
-    def _finalize_final_module(self) -> None:
-        binding.set_option("cadalign", "-disable-lsr=true")
-        try:  # Numba's lock keeps other compilations out
-            super()._finalize_final_module()
-        finally:
-            binding.set_option("cadalign", "-disable-lsr=false")
-
-
-_KIND = "part"
-
-
-class PartLibrary(JITCodeLibrary):
-    """Code that is linked into kernels, and has no address of its own.
-
-    Left alone, Numba optimizes every function, makes it executable, and does both again as a part
-    of each function that calls it, at every level. Here, what kernels call is kept as intermediate
-    code and optimized where it ends up: in a kernel that Python calls.
-    """
-
-    optimized = False
-
-    @property
-    def codegen(self) -> Any:
-        """The library itself, as what is told the environments of its functions."""
-        return self
-
-    def set_env(self, name: str, environment: Any) -> None:
-        """Nothing: the kernel that the function ends up in is told."""
-
-    def get_pointer_to_function(self, name: str) -> int:
-        """No address."""
-        return 0
-
-    def serialize_using_object_code(self) -> tuple[str, str, bytes]:
-        """The intermediate code; there is no other."""
-        return self.name, _KIND, self._get_module_for_linking().as_bitcode()
-
-    @classmethod
-    def _unserialize(cls, codegen: Any, state: Any) -> Any:
-        name, kind, code = state
-        if kind != _KIND:
-            return JITCodeLibrary._unserialize(codegen, state)
-        library = cls(codegen, name)
-        library._final_module = library._shared_module = binding.parse_bitcode(code)
-        library._finalized = True
-        return library
-
-    def _optimize_final_module(self) -> None:
-        if self.optimized:
-            super()._optimize_final_module()
-
-    def _finalize_final_module(self) -> None:
-        self._finalize_dynamic_globals()
-        self._verify_declare_only_symbols()
-        self._finalized = True
-
-
-class KernelCompiler(compiler.Compiler):
-    """Compiler of a kernel that Python calls."""
-
-    library: type[JITCodeLibrary] = KernelLibrary
-
-    def compile_extra(self, function: Any) -> Any:
-        """Compile a function; what it calls, Numba's own functions among it, becomes its parts."""
-        codegen = self.state.targetctx.codegen()
-        self.state.library = self.library(codegen, function.__qualname__)
-        self.state.library.enable_object_caching()
-        with parts_in(codegen):
-            return super().compile_extra(function)
-
-
-class PartCompiler(KernelCompiler):
-    """Compiler of what kernels call."""
-
-    library = PartLibrary
-
-
-class FastPartCompiler(KernelCompiler):
-    """Compiler of what kernels call and may be reordered: that once, for the same bits in all."""
-
-    library = type("FastPartLibrary", (PartLibrary,), {"optimized": True})
-
-
-@contextmanager
-def parts_in(codegen: Any) -> Iterator[None]:
-    """Let all that Numba compiles or reads from disk meanwhile become parts.
-
-    Numba's lock around compiling keeps other threads out.
-    """
-    before = codegen._library_class
-    codegen._library_class = PartLibrary
-    try:
-        yield
-    finally:
-        codegen._library_class = before
 
 
 event.register("numba:compile", CompileProgress())

@@ -18,7 +18,7 @@ from cadalign.estimation.view import View, numbered
 from cadalign.estimation.warning import Kind
 from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
-from cadalign.shapes.parts import inflation_with, probability_within
+from cadalign.shapes.parts import inflation_with
 
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
@@ -27,7 +27,12 @@ if TYPE_CHECKING:
 AnyModel = Model | ShapeModel
 
 AS_MANY_AGREE = 12.0
-"""Gain of -2 log likelihood by a mistake that is corrected, at least."""
+"""Gain of -2 log likelihood without a cause, at least."""
+_OF_UNCERTAIN = 0.5  # share of it that suffices for a mistake, where shape or noise are uncertain
+_UNLIKELY = 8.0  # -2 log of the share of objects that are not upright, or seen from below
+_AS_EXPECTED = 1.3  # squares of uncertain shapes, over those expected, up to which none is doubted
+_LEFT = 0.5  # of the squares that are expected, that right data leave at least
+_TWICE = 2.0  # squares with a mistake, over those without, where the noise is unknown
 _MOST_CORRECTED = 1.6  # residuals of uncertain shapes without a mistake, over their deviations
 _LEAST_RATIO = 1.7  # of the residuals with and without it
 _MUCH_LESS = 5.0  # the same, where those without it are of a wrong sigma
@@ -36,7 +41,9 @@ _AS_MANY_ARE_FOUND = 2 * math.log(100)  # the same after a robust search, where 
 _FEW_REJECTED = 0.1  # share of the keypoints, up to which an uncertain shape is not doubted
 _MOST_REJECTED = 1 / 3  # share of the keypoints that are outliers; more are none
 _CHANCE_OF_RATIO = 1e-3  # that residuals of an unknown noise differ by as much
-_UPRIGHT = 0.5  # cosine between the model's y axis and the photo's upwards, at least
+_UPRIGHT = 0.5  # cosine between the model's up axis and the photo's upwards, at least
+_SEEN_ALONG = 0.3  # of the up axis in the photo, which is seen end-on
+_BELOW_DEG, _LOW_DEG = -7.0, 0.0  # elevations of cameras below the ground, and on it
 
 
 class Rule(NamedTuple):
@@ -69,16 +76,27 @@ class Agreement(NamedTuple):
     keypoints: int
     sigma: float | None  # estimated [px]
     squares: Sequence[float]
+    posture: str  # what is unlikely of the object's pose; empty if nothing is
+    is_low: bool  # the camera is hardly above the ground, if at all
 
     @property
     def ratio(self) -> float:
         """Residuals over their standard deviations; 0 where nothing is redundant."""
         return math.sqrt(self.chi_square / self.redundancy) if self.redundancy > 0 else 0.0
 
-    @property
-    def is_upright(self) -> bool:
-        """True if the model's y axis points up in the photo."""
-        return bool(-self.result.alignment.rotation[1, 1] > _UPRIGHT)
+
+def _posture(result: Result, axis: str | None) -> tuple[str, bool]:
+    """Posture of an object with an up axis in a photo that was taken upright; `Agreement`."""
+    if axis is None:
+        return "", False
+    pose = result.alignment
+    right, down, away = pose.rotation[:, "xyz".index(axis)].tolist()
+    ray = pose.apply(result.points_3d).mean(axis=0)
+    along = -float(ray @ (right, down, away)) / max(float(np.linalg.norm(ray)), 1e-300)
+    elevation, across = math.degrees(math.asin(max(-1.0, min(along, 1.0)))), math.hypot(right, down)
+    if across > _SEEN_ALONG and -down < _UPRIGHT * across:
+        return f"{'stands on its head' if down > _UPRIGHT * across else 'lies on its side'}", True
+    return "is seen from below the ground" * (elevation < _BELOW_DEG), elevation < _LOW_DEG
 
 
 def _equations_of(piece: EvidenceSummary) -> int:
@@ -101,6 +119,7 @@ class DiagnosisCase:
     size: Size | None = None
     has_rows: bool = False  # the ids of keypoints are their rows
     labels: Sequence[Hashable] = ()  # what the user calls the keypoints of these rows
+    is_tolerant: bool = False  # a robust loss leaves large residuals out of account
 
     @property
     def inflation(self) -> float:
@@ -171,7 +190,10 @@ class DiagnosisCase:
             logs = np.log(result.alignment.scale)
             score += float(((logs - logs.mean()) ** 2).sum())
         noise = result.sigma if any(view.sigma is None for view in views) else None
-        agreed = inliers, count, noise, squares
+        posture, is_low = _posture(result, self.model.up_axis)
+        if posture and not self.is_exact:
+            score += _UNLIKELY
+        agreed = inliers, count, noise, squares, posture, is_low
         return Agreement(result, score + chi_square, chi_square, redundancy, *agreed)
 
     def has_chance(self, found: Agreement) -> bool:
@@ -182,19 +204,14 @@ class DiagnosisCase:
         return chance_of(squares, found.redundancy, freedom) >= FALSE_ALARMS
 
     def has_contradiction(self, found: Agreement) -> bool:
-        """True if a piece of evidence, alone, has residuals beyond its noise.
+        """True if a piece of evidence may be wrong: alone, it has residuals beyond its noise.
 
-        Of a learned shape in one view, a keypoint is a piece: where the shape's deviations have
-        tails, the others and the prior tell its own scale.
+        An uncertain shape bends to what is wrong, and has more residuals in all.
         """
-        pieces, posterior = found.result.evidence, found.result.posterior
-        if posterior.misses is not None and found.chi_square >= found.redundancy > 0:
-            (alone, total), freedom, others = posterior.misses, posterior.degrees_of_freedom, None
-            if freedom is not None:
-                others = freedom + found.redundancy - 2
-                alone *= (others - 2) / (freedom - 2 + total - alone)
-            chance = 1 - probability_within(alone, 2, others)
-            return bool(found.keypoints * chance < FALSE_ALARMS)
+        pieces = found.result.evidence
+        if not self.is_exact and found.sigma is None:
+            most = found.chi_square - _LEFT * found.redundancy  # that its removal could gain
+            return most > AS_MANY_AGREE * self.inflation**2
         counts = [_equations_of(each) for each in pieces]
         return len(pieces) > 1 and any(
             chance_of(count * each.rms_sigmas**2, count) * len(pieces) < FALSE_ALARMS
@@ -212,7 +229,13 @@ class DiagnosisCase:
         if self.ransac is not None and (self.is_exact or given.ratio >= 1):
             return True
         if given.sigma is None:
-            return not self.has_chance(given) or self.has_contradiction(given)
+            is_odd = bool(given.posture or given.is_low)
+            is_odd |= given.chi_square > _AS_EXPECTED * given.redundancy > 0
+            return (
+                (is_odd and not self.is_exact)
+                or not self.has_chance(given)
+                or self.has_contradiction(given)
+            )
         pixels = [view.pixels for view in self.views]
         return given.redundancy > 0 and is_large_sigma(given.sigma, pixels)
 
@@ -231,12 +254,20 @@ class DiagnosisCase:
         if is_robust and (self.is_exact or given.inliers < given.keypoints):
             more = found.inliers > given.inliers or found.inliers == found.keypoints
             return more and gain > _MORE_AGREE
-        if not gain > (_AS_MANY_ARE_FOUND if is_robust else rule.gain) * self.inflation**2:
+        rejected = found.keypoints - found.inliers
+        least = (_AS_MANY_ARE_FOUND if is_robust else rule.gain) * self.inflation**2
+        is_correction = rule.kind == "mistake" and rule.gain <= AS_MANY_AGREE
+        if is_correction and not (self.is_exact and given.sigma is None):
+            least = _OF_UNCERTAIN * rule.gain
+        if not gain > least * (max(rejected, 1) if "ransac" in rule.changes else 1):
             return False
         if found.sigma is not None and given.sigma is not None:
+            if is_correction:
+                squares = (given.sigma / found.sigma) ** 2
+                return squares > _TWICE and found.redundancy * math.log(squares) > least
             ratio = f_quantile(found.redundancy, found.redundancy, _CHANCE_OF_RATIO)
             return found.sigma < given.sigma / math.sqrt(ratio)
-        rejected, fits = found.keypoints - found.inliers, self.has_chance(found)
+        fits = self.has_chance(found)
         if rejected or "ransac" in rule.changes:
             return fits and 0 < rejected <= _MOST_REJECTED * found.keypoints
         is_small = found.ratio < min(_MOST_CORRECTED, given.ratio / _LEAST_RATIO)

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -22,9 +23,8 @@ from cadalign.errors import (
 from cadalign.estimation.agreement import DiagnosisCase
 from cadalign.estimation.contours import refine
 from cadalign.estimation.diagnose import diagnose, diagnose_refusal
-from cadalign.estimation.estimates import as_given
+from cadalign.estimation.estimates import as_given, single_posterior
 from cadalign.estimation.fit import fit_one
-from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.joint import result_of, result_of_minima, with_cause
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions, RansacOptions
@@ -36,11 +36,11 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import LEAST_LIKELIHOOD, FitStats
 from cadalign.estimation.results import Results
 from cadalign.estimation.search import search, widened_by_noise
-from cadalign.estimation.uncertainty.shape_posterior import single_posterior
 from cadalign.estimation.view import View, numbered
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import turned_alignment
 from cadalign.io.evidence import Size
+from cadalign.io.focal import PriorOption
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import inflation_with
 from cadalign.solvers.constants import LEAST_POINTS
@@ -145,15 +145,14 @@ def align(
         return _estimate(compile_problem(model, views, size, some, own, ransac), start)
 
     seen = [given[number] for number in problem.numbers]
-    case = DiagnosisCase(model, seen, again, ransac, size)
+    case = DiagnosisCase(model, seen, again, ransac, size, is_tolerant=loss != FitOptions.loss)
     try:
         result = _estimate(problem, start)
     except (NoConsensusError, DegenerateError) as error:
         named = diagnose_refusal(case, with_keypoints=isinstance(error, NoConsensusError))
         error.fix = named or error.fix
         raise
-    cause = diagnose(case, result=result) if loss == FitOptions.loss else None
-    return with_cause(result, cause, problem.views)
+    return with_cause(result, partial(diagnose, case, result=result), problem.views, ransac)
 
 
 def _estimate(problem: Problem, start: float) -> Result:
@@ -225,10 +224,10 @@ def _align_single(problem: Problem, start: float) -> Result:
     kept = zip(likelihoods.tolist(), minima.label.tolist(), minima.states, strict=False)
     boxes = model if covariances.any() else None
     estimates = [
-        single_posterior(
-            mixture, component, seen, state, inflation, boxes, is_best=not rank
-        )._replace(likelihood=likelihood, cameras=(view.camera,))
-        for rank, (likelihood, component, state) in enumerate(kept)
+        single_posterior(mixture, component, seen, state, inflation, boxes)._replace(
+            likelihood=likelihood, cameras=(view.camera,)
+        )
+        for likelihood, component, state in kept
     ]
     component, cost = int(minima.label[0]), float(minima.costs[0])
 

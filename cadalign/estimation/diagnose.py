@@ -11,25 +11,32 @@ import math
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import combinations
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import quote
-from cadalign.estimation.agreement import Agreement, AnyModel, DiagnosisCase, Rule
+from cadalign.estimation.agreement import (
+    AS_MANY_AGREE,
+    Agreement,
+    AnyModel,
+    DiagnosisCase,
+    Rule,
+)
 from cadalign.estimation.assemble import result_of_keypoints
 from cadalign.estimation.fit import fit_once
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.problems import pack_one
 from cadalign.estimation.result_parts import FittedKeypoints, listed
-from cadalign.estimation.uncertainty.doubts import OTHER_SIZES
 from cadalign.estimation.uncertainty.residuals import named_keypoints
 from cadalign.estimation.view import View
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import rescaled_pixels
+from cadalign.geometry.plausible_camera import OTHER_SIZES
 from cadalign.io.evidence import LENGTHS, Size
 
 if TYPE_CHECKING:
@@ -40,6 +47,7 @@ _MOST_INSIDE = 0.8  # share of the keypoints that lie in their image
 _CAMERA_GAIN = 19.5  # by a focal length of its own, by chance in one of 100,000
 _PER_EQUATION = 3.0  # gain that a piece of evidence must leave, without which there are fewer
 _MOST_VIEWS = 10  # those with the largest residuals, of which each is left out
+_APART = 5.0  # distance of pixels of one point, that is no noise [px]
 _WRONG_UNIT = 100.0  # factor between an object's size and its model's
 
 
@@ -69,11 +77,15 @@ def diagnose(case: DiagnosisCase, *, result: Result | None = None) -> EstimateWa
 
 
 def _likeliest(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
-    rules = list(_rules_for(case, given))
+    rules = list(_mistakes_in(case)) if case.is_tolerant else list(_rules_for(case, given))
     found = [(rule, each) for rule in rules if (each := case.without(rule)) is not None]
     explaining = [each for each in found if case.explains(*each, given)]
     if not explaining:
-        return None if case.has_chance(given) else _warning(case, MISFIT, given, given)
+        return (
+            None
+            if case.is_tolerant or case.has_chance(given)
+            else _warning(case, MISFIT, given, given)
+        )
     rule, best = max(explaining, key=lambda each: case.gain(each[0], each[1], given))
     least = case.gain(rule, best, given) - _AS_LIKELY
     alike = [each for each in found if each[0].kind == rule.kind]
@@ -212,6 +224,16 @@ def _remeasured(size: Size, factor: float) -> Size:
     return replace(size, **{name: each and each * factor for name, each in lengths.items()})
 
 
+def _without_rows(view: View, *, number: int, rows: tuple[int, ...]) -> View:
+    if view.number != number:
+        return view
+    kept = np.delete(np.arange(len(view.pixels)), rows)
+    ids = [view.keypoint_ids[row] for row in kept.tolist()]
+    each = {name: getattr(view, name) for name in ("sigma", "scores", "depth")}
+    some: dict[str, Any] = {name: np.asarray(v)[kept] for name, v in each.items() if np.ndim(v) > 0}
+    return replace(view, points_2d=view.pixels[kept], ids=ids, **some)
+
+
 def _left_out(view: View, *, number: int, name: str | None) -> View | None:
     """The view without a field, or None for the whole view, if it has the number."""
     if view.number != number:
@@ -249,14 +271,16 @@ MISFIT = Rule("misfit")
 def _rules_for(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
     model, fails = case.model, not case.has_chance(given)
     yield from _mistakes_in(case)
-    yield from _other_sizes(case)
+    yield from _pairs_apart(case)
+    yield from _other_sizes(case) if case.is_exact or fails else ()
     if case.is_plain and isinstance(model, Model) and fails:
         if model.stretch is not None or model.stretch_sigma is not None:
             yield HELD
         if given.result.focal == "known":
             yield ANOTHER_FOCAL
     if fails or case.has_contradiction(given):
-        yield from () if case.ransac else (OUTLIERS,)
+        least = OUTLIERS.gain if case.is_exact else AS_MANY_AGREE
+        yield from () if case.ransac else (OUTLIERS._replace(gain=least),)
         yield from _pieces_of(case, given)
 
 
@@ -282,6 +306,22 @@ def _mistakes_in(case: DiagnosisCase) -> Iterator[Rule]:
             yield Rule("unit", f"`{name}`", undo, changes=changes)
 
 
+def _pairs_apart(case: DiagnosisCase) -> Iterator[Rule]:
+    """One point of the model that is paired with two pixels."""
+    if not isinstance(case.model, Model):
+        return
+    points = dict(zip(case.model.ids or (), cast(FloatArray, case.model.points_3d), strict=True))
+    for view in case.views:
+        names, places = view.keypoint_ids, [points[name] for name in view.keypoint_ids]
+        for a, b in combinations(range(len(names)), 2):
+            apart = float(np.linalg.norm(view.pixels[a] - view.pixels[b]))
+            if apart > _APART and np.array_equal(places[a], places[b]):
+                clause = f"keypoints {quote(names[a])} and {quote(names[b])} are one point of the "
+                clause += f"model and lie {apart:.3g} px apart"
+                undo = partial(_without_rows, number=view.number, rows=(a, b))
+                yield Rule("mistake", clause, undo)
+
+
 def _other_sizes(case: DiagnosisCase) -> Iterator[Rule]:
     """Mistakes in the resolution of keypoints, whose noise may grow with it."""
     camera, points = case.views[0].camera, np.concatenate([view.pixels for view in case.views])
@@ -295,9 +335,12 @@ def _other_sizes(case: DiagnosisCase) -> Iterator[Rule]:
         return bool(inside.sum() > _MOST_INSIDE * len(points))
 
     own, is_inside = f"{camera.width} x {camera.height} px", holds_most(1.0)
+    lie_inside = bool(camera.contains(points).all())
     for factor in OTHER_SIZES:
         is_usual = (factor > 1) != is_inside and (factor > 1 or case.ransac is None)
-        if not case.is_plain and not (is_usual and holds_most(factor)):
+        if not holds_most(factor) or (factor > 1 and lie_inside):  # a contradiction
+            continue
+        if not case.is_plain and not is_usual:
             continue
         width, height = (max(1, round(side * factor)) for side in (camera.width, camera.height))
         clause = f"the keypoints are of images of {width} x {height} px, the camera of {own}"
@@ -326,7 +369,7 @@ def _pieces_of(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
 
 UNIT = "in another unit (millimetres for metres)?"
 _TEXTS = {
-    "mistake": "{named}: corrected, {compared}",
+    "mistake": "{posture}{named}{asked} corrected, {compared}",
     "unit": "{named}: is it " + UNIT + " Corrected, {compared}",
     "contradiction": "{named} contradicts the other evidence: without it, {compared}",
     "stretch": "the keypoints contradict the constraint on the stretch: without it they fit "
@@ -344,8 +387,12 @@ def _warning(
     case: DiagnosisCase, rule: Rule, best: Agreement, given: Agreement, *, named: str = ""
 ) -> EstimateWarning:
     scale = ", ".join(f"{value:.3g}" for value in best.result.alignment.scale.tolist())
-    wrong, view, keypoints = _outliers_of(case, best) if rule is OUTLIERS else ("", None, ())
+    posture, asked = "", ":"
+    if given.posture and not (best.posture or case.is_exact):
+        posture, asked = f"the object {given.posture}: is it so, or is it that ", "?"
+    wrong, view, keypoints = _outliers_of(case, best) if rule.kind == "outlier" else ("", None, ())
     words = {"named": named, "compared": _compared(best, given), "scale": scale, "wrong": wrong}
+    words |= {"posture": posture, "asked": asked}
     text = _TEXTS[rule.kind].format(best=best, given=given, **words)
     return EstimateWarning(rule.kind, text, 0 if rule is ANOTHER_FOCAL else view, keypoints)
 
@@ -374,7 +421,7 @@ def _outliers_of(case: DiagnosisCase, best: Agreement) -> tuple[str, int | None,
 
 def _named(likely: Sequence[tuple[Rule, Agreement]]) -> str:
     """Names of rules that are as likely; first those of an upright object."""
-    upright = {rule.clause: None for rule, each in likely if each.is_upright}
+    upright = {rule.clause: None for rule, each in likely if not each.posture}
     others = {rule.clause: None for rule, each in likely if rule.clause not in upright}
     named = listed(list(upright or others)) if likely else ""
     if upright and others:

@@ -14,7 +14,6 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, copied
 from cadalign.errors import CadalignError, InputError, NoConsensusError, require_kind
 from cadalign.estimation.assemble import result_of_keypoints
-from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma, pixel_information
 from cadalign.estimation.problems import (
     Problems,
@@ -23,6 +22,7 @@ from cadalign.estimation.problems import (
     joined,
     pack_many,
     pack_one,
+    repeated,
 )
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FittedKeypoints
@@ -31,7 +31,8 @@ from cadalign.estimation.solve import are_solved_at_once, fit_keypoints, solve
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.solvers.constants import POSE_SIZE
+from cadalign.io.focal import PriorOption
+from cadalign.solvers.constants import LEAST_POINTS, POSE_SIZE
 
 
 @np.errstate(all="ignore")  # what is not finite is refused
@@ -211,6 +212,8 @@ def fit_once(
     start: float,
 ) -> FittedKeypoints:
     """Fit the only problem, without a diagnosis of keypoints that no alignment explains."""
+    if firsts := _firsts(problems):
+        return _fit_distinct(firsts, problems, options, ransac, scores, start)
     options = options.for_camera(problems.camera)
     if ransac is None:
         return fit_keypoints(problems, options, start)
@@ -218,6 +221,38 @@ def fit_once(
     from cadalign.estimation.consensus import fit_robustly
 
     return fit_robustly(problems, options, ransac, scores, start)
+
+
+def _firsts(problems: Problems) -> list[int]:
+    """Rows without those that repeat a keypoint; none where nothing is repeated."""
+    u = problems.points_2d[:, 0].tolist()  # most are told apart by these
+    if len(set(u)) == len(u):
+        return []
+    rows = sorted(set(repeated(problems.points_3d, problems.points_2d)))
+    return rows if LEAST_POINTS < len(rows) < len(u) else []  # of fewer, errors say why
+
+
+def _fit_distinct(
+    rows: list[int],
+    problems: Problems,
+    options: FitOptions,
+    ransac: RansacOptions | None,
+    scores: npt.ArrayLike | None,
+    start: float,
+) -> FittedKeypoints:
+    """Fit some rows; the others, which repeat them, are no inliers and have residuals."""
+    points, pixels, camera = problems.points_3d.copy(), problems.points_2d, problems.camera
+    if np.ndim(options.sigma) > 0:  # type: ignore[arg-type]
+        options = replace(options, sigma=np.asarray(options.sigma)[rows])
+    some = pack_one(points[rows], pixels[rows], camera)
+    trusted = None if scores is None else np.asarray(scores)[rows]
+    found = fit_once(some, options, ransac, trusted, start)
+    inliers = np.zeros(len(points), dtype=bool)
+    inliers[rows] = found.inliers
+    residuals = found.camera.project_where_ahead(found.alignment.apply(points)) - pixels
+    others = tuple(replace(each, points_3d=points) for each in found.alternatives)
+    found = replace(found, points_3d=points, alternatives=others)
+    return replace(found, residuals=residuals, inliers=inliers)
 
 
 # Checking options takes as long as solving a small problem linearly, and calls repeat them.
@@ -305,7 +340,7 @@ def fit_batch(
     if scores is not None:
         scores = each_of(scores, "scores", count, "sets")
     is_alone = per_problem or ransac is not None or symmetry is not None
-    is_alone |= not are_solved_at_once(problems, options)
+    is_alone |= not are_solved_at_once(problems, options) or any(map(_firsts, problems))
     entries: list[Any] = [None] * count
     table = np.full((count, COLUMNS), np.nan)
 

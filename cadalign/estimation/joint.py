@@ -7,8 +7,9 @@ stands for all. Keypoints of one exact model have their own form, for `cadalign.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property, partial
 from typing import Any, cast
 
 import numpy as np
@@ -28,7 +29,6 @@ from cadalign.estimation.estimates import (
     widened_boxes,
     with_box,
 )
-from cadalign.estimation.focal import prior_of_camera
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.prior import camera_like, is_exact, redundancy_of, widened
@@ -47,12 +47,16 @@ from cadalign.estimation.result_parts import (
     ViewResult,
     alternatives_of,
     keypoint_summary,
+    quickly,
 )
 from cadalign.estimation.search import Minimum, search
 from cadalign.estimation.symmetry import SAME_SQUARES, stretched_axes
 from cadalign.estimation.uncertainty.doubts import (
     another_pose,
+    first_of_camera,
     outside_image,
+    rejections,
+    stretch_doubts,
     unexplained,
 )
 from cadalign.estimation.uncertainty.residuals import summaries_of
@@ -60,6 +64,7 @@ from cadalign.estimation.view import View
 from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment, describe_plane
 from cadalign.geometry.rotations import nearest_rotation
+from cadalign.io.focal import prior_of_camera
 from cadalign.shapes.parts import inflation_with
 from cadalign.solvers.joint.covariance import joint_covariance, pose_and_border
 from cadalign.solvers.joint.evidence import points_of
@@ -155,7 +160,6 @@ def result_of(
         evidence=(*summaries, *notes.evidence),
         degrees_of_freedom=prior.degrees_of_freedom,
         redundancy=redundancy,
-        misses=best.misses,
     )
     of_views[0] = replace(of_views[0], posterior=posterior)
     has_length = prior.lengths > 0
@@ -235,25 +239,64 @@ def result_of_minima(
     )
 
 
-def with_cause(result: Result, cause: EstimateWarning | None, views: Sequence[View]) -> Result:
+class DiagnosedPosterior(Posterior):
+    """Posterior whose causes of a misfit are sought when its warnings are asked for."""
+
+    stated: Warnings
+    causes: Callable[[], Warnings]
+
+    @cached_property
+    def warnings(self) -> Warnings:
+        return (*self.causes(), *self.stated)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is stored, without the function that seeks."""
+        own = vars(self) | {"warnings": self.warnings}
+        return {name: own[name] for name in own if name != "causes"}
+
+
+def with_cause(
+    result: Result,
+    diagnosis: Callable[[], EstimateWarning | None],
+    views: Sequence[View],
+    ransac: RansacOptions | None,
+) -> Result:
     """The result with the cause of a misfit, and warnings about noise and keypoints' places."""
-    causes: Warnings = () if cause is None else (cause,)
+    causes = partial(_causes, result, diagnosis, views, ransac)
+    known = vars(result.posterior) | {"causes": causes, "stated": result.warnings}
+    known.pop("warnings")
+    return replace(result, posterior=quickly(DiagnosedPosterior, known))
+
+
+def _causes(
+    result: Result,
+    diagnosis: Callable[[], EstimateWarning | None],
+    views: Sequence[View],
+    ransac: RansacOptions | None,
+) -> Warnings:
+    cause, sigma = diagnosis(), result.sigma
+    causes: Warnings = ()
     lacking = [view.pixels for view in views if view.sigma is None and len(view.keypoint_ids)]
-    if lacking and result.sigma is not None and not any(c.kind == "mistake" for c in causes):
-        causes = (*unexplained(result.sigma, lacking), *causes)
-    placed = (
+    if lacking and sigma is not None and not (cause and cause.kind == "mistake"):
+        causes = unexplained(sigma, lacking)
+    placed = tuple(
         warning
         for view in views
         for warning in outside_image(
             view.pixels,
             view.camera,
-            agree=not causes,
+            cause=cause or next(iter(causes), None),
+            sigma=view.sigma,
             view=view.number,
             where=f"views[{view.number}]: " if len(views) > 1 else "",
         )
     )
-    warnings = (*causes, *placed, *result.warnings)
-    return replace(result, posterior=result.posterior.stating(warnings=warnings))
+    found = (*causes, *first_of_camera(placed, cause))
+    if cause is None and result.std is not None and isinstance(result.model, Model):
+        found += stretch_doubts(result.alignment, result.std, result.model.fit_options())
+    if ransac is None or (cause is not None and cause.kind == "mistake"):
+        return found
+    return (*found, *rejections(result.views, ransac, common_sigma(views)))
 
 
 def common_sigma(views: Sequence[View]) -> float | None:

@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_positive, is_number, is_whole
 from cadalign.errors import InputError, quote
-from cadalign.estimation.focal import USUAL, PriorOption, check_prior, prior_of_camera
 from cadalign.geometry.camera import Camera
+from cadalign.io.focal import USUAL, PriorOption, check_prior, prior_of_camera
 from cadalign.solvers.constants import AEPNP, AP4P, CAUCHY, HUBER, LINEAR, UNKNOWNS, ScalePrior
 
 METHODS = ("optimal", "aepnp", "aepnp-paper", "epnp")

@@ -12,10 +12,10 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError, quote
-from cadalign.estimation.focal import PriorOption, focal_grid, log_focal_range, prior_of_camera
 from cadalign.estimation.model import Model
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
+from cadalign.io.focal import LONGEST, SHORTEST, PriorOption, prior_of_camera
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import BoxMargins, FewKeypoints
 from cadalign.solvers.constants import ScalePrior
@@ -25,6 +25,8 @@ _COMMON_SCALE_SIGMA = 3.0  # of the log of a size that other evidence determines
 _SAME_SCALE_SIGMA = 1e-4
 _PROPORTION_SIGMA = 3.0  # of free log scales about their mean, lest an unseen axis collapses
 _NO_BOUND = ScalePrior(0.0, 0.0)
+# Focal lengths from which a search starts [longer sides of the image].
+_FOCAL_GRID = (0.15, 0.22, 0.3, 0.4, 0.55, 0.72, 0.95, 1.25, 1.65, 2.3, 3.3, 5.0, 10.0, 30.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +167,29 @@ def widened(evidence: Evidence, state: State, factor: float) -> tuple[Evidence, 
 def is_exact(evidence: Evidence) -> bool:
     """True if the shape is known but for its scales."""
     return not (len(evidence.shape.modes) or evidence.shape.spread.any())
+
+
+def log_focal_range(
+    camera: Camera, prior: PriorOption, unit: float = 1.0
+) -> tuple[float, float, float, float]:
+    """Bounds of a log focal length, over ``unit`` [px], and its prior's mean and weight."""
+    prior = prior_of_camera(prior, camera)
+    side = max(camera.width, camera.height) / unit
+    low, high = math.log(SHORTEST * side), math.log(LONGEST * side)
+    if prior is None:
+        return low, high, 0.0, 0.0
+    mean = math.log(prior.focal / unit)
+    return min(low, mean), max(high, mean), mean, prior.relative_sigma**-2
+
+
+def focal_grid(camera: Camera, prior: PriorOption) -> FloatArray:
+    """Focal lengths from which the search starts [px]; with a prior those near it, and it."""
+    prior = prior_of_camera(prior, camera)
+    grid = np.array(_FOCAL_GRID) * max(camera.width, camera.height)
+    if prior is None:
+        return grid
+    near = np.abs(np.log(grid / prior.focal)) < max(4 * prior.relative_sigma, 0.5)
+    return np.sort(np.append(grid[near], prior.focal))
 
 
 @dataclass(frozen=True)

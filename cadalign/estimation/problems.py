@@ -26,6 +26,7 @@ from cadalign.solvers.projection import all_finite, pinhole_rays
 
 T = TypeVar("T")
 
+_SAME_DIGITS = 6  # decimals of keypoints that are the same
 _NO_RESIDUALS = np.empty((0, 2))
 _NO_ERRORS: Mapping[int, CadalignError] = MappingProxyType({})
 
@@ -61,6 +62,13 @@ def joined(problems: Sequence[Problems]) -> Problems:
         np.cumsum([0, *(len(each.points_3d) for each in problems)], dtype=np.int64),
         problems[0].camera,
     )
+
+
+def repeated(points_3d: FloatArray, points_2d: FloatArray) -> list[int]:
+    """The first row with the same point of the model and the same pixel, for each of n rows."""
+    rows = np.concatenate([points_3d, points_2d], axis=1).round(_SAME_DIGITS).tolist()
+    first: dict[tuple[float, ...], int] = {}
+    return [first.setdefault(tuple(row), number) for number, row in enumerate(rows)]
 
 
 def pack_one(

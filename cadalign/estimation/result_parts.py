@@ -226,7 +226,6 @@ class Posterior:
     points_cam_covariance: FloatArray | None = None
     degrees_of_freedom: float | None = None
     redundancy: int = 0
-    misses: tuple[float, float] | None = None
     warnings: Warnings = ()
     evidence: tuple[EvidenceSummary, ...] = ()
 

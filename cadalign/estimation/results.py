@@ -13,7 +13,6 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import CadalignError, DataError
 from cadalign.estimation.result import Result
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.rotations import quat_wxyz_from_rotation
 from cadalign.io.documents import in_file, parse_json
 from cadalign.io.files import as_path
 from cadalign.solvers.constants import POSE_SIZE
@@ -23,20 +22,6 @@ if TYPE_CHECKING:
 
 COLUMNS = POSE_SIZE + 2
 """Columns of a table of results: a packed alignment, rms and focal length."""
-RESULT_COLUMNS: tuple[tuple[str, type], ...] = (
-    *(("status", str), ("reason", str), ("method", str)),
-    *(("views", int), ("keypoints", int), ("inliers", int)),
-    *((f"q{axis}", float) for axis in "wxyz"),
-    *((f"t{axis}", float) for axis in "xyz"),
-    *((f"scale_{axis}", float) for axis in "xyz"),
-    *(("focal_length", float), ("sigma", float), ("rotation_std_deg", float)),
-    *((f"t{axis}_std", float) for axis in "xyz"),
-    *((f"scale_{axis}_std", float) for axis in "xyz"),
-    *(("focal_length_std", float), ("rms_px", float), ("cost", float)),
-    *(("alternatives", int), ("uncertain", str)),
-    *(("warning_count", int), ("warning_kinds", str), ("warnings", str)),
-)
-"""Names and types of the cells of a result in every table."""
 _TABLE, _RECORDS = "results.parquet", "records.parquet"  # of a run, see `cadalign.batch.outputs`
 _FIX = "give a folder that `cadalign fit` or `cadalign.fit_many` has written"
 
@@ -157,6 +142,8 @@ class Results(Sequence[Result | CadalignError]):
         """
         import pandas as pd
 
+        from cadalign.export.tables import RESULT_COLUMNS, failed_row, row_of
+
         rows = (
             {"row": number} | (row_of(each) if isinstance(each, Result) else failed_row(str(each)))
             for number, each in enumerate(self)
@@ -209,46 +196,6 @@ class Results(Sequence[Result | CadalignError]):
             else DataError(reasons[row])
             for row, state in enumerate(states)
         )
-
-
-def failed_row(reason: str) -> dict[str, Any]:
-    """The cells of a problem without solution."""
-    texts = ("method", "uncertain", "warning_kinds", "warnings")
-    return {"status": "failed", "reason": reason, **dict.fromkeys(texts, "")}
-
-
-def row_of(result: Result) -> dict[str, Any]:
-    """The cells of a result, by the names of `RESULT_COLUMNS`."""
-    pose, std, warnings = result.alignment, result.std, result.warnings
-    sigma: Any = result.sigma
-    if sigma is None and result.options is not None:
-        sigma = result.options.sigma
-    row: dict[str, Any] = {
-        "status": "ok",
-        "reason": "",
-        "method": result.method,
-        "views": len(result.views),
-        "keypoints": len(result.inliers),
-        "inliers": int(result.inliers.sum()),
-        "focal_length": result.camera.fx,
-        "sigma": None if sigma is None or np.ndim(sigma) else float(sigma),
-        "rms_px": result.rms,
-        "cost": result.cost,
-        "alternatives": len(result.alternatives),
-        "uncertain": "; ".join(result.uncertain),
-        "warning_count": len(warnings),
-        "warning_kinds": "; ".join(each.kind for each in warnings),
-        "warnings": "; ".join(each.text for each in warnings),
-    }
-    by_axis: dict[str, Any] = {"t{}": pose.translation, "scale_{}": pose.scale}
-    if std is not None:
-        by_axis |= {"t{}_std": std.translation, "scale_{}_std": std.scale}
-        row |= {"rotation_std_deg": std.rotation_deg, "focal_length_std": std.focal}
-    for name, values in by_axis.items():
-        row |= {name.format(axis): float(each) for axis, each in zip("xyz", values, strict=True)}
-    quaternion = quat_wxyz_from_rotation(pose.rotation).tolist()
-    row |= {f"q{axis}": value for axis, value in zip("wxyz", quaternion, strict=True)}
-    return row
 
 
 def _read_result(texts: Any, row: int, where: str) -> Result:

@@ -47,12 +47,12 @@ class EstimateWarning:
         - "chance": keypoints at random would agree as well;
         - "untested": no equation is left that tests the estimate;
         - "outside-image": keypoints lie outside of the image;
-        - "camera": the focal length is contradicted, or the principal point is another image's;
-        - "stretch": the constraint on the stretch is contradicted;
+        - "camera": the focal length is contradicted, or the camera is implausible;
+        - "stretch": the constraint on the stretch is contradicted, or the stretch implausible;
         - "contradiction": a piece of evidence contradicts the rest;
-        - "unit": depths or distances are in another unit;
+        - "unit": depths or distances are in another unit, or keypoints are no pixels;
         - "mask", "photo": it is left out, or agrees in part;
-        - "left-out": a view is;
+        - "left-out": a view is, or a keypoint that was not found or given twice;
         - "focal": the estimated focal length contradicts its prior;
         - "alternative": another pose is likely, too.
     text : str

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, as_floats, as_points, as_positive
+from cadalign.arrays import FloatArray, as_positive
 from cadalign.errors import InputError
-from cadalign.geometry.alignment import Alignment, extent
+from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import nearest_rigid
@@ -34,24 +33,16 @@ class ExportView:
         Pose and stretch in this camera.
     image : path or (h, w, 3) uint8, optional
         The photo.
-    points_2d : (n, 2) float, optional
-        Keypoints observed in it [px].
-    ids : tuple of n int or str
-        Which keypoints of the object these are.
     """
 
     camera: Camera
     cam_from_model: Alignment
     image: Path | str | ByteImage | None = None
-    points_2d: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
-    ids: tuple[Hashable, ...] = ()
 
     def __post_init__(self) -> None:
         self.camera.require_focal()
         if isinstance(self.image, str):
             object.__setattr__(self, "image", Path(self.image))
-        points = as_floats(self.points_2d, name="points_2d", shape=(len(self.ids), 2))
-        object.__setattr__(self, "points_2d", points)
 
     def read_image(self) -> ByteImage | None:
         """The photo's pixels, None where there is none.
@@ -81,11 +72,9 @@ class AlignedObject:
     ----------
     views : tuple of ExportView
         Its photos, at least one. All have the same stretch.
-    points_3d : (k, 3) float
-        The object's keypoints in the model's frame, before the stretch.
-    ids : tuple of k int or str
-    mesh : Mesh, optional
-        The object's mesh, warped where a shape was estimated, in the same frame.
+    mesh : Mesh
+        The object's mesh in the model's frame before the stretch, warped where a shape was
+        estimated.
     rig_from_model : Alignment, optional
         Pose and stretch in the frame that views of known motion share.
     world_from_cam : (4, 4) float, optional
@@ -100,13 +89,11 @@ class AlignedObject:
     Raises
     ------
     InputError
-        If there is no view, shapes don't match, or the views' stretches differ.
+        If there is no view, or the views' stretches differ.
     """
 
     views: tuple[ExportView, ...]
-    points_3d: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
-    ids: tuple[Hashable, ...] = ()
-    mesh: Mesh | None = None
+    mesh: Mesh
     rig_from_model: Alignment | None = None
     world_from_cam: FloatArray | None = None
     name: str = "model"
@@ -116,10 +103,6 @@ class AlignedObject:
     def __post_init__(self) -> None:
         if not self.views:
             raise InputError("give at least one view", where="views")
-        points = as_points(self.points_3d, name="points_3d", dimension=3)
-        if len(points) != len(self.ids):
-            raise InputError(f"{len(self.ids)} for {len(points)} keypoints", where="ids")
-        object.__setattr__(self, "points_3d", points)
         object.__setattr__(self, "metres", as_positive(self.metres, name="metres"))
         if self.world_from_cam is not None:
             world = nearest_rigid(self.world_from_cam, where="world_from_cam")
@@ -130,28 +113,6 @@ class AlignedObject:
             if np.abs(pose.scale / poses[0].scale - 1).max() > _SAME:
                 what = f"{pose.scale.tolist()} in one view, {poses[0].scale.tolist()} in the first"
                 raise InputError(what, where="scale", fix="all views show one object")
-
-    @property
-    def bounds(self) -> FloatArray:
-        """Lowest and highest coordinates of mesh, or keypoints, in the model's frame (2, 3)."""
-        if self.mesh is not None:
-            return self.mesh.bounds
-        if not len(self.points_3d):
-            raise InputError("there is neither a mesh nor a keypoint", where="mesh", fix="give one")
-        return extent(self.points_3d)
-
-    def require_mesh(self) -> Mesh:
-        """The mesh.
-
-        Raises
-        ------
-        InputError
-            If there is none.
-        """
-        if self.mesh is None:
-            what = "there is no mesh of the model to write"
-            raise InputError(what, where="mesh", fix="give one, or an observation with a `model`")
-        return self.mesh
 
     def frame_from_model(self, frame: Frame) -> Alignment:
         """Pose and stretch in a frame: the first view's camera, the rig, the world, or the model's.
@@ -189,5 +150,5 @@ class AlignedObject:
 
     def placed_mesh(self, frame: Frame) -> Mesh:
         """The mesh, stretched and placed in a frame [units of the camera frame]."""
-        mesh, placing = self.require_mesh(), self.frame_from_model(frame)
-        return replace(mesh, vertices=placing.apply(mesh.vertices))
+        placing = self.frame_from_model(frame)
+        return replace(self.mesh, vertices=placing.apply(self.mesh.vertices))

@@ -2,9 +2,14 @@
 
 The scene's axes are those of the chosen frame; the first camera's are turned to glTF's, so that it
 stands in the origin, looks along -z and has y up. Lengths are metres, by `AlignedObject.metres`.
-The model is a node whose transform holds pose and stretch. Every view is a camera node with the
-photo's field of view, see `cadalign.export.scene_parts`, and a rectangle with the photo behind the
-object, seen from its camera's side only and unlit (KHR_materials_unlit).
+The model is a node whose transform holds pose and stretch. Every view is a camera node and a
+rectangle with the photo behind the object, seen from its camera's side only and unlit
+(KHR_materials_unlit).
+
+glTF's cameras have their principal point in the image's centre and no lens distortion. So the photo
+stands where the camera sees it, and the camera's field of view is the least one about the principal
+point that holds all of it: the image of that camera is the photo with a margin at one side. A
+distorted photo is resampled to a pinhole camera's.
 
 Buffers, accessors and images are trimesh's. Cameras and materials are written here: trimesh has one
 camera, whose aspect ratio is that of angles, no unlit materials, and colours of 8 bits.
@@ -15,18 +20,22 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import trimesh
 from PIL import Image
 from trimesh.visual.color import srgb_to_linear
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.export.aligned_object import AlignedObject, Frame
-from cadalign.export.scene_parts import PlacedPhoto, placed_parts
+from cadalign.geometry.alignment import bounds_corners
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.conventions import OPENGL_AXES, OPENGL_FLIP
 from cadalign.geometry.mesh import Material, Mesh
 from cadalign.io.files import write_whole
+from cadalign.io.images import ByteImage
 
 _gltf: Any = trimesh.exchange.gltf  # which has no types
 _visual: Any = trimesh.visual
@@ -35,9 +44,46 @@ _CLAMP_TO_EDGE = 33071  # as OpenGL numbers it
 _OPAQUE = 0.999  # least opacity of what is drawn as opaque
 _WHITE = (1.0, 1.0, 1.0, 1.0)
 
+_BORDER = 0.5  # from the corner pixel's centre to the image's border [px]
+_GROWTH = 2.0  # how much larger than the photo an undistorted one may become, each way
+_AGREES = 1e-6
+_RIM = 1.5  # how far the border's colours go on beyond the photo [px]
+_BEHIND = 1.5  # depth of the photo over that of the object's farthest corner
+_FAR_OFF = 100.0  # coordinates over the extent
+_NEAR, _FAR = 1e-3, 10.0  # depths between which a viewer draws, over that of the photo
+
 
 _Node = tuple[str, trimesh.Trimesh, dict[str, Any], FloatArray]
 """Name, mesh, material and place in the scene."""
+
+
+class PlacedPhoto(NamedTuple):
+    """A photo in a scene, as a rectangle behind the object."""
+
+    image: ByteImage | None
+    """The photo (h, w, 3), without lens distortion."""
+    low: FloatArray
+    """Its top left corner (2,) in normalised image coordinates, x right and y down."""
+    high: FloatArray
+    """Its bottom right corner (2,)."""
+    depth: float
+    """Depth at which it stands [m]."""
+    pose: FloatArray
+    """Pose (4, 4) of its camera, which has glTF's axes [m]."""
+
+    @property
+    def look(self) -> dict[str, float]:
+        """The camera of glTF that holds the photo about its principal point."""
+        across, down = np.maximum(np.abs(self.low), np.abs(self.high)).tolist()
+        field = {"aspectRatio": across / down, "yfov": 2 * float(np.arctan(down))}
+        return field | {"znear": _NEAR * self.depth, "zfar": _FAR * self.depth}
+
+    @property
+    def corners(self) -> FloatArray:
+        """Top left, bottom left, bottom right, top right, in glTF's axes; (4, 3) float."""
+        (left, top), (right, bottom) = self.low, self.high
+        rows = [[left, top, 1], [left, bottom, 1], [right, bottom, 1], [right, top, 1]]
+        return np.asarray(np.array(rows) * self.depth * OPENGL_AXES)
 
 
 def write_glb(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -> None:
@@ -46,11 +92,12 @@ def write_glb(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -
     Raises
     ------
     InputError
-        If there is no mesh, or the frame is not known.
+        If the frame is not known.
     DataError
         If a photo cannot be read.
     """
-    mesh, placing, photos = placed_parts(exported, frame)
+    mesh, placing = _placed_mesh(exported, frame)
+    photos = [_placed_photo(exported, frame, number) for number in range(len(exported.views))]
     nodes = [
         (f"{exported.name}_{number}", surface, material, placing)
         for number, (surface, material) in enumerate(_parts(mesh))
@@ -58,7 +105,7 @@ def write_glb(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -
     nodes += [
         _photo_node(f"photo_{number}", photo)
         for number, photo in enumerate(photos)
-        if photo.plane.image is not None
+        if photo.image is not None
     ]
     scene = trimesh.Scene()
     for number, (_, surface, _, place) in enumerate(nodes):
@@ -117,7 +164,7 @@ def _textured(vertices: FloatArray, faces: Any, uv: FloatArray, texture: Any) ->
 
 def _photo_node(name: str, photo: PlacedPhoto) -> _Node:
     uv = np.array([[0.0, 1.0], [0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
-    mesh = _textured(photo.corners, np.array([[0, 1, 2], [0, 2, 3]]), uv, photo.plane.image)
+    mesh = _textured(photo.corners, np.array([[0, 1, 2], [0, 2, 3]]), uv, photo.image)
     material = {
         "name": name,
         "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
@@ -172,3 +219,88 @@ def _add_cameras(tree: dict[str, Any], photos: Sequence[PlacedPhoto]) -> None:
         roots.append(len(tree["nodes"]))
         matrix = photo.pose.T.ravel().tolist()
         tree["nodes"].append({"name": name, "camera": number, "matrix": matrix})
+
+
+def _placed_mesh(exported: AlignedObject, frame: Frame) -> tuple[Mesh, FloatArray]:
+    """The mesh and its place (4, 4) in the scene.
+
+    A mesh far from its origin, whose vertices single precision would round, is moved there, and so
+    its place.
+    """
+    mesh = exported.mesh
+    placing = _root(frame) @ exported.frame_from_model(frame).cam_from_model
+    placing[:3] *= exported.metres
+    low, high = mesh.bounds
+    if np.abs(mesh.bounds).max() > _FAR_OFF * np.abs(high - low).max():
+        middle = (low + high) / 2
+        mesh = replace(mesh, vertices=mesh.vertices - middle)
+        placing[:3, 3] += placing[:3, :3] @ middle
+    return mesh, placing
+
+
+def _root(frame: Frame) -> FloatArray:
+    """The scene's axes from those of a frame: the first camera's are turned to glTF's."""
+    return OPENGL_FLIP if frame == "camera" else np.eye(4)
+
+
+def _placed_photo(exported: AlignedObject, frame: Frame, number: int) -> PlacedPhoto:
+    """A view's photo, behind the object's farthest corner."""
+    view = exported.views[number]
+    pose = _root(frame) @ exported.frame_from_cam(frame, number) @ OPENGL_FLIP
+    pose[:3, 3] *= exported.metres
+    corners = view.cam_from_model.apply(bounds_corners(*exported.mesh.bounds))
+    depth = _BEHIND * float(np.abs(corners[:, 2]).max()) * exported.metres
+    return PlacedPhoto(*photo_plane(view.camera, view.read_image()), depth, pose)
+
+
+def photo_plane(
+    camera: Camera, image: ByteImage | None
+) -> tuple[ByteImage | None, FloatArray, FloatArray]:
+    """A camera's photo without lens distortion, and its corners at depth 1; see `PlacedPhoto`."""
+    if camera.distortion:
+        pinhole = _pinhole_of(camera)
+        image = None if image is None else _undistorted(image, camera, pinhole)
+        camera = pinhole
+    centre, focal = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
+    size = np.array([camera.width, camera.height])
+    return image, (-_BORDER - centre) / focal, (size - _BORDER - centre) / focal
+
+
+def _pinhole_of(camera: Camera) -> Camera:
+    """A camera without distortion, of the same focal length, that holds all pixels it can."""
+    width, height = camera.width, camera.height
+    across, down = np.arange(width + 1) - _BORDER, np.arange(height + 1) - _BORDER
+    sides = [np.stack([across, np.full(width + 1, y)], axis=1) for y in (down[0], down[-1])]
+    sides += [np.stack([np.full(height + 1, x), down], axis=1) for x in (across[0], across[-1])]
+    normalized, valid = camera.normalize_where_valid(np.concatenate(sides))
+    pixels = normalized[valid] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    whole = np.array([[-_BORDER] * 2, [width - _BORDER, height - _BORDER]])
+    pixels = pixels if len(pixels) else whole
+    slack = (_GROWTH - 1) * np.array([width, height])
+    low = np.maximum(np.floor(pixels.min(axis=0) + _BORDER), -slack)
+    high = np.minimum(np.ceil(pixels.max(axis=0) + _BORDER), [width, height] + slack)
+    columns, rows = (int(n) for n in np.maximum(high - low, 1))
+    cx, cy = camera.cx - float(low[0]), camera.cy - float(low[1])
+    return Camera(columns, rows, camera.fx, camera.fy, cx, cy)
+
+
+def _undistorted(image: ByteImage, camera: Camera, pinhole: Camera) -> ByteImage:
+    """The photo as the pinhole camera would have taken it, black where it shows nothing."""
+    columns, rows = np.meshgrid(np.arange(pinhole.width), np.arange(pinhole.height))
+    targets = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float)
+    normalized = pinhole.normalize(targets)
+    sources = camera.pixels_from_normalized(normalized)
+    # Past the fold of the lens model a far place would be given a pixel of the photo.
+    inside: BoolArray = np.asarray(np.isfinite(sources).all(axis=1))
+    inside[inside] = camera.contains(sources[inside], margin=-_RIM)
+    back, valid = camera.normalize_where_valid(sources[inside])
+    gap = np.abs(back - normalized[inside]).max(axis=1, initial=0.0)
+    inside[inside] = valid & (gap < _AGREES)
+    sources[~inside] = -10.0
+    maps = sources.reshape(pinhole.height, pinhole.width, 2).astype(np.float32)
+    # The rim has its colour, or viewers would mix black into the photo's borders.
+    drawn = cv2.remap(
+        image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    drawn[~inside.reshape(drawn.shape[:2])] = 0
+    return np.asarray(drawn, dtype=np.uint8)

@@ -7,14 +7,18 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final, Literal
 
 from cadalign.arrays import as_positive
+from cadalign.errors import InputError
+from cadalign.geometry.camera import Camera
 
 logger = logging.getLogger("cadalign")
 
 SHORTEST, LONGEST = 0.1, 50.0
 """Focal lengths that a camera has [longer sides of the image]: 157 to 1 degrees are seen."""
+USUAL: Final = "usual"
+"""In the place of a prior: that of usual lenses, `FocalPrior.of_usual_lenses`."""
 _USUAL_FOCAL = 1.2  # over the longer side of the image
 _USUAL_SIGMA = 0.6
 _EXIF_SIGMA = 0.05  # roundings, focusing, and corrections of the lens inside the camera
@@ -127,6 +131,33 @@ class FocalPrior:
         """
         focal = read_focal(path)
         return None if focal is None else cls(focal, relative_sigma, "the photo's EXIF data")
+
+
+PriorOption = FocalPrior | Literal["usual"] | None
+"""Prior on an unknown focal length: one's own, that of usual lenses, or none."""
+
+
+def prior_of_camera(prior: PriorOption, camera: Camera) -> FocalPrior | None:
+    """The prior on the focal length of a camera."""
+    if prior == USUAL:
+        return FocalPrior.of_usual_lenses(camera.width, camera.height)
+    assert not isinstance(prior, str)
+    return prior
+
+
+def check_prior(prior: object, *, focal: str) -> None:
+    """Refuse what is no prior, and one on a known focal length."""
+    if prior is None or (isinstance(prior, str) and prior == USUAL):
+        return
+    if not isinstance(prior, FocalPrior):
+        what = f"expected a cadalign.FocalPrior, 'usual' or None, got {type(prior).__name__}"
+        raise InputError(what, where="focal_prior")
+    if focal != "estimate":
+        raise InputError(
+            "given for a known focal length",
+            where="focal_prior",
+            fix='give focal="estimate" with it',
+        )
 
 
 def read_focal(path: str | os.PathLike[str]) -> float | None:

@@ -66,8 +66,11 @@ def kind_of(data: object) -> str | None:
         return FIT
     if {"annotations", "instance_info"} & fields:
         return DETECTOR
-    if "format" in fields and "keypoints" in fields:
-        return MODEL_KEYPOINTS
+    if "keypoints" in fields and "camera" not in fields:
+        points = data["keypoints"]
+        first = points[0] if isinstance(points, list) and points else None
+        if "format" in fields or (isinstance(first, dict) and "uv" not in first):
+            return MODEL_KEYPOINTS
     if {"views", "keypoints"} & fields:
         return OBSERVATION
     if {"asset", "meshes"} <= fields:

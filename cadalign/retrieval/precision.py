@@ -14,6 +14,7 @@ from cadalign.estimation.result_parts import FittedKeypoints, Posterior, point_s
 from cadalign.estimation.uncertainty.residuals import loss_slopes
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.solvers.constants import CAUCHY, HUBER
 
 
 def posterior_of_keypoints(
@@ -57,3 +58,13 @@ def posterior_by_shape(shape: Result, alignment: Alignment, options: FitOptions)
     change[6:] *= np.array([[name in free] for name in "xyz"])
     covariance = cast(FloatArray, shape.covariance)
     return Posterior(change @ covariance @ change.T, degrees_of_freedom=shape.degrees_of_freedom)
+
+
+def bent(squares: FloatArray, loss: int, bend: float) -> FloatArray:
+    """Loss on squared whitened lengths of any shape, one of `cadalign.solvers.constants`."""
+    if loss == HUBER:
+        linear = 2 * bend * np.sqrt(squares) - bend**2
+        return np.asarray(np.where(squares <= bend**2, squares, linear))
+    if loss == CAUCHY:
+        return np.asarray(bend**2 * np.log1p(squares / bend**2))
+    return squares

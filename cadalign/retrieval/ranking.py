@@ -31,7 +31,6 @@ from cadalign.estimation.options import LOSSES, Sigma
 from cadalign.estimation.problems import rays_of, whitening_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Posterior
-from cadalign.estimation.uncertainty.residuals import bent
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, faced, turned_alignment
 from cadalign.geometry.pixels import perspective
@@ -39,7 +38,7 @@ from cadalign.retrieval.kernels import LEAST_SHARED, Candidates, Query, bound_al
 from cadalign.retrieval.match import Match
 from cadalign.retrieval.models import ModelKey, ModelTable, check_semantic_ids
 from cadalign.retrieval.options import RetrievalOptions
-from cadalign.retrieval.precision import posterior_by_shape, posterior_of_keypoints
+from cadalign.retrieval.precision import bent, posterior_by_shape, posterior_of_keypoints
 from cadalign.solvers.constants import POSE_SIZE
 
 _BOUNDED_AT_ONCE = 1024  # candidates that a thread bounds at a time

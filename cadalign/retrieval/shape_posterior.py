@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.errors import InputError
+from cadalign.estimation.estimates import linearised
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.pack import seen_keypoints
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.result import Result
-from cadalign.estimation.uncertainty.shape_posterior import linearised
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import faced, turned_alignment
 from cadalign.shapes.gaussians import Gaussians

@@ -14,7 +14,6 @@ import numpy as np
 from cadalign.arrays import FloatArray, as_points, read_only
 from cadalign.errors import DataError, InputError, quote, require_kind
 from cadalign.geometry.alignment import extent
-from cadalign.geometry.mesh import Mesh
 from cadalign.io.files import as_path, require_utf8
 from cadalign.shapes.parts import (
     BOX_ROWS,
@@ -98,18 +97,6 @@ def _check_reach(points: FloatArray, bounds: FloatArray, where: str) -> None:
         raise InputError(what, where=where, fix="give the box in the keypoints' axes and unit")
 
 
-class DatasetModel(Protocol):
-    """A data set's model, such as `cadalign.datasets.AnnotatedModel`."""
-
-    @property
-    def model_id(self) -> str: ...
-    @property
-    def keypoints(self) -> Any: ...
-    @property
-    def mesh_path(self) -> Path | None: ...
-    def load_mesh(self, *, check: bool = True) -> Mesh: ...
-
-
 class Dataset(Protocol):
     """A data set of annotated models, such as `cadalign.datasets.KeypointNet`."""
 
@@ -118,9 +105,12 @@ class Dataset(Protocol):
 
 
 def examples_of(
-    models: Sequence[DatasetModel], *, meshes: bool, on_progress: Callable[[int, int], object]
+    models: Sequence[Any], *, meshes: bool, on_progress: Callable[[int, int], object]
 ) -> list[Example]:
-    """Convert a data set's models; boxes are those of the meshes if at least half have one."""
+    """Convert `cadalign.datasets.AnnotatedModel`s; their boxes are those of the meshes.
+
+    If less than half have a mesh, boxes are left out.
+    """
     with_mesh = sum(model.mesh_path is not None for model in models)
     measured = meshes and with_mesh > 0 and 2 * with_mesh >= len(models)
     examples = []

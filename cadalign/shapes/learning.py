@@ -153,27 +153,24 @@ class _CrossValidation:
         self._held_out = [models.some(self._folds == fold) for fold in range(folds)]
         self._on_progress, self._done = on_progress, 0
 
-    def choose(self, components: int | None, modes: int | None, reflection: bool) -> Choice:
+    def choose(self, components: int | None) -> Choice:
         """Choose a recipe and the number of modes, and calibrate what they give.
 
         Few models tell nothing but how strongly covariances are to be drawn to equal entries, and
         how far from the truth estimates are.
         """
-        if len(self._models.rows) < _LEAST_TO_CHOOSE:
-            return self._choose_of_few(components or 1, modes)
-        best = max((self._try(_Recipe(each)) for each in _STRENGTHS), key=_total)
-        if reflection:
-            best = self._with_reflection(best)
-        best = self._with_components(best, components)
-        modes = modes or self._modes(best)
-        return Choice(best.recipe, modes, self._calibration(best, modes), self._margins(best))
-
-    def _choose_of_few(self, components: int, modes: int | None) -> Choice:
-        best = max((self._try(_Recipe(each)) for each in _STRENGTHS_OF_FEW), key=_total)
-        recipe = replace(best.recipe, components=components)
-        if components > 1:  # but for one model each
-            most = len(self._models.rows) - 1
-            best = self._try(replace(recipe, components=min(components, most)))
+        count = len(self._models.rows)
+        is_few, modes = count < _LEAST_TO_CHOOSE, None
+        strengths = _STRENGTHS_OF_FEW if is_few else _STRENGTHS
+        best = max((self._try(_Recipe(each)) for each in strengths), key=_total)
+        if is_few:
+            recipe = replace(best.recipe, components=components or 1)
+            if recipe.components > 1:  # but for one model each
+                most = min(recipe.components, count - 1)
+                best = self._try(replace(recipe, components=most))
+        else:
+            best = self._with_components(self._with_reflection(best), components)
+            recipe, modes = best.recipe, self._modes(best)
         return Choice(recipe, modes, self._calibration(best, modes), self._margins(best))
 
     def _with_reflection(self, best: _Trial) -> _Trial:
@@ -233,20 +230,17 @@ def learn_parts(
     on_progress: Callable[[int, int], object],
     *,
     components: int | None,
-    modes: int | None,
-    reflection: bool,
 ) -> dict[str, Any]:
     """Learn the fields of a `cadalign.ShapeModel`, but for its names; see `ShapeModel.learn`."""
-    wanted = {"components": components, "modes": modes}
-    require_counts(**{name: count for name, count in wanted.items() if count is not None})
+    if components is not None:
+        require_counts(components=components)
     ids, rows, training = tabulated(examples)
     if (components or 1) > len(rows):
         what = f"{components} are more than the {len(rows)} models"
         raise InputError(what, where="components")
     extents = np.nanmax(rows, axis=1) - np.nanmin(rows, axis=1)
     models = _Models(ids, rows, float(np.median(np.linalg.norm(extents, axis=1))))
-    tried = _CrossValidation(models, on_progress)
-    choice = tried.choose(components, modes, reflection)
+    choice = _CrossValidation(models, on_progress).choose(components)
     mixture = models.mixture(choice.recipe)
     on_progress(_STEPS, _STEPS)
     weights = mixture.weights / mixture.weights.sum()

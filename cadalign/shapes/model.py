@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, IntArray, as_floats, is_number, is_whole
+from cadalign.arrays import FloatArray, IntArray, as_floats, is_number
 from cadalign.errors import InputError, quote, require_kind
-from cadalign.shapes.basis import component_of_basis, component_of_covariance, symmetric_component
+from cadalign.shapes.basis import component_of_basis, symmetric_component
 from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.outputs import read_shape, write_shape
 from cadalign.shapes.parts import (
@@ -29,8 +29,6 @@ from cadalign.shapes.parts import (
     check_ids,
     check_mixture,
     check_text,
-    checked_box,
-    given_ids,
 )
 
 if TYPE_CHECKING:
@@ -45,8 +43,7 @@ class ShapeModel:
     """The shapes of a category: keypoints and bounding box, jointly Gaussian, or a mixture.
 
     `ShapeModel.learn` and `ShapeModel.from_dataset` learn one from models, `ShapeModel.from_basis`
-    and `ShapeModel.from_covariance` make one from given numbers, `ShapeModel.open` reads one that
-    `ShapeModel.save` wrote.
+    makes one from given numbers, `ShapeModel.open` reads one that `ShapeModel.save` wrote.
 
     Raises
     ------
@@ -134,15 +131,14 @@ class ShapeModel:
         up_axis: Literal["x", "y", "z"] | None = None,
         unit: str = "model units",
         components: int | None = None,
-        modes: int | None = None,
-        reflection: bool = True,
         on_progress: OnProgress = lambda done, total: None,
     ) -> ShapeModel:
         """Learn the shapes of a category from models of it.
 
-        Models may lack keypoints; these are completed by expectation maximisation. What is not
-        given is chosen by the likelihood of models that were held out. Ids that few models have
-        keep wide standard deviations.
+        Models may lack keypoints; these are completed by expectation maximisation. The numbers of
+        Gaussians and of modes are chosen by the likelihood of models that were held out, and so is
+        whether the category has a mirror symmetry: the mirrored models are then learned from, too.
+        Ids that few models have keep wide standard deviations.
 
         Parameters
         ----------
@@ -151,12 +147,7 @@ class ShapeModel:
         category, up_axis, unit
             See `ShapeModel`.
         components : int, optional
-            Number of Gaussians.
-        modes : int, optional
-            Number of modes of each.
-        reflection : bool
-            Whether to look for a mirror symmetry and, where it makes held-out models more likely,
-            to learn from the mirrored models, too.
+            Number of Gaussians; each costs a search of its own when an image is aligned.
         on_progress : callable
             Called with the number of steps done and of all.
 
@@ -168,9 +159,7 @@ class ShapeModel:
         """
         from cadalign.shapes.learning import learn_parts  # an estimate learns nothing
 
-        learned = learn_parts(
-            list(models), on_progress, components=components, modes=modes, reflection=reflection
-        )
+        learned = learn_parts(list(models), on_progress, components=components)
         return cls(category=category, up_axis=up_axis, unit=unit, **learned)
 
     @classmethod
@@ -182,8 +171,6 @@ class ShapeModel:
         split: str | None = None,
         meshes: bool = True,
         components: int | None = None,
-        modes: int | None = None,
-        reflection: bool = True,
         on_progress: OnProgress = lambda done, total: None,
     ) -> ShapeModel:
         """Learn the shapes of a category of `cadalign.datasets.KeypointNet`.
@@ -198,7 +185,7 @@ class ShapeModel:
         meshes : bool
             Whether to read the meshes for the bounding boxes, where at least half of the models
             have one; otherwise the boxes are those of the keypoints.
-        components, modes, reflection, on_progress
+        components, on_progress
             See `ShapeModel.learn`; the first steps are those of reading.
 
         Raises
@@ -220,8 +207,6 @@ class ShapeModel:
             up_axis="y",
             unit="diagonal",
             components=components,
-            modes=modes,
-            reflection=reflection,
             on_progress=on_progress,
         )
 
@@ -233,7 +218,6 @@ class ShapeModel:
         deviations: npt.ArrayLike,
         *,
         ids: Sequence[KeypointId] | None = None,
-        names: Sequence[str] | None = None,
         box: npt.ArrayLike | None = None,
         residual_sigma: float = 0.0,
         size_sigma: npt.ArrayLike | None = None,
@@ -253,8 +237,8 @@ class ShapeModel:
             on.
         deviations : (K,) float
             Standard deviations of their coefficients, 0 or more.
-        ids, names : (m,) int or str, optional
-            Semantic ids or names of the keypoints, one of both; by default ``0 ... m - 1``.
+        ids : (m,) int or str, optional
+            Semantic ids or names of the keypoints; by default ``0 ... m - 1``.
         box : (2, 3) float, optional
             Least and greatest corner of the mean shape's bounding box. With each mode it moves by
             the shift and the stretch along each axis that fit the keypoints' motion best. By
@@ -281,7 +265,7 @@ class ShapeModel:
         --------
         >>> mean = [[0, 0, 0], [4, 0, 0], [4, 2, 0], [0, 2, 1]]
         >>> longer = [[0, 0, 0], [1, 0, 0], [1, 0, 0], [0, 0, 0]]
-        >>> cars = ShapeModel.from_basis(mean, [longer], [0.5], names=["a", "b", "c", "d"],
+        >>> cars = ShapeModel.from_basis(mean, [longer], [0.5], ids=["a", "b", "c", "d"],
         ...                              size_sigma=0.1, unit="m")
         >>> cars.components[0].modes.shape
         (2, 6, 3)
@@ -289,7 +273,10 @@ class ShapeModel:
         component = component_of_basis(
             mean, modes, deviations, box=box, residual_sigma=residual_sigma, size_sigma=size_sigma
         )
-        labels = given_ids(ids, names, len(component.mean) - BOX_ROWS)
+        count = len(component.mean) - BOX_ROWS
+        labels = check_ids(range(count) if ids is None else list(ids), "ids")
+        if len(labels) != count:
+            raise InputError(f"{len(labels)} for {count} keypoints", where="ids")
         if reflection is not None:
             require_kind(reflection, Reflection, "reflection")
             component = symmetric_component(component, labels, reflection)
@@ -302,48 +289,6 @@ class ShapeModel:
             reflection=reflection,
             unit=unit,
         )
-
-    @classmethod
-    def from_covariance(
-        cls,
-        mean: npt.ArrayLike,
-        covariance: npt.ArrayLike,
-        *,
-        ids: Sequence[KeypointId] | None = None,
-        names: Sequence[str] | None = None,
-        modes: int | None = None,
-        category: str = "object",
-        up_axis: Literal["x", "y", "z"] | None = None,
-        unit: str = "model units",
-    ) -> ShapeModel:
-        """Make a shape model from the mean and covariance of keypoints and box.
-
-        Parameters
-        ----------
-        mean : (m + 2, 3) float
-            The keypoints, then the least and the greatest corner of the bounding box.
-        covariance : (3 (m + 2), 3 (m + 2)) float
-            Covariance of x, y, z of the first row, and so on [model units squared].
-        ids, names
-            See `ShapeModel.from_basis`.
-        modes : int, optional
-            Number of modes to keep; what they leave is spread evenly over the coordinates.
-        category, up_axis, unit
-            See `ShapeModel`.
-
-        Raises
-        ------
-        InputError
-            If a shape is wrong, a value is NaN or infinite, or the covariance is not symmetric and
-            positive semi-definite.
-        """
-        rows = as_floats(mean, name="mean", shape=(None, 3))
-        if modes is not None and (not is_whole(modes) or modes < 0):
-            raise InputError(f"{modes!r} is not a whole number >= 0", where="modes")
-        checked_box(rows[-BOX_ROWS:], "mean, its last two rows, the box")
-        component = component_of_covariance(rows, covariance, modes=modes)
-        labels = given_ids(ids, names, len(rows) - BOX_ROWS)
-        return cls(category, labels, (component,), up_axis=up_axis, unit=unit)
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> ShapeModel:

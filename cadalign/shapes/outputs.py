@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
 
@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import BOX_EDGES, bounds_corners
 from cadalign.io.documents import Count, Document, PathText, in_file
@@ -41,11 +41,10 @@ SEAL = Seal(
 _MAX_BYTES = 1 << 30  # of thousands of models with hundreds of keypoints each
 _MODES = 4  # of a picture
 _DEVIATIONS = 2.0
+_COMMON = 0.25  # share of the training models whose keypoints are joined by lines
 _CELL = 2.9  # inches
 _AZIMUTH, _ELEVATION = np.radians(32.0), np.radians(18.0)
-_GREY, _LESS, _MORE, _BOX = "#8a8f98", "#2a6fbb", "#d9622b", "#c3c7cd"
-_COMMON = 0.25  # share of the training models whose keypoints are joined by lines
-_LABELLED = 40  # keypoints, above which their ids would cover one another
+_GREY, _DARK, _LESS, _MORE, _BOX = "#8a8f98", "#30343b", "#2a6fbb", "#d9622b", "#c3c7cd"
 
 
 class _Array(Document):
@@ -72,7 +71,6 @@ def read_shape(path: str | os.PathLike[str], kind: type[Kind]) -> Kind:
     try:
         document = msgspec.msgpack.decode(payload)
         model = msgspec.convert(document, kind, dec_hook=_read)
-        _check_known(document, model)
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         cause = error.__cause__
         if isinstance(cause, InputError) and str(cause) == str(error):  # of the model as a whole
@@ -106,19 +104,6 @@ def _read(kind: Any, value: Any) -> Any:
     return numbers.reshape(array.shape).astype(dtype.newbyteorder("="))
 
 
-def _check_known(document: Any, made: Any) -> None:
-    """Refuse fields of a document that what was made of it does not have."""
-    if isinstance(made, tuple):
-        for entry, part in zip(document, made, strict=True):
-            _check_known(entry, part)
-    elif is_dataclass(made):
-        unknown = document.keys() - {each.name for each in fields(made)}
-        if unknown:
-            raise InputError(f"unknown field {min(unknown)!r}")
-        for name, entry in document.items():
-            _check_known(entry, getattr(made, name))
-
-
 def draw_shape(path: Path, model: ShapeModel) -> None:
     """Draw a row for each component: the mean with its box and ids, then the first modes.
 
@@ -141,105 +126,65 @@ def draw_shape(path: Path, model: ShapeModel) -> None:
     )
     axes = figure.subplots(rows, columns, squeeze=False)
     for row, component in zip(axes, model.components, strict=True):
+        for each in row:
+            each.set_aspect("equal")
+            each.set_axis_off()
         _draw_component(row, model, component)
     write_whole(path, lambda unfinished: figure.savefig(unfinished, dpi=110))
 
 
-def neighbour_pairs(points: FloatArray) -> list[tuple[int, int]]:
-    """Pairs of points that have no third point nearer to both: a skeleton of the shape.
+def neighbour_pairs(points: FloatArray) -> IntArray:
+    """Pairs (n, 2) of points that have no third point nearer to both: a skeleton of the shape.
 
     The relative neighbourhood graph, which holds the minimum spanning tree: Toussaint, "The
     relative neighbourhood graph of a finite planar set", 1980.
 
     Examples
     --------
-    >>> neighbour_pairs(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]))
-    [(0, 1), (1, 2)]
+    >>> neighbour_pairs(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])).tolist()
+    [[0, 1], [1, 2]]
     """
     gaps = np.linalg.norm(points[:, None] - points, axis=2)
     blocked = (np.maximum(gaps[:, None, :], gaps[None, :, :]) < gaps[..., None]).any(axis=2)
-    return [
-        (first, second)
-        for first in range(len(points))
-        for second in range(first + 1, len(points))
-        if not blocked[first, second]
-    ]
+    return np.argwhere(np.triu(~blocked, 1))
 
 
 def _draw_component(row: Sequence[Axes], model: ShapeModel, component: ShapeComponent) -> None:
-    view = _view(model.up_axis)
-    points = component.mean[:-BOX_ROWS]
-    common = _common(model)
+    view, mean, common = _view(model.up_axis), component.mean, _common(model)
     chosen = np.flatnonzero(common)
-    pairs = [(int(chosen[a]), int(chosen[b])) for a, b in neighbour_pairs(points[chosen])]
-    for axes in row:
-        axes.set_aspect("equal")
-        axes.set_axis_off()
-    _draw_mean(row[0], model, component, view, pairs, common)
-    total = float(np.trace(component.covariance))
-    for number, axes in enumerate(row[1:]):
-        if number >= len(component.modes):
-            continue
-        mode = component.modes[number]
-        share = 100 * float((mode**2).sum()) / total if total else 0.0
-        axes.set_title(f"mode {number + 1}: {share:.0f} % of the variance", fontsize=8)
-        shapes = [(0.0, _GREY), (-_DEVIATIONS, _LESS), (_DEVIATIONS, _MORE)]
-        for deviations, color in shapes:
-            moved = (component.mean + deviations * mode) @ view
-            _draw_skeleton(axes, moved[:-BOX_ROWS], pairs, common, color)
-        ends = [(component.mean + side * mode)[:-BOX_ROWS] @ view for side in (-2.0, 2.0)]
-        for start, end in zip(*ends, strict=True):
-            axes.plot(*np.transpose([start, end]), color=_GREY, lw=0.5, alpha=0.5, zorder=1)
+    lines = chosen[neighbour_pairs(mean[chosen])].T
+    sizes = np.where(common, 14, 5)
 
+    def draw(axes: Axes, shape: FloatArray, color: str) -> None:
+        flat = (shape @ view)[:-BOX_ROWS]
+        axes.plot(*flat[lines].transpose(2, 0, 1), color=color, lw=1.3, zorder=2)
+        axes.scatter(flat[:, 0], flat[:, 1], s=sizes, color=color, zorder=3, linewidths=0)
 
-def _draw_mean(
-    axes: Axes,
-    model: ShapeModel,
-    component: ShapeComponent,
-    view: FloatArray,
-    pairs: list[tuple[int, int]],
-    common: BoolArray,
-) -> None:
-    title = (
-        "mean" if len(model.components) == 1 else f"{100 * component.weight:.0f} % of the models"
+    corners = bounds_corners(*mean[-BOX_ROWS:]) @ view
+    row[0].plot(*corners[np.transpose(BOX_EDGES)].transpose(2, 0, 1), color=_BOX, lw=0.7, zorder=0)
+    draw(row[0], mean, _DARK)
+    share = 100 * component.weight
+    row[0].set_title(
+        "mean" if len(model.components) == 1 else f"{share:.0f} % of the models", size=8
     )
-    axes.set_title(title, fontsize=8)
-    low, high = component.mean[-BOX_ROWS:]
-    seen = bounds_corners(low, high) @ view
-    for first, second in BOX_EDGES:
-        axes.plot(*seen[[first, second]].T, color=_BOX, lw=0.7, zorder=0)
-    flat = component.mean[:-BOX_ROWS] @ view
-    _draw_skeleton(axes, flat, pairs, common, "#30343b")
-    if len(flat) > _LABELLED:
-        return
-    for label, place in zip(model.ids, flat, strict=True):
-        axes.annotate(
-            str(label),
-            place,
-            xytext=(3, 3),
-            textcoords="offset points",
-            fontsize=6,
-            color="#5b616b",
-        )
-
-
-def _draw_skeleton(
-    axes: Axes, flat: FloatArray, pairs: list[tuple[int, int]], common: BoolArray, color: str
-) -> None:
-    for first, second in pairs:
-        axes.plot(*flat[[first, second]].T, color=color, lw=1.3, solid_capstyle="round", zorder=2)
-    for chosen, size in ((common, 14), (~common, 5)):
-        x, y = flat[chosen].T
-        axes.scatter(x, y, s=size, color=color, zorder=3, linewidths=0)
+    for label, place in zip(model.ids, (mean @ view)[:-BOX_ROWS], strict=True):
+        offset: Any = {"xytext": (3, 3), "textcoords": "offset points"}
+        row[0].annotate(str(label), place, **offset, fontsize=6, color=_DARK)
+    total = float(np.trace(component.covariance)) or 1.0
+    modes = zip(row[1:], component.modes, component.variance, strict=False)
+    for number, (axes, mode, variance) in enumerate(modes, start=1):
+        axes.set_title(f"mode {number}: {100 * variance / total:.0f} % of the variance", size=8)
+        for deviations, color in ((0.0, _GREY), (-_DEVIATIONS, _LESS), (_DEVIATIONS, _MORE)):
+            draw(axes, mean + deviations * mode, color)
 
 
 def _common(model: ShapeModel) -> BoolArray:
     """The keypoints that a good part of the training models have; all if there are none."""
+    every = np.ones(len(model.ids), dtype=bool)
     if model.training is None:
-        return np.ones(len(model.ids), dtype=bool)
-    shares = np.isfinite(model.training.points_3d[..., 0]).mean(axis=0)
-    common = np.asarray(shares >= _COMMON)
-    return common if common.sum() > 1 else np.ones(len(model.ids), dtype=bool)
+        return every
+    common = np.isfinite(model.training.points_3d[..., 0]).mean(axis=0) >= _COMMON
+    return np.asarray(common) if common.sum() > 1 else every
 
 
 def _view(up_axis: str | None) -> FloatArray:

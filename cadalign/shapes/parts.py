@@ -356,17 +356,3 @@ def check_ids(ids: Sequence[KeypointId], where: str) -> tuple[KeypointId, ...]:
     if twice is not None:
         raise InputError(f"{twice!r} occurs twice", where=where)
     return tuple(found)
-
-
-def given_ids(
-    ids: Sequence[KeypointId] | None, names: Sequence[str] | None, count: int
-) -> tuple[KeypointId, ...]:
-    """The checked ids or names of so many keypoints, by default their numbers."""
-    if ids is not None and names is not None:
-        raise InputError("both ids and names are given", where="names", fix="give one of them")
-    where = "ids" if names is None else "names"
-    given = ids if names is None else names
-    labels = check_ids(range(count) if given is None else list(given), where)
-    if len(labels) != count:
-        raise InputError(f"{len(labels)} for {count} keypoints", where=where)
-    return labels

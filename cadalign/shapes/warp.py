@@ -9,7 +9,6 @@ overshoot and fold the mesh where near keypoints move apart.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -71,17 +70,12 @@ def warp_mesh(
     targets = as_floats(target, name="target", shape=(len(places), 3))
     if not len(places):
         raise InputError("no keypoints", where="source")
-    if bounds is not None:
+    if bounds is None:
+        corners = _stretched_box(mesh.bounds, places, targets)
+    else:
         corners = checked_box(bounds, "bounds")
-        warp = linear_warp(mesh.vertices, mesh.bounds, places)
-        return replace(mesh, vertices=warp.apply(targets, corners))
-    diagonal = _diagonal(mesh.bounds, places)
-    merged = _merging(places, _COINCIDENT * diagonal)
-    places, targets = merged @ places, merged @ targets
-    stretch = _stretch_of_keypoints(places, targets)
-    weights = _weights(mesh.vertices, mesh.bounds, places, diagonal)
-    vertices = stretch(mesh.vertices) + weights @ (targets - stretch(places))
-    return replace(mesh, vertices=vertices)
+    warp = linear_warp(mesh.vertices, mesh.bounds, places)
+    return replace(mesh, vertices=warp.apply(targets, corners))
 
 
 class LinearWarp(NamedTuple):
@@ -170,17 +164,20 @@ def _merging(places: FloatArray, tolerance: float) -> FloatArray:
     return np.asarray(same / same.sum(axis=1, keepdims=True))
 
 
-def _stretch_of_keypoints(
-    places: FloatArray, targets: FloatArray
-) -> Callable[[FloatArray], FloatArray]:
-    """The shift and the stretch along each axis that fit best, drawn to an equal stretch of all."""
+def _stretched_box(box: FloatArray, source: FloatArray, target: FloatArray) -> FloatArray:
+    """A box (2, 3) after the shift and the stretch along each axis that fit the keypoints best.
+
+    The stretch is drawn to an equal one along all axes.
+    """
+    merging = _merging(source, _COINCIDENT * _diagonal(box, source))
+    places, targets = merging @ source, merging @ target
     centre, to = places.mean(axis=0), targets.mean(axis=0)
     offsets, moved = places - centre, targets - to
     total = float((offsets**2).sum())
     if not total:
-        return lambda points: points - centre + to
+        return np.asarray(box - centre + to)
     equal = float(np.sqrt((moved**2).sum() / total)) or 1.0
     weight = _PRIOR_SPREAD**2 * total
     stretch = ((offsets * moved).sum(axis=0) + weight * equal) / ((offsets**2).sum(axis=0) + weight)
     stretch = np.maximum(stretch, _LEAST_STRETCH * equal)
-    return lambda points: (points - centre) * stretch + to
+    return np.asarray((box - centre) * stretch + to)

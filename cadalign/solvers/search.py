@@ -24,34 +24,34 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import KernelFamily, borrowing, kernel
+from cadalign.compile import borrowing, kernel, kernel_family
 from cadalign.solvers.linalg import copy_into
 
-room_of = KernelFamily("room_of")
+room_of = kernel_family("room_of")
 """``(system)``: room for the equations that steps are from and for those of a trial, in turns.
 
 Their ``gradient`` has one entry for each unknown.
 """
-evaluate = KernelFamily("evaluate")
+evaluate = kernel_family("evaluate")
 """``(system, state, equations)``: write the normal equations at a state; returns the cost."""
-cost_at = KernelFamily("cost_at")
+cost_at = kernel_family("cost_at")
 """``(system, state)``: the cost at a state, without derivatives."""
-solve = KernelFamily("solve")
+solve = kernel_family("solve")
 """``(system, equations, damping, step)``: write the damped Gauss-Newton step.
 
 Returns the decrease of the cost that the equations predict for it, NaN where they have no solution.
 """
-move = KernelFamily("move")
+move = kernel_family("move")
 """``(system, state, equations, damping, step, moved)``: write the state that a step leads to.
 
 What the equations eliminate follows it.
 """
-score_of = KernelFamily("score_of")
+score_of = kernel_family("score_of")
 """``(system, state, cost)``: -2 log of the evidence by Laplace's approximation, but for a constant.
 
 Infinite where the unknowns are not determined; ``cost`` where the system ranks by cost.
 """
-are_same = KernelFamily("are_same")
+are_same = kernel_family("are_same")
 """``(system, first, second)``: True if two states lie at the same minimum."""
 
 _RELATIVE_DECREASE = 1e-12

@@ -15,9 +15,9 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, is_number
 from cadalign.errors import CadalignError, InputError, require_kind
-from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.options import FitOptions
 from cadalign.geometry.camera import Camera
+from cadalign.io.focal import PriorOption
 from cadalign.torch.fits import FitTask, fits_of
 
 if TYPE_CHECKING:

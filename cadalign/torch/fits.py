@@ -15,8 +15,8 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.fit import fit_once
-from cadalign.estimation.focal import log_focal_range
 from cadalign.estimation.options import LOSSES, FitOptions
+from cadalign.estimation.prior import log_focal_range
 from cadalign.estimation.problems import Problems, in_threads, joined, rays_of
 from cadalign.estimation.solve import are_solved_at_once, solve
 from cadalign.geometry.camera import Camera

@@ -73,6 +73,7 @@ def draw_lines(canvas: Canvas, geometry: Geometry, color: Color) -> None:
 
 OBSERVED_COLOR: Color = (255, 255, 255)
 REPROJECTED_COLOR: Color = (255, 222, 40)
+OUTLIER_COLOR: Color = (140, 140, 140)
 UNSEEN_COLOR: Color = (255, 150, 225)
 
 REGION_SHARE = 0.95
@@ -86,8 +87,8 @@ _LEAST_REGION = 3.0  # px across; smaller ones are hidden by the markers
 class KeypointMarks:
     """Keypoints to be drawn [px]; None for what is not.
 
-    ``seen`` (k, 2), ``back`` (m, 2) and ``unseen`` (n, 2) are points, ``residuals`` (r, 2, 2) lines
-    from one to another, and ``regions`` (q, j, 2) closed curves.
+    ``seen`` (k, 2), ``back`` (m, 2), ``unseen`` (n, 2) and ``outliers`` (o, 2) are points,
+    ``residuals`` (r, 2, 2) lines from one to another, and ``regions`` (q, j, 2) closed curves.
     """
 
     seen: FloatArray | None = None
@@ -95,6 +96,7 @@ class KeypointMarks:
     residuals: FloatArray | None = None
     unseen: FloatArray | None = None
     regions: FloatArray | None = None
+    outliers: FloatArray | None = None
 
     @classmethod
     def checked(
@@ -103,6 +105,7 @@ class KeypointMarks:
         reprojected: npt.ArrayLike | None,
         unseen: npt.ArrayLike | None,
         regions: npt.ArrayLike | None,
+        outliers: npt.ArrayLike | None,
     ) -> KeypointMarks:
         """The marks of `draw_overlay`'s arguments; raises InputError where they don't match."""
         seen = None if observed is None else as_points(observed, name="observed", dimension=2)
@@ -120,6 +123,7 @@ class KeypointMarks:
             pairs,
             None if unseen is None else as_points(unseen, name="unseen", dimension=2),
             None if regions is None else as_floats(regions, name="regions", shape=(None, None, 2)),
+            None if outliers is None else as_points(outliers, name="outliers", dimension=2),
         )
 
     def placed(self, canvas: Canvas) -> KeypointMarks:
@@ -143,6 +147,8 @@ class KeypointMarks:
             canvas.line(pair, REPROJECTED_COLOR, width=1.0)
         for point in () if self.seen is None else self.seen:
             canvas.ring(point, OBSERVED_COLOR, radius=5)
+        for point in () if self.outliers is None else self.outliers:
+            canvas.ring(point, OUTLIER_COLOR, radius=5)
         for point in () if self.back is None else self.back:
             canvas.cross(point, REPROJECTED_COLOR, radius=3.5)
 
@@ -154,6 +160,8 @@ class KeypointMarks:
             entries.append(("observed", OBSERVED_COLOR, "ring"))
         if self.back is not None:
             entries.append(("reprojected", REPROJECTED_COLOR, "cross"))
+        if self.outliers is not None and len(self.outliers):
+            entries.append(("left out", OUTLIER_COLOR, "ring"))
         if self.unseen is not None and len(self.unseen):
             entries.append(("not observed", UNSEEN_COLOR, "ring"))
         if self.regions is not None and len(self.regions):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -9,11 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.result import Result
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.evidence import ObservedImage
 from cadalign.io.images import read_image
 from cadalign.io.meshes.files import load_mesh, mesh_at
 from cadalign.io.observation import Observation
@@ -80,10 +79,9 @@ _CONTOUR_COLOR = (70, 190, 250)
 
 
 def draw_result(
-    image: ObservedImage,
-    result: Result,
+    photo: npt.ArrayLike,
+    result: Any,
     *,
-    photo: ByteImage | None = None,
     mesh: Mesh | None = None,
     bounds: FloatArray | None = None,
     mask: npt.NDArray[Any] | None = None,
@@ -92,15 +90,13 @@ def draw_result(
     """Draw the estimated box, keypoints with their uncertainty, and mesh over the photo of a view.
 
     Keypoints that the view does not show are drawn with the regions that hold them; where the views
-    have a pose each, regions are drawn in the first one alone. ``photo`` (h, w, 3) is the image's
-    if it has been read already, grey where there is none; ``mesh`` the object's in the model's
-    frame before the stretch, see `mesh_of`; ``bounds`` (2, 3) the box to draw in that frame, by
-    default the result's; ``mask`` (h, w) the view's, whose contour is drawn; ``number`` the view's
-    in the result.
+    have a pose each, regions are drawn in the first one alone. ``photo`` is as for `draw_overlay`,
+    ``result`` a `cadalign.Result`; ``mesh`` the object's in the model's frame before the stretch,
+    see `mesh_of`; ``bounds`` (2, 3) the box to draw in that frame, by default the result's;
+    ``mask`` (h, w) the view's, whose contour is drawn; ``number`` the view's in the result.
     """
     view = result.views[number]
     camera, alignment = view.camera, view.alignment
-    photo = photo_of(image, camera) if photo is None else photo
     in_camera = alignment.apply(result.points_3d)
     ahead = camera.sees(in_camera)
     seen = set(view.ids)
@@ -118,7 +114,7 @@ def draw_result(
     if mesh is not None:
         frame = cast_geometry(Scene(mesh), camera, alignment)
     return draw_overlay(
-        photo if mask is None else draw_contour(photo, np.asarray(mask)),
+        photo if mask is None else draw_contour(np.asarray(photo), np.asarray(mask)),
         camera,
         est_box=Box.from_model(result.bounds if bounds is None else bounds, alignment),
         est_frame=frame,
@@ -126,15 +122,18 @@ def draw_result(
         reprojected=camera.project_where_ahead(own),
         unseen=camera.project(in_camera[unseen]) if unseen.any() else None,
         regions=regions,
+        outliers=view.points_2d[~view.inliers],
     )
 
 
-def photo_of(observation: ObservedImage, camera: Camera) -> ByteImage:
-    """The photo (h, w, 3), grey where there is none; refuses images that are too large."""
+def photo_of(image: Path | str | npt.ArrayLike | None, camera: Camera) -> npt.NDArray[Any]:
+    """The pixels of a photo, grey where there is none; refuses images that are too large."""
     check_image_size(camera)
-    if observation.image is None:
+    if image is None:
         return np.full((camera.height, camera.width, 3), LIGHT_GREY, dtype=np.uint8)
-    return read_image(observation.image, camera)
+    if isinstance(image, Path | str):
+        return read_image(Path(image), camera)
+    return np.asarray(image)
 
 
 def draw_contour(image: ByteImage, mask: npt.NDArray[Any]) -> ByteImage:
@@ -146,7 +145,7 @@ def draw_contour(image: ByteImage, mask: npt.NDArray[Any]) -> ByteImage:
     return drawn
 
 
-def mesh_of(observation: Observation, result: Result) -> Mesh | None:
+def mesh_of(observation: Observation, result: Any) -> Mesh | None:
     """The object's mesh, warped from the observation's model or the nearest training model.
 
     Of a fit of pairs the model's own. In the model's frame, before the stretch. None where no mesh

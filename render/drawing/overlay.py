@@ -58,7 +58,8 @@ def draw_overlay(
     reprojected: npt.ArrayLike | None = None,
     unseen: npt.ArrayLike | None = None,
     regions: npt.ArrayLike | None = None,
-    axes: bool | Box = True,
+    outliers: npt.ArrayLike | None = None,
+    axes: bool = True,
     legend: bool = True,
 ) -> ByteImage:
     """Draw an alignment over its image.
@@ -89,8 +90,10 @@ def draw_overlay(
     regions : (r, j, 2) float, optional
         Outlines of regions that hold keypoints [px]; see
         `cadalign.render.drawing.layers.confidence_regions`.
-    axes : bool or Box
-        Whether to draw the axes, or the box to draw them in.
+    outliers : (n, 2) float, optional
+        Observed keypoints that the estimate left out [px]: their rings are grey.
+    axes : bool
+        Whether to draw the axes.
     legend : bool
         Whether to draw it.
 
@@ -119,21 +122,20 @@ def draw_overlay(
     canvas = Canvas(pixels)
     if est_frame is not None:
         draw_lines(canvas, est_frame, EST_COLOR)
-    marks = KeypointMarks.checked(observed, reprojected, unseen, regions)
+    marks = KeypointMarks.checked(observed, reprojected, unseen, regions, outliers)
     strokes: list[_Stroke] = []
     for box, color in ((gt_box, GT_COLOR), (est_box, EST_COLOR)):
         if box is not None:
             strokes += _edge_strokes(box, color, camera)
-    main_box = axes if isinstance(axes, Box) else est_box if est_box is not None else gt_box
-    has_axes = bool(axes) and main_box is not None
-    if axes and main_box is not None:
+    main_box = (est_box or gt_box) if axes else None
+    if main_box is not None:
         strokes += _axis_strokes(main_box, camera)
     strokes = [replace(stroke, points=canvas.place(stroke.points)) for stroke in strokes]
     marks = marks.placed(canvas)
     _draw_strokes(canvas, strokes)
     marks.draw(canvas)
     predicted = est_box is not None or est_frame is not None
-    entries = _legend_entries(gt_box, predicted, axes=has_axes)
+    entries = _legend_entries(gt_box, predicted, axes=main_box is not None)
     entries += marks.legend
     if legend and entries:
         canvas.legend(entries, keep_clear=np.concatenate([_drawn_pixels(strokes), marks.pixels]))

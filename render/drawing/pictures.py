@@ -14,7 +14,7 @@ from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.render.drawing.canvas import ByteImage, Canvas
-from cadalign.render.scene import Geometry, Scene
+from cadalign.render.scene import LIGHT_GREY, Geometry, Scene
 from cadalign.render.viewpoints import frame_object, look_at, seen_in_image
 
 VIEWS: dict[str, tuple[float, float]] = {
@@ -65,7 +65,6 @@ def keypoint_picture(
     cam_from_model: Alignment,
     *,
     visible: npt.ArrayLike | None = None,
-    numbers: bool = True,
 ) -> ByteImage:
     """Draw numbered keypoints over a picture: those that are seen yellow, hidden ones grey.
 
@@ -78,8 +77,6 @@ def keypoint_picture(
     cam_from_model : Alignment
     visible : (k,) bool, optional
         Which of them are seen; by default all.
-    numbers : bool
-        Whether to write each one's row beside it.
 
     Returns
     -------
@@ -102,8 +99,7 @@ def keypoint_picture(
         color = _SEEN_COLOR if shown[row] else _HIDDEN_COLOR
         place = canvas.place(camera.project(in_camera[row : row + 1]))[0]
         canvas.ring(place, color, radius=4)
-        if numbers:
-            canvas.label(str(row), place + np.array([11, -9]) * canvas.unit, color)
+        canvas.label(str(row), place + np.array([11, -9]) * canvas.unit, color)
     return canvas.finished()
 
 
@@ -158,22 +154,13 @@ def pose_in_view(
     return frame_object(scene.bounds, camera, rotation=rotation, fill=_FILL, scale=scale)
 
 
-def contact_sheet(
-    images: Sequence[ByteImage],
-    labels: Sequence[str],
-    *,
-    columns: int | None = None,
-    background: tuple[int, int, int] = (255, 255, 255),
-) -> ByteImage:
+def contact_sheet(images: Sequence[ByteImage], labels: Sequence[str]) -> ByteImage:
     """Put pictures of one size side by side, each with a label beneath.
 
     Parameters
     ----------
     images : sequence of (h, w, 3) uint8
     labels : sequence of str
-    columns : int, optional
-        By default about as many as rows.
-    background : tuple of 3 int
 
     Returns
     -------
@@ -189,12 +176,12 @@ def contact_sheet(
     if len({image.shape for image in images}) > 1:
         raise InputError("all must have the same size", where="images")
     height, width = images[0].shape[:2]
-    across = columns or int(np.ceil(np.sqrt(len(images))))
+    across = int(np.ceil(np.sqrt(len(images))))
     down = -(-len(images) // across)
     gap = max(4, min(height, width) // 40)
     line = max(14, height // 16)
     size = (across * (width + gap) + gap, down * (height + line + gap) + gap)
-    sheet = Image.new("RGB", size, background)
+    sheet = Image.new("RGB", size, LIGHT_GREY)
     pen = ImageDraw.Draw(sheet)
     font = ImageFont.load_default(size=0.72 * line)
     for number, (image, label) in enumerate(zip(images, labels, strict=True)):

@@ -239,7 +239,7 @@ class PosedScene:
 
 
 def pose_scene(
-    scene: Scene, camera: Camera, cam_from_model: Alignment, *, caster: RayCaster | None
+    scene: Scene, camera: Camera, cam_from_model: Alignment, *, caster: RayCaster | None = None
 ) -> PosedScene | None:
     """Place a scene before a camera; None if it is unseen. The caster is by default its own."""
     block = _object_rectangle(scene, camera, cam_from_model)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from operator import attrgetter
 
 import cv2
 import numpy as np
@@ -33,8 +32,6 @@ class RaycastRenderer:
     ----------
     studio : Studio, optional
         The lights.
-    caster_of : callable, optional
-        Gives what casts a scene's rays; by default the scene's own caster, embree's.
 
     Examples
     --------
@@ -50,14 +47,8 @@ class RaycastRenderer:
 
     name = "raycast"
 
-    def __init__(
-        self,
-        *,
-        studio: Studio | None = None,
-        caster_of: Callable[[Scene], RayCaster] = attrgetter("caster"),
-    ) -> None:
+    def __init__(self, *, studio: Studio | None = None) -> None:
         self.studio = studio or Studio()
-        self._caster_of = caster_of
 
     def render(
         self, scene: Scene, camera: Camera, cam_from_model: Alignment, *, samples: int = 8
@@ -92,7 +83,7 @@ class RaycastRenderer:
         check_samples(samples)
         check_image_size(camera)
         color: ByteImage = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
-        posed = pose_scene(scene, camera, cam_from_model, caster=self._caster_of(scene))
+        posed = pose_scene(scene, camera, cam_from_model, caster=self._caster(scene))
 
         def shade(
             posed: PosedScene, band: Rectangle, rays: FloatArray, face: FaceArray, depth: FloatArray
@@ -109,23 +100,12 @@ class RaycastRenderer:
             darken_corners(color, geometry, posed, self.studio)
         return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
 
-    def drawn_by(self, scene: Scene, *, samples: int) -> str:
-        """The renderer's own name."""
-        return self.name
+    def _caster(self, scene: Scene) -> RayCaster:
+        return scene.caster
 
     def _antialias(self, color: ByteImage, posed: PosedScene, samples: int) -> None:
-        part = color[posed.block.slices]
-        unlike = _unlike_neighbours(part)
-        if posed.scene.surface.opaque:
-            self._sample(color, unlike, posed, samples)
-            return
-        # What shows through is softer than an outline, and costs a ray for each layer.
-        outline = _unlike_neighbours(part[:, :, 3:])
-        self._sample(color, unlike & outline, posed, samples)
-        self._sample(color, unlike & ~outline, posed, -(-samples // 2))
-
-    def _sample(self, color: ByteImage, chosen: BoolArray, posed: PosedScene, samples: int) -> None:
-        rows, columns = np.nonzero(chosen)
+        """Cast more rays through pixels that differ from their neighbours."""
+        rows, columns = np.nonzero(_unlike_neighbours(color[posed.block.slices]))
         pixels = np.column_stack([columns + posed.block.left, rows + posed.block.top])
         offsets = _subpixel_offsets(samples)
         step = max(1, _RAYS_AT_ONCE // samples)
@@ -153,21 +133,14 @@ class Open3DRenderer(RaycastRenderer):
                 where="open3d",
                 fix="run `cadalign doctor` to see what is missing, or use the ray-cast renderer",
             ) from None
-        super().__init__(studio=studio, caster_of=attrgetter("open3d_caster"))
+        super().__init__(studio=studio)
+
+    def _caster(self, scene: Scene) -> RayCaster:
+        return scene.open3d_caster
 
 
-def cast_geometry(
-    scene: Scene, camera: Camera, cam_from_model: Alignment, *, caster: RayCaster | None = None
-) -> Geometry:
+def cast_geometry(scene: Scene, camera: Camera, cam_from_model: Alignment) -> Geometry:
     """Depth, triangle numbers and normals without colour: one ray through each pixel's centre.
-
-    Parameters
-    ----------
-    scene : Scene
-    camera : Camera
-    cam_from_model : Alignment
-    caster : RayCaster, optional
-        By default the scene's own.
 
     Returns
     -------
@@ -180,7 +153,7 @@ def cast_geometry(
         If the image is too large.
     """
     check_image_size(camera)
-    return geometry_of(camera, pose_scene(scene, camera, cam_from_model, caster=caster))
+    return geometry_of(camera, pose_scene(scene, camera, cam_from_model))
 
 
 def check_samples(samples: int) -> None:

@@ -38,10 +38,17 @@ _WIDE_SIDE = 1000  # of their images [px]
 Draw = Callable[[np.random.Generator], SimulatedProblem]
 
 
+def accuracy(given: BenchmarkData) -> Tables:
+    """Accuracy against the Cramer-Rao bound: usual and wide lenses, unknown focal lengths."""
+    yield from _solvers(given)
+    yield from _wide_lenses(given)
+    yield from _unknown_focal(given)
+
+
 # Known focal length -------------------------------------------------------------------------------
 
 
-def solvers(given: BenchmarkData) -> Tables:
+def _solvers(given: BenchmarkData) -> Tables:
     """Accuracy against the Cramer-Rao bound, speed against OpenCV.
 
     Everything runs in one process on the same problems; speeds are ratios of medians.
@@ -57,7 +64,7 @@ def solvers(given: BenchmarkData) -> Tables:
     yield "Time over OpenCV's, which does not stretch", [r for p in problems for r in _speed(p)]
 
 
-def wide_lenses(given: BenchmarkData) -> Tables:
+def _wide_lenses(given: BenchmarkData) -> Tables:
     """Accuracy of fits of 20 points with wide lenses against the Cramer-Rao bound.
 
     Objects lie anywhere in the field of view, which fills an image of 1000 x 1000 px.
@@ -72,7 +79,7 @@ def wide_lenses(given: BenchmarkData) -> Tables:
             camera = Camera(*size, focal, focal, half, half, coefficients, lens=lens)
             draw, name = partial(_wide_problem, camera, reach), f"{lens}, {field} degrees"
             rows.append(_over_bound(name, draw, 1.0, given.count or 1000, given.seed))
-    yield _TITLE, rows
+    yield f"Wide lenses. {_TITLE}", rows
 
 
 def _over_bound(name: str, draw: Draw, noise: float, count: int, seed: int) -> Row:
@@ -145,7 +152,7 @@ def _medians(calls: dict[str, Callable[[], object]], count: int) -> dict[str, fl
 # Unknown focal length -----------------------------------------------------------------------------
 
 
-def unknown_focal(given: BenchmarkData) -> Tables:
+def _unknown_focal(given: BenchmarkData) -> Tables:
     """Fits with an unknown focal length: accuracy against the Cramer-Rao bound, and outliers."""
     title = "1 px: median errors over the Cramer-Rao bound's of 9 unknowns"
     count = given.count or 1000

@@ -36,23 +36,23 @@ _REST = 0.03  # what the modes leave of a keypoint's place [m]
 _OBJECT_FROM_CAR = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
-def kitti(given: BenchmarkData) -> Tables:
+def cars(given: BenchmarkData) -> Tables:
     """Cars of KITTI with at least 6 keypoints that score more than 0.4, by KITTI's metrics.
 
     Medians; of yaw with the 90th percentile. A tilted estimate counts as the upright box of its
     heading, centre and extents.
     """
-    folder = given.real("kitti_cars")
+    folder = given.folder("real", "kitti_cars")
     shape = _car_shape(folder)
-    cars = [each for each in _read_cars(folder) if len(each.names) >= _LEAST_KEYPOINTS]
+    seen = [each for each in _read_cars(folder) if len(each.names) >= _LEAST_KEYPOINTS]
     rows = []
     for method in ("epnp", "rigid", "stretched", "similar", "shape"):
-        errors = [_box_errors(_box_of(car, method, shape), car.box) for car in cars]
+        errors = [_box_errors(_box_of(car, method, shape), car.box) for car in seen]
         yaws, depths, ious, ious_above = np.array(errors).T
         row: Row = {"method": method, "yaw, deg": section.spread(yaws)}
         row |= {"depth, %": 100 * float(np.median(depths)), "3D IoU": float(np.median(ious))}
         rows.append(row | {"bird's-eye IoU": float(np.median(ious_above))})
-    yield f"{len(cars)} cars", rows
+    yield f"{len(seen)} cars", rows
 
 
 class _Car(NamedTuple):
@@ -125,7 +125,7 @@ def _car_shape(folder: Path) -> cadalign.ShapeModel:
         points,
         modes,
         np.full(len(modes), _MODE_DEVIATION),
-        names=names,
+        ids=names,
         box=box,
         residual_sigma=_REST,
         size_sigma=_LENGTH_SIGMAS,

@@ -33,7 +33,7 @@ _WORSE_DEG = 1.0
 _INNER = 0.95  # probability of the regions whose coverage is counted
 
 
-def photos(given: BenchmarkData) -> Tables:
+def photo(given: BenchmarkData) -> Tables:
     """Rough clicks alone, and with the photo.
 
     Six clicks with an error of 4 px in a photo 640 px wide. Composites are models of ShapeNet and
@@ -159,7 +159,7 @@ def _spread_places(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def _real_cases(given: BenchmarkData, folder: str) -> Iterator[PhotoCase]:
     """The objects of real photos: bop_samples (HANDAL, LINEMOD), lmo_multiview (occluded ones)."""
     is_sample = folder == "bop_samples"
-    entries = (_posed if is_sample else _lmo)(given.real(folder))
+    entries = (_posed if is_sample else _lmo)(given.folder("real", folder))
     for photo, fields, model, rotation, shift in entries:
         group = photo.parent.name if is_sample else "lmo"
         camera = Camera(*(fields[name] for name in ("width", "height", "fx", "fy", "cx", "cy")))
@@ -193,7 +193,7 @@ def _lmo(root: Path) -> Iterator[_Posed]:
 
 def _composites(given: BenchmarkData, count: int) -> Iterator[PhotoCase]:
     """Models of ShapeNet and of the sample, rendered before real photos; some partly hidden."""
-    root = given.needed().parent
+    root = given.folder()
     with tempfile.TemporaryDirectory() as folder:
         sample, real = section.meshed_models(given, folder, per_category=2)
         scenes = [(m, Scene(m.load_mesh())) for m in (*real, *sample)]

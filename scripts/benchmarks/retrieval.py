@@ -38,6 +38,12 @@ _RANKINGS: dict[str, dict[str, Any]] = {"fit": {}, "fit, shape_sigma": {"shape_s
 
 
 def retrieval(given: BenchmarkData) -> Tables:
+    """Time and memory of queries, and objects that are not in the library."""
+    yield from _times(given)
+    yield _unseen(given)
+
+
+def _times(given: BenchmarkData) -> Tables:
     """Time of a query and memory, for real models and growing synthetic libraries.
 
     The synthetic models are the real ones with their keypoints moved by 3 % of the extent, models
@@ -45,7 +51,7 @@ def retrieval(given: BenchmarkData) -> Tables:
     are cores, after warm-up. Ratios are those of processor time to `reference_seconds`. A run of
     `cadalign retrieve` has two processes.
     """
-    real = list(Library.from_dataset(KeypointNet(given.needed())))
+    real = list(Library.from_dataset(KeypointNet(given.folder("keypointnet"))))
     mixed = [real[k] for k in np.random.default_rng(0).permutation(len(real)).tolist()]
     for size in (len(real), *given.sizes):
         with tempfile.TemporaryDirectory() as folder:
@@ -130,7 +136,7 @@ def _retrieve(library: Library, seen: RetrievalQuery, noise_px: float) -> Any:
     return library.retrieve(seen.points_2d, seen.ids, KEYPOINT_CAMERA, sigma=noise_px)
 
 
-def unseen_retrieval(given: BenchmarkData) -> Tables:
+def _unseen(given: BenchmarkData) -> Table:
     """Retrieval of objects that are not in the library: box IoU up to scale of the first match.
 
     Objects are those of the split val, with all keypoints and 2 px of noise; shape models are
@@ -138,14 +144,14 @@ def unseen_retrieval(given: BenchmarkData) -> Tables:
     are the same after a stretch. Each column is a ranking: by the fit of each model, exact or with
     an uncertainty of its shape, and by the estimated shape. Boxes are those of the keypoints.
     """
-    dataset, rows = KeypointNet(given.needed()), []
+    dataset, rows = KeypointNet(given.folder("keypointnet")), []
     for category in ("chair", "airplane", "bottle", "mug", "guitar"):
         shape = section.learned_shape(dataset, category)
         library = Library.from_models(
             [LibraryModel.of_annotated(model, with_mesh=False) for model in dataset[category]]
         )
         rows.append({"category": category} | _ranked(dataset, library, shape, given.count or 40))
-    yield "first matches: median IoU", rows
+    return "first matches: median IoU", rows
 
 
 def _ranked(dataset: KeypointNet, library: Library, shape: ShapeModel, count: int) -> Row:

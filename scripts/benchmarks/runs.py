@@ -14,7 +14,7 @@ import poselib
 from scipy.spatial.transform import Rotation
 
 from benchmarks import section
-from benchmarks.section import COMMAND, BenchmarkData, Row, Tables
+from benchmarks.section import COMMAND, BenchmarkData, Row, Table, Tables
 from cadalign import Camera, RansacOptions
 from cadalign.datasets import Colmap, Correspondences, KeypointNet, write_sample_dataset
 from cadalign.evaluation.instances.correspondences import errors_of, spoil
@@ -24,6 +24,13 @@ _CAMERA = Camera(640, 480, 700.0, 700.0, 319.5, 239.5)
 _SIZES = (25_000, 100_000)  # observations of the shorter and of the longer run
 _SEARCH = {"max_reproj_error": 4.0, "success_prob": 0.9999}
 _OPENCV_DRAWS = 2  # it takes the better part of a second
+
+
+def runs(given: BenchmarkData) -> Tables:
+    """Fits of many observations, evaluations, and searches in real correspondences."""
+    yield _fits(given)
+    yield _evaluations(given)
+    yield _ransac(given)
 
 
 def _used(*call: str) -> section.Used:
@@ -55,13 +62,13 @@ def _dask_over_processes(name: str, call: list[str]) -> Row:
     return section.figure(name, on_dask.wall, "s", on_dask.wall / _used(*call, "--workers=2").wall)
 
 
-def evaluation(given: BenchmarkData) -> Tables:
+def _evaluations(given: BenchmarkData) -> Table:
     """Instances a second of whole runs, with two processes or two workers of a Dask cluster.
 
     Rates are those of what a longer run does more than a shorter one: neither start nor figures are
     in them.
     """
-    root = given.needed()
+    root = given.folder("keypointnet")
     with tempfile.TemporaryDirectory() as folder:
         samples = write_sample_dataset(Path(folder) / "samples", per_category=12)
         on_hulls = _evaluate(root, "--visibility=hull")
@@ -76,14 +83,14 @@ def evaluation(given: BenchmarkData) -> Tables:
             rows += _rate_and_memory(name, count, *runs)
         dask = "run by Dask over one by processes"
         rows.append(_dask_over_processes(dask, [*on_hulls, "--views-per-model=3"]))
-    yield "Evaluations", rows
+    return "Evaluations", rows
 
 
 def _evaluate(root: Path, *options: str) -> list[str]:
     return ["evaluate", "keypointnet", str(root), *options, "--json"]
 
 
-def fits(given: BenchmarkData) -> Tables:
+def _fits(given: BenchmarkData) -> Table:
     """Observations a second of whole runs by two processes, memory, and two Dask workers."""
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
@@ -93,7 +100,7 @@ def fits(given: BenchmarkData) -> Tables:
             rows += _rate_and_memory(f"fits by {method}", _SIZES[1] - _SIZES[0], *runs)
         dask = "fits by Dask over those by processes"
         rows.append(_dask_over_processes(dask, _fit(files[0], "aepnp")))
-    yield f"Fits of {_POINTS} keypoints", rows
+    return f"Fits of {_POINTS} keypoints", rows
 
 
 def _fit(file: Path, method: str) -> list[str]:
@@ -122,16 +129,16 @@ def _write_observations(folder: Path, count: int, seed: int) -> Path:
 # Robust search ------------------------------------------------------------------------------------
 
 
-def ransac(given: BenchmarkData) -> Tables:
+def _ransac(given: BenchmarkData) -> Table:
     """The robust search on real correspondences: success, and time over PoseLib's and OpenCV's.
 
     Images are those of `cadalign evaluate correspondences`: scales are drawn anew for every image
     and draw, and a share of the points is moved to anywhere. PoseLib and OpenCV get the true
     scales: they solve the easier problem without stretch.
     """
-    images = list(Colmap(given.needed("colmap")))
+    images = list(Colmap(given.folder("sfm", "maupertuis_colmap")))
     shares = (0.0, 0.2, 0.5, 0.8, 0.9)
-    yield "Robust search", [_row(images, share, given.count or 20) for share in shares]
+    return "Robust search", [_row(images, share, given.count or 20) for share in shares]
 
 
 def _row(images: list[Correspondences], share: float, draws: int) -> Row:

@@ -42,10 +42,8 @@ class NotGivenError(Exception):
 class BenchmarkData:
     """Data, seed and choice of the sections; CADALIGN_DATA names the folder of the data."""
 
-    keypointnet: Path | None = _DATA and _DATA / "keypointnet"
-    """Folder in KeypointNet's layout, with splits; some sections need it, others use it."""
-    colmap: Path | None = _DATA and _DATA / "sfm" / "maupertuis_colmap"
-    """Folder of a COLMAP model."""
+    data: Path | None = _DATA
+    """Folder of the data; some sections need it, others use it."""
     seed: int = 0
     """Seed of random problems."""
     count: int | None = None
@@ -61,16 +59,11 @@ class BenchmarkData:
     store: bool = False
     """Store the measured ratios."""
 
-    def needed(self, name: str = "keypointnet") -> Path:
-        """A folder that a section cannot do without; NotGivenError where there is none."""
-        found: Path | None = getattr(self, name)
-        if found is None:
-            raise NotGivenError(f"give --{name}, or CADALIGN_DATA")
-        return found
-
-    def real(self, name: str) -> Path:
-        """A folder of real photos beside KeypointNet's."""
-        return self.needed().parent / "real" / name
+    def folder(self, *parts: str) -> Path:
+        """A folder of the data; NotGivenError where none are given."""
+        if self.data is None:
+            raise NotGivenError("give --data, or CADALIGN_DATA")
+        return self.data.joinpath(*parts)
 
 
 Table = tuple[str, Iterable[Row]]
@@ -166,7 +159,7 @@ def meshed_models(
     root = write_sample_dataset(Path(folder) / "sample", per_category=per_category)
     sample, real = (
         [] if place is None else [m for m in KeypointNet(place) if m.mesh_path is not None]
-        for place in (root, given.keypointnet)
+        for place in (root, given.data and given.folder("keypointnet"))
     )
     return sample, [model for model in real if model.mesh_path.suffix == ".obj"]
 

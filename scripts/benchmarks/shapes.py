@@ -10,7 +10,7 @@ import numpy as np
 
 import cadalign
 from benchmarks import section
-from benchmarks.section import BenchmarkData, Row, Tables
+from benchmarks.section import BenchmarkData, Row, Table, Tables
 from cadalign.arrays import instance_rng
 from cadalign.datasets import KeypointNet
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
@@ -27,14 +27,20 @@ _LEAST_KEYPOINTS = 6
 _WITHIN_95 = 1.96
 
 
-def align(given: BenchmarkData) -> Tables:
+def shapes(given: BenchmarkData) -> Tables:
+    """Times with learned shapes, and unknown lenses."""
+    yield _times(given)
+    yield from _photo_lenses(given)
+
+
+def _times(given: BenchmarkData) -> Table:
     """Time of `align` of a view with a learned shape, and of a batch.
 
     Objects are those of the split val, seen with up to 14 noisy keypoints; shape models are learned
     from the split train. Times of single objects are those of the processor, warm and on one
     thread; the batch holds every object five times and has two threads.
     """
-    dataset, rows = KeypointNet(given.needed()), []
+    dataset, rows = KeypointNet(given.folder("keypointnet")), []
     for category in _CATEGORIES:
         shape = section.learned_shape(dataset, category)
         how = {"keypoints": 14, "noise_px": _NOISE_PX}
@@ -49,7 +55,7 @@ def align(given: BenchmarkData) -> Tables:
         row = {"category": category, "components": len(shape.components)}
         rate = len(batch) / section.seconds(call)
         rows.append(row | {"one view ms": section.spread(one), "batch 1/s": rate})
-    yield "align with a learned shape", rows
+    return "align with a learned shape", rows
 
 
 def _view(shape: cadalign.ShapeModel, seen: UnseenObject) -> cadalign.View:
@@ -61,14 +67,14 @@ def _view(shape: cadalign.ShapeModel, seen: UnseenObject) -> cadalign.View:
 # Lenses of photos ---------------------------------------------------------------------------------
 
 
-def photo_lenses(given: BenchmarkData) -> Tables:
+def _photo_lenses(given: BenchmarkData) -> Tables:
     """Unknown focal lengths of photos' lenses: what the prior of usual lenses and EXIF data bring.
 
     Objects of the split val fill their images, through lenses of the distribution of focal lengths
     of `FocalPrior.of_usual_lenses`. Models are the learned shape of the category, or its mean as a
     model that is only similar.
     """
-    dataset = KeypointNet(given.needed())
+    dataset = KeypointNet(given.folder("keypointnet"))
     for category in _CATEGORIES:
         shape = section.learned_shape(dataset, category)
         mean = shape.components[0].mean[: len(shape.ids)]

@@ -8,17 +8,14 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-import cadalign
 from benchmarks import section
 from benchmarks.section import COMMAND, BenchmarkData, Row, Tables
 from cadalign import Observation
 from cadalign.datasets import sample_models
 from cadalign.evaluation.simulation import simulate_problem
 from cadalign.io.images import write_image
-from cadalign.solvers.linear import aepnp_batch
 
 _POINTS = """
 import numpy as np
@@ -70,11 +67,10 @@ def cold(given: BenchmarkData) -> Tables:
     yield "First calls", rows
 
 
-def calls(given: BenchmarkData) -> Tables:
-    """Cost of calls beside their solving: the warm command line, and small fits in Python."""
+def speed(given: BenchmarkData) -> Tables:
+    """Processor time of the warm command line."""
     with tempfile.TemporaryDirectory() as folder:
         yield "Commands, processor time", _commands(Path(folder), given.count or 7)
-    yield "Fits", _fits(given.count or 2000)
 
 
 def _commands(folder: Path, runs: int) -> Iterator[Row]:
@@ -83,45 +79,13 @@ def _commands(folder: Path, runs: int) -> Iterator[Row]:
     def processor(command: list[str]) -> float:
         return section.used_by(command).processor
 
-    for options in (
-        ["--help"],
-        ["fit", seen],
-        ["fit", seen, "--json", "--no-picture"],
-        ["demo", "--out", str(folder / "demo"), "--workers", "0"],
-    ):
+    other = partial(processor, [sys.executable, "-c", _LIBRARIES])
+    for options in (["--help"], ["fit", seen], ["fit", seen, "--json", "--no-picture"]):
         own = partial(processor, [*COMMAND, *options])
-        other = partial(processor, [sys.executable, "-c", _LIBRARIES])
-        is_demo = options[0] == "demo"
-        found = section.medians_in_turns({"own": own, "other": other}, 1 if is_demo else runs)
-        shown = [each for each in options[: 1 if is_demo else None] if each != seen]
-        name, ratio = " ".join(["cadalign", *shown]), found["own"] / found["other"]
+        found = section.medians_in_turns({"own": own, "other": other}, runs)
+        name = " ".join(["cadalign", *(each for each in options if each != seen)])
+        ratio = found["own"] / found["other"]
         yield section.figure(name, found["own"], "s", ratio, _LIBRARIES)
-
-
-def _fits(calls: int) -> Iterator[Row]:
-    ten, seven = (
-        simulate_problem(np.random.default_rng(0), points=points, noise_px=1.0)
-        for points in (10, 7)
-    )
-    x, uv, camera = ten.points_3d, ten.points_2d, ten.camera
-    rays, offsets = camera.normalize(uv), np.array([0, 10])
-    for name, ours, theirs, to in (
-        (
-            "fit(method='aepnp'), 10 points",
-            lambda: cadalign.fit(x, uv, camera, method="aepnp"),
-            lambda: aepnp_batch(x, rays, offsets),
-            "its kernel",
-        ),
-        (
-            "fit, 7 points",
-            lambda: cadalign.fit(seven.points_3d, seven.points_2d, seven.camera),
-            lambda: cv2.solvePnP(x, uv, camera.matrix, None),
-            "OpenCV's ITERATIVE, 10 points",
-        ),
-    ):
-        timed = {"own": partial(section.seconds, ours), "other": partial(section.seconds, theirs)}
-        found = section.medians_in_turns(timed, calls)
-        yield section.figure(name, 1e6 * found["own"], "us", found["own"] / found["other"], to)
 
 
 def _observation(folder: Path) -> Path:

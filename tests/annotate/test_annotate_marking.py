@@ -7,7 +7,6 @@ import json
 import numpy as np
 import pytest
 from support.annotating import Case, agree_with_fit, draw_mask, place_all
-from support.refusals import refusal_text
 
 from cadalign.annotate.actions import perform
 from cadalign.annotate.page_state import page_state
@@ -33,11 +32,13 @@ def box(u: int, v: int) -> np.ndarray:
 
 def test_mask_is_used_saved_and_undone(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
     session = case.open()
-    without = place_all(session, case, count=6)["alignment"]
+    place_all(session, case, count=6)
+    without = session.live(session.photos[0]).result
     draw_mask(session, true_mask(case))
     shown = agree_with_fit(session, case, capsys)
     assert shown["also_used"] == "mask"
-    assert shown["alignment"] != without["alignment"]
+    within = session.live(session.photos[0]).result
+    assert within.alignment != without.alignment
     np.testing.assert_array_equal(read_grey(case.folder / "photo.mask.png") != 0, true_mask(case))
     # Another one takes its place and is undone.
     draw_mask(session, box(100, 100))
@@ -45,7 +46,7 @@ def test_mask_is_used_saved_and_undone(case: Case, capsys: pytest.CaptureFixture
     perform(session, 0, {"do": "undo"})
     np.testing.assert_array_equal(read_grey(case.folder / "photo.mask.png") != 0, true_mask(case))
     again = case.open(keypoints=None)
-    assert page_state(again, 0)["alignment"]["alignment"] == shown["alignment"]
+    assert again.live(again.photos[0]).result.alignment == within.alignment
     perform(session, 0, {"do": "undo"})
     assert page_state(session, 0)["alignment"]["also_used"] == ""
     assert "mask" not in json.loads(case.observation.read_text())
@@ -96,28 +97,25 @@ def test_a_mask_that_was_taken_from_the_file_does_not_come_back(case: Case) -> N
     session = case.open(prepared=False)
     place_all(session, case, count=4)
     draw_mask(session, box(200, 200))
-    assert case.open(prepared=False).photos[0].document.evidence.mask is not None
+    assert case.open(prepared=False).photos[0].marks.mask is not None
     data = json.loads(case.observation.read_text())
     assert data.pop("mask") == "photo.mask.png"
     case.observation.write_text(json.dumps(data))
     again = case.open(prepared=False)
-    assert again.photos[0].document.evidence.mask is None
-    assert len(again.photos[0].document.pairs) == 4
+    assert again.photos[0].marks.mask is None
+    assert len(again.photos[0].marks.pairs) == 4
 
 
-def test_masks_that_cannot_be_the_photos_are_refused(case: Case) -> None:
-    small, colored = case.folder / "small.png", case.folder / "colored.png"
-    write_image(small, np.full((24, 32), 255, dtype=np.uint8))
-    write_image(colored, np.zeros((480, 640, 3), dtype=np.uint8))
-    for mask, what in (
-        (
-            small,
-            "the mask has 32 x 24 pixels, the photo 640 x 480; give a mask of the photo's size",
-        ),
-        (colored, "the image has the mode RGB"),
-        (case.folder / "nowhere.png", "no such file"),
-    ):
-        assert refusal_text(lambda m=mask: case.open(mask=m)).startswith(f"{mask}: {what}")
+def test_a_mask_of_another_size_is_said_and_kept_out(case: Case) -> None:
+    session = case.open()
+    place_all(session, case, count=6)
+    draw_mask(session, true_mask(case))
+    write_image(case.folder / "photo.mask.png", np.full((24, 32), 255, dtype=np.uint8))
+    again = case.open()
+    message = page_state(again, 0)["alignment"]["message"]
+    assert "32 x 24" in message
+    with pytest.raises(CadalignError, match="the mask has 32 x 24 pixels, the photo 640 x 480"):
+        _ = again.photos[0].mask
 
 
 def test_a_mask_of_noise_keeps_no_server_busy(case: Case) -> None:
@@ -141,8 +139,12 @@ def test_a_mask_of_others_is_not_written_over(case: Case) -> None:
         (view,) = json.loads(case.observation.read_text())["views"]
         return str(view["mask"])
 
-    for start in ({}, {"mask": theirs}):
-        session = case.open(prepared=False, **start)
+    for names in (False, True):
+        if names:  # the observation's own mask
+            data = json.loads(case.observation.read_text())
+            data["views"][0]["mask"] = theirs.name
+            case.observation.write_text(json.dumps(data))
+        session = case.open(prepared=False)
         perform(session, 0, {"do": "mask_clear"})
         draw_mask(session, box(200, 200))
         assert named() == "photo.mask-2.png"

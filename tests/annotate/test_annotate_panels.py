@@ -1,90 +1,114 @@
-"""Every panel of the page: reached by keys alone, nothing moves, and it can be heard and read."""
+"""Every part of the page, reached by keys alone: nothing moves, and it can be heard and read."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser
-from support.annotating import Case, make_case, opened_page, place_all, served
-from support.panels import AXE, WATCH_SHIFTS, Keyboard, open_page, prepare, shifts
+from playwright.sync_api import Browser, Page
+from support.annotating import IDLE, Case, opened_page, place_all, served, wait
 from support.web import axe_script
 
-from cadalign.datasets import write_sample_dataset
+pytestmark = pytest.mark.long
 
 DESKTOP, PHONE = (1280, 800), (390, 844)
 SERIOUS = ("serious", "critical")
+SETTLED = f"{IDLE} && annotator.state.alignment.status !== 'preparing'"
+PHOTO, MODEL = "section[aria-label=Photo] canvas", "section[aria-label=Model] canvas"
+WATCH_SHIFTS = """
+window.shifts = [];
+new PerformanceObserver((list) => {
+    for (const entry of list.getEntries()) {
+        if (entry.hadRecentInput) continue;
+        for (const { node, previousRect: a, currentRect: b } of entry.sources) {
+            const what = node?.outerHTML?.slice(0, 90) ?? node?.nodeValue;
+            window.shifts.push(`${what} ${a.x},${a.y} -> ${b.x},${b.y}`);
+        }
+    }
+}).observe({ type: "layout-shift", buffered: true });
+"""
+AXE = """async () => {
+    const { violations } = await axe.run(document, { resultTypes: ["violations"] });
+    return violations.map(({ id, impact, nodes }) =>
+        ({ id, impact, nodes: nodes.map((each) => `${each.html}: ${each.failureSummary}`) }));
+}"""
 
 
-@pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    folder = tmp_path_factory.mktemp("data") / "sample"
-    return write_sample_dataset(folder, per_category=3, categories=["chair"])
+def use_by_keys(page: Page, case: Case, look: Callable[[str], None]) -> None:
+    """Annotate a photo by keys, and go on to the next; ``look`` is called in every part."""
 
+    def keys(*names: str, then: str = SETTLED) -> None:
+        for name in names:
+            page.keyboard.press(name)
+            wait(page, SETTLED)
+        wait(page, then)
 
-@pytest.fixture(scope="module")
-def original(root: Any, tmp_path_factory: pytest.TempPathFactory) -> Case:
-    return make_case(root, tmp_path_factory.mktemp("annotate"))
-
-
-@dataclass(frozen=True)
-class Used:
-    """What a session of keys alone met in a window of one size."""
-
-    visited: list[str]
-    errors: list[str]
-    moved: list[dict[str, Any]]
-    found: dict[str, Any]
+    look("empty")
+    keys("?")
+    look("help")
+    keys("Escape")
+    for keypoint, uv in case.clicks[:7]:
+        for action in (
+            {"do": "place_uv", "uv": uv},
+            {"do": "place_keypoint", "keypoint": keypoint},
+        ):
+            page.evaluate("action => annotator.act(action)", action)
+    wait(page, f"{SETTLED} && annotator.state.alignment.status === 'done'")
+    look("aligned")
+    page.locator(".pairs input").first.press("Control+a")
+    page.keyboard.type("left knee")
+    keys("Enter")
+    page.locator(PHOTO).focus()
+    keys("]")
+    for _ in range(12):
+        page.keyboard.press("Shift+ArrowRight")
+    wait(page, SETTLED)
+    assert page.get_by_role("status").inner_text().startswith("Pair ")
+    look("contradiction")
+    keys("Control+z", "Control+y", "Control+z", "n", "Control+z", "x")
+    look("box")
+    keys("Escape", "v", "f", "+", "-")
+    page.evaluate("annotator.model.stage.camera.lookAt(9, 9, 9)")
+    page.locator(MODEL).focus()
+    keys("Enter")
+    assert "missed the model" in page.get_by_role("status").inner_text()
+    look("message")
+    page.locator(PHOTO).focus()
+    keys("PageDown", then=f"{SETTLED} && annotator.state.image.number === 1")
+    look("next photo")
 
 
 # Colours do not depend on the window's size, nor all else on the scheme.
-@pytest.fixture(
-    scope="module", params=[(DESKTOP, "light"), (PHONE, "dark")], ids=["desktop", "phone"]
+@pytest.mark.parametrize(
+    ("size", "scheme"), [(DESKTOP, "light"), (PHONE, "dark")], ids=["desktop", "phone"]
 )
-def used(
-    request: pytest.FixtureRequest,
-    browser: Browser,
-    original: Case,
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Iterator[Used]:
-    """One session for all tests: what it takes is the way through the panels, not what is asked."""
-    folder = tmp_path_factory.mktemp("used")
-    (width, height), scheme = request.param
-    with served(prepare(original.copied_to(folder / "photos"))) as access:
-        page = open_page(
-            browser, access.url, width=width, height=height, scheme=scheme, scripts=(WATCH_SHIFTS,)
-        )
-        errors: list[str] = []
-        found: dict[str, Any] = {}
-        page.on("pageerror", lambda error: errors.append(str(error)))
+def test_nothing_moves_and_axe_finds_nothing_serious(
+    browser: Browser, case: Case, size: tuple[int, int], scheme: Any
+) -> None:
+    shutil.copy(case.photo, case.folder / "photo_2.png")
+    width, height = size
+    with served(case.open(image=case.folder)) as access:
+        viewport: Any = {"width": width, "height": height}
+        context = browser.new_context(viewport=viewport, color_scheme=scheme)
+        page = context.new_page()
+        page.add_init_script(WATCH_SHIFTS)
+        page.goto(access.url)
+        wait(page, SETTLED)
         page.evaluate(axe_script())
+        found: list[Any] = []
 
-        def check(panel: str) -> None:
-            for each in page.evaluate(AXE, {}):
-                if each["impact"] in SERIOUS:
-                    found.setdefault(each["id"], (panel, each["nodes"]))
+        def look(part: str) -> None:
+            found.extend((part, e) for e in page.evaluate(AXE) if e["impact"] in SERIOUS)
             if page.evaluate("document.documentElement.scrollWidth > innerWidth"):
-                found.setdefault("beyond the window", panel)
+                found.append((part, "beyond the window"))
 
-        keyboard = Keyboard(page, original.clicks[:7], check)
-        keyboard.session()
-        yield Used(keyboard.visited, errors, list(shifts(page, also_after_input=False)), found)
-        page.context.close()
-
-
-@pytest.mark.long
-def test_nothing_moves_in_a_session_of_keys_alone(used: Used) -> None:
-    assert len(set(used.visited)) == 15
-    assert sum(each["value"] for each in used.moved) == 0, used.moved
-    assert used.errors == []
-
-
-@pytest.mark.long
-def test_axe_finds_nothing_serious_in_any_panel(used: Used) -> None:
-    assert used.found == {}
+        use_by_keys(page, case, look)
+        assert found == []
+        assert page.evaluate("window.shifts") == []
+        context.close()
 
 
 @pytest.mark.parametrize("width", [DESKTOP[0], 1024, 901, PHONE[0]])
@@ -93,12 +117,11 @@ def test_pairs_show_whole_names_and_all_buttons(
 ) -> None:
     session = original.copied_to(tmp_path / "photos").open()
     place_all(session, original, count=6)
-
     with opened_page(browser, session, width=width, height=800) as page:
-        names = page.locator("td.name input")
+        names = page.locator(".pairs input")
         assert names.count() == 6
         widths = "all => all.map((each) => [each.value, each.clientWidth, each.scrollWidth])"
         assert [each for each in names.evaluate_all(widths) if each[1] < each[2]] == []
         beyond = """all => all.map((each) => each.getBoundingClientRect().right
-            - each.closest(".scroll").getBoundingClientRect().right)"""
-        assert max(page.locator("td.actions button").evaluate_all(beyond)) <= 0
+            - each.closest(".card").getBoundingClientRect().right)"""
+        assert max(page.locator(".pairs button").evaluate_all(beyond)) <= 0

@@ -8,7 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.annotating import Case, agree_with_fit, draw_mask, masks_searched_once, place_all
+from support.annotating import (
+    Case,
+    agree_with_fit,
+    draw_mask,
+    masks_searched_once,
+    place,
+    place_all,
+)
 
 from cadalign import ShapeModel
 from cadalign.annotate.actions import perform
@@ -40,8 +47,8 @@ def test_a_mask_alone_is_aligned(case: Case, capsys: pytest.CaptureFixture[str])
     draw_true_mask(session, case)
     page, truth = page_state(session, 0), case.instance.cam_from_model
     assert page["alignment"]["status"] == "done", page["alignment"]
-    live, _ = session.live(session.photos[0])
-    assert rotation_error(est=live.alignment, gt=truth) < 0.5
+    live = session.live(session.photos[0])
+    assert rotation_error(est=live.result.alignment, gt=truth) < 0.5
     agree_with_fit(session, case, capsys, rtol=1e-6)
 
 
@@ -66,29 +73,36 @@ def test_a_mask_alone_does_not_align_an_own_shape(case: Case, sample_root: Path,
     assert alignment["message"].startswith("3 more pairs to the first alignment")
 
 
-def test_one_pair_beside_a_mask_counts(case: Case) -> None:
+def test_few_pairs_beside_a_mask_wait(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
     session = case.open()
     draw_true_mask(session, case)
-    place_all(session, case, count=1)
-    live, _ = session.live(session.photos[0])
-    assert live.result is not None, live.message
-    assert rotation_error(est=live.alignment, gt=case.instance.cam_from_model) < 0.5
+    state = place_all(session, case, count=2)
+    assert (
+        "2 pairs do not count: the mask alone aligns until there are 3."
+        in (state["alignment"]["notes"])
+    )
+    agree_with_fit(session, case, capsys, rtol=1e-6)
+    live = session.live(session.photos[0])
     assert np.abs(live.residuals).max() < 5
+    place(session, *case.clicks[2])
+    third = page_state(session, 0)["alignment"]
+    assert third["notes"] == [] or "do not count" not in third["notes"][0]
+    assert session.live(session.photos[0]).counts.all()
 
 
 def test_the_photo_counts_when_it_is_chosen(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
     session = case.open()
     place_all(session, case, count=5)
-    before, _ = session.live(session.photos[0])
+    before = session.live(session.photos[0])
     perform(session, 0, {"do": "use_photo", "on": True})
     page = page_state(session, 0)
     assert page["evidence"]["photo"]
     assert page["alignment"]["also_used"] == "photo"
-    live, _ = session.live(session.photos[0])
+    live = session.live(session.photos[0])
     assert [each.kind for each in live.result.evidence] == ["keypoints", "photo"]
     truth = case.instance.cam_from_model
-    assert rotation_error(est=live.alignment, gt=truth) < rotation_error(
-        est=before.alignment, gt=truth
+    assert rotation_error(est=live.result.alignment, gt=truth) < rotation_error(
+        est=before.result.alignment, gt=truth
     )
     assert json.loads(case.observation.read_text())["fit"]["image"] is True
     agree_with_fit(session, case, capsys, rtol=1e-6)

@@ -13,9 +13,8 @@ from support.annotating import aligned_once, place
 
 from cadalign import Box, Camera
 from cadalign.annotate.live import LiveAlignment
-from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
-from cadalign.annotate.session import Session
+from cadalign.annotate.session import Session, open_session
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet, ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError
@@ -184,9 +183,9 @@ def test_twenty_annotations_are_sane_from_the_fourth_pair(
         state = session.photos[0]
         for count in sorted({*range(4, min(len(case.points_2d), 8) + 1), len(case.points_2d)}):
             with aligned_once(session):
-                for row in range(len(state.document.pairs), count):
+                for row in range(len(state.marks.pairs), count):
                     place(session, row, case.points_2d[row].tolist())
-            live, _ = session.live(state)
+            live = session.live(state)
             assert isinstance(live, LiveAlignment)
             assert live.result is not None, (case.name, count, live.message)
             scale = live.result.alignment.scale

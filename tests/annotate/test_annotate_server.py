@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import http.client
 import json
 import socket
@@ -11,10 +10,7 @@ from collections.abc import Iterator
 import pytest
 from support.annotating import Case, served
 
-from cadalign.annotate import guard
-from cadalign.annotate.guard import MAX_BODY, Access
-from cadalign.annotate.model import detail_bytes, display_bytes
-from cadalign.annotate.server import listen
+from cadalign.annotate.server import Access, listen
 from cadalign.errors import InputError
 
 UNDO = json.dumps({"do": "undo"})
@@ -70,13 +66,8 @@ def test_with_the_token_everything_is_served(access: Access, path: str) -> None:
 
 def test_the_model_is_served(original: Case) -> None:
     session = original.open(prepared=False)
-    model = session.model
     with served(session) as opened:
-        for path, content in (
-            ("/model", display_bytes(model.cad)),
-            ("/details", detail_bytes(model.cad, model.wireframe.creases)),
-        ):
-            assert ask(opened, path)[::2] == (200, content)
+        assert ask(opened, "/model")[::2] == (200, session.model.cad.display_bytes)
 
 
 @pytest.mark.parametrize("path", [*PATHS, "/nowhere", "/?token=", "/?token=wrong"])
@@ -141,7 +132,7 @@ def test_no_path_leads_to_other_files(access: Access, path: str) -> None:
 def test_unknown_photo_is_an_error_in_words(access: Access) -> None:
     status, _, body = ask(access, "/photo/99")
     assert status == 422
-    assert json.loads(body) == {"error": "image: there is no photo 100"}
+    assert body == b"image: there is no photo 100"
 
 
 @pytest.mark.parametrize("origin", ["https://evil.example", "null", "http://127.0.0.1:1", ""])
@@ -162,12 +153,9 @@ def test_own_origin_is_served(access: Access) -> None:
     assert ask(access, "/state/0", Sec_Fetch_Site="none")[0] == 200
 
 
-@pytest.mark.parametrize(
-    "host", ["evil.example", "127.0.0.1", "localhost:1", "127.0.0.1.evil.example"]
-)
+@pytest.mark.parametrize("host", ["evil.example", "", "127.0.0.1.evil.example:80"])
 def test_names_that_were_made_to_lead_here_are_refused(access: Access, host: str) -> None:
-    status, _, body = ask(access, "/state/0", Host=host)
-    assert (status, body) == (400, b"unknown host")
+    assert ask(access, "/state/0", Host=host)[0] == 400
 
 
 def test_only_json_objects_are_actions(access: Access) -> None:
@@ -179,84 +167,14 @@ def test_only_json_objects_are_actions(access: Access) -> None:
     assert ask(access, "/act/0")[0] == 405
 
 
-# --- bodies that are too long ----------------------------------------------------------------
-
-
-def post_head(access: Access, *lines: str) -> bytes:
-    head = ["POST /act/0 HTTP/1.1", f"Host: 127.0.0.1:{access.port}", *lines]
-    head += [f"X-Cadalign-Token: {access.token}", "Content-Type: application/json"]
-    return "\r\n".join([*head, "", ""]).encode()
-
-
-def answer_to(access: Access, head: bytes, chunk: bytes, chunks: int) -> tuple[str, int]:
-    """Status line, and how many chunks could be sent before the server had had enough."""
+def test_a_body_without_the_token_is_not_read(access: Access) -> None:
+    head = f"POST /act/0 HTTP/1.1\r\nHost: 127.0.0.1:{access.port}\r\nContent-Length: 100\r\n\r\n"
     with socket.create_connection(("127.0.0.1", access.port), timeout=20) as client:
-        client.sendall(head)
-        client.settimeout(0.05)
-        sent, answer = 0, b""
-        try:
-            for _ in range(chunks):
-                try:
-                    answer += client.recv(4096)
-                    break
-                except TimeoutError:
-                    client.sendall(chunk)
-                    sent += 1
-            client.settimeout(20)
-            while not answer:
-                answer = client.recv(4096)
-        except (ConnectionError, BrokenPipeError):
-            pass
-        return answer.split(b"\r\n")[0].decode(), sent
-
-
-def test_a_body_of_100_mb_is_refused_without_reading_it(access: Access) -> None:
-    head = post_head(access, f"Content-Length: {100 * 1024 * 1024}")
-    status, sent = answer_to(access, head, 1024 * b"x", 10)
-    assert status.startswith("HTTP/1.1 413")
-    assert sent < 10
-
-
-@pytest.mark.slow
-def test_an_endless_body_is_cut_off(access: Access) -> None:
-    chunk = b"4000\r\n" + 0x4000 * b"x" + b"\r\n"
-    status, sent = answer_to(access, post_head(access, "Transfer-Encoding: chunked"), chunk, 200)
-    assert status.startswith("HTTP/1.1 413")
-    assert sent <= MAX_BODY / 0x4000 + 8
-
-
-def test_a_wrong_length_is_refused(access: Access) -> None:
-    head = post_head(access, "Content-Length: 1e3")
-    assert answer_to(access, head, b"x", 1)[0].split()[1] in ("400", "413")
-
-
-# --- requests that do not end ----------------------------------------------------------------
-
-
-def answer_in_time(client: socket.socket) -> bytes:
-    """All that the server sends before it closes the connection."""
-    client.settimeout(20)
-    answer = b""
-    with contextlib.suppress(ConnectionError):
-        while part := client.recv(4096):
+        client.sendall(head.encode() + b"{")
+        answer = b""
+        while part := client.recv(4096):  # until the server closes the connection
             answer += part
-    return answer
-
-
-@pytest.fixture
-def patient(monkeypatch: pytest.MonkeyPatch, original: Case) -> Iterator[Access]:
-    """An annotator that waits for half a second."""
-    monkeypatch.setattr(guard, "PATIENCE", 0.5)
-    with served(original.open()) as opened:
-        yield opened
-
-
-@pytest.mark.slow
-def test_half_a_body_is_not_waited_for(patient: Access) -> None:
-    head = post_head(patient, "Content-Length: 100") + b"{"
-    with socket.create_connection(("127.0.0.1", patient.port)) as client:
-        client.sendall(head)
-        assert answer_in_time(client).startswith(b"HTTP/1.1 408")
+    assert answer.startswith(b"HTTP/1.1 403")
 
 
 # --- the socket ------------------------------------------------------------------------------

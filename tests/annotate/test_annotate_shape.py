@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from support.annotating import Case, fitted, flat, place, place_all
 
-from cadalign import CadalignError, Result, ShapeModel
+from cadalign import CadalignError, Camera, Result, ShapeModel
 from cadalign.annotate.actions import perform
 from cadalign.annotate.live import LiveAlignment
 from cadalign.annotate.page_state import page_state
@@ -49,7 +49,7 @@ def shape_file(sample_root: Path, tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 def live_shape(session: Session) -> LiveAlignment:
-    live, _ = session.live(session.photos[0])
+    live = session.live(session.photos[0])
     assert isinstance(live, LiveAlignment)
     return live
 
@@ -84,8 +84,7 @@ def test_fit_of_the_observation_gives_the_pages_numbers(
     page = live_shape(session).result
     assert page is not None
     command = Result.from_dict(fitted(case, capsys))
-    saved = Result.from_dict(json.loads((case.folder / "photo_fit/fit.json").read_text()))
-    for read in (command, saved):
+    for read in (command,):
         np.testing.assert_allclose(read.covariance, page.covariance, rtol=1e-9, atol=1e-15)
         ours, theirs = flat(page.alignment.to_dict()), flat(read.alignment.to_dict())
         np.testing.assert_allclose(theirs, ours, rtol=1e-9, atol=1e-9)
@@ -97,8 +96,6 @@ def test_fit_of_the_observation_gives_the_pages_numbers(
         np.testing.assert_allclose(
             read.points_cam_covariance, page.points_cam_covariance[rows], rtol=1e-9, atol=1e-15
         )
-    shown = page_state(session, 0)["alignment"]
-    assert flat(shown["alignment"]) == flat(page.alignment.to_dict())
 
 
 def test_page_shows_box_lines_keypoints_and_regions(case: Case, shape_file: Path) -> None:
@@ -107,18 +104,16 @@ def test_page_shows_box_lines_keypoints_and_regions(case: Case, shape_file: Path
     drawn = state["alignment"]
     shape = ShapeModel.open(shape_file)
     assert state["shape"] == {"category": "chair", "missing": [77]}
-    assert len(drawn["keypoints"]) == len(shape.ids)
     used = {number for number, _ in case.clicks} & set(shape.ids)
-    assert [keypoint["state"] for keypoint in drawn["keypoints"]].count("marked") == len(used)
-    assert len(drawn["regions"]) + len(drawn["faint_regions"]) > 1
-    assert drawn["faint_regions"]  # of the keypoint that the model lacks
+    # All but the one that the model lacks.
+    assert len(drawn["unmarked"]) == len(drawn["regions"]) == len(shape.ids) - len(used) - 1
     assert len(drawn["lines"]) > 100
-    assert len(drawn["box"]) > 100
+    assert len(drawn["box"]) == 12 * 16
     labels = [fact["label"] for fact in drawn["facts"]]
-    assert labels[:5] == [*(f"Length along {axis}" for axis in "xyz"), "Rotation", "Distance"]
+    assert labels[:5] == [*(f"Length {axis}" for axis in "xyz"), "Rotation", "Distance"]
 
 
-def test_three_pairs_give_an_estimate_that_says_what_is_open(case: Case, shape_file: Path) -> None:
+def test_three_pairs_give_an_estimate_that_more_make_certain(case: Case, shape_file: Path) -> None:
     session = case.open(shape=shape_file)
     known = [click for click in case.clicks if click[0] in ShapeModel.open(shape_file).ids]
     for keypoint, uv in known[:2]:
@@ -126,7 +121,6 @@ def test_three_pairs_give_an_estimate_that_says_what_is_open(case: Case, shape_f
     assert page_state(session, 0)["alignment"]["message"].startswith("1 more pair to the first")
     place(session, *known[2])
     few = page_state(session, 0)
-    assert any("the pairs leave it open" in fact["note"] for fact in few["alignment"]["facts"])
     assert few["suggestion"]["keypoint"] not in [keypoint for keypoint, _ in known[:3]]
     for keypoint, uv in known[3:]:
         place(session, keypoint, uv)
@@ -212,45 +206,43 @@ def test_unknown_focal_length_is_estimated_with_the_shape(
     assert found is not None
     assert found.std is not None
     assert found.focal == "estimate"
-    assert found.focal_prior == session.photos[0].intrinsics.likely_focal
+    assert found.focal_prior == session.photos[0].photo.likely_focal
     assert fact["note"] == "estimated"
     assert fact["value"].startswith(f"{found.camera.fx:.0f} ± ")
     off = np.log(found.camera.fx / case.instance.camera.fx)
     assert abs(off) < 3 * found.std.focal
-    assert page_state(session, 0)["priors"]["has_focal"]
     assert not Observation.load(case.observation).camera.focal_known
-    saved = Result.from_dict(json.loads((case.folder / "photo_fit/fit.json").read_text()))
-    assert saved.camera == found.camera
     assert main(["fit", str(case.observation), "--out", str(tmp_path / "x")]) == 0
     fitted = Result.from_dict(json.loads((tmp_path / "x/fit.json").read_text()))
     assert fitted.camera.fx == pytest.approx(found.camera.fx, rel=1e-9)
     np.testing.assert_allclose(fitted.covariance, found.covariance, rtol=1e-6, atol=1e-12)
-    perform(session, 0, {"do": "focal", "known": True})
+    perform(session, 0, {"do": "focal", "pixels": 900})
     assert Observation.load(case.observation).camera.focal_known
     known = live_shape(session).result
     assert known is not None
     assert known.focal == "known"
 
 
-@pytest.mark.parametrize("kind", ["learned", "similar"])
-@pytest.mark.parametrize("prior", [True, False])
-def test_three_pairs_leave_an_unknown_focal_length_to_its_prior(
-    case: Case, shape_file: Path, kind: str, *, prior: bool
+def test_three_pairs_without_a_prior_leave_an_unknown_focal_length_assumed(
+    case: Case, shape_file: Path
 ) -> None:
-    session = case.open(**options_of(kind, shape_file), camera=None)
-    perform(session, 0, {"do": "prior", "stretch": None, "focal": prior})
-    numbers = {point.semantic_id: number for number, point in session.model.registry}
-    for semantic_id, uv in case.clicks[LACKING : LACKING + 3]:
-        place(session, numbers[semantic_id], uv)
+    rows = slice(LACKING, LACKING + 3)
+    ids = case.instance.ids[rows]
+    of_model = {p.semantic_id: p.xyz for p in ModelKeypoints.load(case.keypoints).keypoints}
+    camera = Camera.without_focal(case.instance.camera.width, case.instance.camera.height)
+    Observation(
+        np.array([of_model[number] for number in ids.tolist()]),
+        case.instance.points_2d[rows],
+        camera,
+        ids=ids,
+        fit_options={"focal_prior": None},
+    ).save(case.observation)
+    session = case.open(shape=shape_file, camera=None)
     live = live_shape(session)
-    assert live.result is not None
-    assert live.provisional != prior
-    assert (case.folder / "photo_fit/fit.json").exists() == prior
-    if not prior:
-        assert live.message.startswith("The focal length is assumed: add a pair")
-        assert live.camera is not None
-        likely = session.photos[0].intrinsics.likely_focal
-        assert live.camera.fx == pytest.approx(likely.focal)
+    assert live.estimate is not None
+    assert live.estimate.message.startswith("The focal length is assumed: add a pair")
+    likely = session.photos[0].photo.likely_focal
+    assert live.estimate.result.camera.fx == pytest.approx(likely.focal)
 
 
 def test_contradicting_pair_is_named(case: Case, shape_file: Path) -> None:

@@ -16,7 +16,7 @@ from support.refusals import refusal_line
 from cadalign.cli.doctor import Doctor, compiled_cache
 from cadalign.cli.render import Render
 from cadalign.errors import DataError, InputError, RenderError
-from cadalign.render.probe import RENDERERS, Probe, probe_renderer
+from cadalign.render.probe import RENDERERS, Probe
 
 
 @pytest.fixture
@@ -31,22 +31,6 @@ def _run(model, *arguments, renderer="raycast"):
     """Run the command as the command line does."""
     command = tyro.cli(Render, args=[str(model), "--renderer", renderer, *map(str, arguments)])
     return command.run()
-
-
-@pytest.mark.long
-def test_the_renderer_that_really_drew_is_named(tmp_path, capsys):
-    if not probe_renderer("pyrender").works:
-        pytest.skip("pyrender does not work here")
-    names = {}
-    for opacity in (255, 90):
-        box = trimesh.creation.box((0.4, 0.8, 0.6))
-        box.visual.vertex_colors = [180, 40, 40, opacity]
-        path = tmp_path / f"box{opacity}.ply"
-        box.export(path)
-        out = tmp_path / f"box{opacity}.png"
-        assert _run(path, "--out", out, "--resolution", "64x48", renderer="pyrender") == 0
-        names[opacity] = capsys.readouterr().err.split("drawn by ")[1].strip(")\n")
-    assert names == {255: "pyrender", 90: "raycast"}
 
 
 def _pixels(path):
@@ -168,8 +152,8 @@ def test_a_file_that_cannot_be_written_is_named(model, tmp_path):
 
 
 def _health(**changes):
-    good = Probe("raycast", True, "processor", "trimesh 5, embreex 4", 80.0)
-    bad = Probe("pyrender", False, "OpenGL does not start", "pyrender2 0.2")
+    good = Probe("raycast", True, "processor")
+    bad = Probe("pyrender", False, "OpenGL does not start")
     values = {
         "renderers": [vars(bad), vars(good)],
         "best": "raycast",
@@ -194,11 +178,11 @@ def test_doctor_tells_what_works_and_how_to_enable_the_rest(monkeypatch, capsys)
     assert "OpenGL does not start" in text
     assert "of which this process may use 2" in text
     assert Doctor(json=True).run() == 0
-    assert json.loads(capsys.readouterr().out)["renderers"][1]["milliseconds"] == 80.0
+    assert json.loads(capsys.readouterr().out)["renderers"][1]["detail"] == "processor"
 
 
 def test_doctor_fails_where_not_even_ray_casting_works(monkeypatch, capsys):
-    broken = Probe("raycast", False, "embreex is gone", "")
+    broken = Probe("raycast", False, "embreex is gone")
     monkeypatch.setattr("cadalign.cli.doctor.examine", lambda: _health(renderers=[vars(broken)]))
     assert Doctor().run() == 1
 
@@ -217,7 +201,7 @@ def test_the_state_of_the_cache_is_told(tmp_path, monkeypatch):
 
 def test_nothing_is_compiled_ahead_that_could_not_be_kept(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr("cadalign.compile.files.can_write", lambda folder: False)
+    monkeypatch.setattr("cadalign.compile.folder.can_write", lambda folder: False)
     assert refusal_line(capsys, "doctor", "--compile") == (
         f"--compile: {tmp_path} cannot be written to; set NUMBA_CACHE_DIR to a folder that can be"
     )
@@ -231,8 +215,7 @@ def test_doctor_runs_for_real(monkeypatch, capsys):
     names = [renderer["name"] for renderer in health["renderers"]]
     assert names == ["pyrender", "raycast"]
     for renderer in health["renderers"]:
-        assert renderer["works"] == (renderer["milliseconds"] is not None)
-        assert renderer["works"] or renderer["detail"]
+        assert renderer["detail"]
 
 
 def test_textures_of_the_model_are_not_written_over(model, capsys) -> None:

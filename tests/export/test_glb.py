@@ -1,4 +1,4 @@
-"""GLB files: what three.js, trimesh and Open3D make of them."""
+"""GLB files: what three.js and trimesh make of them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from cadalign.datasets import load_mesh
 from cadalign.datasets import open as open_photos
 from cadalign.errors import DataError, InputError
 from cadalign.export import AlignedObject, ExportView, export_object
-from cadalign.export.scene_parts import photo_plane
+from cadalign.export.glb import photo_plane
 from cadalign.geometry.mesh import Material
 from cadalign.render import Scene, cast_geometry
 
@@ -52,7 +52,7 @@ def agrees(three: ThreeViewer, path: Path, exported: AlignedObject) -> float:
     """IoU of the silhouette in three.js with that of the overlay."""
     view = exported.views[0]
     drawn = three.show(path, part="mask", width=FINE * view.camera.width)
-    cast = cast_geometry(Scene(exported.require_mesh()), view.camera, view.cam_from_model)
+    cast = cast_geometry(Scene(exported.mesh), view.camera, view.cam_from_model)
     mask = drawn.at_pixels(view.camera)[..., 0] > 127
     return float((mask & cast.mask).sum() / (mask | cast.mask).sum())
 
@@ -70,7 +70,7 @@ def test_three_shows_the_object_where_the_overlay_does(
     assert gap.mean() < 1.0
     assert np.quantile(gap, 0.999) <= 4
     both = three.show(path, part="all", width=FINE * camera.width).at_pixels(camera)
-    mask = cast_geometry(Scene(exported.require_mesh()), camera, POSE).mask
+    mask = cast_geometry(Scene(exported.mesh), camera, POSE).mask
     assert np.abs(both.astype(int) - photo)[~mask].mean() < 1.0  # the photo stands behind
 
 
@@ -85,7 +85,7 @@ def test_three_agrees_on_real_photos(three: ThreeViewer, tmp_path: Path, real_da
         assert pose is not None
         view = ExportView(photo.camera, pose, photo.image)  # type: ignore[arg-type]
         exported = AlignedObject((view,), mesh=found.model.load_mesh(), name="chair")
-        if not cast_geometry(Scene(exported.require_mesh()), photo.camera, pose).mask.any():
+        if not cast_geometry(Scene(exported.mesh), photo.camera, pose).mask.any():
             continue
         path = export_object(tmp_path / f"{found.object_id}.glb", exported)
         assert agrees(three, path, exported) >= LEAST_IOU
@@ -110,7 +110,7 @@ def test_trimesh_reads_mesh_texture_and_place(tmp_path: Path) -> None:
     scene.delete_geometry("photo_0")
     expected = exported.placed_mesh("camera").bounds * 0.5 * [1, -1, -1]
     np.testing.assert_allclose(scene.bounds, np.sort(expected, axis=0), atol=1e-6)
-    texture = exported.require_mesh().materials[0].texture
+    texture = exported.mesh.materials[0].texture
     image = scene.geometry["model_0"].visual.material.baseColorTexture
     np.testing.assert_array_equal(np.asarray(image.convert("RGB")), texture)
 
@@ -134,7 +134,7 @@ def test_colors_are_linear_light(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_a_mesh_far_from_its_origin_keeps_its_form(tmp_path: Path) -> None:
     exported = aligned(tmp_path)
-    mesh, place = exported.require_mesh(), np.full(3, 1e6)
+    mesh, place = exported.mesh, np.full(3, 1e6)
     far = replace(mesh, vertices=mesh.vertices + place)
     view = exported.views[0]
     moved = POSE.translation - POSE.rotation @ (POSE.scale * place)
@@ -150,7 +150,7 @@ def test_a_mesh_far_from_its_origin_keeps_its_form(tmp_path: Path) -> None:
 
 def test_vertex_colors_take_the_place_of_the_material_s(tmp_path: Path) -> None:
     exported = aligned(tmp_path)
-    mesh = exported.require_mesh()
+    mesh = exported.mesh
     colors = np.tile([0.5, 0.25, 1.0, 1.0], (len(mesh.vertices), 1))
     grey = Material("grey", (0.2, 0.2, 0.2, 1.0))
     colored = Mesh(mesh.vertices, mesh.faces, vertex_colors=colors, materials=(grey,))
@@ -160,17 +160,6 @@ def test_vertex_colors_take_the_place_of_the_material_s(tmp_path: Path) -> None:
     found = load_mesh(path)
     assert found.vertex_colors is not None
     assert np.abs(found.vertex_colors[:, :3] - [0.5, 0.25, 1.0]).max(axis=1).min() < 0.01
-
-
-def test_open3d_reads_the_object(tmp_path: Path) -> None:
-    open3d = pytest.importorskip("open3d", reason="open3d is not installed")
-    exported = aligned(tmp_path)
-    without_photo = replace(exported, views=(replace(exported.views[0], image=None),))
-    path = export_object(tmp_path / "wedge.glb", without_photo)
-    mesh = open3d.io.read_triangle_mesh(str(path))
-    expected = np.sort(exported.placed_mesh("camera").bounds * [1, -1, -1], axis=0)
-    np.testing.assert_allclose(mesh.get_min_bound(), expected[0], atol=1e-6)
-    np.testing.assert_allclose(mesh.get_max_bound(), expected[1], atol=1e-6)
 
 
 def test_every_view_has_a_camera_where_it_stands(tmp_path: Path) -> None:
@@ -200,18 +189,15 @@ def test_world_frame_places_camera_and_object(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_undistorted_photo_keeps_its_corners() -> None:
-    plane = photo_plane(LENS, photo_of(LENS))
-    assert plane.image is not None
+    _, low, high = photo_plane(LENS, photo_of(LENS))
     corners = LENS.normalize([[-0.5, -0.5], [319.5, 239.5]])
     step = 1 / 300
-    assert (plane.low <= corners[0] + step).all()
-    assert (plane.high >= corners[1] - step).all()
+    assert (low <= corners[0] + step).all()
+    assert (high >= corners[1] - step).all()
 
 
 @pytest.mark.long
 def test_what_is_missing_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="mesh: there is no mesh"):
-        export_object(tmp_path / "a.glb", aligned(tmp_path, mesh=None))
     gone = replace(aligned(tmp_path).views[0], image=tmp_path / "gone.png")
     with pytest.raises(DataError, match=r"gone\.png: no such file"):
         export_object(tmp_path / "a.glb", replace(aligned(tmp_path), views=(gone,)))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from fuzz import fits, mutations, readers
-from fuzz.failures import LONGEST_FIT, fit_outcome
+from fuzz.failures import LONGEST_SEARCH, fit_outcome
 from fuzz.fit_cases import draw_case, draw_cases
 
 pytestmark = pytest.mark.long
@@ -51,7 +51,7 @@ def test_failures_name_their_seed(monkeypatch: pytest.MonkeyPatch) -> None:
     def wrong(case: fits.Case) -> float:
         if case.kind == "exact":
             raise ArithmeticError("broken on purpose")
-        return 2 * LONGEST_FIT
+        return 2 * LONGEST_SEARCH
 
     monkeypatch.setattr(fits, "run_case", wrong)
     outcome = fit_outcome("fits", 0, 20)

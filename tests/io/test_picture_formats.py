@@ -108,7 +108,6 @@ READERS = [
     read_grey,
     FocalPrior.from_exif,
     lambda path: PhotoObject(object_id="a", category="a", mask_path=path).read_mask(),
-    lambda path: PhotoFile(path, 4, 4).thumbnail(),
     lambda path: PhotoFile(path, 4, 4).encoded(),
 ]
 

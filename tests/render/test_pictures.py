@@ -67,13 +67,13 @@ def test_keypoints_are_ringed_where_they_are(geometry):
     image = np.full((120, 160, 3), 128, np.uint8)
     pose = look_at(azimuth=0, elevation=0, distance=3)
     points = [[0.5, 0.5, 0.5], [-0.5, 0.5, 0.5], [0, 0, 50]]
-    drawn = keypoint_picture(
-        image, CAMERA, points, pose, visible=[True, False, True], numbers=False
-    )
+    drawn = keypoint_picture(image, CAMERA, points, pose, visible=[True, False, True])
     changed = (drawn != image).any(axis=2)
-    middle = CAMERA.project(pose.apply(points[:2])).mean(axis=0)
+    places = CAMERA.project(pose.apply(points[:2]))
     rows, columns = np.nonzero(changed)
-    np.testing.assert_allclose([columns.mean(), rows.mean()], middle, atol=0.6)
+    below = columns[rows > places[0, 1] + 1]  # the numbers stand above
+    assert below.mean() == pytest.approx(places[:, 0].mean(), abs=0.6)
+    assert np.ptp(below) > np.ptp(places[:, 0])
     seen = drawn[:, 80:].reshape(-1, 3).astype(int)
     hidden = drawn[:, :80].reshape(-1, 3).astype(int)
     assert (seen[:, 0] - seen[:, 2]).max() > 100

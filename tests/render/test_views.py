@@ -41,10 +41,9 @@ def corners(scene):
     ],
 )
 def test_camera_stands_at_azimuth_elevation_and_distance(azimuth, elevation, expected):
-    target = np.array([1.0, -2.0, 0.5])
-    pose = look_at(azimuth=azimuth, elevation=elevation, distance=5, target=target)
-    np.testing.assert_allclose(pose.inverse([[0, 0, 0]])[0], target + expected, atol=1e-12)
-    np.testing.assert_allclose(pose.apply([target])[0], [0, 0, 5], atol=1e-12)
+    pose = look_at(azimuth=azimuth, elevation=elevation, distance=5)
+    np.testing.assert_allclose(pose.inverse([[0, 0, 0]])[0], expected, atol=1e-12)
+    np.testing.assert_allclose(pose.apply([[0, 0, 0]])[0], [0, 0, 5], atol=1e-12)
 
 
 def test_y_is_up_and_roll_turns_the_object_counterclockwise():
@@ -58,12 +57,6 @@ def test_y_is_up_and_roll_turns_the_object_counterclockwise():
     np.testing.assert_allclose([x, y], [-1, 0], atol=1e-12)
 
 
-def test_target_is_a_point_before_the_stretch():
-    target, scale = [0.3, 0.4, -0.2], [1.0, 2.0, 0.5]
-    pose = look_at(azimuth=25, elevation=10, distance=3, target=target, scale=scale)
-    np.testing.assert_allclose(pose.apply([target])[0], [0, 0, 3], atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("options", "where"),
     [
@@ -71,7 +64,6 @@ def test_target_is_a_point_before_the_stretch():
         ({"distance": 0}, "distance"),
         ({"azimuth": np.nan}, "look_at"),
         ({"scale": (1, 0, 1)}, "scale"),
-        ({"target": (0, 0)}, "target"),
     ],
 )
 def test_look_at_refuses_bad_values(options, where):
@@ -137,7 +129,7 @@ def test_enough_keypoints_are_seen_and_the_seed_decides(scene, corners):
 def test_too_few_visible_keypoints_are_reported(scene, corners):
     with pytest.raises(
         RenderError,
-        match=r"crate: 8 of 8 keypoints should be visible, but the best of 30 views shows 7; lower",
+        match=r"crate: 8 of 8 keypoints should be visible, but the best of 100 views shows 7;",
     ):
         sample_view(
             scene,
@@ -145,7 +137,6 @@ def test_too_few_visible_keypoints_are_reported(scene, corners):
             CAMERA,
             rng=np.random.default_rng(0),
             min_visible=8,
-            max_attempts=30,
         )
 
 
@@ -161,7 +152,6 @@ def test_fewer_keypoints_than_asked_for_are_reported_at_once(scene, corners):
         {"elevation": (0.0, 95.0)},
         {"fill": (0.0, 0.5)},
         {"fill": (0.5, 1.5)},
-        {"max_attempts": 0},
     ],
 )
 def test_sample_view_refuses_bad_ranges(scene, corners, options):

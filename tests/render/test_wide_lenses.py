@@ -12,13 +12,12 @@ from support.renderers import renderer_or_skip
 
 from cadalign import Alignment, Camera, Mesh, Model, Result, View, align, fit
 from cadalign.cli import main
-from cadalign.export.scene_parts import photo_plane
+from cadalign.export.glb import photo_plane
 from cadalign.geometry.alignment import Box
 from cadalign.geometry.rotations import rotation_from_vector
-from cadalign.io.evidence import ObservedImage
 from cadalign.io.observation import Observation
 from cadalign.render import Scene, cast_geometry, draw_overlay
-from cadalign.render.drawing.model_overlay import draw_result
+from cadalign.render.drawing.model_overlay import draw_result, photo_of
 from cadalign.render.raycast.renderer import RaycastRenderer
 from cadalign.render.scene import LIGHT_GREY
 from cadalign.render.viewpoints import visible_keypoints
@@ -113,7 +112,7 @@ def test_the_picture_of_a_result_shows_model_box_and_regions() -> None:
     seen = FISHEYE.project(pose.apply(points))
     view = View(FISHEYE, seen, ids=[0, 1, 2, 4, 5, 7])
     result = align(Model(points_3d=CORNERS, mesh=BOX_MESH), view)
-    picture = draw_result(ObservedImage(points, seen, FISHEYE), result, mesh=BOX_MESH)
+    picture = draw_result(photo_of(None, FISHEYE), result, mesh=BOX_MESH)
     drawn = cast_geometry(BOX, FISHEYE, pose).mask
     grey = np.array(LIGHT_GREY)
     changed = (np.abs(picture.astype(int) - grey).max(axis=2) > 8) & drawn
@@ -131,13 +130,13 @@ def test_opengl_leaves_wide_lenses_to_rays() -> None:
 def test_the_photo_of_a_wide_lens_is_exported_as_a_pinholes() -> None:
     rows, columns = np.indices((241, 241))
     image = np.stack([rows, columns, 0 * rows], axis=2).astype(np.uint8)
-    plane = photo_plane(FISHEYE, image)
-    assert plane.image is not None
-    height, width = plane.image.shape[:2]
+    flat, low, high = photo_plane(FISHEYE, image)
+    assert flat is not None
+    height, width = flat.shape[:2]
     for u, v in ((0.0, 0.0), (0.7, -0.5), (-0.4, 0.8)):
-        x, y = (np.array([u, v]) - plane.low) / (plane.high - plane.low) * (width, height) - 0.5
+        x, y = (np.array([u, v]) - low) / (high - low) * (width, height) - 0.5
         ((column, row),) = FISHEYE.project([[u, v, 1.0]])
-        shown = plane.image[round(float(y)), round(float(x))].astype(float)
+        shown = flat[round(float(y)), round(float(x))].astype(float)
         np.testing.assert_allclose(shown[:2], [row, column], atol=1.5)
 
 

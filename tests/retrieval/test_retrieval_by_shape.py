@@ -47,7 +47,7 @@ def learn(models: list[LibraryModel]) -> ShapeModel:
         Example(model.model_id, model.ids.tolist(), model.xyz, bounds=model.bounds)
         for model in models
     ]
-    return ShapeModel.learn(examples, category=models[0].category, components=1, reflection=False)
+    return ShapeModel.learn(examples, category=models[0].category, components=1)
 
 
 MODELS = [make_table(number) for number in range(150)]
@@ -231,7 +231,7 @@ def test_categories_share_the_probability() -> None:
     assert {match.category for match in rank_all(library, OBJECTS[0])} == {"table"}
 
 
-NAMED = ShapeModel.from_basis(MODELS[0].xyz, [MODELS[0].xyz], [0.1], names=list("abcdefghij"))
+NAMED = ShapeModel.from_basis(MODELS[0].xyz, [MODELS[0].xyz], [0.1], ids=list("abcdefghij"))
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support.refusals import refusal_text
 
@@ -111,8 +109,8 @@ def test_two_kinds_of_objects_get_two_components() -> None:
 @pytest.mark.long
 def test_the_order_of_models_hardly_matters() -> None:
     models = tables(40)
-    first = ShapeModel.learn(models, components=1, modes=5)
-    second = ShapeModel.learn(models[::-1], components=1, modes=5)
+    first = ShapeModel.learn(models, components=1)
+    second = ShapeModel.learn(models[::-1], components=1)
     assert first.mean == pytest.approx(second.mean, abs=0.02)
 
 
@@ -185,7 +183,7 @@ def test_models_in_another_unit_are_warned_of(count: int, caplog: pytest.LogCapt
         Example(f"mm {row}", each.ids, each.points_3d * 1000)
         for row, each in enumerate(models[:count])
     ]
-    ShapeModel.learn([*models[count:], *odd], components=1, modes=5)
+    ShapeModel.learn([*models[count:], *odd], components=1)
     assert f"models of another size than the others: {count} of 20, such as" in caplog.text
     assert "give all in one unit" in caplog.text
 
@@ -203,7 +201,7 @@ def test_models_with_other_axes_are_warned_of(
     models = tables(20)
     points = models[3].points_3d @ np.transpose(turn) + [0, 0.4, 0]
     models[3] = Example("odd one", models[3].ids, 2 * points)
-    ShapeModel.learn(models, components=1, modes=5)
+    ShapeModel.learn(models, components=1)
     assert "models with other axes than the others: 1 of 20, such as 'odd one'" in caplog.text
     assert words in caplog.text
 
@@ -307,16 +305,6 @@ def test_from_basis_keeps_the_covariance_of_its_modes() -> None:
     flat = sigmas[:, None] * modes.reshape(3, -1)
     expected = flat.T @ flat + 0.05**2 * np.eye(21)
     assert model.components[0].covariance[:21, :21] == pytest.approx(expected, abs=1e-12)
-
-
-@pytest.mark.long
-@given(st.integers(0, 2**32 - 1), st.integers(1, 12))
-def test_from_covariance_keeps_it(seed: int, rank: int) -> None:
-    rng = np.random.default_rng(seed)
-    root = rng.normal(size=(27, rank))
-    model = ShapeModel.from_covariance(np.vstack([TABLE, [[0] * 3, [1] * 3]]), root @ root.T)
-    assert model.components[0].covariance == pytest.approx(root @ root.T, abs=1e-9)
-    assert len(model.components[0].modes) == rank
 
 
 def test_the_nearest_model_is_itself(learned: ShapeModel) -> None:
@@ -484,7 +472,6 @@ def test_refusals(learned: ShapeModel) -> None:
     assert refusal_text(lambda: ShapeModel.learn(some, components=0)) == (
         "components: 0 is not a whole number >= 1"
     )
-    assert ShapeModel.learn(some, modes=np.int64(2)).components[0].modes.shape[0] == 2  # type: ignore[arg-type]
     elsewhere = np.array([[-100.0, 0, -200], [-90, 10, -190]])
     assert refusal_text(lambda: Example("m", IDS, TABLE, bounds=elsewhere)) == (
         "model m, bounds: no keypoint lies in the box from [-100.0, 0.0, -200.0] to "
@@ -498,9 +485,8 @@ def test_refusals(learned: ShapeModel) -> None:
         ({"deviations": [-1.0]}, "deviations: deviations[0] is negative (-1)"),
         ({"deviations": [np.nan]}, "deviations: NaN or infinite values in row 0"),
         ({"modes": np.zeros((1, 6, 3))}, "modes: shape (1, 6, 3), expected (n, 7, 3)"),
-        ({"names": ["a"]}, "names: 1 for 7 keypoints"),
-        ({"names": ["a"] * 7}, "names: 'a' occurs twice"),
-        ({"ids": IDS, "names": IDS}, "names: both ids and names are given; give one of them"),
+        ({"ids": ["a"]}, "ids: 1 for 7 keypoints"),
+        ({"ids": ["a"] * 7}, "ids: 'a' occurs twice"),
         ({"size_sigma": -0.1}, "size_sigma: -0.1 is negative"),
         ({"box": [[1, 0, 0], [0, 1, 1]]}, "box: the least corner [1.0, 0.0, 0.0] exceeds"),
         ({"up_axis": "w"}, "up_axis: 'w' is not one of 'x', 'y', 'z'"),
@@ -519,24 +505,7 @@ def test_a_wrong_basis_is_refused(change: dict[str, object], message: str) -> No
     assert text.startswith(message)
 
 
-def test_a_wrong_covariance_is_refused() -> None:
-    mean = np.vstack([TABLE, TABLE[:2]])
-
-    def text(covariance: FloatArray) -> str:
-        return refusal_text(lambda: ShapeModel.from_covariance(mean, covariance))
-
-    assert text(np.eye(4)) == "covariance: shape (4, 4), expected (27, 27)"
-    assert text(-np.eye(27)).startswith("covariance: not positive semi-definite: its least eigen")
-    assert text(np.triu(np.ones((27, 27)))) == "covariance: not symmetric"
-
-
-def test_a_mean_without_its_box_is_refused() -> None:
-    text = refusal_text(lambda: ShapeModel.from_covariance(TABLE, np.eye(21)))
-    assert text.startswith("mean, its last two rows, the box: the least corner")
-    boxed = np.vstack([TABLE, TABLE.min(axis=0), TABLE.max(axis=0)])
-    for modes in (-1, 2.5, "a"):
-        text = refusal_text(lambda: ShapeModel.from_covariance(boxed, np.eye(27), modes=modes))  # type: ignore[arg-type]  # noqa: B023
-        assert text == f"modes: {modes!r} is not a whole number >= 0"
+def test_a_mean_without_keypoints_is_refused() -> None:
     text = refusal_text(lambda: ShapeModel.from_basis(TABLE[:0], np.zeros((1, 0, 3)), [1.0]))
     assert text == "mean: there are no keypoints"
 

@@ -21,7 +21,7 @@ def test_the_skeleton_holds_the_minimum_spanning_tree(seed: int, count: int) -> 
     points = np.random.default_rng(seed).normal(size=(count, 3))
     gaps = np.linalg.norm(points[:, None] - points, axis=2)
     tree = np.argwhere(minimum_spanning_tree(gaps).toarray() > 0)
-    pairs = set(neighbour_pairs(points))
+    pairs = set(map(tuple, neighbour_pairs(points).tolist()))
     assert {(min(a, b), max(a, b)) for a, b in tree.tolist()} <= pairs
     graph = np.zeros((count, count))
     graph[tuple(np.transpose(sorted(pairs)))] = 1

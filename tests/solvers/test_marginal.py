@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.uncertainty.shape_posterior import single_posterior
+from cadalign.estimation.estimates import single_posterior
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR
 from cadalign.solvers.marginal.equations import (
     POSE,

@@ -18,13 +18,11 @@ from playwright.sync_api import Browser, Page
 
 from cadalign import Result, View, align
 from cadalign.annotate.actions import perform
-from cadalign.annotate.evidence import MarkedMask
-from cadalign.annotate.guard import Access
-from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.page_state import page_state
-from cadalign.annotate.server import listen, make_app, make_server
-from cadalign.annotate.session import Session
+from cadalign.annotate.photos import MarkedMask
+from cadalign.annotate.server import Access, listen, make_app, make_server
+from cadalign.annotate.session import Session, open_session
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, ModelKeypoints
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
@@ -33,9 +31,7 @@ from cadalign.geometry.mesh import farthest_rows
 from cadalign.io.images import write_image
 from cadalign.render import RaycastRenderer, visible_keypoints
 
-IDLE = (
-    "!!(annotator.state && annotator.model.mesh && annotator.photo.picture && annotator.api.idle)"
-)
+IDLE = "!!(annotator.state && annotator.model.mesh && annotator.photo.picture && annotator.idle)"
 """Condition that all is loaded and nothing is under way."""
 
 
@@ -148,9 +144,12 @@ def place_twenty(session: Session, case: Case) -> None:
         case.instance.cam_from_model,
     )
     for point in (p for p, is_seen in zip(corners, seen, strict=True) if is_seen):
-        if len(session.photos[0].document.pairs) >= 20:
+        if len(session.photos[0].marks.pairs) >= 20:
             return
-        if session.model.registry.find(point.xyz, tolerance=1e-3) is None:
+        if (
+            min(np.linalg.norm(np.subtract(p.xyz, point.xyz)) for _, p in session.model.registry)
+            > 1e-3
+        ):
             ((u, v),) = case.instance.camera.project(
                 case.instance.cam_from_model.apply([point.xyz])
             )
@@ -161,7 +160,7 @@ def place_twenty(session: Session, case: Case) -> None:
 
 def corners_of(session: Session, count: int = 96) -> list[ModelKeypoint]:
     """Vertices of the model that are far from each other."""
-    points = session.model.cad.snap_points.xyz
+    points = np.unique(session.model.cad.scene.mesh.vertices, axis=0)
     rows = farthest_rows(points, count, center=session.model.cad.center)
     return [ModelKeypoint("", (x, y, z)) for x, y, z in points[rows].tolist()]
 
@@ -170,7 +169,7 @@ def draw_mask(session: Session, mask: np.ndarray) -> None:
     """Have a mask drawn on the first photo."""
     with session.lock:
         state = session.annotation(0)
-        state.mark(mask=MarkedMask.of(mask))
+        state.record(replace(state.marks, mask=MarkedMask.of(mask)))
         session.save(state)
 
 
@@ -286,7 +285,7 @@ def agree_with_fit(
     session: Session, case: Case, capsys: pytest.CaptureFixture[str], *, rtol: float = 1e-9
 ) -> dict[str, Any]:
     """The page's alignment, which `cadalign fit` must find in the saved file, too."""
-    live, _ = session.live(session.photos[0])
+    live = session.live(session.photos[0])
     assert live.result is not None, live.message
     command, page = fitted(case, capsys), live.result.to_dict()
     for name in ("alignment", "covariance", "std", "stretch"):

@@ -61,10 +61,7 @@ def aligned(folder: Path, *, camera: Camera = CAMERA, **fields: Any) -> AlignedO
     """The wedge in one photo, which is written to ``folder``."""
     path = folder / "000007.png"
     write_image(path, photo_of(camera))
-    ids = tuple(range(len(KEYPOINTS)))
-    observed = camera.project(POSE.apply(KEYPOINTS))[:3]
-    view = ExportView(camera, POSE, path, observed, ids[:3])
-    return AlignedObject((view,), KEYPOINTS, ids, **{"mesh": wedge(), **fields})
+    return AlignedObject((ExportView(camera, POSE, path),), **{"mesh": wedge(), **fields})
 
 
 def turned(view: ExportView, angle: float) -> tuple[ExportView, FloatArray]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-import cadalign.annotate.opening
 import cadalign.annotate.server
+import cadalign.annotate.session
 import cadalign.batch.fits
 import cadalign.cli.annotate
 import cadalign.cli.evaluate
@@ -13,7 +11,5 @@ import cadalign.evaluation.instances.views
 import cadalign.evaluation.plots
 import cadalign.evaluation.runs.run  # noqa: F401
 from cadalign.annotate.problem import warm_up
-from cadalign.evaluation.simulation import simulate_problem
 
-_problem = simulate_problem(np.random.default_rng(0), points=8, noise_px=1.0)
-warm_up(_problem.points_3d, _problem.points_2d, _problem.camera, joint=True)
+warm_up(joint=True)

@@ -25,7 +25,6 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.contours.contour import Image, sampled
 from cadalign.estimation.contours.surface import rigid_surface
-from cadalign.estimation.focal import prior_of_camera
 from cadalign.estimation.model import Model
 from cadalign.estimation.problem import Inits, Problem
 from cadalign.geometry.alignment import Alignment, bounds_corners, model_rays
@@ -35,6 +34,7 @@ from cadalign.geometry.raycaster import RayCaster
 from cadalign.geometry.rotations import angle_between
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import group_of
+from cadalign.io.focal import prior_of_camera
 
 _CELLS = 80  # rows and columns of a silhouette's or a mask's image
 _TURNS = 64  # at which silhouettes are compared

@@ -4,28 +4,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.focal import focal_doubt
-from cadalign.estimation.result_parts import Diagnosis, FittedKeypoints
+from cadalign.estimation.options import USUAL_STRETCH, FitOptions, RansacOptions, Sigma
+from cadalign.estimation.problems import repeated
+from cadalign.estimation.result_parts import Diagnosis, FittedKeypoints, ViewResult
 from cadalign.estimation.uncertainty.residuals import chance_of
 from cadalign.estimation.warning import EstimateWarning, Warnings
-from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.alignment import Alignment, Uncertainty, uncertainty_of
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PIXEL_CENTRE
+from cadalign.geometry.plausible_camera import camera_doubts
 from cadalign.geometry.rotations import vector_from_rotation
+from cadalign.io.focal import PriorOption, prior_of_camera
 from cadalign.shapes.parts import probability_within
+from cadalign.solvers.constants import LEAST_POINTS
 
-OTHER_SIZES = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2.0, 3.0, 4.0)
-"""Usual sizes of other images of a photo, over that of its camera."""
 FALSE_ALARMS = 0.004
 """Probability of residuals by chance, below which they fail their test."""
-_LARGE = 0.02  # estimated sigma, over the keypoints' extent, that is large
+_LARGE = 0.005  # estimated sigma, over the keypoints' extent, that is large
 _LARGEST_SHARE = 0.45  # of the keypoints' spread, of an estimated sigma
-_FAR_FROM_MIDDLE = 0.3  # of an image's size, from its middle to a principal point
-_SAME_MIDDLE = 0.02  # of an image's size, from its middle to a principal point taken for it
+_LEAST_EXTENT = 5.0  # of keypoints [sigma]
+_MOST_REJECTED = 0.3  # share of the keypoints that a robust search rejects without a word
+_NEAR = 3.0  # errors of rejected keypoints, over the largest of inliers, that tell of sigma
+_CONTRADICTING_SIGMAS = 3.0  # of an estimated focal length from its prior
+_BEYOND_PRIOR = 3.5  # stretch, in standard deviations of its prior
 _LEAST_GAIN = 0.9  # of a standard deviation, relative to that of any rotation
 _ANY_ROTATION = math.sqrt(math.pi**2 / 3 + 2)  # standard deviation of uniform rotations [rad]
 _ANOTHER_DEG = 10.0
@@ -39,10 +45,14 @@ def keypoint_warnings(
     """Warnings about the cause of a misfit, and what deviations do not say."""
     cause = None if diagnosis is None or _fit(fitted) else diagnosis(fitted)
     observed = fitted.observed[np.isfinite(fitted.residuals).all(axis=1)]
-    fits = cause is None
     is_mistake = cause is not None and cause.kind == "mistake"
-    placed = outside_image(observed, fitted.camera, agree=fits or is_mistake)
-    found = [*(() if cause is None else (cause,)), *placed]
+    sigma = fitted.options.sigma
+    placed = outside_image(observed, fitted.camera, cause=cause, sigma=sigma)
+    found = first_of_camera(placed, cause)
+    for row, first in enumerate(repeated(fitted.points_3d, fitted.observed)):
+        if row != first and not fitted.inliers[row]:
+            text = f"keypoint {row} is keypoint {first} again, and counts once"
+            found.append(EstimateWarning("left-out", text, 0, (row,)))
     if covariance is None or is_mistake:  # of the alignment nothing else can be said
         return tuple(found)
     options, kept = fitted.options, fitted.points_3d[fitted.inliers]
@@ -51,6 +61,7 @@ def keypoint_warnings(
     if fitted.search is not None:
         chance = fitted.search.doubt(fitted.residuals, fitted.inliers)
         found += () if chance is None else (chance,)
+        found += rejections([fitted], fitted.search.ransac, sigma)
     if 2 * len(kept) <= options.unknowns:
         text = (
             f"{len(kept)} keypoints fit exactly whatever they are: "
@@ -60,11 +71,32 @@ def keypoint_warnings(
     if options.focal == "estimate":
         doubt = focal_doubt(fitted.camera, options.focal_prior)
         found += () if doubt is None else (doubt,)
+    if cause is None:
+        found += stretch_doubts(fitted.alignment, uncertainty_of(covariance), options)
     # Likelihoods tell nothing where keypoints do not fit, or others than these were rejected.
-    if fits and fitted.search is None:
+    if cause is None and fitted.search is None:
         poses = [(each.alignment, each.relative_likelihood) for each in fitted.alternatives]
         found += another_pose(fitted.alignment, poses, covariance)
     return tuple(found)
+
+
+def focal_doubt(camera: Camera, prior: PriorOption) -> EstimateWarning | None:
+    """Warning about a camera whose estimated focal length contradicts its prior, or None."""
+    prior = prior_of_camera(prior, camera)
+    if prior is None:
+        return None
+    if abs(math.log(camera.fx / prior.focal)) <= _CONTRADICTING_SIGMAS * prior.relative_sigma:
+        return None
+    return EstimateWarning(
+        "focal",
+        f"the keypoints contradict the focal length's prior: {camera.fx:.4g} px instead of {prior}",
+    )
+
+
+def first_of_camera(placed: Warnings, cause: EstimateWarning | None) -> list[EstimateWarning]:
+    """Warnings of `outside_image` and the cause of a misfit; doubts of the camera come first."""
+    doubts = [each for each in placed if each.kind == "camera"]
+    return [*doubts, *(() if cause is None else (cause,)), *placed[len(doubts) :]]
 
 
 def _fit(fitted: FittedKeypoints) -> bool:
@@ -115,34 +147,63 @@ def another_pose(
     return (EstimateWarning("alternative", text),)
 
 
+def stretch_doubts(alignment: Alignment, std: Uncertainty, options: FitOptions) -> Warnings:
+    """Warn about scales that the prior, or the bounds where none is given, makes implausible."""
+    found, prior = [], options.stretch_sigma
+    most = math.log(USUAL_STRETCH) if prior is None else _BEYOND_PRIOR * prior
+    for axis in range(3):
+        scale = float(alignment.scale[axis] / alignment.scale[0])
+        if abs(math.log(scale)) - std.scale[axis] > most:
+            text = (
+                f"the object is {scale:.3g} times as long along {'xyz'[axis]} as the model, beside "
+                "its x: are the model's axes and keypoints right?"
+            )
+            found.append(EstimateWarning("stretch", text))
+    return tuple(found)
+
+
+def rejections(
+    views: Sequence[FittedKeypoints | ViewResult], ransac: RansacOptions, sigma: Sigma | None
+) -> Warnings:
+    """Warn about a large share of rejected keypoints, and about many just beyond the threshold."""
+    inliers = np.concatenate([view.inliers for view in views])
+    errors = np.linalg.norm(np.concatenate([view.residuals for view in views])[~inliers], axis=1)
+    limit, share = ransac.threshold(sigma), len(errors) / max(len(inliers), 1)
+    near = int((errors < _NEAR * limit).sum())
+    is_tight = sigma is not None and near > 1 and 2 * near >= len(errors)
+    if share <= _MOST_REJECTED and not is_tight:
+        return ()
+    text = f"{len(errors)} of {len(inliers)} keypoints ({percent(share)}) are rejected"
+    if is_tight:
+        text += f", {near} with less than {_NEAR:g} times the threshold of {limit:.3g} px: is "
+        text += "sigma too small?"
+    return (EstimateWarning("outlier", text),)
+
+
 @np.errstate(over="ignore")  # sizes of images are any numbers
 def outside_image(
-    points_2d: FloatArray, camera: Camera, *, agree: bool, view: int = 0, where: str = ""
+    points_2d: FloatArray,
+    camera: Camera,
+    *,
+    cause: EstimateWarning | None,
+    sigma: Any = None,
+    view: int = 0,
+    where: str = "",
 ) -> Warnings:
-    """Warn about keypoints (n, 2) and a principal point that are none of the image's.
+    """Warn about an implausible camera, and about keypoints (n, 2) that are none of the image's.
 
-    All keypoints lie beyond one side or, where they do not ``agree``, most outside. ``where``
-    begins the texts.
+    All keypoints lie beyond one side or, where they do not agree, by some ``cause``, most outside;
+    or they span hardly more than ``sigma`` [px]. ``where`` begins the texts.
     """
-    found, own = [], np.array([camera.width, camera.height], dtype=float)
-    size = f"{camera.width} x {camera.height} px"
-    point = f"{where}the camera's principal point ({camera.cx:.4g}, {camera.cy:.4g}) is"
-    sizes, middle = np.outer(OTHER_SIZES, own), np.array([camera.cx, camera.cy]) + PIXEL_CENTRE
-    same = np.flatnonzero(np.abs(2 * middle / sizes - 1).max(axis=1) < _SAME_MIDDLE).tolist()
-    if same:
-        width, height = sizes[same[0]]
-        text = (
-            f"{point} the middle of an image of {width:.0f} x {height:.0f} px, its own has "
-            f"{size}: if the photo was resized, give Camera.resized({camera.width}, "
-            f"{camera.height}) of its camera"
-        )
-        found.append(EstimateWarning("camera", text, view))
-    elif np.abs(middle / own - 0.5).max() >= _FAR_FROM_MIDDLE:
-        text = (
-            f"{point} far from the middle of its image of {size}, which is right "
-            "only for a photo cut out of a larger one"
-        )
-        found.append(EstimateWarning("camera", text, view))
+    agree, confirm = cause is None or cause.kind == "mistake", len(points_2d) > LEAST_POINTS
+    confirm &= cause is None or cause.kind not in ("misfit", "camera", "noise")
+    own, size = np.array([camera.width, camera.height]), f"{camera.width} x {camera.height} px"
+    doubts = camera_doubts(camera, is_tested=confirm)
+    found = [EstimateWarning("camera", where + text, view) for text in doubts]
+    extent = float(np.ptp(points_2d, axis=0).max()) if len(points_2d) > 1 else math.inf
+    if np.ndim(sigma) == 0 and sigma is not None and extent < _LEAST_EXTENT * sigma:
+        text = f"{where}the keypoints span {extent:.2g} px, and sigma is {sigma:g} px: are these "
+        found.append(EstimateWarning("unit", text + "pixels?", view))
     outside = np.flatnonzero(~camera.contains(points_2d)).tolist()
     last = own - PIXEL_CENTRE
     beyond = (points_2d < -PIXEL_CENTRE).all(axis=0) | (points_2d > last).all(axis=0)

@@ -43,16 +43,6 @@ def whitening_matrices(whitening: FloatArray) -> FloatArray:
     return matrices
 
 
-def bent(squares: FloatArray, loss: int, bend: float) -> FloatArray:
-    """Loss on squared whitened lengths of any shape, one of `cadalign.solvers.constants`."""
-    if loss == HUBER:
-        linear = 2 * bend * np.sqrt(squares) - bend**2
-        return np.asarray(np.where(squares <= bend**2, squares, linear))
-    if loss == CAUCHY:
-        return np.asarray(bend**2 * np.log1p(squares / bend**2))
-    return squares
-
-
 def loss_slopes(squares: FloatArray, loss: int, bend: float) -> tuple[FloatArray, FloatArray]:
     """First and second derivatives of a loss by the squared length: the first are weights."""
     if loss == HUBER:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import KernelFamily, borrowing, inlined, kernel, unrolled
+from cadalign.compile import borrowing, inlined, kernel, kernel_family, unrolled
 from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.evidence import beyond, fall_of_weight, loss_and_root, weigh_error
 from cadalign.solvers.joint.arrow import Arrow, add_rows, border_start
@@ -33,9 +33,9 @@ from cadalign.solvers.joint.evidence import (
 from cadalign.solvers.linalg import cross, dot, scaled, triple
 from cadalign.solvers.projection import ray_slopes, see, shift, turn, turn_back, write_motion
 
-equations_of = KernelFamily("equations_of")
+equations_of = kernel_family("equations_of")
 """``(block)``: the number of its equations."""
-write_equation = KernelFamily("write_equation")
+write_equation = kernel_family("write_equation")
 """``(block, evidence, state, q, row)``: write derivatives (6 + b,) of the residual of equation q.
 
 The row is zero before. Returns a `BlockEquation`; the state has no displacements.

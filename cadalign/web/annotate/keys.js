@@ -1,17 +1,9 @@
 // The keyboard. Keys that a view understands by itself when it has the focus are the view's.
 
-import { TOOLS } from "./marking.js";
-
-const TOOL_KEYS = Object.fromEntries(Object.entries(TOOLS).map(([name, { key }]) => [key, name]));
-const NUDGE = 0.25;
+const NUDGE = 0.25; // [px of the photo]
 const COARSE = 10;
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 const PAN = 40;
-// ShapeNet's models face -z, with y up: front, right, back, left, top, bottom. None is looked at
-// straight along y, where left is undefined.
-const SIDES = {
-  1: [0, 0, -1], 2: [-1, 0, 0], 3: [0, 0, 1], 4: [1, 0, 0], 5: [0, 1, -0.001], 6: [0, -1, -0.001],
-};
 const ZOOMS = { "+": 1.25, "=": 1.25, "-": 0.8 };
 const ACTIONS = {
   delete: (app) => app.deleteSelected(),
@@ -21,29 +13,47 @@ const ACTIONS = {
   "]": (app) => app.step(1),
   n: (app) => app.suggested(),
   f: (app) => [app.photo.fit(), app.model.frame()],
-  i: (app) => app.act({ do: "use_photo", on: !app.state.evidence.photo }),
-  l: (app) => app.magnify(),
-  o: (app) => app.layout.overlay.next(),
+  i: (app) => app.state.evidence.outline && app.act({ do: "use_photo", on: !app.state.evidence.photo }),
+  x: (app) => app.state.evidence.outline && app.boxing(!app.photo.isBoxing),
+  h: (app) => app.hide(true),
   v: (app) => app.model.frameAsPhoto(),
-  r: (app) => app.showResult(),
-  w: (app) => app.showPhotos(),
   "?": (app) => app.layout.showHelp(),
   pageup: (app) => app.go(-1),
   pagedown: (app) => app.go(1),
 };
-const HELD = { h: (app, hidden) => app.photo.setOverlay({ hidden }), s: (app, held) => app.snap({ held }) };
+
+/** The keys and what they do, for the help. */
+export const HELP = [
+  ["Click, then click", "the photo and the model at the same place, in either order: a pair"],
+  ["Drag", "moves a point of the photo; beside points pans the photo, turns the model"],
+  ["Wheel, + and −", "zoom"],
+  ["Arrow keys", "nudge the selected point by 0.25 px, with Shift by 2.5 px; in the model they turn it"],
+  ["Enter", "places a point at the middle of the view that has the focus"],
+  ["[ and ]", "select the pair before and after"],
+  ["N", "uses the suggested model point"],
+  ["Delete", "deletes the selected pair"],
+  ["Ctrl+Z, Ctrl+Y", "undo, redo"],
+  ["F", "shows all of the photo and the model"],
+  ["V", "looks at the model from where the photo was taken"],
+  ["X", "lets the next drag in the photo draw a box: the object in it becomes the mask"],
+  ["I", "fits to the photo itself, or no more: the outline is sought in it"],
+  ["H held", "hides the alignment over the photo"],
+  ["Page up, Page down", "the photo before and after"],
+  ["Escape", "gives up the box, or selects nothing"],
+  ["?", "this help"],
+];
 
 /** @param {object} app - of main.js; what the keys do returns false where there is nothing to do */
 export function listen(app) {
   document.addEventListener("keydown", (event) => {
-    if (event.defaultPrevented || document.querySelector("dialog[open]:not(.help)")) return;
-    if (event.target.closest("input:not([type=checkbox]), select, textarea")) return;
-    const held = !event.ctrlKey && !event.metaKey && !event.altKey && HELD[event.key.toLowerCase()];
-    const done = held ? held(app, true) : event.ctrlKey || event.metaKey ? withControl(app, event) : plain(app, event);
-    if (done !== false) event.preventDefault();
+    if (event.defaultPrevented || !app.state || event.altKey) return;
+    if (event.key !== "?" && document.querySelector("dialog[open]")) return;
+    if (event.target.closest("input:not([type=checkbox]), select")) return;
+    const act = event.ctrlKey || event.metaKey ? withControl : plain;
+    if (act(app, event) !== false) event.preventDefault();
   });
-  document.addEventListener("keyup", (event) => HELD[event.key.toLowerCase()]?.(app, false));
-  window.addEventListener("blur", () => Object.values(HELD).forEach((act) => act(app, false)));
+  document.addEventListener("keyup", (event) => event.key.toLowerCase() === "h" && app.hide(false));
+  window.addEventListener("blur", () => app.hide(false));
 }
 
 function withControl(app, event) {
@@ -54,26 +64,21 @@ function withControl(app, event) {
 }
 
 function plain(app, event) {
-  if (event.altKey) return false;
   const { photo, model } = app;
-  const inModel = event.target === model.stage.canvas;
-  const inPhoto = event.target === photo.canvas;
-  if (ARROWS[event.key] && !inModel) return arrow(app, event, inPhoto);
   const key = event.key.toLowerCase();
+  if (event.target !== model.canvas && ARROWS[event.key]) return arrow(app, event);
   if (key === "enter") {
-    if (inPhoto) return app.placeMiddle();
-    return inModel && model.pickMiddle();
+    if (event.target === photo.canvas) return photo.place();
+    return event.target === model.canvas && model.pickMiddle();
   }
-  if (ZOOMS[key]) return inPhoto && photo.zoom(ZOOMS[key]);
-  if (TOOL_KEYS[key]) return app.choose(TOOL_KEYS[key]);
-  if (SIDES[key]) return model.frameFrom(SIDES[key]);
+  if (ZOOMS[key]) return event.target === photo.canvas && photo.zoom(ZOOMS[key]);
   return ACTIONS[key] ? ACTIONS[key](app) : false;
 }
 
-function arrow(app, event, inPhoto) {
+function arrow(app, event) {
   const [x, y] = ARROWS[event.key];
   const step = event.shiftKey ? COARSE * NUDGE : NUDGE;
-  if (app.mover.nudge(x * step, y * step)) return true;
-  if (inPhoto) app.photo.pan(-PAN * x, -PAN * y);
-  return inPhoto;
+  if (app.nudge(x * step, y * step)) return true;
+  if (event.target !== app.photo.canvas) return false;
+  return app.photo.pan(-PAN * x, -PAN * y);
 }

@@ -1,224 +1,132 @@
-// The page around the views: bar, messages, help.
+// The page around the views: bar, line of status, help.
 import { button, h } from "../common/dom.js";
-import { TOOLS } from "./marking.js";
-
-const KEYS = [
-  ["Click, then click", "the photo and the model at the same place, in either order: a pair"],
-  ["Drag a point", "moves it, in the photo and on the model"],
-  ["Drag beside points", "pans the photo, turns the model"],
-  ["Wheel, pinch, + and −", "zoom"],
-  ["Arrow keys", "nudge the selected point by 0.25 px, with Shift by 2.5 px; in the model they turn it"],
-  ["Enter", "places a point at the middle of the view that has the focus"],
-  ["[ and ]", "select the pair before and after"],
-  ["N", "uses the suggested model point"],
-  ["Delete", "deletes the selected pair"],
-  ["Ctrl+Z, Ctrl+Y", "undo, redo"],
-  ["F", "shows all of the photo and the model"],
-  ["V", "looks at the model from where the photo was taken"],
-  ["1 to 6", "look at the model from its front, right, back, left, top, bottom"],
-  ["S held", "snaps clicks and drags on the model to corners, creases and silhouette"],
-  ["L", "a loupe beside the pointer, or none"],
-  ["P X", "what is marked in the photo: points; the mask by a box"],
-  ["I", "fits to the photo itself, too, or no more: the outline is sought in it"],
-  ["Right button", "pans the photo while a box is drawn"],
-  ["H held", "hides the alignment over the photo"],
-  ["R", "shows the aligned model before the photo in 3D, or the model to click on again"],
-  ["O", "draws the alignment as edges, shaded, as a box, or not"],
-  ["Page up, Page down", "the photo before and after"],
-  ["W", "the list of photos"],
-  ["Escape", "gives up what is begun, goes back to points, selects nothing"],
-  ["?", "this help"],
-];
-
-const WORKING = "Working…";
+import { HELP } from "./keys.js";
 
 export class Layout {
-  /** @param {object} handlers - undo, redo, previous, next */
+  /** @param {object} handlers - act(action), go(by), goTo(number), boxing(), asPhoto(), suggested(), photo and model: zoom(factor), fit() */
   constructor(handlers, panel) {
+    const { act, go, goTo } = handlers;
     this.title = h("h1");
-    this.place = h("span", { class: "soft count" });
-    this.saved = h("span", { class: "saved", role: "status" });
-    this.previous = button("‹ Previous", handlers.previous, { title: "Page up" });
-    this.next = button("Next ›", handlers.next, { title: "Page down" });
-    this.undo = button("Undo", handlers.undo, { title: "Ctrl+Z" });
-    this.redo = button("Redo", handlers.redo, { title: "Ctrl+Y" });
-    this.list = button("Photos…", handlers.list, { title: "All photos (W)", "aria-haspopup": "dialog" });
-    this.photos = h("nav", { "aria-label": "Photos" }, this.previous, this.place, this.next, this.list);
-    this.help = helpDialog(handlers.tour);
-    this.message = h("p", { class: "message", role: "alert", hidden: true });
+    this.saved = h("span", { class: "soft" });
+    this.photos = h("select", { "aria-label": "Photo", onchange: () => goTo(Number(this.photos.value)) });
+    this.previous = button("‹", () => go(-1), { "aria-label": "Previous photo", title: "Page up" });
+    this.next = button("›", () => go(1), { "aria-label": "Next photo", title: "Page down" });
+    this.nav = h("nav", { "aria-label": "Photos", hidden: true }, this.previous, this.photos, this.next);
+    this.undo = button("Undo", () => act({ do: "undo" }), { title: "Ctrl+Z" });
+    this.redo = button("Redo", () => act({ do: "redo" }), { title: "Ctrl+Y" });
+    this.status = h("p", { class: "status", role: "status" });
     this.photo = h("div", { class: "host" });
     this.model = h("div", { class: "host" });
-    this.overlay = makeOverlay(handlers.overlay);
-    this.tools = makeTools(handlers);
-    this.shown = h("span", { class: "soft" });
-    this.snapping = toggle("Snap", handlers.snap, { title: "Clicks go to corners, creases and silhouette (hold S)" });
-    this.loupe = toggle("Loupe", handlers.loupe, { title: "Magnify about the pointer (L)" });
-    this.result = toggle("Result", handlers.result, { title: "The aligned model before the photo, in 3D (R)" });
+    this.box = button("Mask by a box", handlers.boxing, { title: "Drag a box around the object (X)", "aria-pressed": "false" });
     this.asPhoto = button("As photo", handlers.asPhoto, { title: "Look from where the photo was taken (V)" });
+    this.suggestion = button("", handlers.suggested, { class: "suggestion", title: "Use this point of the model (N)" });
+    this.help = makeHelp();
     document.body.classList.add("waiting"); // for the first state, which says what there is
     document.body.append(
       h(
         "header",
         {},
         this.title,
-        this.photos,
+        this.nav,
         this.saved,
-        h(
-          "div",
-          { class: "tools" },
-          this.snapping,
-          this.loupe,
-          this.undo,
-          this.redo,
-          button("Help", () => this.showHelp(), { title: "?", "aria-haspopup": "dialog" }),
-        ),
+        this.undo,
+        this.redo,
+        button("Help", () => this.showHelp(), { title: "?", "aria-haspopup": "dialog" }),
       ),
-      this.message,
       h(
         "main",
         {},
-        view("Photo", this.photo, handlers.photo, {
-          above: h("div", { class: "above" }, this.tools.root),
-          below: this.overlay.root,
-        }),
-        view("Model", this.model, handlers.model, { below: [this.shown, this.result, this.asPhoto] }),
+        view("Photo", this.photo, handlers.photo, this.box),
+        view("Model", this.model, handlers.model, [this.suggestion, this.asPhoto]),
+        this.status,
         panel,
       ),
+      this.help,
     );
-    this.model.before(this.help); // beside the photo, which stays in sight
   }
 
   show(state) {
-    const { image, saved } = state;
+    const { image, saved, alignment, suggestion } = state;
     document.body.classList.remove("waiting");
     document.title = `${image.name} · cadalign annotate`;
     this.title.textContent = image.name;
-    this.photos.hidden = image.count < 2;
-    this.place.textContent = `${image.number + 1} of ${image.count}`;
+    this.nav.hidden = image.count < 2;
+    this.photos.value = image.number;
     this.previous.disabled = image.number === 0;
     this.next.disabled = image.number === image.count - 1;
     this.undo.disabled = !state.can_undo;
     this.redo.disabled = !state.can_redo;
-    this.asPhoto.hidden = state.alignment.status !== "done";
-    this.result.hidden = state.alignment.status !== "done" || state.alignment.camera_from_page === null;
-    this.saved.classList.toggle("trouble", Boolean(saved.trouble));
-    this.saved.textContent = savedText(saved);
-    if (state.message) this.tell(state.message);
+    this.asPhoto.disabled = alignment.status !== "done";
+    this.box.hidden = !state.evidence.outline;
+    this.suggestion.hidden = !suggestion;
+    this.suggestion.textContent = suggestion ? `Next: ${suggestion.text}` : "";
+    this.saved.classList.toggle("wrong", Boolean(saved.trouble));
+    this.saved.textContent = saved.trouble ? `Not saved: ${saved.trouble}` : `Every change is saved in ${saved.path}`;
+    if (state.message) this.say(state.message);
+    else this.say(progressOf(state), warningsOf(state));
   }
 
-  /** Say in the place of the last save that an answer is waited for, or no more. */
-  showWorking(on) {
-    if (on) [this.before, this.saved.textContent] = [this.saved.textContent, WORKING];
-    else if (this.saved.textContent === WORKING) this.saved.textContent = this.before;
+  /** List the photos of a folder with their numbers of pairs. */
+  listPhotos(photos, current) {
+    const option = ({ name, pairs }, number) => h("option", { value: number }, `${number + 1}. ${name}: ${pairs} pairs`);
+    this.photos.replaceChildren(...photos.map(option));
+    this.photos.value = current;
   }
 
-  /** Open the help at its beginning, or close it. */
+  /** Show a text in the line of status, after warnings. */
+  say(text, warnings = []) {
+    const parts = warnings.map((warning) => h("strong", { class: "wrong" }, warning));
+    this.status.replaceChildren(...parts.flatMap((part) => [part, " "]), text);
+    this.status.title = this.status.textContent;
+  }
+
+  showBoxing(on) {
+    this.box.setAttribute("aria-pressed", String(on));
+    if (on) this.say("Drag a box around the object: it is cut out by its colours.");
+  }
+
+  /** Open the help, or close it. */
   showHelp() {
     if (this.help.open) this.help.close();
-    else this.help.show();
-    this.help.scrollTop = 0;
-  }
-
-  showSnapping(on, active) {
-    press(this.snapping, on);
-    this.snapping.classList.toggle("active", active);
-  }
-
-  /** Say something, or with "" nothing any more. */
-  tell(text) {
-    this.message.textContent = text;
-    this.message.hidden = !text;
+    else this.help.showModal();
   }
 }
 
-/** What clicks in the photo mark. */
-function makeTools({ tool: onChoose }) {
-  const options = Object.entries(TOOLS).map(([name, { label, key }]) =>
-    h("option", { value: name }, `${label} (${key.toUpperCase()})`),
-  );
-  const choice = h("select", { "aria-label": "What a click in the photo marks", onchange: () => onChoose(choice.value) }, options);
-  const root = h("div", { class: "marking" }, choice);
-  const show = (name) => {
-    choice.value = name;
-    // A new element, which does not count as one that has moved.
-    root.replaceChildren(choice, h("span", { class: "soft" }, TOOLS[name].how));
-  };
-  show("points");
-  return { root, show };
+/** What stands beside the photo: pairs that contradict the others, and the first of the notes. */
+function warningsOf({ pairs, alignment }) {
+  const wrong = pairs.filter(({ off }) => off !== null);
+  const texts = wrong.map(({ pair, off }) => `Pair ${pair} contradicts: ${off.toFixed(0)} px.`);
+  return [...texts, ...(alignment.notes ?? []).slice(0, 1)];
 }
 
-/** How the alignment is drawn over the photo: a choice and a slider. */
-function makeOverlay(onChange) {
-  const modes = ["edges", "shaded", "box", "off"];
-  const mode = h(
-    "select",
-    { "aria-label": "Alignment over the photo", title: "O", onchange: () => onChange({ mode: mode.value }) },
-    modes.map((name) => h("option", { value: name }, name)),
-  );
-  const opacity = h("input", {
-    type: "range", min: "0.1", max: "1", step: "0.05", value: "1",
-    "aria-label": "Opacity of the alignment", title: "Opacity; H hides while held",
-    oninput: () => onChange({ opacity: Number(opacity.value) }),
-  });
-  const next = () => {
-    mode.value = modes[(modes.indexOf(mode.value) + 1) % modes.length];
-    onChange({ mode: mode.value });
-  };
-  return { root: h("span", { class: "overlay" }, mode, opacity), next };
+/** What is missing to an alignment. */
+function progressOf({ pairs, alignment }) {
+  const how = "Click a point in the photo and the same point on the model, in either order.";
+  return pairs.length || alignment.status !== "none" ? alignment.message : `${how} ${alignment.message}`;
 }
 
-/** A button that is on or off. */
-function toggle(text, onChange, attributes) {
-  const made = button(text, () => onChange(made.getAttribute("aria-pressed") !== "true"), attributes);
-  press(made, false);
-  return made;
-}
-
-/** Show a toggle as on or off. */
-export function press(made, on) {
-  made.setAttribute("aria-pressed", String(on));
-}
-
-function savedText({ path, at, trouble }) {
-  if (trouble) return `Not saved: ${trouble}`;
-  if (at === null) return `Saves to ${path}`;
-  return `Saved to ${path} at ${new Date(1000 * at).toLocaleTimeString()}`;
-}
-
-function view(name, host, { zoom, fit }, { above = null, below }) {
-  const tools = h(
-    "div",
-    { class: "zoom", role: "group", "aria-label": `Zoom of the ${name.toLowerCase()}` },
-    below,
+function view(name, host, { zoom, fit }, tools) {
+  const zooms = [
     button("−", () => zoom(1 / 1.4), { "aria-label": "Zoom out" }),
     button("+", () => zoom(1.4), { "aria-label": "Zoom in" }),
-    button("Fit", fit, { "aria-label": `Fit the whole ${name.toLowerCase()}` }),
-  );
-  return h("section", { class: "view", "aria-label": name }, h("h2", {}, name), above, tools, host);
+    button("Fit", fit, { "aria-label": `Fit the whole ${name.toLowerCase()}`, title: "F" }),
+  ];
+  return h("section", { class: "view", "aria-label": name }, host, h("div", { class: "tools" }, tools, zooms));
 }
 
-function helpDialog(onTour) {
-  const rows = KEYS.map(([key, text]) => h("div", {}, h("dt", {}, key), h("dd", {}, text)));
-  const dialog = h("dialog", { class: "help", "aria-labelledby": "help-title" });
-  dialog.addEventListener("keydown", (event) => {
-    if (event.key !== "Escape") return;
-    event.stopPropagation();
-    dialog.close();
-  });
-  dialog.append(
-    h("h2", { id: "help-title", tabindex: "-1", autofocus: true }, "Keys and mouse"),
+function makeHelp() {
+  const rows = HELP.map(([key, text]) => h("div", {}, h("dt", {}, key), h("dd", {}, text)));
+  const dialog = h(
+    "dialog",
+    { "aria-labelledby": "help-title" },
+    h("h2", { id: "help-title" }, "Keys and mouse"),
     h("dl", {}, rows),
     h(
       "p",
       {},
-      "Red is the model's box, blue its edges, orange arrows lead from a point to where the alignment puts it. Pink rings are estimated keypoints that are not marked, with the regions that hold them at 95 %. Every change is saved at once.",
+      "Red is the model's box, blue its edges, orange arrows lead from a point to where the alignment puts it. Pink rings are estimated keypoints that are not marked, with the regions that hold them at 95 %.",
     ),
     button("Close", () => dialog.close()),
-    " ",
-    button("Show the tour", () => {
-      dialog.close();
-      onTour();
-    }),
   );
   return dialog;
 }

@@ -1,8 +1,9 @@
 // Numbered points on the model: sprites of one size on the screen, faint where they are hidden.
 import { CanvasTexture, Group, Sprite, SpriteMaterial, SRGBColorSpace, Vector3 } from "three";
-import { drawBadge } from "./marker.js";
+import { drawBadge } from "./drawing.js";
 
 const SIZE = 34; // of a sprite on the screen, with room around the badge [px]
+const SHARP = 3; // pixels of its picture over those
 const TOWARDS = 0.02; // so that the surface does not cut a sprite in half [diagonals]
 const HIDDEN_OPACITY = 0.22;
 
@@ -23,25 +24,16 @@ export class Markers {
     this.shown = markers;
     for (const sprite of this.group.children) sprite.material.dispose();
     this.group.clear();
-    for (const marker of markers) {
-      const map = this.texture(marker.kind, marker.label);
-      const common = { map, sizeAttenuation: false, transparent: true, depthWrite: false };
+    for (const { kind, label, xyz } of markers) {
+      const common = { map: this.texture(kind, label), sizeAttenuation: false, transparent: true, depthWrite: false };
       for (const [depthTest, opacity] of [[false, HIDDEN_OPACITY], [true, 1]]) {
         const sprite = new Sprite(new SpriteMaterial({ ...common, depthTest, opacity }));
-        sprite.userData = { place: new Vector3(...marker.xyz), marker };
-        sprite.renderOrder = marker.kind === "free" ? 1 : 2;
+        sprite.userData.place = new Vector3(...xyz);
+        sprite.renderOrder = kind === "free" ? 1 : 2;
         this.group.add(sprite);
       }
     }
     return true;
-  }
-
-  /** Draw the marker of a pair elsewhere while it is dragged; all are put back without a place. */
-  moveTo(pair, xyz) {
-    for (const { userData } of this.group.children) {
-      const { marker, place } = userData;
-      place.set(...(xyz && marker.pair === pair ? xyz : marker.xyz));
-    }
   }
 
   /** Put the sprites a little before the surface and give them their size; before each drawing. */
@@ -50,8 +42,8 @@ export class Markers {
     const size = (SIZE * 2 * Math.tan((camera.fov * Math.PI) / 360)) / Math.max(host.clientHeight, 1);
     for (const sprite of this.group.children) {
       const { place } = sprite.userData;
-      const towards = camera.position.clone().sub(place);
-      sprite.position.copy(place).addScaledVector(towards.normalize(), TOWARDS);
+      const towards = camera.position.clone().sub(place).normalize();
+      sprite.position.copy(place).addScaledVector(towards, TOWARDS);
       sprite.scale.setScalar(size);
     }
   }
@@ -59,12 +51,9 @@ export class Markers {
   texture(kind, label) {
     const key = `${kind} ${label}`;
     if (!this.textures.has(key)) {
-      const ratio = 3;
-      const canvas = document.createElement("canvas");
-      canvas.width = canvas.height = SIZE * ratio;
+      const canvas = new OffscreenCanvas(SIZE * SHARP, SIZE * SHARP);
       const context = canvas.getContext("2d");
-      context.scale(ratio, ratio);
-      if (kind === "suggested") context.setLineDash([4, 3]);
+      context.scale(SHARP, SHARP);
       drawBadge(context, kind, label, SIZE / 2, SIZE / 2);
       const texture = new CanvasTexture(canvas);
       texture.colorSpace = SRGBColorSpace;

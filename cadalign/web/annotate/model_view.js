@@ -1,15 +1,27 @@
 // The model: orbited, clicked on, and marked with numbered points.
-import { Box3, Raycaster, Vector2, Vector3 } from "three";
+import {
+  AxesHelper,
+  BufferAttribute,
+  BufferGeometry,
+  DoubleSide,
+  Group,
+  LineBasicMaterial,
+  LineSegments,
+  Mesh,
+  MeshLambertMaterial,
+  Raycaster,
+  Vector2,
+  Vector3,
+} from "three";
 import { Stage } from "../common/stage.js";
-import { Loupe, renderLoupe } from "./loupe.js";
-import { kindOf } from "./marker.js";
+import { fetched } from "./api.js";
+import { kindOf } from "./drawing.js";
 import { Markers } from "./markers.js";
-import { fetchModel, makeAxes } from "./model_mesh.js";
-import { ASIDE, disposeResult, makeResult } from "./result_view.js";
 
-const CLICK_REACH = 4;
-const MARKER_REACH = 14;
-const HIDDEN_BY = 0.02; // diagonals that a marker may lie behind the surface
+const CLICK_REACH = 4; // [px]
+const MARKER_REACH = 14; // [px]
+const HIDDEN_BY = 0.02; // that a marker may lie behind the surface [diagonals]
+const BEYOND = 0.12; // how far the axes stick out of the model [diagonals]
 const FRONT = [0.8, 0.6, -1.4]; // ShapeNet's models face -z
 // Directions at models of which y points up, at those of another up axis, which face -y.
 const STANDING = { x: (x, y, z) => [y, z, x], y: (x, y, z) => [x, y, z], z: (x, y, z) => [-x, z, y] };
@@ -17,86 +29,68 @@ const STANDING = { x: (x, y, z) => [y, z, x], y: (x, y, z) => [x, y, z], z: (x, 
 export class ModelView {
   /**
    * @param {HTMLElement} host - the element to fill
-   * @param {object} handlers - onPick(aim), onRepick(pair, aim), onSelect(pair),
-   *   onSuggested(), where an aim has origin, direction and near
+   * @param {object} handlers - onPick({ origin, direction, near }), onSelect(pair), onSuggested()
    */
   constructor(host, handlers) {
     this.handlers = handlers;
     this.stage = new Stage(host, {
-      label:
-        "The model. Arrow keys turn it, plus and minus zoom, Enter places a point at the middle of the view.",
+      label: "The model. Arrow keys turn it, plus and minus zoom, Enter places a point at the middle of the view.",
       zoomToCursor: true,
     });
-    this.stage.canvas.setAttribute("role", "application");
+    this.canvas = this.stage.canvas;
+    this.canvas.setAttribute("role", "application");
     this.markers = new Markers(this.stage);
-    this.loupe = new Loupe(host);
     this.stage.beforeDraw = () => this.markers.face();
-    this.stage.afterDraw = () => {
-      const loupe = this.loupe.place();
-      if (loupe) renderLoupe(this.stage, this.markers.group, loupe);
-    };
     this.state = null;
     this.mesh = null; // until it is there, nothing can be clicked on
     this.upAxis = "y";
     this.raycaster = new Raycaster();
-    const { canvas } = this.stage;
-    // Before the controls, which would turn the model while a point is dragged.
-    host.addEventListener("pointerdown", (event) => this.down(event), { capture: true });
-    canvas.addEventListener("pointerup", (event) => this.release(event));
-    canvas.addEventListener("pointermove", (event) => this.move(event));
-    canvas.addEventListener("pointerleave", () => this.point(null));
-    canvas.addEventListener("pointercancel", () => this.drop());
+    this.canvas.addEventListener("pointerdown", (event) => this.down(event));
+    this.canvas.addEventListener("pointerup", (event) => this.up(event));
+    this.canvas.addEventListener("pointermove", (event) => this.hover(event));
   }
 
-  /** Fetch and show the model; resolves to what is shown of how many faces. */
+  /** Fetch and show the model. */
   async load() {
-    const { header, mesh, group } = await fetchModel();
-    this.mesh = mesh;
-    this.group = group;
-    this.axes = makeAxes(new Box3().setFromObject(mesh));
-    this.stage.scene.add(group, this.axes);
+    const buffer = await (await fetched("model")).arrayBuffer();
+    const [faces, edges] = new Uint32Array(buffer, 0, 2);
+    let offset = 8;
+    const take = (vertices) => {
+      const values = new Float32Array(buffer, offset, 3 * vertices);
+      offset += values.byteLength;
+      return new BufferAttribute(values, 3);
+    };
+    const surface = new BufferGeometry();
+    for (const name of ["position", "normal", "color"]) surface.setAttribute(name, take(3 * faces));
+    const creases = new BufferGeometry();
+    creases.setAttribute("position", take(2 * edges));
+    this.mesh = new Mesh(
+      surface,
+      // The offset keeps lines on the surface from being cut.
+      new MeshLambertMaterial({ vertexColors: true, side: DoubleSide, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 }),
+    );
+    surface.computeBoundingBox(); // about the origin
+    this.ends = surface.boundingBox.max.clone().addScalar(BEYOND);
+    const axes = new AxesHelper(1);
+    axes.scale.copy(this.ends);
+    const grey = new LineBasicMaterial({ color: 0x7d8794, transparent: true, opacity: 0.4 });
+    this.stage.scene.add(new Group().add(this.mesh, new LineSegments(creases, grey), axes));
     this.frame();
-    return header;
+    if (this.state) this.show(this.state, this.selected);
   }
 
-  /** Show the aligned model before the photo in place of the model to click on, or no more. */
-  showResult(on, picture) {
-    const { alignment, image } = this.state ?? {};
-    const isThere = on && this.mesh && alignment?.status === "done" && alignment.camera_from_page !== null;
-    if (this.result) {
-      this.stage.scene.remove(this.result);
-      disposeResult(this.result);
-    }
-    const wasShown = Boolean(this.result);
-    this.result = isThere ? makeResult(this.group, alignment, image, picture) : null;
-    if (this.result) this.stage.scene.add(this.result);
-    if (this.mesh) this.group.visible = this.axes.visible = this.markers.group.visible = !this.result;
-    if (Boolean(this.result) !== wasShown) this.frame();
-    this.stage.invalidate();
-    return Boolean(this.result);
-  }
-
-  /** See the whole model, from its usual front, or the whole result. */
-  frame() {
-    this.stage.orbit(this.result ? new Vector3(0, 1, 0) : this.standing(0, 1, 0));
-    if (this.result) this.stage.frame(this.result, ASIDE);
-    else this.frameFrom(FRONT);
+  /** See the whole model from a direction, given for one of which y points up. */
+  frame(direction = FRONT) {
+    if (!this.mesh) return;
+    const standing = (xyz) => new Vector3(...STANDING[this.upAxis](...xyz));
+    this.stage.orbit(standing([0, 1, 0]));
+    this.stage.frame(this.mesh, standing(direction));
   }
 
   /** Look at the model from where the photo was taken. */
   frameAsPhoto() {
     const eye = this.state?.alignment.eye;
-    if (eye && !this.result && this.mesh) this.stage.frame(this.mesh, new Vector3(...eye));
-  }
-
-  /** Look at the model from a direction, given for one of which y points up. */
-  frameFrom(direction) {
-    if (this.mesh && !this.result) this.stage.frame(this.mesh, this.standing(...direction));
-  }
-
-  /** A direction at the model, given for one of which y points up. */
-  standing(x, y, z) {
-    return new Vector3(...STANDING[this.upAxis](x, y, z));
+    if (eye && this.mesh) this.stage.frame(this.mesh, new Vector3(...eye));
   }
 
   zoom(factor) {
@@ -107,163 +101,95 @@ export class ModelView {
   }
 
   show(state, selected) {
-    this.state = state;
+    Object.assign(this, { state, selected });
     if (this.upAxis !== state.image.up_axis) {
       this.upAxis = state.image.up_axis;
       this.frame();
     }
-    const shown = [];
-    for (const point of state.keypoints) {
-      if (!point.used) shown.push({ kind: "free", label: "", xyz: point.xyz, keypoint: point.keypoint, name: point.name });
-    }
-    for (const pair of state.pairs) {
-      if (pair.xyz) {
-        shown.push({ kind: kindOf(pair, selected), label: String(pair.pair), xyz: pair.xyz, pair: pair.pair, name: pair.name });
-      }
-    }
-    const { suggestion } = state;
-    if (suggestion) shown.push({ kind: "suggested", label: "", xyz: suggestion.xyz, keypoint: suggestion.keypoint, suggested: true, name: "suggested next" });
-    if (!this.markers.show(shown)) return;
+    const { keypoints, pairs, suggestion } = state;
+    const end = (label) => new Vector3().setComponent("xyz".indexOf(label), this.ends[label]).toArray();
+    const axes = this.mesh ? [..."xyz"].map((label) => ({ kind: "axis", label, xyz: end(label), fixed: true })) : [];
+    const free = keypoints.filter(({ used }) => !used).map((point) => ({ kind: "free", label: "", ...point }));
+    const placed = pairs.filter(({ xyz }) => xyz).map((pair) => ({
+      kind: kindOf(pair, selected), label: String(pair.pair), xyz: pair.xyz, pair: pair.pair, name: pair.name,
+    }));
+    const next = suggestion ? [{ kind: "suggested", label: "", xyz: suggestion.xyz, suggested: true, name: "suggested next" }] : [];
+    if (!this.markers.show([...axes, ...free, ...placed, ...next])) return;
     // Not in the same frame as the photo, which is what one looks at.
     requestAnimationFrame(() => requestAnimationFrame(() => this.stage.invalidate()));
   }
 
   /** Place on the page of a point of the model. */
   toPage(xyz) {
-    const { left, top, width, height } = this.stage.canvas.getBoundingClientRect();
+    const { left, top, width, height } = this.canvas.getBoundingClientRect();
     this.stage.camera.updateMatrixWorld(); // it may have moved since it was last drawn
     const point = new Vector3(...xyz).project(this.stage.camera);
     return { x: left + ((point.x + 1) / 2) * width, y: top + ((1 - point.y) / 2) * height };
   }
 
   down(event) {
-    if (event.button !== 0 || !event.isPrimary || event.target !== this.stage.canvas) {
-      this.drop();
-      return;
-    }
-    if (this.result) return;
-    const place = { x: event.clientX, y: event.clientY };
-    const pair = this.markerAt(place)?.pair;
-    this.press = { ...place, pair, moved: false };
-    this.stage.controls.enabled = pair === undefined;
-    if (pair !== undefined) this.stage.canvas.setPointerCapture(event.pointerId);
+    const isClick = event.button === 0 && event.isPrimary;
+    this.press = isClick ? { x: event.clientX, y: event.clientY } : null;
   }
 
-  /** End a drag without a change. */
-  drop() {
-    this.press = null;
-    this.stage.controls.enabled = true;
-    this.markers.moveTo(undefined, null);
-  }
-
-  move(event) {
-    const { left, top } = this.stage.canvas.getBoundingClientRect();
-    this.point({ x: event.clientX - left, y: event.clientY - top });
-    const { press } = this;
-    if (press?.pair === undefined) {
-      this.hover(event);
-      return;
-    }
-    const place = { x: event.clientX, y: event.clientY };
-    press.moved ||= Math.hypot(place.x - press.x, place.y - press.y) > CLICK_REACH;
-    if (!press.moved || !this.mesh) return;
-    this.aim(place);
-    const [hit] = this.raycaster.intersectObject(this.mesh);
-    if (!hit) return;
-    this.markers.moveTo(press.pair, hit.point.toArray());
-    this.stage.invalidate();
-  }
-
-  /** Tell the loupe where the pointer is in the view. */
-  point(place) {
-    this.loupe.pointer = place;
-    if (this.loupe.on) this.stage.invalidate();
-  }
-
-  release(event) {
+  up(event) {
     const { press } = this;
     this.press = null;
-    this.stage.controls.enabled = true;
-    if (press?.pair !== undefined && press.moved) {
-      this.handlers.onRepick(press.pair, this.target({ x: event.clientX, y: event.clientY }, press.pair));
-      return;
-    }
     if (!press || Math.hypot(event.clientX - press.x, event.clientY - press.y) > CLICK_REACH) return;
-    this.pick({ x: event.clientX, y: event.clientY });
+    this.pick(press);
   }
 
   /** Pick at the middle of the view. */
   pickMiddle() {
-    const { left, top, width, height } = this.stage.canvas.getBoundingClientRect();
+    const { left, top, width, height } = this.canvas.getBoundingClientRect();
     this.pick({ x: left + width / 2, y: top + height / 2 });
   }
 
-  /** Pick at a place on the page. */
+  /** Pick at a place on the page: a marker, or the surface by a ray and the unused keypoint near it. */
   pick(place) {
-    if (this.result) return;
     const marker = this.markerAt(place);
-    if (marker?.pair !== undefined) {
-      this.handlers.onSelect(marker.pair);
-    } else if (marker?.suggested) {
-      this.handlers.onSuggested();
-    } else {
-      this.handlers.onPick(this.target(place));
-    }
-  }
-
-  /** The ray through a place on the page, and the unused keypoint near it. */
-  target(place, dragged) {
-    const marker = this.markerAt(place, dragged);
+    if (marker?.pair !== undefined) return this.handlers.onSelect(marker.pair);
+    if (marker?.suggested) return this.handlers.onSuggested();
     const { origin, direction } = this.aim(place);
-    return {
-      origin: origin.toArray(),
-      direction: direction.toArray(),
-      near: marker?.pair === undefined ? (marker?.keypoint ?? null) : null,
-    };
-  }
-
-  /** The tangent of the angle that some pixels at the middle of the view make. */
-  tangent(pixels) {
-    const { camera, canvas } = this.stage;
-    return (pixels * 2 * Math.tan((camera.fov * Math.PI) / 360)) / Math.max(canvas.clientHeight, 1);
+    const near = marker?.keypoint ?? null;
+    return this.handlers.onPick({ origin: origin.toArray(), direction: direction.toArray(), near });
   }
 
   /** The ray through a place on the page. */
   aim({ x, y }) {
-    const { left, top, width, height } = this.stage.canvas.getBoundingClientRect();
+    const { left, top, width, height } = this.canvas.getBoundingClientRect();
     const place = new Vector2((2 * (x - left)) / width - 1, 1 - (2 * (y - top)) / height);
     this.stage.camera.updateMatrixWorld();
     this.raycaster.setFromCamera(place, this.stage.camera);
     return this.raycaster.ray;
   }
 
-  /** The marker at a place on the page that nothing hides, but for that of a dragged pair, if any. */
-  markerAt(place, dragged) {
-    const near = this.markers.shown
-      .filter((marker) => dragged === undefined || marker.pair !== dragged)
-      .map((marker) => ({ marker, at: this.toPage(marker.xyz) }))
-      .map(({ marker, at }) => ({ marker, gap: Math.hypot(at.x - place.x, at.y - place.y) }))
-      .filter(({ gap }) => gap < MARKER_REACH)
-      .sort((a, b) => a.gap - b.gap);
-    const found = near.find(({ marker }) => !this.isHidden(marker.xyz));
-    return found?.marker ?? null;
+  /** The nearest marker at a place on the page that nothing hides. */
+  markerAt(place) {
+    const gap = ({ xyz }) => {
+      const at = this.toPage(xyz);
+      return Math.hypot(at.x - place.x, at.y - place.y);
+    };
+    return this.markers.shown
+      .filter((marker) => !marker.fixed && gap(marker) < MARKER_REACH)
+      .sort((a, b) => gap(a) - gap(b))
+      .find(({ xyz }) => !this.isHidden(xyz));
   }
 
   isHidden(xyz) {
     if (!this.mesh) return false;
-    const { camera } = this.stage;
-    const point = new Vector3(...xyz);
-    const sight = point.clone().sub(camera.position);
+    const { position } = this.stage.camera;
+    const sight = new Vector3(...xyz).sub(position);
     const distance = sight.length();
-    this.raycaster.set(camera.position, sight.normalize());
+    this.raycaster.set(position, sight.normalize());
     const [hit] = this.raycaster.intersectObject(this.mesh);
     return hit !== undefined && hit.distance < distance - HIDDEN_BY;
   }
 
   hover(event) {
-    if (event.buttons || this.result) return;
+    if (event.buttons) return;
     const marker = this.markerAt({ x: event.clientX, y: event.clientY });
-    this.stage.canvas.title = marker?.name ?? "";
-    this.stage.canvas.style.cursor = marker ? "pointer" : "crosshair";
+    this.canvas.title = marker?.name ?? "";
+    this.canvas.style.cursor = marker ? "pointer" : "crosshair";
   }
 }

@@ -1,22 +1,22 @@
-// The photo: zoomed, panned, and drawn over with points and the alignment.
-import { failureOf } from "./api.js";
-import { drawBadge, kindOf, strokeTwice } from "./marker.js";
-import { drawPhotoLoupe, Loupe } from "./loupe.js";
-import { Marking } from "./marking.js";
-import { PhotoGestures } from "./photo_gestures.js";
+// The photo: zoomed, panned, clicked on, and drawn over with points and the alignment.
+import { fetched } from "./api.js";
+import { drawBadge, kindOf, strokeTwice } from "./drawing.js";
 
+const CLICK_REACH = 4; // a press that moves no farther is a click [px]
+const REACH = 16; // of a point to the pointer [px]
+const WHEEL = 0.0016;
 const MARGIN = 12;
 const MOST_ZOOM = 64;
-const REACH = 16;
 const PIXELS_FROM = 4; // from this zoom on, pixels are shown as squares
 const BADGE_OFFSET = 17;
-const FAINT = "rgb(255 150 225 / 30%)";
+const MASK = "#b04dff";
 const UNCERTAIN = "#ff96e1"; // estimated keypoints that are not marked, and their regions
 
 export class PhotoView {
   /**
    * @param {HTMLElement} host - the element to fill
-   * @param {object} handlers - onPlace(uv), onSelect(pair), onMove(pair, uv, done)
+   * @param {object} handlers - onPlace(uv), onSelect(pair), onMove(pair, uv), onBox(corners),
+   *   onTrouble(text)
    */
   constructor(host, handlers) {
     this.host = host;
@@ -29,64 +29,68 @@ export class PhotoView {
       "Photo. Enter places a point at the middle of the view; arrow keys nudge the selected point; plus and minus zoom.",
     );
     host.append(this.canvas);
-    this.loupe = new Loupe(host);
     this.context = this.canvas.getContext("2d");
     this.picture = null;
+    this.mask = null; // tinted
     this.size = { width: 1, height: 1 };
     this.scale = 1;
     this.offset = { x: 0, y: 0 };
     this.state = null;
     this.selected = null;
-    this.dragged = null;
-    this.onDrawn = null;
-    this.overlay = { mode: "edges", opacity: 1, hidden: false };
-    this.shaded = null;
-    this.marking = new Marking(this, (action) => this.handlers.onMark(action));
-    this.gestures = new PhotoGestures(this);
+    this.dragged = null; // the pair that is moved, and where to
+    this.isBoxing = false; // a drag draws a box, in place of panning
+    this.box = null; // two corners
+    this.listen();
     new ResizeObserver(() => this.resize()).observe(host);
-    this.resize();
-  }
-
-  /** Choose how the alignment is drawn: mode off, box, edges or shaded; opacity; hidden. */
-  setOverlay(changed) {
-    Object.assign(this.overlay, changed);
-    this.invalidate();
   }
 
   /** Show another photo. */
   async open(number, { width, height }) {
+    Object.assign(this, { size: { width, height }, picture: null, mask: null, maskKey: null, state: null });
     this.number = number;
-    this.size = { width, height };
-    this.marking.cancel();
-    this.picture = null;
-    this.state = null;
     this.fit();
-    const picture = new Image();
-    picture.src = `photo/${number}`;
-    this.wanted = picture;
-    try {
-      await picture.decode();
-    } catch {
-      const { wanted } = this;
-      const reason = await failureOf(picture.src);
-      if (this.wanted === wanted) this.handlers.onTrouble(reason ?? "The browser cannot show this photo.");
-      return;
-    }
-    if (this.wanted !== picture) return;
+    const picture = await this.load(`photo/${number}`);
+    if (this.number !== number) return;
     this.picture = picture;
     this.invalidate();
+  }
+
+  async load(address) {
+    try {
+      return await createImageBitmap(await (await fetched(address)).blob());
+    } catch (error) {
+      this.handlers.onTrouble(error.message);
+      return null;
+    }
   }
 
   show(state, selected) {
     this.state = state;
     this.selected = selected;
+    if (!this.press) this.dragged = null;
+    this.showMask(state.evidence.mask);
+    this.invalidate();
+  }
+
+  async showMask(key) {
+    if (key === this.maskKey) return;
+    this.maskKey = key;
+    this.mask = null;
+    const image = key && (await this.load(`mask/${this.number}?${key}`));
+    if (!image || key !== this.maskKey) return;
+    this.mask = new OffscreenCanvas(image.width, image.height);
+    const context = this.mask.getContext("2d");
+    context.drawImage(image, 0, 0);
+    context.globalCompositeOperation = "source-in";
+    context.fillStyle = MASK;
+    context.fillRect(0, 0, image.width, image.height);
     this.invalidate();
   }
 
   /** Zoom and pan so that the whole photo is seen. */
   fit() {
     const { width, height } = this.size;
-    const { clientWidth, clientHeight } = this.canvas;
+    const { clientWidth, clientHeight } = this.host;
     this.scale = Math.min((clientWidth - 2 * MARGIN) / width, (clientHeight - 2 * MARGIN) / height);
     this.scale = Math.max(this.scale, 1e-3);
     this.least = this.scale / 2;
@@ -102,11 +106,11 @@ export class PhotoView {
   zoom(factor, center = this.middle) {
     const scale = Math.min(Math.max(this.scale * factor, this.least ?? 0), MOST_ZOOM);
     const ratio = scale / this.scale;
+    this.scale = scale;
     this.offset = {
       x: center.x + (this.offset.x - center.x) * ratio,
       y: center.y + (this.offset.y - center.y) * ratio,
     };
-    this.scale = scale;
     this.fitted = false;
     this.invalidate();
   }
@@ -118,7 +122,7 @@ export class PhotoView {
   }
 
   get middle() {
-    return { x: this.canvas.clientWidth / 2, y: this.canvas.clientHeight / 2 };
+    return { x: this.host.clientWidth / 2, y: this.host.clientHeight / 2 };
   }
 
   /** Place in the view of a pixel; integers are pixel centres. */
@@ -131,19 +135,30 @@ export class PhotoView {
     return [(x - this.offset.x) / this.scale, (y - this.offset.y) / this.scale];
   }
 
-  /** Whether a pixel lies in the photo. */
-  contains([u, v]) {
-    const { width, height } = this.size;
-    return u >= -0.5 && v >= -0.5 && u <= width - 0.5 && v <= height - 0.5;
-  }
-
   /** The nearest pixel that lies in the photo. */
   clamp([u, v]) {
     const { width, height } = this.size;
-    return [
-      Math.min(Math.max(u, -0.5), width - 0.5),
-      Math.min(Math.max(v, -0.5), height - 0.5),
-    ];
+    return [Math.min(Math.max(u, -0.5), width - 0.5), Math.min(Math.max(v, -0.5), height - 0.5)];
+  }
+
+  /** Place a point at a place of the view, if that is in the photo. */
+  place(at = this.middle) {
+    const uv = this.toPixel(at);
+    const [u, v] = this.clamp(uv);
+    if (u === uv[0] && v === uv[1]) this.handlers.onPlace(uv);
+  }
+
+  /** Move a pair's point on the screen; the next state shows it where it is then. */
+  drag(pair, uv) {
+    this.dragged = { pair, uv: this.clamp(uv) };
+    this.invalidate();
+  }
+
+  /** Let the next drag draw a box, or no more. */
+  boxing(on) {
+    this.isBoxing = on;
+    this.box = null;
+    this.invalidate();
   }
 
   /** The pair whose point is at a place of the view, if any. */
@@ -154,6 +169,69 @@ export class PhotoView {
     };
     const points = this.state?.pairs.filter((pair) => pair.uv && gap(pair) < REACH) ?? [];
     return points.sort((a, b) => gap(a) - gap(b))[0] ?? null;
+  }
+
+  listen() {
+    const { canvas } = this;
+    const placed = (act) => (event) => {
+      const { left, top } = canvas.getBoundingClientRect();
+      act.call(this, event, { x: event.clientX - left, y: event.clientY - top });
+    };
+    canvas.addEventListener("pointerdown", placed(this.down));
+    canvas.addEventListener("pointermove", placed(this.move));
+    canvas.addEventListener("pointerup", placed(this.up));
+    canvas.addEventListener("pointercancel", () => this.cancel());
+    canvas.addEventListener("wheel", placed(this.wheel), { passive: false });
+  }
+
+  down(event, place) {
+    if (event.button !== 0 || !event.isPrimary) return;
+    this.canvas.setPointerCapture(event.pointerId);
+    const pair = this.isBoxing ? null : this.pairAt(place);
+    // The point does not jump to the pointer: it keeps its distance.
+    const own = pair && this.toView(pair.uv);
+    const grip = own && { x: own.x - place.x, y: own.y - place.y };
+    this.press = { start: place, last: place, pair, grip, moved: false };
+  }
+
+  move(event, place) {
+    const { press } = this;
+    if (!press) {
+      this.canvas.style.cursor = !this.isBoxing && this.pairAt(place) ? "grab" : "crosshair";
+      return;
+    }
+    const { start, last, pair, grip } = press;
+    press.moved ||= Math.hypot(place.x - start.x, place.y - start.y) > CLICK_REACH;
+    if (!press.moved) return;
+    if (this.isBoxing) this.box = [start, place].map((corner) => this.clamp(this.toPixel(corner)));
+    else if (pair) this.drag(pair.pair, this.toPixel({ x: place.x + grip.x, y: place.y + grip.y }));
+    else this.pan(place.x - last.x, place.y - last.y);
+    press.last = place;
+    this.invalidate();
+  }
+
+  up() {
+    const { press, box } = this;
+    this.press = null;
+    if (!press) return;
+    const { start, pair, moved } = press;
+    if (moved && this.isBoxing) this.handlers.onBox(box);
+    else if (moved && pair) this.handlers.onMove(pair.pair, this.dragged.uv);
+    else if (!moved && pair) this.handlers.onSelect(pair.pair);
+    else if (!moved && !this.isBoxing) this.place(start);
+  }
+
+  cancel() {
+    this.press = this.dragged = this.box = null;
+    this.invalidate();
+  }
+
+  wheel(event, place) {
+    event.preventDefault();
+    // Lines or pages instead of pixels; a pinch on a touchpad comes as a wheel with the control key.
+    const unit = [1, 16, 400][event.deltaMode];
+    const speed = event.ctrlKey ? 5 * WHEEL : WHEEL;
+    this.zoom(Math.exp(-event.deltaY * unit * speed), place);
   }
 
   resize() {
@@ -174,127 +252,84 @@ export class PhotoView {
   }
 
   draw() {
-    const { context, canvas } = this;
+    const { context, canvas, state } = this;
     const ratio = window.devicePixelRatio || 1;
     context.setTransform(1, 0, 0, 1, 0, 0);
     context.clearRect(0, 0, canvas.width, canvas.height);
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    if (this.picture) {
-      const corner = this.toView([-0.5, -0.5]);
-      context.imageSmoothingEnabled = this.scale < PIXELS_FROM;
-      context.imageSmoothingQuality = "high";
-      const { width, height } = this.size;
-      context.drawImage(this.picture, corner.x, corner.y, width * this.scale, height * this.scale);
+    context.lineCap = context.lineJoin = "round";
+    context.imageSmoothingEnabled = this.scale < PIXELS_FROM;
+    context.imageSmoothingQuality = "high";
+    this.drawPicture(this.picture, 1);
+    if (!state) return;
+    if (!this.hidden) {
+      this.drawPicture(this.mask, 0.4);
+      this.drawAlignment(state.alignment);
     }
-    if (this.state) {
-      const { mode, opacity, hidden } = this.overlay;
-      if (!hidden) this.marking.draw(this.context, this.state.evidence);
-      if (mode !== "off" && !hidden) {
-        this.context.globalAlpha = opacity;
-        this.drawAlignment(this.state.alignment, mode);
-        this.context.globalAlpha = 1;
+    if (this.box) {
+      const [[u1, v1], [u2, v2]] = this.box;
+      this.stroke([[u1, v1, u2, v1, u2, v2, u1, v2, u1, v1]], MASK, 2);
+    }
+    if (state.suggestion) {
+      const { x, y } = this.toView(state.suggestion.uv);
+      drawBadge(context, "suggested", "", x, y);
+    }
+    for (const pair of state.pairs) if (pair.uv) this.drawPair(pair);
+  }
+
+  drawPicture(picture, opacity) {
+    if (!picture) return;
+    const { x, y } = this.toView([-0.5, -0.5]);
+    const { width, height } = this.size;
+    this.context.globalAlpha = opacity;
+    this.context.drawImage(picture, x, y, width * this.scale, height * this.scale);
+    this.context.globalAlpha = 1;
+  }
+
+  drawAlignment({ status, lines, box, regions, unmarked }) {
+    if (status !== "done") return;
+    this.stroke(lines, "#35d0ff", 1.2);
+    this.stroke(box, "#ff5a63", 2);
+    this.stroke(regions, UNCERTAIN, 1.2);
+    for (const uv of unmarked) {
+      const { x, y } = this.toView(uv);
+      this.context.beginPath();
+      this.context.arc(x, y, 3.5, 0, 2 * Math.PI);
+      strokeTwice(this.context, UNCERTAIN, 1.8);
+    }
+  }
+
+  /** Stroke paths, each given as u1, v1, u2, v2, ... in pixels. */
+  stroke(paths, style, width) {
+    const { context } = this;
+    context.beginPath();
+    for (const path of paths) {
+      for (let k = 0; k < path.length; k += 2) {
+        const { x, y } = this.toView([path[k], path[k + 1]]);
+        if (k) context.lineTo(x, y);
+        else context.moveTo(x, y);
       }
-      const { suggestion } = this.state;
-      if (suggestion) this.drawDashed("suggested", "", suggestion.uv);
-      this.drawPairs(this.state.pairs);
     }
-    const loupe = this.loupe.place();
-    if (loupe && this.picture) drawPhotoLoupe(this, loupe);
-    this.onDrawn?.();
+    strokeTwice(context, style, width);
   }
 
-  drawAlignment(alignment, mode) {
-    if (alignment.status !== "done") return;
-    const isShaded = mode === "shaded" && alignment.camera_from_page !== null && this.shaded;
-    if (isShaded) {
-      const { clientWidth: width, clientHeight: height } = this.canvas;
-      const seen = this.shaded.draw(alignment, { scale: this.scale, offset: this.offset, width, height });
-      this.context.drawImage(seen, 0, 0, width, height);
-    }
-    this.context.strokeStyle = FAINT;
-    this.context.lineWidth = 0.8;
-    for (const region of alignment.faint_regions) {
-      this.outline(region);
-      this.context.stroke();
-    }
-    if (mode === "edges" || (mode === "shaded" && !isShaded)) this.strokeLines(alignment.lines, "#35d0ff", 1.2);
-    this.strokeLines(alignment.box, "#ff5a63", 2);
-    for (const region of alignment.regions) {
-      this.outline(region);
-      strokeTwice(this.context, UNCERTAIN, 1.2, 1.4, 35);
-    }
-    for (const { uv, state } of alignment.keypoints) {
-      if (state === "unmarked") this.drawRing(this.toView(uv));
-    }
-  }
-
-  /** Outline a closed curve given as x1, y1, x2, y2, ... in pixels. */
-  outline(values) {
+  drawPair(pair) {
     const { context } = this;
-    context.beginPath();
-    for (let k = 0; k < values.length; k += 2) {
-      const { x, y } = this.toView([values[k], values[k + 1]]);
-      context.lineTo(x, y);
+    const isMoved = this.dragged?.pair === pair.pair;
+    const uv = isMoved ? this.dragged.uv : pair.uv;
+    const place = this.toView(uv);
+    if (pair.residual && !isMoved) {
+      this.drawArrow(place, this.toView([uv[0] + pair.residual[0], uv[1] + pair.residual[1]]));
     }
-    context.closePath();
-  }
-
-  /** Where an estimated keypoint is that is not marked. */
-  drawRing({ x, y }) {
-    const { context } = this;
-    context.beginPath();
-    context.arc(x, y, 3.5, 0, 2 * Math.PI);
-    strokeTwice(context, UNCERTAIN, 1.8, 1.8);
-  }
-
-  /** Stroke lines given as x1, y1, x2, y2, ... in pixels. */
-  strokeLines(values, style, width) {
-    const { context } = this;
-    context.beginPath();
-    for (let k = 0; k < values.length; k += 4) {
-      const from = this.toView([values[k], values[k + 1]]);
-      const to = this.toView([values[k + 2], values[k + 3]]);
-      context.moveTo(from.x, from.y);
-      context.lineTo(to.x, to.y);
-    }
-    context.lineCap = "round";
-    strokeTwice(context, style, width, 1.6, 45);
-  }
-
-  /** A dashed badge at a pixel where a point is expected. */
-  drawDashed(kind, label, uv) {
-    const { x, y } = this.toView(uv);
-    this.context.setLineDash([4, 3]);
-    drawBadge(this.context, kind, label, x, y);
-    this.context.setLineDash([]);
-  }
-
-  drawPairs(pairs) {
-    for (const pair of pairs) {
-      if (pair.expected) this.drawDashed("suggested", String(pair.pair), pair.expected);
-      if (!pair.uv) continue;
-      const uv = this.dragged?.pair === pair.pair ? this.dragged.uv : pair.uv;
-      const place = this.toView(uv);
-      if (pair.residual && !this.dragged) {
-        this.drawArrow(place, this.toView([uv[0] + pair.residual[0], uv[1] + pair.residual[1]]));
-      }
-      const kind = kindOf(pair, this.selected);
-      this.drawCross(place, kind);
-      drawBadge(this.context, kind, String(pair.pair), place.x + BADGE_OFFSET, place.y - BADGE_OFFSET);
-    }
-  }
-
-  /** A cross that leaves the pixel itself free. */
-  drawCross({ x, y }, kind) {
-    const { context } = this;
-    const [inner, outer] = [3, 9];
+    const kind = kindOf(pair, this.selected);
+    // A cross that leaves the pixel itself free.
     context.beginPath();
     for (const [dx, dy] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
-      context.moveTo(x + inner * dx, y + inner * dy);
-      context.lineTo(x + outer * dx, y + outer * dy);
+      context.moveTo(place.x + 3 * dx, place.y + 3 * dy);
+      context.lineTo(place.x + 9 * dx, place.y + 9 * dy);
     }
-    const color = { selected: "#ffd23f", wrong: "#ff8a80" }[kind] ?? "#ffffff";
-    strokeTwice(context, color, 1.8, 2.2, 75);
+    strokeTwice(context, { selected: "#ffd23f", wrong: "#ff8a80" }[kind] ?? "#ffffff", 1.8);
+    drawBadge(context, kind, String(pair.pair), place.x + BADGE_OFFSET, place.y - BADGE_OFFSET);
   }
 
   /** From where a point was placed to where the alignment puts it. */
@@ -311,6 +346,6 @@ export class PhotoView {
       context.moveTo(to.x, to.y);
       context.lineTo(to.x - head * Math.cos(angle + turn), to.y - head * Math.sin(angle + turn));
     }
-    strokeTwice(context, "#ffb02e", 2.2, 2.3, 70);
+    strokeTwice(context, "#ffb02e", 2.2);
   }
 }

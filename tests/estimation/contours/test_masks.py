@@ -11,7 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import pytest
-from benchmarks.masks import damaged_mask
+from benchmarks.evidence import damaged_mask
 
 from cadalign import Alignment, Camera, Model, Result, View, align
 from cadalign.datasets import KeypointNet

@@ -104,10 +104,10 @@ def seen(
 
 
 def spoiled(problem: Seen, seed: int) -> Seen:
-    """The problem with 30 % outliers."""
+    """The problem with up to 30 % outliers, as many as are rejected without a warning."""
     rng = np.random.default_rng([seed, 1])
     count = len(problem.points_2d)
-    wrong = rng.choice(count, round(0.3 * count), replace=False)
+    wrong = rng.choice(count, int(0.3 * count), replace=False)
     pixels = with_outliers(problem.points_2d, wrong, rng)
     return Seen(problem.points_3d, pixels, problem.camera)
 

@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
-import importlib
 import re
-from collections.abc import Callable
-from functools import cache
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pytest
 from support.problems import problem_of
 
-from cadalign import Alignment, Camera, Model, Result, ShapeModel, View, align, fit
-from cadalign.datasets import KeypointNet
+from cadalign import Alignment, Camera, Model, Result, View, align, fit
 from cadalign.estimation.uncertainty.doubts import another_pose
 from cadalign.estimation.warning import Warnings
 from cadalign.geometry.rotations import angle_between, rotation_from_vector
-from cadalign.shapes.examples import Example
 
 CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 POSE = Alignment(np.eye(3), [0.0, 0.0, 4.0], np.ones(3))
-MOST_RIGHT = 0.10
-Measured = Callable[..., list[dict[str, Any]]]
 
 
 def with_other(angle_deg: float, share: float, own_deg: float = 2.0) -> Warnings:
@@ -96,56 +86,6 @@ def test_fit_names_another_pose_that_its_deviations_do_not_reach() -> None:
             assert any(each.kind == "alternative" for each in result.warnings)
             named += 1
     assert named > 3
-
-
-@cache
-def learned(root: Path, category: str) -> ShapeModel:
-    """The shape of some models: that of all, with more components, takes ten times as long."""
-    models = list(KeypointNet(root).subset(split="train")[category])[::4][:80]
-    examples = [
-        Example(each.model_id, each.keypoints.ids.tolist(), each.keypoints.xyz) for each in models
-    ]
-    return ShapeModel.learn(examples, category=category, components=1)
-
-
-@pytest.fixture
-def measured(real_data: Path, monkeypatch: pytest.MonkeyPatch) -> Measured:
-    """Cases of the benchmark, by its options."""
-    monkeypatch.syspath_prepend(Path(__file__).parents[3] / "scripts")
-    section = importlib.import_module("benchmarks.section")
-    monkeypatch.setattr(section, "learned_shape", lambda data, name: learned(data.root, name))
-    warned = importlib.import_module("benchmarks.warned")
-    usual = {"objects": 40, "noise_px": 2.0, "categories": (), "wrong": True}
-
-    def rows(**options: Any) -> list[dict[str, Any]]:
-        cases = warned.warned_cases(KeypointNet(real_data / "keypointnet"), **usual | options)
-        return [row for row in cases if not row["refused"]]
-
-    return rows
-
-
-@pytest.mark.long
-def test_right_models_seldom_have_a_warning(measured: Measured) -> None:
-    rows = measured(wrong=False)
-    for kinds in (("own",), ("similar, drawn", "similar, other"), ("learned",)):
-        warned = [row["warned"] for row in rows if row["model"] in kinds]
-        assert len(warned) > 200
-        assert np.mean(warned) <= MOST_RIGHT, kinds
-
-
-@pytest.mark.long
-def test_contradictions_are_named(measured: Measured) -> None:
-    rows = measured(objects=6, categories=("airplane", "bottle", "chair", "mug"))
-
-    def named(data: str, model: str) -> float:
-        chosen = [row for row in rows if (row["data"], row["model"]) == (data, model)]
-        return float(np.mean([row["misfit"] for row in chosen]))
-
-    assert named("moved by 40 px", "own") >= 0.9
-    assert named("moved by 40 px", "learned") >= 0.5
-    assert named("left and right swapped", "own") >= 0.95
-    for model in ("own", "similar, drawn", "similar, other", "learned"):
-        assert named("another category", model) >= 0.8, model
 
 
 def test_similar_models_of_right_size_have_no_warning() -> None:

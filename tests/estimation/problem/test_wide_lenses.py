@@ -26,7 +26,7 @@ from cadalign import (
     fit,
     fit_batch,
 )
-from cadalign.annotate.photos import PhotoFile, intrinsics_of
+from cadalign.annotate.photos import PhotoFile, camera_of
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound
 from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
@@ -407,4 +407,4 @@ def test_the_annotator_takes_no_wide_lens(tmp_path) -> None:
     fix = "undistort the photo, or crop it to a pinhole's view"
     Image.new("RGB", (1000, 1000)).save(tmp_path / "photo.png")
     with pytest.raises(DataError, match=rf"photo.png.*: the annotator takes no fov lens; {fix}$"):
-        intrinsics_of(PhotoFile.open(tmp_path / "photo.png"), FOV)
+        camera_of(PhotoFile.open(tmp_path / "photo.png"), FOV)

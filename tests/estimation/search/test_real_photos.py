@@ -32,7 +32,7 @@ def car_shape(tracks: dict[str, Any]) -> ShapeModel:
         points,
         modes,
         np.full(5, MODE_DEVIATION),
-        names=names,
+        ids=names,
         residual_sigma=0.03,
         size_sigma=LENGTH_SIGMAS,
         reflection=Reflection("x", 0.0, tuple(zip(names[::2], names[1::2], strict=True))),

@@ -1,11 +1,12 @@
-// How a point is drawn, the same in the photo and on the model.
+// How points and lines are drawn, the same in the photo and on the model.
 
-export const KINDS = {
+const KINDS = {
   pair: { fill: "#1f5fbf", ring: "#ffffff", radius: 11 },
   selected: { fill: "#0b2e66", ring: "#ffd23f", radius: 13 },
   wrong: { fill: "#b3261e", ring: "#ffffff", radius: 11 },
   free: { fill: "#ffffff", ring: "#3a4048", radius: 5 },
   suggested: { fill: "transparent", ring: "#ffd23f", radius: 12 },
+  axis: { fill: "#3a4048", ring: "#a4abb5", radius: 9 },
 };
 
 /** What a pair looks like. */
@@ -14,9 +15,9 @@ export function kindOf(pair, selected) {
   return pair.off === null ? "pair" : "wrong";
 }
 
-/** Stroke the path, over a dark line that keeps it visible on any ground, wider by `extra`. */
-export function strokeTwice(context, style, width, extra, dark = 60) {
-  for (const [color, more] of [[`rgb(0 0 0 / ${dark}%)`, extra], [style, 0]]) {
+/** Stroke the path over a dark line, which keeps it visible on any ground. */
+export function strokeTwice(context, style, width) {
+  for (const [color, more] of [["rgb(0 0 0 / 55%)", 2], [style, 0]]) {
     context.strokeStyle = color;
     context.lineWidth = width + more;
     context.stroke();
@@ -28,12 +29,11 @@ export function drawBadge(context, kind, label, x, y) {
   const { fill, ring, radius } = KINDS[kind];
   context.beginPath();
   context.arc(x, y, radius, 0, 2 * Math.PI);
-  if (fill !== "transparent") {
-    context.fillStyle = fill;
-    context.fill();
-  }
-  strokeTwice(context, ring, 2, 2.5);
-  if (!label) return;
+  context.fillStyle = fill;
+  context.fill();
+  context.setLineDash(kind === "suggested" ? [4, 3] : []);
+  strokeTwice(context, ring, 2);
+  context.setLineDash([]);
   context.fillStyle = "#ffffff";
   context.font = "600 12px system-ui, sans-serif";
   context.textAlign = "center";

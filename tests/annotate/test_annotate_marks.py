@@ -8,13 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cadalign.annotate.document import AnnotationDocument, History, Pair
-from cadalign.annotate.models import KeypointRegistry
-from cadalign.annotate.photos import FocalChoice
+from cadalign.annotate.keypoints import KeypointRegistry
+from cadalign.annotate.marks import History, Marks, Pair
 from cadalign.datasets import ModelKeypoint
 from cadalign.errors import InputError
+from cadalign.geometry.camera import Camera
 
-EMPTY = AnnotationDocument()
+CAMERA = Camera.without_focal(640, 480)
+EMPTY = Marks(CAMERA)
 
 
 def test_either_half_may_come_first() -> None:
@@ -28,12 +29,12 @@ def test_either_half_may_come_first() -> None:
 
 
 def test_halves_fill_the_oldest_gap_unless_another_pair_is_preferred() -> None:
-    document = EMPTY
+    marks = EMPTY
     for u in range(3):
-        document, _ = document.place_uv((float(u), 0.0))
-    first, number = document.place_keypoint(7)
+        marks, _ = marks.place_uv((float(u), 0.0))
+    first, number = marks.place_keypoint(7)
     assert number == 1
-    preferred, number = document.place_keypoint(7, preferred=3)
+    preferred, number = marks.place_keypoint(7, preferred=3)
     assert number == 3
     assert preferred.pair(3).complete
     # A pair that has this half already cannot be filled: the oldest gap is.
@@ -42,23 +43,23 @@ def test_halves_fill_the_oldest_gap_unless_another_pair_is_preferred() -> None:
 
 
 def test_numbers_are_never_given_twice() -> None:
-    document, first = EMPTY.place_uv((0.0, 0.0))
-    document, second = document.delete(first).place_uv((0.0, 0.0))
+    marks, first = EMPTY.place_uv((0.0, 0.0))
+    marks, second = marks.delete(first).place_uv((0.0, 0.0))
     assert second != first
 
 
 def test_releasing_the_model_half_keeps_the_photo_half() -> None:
-    document, pair = EMPTY.place_uv((1.0, 2.0))
-    document, _ = document.place_keypoint(5)
-    assert document.release_keypoint(pair).pairs == (Pair(1, (1.0, 2.0)),)
+    marks, pair = EMPTY.place_uv((1.0, 2.0))
+    marks, _ = marks.place_keypoint(5)
+    assert marks.release_keypoint(pair).pairs == (Pair(1, (1.0, 2.0)),)
     lone, pair = EMPTY.place_keypoint(5)
     assert lone.release_keypoint(pair).pairs == ()
 
 
 def test_a_keypoint_has_one_place() -> None:
-    document, _ = EMPTY.place_keypoint(5)
+    marks, _ = EMPTY.place_keypoint(5)
     with pytest.raises(InputError) as error:
-        document.place_keypoint(5)
+        marks.place_keypoint(5)
     assert str(error.value) == (
         "keypoint: this keypoint is already used by pair 1; "
         "move or delete that pair: a keypoint occurs once in a photo"
@@ -75,51 +76,51 @@ def test_unknown_pair_is_refused() -> None:
 EDITS = st.lists(st.tuples(st.integers(0, 4), st.integers(0, 5)), max_size=25)
 
 
-def edited(document: AnnotationDocument, edit: int, which: int) -> AnnotationDocument:
+def edited(marks: Marks, edit: int, which: int) -> Marks:
     """One of all kinds of edits, on one of the pairs if there are any."""
-    numbers = [pair.number for pair in document.pairs]
+    numbers = [pair.number for pair in marks.pairs]
     if edit == 0 or not numbers:
-        return document.place_uv((float(which), 1.0))[0]
+        return marks.place_uv((float(which), 1.0))[0]
     if edit == 1:
-        free = min(set(range(30)) - document.keypoints)
-        return document.place_keypoint(free)[0]
+        free = min(set(range(30)) - marks.keypoints)
+        return marks.place_keypoint(free)[0]
     number = numbers[which % len(numbers)]
     if edit == 2:
-        return document.move(number, (float(which), 2.0))
+        return marks.move(number, (float(which), 2.0))
     if edit == 3:
-        return document.delete(number)
-    return replace(document, focal=FocalChoice(known=which % 2 == 0, pixels=100.0 + which))
+        return marks.delete(number)
+    return replace(marks, camera=CAMERA.with_focal(100.0 + which))
 
 
 @pytest.mark.long
 @given(EDITS)
-def test_undo_leads_back_through_every_document_and_redo_forth(
+def test_undo_leads_back_through_every_marks_and_redo_forth(
     edits: list[tuple[int, int]],
 ) -> None:
     history = History(EMPTY)
-    documents = [EMPTY]
+    markss = [EMPTY]
     for edit, which in edits:
-        history.record(edited(history.document, edit, which))
-        documents.append(history.document)
-    for expected in documents[-2::-1]:
+        history.record(edited(history.marks, edit, which))
+        markss.append(history.marks)
+    for expected in markss[-2::-1]:
         assert history.undo()
-        assert history.document is expected
+        assert history.marks is expected
     assert not history.before
     assert not history.undo()
-    for expected in documents[1:]:
+    for expected in markss[1:]:
         assert history.redo()
-        assert history.document is expected
+        assert history.marks is expected
     assert not history.redo()
 
 
 @given(EDITS)
 def test_no_keypoint_is_used_twice_whatever_is_done(edits: list[tuple[int, int]]) -> None:
-    document = EMPTY
+    marks = EMPTY
     for edit, which in edits:
-        document = edited(document, edit, which)
-        used = [pair.keypoint for pair in document.pairs if pair.keypoint is not None]
+        marks = edited(marks, edit, which)
+        used = [pair.keypoint for pair in marks.pairs if pair.keypoint is not None]
         assert len(used) == len(set(used))
-        numbers = [pair.number for pair in document.pairs]
+        numbers = [pair.number for pair in marks.pairs]
         assert len(numbers) == len(set(numbers))
 
 
@@ -131,24 +132,22 @@ def test_an_edit_after_an_undo_forgets_what_was_undone() -> None:
     assert not history.after
 
 
-def test_moves_of_one_gesture_are_undone_together() -> None:
-    placed, pair = EMPTY.place_uv((0.0, 0.0))
-    history = History(placed)
-    for gesture, u in ((1, 1.0), (1, 2.0), (2, 3.0), (2, 4.0)):
-        history.record(history.document.move(pair, (u, 0.0)), step=(pair, gesture))
-    history.undo()
-    assert history.document.pair(pair).uv == (2.0, 0.0)
-    history.undo()
-    assert history.document is placed
-    assert not history.before
-
-
 # --- the model's keypoints -------------------------------------------------------------------
 
 
+A_AND_B = ModelKeypoint("a", (0, 0, 0), 0), ModelKeypoint("b", (1, 0, 0), 1)
+
+
+def registry_of(*points: ModelKeypoint, tolerance: float = 0.0) -> KeypointRegistry:
+    """A registry of given points."""
+    registry = KeypointRegistry(tolerance=tolerance)
+    registry.merge(points)
+    return registry
+
+
 def test_points_without_id_or_name_get_free_ones() -> None:
-    registry = KeypointRegistry(
-        [ModelKeypoint("seat", (0, 0, 0)), ModelKeypoint("seat", (1, 0, 0), semantic_id=4)]
+    registry = registry_of(
+        ModelKeypoint("seat", (0, 0, 0)), ModelKeypoint("seat", (1, 0, 0), semantic_id=4)
     )
     added = registry.add(ModelKeypoint("", (2, 0, 0)))
     assert {number: point.name for number, point in registry} == {
@@ -161,18 +160,14 @@ def test_points_without_id_or_name_get_free_ones() -> None:
 
 
 def test_points_are_found_by_their_place() -> None:
-    registry = KeypointRegistry(
-        [ModelKeypoint("a", (0, 0, 0), 0), ModelKeypoint("b", (1, 0, 0), 1)]
-    )
-    assert registry.find((0.999, 0, 0), tolerance=0.01) == 1
-    assert registry.find((0.9, 0, 0), tolerance=0.01) is None
-    assert KeypointRegistry().find((0, 0, 0), tolerance=1) is None
+    registry = registry_of(*A_AND_B, tolerance=0.01)
+    assert registry.find((0.999, 0, 0)) == 1
+    assert registry.find((0.9, 0, 0)) is None
+    assert KeypointRegistry(tolerance=1).find((0, 0, 0)) is None
 
 
 def test_names_are_checked() -> None:
-    registry = KeypointRegistry(
-        [ModelKeypoint("a", (0, 0, 0), 0), ModelKeypoint("b", (1, 0, 0), 1)]
-    )
+    registry = registry_of(*A_AND_B)
     registry.rename(0, "  front   left ")
     assert registry[0].name == "front left"
     with pytest.raises(InputError, match=r"^name: another keypoint is called 'b'; choose"):
@@ -185,9 +180,7 @@ def test_names_are_checked() -> None:
 
 
 def test_points_of_an_earlier_session_are_taken_in() -> None:
-    registry = KeypointRegistry(
-        [ModelKeypoint("a", (0, 0, 0), 0), ModelKeypoint("b", (1, 0, 0), 1)], tolerance=1e-6
-    )
+    registry = registry_of(*A_AND_B, tolerance=1e-6)
     registry.merge(
         [
             ModelKeypoint("renamed", (1e-9, 0, 0), 0),

@@ -1,20 +1,19 @@
-"""Marks of an annotation, and the history of them for undo and redo.
+"""Marks of an object in a photo, and the history of them for undo and redo.
 
-Documents are immutable; every edit makes a new one, which the history keeps.
+Marks are immutable: every edit makes others, which the history keeps. They are read from the
+observation file and written to it.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
-from cadalign.annotate.evidence import MarkedEvidence
-from cadalign.annotate.photos import FocalChoice
+from cadalign.annotate.photos import MarkedMask
 from cadalign.errors import InputError
-from cadalign.io.focal import FocalPrior
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
 
-_LONGEST = 1000  # documents in memory
-_UNKNOWN = FocalChoice(known=False)
+_LONGEST = 1000  # marks in memory
 
 Pixel = tuple[float, float]
 
@@ -23,7 +22,7 @@ Pixel = tuple[float, float]
 class Pair:
     """One keypoint; either half may be placed first."""
 
-    number: int  # unique in a document
+    number: int  # unique among the marks
     uv: Pixel | None = None  # the photo half [px]
     keypoint: int | None = None  # the model half: a semantic id
     sigma: float | None = None  # of ``uv`` [px], if the observation file gives one
@@ -37,31 +36,19 @@ class Pair:
 
 
 @dataclass(frozen=True)
-class Priors:
-    """Priors on stretch and focal length until the pairs say otherwise; None for none."""
+class Marks:
+    """All marks of an object in a photo.
 
-    stretch: float | None = None  # standard deviation of the logarithm of each scale about 1
-    focal: FocalPrior | None = None  # on a focal length that is estimated
+    The focal length of a camera without one is estimated. ``photo`` says that the photo itself
+    counts, ``start`` is where the search begins while there are few pairs.
+    """
 
-    def fit_options(self, likely: FocalPrior) -> dict[str, Any]:
-        """Options with which `cadalign fit` has them, where it takes the likely focal length's."""
-        options: dict[str, Any] = {}
-        if self.stretch is not None:
-            options["stretch_sigma"] = self.stretch
-        if self.focal != likely:
-            options["focal_prior"] = None if self.focal is None else asdict(self.focal)
-        return options
-
-
-@dataclass(frozen=True)
-class AnnotationDocument:
-    """All marks of an object in a photo; ``next_number`` is the number of the next pair."""
-
+    camera: Camera
     pairs: tuple[Pair, ...] = ()
-    focal: FocalChoice = _UNKNOWN
-    priors: Priors = Priors()
     next_number: int = 1
-    evidence: MarkedEvidence = field(default_factory=MarkedEvidence)
+    mask: MarkedMask | None = None
+    photo: bool = False
+    start: Alignment | None = None
 
     @property
     def complete_pairs(self) -> tuple[Pair, ...]:
@@ -80,11 +67,11 @@ class AnnotationDocument:
                 return pair
         raise InputError(f"there is no pair {number}", where="pair", fix="reload the page")
 
-    def append(self, pair: Pair) -> AnnotationDocument:
+    def append(self, pair: Pair) -> Marks:
         """Append a pair, whose number is `next_number`."""
         return replace(self, pairs=(*self.pairs, pair), next_number=self.next_number + 1)
 
-    def place_uv(self, uv: Pixel, preferred: int | None = None) -> tuple[AnnotationDocument, int]:
+    def place_uv(self, uv: Pixel, preferred: int | None = None) -> tuple[Marks, int]:
         """Place the photo half of a pair that lacks it, by preference of the pair of that number.
 
         If none lacks it, a new pair is begun. The second value is the pair's number.
@@ -92,38 +79,36 @@ class AnnotationDocument:
         pair = self._lacking("uv", preferred)
         return self._with(replace(pair, uv=uv)), pair.number
 
-    def place_keypoint(
-        self, keypoint: int, preferred: int | None = None
-    ) -> tuple[AnnotationDocument, int]:
+    def place_keypoint(self, keypoint: int, preferred: int | None = None) -> tuple[Marks, int]:
         """Place the model half of a pair, as `place_uv`; it must not be placed already."""
         self._refuse_second(keypoint)
         pair = self._lacking("keypoint", preferred)
         return self._with(replace(pair, keypoint=keypoint)), pair.number
 
-    def move(self, number: int, uv: Pixel) -> AnnotationDocument:
+    def move(self, number: int, uv: Pixel) -> Marks:
         """Move the photo half of a pair."""
         return self._with(replace(self.pair(number), uv=uv))
 
-    def release_keypoint(self, number: int) -> AnnotationDocument:
+    def release_keypoint(self, number: int) -> Marks:
         """Remove the model half of a pair, so that another can be placed."""
         pair = self.pair(number)
         if pair.uv is None:
             return self.delete(number)
         return self._with(replace(pair, keypoint=None))
 
-    def exchange_keypoint(self, number: int, keypoint: int) -> AnnotationDocument:
+    def exchange_keypoint(self, number: int, keypoint: int) -> Marks:
         """Replace the model half of a pair, of which it keeps the photo half."""
-        self._refuse_second(keypoint, number)
+        self._refuse_second(keypoint)
         return self._with(replace(self.pair(number), keypoint=keypoint))
 
-    def delete(self, number: int) -> AnnotationDocument:
+    def delete(self, number: int) -> Marks:
         """Delete a pair."""
         gone = self.pair(number)
         return replace(self, pairs=tuple(pair for pair in self.pairs if pair is not gone))
 
-    def _refuse_second(self, keypoint: int, own: int | None = None) -> None:
+    def _refuse_second(self, keypoint: int) -> None:
         for pair in self.pairs:
-            if pair.keypoint == keypoint and pair.number != own:
+            if pair.keypoint == keypoint:
                 raise InputError(
                     f"this keypoint is already used by pair {pair.number}",
                     where="keypoint",
@@ -136,7 +121,7 @@ class AnnotationDocument:
         wanted = [pair for pair in lacking if pair.number == preferred]
         return (wanted + lacking + [Pair(self.next_number)])[0]
 
-    def _with(self, changed: Pair) -> AnnotationDocument:
+    def _with(self, changed: Pair) -> Marks:
         if changed.number == self.next_number:
             return self.append(changed)
         pairs = tuple(changed if pair.number == changed.number else pair for pair in self.pairs)
@@ -145,25 +130,18 @@ class AnnotationDocument:
 
 @dataclass(eq=False)
 class History:
-    """Documents of an object: the current one, earlier ones, and undone ones."""
+    """The current marks, earlier ones, and undone ones."""
 
-    document: AnnotationDocument
-    before: list[AnnotationDocument] = field(default_factory=list)  # for undo, the next one last
-    after: list[AnnotationDocument] = field(default_factory=list)  # for redo, the next one last
-    _step: object = None
+    marks: Marks
+    before: list[Marks] = field(default_factory=list)  # for undo, the next one last
+    after: list[Marks] = field(default_factory=list)  # for redo, the next one last
 
-    def record(self, document: AnnotationDocument, *, step: object = None) -> None:
-        """Go on to another document.
-
-        Consecutive changes with the same ``step`` are undone together, such as the positions of a
-        point while it is dragged.
-        """
-        if step is None or step != self._step or not self.before:
-            self.before.append(self.document)
-            del self.before[:-_LONGEST]
+    def record(self, marks: Marks) -> None:
+        """Go on to other marks."""
+        self.before.append(self.marks)
+        del self.before[:-_LONGEST]
         self.after.clear()
-        self.document = document
-        self._step = step
+        self.marks = marks
 
     def undo(self) -> bool:
         """Go back by one change; returns False if there is none."""
@@ -173,10 +151,9 @@ class History:
         """Redo the last undone change; returns False if there is none."""
         return self._go(self.after, self.before)
 
-    def _go(self, source: list[AnnotationDocument], target: list[AnnotationDocument]) -> bool:
-        self._step = None
+    def _go(self, source: list[Marks], target: list[Marks]) -> bool:
         if not source:
             return False
-        target.append(self.document)
-        self.document = source.pop()
+        target.append(self.marks)
+        self.marks = source.pop()
         return True

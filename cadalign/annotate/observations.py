@@ -1,0 +1,294 @@
+"""Reading an observation file into marks, and writing marks to it: the only state that lasts.
+
+The observation's field ``unfinished`` has what a fit cannot use: pairs with only one half placed,
+and those whose keypoint the category's shape lacks.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from itertools import chain, count
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from cadalign.annotate.files import LastContent, refuse_other_model, refuse_other_photo
+from cadalign.annotate.keypoints import KeypointRegistry, ObjectShape, positions_of
+from cadalign.annotate.marks import Marks, Pair
+from cadalign.annotate.model import OpenedModel
+from cadalign.annotate.photos import MarkedMask, PhotoFile, camera_of
+from cadalign.arrays import FloatArray
+from cadalign.datasets.models.model_keypoints import ModelKeypoint
+from cadalign.errors import DataError, InputError
+from cadalign.geometry.camera import Camera
+from cadalign.io.documents import (
+    Document,
+    Point2,
+    Point3,
+    Text,
+    convert,
+    in_file,
+    read_json,
+    within,
+)
+from cadalign.io.focal import FocalPrior
+from cadalign.io.images import write_image
+from cadalign.io.observation import Observation
+from cadalign.io.observation_file import SeenKeypoint
+
+logger = logging.getLogger("cadalign")
+
+LIKELY_STRETCH = 0.25
+"""Standard deviation of the logarithm of each scale about 1, where the file states no other."""
+LEAST_JOINT_PAIRS = 3
+"""Pairs of an alignment with evidence beside them; fewer need a start."""
+_OTHER_FILE = "give another --observation or --out"
+# Fields that are not of one image.
+_OF_THE_OBJECT = (
+    *("init", "model", "object", "shape", "size", "symmetry", "up_axis", "fit", "unfinished"),
+)
+_OWN_OPTIONS = {"stretch_sigma", "focal_prior", "image"}
+
+
+class _Half(SeenKeypoint, kw_only=True):
+    """Pair with only the photo half or the model half, or both of which are of no use to a fit."""
+
+    uv: Point2 | None = None
+    xyz: Point3 | None = None
+    name: Text | None = None
+
+    def __post_init__(self) -> None:
+        if self.uv is None and self.semantic_id is None:
+            raise InputError("uv and semantic_id are both missing", fix="give one of them")
+
+
+class _Unfinished(Document):
+    pairs: list[_Half] = msgspec.field(default_factory=list)
+
+
+@dataclass(eq=False)
+class ObservationFile:
+    """The observation file of a photo, which need not exist yet."""
+
+    path: Path
+    photo: PhotoFile
+    model: OpenedModel
+    shape: ObjectShape
+    stored: Observation = field(init=False)
+    """Content of the file when it was opened, of which marks take the place."""
+    _content: LastContent = field(default_factory=LastContent, repr=False)
+    _drawn: tuple[MarkedMask, Path] | None = None  # the mask that was written last, and its file
+
+    def read(self, given: Camera | None, *, up_axis: Any = None) -> Marks:
+        """Read an earlier session's marks, and add new model points to the registry.
+
+        ``given`` is the camera where the file has none. Raises a CadalignError.
+        """
+        self._content.note(self.path)
+        if not self.path.exists():
+            camera = camera_of(self.photo, given)
+            nothing = np.empty((0, 3)), np.empty((0, 2))
+            self.stored = Observation(*nothing, camera, up_axis=up_axis or "y")
+            return Marks(camera)
+        stored = self._load()
+        if stored.others:
+            what = f"has {len(stored.views)} views, the annotator opens files of one photo"
+            raise DataError(what, where=str(self.path), fix=_OTHER_FILE)
+        refuse_other_model(stored.model, self.model.path, where=self.path)
+        refuse_other_photo(stored.image, self.photo.path, where=self.path)
+        self._warn_of_options(stored)
+        with in_file(self.path), within("unfinished"):
+            unfinished = convert(stored.unfinished or {}, _Unfinished)
+        self.stored = stored if up_axis is None else replace(stored, up_axis=up_axis)
+        mask = stored.evidence.mask
+        marks = Marks(
+            camera_of(self.photo, stored.camera),
+            mask=None if mask is None else MarkedMask(mask, stored.evidence.mask_sigma),
+            photo=bool(stored.fit_options.get("image")),
+            start=stored.init,
+        )
+        marks = _with_pairs(marks, stored, self.model.registry)
+        return _with_halves(marks, unfinished.pairs, self.model.registry)
+
+    def write(self, observation: Observation) -> None:
+        """Write the observation as a whole; raises DataError on failure.
+
+        Killed at any moment, the file has everything of before or of now. A file that was changed
+        by others is refused.
+        """
+        self._content.refuse_changed(self.path)
+        observation.save(self.path)
+        self._content.note(self.path)
+
+    @property
+    def focal_prior(self) -> FocalPrior | None:
+        """Prior on an estimated focal length, as `cadalign fit` has it."""
+        stored = self.stored.fit_options.get("focal_prior", self.photo.likely_focal)
+        return FocalPrior(**stored) if isinstance(stored, Mapping) else stored
+
+    @property
+    def stretch_sigma(self) -> float | None:
+        """Prior on the stretch; None for a shape, which has its own."""
+        if self.shape.is_estimated:
+            return None
+        return self.stored.fit_options.get("stretch_sigma") or LIKELY_STRETCH
+
+    def counting(self, marks: Marks) -> tuple[Pair, ...]:
+        """Complete pairs that a fit uses: those whose keypoints the shape knows.
+
+        Few count beside a mask only where a start is known: the mask alone aligns until then.
+        """
+        pairs = marks.complete_pairs
+        known = self.shape.known(self.model.points_of(pairs))
+        counting = tuple(pair for pair, counts in zip(pairs, known, strict=True) if counts)
+        by_mask = marks.mask is not None and marks.start is None and not self.shape.is_estimated
+        return () if by_mask and len(counting) < LEAST_JOINT_PAIRS else counting
+
+    def observation_of(
+        self, marks: Marks, *, sigma: Mapping[str, Any] | None = None
+    ) -> Observation:
+        """The observation of marks, of which the file keeps all else.
+
+        ``sigma`` is the option for the noise that the pairs show.
+        """
+        pairs = self.counting(marks)
+        points = self.model.points_of(pairs)
+        options = {**(sigma or {})}
+        if self.stretch_sigma is not None:
+            options["stretch_sigma"] = self.stretch_sigma
+        if self.shape.sigma is not None:
+            options["shape_sigma"] = self.shape.sigma
+        if marks.photo:
+            options["image"] = True
+        prior = self.focal_prior
+        if prior != self.photo.likely_focal:
+            options["focal_prior"] = None if prior is None else asdict(prior)
+        depths = np.array([np.nan if pair.depth is None else pair.depth for pair in pairs])
+        has_depths = bool(np.isfinite(depths).any())
+        mask_sigma = None if marks.mask is None else marks.mask.sigma
+        evidence = replace(self.stored.evidence, mask=self._mask_file(marks), mask_sigma=mask_sigma)
+        if not has_depths and evidence.depth is None:  # all keypoints with depths may be gone
+            evidence = replace(evidence, depth_sigma=None)
+        halves = [self._half(pair) for pair in marks.pairs if pair not in pairs]
+        return replace(
+            self.stored,
+            points_3d=positions_of(points),
+            points_2d=np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2),
+            camera=marks.camera,
+            sigma=_filled(pair.sigma for pair in pairs),
+            ids=np.array([point.semantic_id for point in points], dtype=np.int64),
+            names=tuple(point.name for point in points),
+            scores=_filled(pair.score for pair in pairs),
+            image=self.photo.path,
+            depths=depths if has_depths else None,
+            evidence=evidence,
+            model=self.model.path,
+            fit_options=options,
+            shape=self.shape.path,
+            init=marks.start if len(pairs) < LEAST_JOINT_PAIRS else None,
+            unfinished={"pairs": halves} if halves else None,
+        )
+
+    def _half(self, pair: Pair) -> dict[str, Any]:
+        """A pair as the field of unfinished ones holds it."""
+        fields = {name: getattr(pair, name) for name in ("uv", "sigma", "score", "depth")}
+        if pair.keypoint is not None:
+            point = self.model.registry[pair.keypoint]
+            fields |= {"semantic_id": pair.keypoint, "xyz": point.xyz, "name": point.name}
+        return {name: value for name, value in fields.items() if value is not None}
+
+    def _mask_file(self, marks: Marks) -> Path | None:
+        """The file of the mask, if there is one; a drawn one is written if it is not yet."""
+        if marks.mask is None or marks.mask.file is not None:
+            return None if marks.mask is None else marks.mask.file
+        mask, path = self._drawn or (None, None)
+        if mask != marks.mask or path is None:
+            numbers = chain([""], (f"-{number}" for number in count(2)))
+            if path is None:
+                paths = (self.path.with_name(f"{self.path.stem}.mask{n}.png") for n in numbers)
+                path = next(each for each in paths if not each.exists())
+            inside = marks.mask.pixels(self.photo.width, self.photo.height)
+            write_image(path, np.where(inside, 255, 0).astype(np.uint8))
+            self._drawn = marks.mask, path
+        return path
+
+    def _load(self) -> Observation:
+        data = read_json(self.path)
+        if isinstance(data, dict) and data.get("keypoints") == [] and "camera" in data:
+            # All pairs were deleted: what is left is kept, and unfinished pairs are the model's.
+            of_the_object = {name: data.pop(name) for name in _OF_THE_OBJECT if name in data}
+            with in_file(self.path):
+                data = {"views": [data], **of_the_object}
+                return Observation.from_dict(data, folder=self.path.parent)
+        return Observation.load(self.path)
+
+    def _warn_of_options(self, stored: Observation) -> None:
+        """Warn of stored options of the fit that the page does not use."""
+        options = dict(stored.fit_options)
+        if options.get("shape_sigma") == self.shape.sigma:
+            options.pop("shape_sigma", None)
+        if "stretch_sigma" in options or options.get("sigma") is None:
+            options.pop("sigma", None)  # found by the annotator, or not stated
+        others = [name for name in options if name not in _OWN_OPTIONS]
+        if stored.shape is not None and self.shape.path is None:
+            others.append(f"shape {stored.shape}")
+        if others:
+            logger.warning(
+                "%s: the annotator fits without the stored %s, and replaces the stored options "
+                "at the first change; keep a copy of the file if they matter",
+                *(self.path, ", ".join(others)),
+            )
+
+
+def _filled(values: Iterable[float | None]) -> FloatArray | None:
+    """The values (n,), 1 where one is missing; None if all are missing."""
+    listed = list(values)
+    if all(value is None for value in listed):
+        return None
+    return np.array([1.0 if value is None else value for value in listed])
+
+
+def _with_halves(marks: Marks, halves: Sequence[_Half], registry: KeypointRegistry) -> Marks:
+    """The marks with unfinished pairs, of which some are of no use any more."""
+    for half in halves:
+        keypoint = half.semantic_id
+        if half.xyz is not None:
+            point = ModelKeypoint(half.name or "", half.xyz, keypoint)
+            keypoint = _registered(point, registry, marks.keypoints)
+        elif keypoint not in registry or keypoint in marks.keypoints:
+            keypoint = None
+        if half.uv is not None or keypoint is not None:
+            pair = Pair(marks.next_number, half.uv, keypoint, half.sigma, half.score, half.depth)
+            marks = marks.append(pair)
+    return marks
+
+
+def _with_pairs(marks: Marks, observation: Observation, registry: KeypointRegistry) -> Marks:
+    ids, names = observation.ids, observation.names
+    columns = (observation.sigma, observation.scores, observation.depths)
+    for row, (x, y, z) in enumerate(observation.points_3d.tolist()):
+        number = None if ids is None else int(ids[row])
+        point = ModelKeypoint("" if names is None else names[row], (x, y, z), number)
+        keypoint = _registered(point, registry, marks.keypoints)
+        known = [None if each is None else float(each[row]) for each in columns]
+        known = [None if each is None or math.isnan(each) else each for each in known]
+        u, v = observation.points_2d[row].tolist()
+        marks = marks.append(Pair(marks.next_number, (u, v), keypoint, *known))
+    return marks
+
+
+def _registered(point: ModelKeypoint, registry: KeypointRegistry, taken: frozenset[int]) -> int:
+    """Find a point of an observation file in the registry, or add it; returns its id."""
+    wanted = point.semantic_id
+    if wanted is not None and wanted not in taken and registry.has(point):
+        return wanted
+    found = registry.find(point.xyz)
+    if found is not None and found not in taken:
+        return found
+    is_free = wanted is not None and wanted not in registry
+    return registry.add(point if is_free else replace(point, semantic_id=None))

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from cadalign.datasets.models.keypoints import Circle, Keypoints, RotationalSymmetry, Symmetries
     from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
     from cadalign.datasets.models.shapenet import SYNSETS, ShapeNet, ShapeNetModel
-    from cadalign.datasets.photos.dataset import PhotoDataset, PhotoSummary
+    from cadalign.datasets.photos.dataset import PhotoDataset
     from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
     from cadalign.datasets.photos.photo import CadModel, Photo, PhotoKeypoints, PhotoObject, Truth
     from cadalign.datasets.photos.pix3d import Pix3D
@@ -55,7 +55,6 @@ __all__ = [
     "PhotoDataset",
     "PhotoKeypoints",
     "PhotoObject",
-    "PhotoSummary",
     "Pix3D",
     "RotationalSymmetry",
     "Scan2CAD",

@@ -31,7 +31,7 @@ def open_photos(path: str | os.PathLike[str]) -> PhotoDataset:
     Returns
     -------
     PhotoDataset
-        Its `PhotoDataset.kind` names the format, `PhotoDataset.summary` counts what is in it.
+        Its `PhotoDataset.kind` names the format.
 
     Raises
     ------

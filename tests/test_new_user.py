@@ -113,7 +113,7 @@ def test_ipython_completes_names(user: Environment, use_jedi: bool) -> None:
 
 @pytest.mark.long
 def test_snippets_of_readme_and_site_run(user: Environment) -> None:
-    user.run("cadalign", ["sample"])
+    user.run("cadalign", ["demo", "--files", "."])
     assert len(PAGES) > 5
     ran = user.run("python", ["-c", RUN_SNIPPETS, *map(str, PAGES)])
     assert [line for line in ran.splitlines() if line.startswith("ran ")] == [

@@ -30,7 +30,7 @@ def test_snippets_run_in_an_empty_folder_and_find_the_stretch(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (commands,) = [block for block in blocks("sh") if "cadalign sample" in block]
+    (commands,) = [block for block in blocks("sh") if "cadalign demo" in block]
     for line in commands.splitlines():
         assert main(shlex.split(line, comments=True)[1:]) == 0, line
     (tmp_path / "chair.glb").unlink()  # the Python snippet's is another
@@ -55,7 +55,7 @@ def test_snippets_run_in_an_empty_folder_and_find_the_stretch(
 @pytest.mark.slow
 def test_named_commands_exist(capsys: pytest.CaptureFixture[str]) -> None:
     commands = set(re.findall(r"^cadalign ([a-z]+)", "\n".join(blocks("sh")), flags=re.MULTILINE))
-    assert {"sample", "observe", "fit", "export"} <= commands
+    assert {"demo", "observe", "fit", "export"} <= commands
     for command in commands:
         with pytest.raises(SystemExit) as stop:
             main([command, "--help"])

@@ -15,31 +15,23 @@ import numpy as np
 
 from cadalign.batch.observation_fit import ObservationFit
 from cadalign.batch.outputs import COLUMNS, RECORD_COLUMNS, naming_row, result_row
-from cadalign.batch.sources import ObservationTask, read_sources
+from cadalign.batch.sources import ObservationTask, ObservationTasks
 from cadalign.datasets.detections.image_keypoints import (
     ImageKeypoints,
-    join_keypoints,
+    observed_in,
     photo_in,
 )
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.estimation.result import Result
-from cadalign.estimation.warning import EstimateWarning
 from cadalign.evaluation.options import ExperimentOptions, absolute_paths
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.work import (
-    Columns,
-    Plan,
-    Row,
-    fingerprint,
-    fingerprint_of_files,
-)
+from cadalign.evaluation.runs.work import Columns, Plan, Row, fingerprint
 from cadalign.export.tables import failed_row
-from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file, parse_json
 from cadalign.io.evidence import ObservedImage
 from cadalign.io.files import read_bytes, read_text
-from cadalign.io.images import exif_note, photo_size, require_one_size
+from cadalign.io.images import photo_size, require_one_size
 from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
 from cadalign.shapes.model import ShapeModel
 
@@ -51,12 +43,11 @@ _ENCODER = msgspec.json.Encoder(enc_hook=np.generic.item)
 
 
 class Estimated(NamedTuple):
-    """Result of an observation, what it is the alignment of, and cells that the tables add."""
+    """Result of an observation, what it is the alignment of, and further cells of the tables."""
 
     observation: Observation
     result: Result
     cells: Row
-    record: Row
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,12 +119,7 @@ class FitRunOptions(ManyOptions):
 
     def estimate_of(self, seen: Observation, where: str) -> Estimated:
         result, _ = self.estimate.fit(seen, where)
-        texts = [(number, _photo_doubt(view)) for number, view in enumerate(seen.views)]
-        doubts = [EstimateWarning("camera", text, number) for number, text in texts if text]
-        if doubts:
-            posterior = result.posterior.stating(warnings=(*doubts, *result.warnings))
-            result = replace(result, posterior=posterior)
-        return Estimated(seen, result, {}, {})
+        return Estimated(seen, result, {})
 
     def contents(self) -> dict[str, Any]:
         shape = self.estimate.shape
@@ -145,18 +131,17 @@ def _photo_doubt(view: ObservedImage) -> str:
     """Warning about a photo, if it is there, of another size than its camera's images."""
     if view.image is None or not view.image.is_file():
         return ""
+    camera = view.camera
     try:
-        width, height = photo_size(view.image)
+        size = photo_size(view.image)
     except DataError:  # which whoever draws it will name
         return ""
-    if (width, height) == (view.camera.width, view.camera.height):
-        return ""
-    note = exif_note(view.image, (view.camera.width, view.camera.height))
-    return (
-        f"{view.image.name} is {width} x {height} px, the camera {view.camera.width} x "
-        f"{view.camera.height}{note}: give camera and keypoints of its resolution "
-        "(`Camera.resized`, `Camera.cropped`)"
-    )
+    try:
+        named = {"its camera": (camera.width, camera.height), view.image.name: size}
+        require_one_size(named, view.image)
+    except DataError as error:
+        return f"{error} (`Camera.resized`, `Camera.cropped`)"
+    return ""
 
 
 def _paths(value: Any) -> Iterator[Path]:
@@ -207,14 +192,16 @@ class ManyEstimates:
             return _failed(task, str(error), seen)
         seen, result = found.observation, found.result
         row = naming_row(task.row, task.name, seen) | result_row(result) | found.cells
-        troubles = [("picture", text) for text in self._draw(task, row, seen, result)]
-        lost = [view.text_of_not_found for view in seen.views]
-        troubles += [("left-out", text) for text in lost if text]
-        row["warning_count"] += len(troubles)
+        troubles = {
+            "picture": self._draw(task, row, seen, result),
+            "camera": [_photo_doubt(view) for view in seen.views],
+            "left-out": [view.text_of_not_found for view in seen.views],
+        }
+        told = [(kind, text) for kind, texts in troubles.items() for text in texts if text]
+        row["warning_count"] += len(told)
         for column, name in enumerate(("warning_kinds", "warnings")):
-            more = [trouble[column] for trouble in troubles]
-            row[name] = "; ".join(filter(None, (row[name], *more)))
-        return row | _record(seen, found) | {"seconds": time.perf_counter() - start}
+            row[name] = "; ".join(filter(None, (row[name], *(each[column] for each in told))))
+        return row | _record(seen, result) | {"seconds": time.perf_counter() - start}
 
     def _draw(
         self, task: ObservationTask, row: Row, seen: Observation, result: Result | None
@@ -238,32 +225,20 @@ class ManyEstimates:
         return seen if shape is None else replace(seen, shape=shape.absolute())
 
     def _detected(self, found: ImageKeypoints, folder: Path) -> Observation:
-        detector, changes = self.options.detector, self.options.changes
+        detector = self.options.detector
         assert self.model is not None
         photo = None
         if found.image is not None:
             photo = _photo_in(detector.images or folder, found.image)
-        sizes = {} if photo is None else {str(photo): photo_size(photo)}
-        if found.size is not None:
-            sizes[found.source] = found.size
-        if sizes:
-            require_one_size(sizes, photo)
-        size = next(iter(sizes.values()), None)
         with in_file(found.source):
-            camera = changes.read_camera(size)
-            if camera is None and size is None:
-                fix = "give --camera, or the folder of the photos (--images)"
-                raise InputError("neither camera nor photo is known", where="camera", fix=fix)
-        joined = join_keypoints(
-            replace(found, size=size),
-            self.model,
-            camera or Camera.without_focal(*size),  # type: ignore[misc]
-            image=photo,
-            min_score=detector.min_score,
-            ignore_unknown=detector.ignore_unknown,
-        )
-        with in_file(found.source):
-            return replace(changes, camera=None).applied_to(joined)
+            return observed_in(
+                found,
+                self.model,
+                self.options.changes,
+                image=photo,
+                min_score=detector.min_score,
+                ignore_unknown=detector.ignore_unknown,
+            )
 
 
 def plan_run(options: ManyOptions, folder: RunFolder) -> Plan[ObservationTask]:
@@ -273,19 +248,13 @@ def plan_run(options: ManyOptions, folder: RunFolder) -> Plan[ObservationTask]:
     is missing.
     """
     options.changes.read_camera((1, 1))  # whatever the size: else every row would say its error
-    tasks = read_sources(options.inputs)
+    tasks = ObservationTasks(options.inputs)
     photos = options.detector.images
     if photos is not None and not photos.is_dir():
         what = f"{photos} is not a folder of photos"
         raise InputError(what, where="images", fix="give the photos' folder, or leave it out")
     model = _model_keypoints(options) if tasks.has_detections else None
-    config = {
-        **options.as_config(),
-        "contents": tasks.fingerprint(),
-        **options.contents(),
-    }
-    if files := tasks.named_files():
-        config["files"] = fingerprint_of_files(files)
+    config = options.as_config() | {"contents": tasks.fingerprint()} | options.contents()
     drawn_in = folder.made_for_pictures() if options.pictures else None
     chunk = max(1, min(LARGEST_CHUNK, len(tasks) // _LEAST_CHUNKS))
     estimates = ManyEstimates(absolute_paths(options), model, drawn_in)
@@ -293,7 +262,7 @@ def plan_run(options: ManyOptions, folder: RunFolder) -> Plan[ObservationTask]:
 
 
 def _model_keypoints(options: ManyOptions) -> ModelKeypoints:
-    """The keypoints that a detector's are paired with: those of --model, or else the options'."""
+    """The keypoints that a detector's are paired with: the model's, or else the options'."""
     if options.detector.model is not None:
         return ModelKeypoints.load(options.detector.model)
     if (found := options.keypoints) is None:
@@ -329,13 +298,13 @@ def _failed(task: ObservationTask, reason: str, seen: Observation | None) -> Row
     return naming_row(task.row, task.name, seen) | failed_row(reason) | _record(seen, None)
 
 
-def _record(seen: Observation | None, found: Estimated | None) -> Row:
+def _record(seen: Observation | None, result: Result | None) -> Row:
     """Observation and result as JSON, but for its time, on which no two runs agree."""
     record: Row = {"observation": "", "result": ""}
     if seen is not None:
         record["observation"] = _ENCODER.encode(seen.to_dict(states_origins=True)).decode()
-    if found is not None:
-        data = found.result.to_dict()
+    if result is not None:
+        data = result.to_dict()
         data["stats"]["seconds"] = 0.0
-        record |= {"result": _ENCODER.encode(data).decode(), **found.record}
+        record["result"] = _ENCODER.encode(data).decode()
     return record

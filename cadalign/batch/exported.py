@@ -1,4 +1,4 @@
-"""The aligned object of a fit's file and the observation that it was fitted to."""
+"""The aligned objects of a fit's file or of a run, with the observations that were fitted."""
 
 from __future__ import annotations
 
@@ -9,13 +9,17 @@ from typing import Any
 
 from cadalign.arrays import FloatArray
 from cadalign.batch.observed import own_ids
-from cadalign.errors import DataError, InputError
+from cadalign.errors import CadalignError, DataError, InputError, all_left_out, unknown
 from cadalign.estimation.result import Result
+from cadalign.estimation.results import Results
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.tables import read_groups
 from cadalign.export.aligned_object import AlignedObject
+from cadalign.export.formats import FORMATS, export_object
 from cadalign.export.results import object_of
-from cadalign.io.documents import in_file, read_json
+from cadalign.io.documents import in_file, parse_json, read_json
+from cadalign.io.files import keeping
 from cadalign.io.kinds import FIT
-from cadalign.io.meshes.files import mesh_at
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.model_overlay import mesh_of
 from cadalign.shapes.model import ShapeModel
@@ -60,7 +64,6 @@ def exported_object(
     for view, image in zip(result.views, seen.views, strict=True):
         _require_same(len(view.residuals), len(image.points_2d), path, "keypoints")
     if result.method != "align":
-        mesh = None if seen.model is None else mesh_at(seen.model)
         own = _labels(seen)  # a fit of pairs knows rows, of which a photo may lack some
         views = tuple(replace(view, ids=own) for view in result.views)
         result = replace(result, ids=own, views=views)
@@ -70,10 +73,53 @@ def exported_object(
         if model is None and any(tuple(view.ids) != own for view, own in pairs):
             what, fix = "its keypoints are not the fit's", "give the observation that was fitted"
             raise DataError(what, where=str(path), fix=fix)
-        mesh = mesh_of(seen, replace(result, model=model))
+        result = replace(result, model=model)
+    mesh = mesh_of(seen, result)
     name = "model" if seen.model is None else seen.model.stem
     images = [view.image for view in seen.views]
     return object_of(result, mesh=mesh, images=images, name=name, **how)
+
+
+def export_run(
+    run: Path, to: Path, *, format: str | None = None, metres: float = 1.0
+) -> tuple[int, list[CadalignError]]:
+    """Write a file of every alignment of a finished run to a folder, named by their rows.
+
+    ``format`` is one of `cadalign.export.formats.FORMATS`, by default the folder's name; ``metres``
+    the length of one unit of the model [m]. Returns the number of objects, and why others are left
+    out.
+
+    Raises InputError if the format is not known, or no object of the run can be written; and
+    DataError if the run cannot be read.
+    """
+    name = format or to.name
+    if name not in FORMATS:
+        raise unknown("format", name, FORMATS)
+    Results.open(run)  # which refuses what is no finished run
+    config = RunFolder(run).read_config() or {}
+    inputs = [Path(str(each)) for each in config.get("inputs", ())]
+    left_out: list[CadalignError] = []
+    count = 0
+    for table in read_groups(RunFolder(run).records, fix="do the run again"):
+        for record in table.to_pylist():
+            if not record["result"]:
+                continue
+            where = f"{run}, row {record['row']}"
+            seen = Observation.from_dict(parse_json(record["observation"], where))
+            result = Result.from_dict(parse_json(record["result"], where))
+            try:
+                with keeping([*inputs, *seen.files]):
+                    exported = exported_object(result, seen, Path(where), metres=metres)
+                    export_object(to / f"{record['row']:06d}.{name}", exported, format=name)
+                count += 1
+            except CadalignError as error:
+                place = error.where or where
+                left_out.append(type(error)(error.what, where=place, fix=error.fix))
+    if left_out and not count:
+        raise all_left_out(left_out)
+    if not count:
+        raise InputError("no observation of the run is aligned", where=str(run))
+    return count, left_out
 
 
 def _labels(seen: Observation) -> tuple[Hashable, ...]:
@@ -100,7 +146,7 @@ def _observation_of(fit: Path, data: Mapping[str, Any]) -> Path:
         return beside
     raise InputError(
         f"{fit} does not tell which observation it is the fit of",
-        where="--observation",
+        where="observation",
         fix="give the observation file that was fitted",
     )
 

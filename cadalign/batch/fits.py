@@ -74,7 +74,7 @@ def fit_many(
         a camera for all. A number as ``focal`` is the focal length [px] of all images. What an
         observation stores holds where an option is at its default or None: unlike those of
         `cadalign.fit`, ``sigma=None`` and ``focal_prior=None`` mean the observation's, or the
-        default; ``similar=True`` estimates sigma, ``focal_prior="none"`` takes no prior.
+        default; ``sigma="none"`` estimates it, ``focal_prior="none"`` takes no prior.
 
     Returns
     -------
@@ -124,18 +124,16 @@ def run_many(
     dask: str | None,
     on_progress: OnProgress = lambda progress: None,
 ) -> None:
-    """Do the run that the options describe, or what is left of it; see `fit_many`."""
+    """Do the run that the options describe, or what is left of it; see `fit_many`.
+
+    By default processes do it, but few observations.
+    """
     plan = plan_run(options, folder)
-    pool = pool_of(len(plan.tasks), workers, dask, threads=options.threads)
+    if workers is None:
+        workers = 0 if len(plan.tasks) < _FEW else -1
+    pool = workers_of(workers, dask, threads=options.threads)
     execute(plan, folder, workers=pool, on_progress=on_progress)
     write_csv(folder)
-
-
-def pool_of(count: int, workers: int | None, dask: str | None, *, threads: int = 1) -> Workers:
-    """The workers of a run of so many tasks; by default processes, for few tasks none."""
-    if workers is None:
-        workers = 0 if count < _FEW else -1
-    return workers_of(workers, dask, threads=threads)
 
 
 def options_of(given: dict[str, Any]) -> FitRunOptions:
@@ -144,9 +142,6 @@ def options_of(given: dict[str, Any]) -> FitRunOptions:
     names = [(field.name, kind) for kind in kinds for field in fields(kind)]
     owners = {name: kind for name, kind in reversed(names) if name != "fitting"}
     parts: dict[Any, dict[str, Any]] = {kind: {} for kind in kinds}
-    prior = given.get("focal_prior")
-    if isinstance(prior, FocalPrior):
-        given = {"focal_prior_sigma": prior.relative_sigma} | given | {"focal_prior": prior.focal}
     for name, value in given.items():
         if name not in owners:
             listed = ", ".join(dict.fromkeys(each for each, _ in names if each != "fitting"))
@@ -170,7 +165,7 @@ def _as_declared(value: Any, kind: type, name: str) -> Any:
 
     Raises InputError if it is of another one.
     """
-    if kind is FitOptions:  # which checks its values itself
+    if kind is FitOptions or isinstance(value, FocalPrior):  # which check their values themselves
         return value
     if name == "size":  # whose lengths are arrays, too
         require_kind(value, Size, name)

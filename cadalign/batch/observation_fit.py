@@ -6,8 +6,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from cadalign.estimation.view import View
     from cadalign.shapes.model import ShapeModel
 
-_NOT_OF_FIT = ("shape_sigma", "image")  # stored options of the model and of the views
+_NOT_OF_FIT = ("shape_sigma", "image", "focal_prior")  # stored options that are read apart
 _OF_THE_MODEL = ("stretch", "stretch_sigma")  # options that a learned shape lacks
 Note = Callable[[str], object]
 """What is told about an estimate, such as the source of its focal length."""
@@ -36,110 +36,78 @@ Note = Callable[[str], object]
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationFit:
-    """Settings of an observation's alignment: model, noise, focal length and robust search."""
+    """Settings of an observation's alignment, in the place of those that its file stores."""
 
-    sigma: float | None = None
-    """Standard deviation of the keypoints [px]; by default the file's, or 1."""
+    sigma: float | Literal["none"] | None = None
+    """Standard deviation of the keypoints [px], or none: estimated from the residuals."""
     similar: bool = False
-    """Estimate sigma from the residuals: for a model that is only similar to the object. Its
-    proportions are similar, too: --stretch-sigma is 0.2, unless the file or a flag says
-    otherwise."""
+    """The model is only similar to the object: sigma is estimated unless it is given, and
+    ``stretch_sigma`` is 0.2, unless the file or an option says otherwise."""
     robust: bool = False
     """Search for outliers among the keypoints (RANSAC) and fit to the inliers."""
     shape: Path | None = None
-    """File of `cadalign shape learn`: estimate the object's own shape, of that category, in place
-    of a stretch. Keypoints need the shape's semantic ids or names, and no xyz; of options stored in
-    the file, sigma, loss and focal length count."""
+    """File of `cadalign shape learn`: estimate the object's own shape, of that category. Of options
+    that the file stores, sigma, loss and focal length count."""
     shape_sigma: float | None = None
     """Estimate the object's own shape from the model's: standard deviation of the keypoints'
     positions on the object about those on the stretched model [model units]."""
-    image: bool = False
-    """Take the photo itself as evidence: the model's outline is sought in it, from the estimate by
-    everything else. The model needs a mesh."""
+    use_photo: bool = False
+    """Take the photo itself as evidence; the model needs a mesh."""
     focal: Literal["known", "estimate"] | None = None
-    """Focal length: known (the file's) or estimate; by default known, if every view has one. Views
-    of equal cameras share an estimated one."""
-    focal_prior: Literal["usual", "none"] | float | None = None
-    """Mean [px] of the prior on an estimated focal length, or: usual (usual lenses) or none; by
-    default the file's, or that of the photo's EXIF data, or else usual."""
-    focal_prior_sigma: float = FocalPrior.relative_sigma
-    """Relative standard deviation of --focal-prior."""
-    up_axis: Literal["x", "y", "z"] | None = None
-    """The model's axis that points up, for evidence of gravity and heights; y, unless the file says
-    otherwise."""
+    """Focal length: known (the file's) or estimate; by default known, if every view has one."""
+    focal_prior: FocalPrior | Literal["usual", "none"] | None = None
+    """Prior on an estimated focal length; by default the file's, or that of the photo's EXIF data,
+    or else that of usual lenses."""
     fitting: FitOptions = field(default_factory=FitOptions)
     """Method and model; of sigma and focal length, the options above hold."""
     ransac: RansacOptions = field(default_factory=RansacOptions)
     """The search for outliers, where it is asked for."""
 
-    @staticmethod
-    def named(name: str) -> str:
-        """Name of an option in messages."""
-        return name
-
-    def stored_in(self, observation: Observation) -> Mapping[str, Any]:
-        """Options of the file that hold unless a flag says otherwise."""
-        stored = dict(observation.fit_options)
-        if self.shape is not None or self.shape_sigma is not None:
-            stored.pop("shape_sigma", None)
-        return stored
-
     def shape_of(self, observation: Observation) -> Path | None:
-        """File of the learned shape to fit: the flag's, or else the file's."""
+        """File of the learned shape to fit: the given one, or else the file's."""
         takes_own = self.shape is None and self.shape_sigma is None
         return observation.shape if takes_own else self.shape
 
     def shape_sigma_of(self, observation: Observation) -> float | None:
-        """Deviation of a similar model's shape: the flag's, or else the file's."""
-        given = self.shape_sigma
-        return self.stored_in(observation).get("shape_sigma") if given is None else given
+        """Deviation of a similar model's shape: the given one, or else the file's."""
+        if self.shape is not None or self.shape_sigma is not None:
+            return self.shape_sigma
+        return observation.fit_options.get("shape_sigma")
 
     def uses_photos(self, observation: Observation) -> bool:
-        """True if the photos themselves are evidence: by the flag, or else by the file."""
-        return self.image or bool(self.stored_in(observation).get("image"))
+        """True if the photos themselves are evidence."""
+        return self.use_photo or bool(observation.fit_options.get("image"))
 
     def stated_sigma(self, observation: Observation) -> dict[str, Sigma | None]:
         """Standard deviation in the place of the keypoints' own, empty if there is none.
 
         None is to be estimated.
         """
-        if self.similar and self.sigma is not None:
-            similar, sigma = self.named("similar"), self.named("sigma")
-            what = f"{similar} estimates the standard deviation, which {sigma} gives"
-            raise InputError(what, where=sigma, fix="give one of the two options")
-        if self.similar or self.sigma is not None:
-            return {"sigma": self.sigma}
-        stored = self.stored_in(observation)
+        if self.sigma is not None or self.similar:
+            return {"sigma": None if isinstance(self.sigma, str) else self.sigma}
+        stored = observation.fit_options
         return {"sigma": stored["sigma"]} if "sigma" in stored else {}
 
     def options_for(self, observation: Observation, where: str, note: Note) -> FitOptions:
         """Options of the fit: those that are given, otherwise those of the file."""
-        given = self.stored_in(observation)
-        other = (*_NOT_OF_FIT, "focal_prior")
+        given = observation.fit_options
         with in_file(where), within("fit"):
-            stored = FitOptions(**{name: given[name] for name in given if name not in other})
+            stored = FitOptions(**{name: given[name] for name in given if name not in _NOT_OF_FIT})
         are_known = all(view.camera.focal_known for view in observation.views)
-        word = self.focal if isinstance(self.focal, str) else None  # a number is the camera's
-        focal = word or given.get("focal", "known" if are_known else "estimate")
+        focal = self.focal or given.get("focal", "known" if are_known else "estimate")
         if focal == "known" and not are_known:
-            raise InputError(
-                "the focal length is unknown",
-                where=f"{where}: camera",
-                fix=f"give {self.named('focal')} estimate, or a calibrated camera",
-            )
+            fix = "give `focal` estimate, or a calibrated camera"
+            raise InputError("the focal length is unknown", where=f"{where}: camera", fix=fix)
         if focal == "known" and self.focal_prior is not None:
-            raise InputError(
-                "given for a known focal length",
-                where=self.named("focal_prior"),
-                fix=f"give {self.named('focal')} estimate with it",
-            )
-        prior = self._prior_for(observation, given, note) if focal == "estimate" else None
+            what, fix = "given for a known focal length", "give `focal` estimate with it"
+            raise InputError(what, where="focal_prior", fix=fix)
+        prior = self._prior_for(observation, note) if focal == "estimate" else None
         shown = prior_of_camera(prior, observation.camera)
         if shown is not None:
             note(f"Focal length is estimated, its prior: {shown}")
         own = 1.0 if observation.sigma is None else observation.sigma
         sigma = self.stated_sigma(observation).get("sigma", own)
-        changes = {**self._set_by_flags, "sigma": sigma, "focal": focal, "focal_prior": prior}
+        changes = {**self._set, "sigma": sigma, "focal": focal, "focal_prior": prior}
         options = replace(stored, **changes)
         is_chosen = "stretch_sigma" in given or options.stretch_sigma is not None
         has_prior = options.method == "optimal" and bool(options.stretched_axes)
@@ -148,20 +116,16 @@ class ObservationFit:
         return options
 
     @property
-    def _set_by_flags(self) -> dict[str, Any]:
+    def _set(self) -> dict[str, Any]:
         """Options of the fit that are not at their defaults."""
         values = {each.name: getattr(self.fitting, each.name) for each in fields(self.fitting)}
         return {name: each for name, each in values.items() if each != getattr(FitOptions, name)}
 
-    def _prior_for(
-        self, observation: Observation, stored: Mapping[str, Any], note: Note
-    ) -> PriorOption:
-        """The prior on an estimated focal length: the flag's, the file's, or the photos'."""
-        given = self.focal_prior
-        if given is not None and not isinstance(given, str):
-            return FocalPrior(given, self.focal_prior_sigma)
-        if given is not None:
-            return USUAL if given == "usual" else None
+    def _prior_for(self, observation: Observation, note: Note) -> PriorOption:
+        """The prior on an estimated focal length: the given one, the file's, or the photos'."""
+        stored = observation.fit_options
+        if self.focal_prior is not None:
+            return None if self.focal_prior == "none" else self.focal_prior
         if "focal_prior" in stored:
             prior = stored["focal_prior"]
             return FocalPrior(**prior) if isinstance(prior, dict) else prior
@@ -170,12 +134,11 @@ class ObservationFit:
     def check_for(self, observation: Observation) -> None:
         """Refuse options that have no effect together with a shape or further evidence."""
         if self.shape is not None and self.shape_sigma is not None:
-            what = f"{self.named('shape')} has learned how far objects of the category differ"
-            where, fix = self.named("shape_sigma"), "give one of the two options"
-            raise InputError(what, where=where, fix=fix)
+            what = "`shape` has learned how far objects of the category differ"
+            raise InputError(what, where="shape_sigma", fix="give one of the two options")
         is_learned = self.shape_of(observation) is not None
         is_similar = self.shape_sigma_of(observation) is not None
-        given, refused = {*self._set_by_flags}, {"method"}
+        given, refused = {*self._set}, {"method"}
         cause = "evidence beyond the keypoints of one image"
         if is_learned or is_similar:
             cause = "a learned shape" if is_learned else "a similar shape"
@@ -183,7 +146,7 @@ class ObservationFit:
             given |= {"similar"} if self.similar else set()
         for name in sorted(given & refused):
             what, fix = f"has no effect together with {cause}", "leave out one of the two"
-            raise InputError(what, where=self.named(name), fix=fix)
+            raise InputError(what, where=name, fix=fix)
 
     def read(
         self, data: Any, where: str, *, folder: Path | None, changes: ObservationChanges
@@ -205,14 +168,12 @@ class ObservationFit:
         where: str,
         *,
         note: Note = lambda text: None,
-        status: AbstractContextManager[Any] | None = None,
     ) -> tuple[Result, tuple[View, ...] | None]:
         """Align an observation, ``where`` is its name in messages.
 
-        ``note`` is called with the source of a focal length, ``status`` entered while
-        `cadalign.align` works. Returns the views that were aligned, too; None for a stretched
-        model's keypoints in one image. Raises CadalignError if options or observation are invalid,
-        or there is no alignment.
+        ``note`` is called with the source of a focal length. Returns the views that were aligned,
+        too; None for a stretched model's keypoints in one image. Raises CadalignError if options or
+        observation are invalid, or there is no alignment.
         """
         notes = [text for view in observation.views if (text := view.text_of_not_found)]
         options = self.options_for(observation, where, notes.append)
@@ -237,18 +198,14 @@ class ObservationFit:
                 result = fit_one(problem, options, *search, labels=seen.labels)
         else:
             self.check_for(observation)
-            result, views = _aligned(self, observation, where, options, status)
+            result, views = _aligned(self, observation, where, options)
         for text in notes:
             note(text)
         return result, views
 
 
 def _aligned(
-    how: ObservationFit,
-    observation: Observation,
-    where: str,
-    options: FitOptions,
-    status: AbstractContextManager[Any] | None,
+    how: ObservationFit, observation: Observation, where: str, options: FitOptions
 ) -> tuple[Result, tuple[View, ...]]:
     """Align all evidence of an observation; returns its views, too."""
     from cadalign.batch.observed import views_of
@@ -259,15 +216,15 @@ def _aligned(
     if has_photos and all(image.image is None for image in observation.views):
         raise InputError(
             "the observation names no photo",
-            where=how.named("image"),
-            fix="write its path as `image` into the file, or leave the option away",
+            where="use_photo",
+            fix="write its path as image into the file, or leave the option away",
         )
     with in_file(where):
         sigma = stated.get("sigma")
         views = views_of(observation, model, sigma=sigma, with_photos=has_photos)
     if stated and sigma is None:
         views = tuple(replace(view, sigma=None) for view in views)
-    with status or nullcontext(), _located(how, where):
+    with _located(how, where):
         result = align(
             model,
             views,
@@ -300,8 +257,7 @@ def _model(
     mesh = None if observation.model is None else mesh_at(observation.model)
     sigma = how.shape_sigma_of(observation)
     with _located(how, where):
-        found = model_of(observation, options=options, shape_sigma=sigma, mesh=mesh)
-        return found if how.up_axis is None else replace(found, up_axis=how.up_axis)
+        return model_of(observation, options=options, shape_sigma=sigma, mesh=mesh)
 
 
 @once_per_file(4)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 from contextlib import nullcontext
-from typing import Any, Protocol
+from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
 from cadalign.errors import CadalignError, InputError, quote
@@ -133,15 +132,8 @@ def own_ids(images: Sequence[ObservedImage]) -> tuple[tuple[Hashable, ...], ...]
     )
 
 
-class Reconstruction(Protocol):
-    """Photos by their names, such as `cadalign.datasets.Colmap`."""
-
-    def __getitem__(self, name: str, /) -> Any:
-        """One photo: its ``camera`` and its ``cam_from_world``, an `Alignment`."""
-
-
 def views_from(
-    images: Reconstruction,
+    images: Any,
     keypoints: Mapping[str, tuple[npt.ArrayLike, Sequence[Hashable] | None]],
     **options: Any,
 ) -> list[View]:
@@ -180,16 +172,9 @@ def views_from(
     >>> cadalign.align(chair, views).rig_from_model  # doctest: +SKIP
     """
     views = []
-    for name, pair in keypoints.items():
-        given: Any = pair
+    for name, (points_2d, ids) in keypoints.items():
         image = images[name]
-        pose = np.eye(4)
-        pose[:3, :3] = image.cam_from_world.rotation
-        pose[:3, 3] = image.cam_from_world.translation
-        if not isinstance(given, tuple) or len(given) != 2:
-            what = f"expected (points_2d, ids), got {quote(given)}"
-            raise InputError(what, where=f"keypoints[{quote(name)}]")
-        points_2d, ids = given
+        pose = image.cam_from_world.cam_from_model
         try:
             views.append(View(image.camera, points_2d, ids=ids, cam_from_rig=pose, **options))
         except CadalignError as error:

@@ -28,10 +28,8 @@ from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
 from cadalign.evaluation.runs.work import Columns, Row
 from cadalign.export.tables import RESULT_COLUMNS, row_of
 from cadalign.geometry.alignment import Box
-from cadalign.geometry.mesh import Mesh
 from cadalign.io.files import write_whole
 from cadalign.io.images import read_image
-from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.model_overlay import mesh_of
 
@@ -148,7 +146,7 @@ def draw_fit(
     except CadalignError as error:
         troubles.append(f"the photo is not shown: {error}")
     try:
-        mesh = None if result is None else _mesh(seen, result)
+        mesh = None if result is None else mesh_of(seen, result)
     except CadalignError as error:
         troubles.append(f"the model is shown as a box: {error}")
     box = None if result is None else Box.from_model(result.bounds, result.alignment)
@@ -161,9 +159,3 @@ def draw_fit(
     except RenderError as error:
         troubles.append(f"not drawn: {error}")
     return tuple(troubles)
-
-
-def _mesh(seen: Observation, result: Result) -> Mesh | None:
-    if result.model is not None:
-        return mesh_of(seen, result)
-    return None if seen.model is None else load_mesh(seen.model)

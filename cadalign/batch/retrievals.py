@@ -77,9 +77,9 @@ class RetrieveRunOptions(ManyOptions):
             "top_categories": [match.category for match in matches],
             "top_ids": [match.model_id for match in matches],
             "top_scores": [match.score for match in matches],
+            "matches": dense_json([match.to_dict() for match in matches]),
         }
-        record = {"matches": dense_json([match.to_dict() for match in matches])}
-        return Estimated(best.observation(seen), best.result, cells, record)
+        return Estimated(best.observation(seen), best.result, cells)
 
     def contents(self) -> dict[str, Any]:
         self.estimate.opened()  # which refuses what cannot be read

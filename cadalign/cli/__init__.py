@@ -26,7 +26,6 @@ COMMANDS = {  # the class of each in its module, and the first sentence of its d
         "evaluate.Demo",
         "Align stretched models to pictures of the originals and show the result.",
     ),
-    "sample": ("sample.Sample", "Write the files of the README's example, to try commands with."),
     "fit": ("fit.Fit", "Align a model to what an observation file holds, and draw the result."),
     "observe": ("observe.Observe", "Pair the keypoints of a detector in a photo with a model's."),
     "annotate": (

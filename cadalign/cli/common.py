@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import re
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, make_dataclass
 from functools import reduce
-from itertools import chain, count
 from operator import or_
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -30,13 +28,6 @@ NOTHING_WORKED: Final = 1
 SOME_FAILED: Final = 3
 """All is done and written, but some rows say ``failed``."""
 _PIPE_WIDTH = 120
-
-
-class OptionError(CadalignError):
-    """A command line option has an invalid value.
-
-    Other than InputError it is no ValueError, which the parser would report without the name.
-    """
 
 
 class UsageError(CadalignError):
@@ -142,25 +133,6 @@ def print_table(table: ConsoleTable) -> None:
     console.print(shown)
     if table.note:
         console.print(table.note)
-
-
-def file_stem(name: str | None, fallback: str) -> str:
-    """A name as it can stand in the name of a file."""
-    return re.sub(r"[^\w.-]+", "_", name or "").strip(".") or fallback  # "..": the folder above
-
-
-def file_stems(names: Iterable[str | None], fallback: str) -> list[str]:
-    """Names as they can stand in the names of files, also where upper and lower case are the same.
-
-    A later one that would be the same as one before is numbered.
-    """
-    found: dict[str, str] = {}
-    for name in names:
-        stem = file_stem(name, fallback)
-        numbered = (f"{stem}_{number}" for number in count(2))
-        chosen = next(each for each in chain([stem], numbered) if each.casefold() not in found)
-        found[chosen.casefold()] = chosen
-    return list(found.values())
 
 
 def make_folder_of(file: Path) -> None:

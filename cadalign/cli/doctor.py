@@ -1,4 +1,4 @@
-"""`cadalign doctor`: check this machine, or a data set of photos."""
+"""`cadalign doctor`: check this machine, and compile ahead for it."""
 
 from __future__ import annotations
 
@@ -7,47 +7,34 @@ import platform
 import time
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
-from cadalign.cli.common import JsonOption, answer, new_console, print_json, waiting
+from cadalign.cli.common import JsonOption, answer, print_json, waiting
 from cadalign.errors import InputError
-
-if TYPE_CHECKING:
-    from cadalign.datasets import PhotoSummary
-    from cadalign.render.probe import Probe
-
-# Problems of a data set that are printed; JSON has all.
-_SHOWN = 10
 
 
 @dataclass(frozen=True)
 class Doctor(JsonOption):
     """Check the renderers, and show how to enable missing ones.
 
-    Also shows the processor cores and the cache of compiled solvers. With --data, lists what lies
-    in a folder of photos instead: its format, and how many photos and objects can be read. With
-    --compile, compiles the solvers ahead.
+    Also shows the processor cores and the cache of compiled solvers. With --compile, compiles the
+    solvers ahead.
     """
 
-    data: Path | None = None
-    """Folder of a data set of photos, in any known format (see cadalign.datasets.open)."""
     compile: bool = False
     """Compile all solvers now, as for a Docker image, in place of when they are first called."""
 
     def run(self) -> int:
-        """Run the checks; returns the exit code, 0 if ray casting works or photos can be read."""
-        if self.data is not None:
-            return self._check_data(self.data)
+        """Run the checks; returns the exit code, 0 if ray casting works."""
         if self.compile:
             return self._compile()
         with waiting("trying the renderers, each in a process of its own ..."):
             health = examine()
         if self.json:
-            print_json(asdict(health))
+            print_json(health)
         else:
             _print(health)
-        return 0 if health.renderers[-1].works else 1
+        return 0 if health["renderers"][-1]["works"] else 1
 
     def _compile(self) -> int:
         from cadalign.cli.compile_ahead import compile_ahead
@@ -63,93 +50,39 @@ class Doctor(JsonOption):
             answer(f"Compiled in {found['seconds']} s: {found['cache']}")
         return 0
 
-    def _check_data(self, folder: Path) -> int:
-        from cadalign.datasets import open_photos
 
-        with waiting("reading the annotations ...") as show:
-            dataset = open_photos(folder)
-            summary = dataset.summary(progress=lambda count: show(f"{count} photos read ..."))
-        if self.json:
-            print_json({**asdict(summary), "root": str(summary.root)})
-        else:
-            _print_data(summary)
-        return 0 if summary.photos else 1
-
-
-def _print(health: Health) -> None:
-    from rich.table import Table
-
-    table = Table("renderer", "works", "drawn by / what is wrong", title="Renderers")
-    for renderer in health.renderers:
-        table.add_row(
-            renderer.name,
-            "yes" if renderer.works else "no",
-            renderer.detail,
-        )
-    new_console(stderr=False).print(table)
-    answer(f"--renderer auto takes: {health.best}")
-    for name, command in health.remedies.items():
+def _print(health: dict[str, Any]) -> None:
+    for each in health["renderers"]:
+        answer(f"{each['name']:9} {'works' if each['works'] else 'fails'}: {each['detail']}")
+    answer(f"--renderer auto takes: {health['best']}")
+    for name, command in health["remedies"].items():
         answer(f"To enable {name}: {command}")
-    answer(f"Python {health.python}, NumPy {health.numpy}, Numba {health.numba}")
-    answer(f"Cores: {health.cores}, of which this process may use {health.usable_cores}")
-    answer(f"Compiled solvers: {health.cache}")
+    answer(f"Python {health['python']}, NumPy {health['numpy']}, Numba {health['numba']}")
+    answer(f"Cores: {health['cores']}, of which this process may use {health['usable_cores']}")
+    answer(f"Compiled solvers: {health['cache']}")
 
 
-def _print_data(summary: PhotoSummary) -> None:
-    from rich.table import Column, Table
+def examine() -> dict[str, Any]:
+    """Try every renderer in a process of its own and collect the rest; takes some seconds.
 
-    answer(f"{summary.root}: {summary.kind}")
-    answer(f"{summary.photos} of {summary.records} photos can be read, {summary.images} with image")
-    table = Table("category", Column("objects", justify="right"), title="Objects")
-    for category, count in summary.categories.items():
-        table.add_row(category, str(count))
-    new_console(stderr=False).print(table)
-    answer(
-        f"{summary.objects} objects: {summary.with_pose} with pose, {summary.with_keypoints} with "
-        f"keypoints, {summary.with_model} with CAD model, {summary.with_mask} with mask"
-    )
-    for problem in summary.problems[:_SHOWN]:
-        answer(f"Left out: {problem}")
-    if len(summary.problems) > _SHOWN:
-        answer(f"... and {len(summary.problems) - _SHOWN} more problems; --json has all")
-
-
-@dataclass(frozen=True)
-class Health:
-    """Findings of `examine`."""
-
-    renderers: tuple[Probe, ...]
-    """All of them, ray casting last."""
-    best: str
-    """The renderer that "auto" selects."""
-    remedies: dict[str, str]
-    """For each renderer that does not work, the commands that would enable it."""
-    cores: int
-    usable_cores: int
-    """Those that this process may use."""
-    cache: str
-    """Location and state of the cache of compiled solvers."""
-    python: str
-    numpy: str
-    numba: str
-
-
-def examine() -> Health:
-    """Try every renderer in a process of its own and collect the rest; takes some seconds."""
+    ``renderers`` are all of them, ray casting last; ``best`` is what "auto" selects, ``remedies``
+    are the commands that would enable what does not work.
+    """
     from cadalign.render.probe import REMEDIES, RENDERERS, best_renderer, probe_renderer
 
-    renderers = tuple(probe_renderer(name) for name in RENDERERS)
-    return Health(
-        renderers=renderers,
-        best=best_renderer(),
-        remedies={each.name: REMEDIES[each.name] for each in renderers if not each.works},
-        cores=os.cpu_count() or 1,
-        usable_cores=_usable_cores(),
-        cache=compiled_cache(),
-        python=platform.python_version(),
-        numpy=version("numpy"),
-        numba=version("numba"),
-    )
+    renderers = [asdict(probe_renderer(name)) for name in RENDERERS]
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    names = [each["name"] for each in renderers if not each["works"]]
+    return {
+        "renderers": renderers,
+        "best": best_renderer(),
+        "remedies": {name: REMEDIES[name] for name in names},
+        "cores": os.cpu_count() or 1,
+        "usable_cores": usable or 1,
+        "cache": compiled_cache(),
+        "python": platform.python_version(),
+        **{name: version(name) for name in ("numpy", "numba")},
+    }
 
 
 def compiled_cache() -> str:
@@ -174,9 +107,3 @@ def require_cache() -> None:
     if not can_write(folder):
         fix = "set NUMBA_CACHE_DIR to a folder that can be"
         raise InputError(f"{folder} cannot be written to", where="--compile", fix=fix)
-
-
-def _usable_cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

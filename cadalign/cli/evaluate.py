@@ -127,9 +127,17 @@ class _DemoCommand(RunCommand):
 
     out: Path = Path("demo")
     """Folder to write to."""
+    files: Path | None = None
+    """Write the files of the README's example to this folder, to try commands with, and nothing
+    else."""
 
     def run(self) -> int:
         """Run the demonstration; returns the exit code."""
+        if self.files is not None:
+            from cadalign.cli.sample import write_example
+
+            write_example(self.files)
+            return SUCCESS
         # Renderers and solvers take a moment to import; `cadalign --help` should not wait for them.
         from cadalign.report import write_report
 

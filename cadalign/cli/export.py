@@ -24,15 +24,14 @@ class Export:
 
     GLB holds the textured model, stretched or warped, the cameras and the photos behind it: it
     opens in Blender, three.js and viewers as the overlay shows it. OBJ and PLY hold the mesh.
-    A run of many fits becomes a folder of the observation and fit.json of each, of overlays, or of
-    GLBs.
+    A run of many fits becomes a folder with a file of each.
     """
 
     fit: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FIT.JSON|RUN")]
     """Result of `cadalign fit` or `cadalign annotate`; their folder; or the folder of a run of many
     fits."""
     to: Path
-    """File to write. For a run, a format's name is a folder of that name: json, overlay, glb."""
+    """File to write. For a run the folder, whose name is the format's unless one is given."""
     format: str | None = None
     """Format, by default what the name's ending tells: glb, obj, ply."""
     observation: Path | None = None
@@ -57,7 +56,7 @@ class Export:
             fit = fit / "fit.json"
         if fit.is_dir():
             return self._export_run()
-        with named_as_flags(self, others={"world_from_cam": "--world"}):
+        with named_as_flags(self, world_from_cam="--world"):
             if self.frame != "world":
                 refuse_unused(self, ["world"], "without --frame world")
             name = self.format or format_of(self.to)
@@ -74,10 +73,8 @@ class Export:
 
     def _export_run(self) -> int:
         """Write a run; returns the exit code, 3 where some objects are left out."""
-        from cadalign.batch.exports import export_run, require_run
-        from cadalign.evaluation.runs.folder import RunFolder
+        from cadalign.batch.exported import export_run
 
-        require_run(RunFolder(self.fit))
         with named_as_flags(self):
             refuse_unused(self, ["observation", "shape", "world", "frame"], "on a run")
             count, left_out = export_run(self.fit, self.to, format=self.format, metres=self.metres)

@@ -17,7 +17,6 @@ from cadalign.errors import refuse_unused
 from cadalign.io.files import keeping, refuse_input, require_utf8
 
 if TYPE_CHECKING:
-    from cadalign.datasets import KeypointNet
     from cadalign.retrieval import Library
 
 
@@ -39,31 +38,24 @@ class LibraryBuild:
 
     def run(self) -> int:
         """Build the library; returns the exit code."""
+        from cadalign.cli.runs import progress_bar
         from cadalign.datasets import KeypointNet
+        from cadalign.retrieval import Library
         from cadalign.retrieval.own_models import keypoint_files
 
         for folder in (self.root, self.shapenet):
             if folder is not None:
                 require_utf8(folder)
-        files = keypoint_files(self.root) if self.root.is_dir() else []
-        if files:
+        own = keypoint_files(self.root) if self.root.is_dir() else []
+        files: Iterable[Path] = own
+        dataset, total, done = None, len(own), count(1)
+        if own:
             with named_as_flags(self):
                 refuse_unused(self, {"split", "shapenet"}, "on a folder of own models")
-            return self._write(files, len(files))
-        dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
-        dataset = dataset.subset(categories=self.categories, split=self.split)
-        self._write(dataset.files, len(dataset.ids()), dataset)
-        left_out = len(dataset.problems)
-        if left_out:
-            say(f"Left out: {left_out} models with malformed annotations")
-        return 0
-
-    def _write(self, files: Iterable[Path], total: int, dataset: KeypointNet | None = None) -> int:
-        """Write the library of a data set, or else of own models."""
-        from cadalign.cli.runs import progress_bar
-        from cadalign.retrieval import Library
-
-        done = count(1)
+        else:
+            dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
+            dataset = dataset.subset(categories=self.categories, split=self.split)
+            files, total = dataset.files, len(dataset.ids())
         with keeping(files), progress_bar("reading models") as show:
             refuse_input(self.out)
             make_folder_of(self.out)
@@ -79,6 +71,8 @@ class LibraryBuild:
             library.save(self.out)
         megabytes = self.out.stat().st_size / 1e6
         say(f"{_describe(library)}\nWritten: {self.out} ({megabytes:.1f} MB)")
+        if dataset is not None and dataset.problems:
+            say(f"Left out: {len(dataset.problems)} models with malformed annotations")
         return 0
 
 

@@ -1,18 +1,26 @@
-"""`cadalign render`: images of one model."""
+"""`cadalign render`: pictures of one model."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from cadalign.cli.common import make_folder_of, say
 from cadalign.cli.options import named_as_flags
+from cadalign.errors import InputError
+from cadalign.io.images import JPEG_ENDING
 
 if TYPE_CHECKING:
-    from cadalign.cli.render_job import RenderJob
+    from cadalign.arrays import FloatArray
+    from cadalign.render.drawing.canvas import ByteImage
+    from cadalign.render.drawing.pictures import Angles
+    from cadalign.render.scene import Renderer, Scene
+
+_ENDINGS = (".png", JPEG_ENDING)
 
 
 @dataclass(frozen=True)
@@ -29,11 +37,10 @@ class Render:
     view: tuple[str, ...] = ("iso",)
     """Views: iso, front, right, back, left, top, bottom, azimuth,elevation[,roll] in
     degrees (write --view=-30,20 if it begins with a minus), or all."""
-    size: str = "640x480"
-    """Image size WIDTHxHEIGHT in pixels; of a contact sheet, each picture's."""
+    resolution: str = "640x480"
+    """Width and height in pixels; of a contact sheet, each picture's."""
     keypoints: Path | None = None
-    """JSON file with keypoints to draw: a list of [x, y, z], a model's .keypoints.json, or
-    KeypointNet's annotations."""
+    """Keypoints to draw: the model's NAME.keypoints.json, or KeypointNet's annotations."""
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Stretch along the model's axes."""
     fov: float = 35.0
@@ -45,15 +52,75 @@ class Render:
 
     def run(self) -> int:
         """Draw and write; returns the exit code."""
-        from cadalign.cli.render_job import RenderJob
-
-        with named_as_flags(self, others={"fov_x": "--fov", "elevation": "--view"}):
-            return self._draw(RenderJob.of(self))
-
-    def _draw(self, job: RenderJob) -> int:
+        from cadalign.datasets.models.model_keypoints import ModelKeypoints
         from cadalign.io.images import write_image
+        from cadalign.io.meshes.files import load_mesh
+        from cadalign.render.drawing.pictures import contact_sheet
+        from cadalign.render.probe import make_renderer
+        from cadalign.render.scene import Scene
 
-        make_folder_of(self.out)
-        write_image(self.out, job.picture())
+        with named_as_flags(self, elevation="--view"):
+            camera, views = self._camera(), self._views()
+            scene, renderer = Scene(load_mesh(self.model)), make_renderer(self.renderer)
+            keypoints = None
+            if self.keypoints is not None:
+                keypoints = ModelKeypoints.load(self.keypoints, model=self.model).xyz
+            images = [
+                self._draw(scene, renderer, camera, each, keypoints) for each in views.values()
+            ]
+            picture = images[0]
+            if len(images) > 1:
+                picture = contact_sheet(images, list(views))
+            make_folder_of(self.out)
+            write_image(self.out, picture)
         say(f"Written: {self.out}")
         return 0
+
+    def _camera(self) -> Any:
+        """The camera of each picture; what the options say is checked."""
+        from cadalign.geometry.camera import Camera
+        from cadalign.render.scene import check_image_size
+
+        size = re.fullmatch(r"(\d{1,9})[xX](\d{1,9})", self.resolution.strip())
+        if size is None or not (int(size[1]) and int(size[2])):
+            what, fix = f"{self.resolution!r} is no resolution", "give WIDTHxHEIGHT, as 640x480"
+            raise InputError(what, where="--resolution", fix=fix)
+        camera = Camera.from_fov(int(size[1]), int(size[2]), fov_x=self.fov)
+        check_image_size(camera)
+        if self.out.suffix.lower() not in _ENDINGS:
+            what = f"{self.out.name} is neither a PNG nor a JPEG file"
+            fix = f"give a name that ends in {' or '.join(_ENDINGS)}"
+            raise InputError(what, where="--out", fix=fix)
+        if not all(0 < each < float("inf") for each in self.scale):
+            raise InputError(f"{self.scale} is not positive", where="--scale")
+        return camera
+
+    def _views(self) -> dict[str, Angles]:
+        from cadalign.render.drawing.pictures import VIEWS, Angles
+
+        views: dict[str, Angles] = {}
+        for word in self.view:
+            every = {name: Angles(*angles) for name, angles in VIEWS.items()}
+            views |= every if word == "all" else {word: Angles.parse(word)}
+        if not views:
+            raise InputError("no view is given", where="--view", fix="give one or more")
+        return views
+
+    def _draw(
+        self,
+        scene: Scene,
+        renderer: Renderer,
+        camera: Any,
+        view: Angles,
+        keypoints: FloatArray | None,
+    ) -> ByteImage:
+        """One picture, (h, w, 3) uint8."""
+        from cadalign.render.drawing.pictures import keypoint_picture, pose_in_view
+        from cadalign.render.viewpoints import visible_keypoints
+
+        pose = pose_in_view(scene, camera, view, scale=self.scale)
+        image = renderer.render(scene, camera, pose, samples=self.samples).composite()
+        if keypoints is None:
+            return image
+        visible = visible_keypoints(scene, keypoints, camera, pose)
+        return keypoint_picture(image, camera, keypoints, pose, visible=visible)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from cadalign.cli.common import make_folder, print_json, print_table, say, waiting
-from cadalign.cli.options import CameraOptions, FlaggedOptions, ManyCommand, named_as_flags
+from cadalign.cli.options import CameraOptions, ManyCommand, named_as_flags
 from cadalign.estimation.options import Sigma
 from cadalign.io.documents import read_json
 from cadalign.io.files import keeping
@@ -25,13 +26,16 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class _RetrievalOptions(FlaggedOptions, RetrievalOptions):
+class _RetrievalOptions(RetrievalOptions):
     """Ranking of the models; the observation file supplies the standard deviation."""
 
     sigma: tyro.conf.Suppress[Sigma | None] = RetrievalOptions.sigma
     method: str = RetrievalOptions.method
     """Solver: optimal (maximum likelihood, searched globally) or epnp (OpenCV's, without
     stretch)."""
+
+    def __post_init__(self) -> None:
+        """Check nothing: options are checked once the command runs, and refused in one line."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,33 +65,35 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
     def run(self) -> int:
         """Run the retrieval, or the retrievals; returns the exit code."""
         path = self.first()
-        is_file = path.suffix.lower() == ".json" and path.is_file()
+        is_file = path.suffix.lower() == ".json" and os.path.isfile(path)
         is_many = is_of_many(path, read_json(path) if is_file else None)
         with named_as_flags(self, self.ranking):
+            how = ObservationRetrieval(
+                library=self.library,
+                shape=self.shape,
+                sigma=self.sigma,
+                ranking=RetrievalOptions(**vars(self.ranking)),
+            )
             if len(self.observations) > 1 or is_many:
-                return self._retrieve_many()
+                return self._retrieve_many(how)
             self.refuse_of_many("workers")
-            return self._retrieve(path)
+            return self._retrieve(path, how)
 
-    def _retrieve_many(self) -> int:
+    def _retrieve_many(self, how: ObservationRetrieval) -> int:
         """Retrieve the models of all observations; returns the exit code."""
         from cadalign.batch.retrievals import RetrieveRunOptions
         from cadalign.cli.runs import inputs_of, run_command
 
-        given = {each.name: getattr(self, each.name) for each in fields(ObservationRetrieval)}
-        given["ranking"] = RetrievalOptions(**vars(self.ranking))
-        options = RetrieveRunOptions(
-            estimate=ObservationRetrieval(**given), **inputs_of(self, self.of_camera)
-        )
+        options = RetrieveRunOptions(estimate=how, **inputs_of(self))
         return run_command(self, options, done="retrieved")
 
-    def _retrieve(self, path: Path) -> int:
+    def _retrieve(self, path: Path, how: ObservationRetrieval) -> int:
         """Retrieve the models of one observation; returns the exit code."""
         from cadalign.retrieval.page import none_text, write_retrieval
 
-        query = self.with_ids(Observation.load(path, needs_xyz=False), str(path))
-        query = self.of_camera.applied_to(query, str(path))
-        library, _ = self.opened()
+        query = how.with_ids(Observation.load(path, needs_xyz=False), str(path))
+        query = self.changes.applied_to(query, str(path))
+        library, _ = how.opened()
         camera = query.camera
         # The table needs no photo, which may have been moved.
         photo = None
@@ -95,7 +101,7 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
             photo = read_image(query.image, camera)
         with waiting("retrieving (the first time after an installation takes a minute)"):
             workers = -1 if self.workers is None else self.workers
-            matches = self.retrieve(query, str(path), workers=workers)
+            matches = how.retrieve(query, str(path), workers=workers)
         found = matches[0].camera if matches else None
         if not camera.focal_known and found is not None:
             say(f"Focal length: estimated as {found.fx:.4g} px")

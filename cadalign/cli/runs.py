@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -23,8 +24,7 @@ from cadalign.errors import DataError
 from cadalign.io.observation import DetectorOptions
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-    from pathlib import Path
+    from collections.abc import Callable
 
     from cadalign.batch.experiment import ManyOptions
     from cadalign.cli.options import ManyCommand
@@ -32,10 +32,11 @@ if TYPE_CHECKING:
     from cadalign.evaluation.runs.engine import Progress as RunProgress
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.tables import Run
-    from cadalign.io.observation import ObservationChanges
 
 T = TypeVar("T")
 _MOST_REASONS, _MOST_OF_EVALUATIONS = 10, 3
+_SHOWN = 100
+"""Observations, the first ones, whose photos the page shows."""
 _ON_PAGE = 5000
 """Observations beyond which the page is left to `cadalign report`."""
 
@@ -109,22 +110,14 @@ def run_progress(label: str) -> Iterator[Callable[[RunProgress], None]]:
         yield lambda state: show(state.done, state.total)
 
 
-def tracked(items: Iterable[T], label: str, *, total: int) -> Iterator[T]:
-    """The items one after the other, while a progress bar is shown."""
-    with progress_bar(label) as show:
-        for done, item in enumerate(items):
-            show(done, total)
-            yield item
-
-
-def inputs_of(command: ManyCommand, changes: ObservationChanges) -> dict[str, Any]:
+def inputs_of(command: Any) -> dict[str, Any]:
     """The fields of `ManyOptions` that a command states."""
     names = DetectorOptions.__dataclass_fields__
     return {
         "inputs": command.observations,
-        "changes": changes,
+        "changes": command.changes,
         "detector": DetectorOptions(**{name: getattr(command, name) for name in names}),
-        "pictures": command.pictures if command.picture else 0,
+        "pictures": _SHOWN if command.picture else 0,
     }
 
 
@@ -207,15 +200,6 @@ def run_folder(command: ManyCommand, options: ManyOptions) -> RunFolder:
     kind, first = options.experiment, command.observations[0]
     if command.out is not None:
         return RunFolder(command.out)
-    if len(command.observations) > 1 or not first.exists():
+    if len(command.observations) > 1 or not os.path.exists(first):
         return RunFolder(first.parent / kind)
     return RunFolder(beside(first, f"_{kind}"))
-
-
-def write_overlays(run: RunFolder, to: Path) -> None:
-    """Draw all aligned models of a run over their photos, in a folder."""
-    from cadalign.batch.exports import export_run
-
-    count, left_out = export_run(run.path, to, format="overlay")
-    left = f", {len(left_out):,} left out" if left_out else ""
-    say(f"Overlays: {count:,} in {to}{left}")

@@ -1,13 +1,10 @@
-"""`cadalign sample`: the files of the README's example, to try the commands with."""
+"""`cadalign demo --files`: the files of the README's example, to try the commands with."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import tyro
 
 from cadalign.cli.common import make_folder, say
 
@@ -29,46 +26,37 @@ _FACES = (
 _TURN, _PLACE, _STRETCH = (-2.578, -0.193, 0.824), (0.0, 0.291, 2.735), (1.0, 1.3, 0.8)
 
 
-@dataclass(frozen=True)
-class Sample:
-    """Write the files of the README's example, to try commands with.
+def write_example(folder: Path) -> None:
+    """Write the files of the README's example to a folder.
 
     They are chair.obj, chair.keypoints.json, photo.jpg, which shows another chair with a focal
     length of 935 px, and found.json, as a detector finds its keypoints.
     """
+    from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
+    from cadalign.geometry.alignment import Alignment
+    from cadalign.geometry.camera import Camera
+    from cadalign.geometry.mesh import Mesh
+    from cadalign.geometry.rotations import rotation_from_vector
+    from cadalign.io.files import write_json
+    from cadalign.io.images import write_image
+    from cadalign.io.meshes.files import write_obj_mesh
+    from cadalign.render import RaycastRenderer, Scene
 
-    folder: Annotated[Path, tyro.conf.Positional] = Path()
-    """Where to write them."""
-
-    def run(self) -> int:
-        """Write the files; returns the exit code."""
-        from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
-        from cadalign.geometry.alignment import Alignment
-        from cadalign.geometry.camera import Camera
-        from cadalign.geometry.mesh import Mesh
-        from cadalign.geometry.rotations import rotation_from_vector
-        from cadalign.io.files import write_json
-        from cadalign.io.images import write_image
-        from cadalign.io.meshes.files import write_obj_mesh
-        from cadalign.render import RaycastRenderer, Scene
-
-        folder = self.folder
-        make_folder(folder)
-        mesh = Mesh(np.array(KEYPOINTS + _FEET), np.array(_FACES))
-        write_obj_mesh(folder / "chair.obj", mesh)
-        named = tuple(map(ModelKeypoint, NAMES, KEYPOINTS))
-        ModelKeypoints(named, folder / "chair.obj").save(folder / "chair.keypoints.json")
-        camera = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
-        turn, place, stretch = map(np.array, (_TURN, _PLACE, _STRETCH))
-        pose = Alignment(rotation_from_vector(turn), place, stretch)
-        frame = RaycastRenderer().render(Scene(mesh), camera, pose)
-        write_image(folder / "photo.jpg", frame.composite())
-        flat = [number for u, v in FOUND for number in (u, v, 2)]
-        found = {
-            "images": [{"id": 1, "file_name": "photo.jpg", "width": 640, "height": 480}],
-            "annotations": [{"id": 1, "image_id": 1, "category_id": 1, "keypoints": flat}],
-            "categories": [{"id": 1, "name": "chair", "keypoints": list(NAMES)}],
-        }
-        write_json(folder / "found.json", found)
-        say(f"Written to {folder}: chair.obj, chair.keypoints.json, photo.jpg, found.json")
-        return 0
+    make_folder(folder)
+    mesh = Mesh(np.array(KEYPOINTS + _FEET), np.array(_FACES))
+    write_obj_mesh(folder / "chair.obj", mesh)
+    named = tuple(map(ModelKeypoint, NAMES, KEYPOINTS))
+    ModelKeypoints(named, folder / "chair.obj").save(folder / "chair.keypoints.json")
+    camera = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
+    turn, place, stretch = map(np.array, (_TURN, _PLACE, _STRETCH))
+    pose = Alignment(rotation_from_vector(turn), place, stretch)
+    frame = RaycastRenderer().render(Scene(mesh), camera, pose)
+    write_image(folder / "photo.jpg", frame.composite())
+    flat = [number for u, v in FOUND for number in (u, v, 2)]
+    found = {
+        "images": [{"id": 1, "file_name": "photo.jpg", "width": 640, "height": 480}],
+        "annotations": [{"id": 1, "image_id": 1, "category_id": 1, "keypoints": flat}],
+        "categories": [{"id": 1, "name": "chair", "keypoints": list(NAMES)}],
+    }
+    write_json(folder / "found.json", found)
+    say(f"Written to {folder}: chair.obj, chair.keypoints.json, photo.jpg, found.json")

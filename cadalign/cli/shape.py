@@ -97,7 +97,17 @@ def _summary(model: ShapeModel) -> dict[str, Any]:
     counts = None
     if training is not None:
         seen = np.isfinite(training.points_3d[..., 0]).sum(axis=0)
-        counts = {str(label): int(count) for label, count in zip(model.ids, seen, strict=True)}
+        counts = dict(zip(map(str, model.ids), seen.tolist(), strict=True))
+    components = [
+        {
+            "weight": each.weight,
+            "modes": len(each.modes),
+            "sigma": float(np.sqrt(np.diag(each.covariance).mean())),
+            "residual_sigma": each.residual_sigma,
+            "variance_shares": (each.variance / max(np.trace(each.covariance), 1e-300)).tolist(),
+        }
+        for each in model.components
+    ]
     return {
         "category": model.category,
         "unit": model.unit,
@@ -105,52 +115,32 @@ def _summary(model: ShapeModel) -> dict[str, Any]:
         "keypoints": len(model.ids),
         "models": None if training is None else len(training),
         "models_with_keypoint": counts,
-        "reflection": None
-        if mirror is None
-        else {"axis": mirror.axis, "offset": mirror.offset, "pairs": mirror.pairs},
-        "components": [
-            {
-                "weight": each.weight,
-                "modes": len(each.modes),
-                "sigma": float(np.sqrt(np.diag(each.covariance).mean())),
-                "residual_sigma": each.residual_sigma,
-                "variance_shares": (
-                    each.variance / max(np.trace(each.covariance), 1e-300)
-                ).tolist(),
-            }
-            for each in model.components
-        ],
+        "reflection": None if mirror is None else vars(mirror),
+        "components": components,
     }
 
 
 def _text(model: ShapeModel) -> str:
-    summary = _summary(model)
+    summary, mirror = _summary(model), model.reflection
     models = "given" if summary["models"] is None else f"learned from {summary['models']} models"
     lines = [
         f"{model.category}: {len(model.ids)} keypoints, {models}; lengths in {model.unit}",
         f"  up axis      {model.up_axis or 'unknown'}",
     ]
-    mirror = model.reflection
     if mirror is not None:
         pairs = ", ".join(f"{first}-{second}" for first, second in mirror.pairs)
         lines.append(f"  reflection   across {mirror.axis}, pairs {pairs or 'none'}")
     for number, each in enumerate(summary["components"], start=1):
-        shares = each["variance_shares"]
-        listed = ", ".join(f"{100 * share:.0f}" for share in shares[:_MODES])
-        held = f" the first {len(shares[:_MODES])} hold {listed} % of the variance;"
+        held = 100 * sum(each["variance_shares"][:_MODES])
         lines.append(
-            f"  component {number}  {100 * each['weight']:.0f} %, {each['modes']} modes;"
-            f"{held if shares else ''} standard deviation of a coordinate {each['sigma']:.3g}, "
-            f"{each['residual_sigma']:.2g} besides the modes"
+            f"  component {number}  {100 * each['weight']:.0f} %, {each['modes']} modes, of which "
+            f"the first {_MODES} hold {held:.0f} % of the variance; standard deviation of a "
+            f"coordinate {each['sigma']:.3g}, {each['residual_sigma']:.2g} besides the modes"
         )
-    counts = summary["models_with_keypoint"]
-    if counts is not None:
-        rare = [
-            f"{label} ({count})"
-            for label, count in counts.items()
-            if count < len(model.training or ()) / 4
-        ]
-        lines.append(f"  rare keypoints (models that have it): {', '.join(rare) or 'none'}")
+    counts = summary["models_with_keypoint"] or {}
+    rare = [f"{name} ({n})" for name, n in counts.items() if n < len(model.training or ()) / 4]
+    if rare:
+        lines.append(f"  rare keypoints (models that have it): {', '.join(rare)}")
     return "\n".join(lines)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from contextlib import suppress
 from pathlib import Path
 
@@ -123,11 +124,11 @@ def refuse_other_file(path: Path, wanted: str) -> None:
 
 def is_of_many(path: Path, data: object = None) -> bool:
     """True for an input that may hold many observations; ``data`` is the content of a JSON file."""
-    if path.is_dir() or path.suffix.lower() in (*LINES, TABLE):
+    if os.path.isdir(path) or path.suffix.lower() in (*LINES, TABLE):
         return True
     return kind_of(data) == DETECTOR or is_pattern(path)
 
 
 def is_pattern(path: Path) -> bool:
     """True for what matches files, and is none."""
-    return not frozenset("*?[").isdisjoint(str(path)) and not path.exists()
+    return not frozenset("*?[").isdisjoint(str(path)) and not os.path.exists(path)

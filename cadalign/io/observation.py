@@ -270,9 +270,9 @@ class DetectorOptions:
     """Complements of a detector's file of keypoints, and which of its keypoints count."""
 
     model: Path | None = None
-    """Keypoints of the model, NAME.keypoints.json, that those of a detector's file are paired with:
-    by name, otherwise by semantic id, otherwise by order. With --shape, the shape's by default. Of
-    `fit --mask` without an observation, the model itself."""
+    """The model, whose keypoints those of a detector's file are paired with, by name, otherwise by
+    semantic id, otherwise by order: NAME.keypoints.json, or the mesh that this lies beside. With
+    --shape, the shape's by default. Of `fit --mask` without an observation, the mesh."""
     images: Path | None = None
     """Folder of the photos that a detector's file names."""
     min_score: float = 0.0

@@ -90,7 +90,7 @@ class ObservationRetrieval:
         assert ids is not None
         if shape is None and not camera.focal_known:
             what = "the focal length is unknown, without which no model's pose is searched"
-            fix = "rank by --shape, which estimates it, or give a calibrated camera"
+            fix = "rank by `shape`, which estimates it, or give a calibrated camera"
             raise InputError(what, where=f"{where}: camera", fix=fix)
         prior = None
         if not camera.focal_known and seen.image is not None:
@@ -129,5 +129,5 @@ def _opened_shapes(
     if len(by_category) < len(models):
         names = [model.category for model in models]
         twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"two files of the category {twice!r}", where="--shape")
+        raise InputError(f"two files of the category {twice!r}", where="shape")
     return by_category

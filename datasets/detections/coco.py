@@ -6,14 +6,17 @@ The forms that are read are described in docs/formats/detections.md.
 from __future__ import annotations
 
 import logging
+import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 from msgspec import field
 
 from cadalign.arrays import BoolArray, FloatArray, is_number
@@ -275,8 +278,7 @@ def _with_flags_read(found: ImageKeypoints) -> ImageKeypoints:
 # Masks ------------------------------------------------------------------------------------------
 
 _MASK_FIX = "give COCO polygons, or the run lengths of a mask of this image"
-_FIRST, _LAST = 48, 111  # characters of compressed run lengths
-_MOST_BITS = 35  # of a length: more than any image has pixels
+_WHOLE_RUNS = re.compile("[0-o]*[0-O]")  # compressed, the last group being a length's last
 _MOST_PIXELS = 2**28
 _LEAST_NUMBERS = 6  # of a polygon
 
@@ -293,8 +295,7 @@ def decode_segmentation(segmentation: Any, *, width: int, height: int) -> BoolAr
 
     It is, as in the JSON, a list of polygons ``[x, y, x, y, ...]`` in a frame whose origin is the
     top-left corner of the image, or ``{"size": [height, width], "counts": ...}``: lengths of runs
-    as a list or as COCO's text, which holds the difference of every length from the last but one
-    in groups of five bits. Raises DataError if it is neither, or of another image size, or the
+    as a list or as COCO's text. Raises DataError if it is neither, or of another image size, or the
     mask is empty.
 
     Examples
@@ -331,44 +332,41 @@ def _polygons(segmentation: Any) -> list[list[float]]:
 
 
 def _decode_runs(runs: _Runs, width: int, height: int) -> BoolArray:
+    from pycocotools import mask as coco  # takes a while to import
+
     if runs.size != (height, width):
         what = f"the mask is {runs.size[1]} x {runs.size[0]}, the image {width} x {height}"
         raise DataError(what, where="segmentation.size", fix=_MASK_FIX)
-    hint, counts = "", runs.counts
-    if isinstance(counts, str):
-        hint, counts = "; is the text whole?", _decompress(counts)
-    if sum(counts) != width * height or min(counts, default=0) < 0:
-        what = f"the runs have {sum(counts)} pixels, the image {width * height}{hint}"
-        raise DataError(what, where="segmentation.counts", fix=_MASK_FIX)
-    inside = np.arange(len(counts)) % 2 == 1
-    return np.ascontiguousarray(np.repeat(inside, counts).reshape(width, height).T)
+    where, size = "segmentation.counts", {"size": [height, width]}
+    if isinstance(runs.counts, str):
+        # Behind a last group that announces another one, pycocotools reads on.
+        coded = size | {"counts": runs.counts.encode()}
+        inside = _decoded(coded) if _WHOLE_RUNS.fullmatch(runs.counts) else None
+        # Pixels behind the last run are what was in the memory.
+        if inside is None or coco.encode(np.asfortranarray(inside))["counts"] != coded["counts"]:
+            what = "is not the text of a whole mask of this image"
+            raise DataError(what, where=where, fix=_MASK_FIX)
+        return np.asarray(inside != 0)
+    if sum(runs.counts) != width * height:
+        what = f"the runs have {sum(runs.counts)} pixels, the image {width * height}"
+        raise DataError(what, where=where, fix=_MASK_FIX)
+    return np.asarray(
+        _decoded(coco.frPyObjects(size | {"counts": runs.counts}, height, width)) != 0
+    )
 
 
-def _decompress(text: str) -> list[int]:
-    """Run lengths of COCO's text; see ``rleFrString`` in its ``maskApi.c``."""
-    counts: list[int] = []
-    value = shift = 0
-    for place, character in enumerate(text):
-        bits = ord(character) - _FIRST
-        if not 0 <= bits <= _LAST - _FIRST or shift > _MOST_BITS:
-            what = f"character {place} is not of compressed run lengths"
-            raise DataError(what, where="segmentation.counts", fix=_MASK_FIX)
-        value |= (bits & 0x1F) << shift
-        shift += 5
-        if bits & 0x20:
-            continue
-        if bits & 0x10:
-            value -= 1 << shift
-        counts.append(value + (counts[-2] if len(counts) > 2 else 0))
-        value = shift = 0
-    if shift:
-        raise DataError("the text is cut short", where="segmentation.counts", fix=_MASK_FIX)
-    return counts
+def _decoded(coded: dict[str, Any]) -> npt.NDArray[np.uint8] | None:
+    """The pixels of compressed run lengths; None where these are of more than there are."""
+    from pycocotools import mask as coco  # takes a while to import
+
+    with suppress(ValueError), warnings.catch_warnings(action="ignore"):  # of NumPy's conventions
+        return np.asarray(coco.decode(coded))
+    return None
 
 
 def _fill(polygons: Sequence[Sequence[float]], width: int, height: int) -> BoolArray:
     """Pixels (height, width) inside any of the polygons."""
-    from pycocotools import mask  # takes a while to import
+    from pycocotools import mask as coco  # takes a while to import
 
     for number, polygon in enumerate(polygons):
         where = f"segmentation[{number}]"
@@ -381,8 +379,5 @@ def _fill(polygons: Sequence[Sequence[float]], width: int, height: int) -> BoolA
             raise DataError("has points far outside of the image", where=where, fix=_MASK_FIX)
     if not polygons:
         return np.zeros((height, width), dtype=bool)
-    runs = mask.merge(
-        mask.frPyObjects([list(map(float, each)) for each in polygons], height, width)
-    )
-    with warnings.catch_warnings(action="ignore"):  # its of NumPy's newer conventions
-        return np.asarray(mask.decode(runs) != 0)
+    each = [list(map(float, polygon)) for polygon in polygons]
+    return np.asarray(_decoded(coco.merge(coco.frPyObjects(each, height, width))) != 0)

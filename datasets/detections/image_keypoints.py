@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,9 @@ from cadalign.datasets.models.model_keypoints import ModelKeypoints
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import check_pixels, unmeasured
+from cadalign.io.images import photo_size, read_mask, require_one_size
 from cadalign.io.kinds import PHOTO_ENDINGS
-from cadalign.io.observation import Observation
+from cadalign.io.observation import Observation, ObservationChanges
 
 VISIBILITY_SCORES = (0.0, 0.5, 1.0)
 """Scores by COCO's visibility flag: not labelled, labelled but hidden, visible."""
@@ -266,6 +267,42 @@ def join_keypoints(
         image=image,
         model=model.model,
         not_found=tuple(np.flatnonzero(~found.measured).tolist()),
+    )
+
+
+def observed_in(
+    found: ImageKeypoints,
+    model: ModelKeypoints,
+    changes: ObservationChanges,
+    *,
+    image: Path | None = None,
+    **how: Any,
+) -> Observation:
+    """Pair an image's keypoints with the model's, with the camera and the evidence of ``changes``.
+
+    Without a camera it is one of the photo's size, whose focal length is unknown. ``how`` are
+    further arguments of `join_keypoints`.
+
+    Raises CadalignError as that does; and if files cannot be read, or photo, mask, camera and
+    keypoints are of images of several sizes, or of none that is known.
+    """
+    sizes = {} if image is None else {str(image): photo_size(image)}
+    mask = changes.evidence.get("mask")
+    if mask is not None:  # read as a fit reads it, which refuses others
+        height, width = read_mask(mask).shape
+        sizes[str(mask)] = (width, height)
+    if found.size is not None:
+        sizes[found.source] = found.size
+    camera = changes.read_camera(next(iter(sizes.values()), None))
+    if camera is not None:
+        sizes = {str(changes.camera): (camera.width, camera.height), **sizes}
+    if not sizes:
+        fix = "give the photo, or the camera"
+        raise DataError("the photo's size is unknown", where=found.source, fix=fix)
+    require_one_size(sizes, image)
+    camera = camera or Camera.without_focal(*next(iter(sizes.values())))
+    return replace(changes, camera=None).applied_to(
+        join_keypoints(found, model, camera, image=image, **how)
     )
 
 

@@ -23,7 +23,6 @@ from cadalign.datasets.models.keypoints import (
     annotated_symmetry,
     entry_id,
     parse_entry,
-    read_entries,
 )
 from cadalign.datasets.models.shapenet import (
     MeshLocator,
@@ -31,6 +30,7 @@ from cadalign.datasets.models.shapenet import (
     require_category,
     synset_of_name,
 )
+from cadalign.datasets.photos.dataset import read_list
 from cadalign.errors import DataError, InputError, unknown
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry
@@ -321,7 +321,7 @@ class KeypointNet:
 
     def _build(self, category: str, path: Path) -> _Models:
         models: _Models = {}
-        for position, entry in enumerate(read_entries(path)):
+        for position, entry in enumerate(read_list(path)):
             model_id = entry_id(entry, position)
             where = f"{path.name}, model {model_id}"
             try:

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
-from cadalign.errors import DataError, InputError, quote
+from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.geometry.symmetry import Symmetry, SymmetryAxis
@@ -25,10 +24,8 @@ from cadalign.io.documents import (
     Id,
     Point3,
     convert,
-    read_json,
     require_unique,
 )
-from cadalign.io.files import damaged
 
 _FIX = "repair or remove this model's annotation"
 # Real barycentric coordinates sum to 0.999 ... 1.001.
@@ -171,18 +168,6 @@ class _Entry(ForeignDocument):
                         f"{beyond[0]} is not the row of one of the {len(self.keypoints)} keypoints",
                         where=f"symmetries.{kind}[{position}].kp_indexes",
                     )
-
-
-def read_entries(path: Path) -> list[Any]:
-    """Read an annotation file's list of models, not yet checked."""
-    try:
-        entries = read_json(path)
-    except DataError as error:
-        raise damaged(error.what, error.where) from None
-    if not isinstance(entries, list):
-        fix = "is it one of KeypointNet's annotation files?"
-        raise DataError(f"{quote(entries)} is not a list of models", where=str(path), fix=fix)
-    return entries
 
 
 def entry_id(entry: Any, position: int) -> str:

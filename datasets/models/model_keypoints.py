@@ -31,7 +31,7 @@ from cadalign.io.documents import (
     written_path,
 )
 from cadalign.io.files import as_path, write_json
-from cadalign.io.kinds import MODEL_KEYPOINTS
+from cadalign.io.kinds import MESH_ENDINGS, MODEL_KEYPOINTS
 
 FORMAT = "cadalign model keypoints"
 VERSION = 1
@@ -150,7 +150,7 @@ class ModelKeypoints:
         ----------
         path : str or path-like
             A file as described in docs/formats/model_keypoints.md, or KeypointNet's annotations of
-            a category.
+            a category; or a mesh, beside which such a file lies.
         model : Path, optional
             The mesh file; of KeypointNet's annotations those of the model are taken whose id
             occurs in this path.
@@ -163,6 +163,9 @@ class ModelKeypoints:
             file and field.
         """
         path = as_path(path)
+        if path.suffix.lower() in MESH_ENDINGS:
+            beside = path.with_suffix(SUFFIX)
+            path = beside if os.path.isfile(beside) else path
         data = read_json(path, MODEL_KEYPOINTS)
         if isinstance(data, list):
             return cls._from_annotations(data, path, model)

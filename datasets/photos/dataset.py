@@ -2,56 +2,19 @@
 
 from __future__ import annotations
 
-from codecs import BOM_UTF8
-from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, MutableMapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-import msgspec
-from msgspec import Raw
-
 from cadalign.datasets.photos.photo import Photo, PhotoObject
 from cadalign.datasets.records import RecordSet
-from cadalign.errors import CadalignError, DataError, brief
-from cadalign.io.documents import convert, in_file
-from cadalign.io.files import damaged, read_bytes
+from cadalign.errors import CadalignError, DataError, quote
+from cadalign.io.documents import read_json
+from cadalign.io.files import damaged
 
-T = TypeVar("T")
 K = TypeVar("K", bound=Hashable)
 _Record = TypeVar("_Record")
-
-
-@dataclass(frozen=True)
-class PhotoSummary:
-    """Counts of what a data set of photos holds."""
-
-    kind: str
-    """The data set's format."""
-    root: Path
-    """Its folder."""
-    records: int
-    """Photos that its annotations list."""
-    photos: int
-    """Those that can be read."""
-    images: int
-    """Those whose image is there."""
-    objects: int
-    """Objects in them."""
-    categories: dict[str, int]
-    """Number of objects of each category, the most frequent first."""
-    with_keypoints: int
-    """Objects with keypoints."""
-    with_model: int
-    """Objects with a CAD model."""
-    with_pose: int
-    """Objects with a pose."""
-    with_mask: int
-    """Objects with a mask."""
-    problems: tuple[str, ...]
-    """Why records or objects could not be read."""
 
 
 class PhotoDataset(RecordSet[Photo]):
@@ -81,38 +44,6 @@ class PhotoDataset(RecordSet[Photo]):
         """List the files of the annotations, by which a run knows those that it began with."""
         found = (path for pattern in self.patterns for path in self.root.glob(pattern))
         return sorted({path for path in found if path.is_file()})
-
-    def summary(self, *, progress: Callable[[int], object] | None = None) -> PhotoSummary:
-        """Read all records, not the images, and count what there is.
-
-        ``progress`` is called with the number of photos read after each.
-        """
-        photos = images = 0
-        objects: Counter[str] = Counter()
-        having = dict.fromkeys(("keypoints", "model", "pose", "mask"), 0)
-        for photo in self:
-            photos += 1
-            images += photo.image is not None
-            for found in photo.objects:
-                objects[found.category] += 1
-                truth = found.truth
-                having["keypoints"] += found.keypoints is not None
-                having["model"] += found.model is not None
-                having["pose"] += truth.cam_from_model is not None
-                having["mask"] += found.mask_path is not None
-            if progress is not None:
-                progress(photos)
-        return PhotoSummary(
-            kind=self.kind,
-            root=self.root,
-            records=len(self),
-            photos=photos,
-            images=images,
-            objects=objects.total(),
-            categories=dict(objects.most_common()),
-            **{f"with_{name}": count for name, count in having.items()},
-            problems=tuple(str(problem) for problem in self.problems.values()),
-        )
 
 
 @contextmanager
@@ -154,34 +85,15 @@ def read_each(
     return tuple(found), tuple(problems)
 
 
-def read_list(path: Path) -> list[Raw]:
-    """Read a JSON file that holds a list, its entries not yet parsed.
+def read_list(path: Path) -> list[Any]:
+    """Read a JSON file that holds a list.
 
     Raises DataError if it cannot be read, is no valid JSON (cut short, say), or holds no list.
     """
-    return list(_decode(read_bytes(path), list[Raw], "a list", path))
-
-
-def parse(raw: Raw, kind: type[T] | Any, *, path: Path, where: str) -> T | Any:
-    """Parse an entry as a declared type; errors name the file and the place in it.
-
-    Raises DataError if it is not of this type, or no valid JSON.
-    """
-    data = _decode(raw, Any, "", f"{path}: {where}")
-    with in_file(path):
-        return convert(data, kind, where)
-
-
-def _decode(data: bytes | Raw, kind: Any, name: str, where: Path | str) -> Any:
-    if isinstance(data, bytes):
-        data = data.removeprefix(BOM_UTF8)
     try:
-        return msgspec.json.decode(data, type=kind)
-    except msgspec.ValidationError:
-        raise DataError(f"expected {name}", where=str(where)) from None
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        what = f"not valid JSON: {brief(error)}"
-        raise damaged(what, where) if name else DataError(what, where=str(where)) from None
-    except RecursionError:
-        what = "not valid JSON: nested too deeply" if name else "nested too deeply"
-        raise DataError(what, where=str(where)) from None
+        found = read_json(path)
+    except DataError as error:
+        raise damaged(error.what, error.where) from None
+    if not isinstance(found, list):
+        raise DataError(f"{quote(found)} is not a list", where=str(path))
+    return found

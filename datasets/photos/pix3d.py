@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 from msgspec import field
 
-from cadalign.datasets.photos.dataset import PhotoDataset, parse, read_list
+from cadalign.datasets.photos.dataset import PhotoDataset, read_list
 from cadalign.datasets.photos.photo import (
     CadModel,
     NamedPoints,
@@ -30,7 +30,17 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PIXEL_CENTRE
 from cadalign.geometry.rotations import nearest_rotation
-from cadalign.io.documents import Finite, ForeignDocument, PathText, Point2, Point3, Positive, Text
+from cadalign.io.documents import (
+    Finite,
+    ForeignDocument,
+    PathText,
+    Point2,
+    Point3,
+    Positive,
+    Text,
+    convert,
+    in_file,
+)
 from cadalign.io.files import as_path
 from cadalign.io.meshes.files import load_mesh
 
@@ -81,7 +91,8 @@ class Pix3D(PhotoDataset):
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
         path = self.root / ANNOTATIONS
-        entry: _Entry = parse(self._entries[index], _Entry, path=path, where=f"[{index}]")
+        with in_file(path):
+            entry: _Entry = convert(self._entries[index], _Entry, f"[{index}]")
         width, height = map(int, entry.img_size)
         camera = _camera(width, height, entry.focal_length)
         shown = PhotoObject(

@@ -18,7 +18,6 @@ from cadalign.datasets.models.shapenet import MESH_FILES, name_of_synset
 from cadalign.datasets.photos.dataset import (
     PhotoDataset,
     leaving_out,
-    parse,
     read_each,
     read_list,
 )
@@ -38,7 +37,7 @@ from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.geometry.symmetry import SCAN2CAD_FOLDS, Symmetry
-from cadalign.io.documents import Finite, ForeignDocument, Id, Point3, Positive, convert
+from cadalign.io.documents import Finite, ForeignDocument, Id, Point3, Positive, convert, in_file
 from cadalign.io.files import as_path
 
 FULL = "full_annotations.json"
@@ -185,7 +184,8 @@ class Scan2CAD(PhotoDataset):
         return Photo(name, frame.image_path, camera, objects, up=up, problems=problems)
 
     def _parse(self, number: int, kind: Any) -> Any:
-        return parse(self._entries[number], kind, path=self.annotations, where=f"[{number}]")
+        with in_file(self.annotations):
+            return convert(self._entries[number], kind, f"[{number}]")
 
 
 def _object(

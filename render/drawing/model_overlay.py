@@ -14,7 +14,7 @@ from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.images import read_image
-from cadalign.io.meshes.files import load_mesh
+from cadalign.io.meshes.files import load_mesh, mesh_at
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.canvas import ByteImage
 from cadalign.render.drawing.layers import confidence_regions
@@ -148,9 +148,11 @@ def draw_contour(image: ByteImage, mask: npt.NDArray[Any]) -> ByteImage:
 def mesh_of(observation: Observation, result: Any) -> Mesh | None:
     """The object's mesh, warped from the observation's model or the nearest training model.
 
-    In the model's frame, before the stretch. None where no mesh is known; a training mesh that
-    cannot be read is warned of (logger "cadalign").
+    Of a fit of pairs the model's own. In the model's frame, before the stretch. None where no mesh
+    is known; a training mesh that cannot be read is warned of (logger "cadalign").
     """
+    if result.method != "align":
+        return None if observation.model is None else mesh_at(observation.model)
     from cadalign.shapes.model import ShapeModel  # takes time to import
     from cadalign.shapes.warp import warp_mesh
 

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 import cadalign
-from cadalign import Alignment, Camera, Mesh, Observation, Result, Results
-from cadalign.batch.exports import export_run
+from cadalign import Alignment, Camera, Mesh, Observation
+from cadalign.batch.exported import export_run
 from cadalign.cli import main
 from cadalign.errors import DataError, InputError
 from cadalign.io.meshes.files import load_mesh, write_obj_mesh
@@ -64,34 +64,25 @@ def test_glb_is_one_file_of_each(
 
 
 def test_what_cannot_be_written_is_said(run: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="holds one fit; of a run, give one of json, overlay, glb"):
-        export_run(run, tmp_path / "out.obj")
-    assert export_run(run, tmp_path / "json") == (3, [])
-    with pytest.raises(DataError, match="neither a fit nor a run of fits; give"):
-        export_run(tmp_path, tmp_path / "out.glb")
-    (tmp_path / "chair_fit").mkdir()
-    (tmp_path / "chair_fit" / "fit.json").write_text("{}")
-    with pytest.raises(DataError, match="give the folder of one of the fits in it: chair_fit"):
-        export_run(tmp_path, tmp_path / "out.obj")
+    with pytest.raises(InputError, match="format: unknown format 'out'; known are glb, obj, ply"):
+        export_run(run, tmp_path / "out")
+    with pytest.raises(DataError, match="not the folder of a run of fits; give"):
+        export_run(tmp_path, tmp_path / "glb")
     unfinished = shutil.copytree(run, tmp_path / "unfinished")
     (unfinished / "results.parquet").unlink()
-    with pytest.raises(DataError, match="not a finished run of fits; start the command that made"):
-        export_run(unfinished, tmp_path / "out.glb")
+    with pytest.raises(DataError, match="the run is not finished; start the command that made"):
+        export_run(unfinished, tmp_path / "glb")
 
 
-def test_photos_of_a_run_and_its_files_are_not_written_over(run: Path, tmp_path: Path) -> None:
-    photo = tmp_path / "000001.png"  # which the second one's overlay would be called
-    shutil.copy(run.parent / "000004.png", photo)
-    seen = [box_in(photo, number, run.parent / "box.obj") for number in range(2)]
+def test_meshes_of_a_run_are_not_written_over(run: Path, tmp_path: Path) -> None:
+    mesh = tmp_path / "000001.obj"  # which the second one's file would be called
+    shutil.copy(run.parent / "box.obj", mesh)
+    seen = [box_in(run.parent / "000004.png", number, mesh) for number in range(2)]
     cadalign.fit_many(seen, out=tmp_path / "run")
-    before = photo.read_bytes()
-    count, left_out = export_run(tmp_path / "run", tmp_path, format="overlay")
-    assert (count, photo.read_bytes()) == (1, before)
-    assert [error.where for error in left_out] == [str(photo)]
-    seen[0].save(tmp_path / "000000.json")
-    cadalign.fit_many(tmp_path / "000000.json", out=tmp_path / "one")
-    with pytest.raises(DataError, match="what is to be written is made from this file"):
-        export_run(tmp_path / "one", tmp_path, format="json")
+    before = mesh.read_bytes()
+    count, left_out = export_run(tmp_path / "run", tmp_path, format="obj")
+    assert (count, mesh.read_bytes()) == (1, before)
+    assert [error.where for error in left_out] == [str(mesh)]
 
 
 def test_a_fit_remembers_its_observation(run: Path, tmp_path: Path) -> None:
@@ -107,33 +98,3 @@ def test_a_fit_remembers_its_observation(run: Path, tmp_path: Path) -> None:
     assert data["observation"] == "../somewhere/seen.json"
     assert main(["export", str(out / "fit.json"), "--to", str(tmp_path / "box.glb")]) == 0
     assert (tmp_path / "box.glb").is_file()
-
-
-def test_documents_are_those_of_single_fits(run: Path, tmp_path: Path) -> None:
-    out = ["--to", str(tmp_path / "docs"), "--format", "json"]
-    assert main(["export", str(run), *out]) == 0
-    names = [f"{row:06d}{end}" for row in range(3) for end in (".json", "_fit")]
-    assert sorted(path.name for path in (tmp_path / "docs").iterdir()) == names
-    fit = tmp_path / "docs" / "000002_fit" / "fit.json"
-    expected = Results.open(run)[2]
-    assert isinstance(expected, Result)
-    np.testing.assert_array_equal(Result.load(fit).alignment.packed, expected.alignment.packed)
-    assert main(["export", str(fit), "--to", str(tmp_path / "box.glb")]) == 0
-    assert main(["fit", str(tmp_path / "docs" / "000002.json"), "--no-picture"]) == 0
-    again = Result.load(fit)
-    np.testing.assert_allclose(again.alignment.scale, expected.alignment.scale)
-
-
-def test_overlays_of_many_are_those_of_single_fits(run: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "docs"
-    export_run(run, folder, format="json")
-    one = ["fit", str(folder / "000000.json"), "--no-picture"]
-    assert main([*one, "--overlay", str(tmp_path / "one.png")]) == 0
-    many = ["fit", str(folder / "000000.json"), str(folder / "000000.json"), "--no-picture"]
-    assert main([*many, "--overlay", str(tmp_path / "all"), "--out", str(tmp_path / "run")]) == 0
-    names = ["000000.png", "000001.png"]
-    assert sorted(path.name for path in (tmp_path / "all").iterdir()) == names
-    expected = np.asarray(Image.open(tmp_path / "one.png"))
-    for name in names:
-        np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "all" / name)), expected)
-    assert export_run(run, tmp_path / "drawn", format="overlay") == (3, [])

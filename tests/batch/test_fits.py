@@ -197,7 +197,7 @@ def test_a_run_does_not_go_on_with_another_photo_or_mesh(tmp_path: Path, name: s
     for changed in (photo, mesh):
         before = changed.stat().st_mtime_ns
         changed.write_bytes(b"another")
-        with pytest.raises(DataError, match="another configuration: files is"):
+        with pytest.raises(DataError, match="another configuration: contents is"):
             cadalign.fit_many(tmp_path, out=tmp_path / "run")
         changed.write_bytes(b"one")
         os.utime(changed, ns=(before, before))

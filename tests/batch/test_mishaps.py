@@ -17,7 +17,6 @@ from support.forked import MAIN, Program
 
 import cadalign
 from cadalign import Camera, Observation
-from cadalign.batch.experiment import FitRunOptions
 from cadalign.cli import main
 from cadalign.datasets import ModelKeypoint, ModelKeypoints
 from cadalign.evaluation.runs.engine import Progress
@@ -278,6 +277,7 @@ def test_photo_of_another_size_than_its_camera_is_warned_of(tmp_path: Path) -> N
     photo = tmp_path / "photo.png"
     write_image(photo, np.zeros((960, 1280, 3), dtype=np.uint8))
     seen = Observation(problem.points_3d, problem.points_2d, problem.camera, image=photo)
-    options = FitRunOptions(inputs=(tmp_path,))
-    (warning,) = options.estimate_of(seen, "seen.json").result.warnings
-    assert warning.text.startswith("photo.png is 1280 x 960 px, the camera 640 x 480: give camera")
+    cadalign.fit_many([seen], out=tmp_path / "run")
+    (row,) = rows_of(tmp_path / "run")
+    assert row["warning_kinds"].split("; ")[-1] == "camera"
+    assert "photo.png: the image has 1280 x 960 pixels, that of its camera 640 x" in row["warnings"]

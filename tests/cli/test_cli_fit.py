@@ -17,7 +17,7 @@ import pytest
 from support.files import TETRAHEDRON
 from support.refusals import refusal_line
 
-from cadalign import RansacOptions, Result, fit
+from cadalign import Result, fit
 from cadalign.cli import main
 from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
 from cadalign.io.observation import Observation
@@ -95,11 +95,13 @@ def test_method_is_chosen_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[
         (STORED, [], STORED),
         (STORED, ["--sigma", "2", "--stretch", "z"], STORED | {"sigma": 2.0, "stretch": "z"}),
         ({"sigma": None}, [], {"sigma": None}),  # which has no prior of its own
+        ({"sigma": 3.0}, ["--sigma", "none"], {"sigma": None}),
+        ({}, ["--similar", "--sigma", "2"], {"sigma": 2.0, "stretch_sigma": 0.2}),
         ({}, [], {"sigma": SIGMA}),
         (
             {},
-            ["--sigma", "2", "--loss", "cauchy", "--stretch", "y", "--stretch-sigma", "0.3"],
-            STORED | {"sigma": 2.0},
+            ["--sigma", "2", "--loss", "cauchy", "--stretch", "y"],
+            {"sigma": 2.0, "loss": "cauchy", "stretch": "y"},
         ),
     ],
 )
@@ -121,7 +123,6 @@ def test_options_are_those_of_the_command_or_of_the_file(
     ("flags", "stored", "prior"),
     [
         ([], {}, 0.2),
-        (["--stretch-sigma", "0.4"], {}, 0.4),
         ([], {"stretch_sigma": 0.1}, 0.1),
         ([], {"stretch_sigma": None}, None),
         (["--stretch", "none"], {}, None),
@@ -155,18 +156,7 @@ def test_wrong_stored_options_name_the_file(
 ) -> None:
     path = write_observation(tmp_path / "chair.json", fit_options={"stretch": "x"})
     message = refusal_line(capsys, "fit", str(path))
-    assert message.startswith(f"{path}: fit.stretch: unknown stretch 'x'")
-
-
-def test_options_of_ransac_need_no_prefix(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write_observation(tmp_path / "chair.json")
-    flags = ["--robust", "--max-reproj-error", "6", "--seed", "3", "--no-refine"]
-    assert main(["fit", str(path), *flags]) == 0
-    ransac = RansacOptions(max_reproj_error=6.0, seed=3, refine=False)
-    expected = fit(PROBLEM.points_3d, PROBLEM.points_2d, PROBLEM.camera, ransac=ransac)
-    assert capsys.readouterr().out == f"{expected}\n"
+    assert message.startswith(f"{path}: fit.stretch: unknown stretch 'x'; known are yz, y, z, none")
 
 
 def test_a_rejected_keypoint_behind_the_camera_is_written_and_drawn(
@@ -237,15 +227,18 @@ def test_the_photo_is_not_drawn_over(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "nothing.json"
     assert refusal_line(capsys, "fit", str(path)) == f"{path}: no such file"
+    for name in ("a" * 300, "a" * 300 + ".json", "a" * 300 + ".jsonl"):
+        line = refusal_line(capsys, "fit", name)
+        assert line == f"{name}: cannot be read (File name too long)"
 
 
 @pytest.mark.parametrize(
     ("flags", "text"),
     [
         (
-            ["--sigma", "2", "--similar"],
-            "--sigma: --similar estimates the standard deviation, which --sigma gives; "
-            "give one of the two options",
+            ["--sigma", "0"],
+            "--sigma: 0.0 is not a standard deviation; give a positive number, one per keypoint, "
+            "or a 2 x 2 covariance per keypoint, in pixels",
         ),
         (
             ["--method", "best"],

@@ -186,7 +186,8 @@ def test_prior_of_the_photo_is_used(tmp_path: Path, capsys: pytest.CaptureFixtur
     path = without_focal(write(tmp_path, *images))
     assert main(["fit", str(path), "--no-picture"]) == 0
     assert "+- 5 %, the photo's EXIF data" in capsys.readouterr().err
-    assert main(["fit", str(path), "--no-picture", "--focal-prior", "usual"]) == 0
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"fit": {"focal_prior": "usual"}}))
+    assert main(["fit", str(path), "--no-picture"]) == 0
     assert "EXIF" not in capsys.readouterr().err
 
 
@@ -362,7 +363,7 @@ class TestPhotoAndMaskAlone:
         path = write(tmp_path, seen, model=mesh)
         assert main(["fit", str(path), "--no-picture"]) == 0
         assert self.kinds(tmp_path) == ["keypoints"]
-        assert main(["fit", str(path), "--no-picture", "--image"]) == 0
+        assert main(["fit", str(path), "--no-picture", "--use-photo"]) == 0
         assert self.kinds(tmp_path) == ["keypoints", "photo"]
         path = write(tmp_path, seen, model=mesh, fit_options={"image": True})
         assert main(["fit", str(path), "--no-picture"]) == 0
@@ -372,8 +373,8 @@ class TestPhotoAndMaskAlone:
         self, mesh: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         path = write(tmp_path, observed(), model=mesh)
-        line = refusal_line(capsys, "fit", str(path), "--image")
-        assert "--image: the observation names no photo" in line
+        line = refusal_line(capsys, "fit", str(path), "--use-photo")
+        assert "--use-photo: the observation names no photo" in line
 
     def test_mask_alone_needs_no_file(
         self, mesh: Path, shown: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -386,6 +387,11 @@ class TestPhotoAndMaskAlone:
         overlap = cast_geometry(Scene(load_mesh(mesh)), CAMERA, result.alignment).mask
         assert (overlap & shown).sum() > 0.95 * (overlap | shown).sum()
         assert (tmp_path / "a_fit" / "overlay.png").exists()
+        points = {"format": "cadalign model keypoints", "version": 1, "keypoints": []}
+        (tmp_path / "k.json").write_text(json.dumps(points | {"model": mesh.name}))
+        named = ["--model", str(tmp_path / "k.json"), *given[2:], "--out", str(tmp_path / "named")]
+        assert main(["fit", "--mask", str(tmp_path / "a.png"), *named]) == 0
+        assert Result.load(tmp_path / "named" / "fit.json").alignment == result.alignment
         # The other commands go on from it.
         assert main(["export", str(tmp_path / "a_fit"), "--to", str(tmp_path / "a.obj")]) == 0
         placed = result.alignment.apply(load_mesh(mesh).vertices)

@@ -12,18 +12,7 @@ import pytest
 from cadalign.cli import main
 
 PATHS = (
-    *(
-        "demo",
-        "sample",
-        "fit",
-        "observe",
-        "annotate",
-        "retrieve",
-        "report",
-        "export",
-        "render",
-        "doctor",
-    ),
+    *("demo", "fit", "observe", "annotate", "retrieve", "report", "export", "render", "doctor"),
     *("library build", "library show", "shape learn", "shape show"),
     *("evaluate keypointnet", "evaluate unseen", "evaluate photos"),
     *("evaluate correspondences", "evaluate retrieval"),

@@ -16,7 +16,6 @@ from support.refusals import refusal_line
 
 from cadalign import Alignment, Camera, FocalPrior, Result, fit
 from cadalign.cli import main
-from cadalign.cli.observe import _names
 from cadalign.datasets import ModelKeypoint, ModelKeypoints
 from cadalign.evaluation.simulation import SimulatedProblem, random_rotation
 from cadalign.io.observation import Observation
@@ -49,6 +48,12 @@ def folder(tmp_path: Path) -> Path:
         tmp_path / "model.keypoints.json"
     )
     return tmp_path
+
+
+def store(folder: Path, **options: Any) -> None:
+    """Write options of the fit into the observation."""
+    path = folder / "found.observation.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"fit": options}))
 
 
 def observing(folder: Path, *options: str) -> list[str]:
@@ -109,11 +114,13 @@ def test_fit_of_a_photo_without_focal_length_takes_exif_into_account(
     assert result.camera.fx == pytest.approx(expected.camera.fx, rel=1e-9)
     assert result.camera.fx == pytest.approx(620, rel=0.03)
     assert result.focal_prior == prior
-    without = fitted(folder, "found.observation", "--focal-prior", "usual")
+    store(folder, focal_prior="usual")
+    without = fitted(folder, "found.observation")
     usual = FocalPrior.of_usual_lenses(640, 480)
     assert without.focal_prior == usual
     assert f"its prior: {usual}" in capsys.readouterr().err
-    assert fitted(folder, "found.observation", "--focal-prior", "none").focal_prior is None
+    store(folder, focal_prior=None)
+    assert fitted(folder, "found.observation").focal_prior is None
     assert without.std is not None
     assert result.std is not None
     assert without.std.focal > result.std.focal
@@ -157,26 +164,21 @@ def test_focal_length_or_field_of_view_is_given_in_the_command(
     result = fitted(folder, "found.observation", "--fov", str(fov))
     assert result.focal == "known"
     assert result.camera.fx == pytest.approx(620)
-    prior = fitted(folder, "found.observation", "--focal-prior", "600", "--focal-prior-sigma", ".1")
-    assert prior.focal_prior == FocalPrior(600.0, 0.1)
     observe(folder, "--image", str(folder / "photo.jpg"), "--focal", "620")
     assert Observation.load(folder / "found.observation.json").camera == TRUE
     capsys.readouterr()
     for options, message in (
         (["--focal", "620", "--fov", "50"], "--fov: given beside the focal length"),
         (["--focal", "estimate", "--fov", "50"], "--fov: given beside --focal estimate"),
-        (["--fov", "190"], "--fov: 190 is not between 0 and 180 degrees"),
-        (["--focal", "-3"], "--focal: -3 is not positive"),
-        (["--focal-prior", "500"], "--focal-prior: given for a known focal length"),
+        (["--fov", "190"], "--fov: 190.0 is not between 0 and 180 degrees"),
+        (["--focal", "-3"], "camera.fx: the focal length is -3"),
     ):
         assert main(["fit", str(folder / "found.observation.json"), *options]) == 1
         assert message in capsys.readouterr().err
 
 
 def test_scores_can_weigh_instead(folder: Path) -> None:
-    observe(
-        folder, "--image", str(folder / "photo.jpg"), "--weigh", "--sigma", "2", "--min-score", ".5"
-    )
+    observe(folder, "--image", str(folder / "photo.jpg"), "--weigh", "2", "--min-score", ".5")
     observation = Observation.load(folder / "found.observation.json")
     assert observation.scores is None
     assert observation.sigma is not None
@@ -211,7 +213,10 @@ def test_csv_goes_the_same_way(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ([], "{folder}/found.json: [0]: the photo's size is unknown; give --image or --camera"),
+        (
+            [],
+            "{folder}/found.json: [0]: the photo's size is unknown; give the photo, or the camera",
+        ),
         (["--image", "{folder}/none.jpg"], "{folder}/none.jpg: no such file"),
         (
             ["--image", "{folder}/found.json"],
@@ -288,11 +293,11 @@ def masked(folder: Path) -> Path:
 def test_mask_is_written_beside_the_observation(
     masked: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert observe(masked, "--camera", str(masked / "camera.json"), "--mask-sigma", "2") == 0
+    assert observe(masked, "--camera", str(masked / "camera.json")) == 0
     path = masked / "found.observation.mask.png"
     assert capsys.readouterr().out.endswith(f"; mask: {path}\n")
     evidence = Observation.load(masked / "found.observation.json").evidence
-    assert (evidence.mask, evidence.mask_sigma) == (path, 2.0)
+    assert evidence.mask == path
     assert json.loads((masked / "found.observation.json").read_text())["mask"] == path.name
     with Image.open(path) as mask:
         pixels = np.asarray(mask)
@@ -312,21 +317,12 @@ def test_mask_that_a_fit_cannot_use_is_left_out(
     assert Observation.load(masked / "found.observation.json").is_plain
 
 
-def test_options_give_depth_gravity_and_size(masked: Path) -> None:
-    Image.fromarray(np.full((480, 640), 4000, dtype=np.uint16)).save(masked / "depth.png")
+def test_options_give_mask_and_size(masked: Path) -> None:
     Image.fromarray(np.full((480, 640), 255, dtype=np.uint8)).save(masked / "mask.png")
     options = ["--camera", masked / "camera.json", "--mask", masked / "mask.png"]
-    options += ["--depth", masked / "depth.png", "--depth-scale", ".001", "--depth-sigma", ".02"]
-    options += ["--up", "0", "-1", ".1", "--up-sigma-deg", "2", "--camera-height", "1.5"]
-    options += ["--size", "height", ".9", "sigma", ".02"]
-    assert observe(masked, *map(str, options)) == 0
+    assert observe(masked, *map(str, options), "--size", "height", ".9", "sigma", ".02") == 0
     observation = Observation.load(masked / "found.observation.json")
-    evidence = observation.evidence
-    assert (evidence.mask, evidence.depth) == (masked / "mask.png", masked / "depth.png")
-    assert (evidence.depth_scale, evidence.depth_sigma) == (0.001, 0.02)
-    assert evidence.up is not None
-    assert evidence.up.tolist() == [0.0, -1.0, 0.1]
-    assert (evidence.up_sigma_deg, evidence.camera_height) == (2.0, 1.5)
+    assert observation.evidence.mask == masked / "mask.png"
     assert observation.size is not None
     assert observation.size.given == {"height": 0.9, "sigma": 0.02}
 
@@ -334,13 +330,9 @@ def test_options_give_depth_gravity_and_size(masked: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (["--mask-sigma", "-1"], "--mask-sigma: -1.0 is not positive"),
-        (["--no-segmentation", "--mask-sigma", "1"], "--mask-sigma: given without mask; "),
-        (["--depth-scale", ".001"], "--depth-scale: given without depth; "),
-        (["--depth", "{folder}/none.png"], "{folder}/none.png: no such file"),
+        (["--mask", "{folder}/none.png"], "{folder}/none.png: no such file"),
         (["--mask", "{folder}/small.png"], "{folder}/small.png: the image has 8 x 6 pixels, "),
         (["--mask", "{folder}/photo.jpg"], "{folder}/photo.jpg: the image has the mode RGB; give"),
-        (["--depth", "{folder}/photo.jpg"], "{folder}/photo.jpg: the image has the mode RGB; give"),
         (["--size", "height", "-1"], "--size.height: -1.0 is not a positive number"),
         (["--size", "depth", "1"], "--size: unknown field 'depth'; known are height, length, "),
         (["--size", "sigma", "1"], "--size: no length is given; give width, height or length"),
@@ -353,47 +345,6 @@ def test_evidence_that_cannot_be_used_is_refused(
     given = [option.format(folder=masked) for option in options]
     line = refusal_line(capsys, *observing(masked, "--camera", str(masked / "camera.json"), *given))
     assert line.startswith(text.format(folder=masked))
-
-
-def test_observations_of_another_time_in_the_folder_are_named(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out, lines = folder / "all", ["image,name,u,v"]
-    (folder / "camera.json").write_text(json.dumps(TRUE.to_dict()))
-    for photo in ("a.jpg", "b.jpg"):
-        points = zip(NAMES, POINTS_2D, strict=True)
-        lines += [f"{photo},{name},{u},{v}" for name, (u, v) in points]
-    command = observing(folder, "--every", "--camera", str(folder / "camera.json"))
-    command[1] = str(folder / "found.csv")
-    cases = (
-        (lines, ""),
-        (lines[:25], "b.json"),
-        ([*lines[:1], "a.jpg,tail,1,2"], "a.json, b.json"),
-    )
-    for rows, said in cases:
-        (folder / "found.csv").write_text("\n".join(rows))
-        main([*command, "--out", str(out)])
-        (out / "camera.json").write_text("{}")  # which is no observation
-        start = "Not written now, but in the folder, too, which a fit takes whole: "
-        found = [line for line in capsys.readouterr().err.splitlines() if line.startswith(start)]
-        assert found == ([start + said] if said else [])
-
-
-def test_files_of_names_that_read_alike_stay_apart() -> None:
-    assert _names(["a.png", "a.jpg", "a_0.png", "A b.png", "a_b.png"]) == [
-        *("a_0", "a_1", "a_0_2", "A_b", "a_b_2")
-    ]
-
-
-def test_what_would_have_no_effect_or_be_no_direction_is_refused(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    given = ["observe", folder / "found.json", folder / "model.keypoints.json"]
-    given += ["--image", folder / "photo.jpg"]
-    assert refusal_line(capsys, *given, "--sigma", "3") == (
-        "--sigma: has no effect without --weigh; give both, or the fit `--sigma`"
-    )
-    assert "up: a direction must not be zero" in refusal_line(capsys, *given, "--up", 0, 0, 0)
 
 
 def coco(folder: Path, **changes: Any) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import pickle
 
 import numpy as np
@@ -13,7 +12,6 @@ from support.photo_sets import WRITERS, write_pix3d
 
 import cadalign
 import cadalign.datasets
-from cadalign.cli import main
 from cadalign.datasets import CadModel, PhotoKeypoints, PhotoObject, Pix3D
 from cadalign.datasets.formats import PHOTO_FORMATS
 from cadalign.errors import DataError
@@ -100,27 +98,13 @@ def test_hostile_entries_are_told(tmp_path, name, bad):
     assert len(str(caught.value)) < 2000
 
 
-def test_the_doctor_lists_a_data_set(tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")
+def test_what_can_be_read_is_given_and_the_rest_is_told(tmp_path):
     write_scan2cad(tmp_path, scenes=2, frames=2)
     (tmp_path / "scans/scene0001_00/pose/1.txt").write_text("x")
-    assert main(["doctor", "--data", str(tmp_path)]) == 0
-    text = capsys.readouterr().out
-    assert "Scan2CAD" in text
-    assert "3 of 4 photos can be read, 3 with image" in text
-    assert "3 objects: 3 with pose, 3 with keypoints, 3 with CAD model, 0 with mask" in text
-    assert "Left out:" in text
-    assert main(["doctor", "--json", "--data", str(tmp_path)]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["categories"] == {"chair": 3}
-    assert len(found["problems"]) == 1
-
-
-def test_the_doctor_fails_where_nothing_can_be_read(tmp_path, capsys):
-    assert main(["doctor", "--data", str(tmp_path)]) == 1
-    assert "no data set of photos is recognised" in capsys.readouterr().err
-    write_text(tmp_path / "pix3d.json", "[]")
-    assert main(["doctor", "--data", str(tmp_path)]) == 1
+    dataset = cadalign.datasets.open(tmp_path)
+    photos = list(dataset)
+    assert (dataset.kind, len(dataset), len(photos), len(dataset.problems)) == ("Scan2CAD", 4, 3, 1)
+    assert [each.category for photo in photos for each in photo.objects] == ["chair"] * 3
 
 
 def test_open_is_a_public_name():

@@ -71,7 +71,7 @@ def example(name: str) -> Any:
 
 def test_example_of_an_observation_is_fitted(tmp_path: Path) -> None:
     """The chair of `cadalign sample`, which is 1.3 times as high and 0.8 times as deep as wide."""
-    assert main(["sample", str(tmp_path)]) == 0
+    assert main(["demo", "--files", str(tmp_path)]) == 0
     source = tmp_path / "chair.json"
     source.write_text(json.dumps(example("observation")), encoding="utf-8")
     assert main(["fit", str(source)]) == 0

@@ -20,10 +20,9 @@ _VALUES = [
     "\u00e9\u4e2d", "-", "--", "/", "/dev/null", "/nonexistent/x", "../..", "a" * 300, "y", "huber",
 ]  # fmt: skip
 _COMMANDS: dict[str, list[str]] = {
-    "fit": ["--method", "--loss", "--stretch", "--max-reproj-error", "--focal", "--sigma",
-            "--robust", "--similar", "--json", "--out", "--stretch-sigma", "--shape",
-            "--shape-sigma"],
-    "observe": ["--image", "--model", "--out", "--object", "--min-score", "--sigma"],
+    "fit": ["--method", "--loss", "--stretch", "--focal", "--sigma", "--robust", "--similar",
+            "--json", "--out", "--shape", "--shape-sigma", "--use-photo", "--mask", "--model"],
+    "observe": ["--image", "--out", "--object", "--min-score", "--weigh", "--mask"],
     "retrieve": ["--library", "--out", "--top", "--category", "--json", "--loss"],
     "render": ["--out", "--width", "--height", "--view", "--keypoints"],
     "report": ["--out", "--format"],

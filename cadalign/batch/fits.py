@@ -22,7 +22,7 @@ from cadalign.batch.outputs import write_csv
 from cadalign.errors import DataError, InputError, require_kind
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.results import Results
-from cadalign.evaluation.runs.engine import OnProgress, Workers, execute, workers_of
+from cadalign.evaluation.runs.engine import OnProgress, execute, workers_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.io.documents import convert
 from cadalign.io.evidence import Size

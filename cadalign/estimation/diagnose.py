@@ -48,6 +48,7 @@ _CAMERA_GAIN = 19.5  # by a focal length of its own, by chance in one of 100,000
 _PER_EQUATION = 3.0  # gain that a piece of evidence must leave, without which there are fewer
 _MOST_VIEWS = 10  # those with the largest residuals, of which each is left out
 _APART = 5.0  # distance of pixels of one point, that is no noise [px]
+_WORST = 3  # keypoints that are named where nothing explains the residuals
 _WRONG_UNIT = 100.0  # factor between an object's size and its model's
 
 
@@ -376,10 +377,10 @@ _TEXTS = {
     "better, with the scale ({scale})",
     "camera": "the keypoints contradict the camera: they fit one better that has a focal length "
     "of {best.result.camera.fx:.4g} px",
-    "outlier": "the residuals are {given.ratio:.2g} times as large as sigma explains: {wrong} not "
-    "fit the others (with the distance from where those put it)",
+    "outlier": "the residuals are {given.ratio:.2g} times as large as sigma explains: {wrong} "
+    "{do} not fit the others (with the distance from where those put it)",
     "misfit": "the residuals are {given.ratio:.2g} times as large as sigma and the spread of "
-    "shapes explain: keypoints, sigma, the camera or the model are wrong",
+    "shapes explain: keypoints, sigma, the camera or the model are wrong; the worst are {wrong}",
 }
 
 
@@ -390,19 +391,28 @@ def _warning(
     posture, asked = "", ":"
     if given.posture and not (best.posture or case.is_exact):
         posture, asked = f"the object {given.posture}: is it so, or is it that ", "?"
-    wrong, view, keypoints = _outliers_of(case, best) if rule.kind == "outlier" else ("", None, ())
+    wrong, view, keypoints = "", None, tuple[int, ...]()
+    if rule.kind in ("outlier", "misfit"):
+        wrong, view, keypoints = _wrong_keypoints(case, best, all_agree=rule.kind == "misfit")
     words = {"named": named, "compared": _compared(best, given), "scale": scale, "wrong": wrong}
-    words |= {"posture": posture, "asked": asked}
+    words |= {"posture": posture, "asked": asked, "do": "does" if len(keypoints) == 1 else "do"}
     text = _TEXTS[rule.kind].format(best=best, given=given, **words)
     return EstimateWarning(rule.kind, text, 0 if rule is ANOTHER_FOCAL else view, keypoints)
 
 
-def _outliers_of(case: DiagnosisCase, best: Agreement) -> tuple[str, int | None, tuple[int, ...]]:
-    """Names of the outliers with their errors, and the view and the rows of those in one view."""
+def _wrong_keypoints(
+    case: DiagnosisCase, best: Agreement, *, all_agree: bool
+) -> tuple[str, int | None, tuple[int, ...]]:
+    """Names of outliers with their errors, and the view and the rows of those in one view.
+
+    Where ``all_agree`` the keypoints with the largest errors take their place.
+    """
     texts, wrong = [], dict[int, tuple[int, ...]]()
-    for view, own in zip(case.views, best.result.views, strict=True):
-        rows, names = np.flatnonzero(~own.inliers).tolist(), view.keypoint_ids
-        errors = np.linalg.norm(own.residuals, axis=1)
+    lengths = [np.linalg.norm(own.residuals, axis=1) for own in best.result.views]
+    largest = np.sort(np.concatenate(lengths))[-_WORST:][0] if all_agree else math.inf
+    for view, own, errors in zip(case.views, best.result.views, lengths, strict=True):
+        marked = errors >= largest if all_agree else ~own.inliers
+        rows, names = np.flatnonzero(marked).tolist(), view.keypoint_ids
         if rows:
             numbers = [names[row] for row in rows] if case.has_rows else rows
             wrong[view.number] = tuple(cast("list[int]", numbers))
@@ -415,7 +425,7 @@ def _outliers_of(case: DiagnosisCase, best: Agreement) -> tuple[str, int | None,
             of_each = zip(map(quote, called), errors[rows].tolist(), strict=True)
             texts.append(where + named_keypoints(dict(of_each)))
     total = sum(map(len, wrong.values()))
-    text = f"{'keypoint' if total == 1 else 'keypoints'} {'; '.join(texts)} do{'es' * (total == 1)}"
+    text = f"{'keypoint' if total == 1 else 'keypoints'} {'; '.join(texts)}"
     return (text, None, ()) if len(wrong) > 1 else (text, *next(iter(wrong.items())))
 
 

@@ -15,6 +15,7 @@ from cadalign.datasets import ModelKeypoints, choose_object, read_image_keypoint
 from cadalign.datasets.detections.coco import decode_segmentation
 from cadalign.datasets.detections.image_keypoints import ImageKeypoints, observed_in
 from cadalign.errors import DataError
+from cadalign.geometry.plausible_camera import camera_doubts
 from cadalign.io.documents import in_file
 from cadalign.io.evidence import ImageEvidence
 from cadalign.io.files import keeping
@@ -85,6 +86,8 @@ class Observe(EvidenceOptions):
             say(f"{self.keypoints} calls the photo {called}; its keypoints count for {name}")
         if observation.not_found:
             say(f"{found.source}: {observation.text_of_not_found}")
+        for doubt in camera_doubts(observation.camera):
+            say(f"{out}: {doubt}")
         shown = observation.evidence.mask
         text = "" if shown is None else f"; mask: {shown}"
         answer(f"{len(observation.points_2d)} of {len(found)} keypoints: {out}{text}")

@@ -26,12 +26,12 @@ from cadalign.estimation.agreement import (
     Rule,
 )
 from cadalign.estimation.assemble import result_of_keypoints
+from cadalign.estimation.causes import UNIT, named, warning_of
 from cadalign.estimation.fit import fit_once
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.problems import pack_one
 from cadalign.estimation.result_parts import FittedKeypoints, listed
-from cadalign.estimation.uncertainty.residuals import named_keypoints
 from cadalign.estimation.view import View
 from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
@@ -48,7 +48,6 @@ _CAMERA_GAIN = 19.5  # by a focal length of its own, by chance in one of 100,000
 _PER_EQUATION = 3.0  # gain that a piece of evidence must leave, without which there are fewer
 _MOST_VIEWS = 10  # those with the largest residuals, of which each is left out
 _APART = 5.0  # distance of pixels of one point, that is no noise [px]
-_WORST = 3  # keypoints that are named where nothing explains the residuals
 _WRONG_UNIT = 100.0  # factor between an object's size and its model's
 
 
@@ -85,13 +84,13 @@ def _likeliest(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
         return (
             None
             if case.is_tolerant or case.has_chance(given)
-            else _warning(case, MISFIT, given, given)
+            else warning_of(case, MISFIT, given, given)
         )
     rule, best = max(explaining, key=lambda each: case.gain(each[0], each[1], given))
     least = case.gain(rule, best, given) - _AS_LIKELY
     alike = [each for each in found if each[0].kind == rule.kind]
     likely = [each for each in alike if case.gain(*each, given) >= least]
-    return _warning(case, rule, best, given, named=_named(likely))
+    return warning_of(case, rule, best, given, clauses=named(likely))
 
 
 def _without_outlines(views: Sequence[View]) -> tuple[View, ...]:
@@ -105,10 +104,10 @@ def _without_outlines(views: Sequence[View]) -> tuple[View, ...]:
 def _of_another_size(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
     """The warning about measured lengths that make the object larger than any of its kind."""
     size = float(np.exp(np.log(given.result.alignment.scale).mean()))
-    named = listed([f"`{name}`" for name in _measures_of(case)] or [""])
-    if not named or 1 / _WRONG_UNIT < size < _WRONG_UNIT:
+    fields = listed([f"`{name}`" for name in _measures_of(case)] or [""])
+    if not fields or 1 / _WRONG_UNIT < size < _WRONG_UNIT:
         return None
-    text = f"{named}: the object is {size:.2g} times as large as the model, is it {UNIT}"
+    text = f"{fields}: the object is {size:.2g} times as large as the model, is it {UNIT}"
     return EstimateWarning("unit", text)
 
 
@@ -159,7 +158,7 @@ def diagnose_refusal(case: DiagnosisCase, *, with_keypoints: bool = True) -> str
         return None
     best = min((each for _, each in found), key=lambda each: each.score)
     likely = [each for each in found if each[1].score <= best.score + _AS_LIKELY]
-    return f"{_named(likely)}: corrected, {best.inliers} of {best.keypoints} keypoints agree"
+    return f"{named(likely)}: corrected, {best.inliers} of {best.keypoints} keypoints agree"
 
 
 def case_of_fit(
@@ -364,88 +363,3 @@ def _pieces_of(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
             yield piece(f"views[{view.number}].{name}", undo_view=undo)
     if case.size is not None:
         yield piece("size", changes={"size": None})
-
-
-# Texts -------------------------------------------------------------------------------------------
-
-UNIT = "in another unit (millimetres for metres)?"
-_TEXTS = {
-    "mistake": "{posture}{named}{asked} corrected, {compared}",
-    "unit": "{named}: is it " + UNIT + " Corrected, {compared}",
-    "contradiction": "{named} contradicts the other evidence: without it, {compared}",
-    "stretch": "the keypoints contradict the constraint on the stretch: without it they fit "
-    "better, with the scale ({scale})",
-    "camera": "the keypoints contradict the camera: they fit one better that has a focal length "
-    "of {best.result.camera.fx:.4g} px",
-    "outlier": "the residuals are {given.ratio:.2g} times as large as sigma explains: {wrong} "
-    "{do} not fit the others (with the distance from where those put it)",
-    "misfit": "the residuals are {given.ratio:.2g} times as large as sigma and the spread of "
-    "shapes explain: keypoints, sigma, the camera or the model are wrong; the worst are {wrong}",
-}
-
-
-def _warning(
-    case: DiagnosisCase, rule: Rule, best: Agreement, given: Agreement, *, named: str = ""
-) -> EstimateWarning:
-    scale = ", ".join(f"{value:.3g}" for value in best.result.alignment.scale.tolist())
-    posture, asked = "", ":"
-    if given.posture and not (best.posture or case.is_exact):
-        posture, asked = f"the object {given.posture}: is it so, or is it that ", "?"
-    wrong, view, keypoints = "", None, tuple[int, ...]()
-    if rule.kind in ("outlier", "misfit"):
-        wrong, view, keypoints = _wrong_keypoints(case, best, all_agree=rule.kind == "misfit")
-    words = {"named": named, "compared": _compared(best, given), "scale": scale, "wrong": wrong}
-    words |= {"posture": posture, "asked": asked, "do": "does" if len(keypoints) == 1 else "do"}
-    text = _TEXTS[rule.kind].format(best=best, given=given, **words)
-    return EstimateWarning(rule.kind, text, 0 if rule is ANOTHER_FOCAL else view, keypoints)
-
-
-def _wrong_keypoints(
-    case: DiagnosisCase, best: Agreement, *, all_agree: bool
-) -> tuple[str, int | None, tuple[int, ...]]:
-    """Names of outliers with their errors, and the view and the rows of those in one view.
-
-    Where ``all_agree`` the keypoints with the largest errors take their place.
-    """
-    texts, wrong = [], dict[int, tuple[int, ...]]()
-    lengths = [np.linalg.norm(own.residuals, axis=1) for own in best.result.views]
-    largest = np.sort(np.concatenate(lengths))[-_WORST:][0] if all_agree else math.inf
-    for view, own, errors in zip(case.views, best.result.views, lengths, strict=True):
-        marked = errors >= largest if all_agree else ~own.inliers
-        rows, names = np.flatnonzero(marked).tolist(), view.keypoint_ids
-        if rows:
-            numbers = [names[row] for row in rows] if case.has_rows else rows
-            wrong[view.number] = tuple(cast("list[int]", numbers))
-            where = f"views[{view.number}]: " if len(case.views) > 1 else ""
-            called = (
-                [case.labels[each] for each in wrong[view.number]]
-                if case.labels
-                else [names[row] for row in rows]
-            )
-            of_each = zip(map(quote, called), errors[rows].tolist(), strict=True)
-            texts.append(where + named_keypoints(dict(of_each)))
-    total = sum(map(len, wrong.values()))
-    text = f"{'keypoint' if total == 1 else 'keypoints'} {'; '.join(texts)}"
-    return (text, None, ()) if len(wrong) > 1 else (text, *next(iter(wrong.items())))
-
-
-def _named(likely: Sequence[tuple[Rule, Agreement]]) -> str:
-    """Names of rules that are as likely; first those of an upright object."""
-    upright = {rule.clause: None for rule, each in likely if not each.posture}
-    others = {rule.clause: None for rule, each in likely if rule.clause not in upright}
-    named = listed(list(upright or others)) if likely else ""
-    if upright and others:
-        named += f" (or, if y is not up in the photo, {listed(list(others))})"
-    return named
-
-
-def _compared(best: Agreement, given: Agreement) -> str:
-    rejected = given.keypoints - given.inliers
-    if rejected:
-        share = f"{rejected} ({100 * rejected / given.keypoints:.0f} %)"
-        agree = f"{best.inliers} of {best.keypoints} keypoints agree"
-        return f"{agree}; as given, {share} are rejected"
-    if best.sigma is not None and given.sigma is not None:
-        return f"sigma is {best.sigma:.2g} px; as given, {given.sigma:.2g} px"
-    what = "times what their standard deviations allow"
-    return f"the residuals are {best.ratio:.2g} {what}; as given, {given.ratio:.2g} times"

@@ -138,8 +138,7 @@ def fit(
     150.0
     """
     start = time.perf_counter()
-    shape, lens = (stretch, stretch_sigma), (focal, focal_prior)
-    chosen: tuple[Any, ...] = (method, sigma, loss, loss_scale, *shape, *lens)
+    chosen: Any = (method, sigma, loss, loss_scale, stretch, stretch_sigma, focal, focal_prior)
     try:
         options = _checked_options(*chosen)
     except InputError:
@@ -325,8 +324,9 @@ def fit_batch(
     """
     per_problem = isinstance(sigma, list | tuple) or np.ndim(sigma) > 0  # type: ignore[arg-type]
     given: Any = 1.0 if per_problem else sigma
-    shape, lens = (stretch, stretch_sigma), (focal, focal_prior)
-    options = FitOptions(method, given, loss, loss_scale, *shape, *lens)
+    options = FitOptions(
+        method, given, loss, loss_scale, stretch, stretch_sigma, focal, focal_prior
+    )
     problems = pack_many(points_3d, points_2d, camera)
     count = len(problems)
     each_options = [options] * count

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
@@ -14,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, is_number
-from cadalign.errors import DataError, InputError, quote
+from cadalign.errors import InputError, quote
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.result_parts import (
     NO_STATS,
@@ -47,8 +46,6 @@ if TYPE_CHECKING:
     from cadalign.export.aligned_object import Frame
     from cadalign.geometry.mesh import Mesh
     from cadalign.shapes.model import ShapeModel
-
-logger = logging.getLogger("cadalign")
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,22 +338,6 @@ class Result:
             return own
         known = np.isfinite(source).all(axis=1)
         return warp_mesh(own, source[known], self.points_3d[known], bounds=self.bounds)
-
-    def known_mesh(self, mesh: Mesh | str | os.PathLike[str] | None) -> Mesh | None:
-        """As `mesh`; None where there is no mesh to warp.
-
-        A mesh of the model that cannot be read is warned of (logger "cadalign").
-        """
-        try:
-            return self.mesh(mesh)
-        except InputError:
-            if mesh is not None:
-                raise
-        except DataError as error:
-            if mesh is not None:
-                raise
-            logger.warning("the nearest training model is not drawn: %s", error)
-        return None
 
     def plot(
         self,

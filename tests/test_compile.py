@@ -36,7 +36,7 @@ print(sum(kernels.twice.stats.cache_hits.values()))
 
 
 # Forked from a process that has compiled code loaded, and knows where it is kept.
-ANEW = "from cadalign.compile import folder; folder.kernel_folder.cache_clear(); "
+ANEW = "from cadalign.compile import once; once._folder.cache_clear(); "
 
 
 def use(folder: Path, values: str) -> Program:
@@ -117,7 +117,11 @@ def test_the_folder_is_named_by_the_content_of_every_module_with_kernels(
         (tmp_path / path).write_text("1")
     (tmp_path / "compile").mkdir()
     monkeypatch.setattr(folder, "_PACKAGE", tmp_path)
-    named = kernel_folder.__wrapped__
+
+    def named() -> Path:
+        folder._version.cache_clear()
+        return kernel_folder()
+
     before = named()
     assert named() == before
     for path in users:

@@ -24,19 +24,23 @@ _SOURCES = (
 _UNUSED_DAYS = 60
 
 
-@cache
 def kernel_folder() -> Path:
     """Folder in $NUMBA_CACHE_DIR, the user's cache, or the package's own.
 
     The first that can be written to; in the user's cache if none can. Numba alone compiles a
     function anew when its own file changes, but not when one that it calls in another file does.
     """
+    return cache_folder() / _version(_PACKAGE)
+
+
+@cache
+def _version(package: Path) -> str:
     content = hashlib.sha256(numba.__version__.encode())
     for name in _SOURCES:
-        path = _PACKAGE / name
+        path = package / name
         for source in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
             content.update(source.read_bytes())
-    return cache_folder() / content.hexdigest()[:16]
+    return content.hexdigest()[:16]
 
 
 def cache_folder() -> Path:

@@ -134,6 +134,9 @@ class FastPartCompiler(KernelCompiler):
     library = type("FastPartLibrary", (PartLibrary,), {"optimized": True})
 
 
+_folder = cache(kernel_folder)
+
+
 class _Locator(_CacheLocator):
     """Places of the files of a source's kernels, by its content."""
 
@@ -142,7 +145,7 @@ class _Locator(_CacheLocator):
         self._hash = hashlib.sha256(content).hexdigest()
 
     def get_cache_path(self) -> str:
-        return str(kernel_folder())
+        return str(_folder())
 
     def get_source_stamp(self) -> str:
         return self._hash

@@ -66,7 +66,8 @@ def joined(problems: Sequence[Problems]) -> Problems:
 
 def repeated(points_3d: FloatArray, points_2d: FloatArray) -> list[int]:
     """The first row with the same point of the model and the same pixel, for each of n rows."""
-    rows = np.concatenate([points_3d, points_2d], axis=1).round(_SAME_DIGITS).tolist()
+    with np.errstate(over="ignore"):  # of numbers that have no such digits
+        rows = np.concatenate([points_3d, points_2d], axis=1).round(_SAME_DIGITS).tolist()
     first: dict[tuple[float, ...], int] = {}
     return [first.setdefault(tuple(row), number) for number, row in enumerate(rows)]
 

@@ -136,13 +136,12 @@ def test_a_mask_of_others_is_not_written_over(case: Case) -> None:
     kept = theirs.read_bytes()
 
     def named() -> str:
-        (view,) = json.loads(case.observation.read_text())["views"]
-        return str(view["mask"])
+        return str(json.loads(case.observation.read_text())["mask"])
 
     for names in (False, True):
         if names:  # the observation's own mask
             data = json.loads(case.observation.read_text())
-            data["views"][0]["mask"] = theirs.name
+            data["mask"] = theirs.name
             case.observation.write_text(json.dumps(data))
         session = case.open(prepared=False)
         perform(session, 0, {"do": "mask_clear"})

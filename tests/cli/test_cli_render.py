@@ -15,6 +15,7 @@ from support.refusals import refusal_line
 
 from cadalign.cli.doctor import Doctor, compiled_cache
 from cadalign.cli.render import Render
+from cadalign.compile.folder import kernel_folder
 from cadalign.errors import DataError, InputError, RenderError
 from cadalign.render.probe import RENDERERS, Probe
 
@@ -189,9 +190,10 @@ def test_doctor_fails_where_not_even_ray_casting_works(monkeypatch, capsys):
 
 def test_the_state_of_the_cache_is_told(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    assert compiled_cache() == f"none yet; they will be kept in {tmp_path / 'cache'}"
-    (tmp_path / "cache" / "x").mkdir(parents=True)
-    (tmp_path / "cache" / "x" / "one.nbi").write_text("")
+    assert compiled_cache() == f"none yet; they will be kept in {kernel_folder()}"
+    assert kernel_folder().parent == tmp_path / "cache"
+    kernel_folder().mkdir(parents=True)
+    (kernel_folder() / "one.nbi").write_text("")
     assert compiled_cache().startswith("1 functions kept")
     if hasattr(os, "getuid") and os.getuid():
         (tmp_path / "shut").mkdir(mode=0o500)
@@ -202,9 +204,9 @@ def test_the_state_of_the_cache_is_told(tmp_path, monkeypatch):
 def test_nothing_is_compiled_ahead_that_could_not_be_kept(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr("cadalign.compile.folder.can_write", lambda folder: False)
-    assert refusal_line(capsys, "doctor", "--compile") == (
-        f"--compile: {tmp_path} cannot be written to; set NUMBA_CACHE_DIR to a folder that can be"
-    )
+    fix = "set NUMBA_CACHE_DIR to a folder that can be"
+    line = refusal_line(capsys, "doctor", "--compile")
+    assert line == f"--compile: {kernel_folder()} cannot be written to; {fix}"
 
 
 @pytest.mark.long

@@ -162,6 +162,7 @@ def stretch_doubts(alignment: Alignment, std: Uncertainty, options: FitOptions) 
     return tuple(found)
 
 
+@np.errstate(over="ignore")  # of errors that are any numbers
 def rejections(
     views: Sequence[FittedKeypoints | ViewResult], ransac: RansacOptions, sigma: Sigma | None
 ) -> Warnings:
@@ -175,8 +176,9 @@ def rejections(
         return ()
     text = f"{len(errors)} of {len(inliers)} keypoints ({percent(share)}) are rejected"
     if is_tight:
-        text += f", {near} with less than {_NEAR:g} times the threshold of {limit:.3g} px: is "
-        text += "sigma too small?"
+        text += (
+            f", {near} below {_NEAR:g} times the threshold of {limit:.3g} px: is sigma too small?"
+        )
     return (EstimateWarning("outlier", text),)
 
 
@@ -210,8 +212,7 @@ def outside_image(
     if 2 * len(outside) > len(points_2d) and (beyond.any() or not agree):
         text = (
             f"{where}{len(outside)} of {len(points_2d)} keypoints lie outside of the image of "
-            f"{size}: are they of another resolution than the camera, or of "
-            "another photo?"
+            f"{size}: are they of another resolution than the camera, or of another photo?"
         )
         found.append(EstimateWarning("outside-image", text, view, tuple(outside)))
     return tuple(found)

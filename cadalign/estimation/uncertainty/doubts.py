@@ -176,9 +176,7 @@ def rejections(
         return ()
     text = f"{len(errors)} of {len(inliers)} keypoints ({percent(share)}) are rejected"
     if is_tight:
-        text += (
-            f", {near} below {_NEAR:g} times the threshold of {limit:.3g} px: is sigma too small?"
-        )
+        text += f", {near} below {_NEAR:g} times the threshold, {limit:.3g} px: is sigma too small?"
     return (EstimateWarning("outlier", text),)
 
 

@@ -53,7 +53,7 @@ def _wrong_keypoints(
 ) -> tuple[str, int | None, tuple[int, ...]]:
     """Names of outliers with their errors, and the view and the rows of those in one view.
 
-    Where ``all_agree`` the keypoints with the largest errors take their place.
+    Where ``all_agree`` those with the largest errors are named, and none is said to be wrong.
     """
     texts, wrong = [], dict[int, tuple[int, ...]]()
     lengths = [np.linalg.norm(own.residuals, axis=1) for own in best.result.views]
@@ -72,7 +72,7 @@ def _wrong_keypoints(
             texts.append(where + named_keypoints(dict(of_each)))
     total = sum(map(len, wrong.values()))
     text = f"{'keypoint' if total == 1 else 'keypoints'} {'; '.join(texts)}"
-    return (text, None, ()) if len(wrong) > 1 else (text, *next(iter(wrong.items())))
+    return (text, None, ()) if all_agree or len(wrong) > 1 else (text, *next(iter(wrong.items())))
 
 
 def named(likely: Sequence[tuple[Rule, Agreement]]) -> str:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import DataError, InputError
+from cadalign.errors import InputError
 from cadalign.export.aligned_object import AlignedObject, ExportView
 from cadalign.geometry.alignment import (
     NOT_DETERMINED,
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Photo = Path | str | ByteImage | None
-logger = logging.getLogger("cadalign")
 
 
 def result_text(result: Any) -> str:
@@ -88,9 +86,13 @@ def plot_result(
     if not 0 <= view < len(result.views):
         what = f"{view} is not one of the {len(result.views)} views"
         raise InputError(what, where="view", fix="views count from 0")
-    from cadalign.render.drawing.model_overlay import draw_result, photo_of  # takes time to import
+    from cadalign.render.drawing.model_overlay import (  # takes time to import
+        draw_result,
+        drawable_mesh,
+        photo_of,
+    )
 
-    camera, known = result.views[view].camera, _known_mesh(result, mesh)
+    camera, known = result.views[view].camera, drawable_mesh(result, mesh)
     photo = photo_of(os.fspath(image) if isinstance(image, os.PathLike) else image, camera)
     bounds = None if known is None or result.own_bounds is not None else known.bounds
     picture = draw_result(photo, result, mesh=known, bounds=bounds, number=view)
@@ -136,7 +138,9 @@ def object_of(
     if len(photos) != len(result.views):
         what = f"{len(photos)}, but the result has {len(result.views)} views"
         raise InputError(what, where="images", fix="give one or None for each")
-    known = _known_mesh(result, mesh)
+    from cadalign.render.drawing.model_overlay import drawable_mesh  # takes time to import
+
+    known = drawable_mesh(result, mesh)
     if known is None:
         what = "there is no mesh of the model to write"
         raise InputError(what, where="mesh", fix="give one, or an observation with a `model`")
@@ -149,17 +153,3 @@ def object_of(
         name,
         metres,
     )
-
-
-def _known_mesh(result: Any, mesh: Mesh | str | os.PathLike[str] | None) -> Mesh | None:
-    """The mesh of a result; None where there is none to warp, or the model's cannot be read."""
-    try:
-        return cast(Mesh, result.mesh(mesh))
-    except InputError:
-        if mesh is not None:
-            raise
-    except DataError as error:
-        if mesh is not None:
-            raise
-        logger.warning("the nearest training model is not drawn: %s", error)
-    return None

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import logging
+import os
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
+from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
@@ -21,6 +24,8 @@ from cadalign.render.drawing.layers import confidence_regions
 from cadalign.render.drawing.overlay import draw_overlay
 from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry
 from cadalign.render.scene import LIGHT_GREY, Scene, check_image_size
+
+logger = logging.getLogger("cadalign")
 
 
 def overlay_model(
@@ -168,8 +173,22 @@ def mesh_of(observation: Observation, result: Any) -> Mesh | None:
     source = np.array(list(sources.values())).reshape(-1, 3)
     target = result.points_3d[[row_of[label] for label in sources]]
     if observation.model is None or (model is not None and not source.any()):
-        return None if model is None else result.known_mesh(None)
+        return None if model is None else drawable_mesh(result)
     mesh = load_mesh(observation.model)
     if not sources or np.abs(source - target).max() <= _SAME * np.ptp(source):
         return mesh
     return warp_mesh(mesh, source, target, bounds=result.bounds)
+
+
+def drawable_mesh(result: Any, mesh: Mesh | str | os.PathLike[str] | None = None) -> Mesh | None:
+    """The mesh of a result; None where there is none to warp, or the model's cannot be read."""
+    try:
+        return cast(Mesh, result.mesh(mesh))
+    except InputError:
+        if mesh is not None:
+            raise
+    except DataError as error:
+        if mesh is not None:
+            raise
+        logger.warning("the nearest training model is not drawn: %s", error)
+    return None

@@ -19,7 +19,6 @@ from cadalign import Alignment, Box, Camera, Library, Match, fit
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.options import LOSSES
-from cadalign.estimation.uncertainty.residuals import bent
 from cadalign.evaluation.experiments.retrieval import RetrievalTask, observe_model
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.simulation import random_rotation
@@ -27,6 +26,7 @@ from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.absence import SAME_SHAPE, shape_distance
 from cadalign.retrieval.kernels import error_bound, search_all
 from cadalign.retrieval.options import RetrievalOptions
+from cadalign.retrieval.precision import bent
 from cadalign.retrieval.ranking import gather_candidates, observe, rank
 
 CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)

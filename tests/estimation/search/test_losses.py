@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cadalign.estimation.uncertainty.residuals import bent, loss_slopes
+from cadalign.estimation.uncertainty.residuals import loss_slopes
+from cadalign.retrieval.precision import bent
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR
 
 

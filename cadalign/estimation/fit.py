@@ -34,6 +34,8 @@ from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.focal import PriorOption
 from cadalign.solvers.constants import LEAST_POINTS, POSE_SIZE
 
+_MOST_COMPARED = 64  # keypoints: one of more that counts twice changes little
+
 
 @np.errstate(all="ignore")  # what is not finite is refused
 def fit(
@@ -224,8 +226,8 @@ def fit_once(
 
 def _firsts(problems: Problems) -> list[int]:
     """Rows without those that repeat a keypoint; none where nothing is repeated."""
-    u = problems.points_2d[:, 0].tolist()  # most are told apart by these
-    if len(set(u)) == len(u):
+    u = problems.points_2d[:_MOST_COMPARED, 0].tolist()  # most are told apart by these
+    if len(set(u)) == len(u) or len(problems.points_2d) > _MOST_COMPARED:
         return []
     rows = sorted(set(repeated(problems.points_3d, problems.points_2d)))
     return rows if LEAST_POINTS < len(rows) < len(u) else []  # of fewer, errors say why
@@ -240,18 +242,16 @@ def _fit_distinct(
     start: float,
 ) -> FittedKeypoints:
     """Fit some rows; the others, which repeat them, are no inliers and have residuals."""
-    points, pixels, camera = problems.points_3d.copy(), problems.points_2d, problems.camera
+    points, pixels = problems.points_3d.copy(), problems.points_2d
     if np.ndim(options.sigma) > 0:  # type: ignore[arg-type]
         options = replace(options, sigma=np.asarray(options.sigma)[rows])
-    some = pack_one(points[rows], pixels[rows], camera)
-    trusted = None if scores is None else np.asarray(scores)[rows]
-    found = fit_once(some, options, ransac, trusted, start)
-    inliers = np.zeros(len(points), dtype=bool)
-    inliers[rows] = found.inliers
+    scores = None if scores is None else np.asarray(scores)[rows]
+    some = pack_one(points[rows], pixels[rows], problems.camera)
+    found, kept = fit_once(some, options, ransac, scores, start), np.zeros(len(points), dtype=bool)
+    kept[rows] = found.inliers
     residuals = found.camera.project_where_ahead(found.alignment.apply(points)) - pixels
     others = tuple(replace(each, points_3d=points) for each in found.alternatives)
-    found = replace(found, points_3d=points, alternatives=others)
-    return replace(found, residuals=residuals, inliers=inliers)
+    return replace(found, points_3d=points, alternatives=others, residuals=residuals, inliers=kept)
 
 
 # Checking options takes as long as solving a small problem linearly, and calls repeat them.

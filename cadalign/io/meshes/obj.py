@@ -97,6 +97,9 @@ def _logical_lines(data: bytes) -> Iterator[tuple[int, bytes]]:
     """The lines with their numbers, stripped; a line that ends in a backslash goes on."""
     # A tab may separate the keyword too.
     lines = data.replace(b"\t", b" ").split(b"\n")
+    if b"\\" not in data:  # as in most files: a loop takes longer
+        yield from enumerate(map(bytes.strip, lines), start=1)
+        return
     parts: list[bytes] = []
     for number, line in enumerate(map(bytes.strip, lines), start=1):
         if line[-1:] == b"\\" and number < len(lines):

@@ -124,19 +124,16 @@ def diagnose_fit(
 
     Messages name keypoints by their ``labels``, by default their rows.
     """
-    search, options, observed = fitted.search, fitted.options, fitted.observed
+    search, options, counted = fitted.search, fitted.options, fitted.is_counted
     first = None if search is None else search.ransac
-    passes = [(np.isfinite(fitted.residuals).all(axis=1), first)]
+    passes = [(np.isfinite(fitted.residuals).all(axis=1) & counted, first)]
     if search and options.sigma is not None and fitted.fisher_covariance is not None:
         passes.append((fitted.inliers, None))
     for kept, ransac in passes:
-        rows, own = np.flatnonzero(kept), options
-        if options.sigma is not None and np.ndim(options.sigma) > 0:
-            own = replace(options, sigma=np.asarray(options.sigma)[rows])
         # Samples need not be drawn where all agree.
-        drawn = None if fitted.inliers.all() else ransac
-        seen = fitted.points_3d, observed[rows], fitted.camera
-        case = case_of_fit(*seen, own, drawn, rows.tolist())
+        drawn = None if fitted.inliers[counted].all() else ransac
+        seen = fitted.points_3d, fitted.observed, fitted.camera
+        case = case_of_fit(*seen, options, drawn, np.flatnonzero(kept).tolist())
         if cause := diagnose(replace(case, ransac=ransac, labels=labels)):
             return cause
     return None
@@ -169,7 +166,9 @@ def case_of_fit(
     ransac: RansacOptions | None,
     rows: list[int] | None = None,
 ) -> DiagnosisCase:
-    """The case of a fit of a model's keypoints (m, 3), by their rows, to those of an image."""
+    """The case of a fit of a model's keypoints (n, 3) to those of an image, or of some rows."""
+    if rows is not None:
+        points_2d, options = points_2d[rows], options.for_keypoints(rows)
     seen = View(camera, points_2d, ids=rows, sigma=options.sigma)
     shape = {name: getattr(options, name) for name in ("stretch", "stretch_sigma")}
 

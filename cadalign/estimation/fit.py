@@ -18,11 +18,11 @@ from cadalign.estimation.options import FitOptions, RansacOptions, Sigma, pixel_
 from cadalign.estimation.problems import (
     Problems,
     each_of,
+    first_rows,
     in_threads,
     joined,
     pack_many,
     pack_one,
-    repeated,
 )
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FittedKeypoints
@@ -32,9 +32,7 @@ from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.focal import PriorOption
-from cadalign.solvers.constants import LEAST_POINTS, POSE_SIZE
-
-_MOST_COMPARED = 64  # keypoints: one of more that counts twice changes little
+from cadalign.solvers.constants import POSE_SIZE
 
 
 @np.errstate(all="ignore")  # what is not finite is refused
@@ -185,7 +183,7 @@ def fit_one(
         from cadalign.estimation.diagnose import case_of_fit, diagnose_refusal  # makes fits anew
 
         given = problems.points_3d, problems.points_2d, problems.camera
-        case = case_of_fit(*given, options, ransac)
+        case = case_of_fit(*given, options, ransac, sorted(set(first_rows(problems))) or None)
         error.fix = diagnose_refusal(case) or error.fix
         raise
     return result_of_keypoints(
@@ -213,7 +211,7 @@ def fit_once(
     start: float,
 ) -> FittedKeypoints:
     """Fit the only problem, without a diagnosis of keypoints that no alignment explains."""
-    if firsts := _firsts(problems):
+    if firsts := first_rows(problems):
         return _fit_distinct(firsts, problems, options, ransac, scores, start)
     options = options.for_camera(problems.camera)
     if ransac is None:
@@ -224,34 +222,31 @@ def fit_once(
     return fit_robustly(problems, options, ransac, scores, start)
 
 
-def _firsts(problems: Problems) -> list[int]:
-    """Rows without those that repeat a keypoint; none where nothing is repeated."""
-    u = problems.points_2d[:_MOST_COMPARED, 0].tolist()  # most are told apart by these
-    if len(set(u)) == len(u) or len(problems.points_2d) > _MOST_COMPARED:
-        return []
-    rows = sorted(set(repeated(problems.points_3d, problems.points_2d)))
-    return rows if LEAST_POINTS < len(rows) < len(u) else []  # of fewer, errors say why
-
-
 def _fit_distinct(
-    rows: list[int],
+    firsts: Sequence[int],
     problems: Problems,
     options: FitOptions,
     ransac: RansacOptions | None,
     scores: npt.ArrayLike | None,
     start: float,
 ) -> FittedKeypoints:
-    """Fit some rows; the others, which repeat them, are no inliers and have residuals."""
-    points, pixels = problems.points_3d.copy(), problems.points_2d
-    if np.ndim(options.sigma) > 0:  # type: ignore[arg-type]
-        options = replace(options, sigma=np.asarray(options.sigma)[rows])
+    """Fit the first rows; the others, which repeat them, are no inliers and have residuals."""
+    rows, points, pixels = sorted(set(firsts)), problems.points_3d.copy(), problems.points_2d
+    own = options.for_keypoints(rows)
     scores = None if scores is None else np.asarray(scores)[rows]
     some = pack_one(points[rows], pixels[rows], problems.camera)
-    found, kept = fit_once(some, options, ransac, scores, start), np.zeros(len(points), dtype=bool)
+    found, kept = fit_once(some, own, ransac, scores, start), np.zeros(len(points), dtype=bool)
     kept[rows] = found.inliers
     residuals = found.camera.project_where_ahead(found.alignment.apply(points)) - pixels
-    others = tuple(replace(each, points_3d=points) for each in found.alternatives)
-    return replace(found, points_3d=points, alternatives=others, residuals=residuals, inliers=kept)
+    return replace(
+        found,
+        points_3d=points,
+        alternatives=tuple(replace(each, points_3d=points) for each in found.alternatives),
+        residuals=residuals,
+        inliers=kept,
+        options=replace(found.options, sigma=options.sigma),
+        repeats=tuple((row, first) for row, first in enumerate(firsts) if row != first),
+    )
 
 
 # Checking options takes as long as solving a small problem linearly, and calls repeat them.
@@ -340,7 +335,7 @@ def fit_batch(
     if scores is not None:
         scores = each_of(scores, "scores", count, "sets")
     is_alone = per_problem or ransac is not None or symmetry is not None
-    is_alone |= not are_solved_at_once(problems, options) or any(map(_firsts, problems))
+    is_alone |= not are_solved_at_once(problems, options) or any(map(first_rows, problems))
     entries: list[Any] = [None] * count
     table = np.full((count, COLUMNS), np.nan)
 

@@ -296,7 +296,9 @@ def _causes(
         found += stretch_doubts(result.alignment, result.std, result.model.fit_options())
     if ransac is None or (cause is not None and cause.kind == "mistake"):
         return found
-    return (*found, *rejections(result.views, ransac, common_sigma(views)))
+    residuals = np.concatenate([view.residuals for view in result.views])
+    inliers = np.concatenate([view.inliers for view in result.views])
+    return (*found, *rejections(residuals, inliers, ransac, common_sigma(views)))
 
 
 def common_sigma(views: Sequence[View]) -> float | None:

@@ -6,7 +6,7 @@ The command line nests these dataclasses, and shows the text below each field as
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -114,6 +114,12 @@ class FitOptions(AlignmentOptions):
         if self.focal_prior != USUAL:
             return self
         return replace(self, focal_prior=prior_of_camera(self.focal_prior, camera))
+
+    def for_keypoints(self, rows: Sequence[int]) -> FitOptions:
+        """The options for some of the keypoints, with their standard deviations."""
+        if self.sigma is None or np.ndim(self.sigma) == 0:
+            return self
+        return replace(self, sigma=np.asarray(self.sigma)[rows])
 
     @property
     def stretched_axes(self) -> str:

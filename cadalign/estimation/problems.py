@@ -20,13 +20,14 @@ from cadalign.estimation.options import SIGMA_HELP, FitOptions, Sigma, pixel_inf
 from cadalign.geometry.alignment import describe_plane
 from cadalign.geometry.camera import Camera, rays_ahead
 from cadalign.geometry.pixels import check_pixels
-from cadalign.solvers.constants import NOT_FOUND, OUT_OF_RANGE, TOO_FEW
+from cadalign.solvers.constants import LEAST_POINTS, NOT_FOUND, OUT_OF_RANGE, TOO_FEW
 from cadalign.solvers.linear import aepnp_error, out_of_range_error
 from cadalign.solvers.projection import all_finite, pinhole_rays
 
 T = TypeVar("T")
 
 _SAME_DIGITS = 6  # decimals of keypoints that are the same
+_MOST_COMPARED = 64  # keypoints: one of more that counts twice changes little
 _NO_RESIDUALS = np.empty((0, 2))
 _NO_ERRORS: Mapping[int, CadalignError] = MappingProxyType({})
 
@@ -64,12 +65,16 @@ def joined(problems: Sequence[Problems]) -> Problems:
     )
 
 
-def repeated(points_3d: FloatArray, points_2d: FloatArray) -> list[int]:
-    """The first row with the same point of the model and the same pixel, for each of n rows."""
+def first_rows(problem: Problems) -> list[int]:
+    """The first row with the same point and pixel, for each; none where none is to be left out."""
+    u = problem.points_2d[:_MOST_COMPARED, 0].tolist()  # most are told apart by these
+    if len(set(u)) == len(u) or len(problem.points_2d) > _MOST_COMPARED:
+        return []
     with np.errstate(over="ignore"):  # of numbers that have no such digits
-        rows = np.concatenate([points_3d, points_2d], axis=1).round(_SAME_DIGITS).tolist()
+        pairs = np.concatenate([problem.points_3d, problem.points_2d], axis=1).round(_SAME_DIGITS)
     first: dict[tuple[float, ...], int] = {}
-    return [first.setdefault(tuple(row), number) for number, row in enumerate(rows)]
+    firsts = [first.setdefault(tuple(row), number) for number, row in enumerate(pairs.tolist())]
+    return firsts if LEAST_POINTS < len(first) < len(firsts) else []  # of fewer, errors say why
 
 
 def pack_one(

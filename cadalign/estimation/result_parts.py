@@ -126,6 +126,14 @@ class FittedKeypoints:
     alternatives: tuple[Alternative, ...] = ()
     stats: FitStats = NO_STATS
     search: KeypointSearch | None = None  # for the inliers, where they were searched for
+    repeats: tuple[tuple[int, int], ...] = ()  # rows left out, and those that they repeat
+
+    @property
+    def is_counted(self) -> BoolArray:
+        """Rows (n,) that are not left out."""
+        counted = np.ones(len(self.points_3d), dtype=bool)
+        counted[[row for row, _ in self.repeats]] = False
+        return counted
 
     @property
     def observed(self) -> FloatArray:

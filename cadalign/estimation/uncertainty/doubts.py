@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.options import USUAL_STRETCH, FitOptions, RansacOptions, Sigma
-from cadalign.estimation.problems import repeated
-from cadalign.estimation.result_parts import Diagnosis, FittedKeypoints, ViewResult
+from cadalign.estimation.result_parts import Diagnosis, FittedKeypoints
 from cadalign.estimation.uncertainty.residuals import chance_of
 from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment, Uncertainty, uncertainty_of
@@ -44,24 +43,25 @@ def keypoint_warnings(
 ) -> Warnings:
     """Warnings about the cause of a misfit, and what deviations do not say."""
     cause = None if diagnosis is None or _fit(fitted) else diagnosis(fitted)
-    observed = fitted.observed[np.isfinite(fitted.residuals).all(axis=1)]
+    counted, residuals = fitted.is_counted, fitted.residuals
+    observed = fitted.observed[np.isfinite(residuals).all(axis=1) & counted]
     is_mistake = cause is not None and cause.kind == "mistake"
     sigma = fitted.options.sigma
     placed = outside_image(observed, fitted.camera, cause=cause, sigma=sigma)
     found = first_of_camera(placed, cause)
-    for row, first in enumerate(repeated(fitted.points_3d, fitted.observed)):
-        if row != first and not fitted.inliers[row]:
-            text = f"keypoint {row} is keypoint {first} again, and counts once"
-            found.append(EstimateWarning("left-out", text, 0, (row,)))
+    for row, first in fitted.repeats:
+        text = f"keypoint {row} is keypoint {first} again, and counts once"
+        found.append(EstimateWarning("left-out", text, 0, (row,)))
     if covariance is None or is_mistake:  # of the alignment nothing else can be said
         return tuple(found)
     options, kept = fitted.options, fitted.points_3d[fitted.inliers]
     if fitted.sigma is not None and options.sigma is None:
         found += unexplained(fitted.sigma, [observed])
     if fitted.search is not None:
-        chance = fitted.search.doubt(fitted.residuals, fitted.inliers)
+        agreeing = residuals[counted], fitted.inliers[counted]
+        chance = fitted.search.doubt(*agreeing)
         found += () if chance is None else (chance,)
-        found += rejections([fitted], fitted.search.ransac, sigma)
+        found += rejections(*agreeing, fitted.search.ransac, sigma)
     if 2 * len(kept) <= options.unknowns:
         text = (
             f"{len(kept)} keypoints fit exactly whatever they are: "
@@ -164,11 +164,10 @@ def stretch_doubts(alignment: Alignment, std: Uncertainty, options: FitOptions) 
 
 @np.errstate(over="ignore")  # of errors that are any numbers
 def rejections(
-    views: Sequence[FittedKeypoints | ViewResult], ransac: RansacOptions, sigma: Sigma | None
+    residuals: FloatArray, inliers: BoolArray, ransac: RansacOptions, sigma: Sigma | None
 ) -> Warnings:
     """Warn about a large share of rejected keypoints, and about many just beyond the threshold."""
-    inliers = np.concatenate([view.inliers for view in views])
-    errors = np.linalg.norm(np.concatenate([view.residuals for view in views])[~inliers], axis=1)
+    errors = np.linalg.norm(residuals[~inliers], axis=1)
     limit, share = ransac.threshold(sigma), len(errors) / max(len(inliers), 1)
     near = int((errors < _NEAR * limit).sum())
     is_tight = sigma is not None and near > 1 and 2 * near >= len(errors)

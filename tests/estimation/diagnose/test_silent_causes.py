@@ -175,6 +175,30 @@ def test_a_pair_that_is_given_twice_counts_once(real_data: Path) -> None:
     assert twice.warnings == (EstimateWarning("left-out", text, 0, (count,)),)
 
 
+@pytest.mark.parametrize("ransac", [None, RansacOptions()])
+@pytest.mark.parametrize("wrong", [0, 1])
+def test_pairs_that_are_given_twice_change_no_other_warning(
+    real_data: Path, ransac: RansacOptions | None, wrong: int
+) -> None:
+    given = seen(real_data, "chair", 1)
+    given.points_2d[:wrong] += [90, 70]
+    rows = [*range(len(given.ids)), 0, 1, 2]
+    once, twice = (
+        fit(
+            given.points_3d[own],
+            given.points_2d[own],
+            CAMERA,
+            sigma=np.ones(len(own)),
+            ransac=ransac,
+        )
+        for own in (rows[:-3], rows)
+    )
+    own = [each for each in twice.warnings if each.kind != "left-out"]
+    assert [each.text for each in own] == [each.text for each in once.warnings]
+    assert len(twice.warnings) == len(own) + 3
+    assert [each.count for each in twice.evidence] == [each.count for each in once.evidence]
+
+
 @pytest.mark.long
 def test_no_hypothesis_contradicts_where_the_keypoints_lie(real_data: Path) -> None:
     """Wrong keypoints inside of the image are not those of a larger one."""

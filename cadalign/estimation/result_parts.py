@@ -237,10 +237,6 @@ class Posterior:
     warnings: Warnings = ()
     evidence: tuple[EvidenceSummary, ...] = ()
 
-    def stating(self, **known: Any) -> Posterior:
-        """A copy with other values of some fields; what is computed when asked for stays so."""
-        return quickly(type(self), vars(self) | known)
-
 
 class OutlineNotes(NamedTuple):
     """Additions of masks and photos to a result."""

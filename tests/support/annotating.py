@@ -27,7 +27,6 @@ from cadalign.cli import main
 from cadalign.datasets import KeypointNet, ModelKeypoints
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.evaluation.instances.instance import Instance, load_scene, make_instance
-from cadalign.geometry.mesh import farthest_rows
 from cadalign.io.images import write_image
 from cadalign.render import RaycastRenderer, visible_keypoints
 
@@ -161,7 +160,11 @@ def place_twenty(session: Session, case: Case) -> None:
 def corners_of(session: Session, count: int = 96) -> list[ModelKeypoint]:
     """Vertices of the model that are far from each other."""
     points = np.unique(session.model.cad.scene.mesh.vertices, axis=0)
-    rows = farthest_rows(points, count, center=session.model.cad.center)
+    rows = [int(np.linalg.norm(points - session.model.cad.center, axis=1).argmax())]
+    nearest = np.full(len(points), np.inf)
+    while len(rows) < min(count, len(points)):
+        nearest = np.minimum(nearest, np.linalg.norm(points - points[rows[-1]], axis=1))
+        rows.append(int(nearest.argmax()))
     return [ModelKeypoint("", (x, y, z)) for x, y, z in points[rows].tolist()]
 
 

@@ -97,14 +97,6 @@ def read_groups(path: Path, *, fix: str) -> Iterator[pa.Table]:
             yield table
 
 
-def uncompressed_bytes(path: Path, *, fix: str) -> int:
-    """Size of a Parquet file's content; errors are those of `read_table`."""
-    with _reading(path, fix):
-        metadata = pq.read_metadata(path)
-        groups = (metadata.row_group(index) for index in range(metadata.num_row_groups))
-        return sum(group.total_byte_size for group in groups)
-
-
 @contextmanager
 def _reading(path: Path, fix: str) -> Iterator[None]:
     try:
@@ -262,10 +254,6 @@ class Run:
                 if not self.is_finished and columns[-1][0] in table.column_names:
                     table = table.filter(table[columns[-1][0]].is_valid())
                 yield from checked(table, columns, path=path, fix=_RECORDS_FIX).to_pylist()
-
-    def record_bytes(self) -> int:
-        """Rough size of the instance records."""
-        return sum(uncompressed_bytes(path, fix=_RECORDS_FIX) for path in self._record_files())
 
     def _record_files(self) -> list[Path]:
         whole = self.folder.records

@@ -26,11 +26,11 @@ from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import Equal
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
+from cadalign.solvers.marginal.equations import POSE_UNKNOWNS
 from cadalign.solvers.marginal.problem import Mixture, Seen, coordinates_of, shape_at
 from cadalign.solvers.projection import ray_derivatives
 
 _Held = tuple[bool, bool, bool]
-_POSE = 6
 _ALONG_AXES = 1e-6  # of a rotation's entries, that are 0 or 1 where it takes axes to axes
 
 
@@ -258,14 +258,14 @@ def linearised(
     count, matrices = len(points), whitening_matrices(seen.whitening)
     rays = perspective(points @ pose.linear.T + pose.translation)
     errors = (matrices @ (rays - seen.rays)[:, :, None])[:, :, 0]
-    by_pose = matrices @ ray_derivatives(points, pose.packed)[:, :, :_POSE]
+    by_pose = matrices @ ray_derivatives(points, pose.packed)[:, :, :POSE_UNKNOWNS]
     weights, _ = loss_slopes((errors**2).sum(axis=1), seen.loss, seen.loss_scale)
     roots = np.sqrt(weights)[:, None]
     by_pose *= roots[..., None]
     blocks = np.zeros((count, 2, count, 3))  # a translation moves every point alike
     np.einsum("iaib->iab", blocks)[:] = by_pose[..., 3:] @ pose.linear
     rows = blocks.reshape(2 * count, 3 * count)
-    return (roots * errors).ravel(), rows, by_pose.reshape(2 * count, _POSE)
+    return (roots * errors).ravel(), rows, by_pose.reshape(2 * count, POSE_UNKNOWNS)
 
 
 def single_posterior(
@@ -304,7 +304,7 @@ def single_posterior(
         unknown = np.full((m, 3, 3), np.inf)
         return Estimate(boxed, still, (pose,), (np.full((9, 9), np.inf),), unknown, unknown)
     of_pose, solved = root.T @ root, across @ inverse
-    by_steps = (-solved @ jacobian).reshape(m + 1, 3, _POSE)
+    by_steps = (-solved @ jacobian).reshape(m + 1, 3, POSE_UNKNOWNS)
     left = np.einsum("iaib->iab", prior.reshape(m + 1, 3, m + 1, 3))
     blocks = m + 1, 3, 2 * count
     left = left - solved.reshape(blocks) @ across.reshape(blocks).swapaxes(1, 2)
@@ -315,7 +315,7 @@ def single_posterior(
     of_seen = rotation @ left[:m] @ rotation.T + in_camera @ of_pose @ in_camera.swapaxes(1, 2)
     extent = points[-1] - points[-2]
     relative = np.where(extent > 0, 1.0 / np.where(extent > 0, extent, 1.0), 0.0)
-    logs = np.concatenate([np.eye(_POSE), relative[:, None] * by_steps[m]])
+    logs = np.concatenate([np.eye(POSE_UNKNOWNS), relative[:, None] * by_steps[m]])
     covariance = logs @ of_pose @ logs.T
-    covariance[_POSE:, _POSE:] += relative[:, None] * relative * left[m]
+    covariance[POSE_UNKNOWNS:, POSE_UNKNOWNS:] += relative[:, None] * relative * left[m]
     return Estimate(boxed, still, (pose,), (covariance,), whole[:m], of_seen)

@@ -23,9 +23,8 @@ from cadalign.estimation.view import View
 from cadalign.geometry.camera import faced, turned_alignment
 from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.marginal.equations import POSE_UNKNOWNS
 from cadalign.solvers.marginal.problem import Seen, coordinates_of
-
-_POSE = 6
 
 
 class ShapePosterior(NamedTuple):
@@ -60,7 +59,7 @@ def shape_posterior(
     estimate, columns = np.concatenate([result.points_3d, result.bounds]), coordinates_of(seen)
     errors, rows, by_pose = linearised(estimate[seen.points], pose, seen)
     full, triangle = np.linalg.qr(by_pose, mode="complete")
-    rest = full[:, _POSE:].T
+    rest = full[:, POSE_UNKNOWNS:].T
     rows, right = rest @ rows, rest @ (rows @ estimate[seen.points].ravel() - errors)
     logs, means, covariances = [], [], []
     for weight, mean, covariance in zip(*gaussians_of(result.model), strict=True):

@@ -363,20 +363,14 @@ def _check_numbers(model: object, views: Sequence[View]) -> None:
     known = model.ids if isinstance(model, Model | ShapeModel) else ()
     for number, view in enumerate(views):
         count = len(view.keypoint_ids)
-        if known and view.is_numbered and count not in (0, len(known)):
-            raise InputError(
-                f"{count} keypoints without ids, but the model has {len(known)}",
-                where=f"views[{number}].ids",
-                fix="give the model's id of each keypoint of the view, in the view's order",
-            )
-        own = tuple(known or ())[: len(view.keypoint_ids)]
-        if view.is_numbered and own != tuple(range(len(own))):
-            listed = ", ".join(quote(each) for each in own[:5]) + (", ..." if len(own) > 5 else "")
-            raise InputError(
-                f"no ids are given, and the model's keypoints are not 0, 1, 2, ... but {listed}",
-                where=f"views[{number}].ids",
-                fix="give the model's id of each keypoint of the view, in the view's order",
-            )
+        if not (known and count and view.is_numbered) or known == tuple(range(count)):
+            continue
+        what = f"{count} keypoints without ids, but the model has {len(known)}"
+        if count == len(known):
+            listed = ", ".join(map(quote, known[:5])) + (", ..." if count > 5 else "")
+            what = f"no ids are given, and the model's keypoints are not 0, 1, 2, ... but {listed}"
+        fix = "give the model's id of each keypoint of the view, in the view's order"
+        raise InputError(what, where=f"views[{number}].ids", fix=fix)
 
 
 def _checked_inits(init: Any, views: Sequence[View]) -> list[Alignment | None]:

@@ -296,9 +296,7 @@ def _causes(
         found += stretch_doubts(result.alignment, result.std, result.model.fit_options())
     if ransac is None or (cause is not None and cause.kind == "mistake"):
         return found
-    residuals = np.concatenate([view.residuals for view in result.views])
-    inliers = np.concatenate([view.inliers for view in result.views])
-    return (*found, *rejections(residuals, inliers, ransac, common_sigma(views)))
+    return found + rejections(result.residuals, result.inliers, ransac, common_sigma(views))
 
 
 def common_sigma(views: Sequence[View]) -> float | None:

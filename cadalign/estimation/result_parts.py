@@ -131,9 +131,7 @@ class FittedKeypoints:
     @property
     def is_counted(self) -> BoolArray:
         """Rows (n,) that are not left out."""
-        counted = np.ones(len(self.points_3d), dtype=bool)
-        counted[[row for row, _ in self.repeats]] = False
-        return counted
+        return ~np.isin(np.arange(len(self.points_3d)), [row for row, _ in self.repeats])
 
     @property
     def observed(self) -> FloatArray:

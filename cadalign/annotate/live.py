@@ -10,7 +10,7 @@ import numpy as np
 from cadalign.annotate.keypoints import KeypointRegistry, ObjectShape, positions_of
 from cadalign.annotate.model import Wireframe
 from cadalign.annotate.observations import LEAST_JOINT_PAIRS
-from cadalign.annotate.problem import Estimate
+from cadalign.annotate.problem import LiveEstimate
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.estimation.result import Result
@@ -41,7 +41,7 @@ class Suggestion:
 class LiveAlignment:
     """Alignment of what is marked so far; without one a message says why."""
 
-    estimate: Estimate | None = None
+    estimate: LiveEstimate | None = None
     message: str = ""
     counts: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))
     """(n,), the complete pairs that count."""
@@ -60,7 +60,7 @@ class LiveAlignment:
 
 
 def live_alignment(
-    estimate: Estimate,
+    estimate: LiveEstimate,
     shape: ObjectShape,
     registry: KeypointRegistry,
     wireframe: Wireframe,
@@ -109,7 +109,7 @@ def missing_text(counts: BoolArray, shape: ObjectShape, observation: Observation
 
 
 def suggest(
-    estimate: Estimate, lines: Wireframe, points: Sequence[ModelKeypoint], shape: ObjectShape
+    estimate: LiveEstimate, lines: Wireframe, points: Sequence[ModelKeypoint], shape: ObjectShape
 ) -> Suggestion | None:
     """Choose the visible one of some keypoints that tells most.
 

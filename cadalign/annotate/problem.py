@@ -99,7 +99,7 @@ class Known:
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class LiveEstimate:
     """An alignment of what is marked; a ``message`` says what it assumes beyond that.
 
     ``sigma`` is the pairs' standard deviation [px], ``fit_options`` are those with which `cadalign
@@ -145,7 +145,7 @@ class LiveProblem:
         model = self.model
         return model if isinstance(model, Model) and model.shape_sigma is None else None
 
-    def estimate(self) -> Estimate:
+    def estimate(self) -> LiveEstimate:
         """Align with as few assumptions as the marks need; raises a CadalignError without."""
         reason: CadalignError | None = None
         for attempt, message in self._attempts():
@@ -156,7 +156,7 @@ class LiveProblem:
                 continue
             judged = attempt if attempt.exact else attempt.at_focal(result.camera)
             outliers = judged.contradicting()
-            return Estimate(result, message, sigma, {} if message else options, outliers)
+            return LiveEstimate(result, message, sigma, {} if message else options, outliers)
         assert reason is not None
         raise reason
 

@@ -19,7 +19,7 @@ from cadalign.annotate.model import OpenedModel, open_model
 from cadalign.annotate.observations import ObservationFile
 from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.photos import PhotoFile, camera_of, find_photos
-from cadalign.annotate.problem import Estimate, Known, LiveProblem, warm_up
+from cadalign.annotate.problem import Known, LiveEstimate, LiveProblem, warm_up
 from cadalign.arrays import BoolArray
 from cadalign.errors import CadalignError, DataError, DegenerateError, InputError
 from cadalign.io.observation import Observation, read_camera, with_lens
@@ -38,7 +38,7 @@ class Annotation:
     """True if it was saved before the solvers were ready, so without what they find."""
     live: tuple[Marks, LiveAlignment] | None = None
     """The last alignment, with its marks."""
-    _estimated: tuple[str, Estimate] | None = None  # with what it depends on
+    _estimated: tuple[str, LiveEstimate] | None = None  # with what it depends on
 
     @property
     def marks(self) -> Marks:
@@ -106,7 +106,7 @@ class Annotation:
             marks.keypoints,
         )
 
-    def _estimate(self, observation: Observation) -> Estimate:
+    def _estimate(self, observation: Observation) -> LiveEstimate:
         registry, file = self.model.registry, self.file
         points = [point for _, point in registry if self.shape.id_of(point) is not None]
         depends = replace(observation, unfinished=None).to_dict()

@@ -18,7 +18,7 @@ from cadalign.annotate.live import LiveAlignment, Suggestion, live_alignment, mi
 from cadalign.annotate.model import Wireframe
 from cadalign.annotate.observations import LIKELY_STRETCH
 from cadalign.annotate.page_state import facts_of
-from cadalign.annotate.problem import Estimate, Known, LiveProblem
+from cadalign.annotate.problem import Known, LiveEstimate, LiveProblem
 from cadalign.datasets import ModelKeypoint
 from cadalign.errors import DegenerateError, InputError
 from cadalign.evaluation.simulation import SimulatedProblem
@@ -45,7 +45,7 @@ def estimate_of(
     camera: Camera | None = None,
     points_2d: np.ndarray | None = None,
     stretch: float = WEAK,
-) -> Estimate:
+) -> LiveEstimate:
     """The estimate of a problem's pairs, by default with its own camera."""
     observation = Observation(
         problem.points_3d,

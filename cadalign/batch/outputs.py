@@ -88,7 +88,7 @@ WARNED = {"warning_kinds": "with warnings", "uncertain": "uncertain"}
 
 
 def warnings_text(table: pa.Table) -> str:
-    """How many rows of a table have warnings, of which kinds, and what is uncertain of how many."""
+    """Counts of a table's rows with warnings, by kind, and of those with something uncertain."""
     said = []
     for column, label in WARNED.items():
         rows = [{*cell.split("; ")} for cell in table[column].to_pylist() if cell]

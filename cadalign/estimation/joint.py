@@ -250,7 +250,7 @@ class DiagnosedPosterior(Posterior):
         return (*self.causes(), *self.stated)
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is stored, without the function that seeks."""
+        """The fields to store, without the function that seeks."""
         own = vars(self) | {"warnings": self.warnings}
         return {name: own[name] for name in own if name != "causes"}
 

@@ -230,7 +230,7 @@ class ObservedImage:
 
     @property
     def labels(self) -> tuple[str | int, ...]:
-        """What messages call the keypoints: their names, or else their rows in the file."""
+        """Names of the keypoints in messages, or else their rows in the file."""
         count = len(self.points_2d) + len(self.not_found)
         if self.names is not None and len(set(self.names)) == len(self.names):
             return self.names
@@ -238,7 +238,7 @@ class ObservedImage:
 
     @property
     def text_of_not_found(self) -> str:
-        """What is said of the keypoints that are left out; empty where none is."""
+        """A note about the keypoints that are left out; empty where none is."""
         if not self.not_found:
             return ""
         count, rows = len(self.not_found), ", ".join(map(str, self.not_found[:_LISTED]))

@@ -112,7 +112,7 @@ def photo_size(path: str | os.PathLike[str]) -> tuple[int, int]:
 
 
 def exif_note(path: Path, size: tuple[int, int]) -> str:
-    """What is said of a photo of another size (width, height) than this one, if EXIF turned it."""
+    """A note about a photo of another size than this (width, height), if EXIF turned it."""
     with open_photo(path) as image:
         is_turned = image.size == size and image.getexif().get(_ORIENTATION) in _ON_ITS_SIDE
     if not is_turned:

@@ -96,7 +96,7 @@ class ImageKeypoints:
 
     @property
     def is_found(self) -> BoolArray:
-        """Which keypoints were found (k,): a measured pixel, and no score of 0."""
+        """Marks the keypoints (k,) that were found: with a measured pixel, and no score of 0."""
         return self.measured if self.scores is None else np.asarray(self.scores > 0)
 
     def check_camera(self, camera: Camera) -> None:

@@ -15,6 +15,7 @@ and then adds distortion, for the first two: OpenCV's model with k1, k2, p1, p2,
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import lru_cache
 from typing import Literal, get_args
 
@@ -71,10 +72,8 @@ def unmeasured(points_2d: FloatArray, *, least: int = _SEVERAL) -> BoolArray:
     [True, False, True, True]
     """
     bad = np.asarray(~np.isfinite(points_2d).all(axis=1))
-    for value in _PLACEHOLDERS:
-        here = (points_2d == value).all(axis=1)
-        if np.count_nonzero(here) >= least:
-            bad |= here
+    for _, here in _placeholders(points_2d, least):
+        bad |= here
     known = points_2d[~bad]
     if len(known) >= _CROWD and np.ptp(known, axis=0).max() >= _CROWDED_SPAN:
         _, of, counts = np.unique(known, axis=0, return_inverse=True, return_counts=True)
@@ -109,13 +108,20 @@ def check_pixels(points_2d: FloatArray, width: int, height: int, *, where: str) 
 
 
 def _refuse_placeholders(points_2d: FloatArray, where: str) -> None:
+    for value, here in _placeholders(points_2d, _SEVERAL):
+        rows = np.flatnonzero(here)
+        listed = ", ".join(map(str, rows[:5])) + (", ..." if len(rows) > 5 else "")
+        what = f"{len(rows)} keypoints, rows {listed}, are at exactly ({value:g}, {value:g})"
+        fix = "detectors write this for keypoints that they did not find: leave these out"
+        raise InputError(what, where=where, fix=fix)
+
+
+def _placeholders(points_2d: FloatArray, least: int) -> Iterator[tuple[float, BoolArray]]:
+    """Values of both coordinates that are written ``least`` times, and the rows (n,) of each."""
     for value in _PLACEHOLDERS:
-        rows = np.flatnonzero((points_2d == value).all(axis=1))
-        if len(rows) >= _SEVERAL:
-            listed = ", ".join(map(str, rows[:5])) + (", ..." if len(rows) > 5 else "")
-            what = f"{len(rows)} keypoints, rows {listed}, are at exactly ({value:g}, {value:g})"
-            fix = "detectors write this for keypoints that they did not find: leave these out"
-            raise InputError(what, where=where, fix=fix)
+        here = (points_2d == value).all(axis=1)
+        if np.count_nonzero(here) >= least:
+            yield value, here
 
 
 def perspective(points_cam: FloatArray) -> FloatArray:

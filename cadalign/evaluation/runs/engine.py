@@ -224,12 +224,15 @@ def _submitted(
     executor: Executor, workers: Workers, call: Callable[..., Any], tasks: Sequence[Any]
 ) -> Future[Any]:
     """Hand out a call; the future of a dead executor has the error that says so."""
+    future: Future[Any] = Future()
     try:
         return executor.submit(call, tasks)
     except workers.deaths as error:
-        future: Future[Any] = Future()
         future.set_exception(error)
-        return future
+    except (OSError, ValueError) as error:
+        # A process cannot be started: the pool is closing its pipes, since another one has died.
+        future.set_exception(BrokenProcessPool(reason_of(error)))
+    return future
 
 
 def _rows_of(future: Future[list[Row]], workers: Workers) -> list[Row]:

@@ -7,13 +7,14 @@ appendix B1 of the Advanced Visualizer manual.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from itertools import chain
+import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, IntArray, parse_numbers
+from cadalign.arrays import BoolArray, FloatArray, IntArray, parse_numbers
 from cadalign.errors import DataError
 from cadalign.geometry.mesh import Material, Mesh
 from cadalign.io.files import damaged
@@ -21,7 +22,10 @@ from cadalign.io.meshes.materials import WHITE, load_materials
 
 _DIGITS = b"0123456789+-"
 _MAX_VALUES = 16  # of a vertex; the format has at most 7
-_Rows = list[list[bytes]]
+_BLANK, _NEWLINE = b" \n"
+_BLANKS = bytes.maketrans(b"\t\r", b"  ")
+_Rows = tuple[bytes, IntArray]
+"""Words of some lines, one after the other, and how many each line has."""
 
 
 def read_obj(data: bytes, path: Path) -> Mesh:
@@ -31,37 +35,42 @@ def read_obj(data: bytes, path: Path) -> Mesh:
     that a triangle comes from. Lines and points (``l``, ``p``) have no number. Normals, groups,
     curves and surfaces are not read.
     """
-    rows: dict[bytes, _Rows] = {b"v": [], b"vt": [], b"f": []}
-    # Of each face: vertices and texture coordinates before it, from which negative indices count
-    # back, and the number of its material.
-    before: list[tuple[int, int, int]] = []
+    data = _tidied(data)
+    codes = np.frombuffer(data, np.uint8)
+    ends = np.flatnonzero(codes == _NEWLINE)
+    starts = np.append(0, ends[:-1] + 1)
+    found = {key: _begin_with(key, codes, starts) for key in (b"v", b"vt", b"f", b"vn")}
+    faces = np.flatnonzero(found[b"f"])
     libraries: list[str] = []
-    numbers, material = {"": 0}, 0
-    for number, line in _logical_lines(data):
+    numbers, changes = {"": 0}, [(0, 0)]  # materials; the line from which on faces have which
+    others = ~np.logical_or.reduce([*found.values()]) & (ends > starts)
+    for number in np.flatnonzero(others).tolist():
+        line = data[starts[number] : ends[number]]
         key, _, body = line.partition(b" ")
-        if key in rows:
-            if key == b"f":
-                before.append((len(rows[b"v"]), len(rows[b"vt"]), material))
-            rows[key].append(_words(body))
-        elif key == b"usemtl":
-            material = numbers.setdefault(_text(body), len(numbers))
+        if key == b"usemtl":
+            changes.append((number, numbers.setdefault(_text(body), len(numbers))))
         elif key == b"mtllib":
             libraries.append(_text(body))
         elif b"\0" in line:
-            raise damaged("holds binary data, not the text of an OBJ file", f"line {number}")
-    if not before:
-        what = f"no faces; {len(rows[b'v'])} vertices were found"
+            raise damaged("holds binary data, not the text of an OBJ file", f"line {number + 1}")
+    if not len(faces):
+        what = f"no faces; {found[b'v'].sum()} vertices were found"
         raise DataError(what, fix="is it an OBJ file, and whole?")
-    if not rows[b"v"]:
-        raise damaged(f"{len(before)} faces, but no vertices")
+    if not found[b"v"].any():
+        raise damaged(f"{len(faces)} faces, but no vertices")
+    lengths = ends + 1 - starts
+    rows = {key: _words(key, codes[np.repeat(found[key], lengths)]) for key in (b"v", b"vt", b"f")}
     try:
         vertices, colors = _parse_vertices(rows[b"v"])
         coordinates = _parse_rows(rows[b"vt"])
         corners, sizes = _parse_faces(rows[b"f"])
     except (ValueError, OverflowError):
         raise _first_malformed(data) from None
-    counts, looks = np.split(np.array(before), [2], axis=1)
-    seen = np.repeat(counts, sizes, axis=0)
+    # Vertices and texture coordinates before each face: negative indices count back from there.
+    before = np.stack([np.cumsum(found[key])[faces] for key in (b"v", b"vt")], axis=1)
+    first, materials = np.array(changes).T
+    looks = materials[np.searchsorted(first, faces, side="right") - 1]
+    seen = np.repeat(before, sizes, axis=0)
     has_uv = corners[:, 1] != 0
     indices = np.where(corners < 0, seen + corners, corners - 1)
     for kind, name, count, used in (
@@ -93,34 +102,57 @@ def read_obj(data: bytes, path: Path) -> Mesh:
     )
 
 
-def _logical_lines(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """The lines with their numbers, stripped; a line that ends in a backslash goes on."""
-    # A tab may separate the keyword too.
-    lines = data.replace(b"\t", b" ").split(b"\n")
-    if b"\\" not in data:  # as in most files: a loop takes longer
-        yield from enumerate(map(bytes.strip, lines), start=1)
-        return
+def _tidied(data: bytes) -> bytes:
+    """The text with blanks for tabs, none at the begin of a line, and a newline at its end.
+
+    A line that ends in a backslash goes on; empty lines behind it keep the count.
+    """
+    data = data.translate(_BLANKS) + b"\n"  # a tab may separate the keyword too
+    if b"\\" not in data and b"\n " not in data and data[:1] != b" ":
+        return data
+    lines: list[bytes] = []
     parts: list[bytes] = []
-    for number, line in enumerate(map(bytes.strip, lines), start=1):
-        if line[-1:] == b"\\" and number < len(lines):
+    for line in map(bytes.strip, data.split(b"\n")):
+        if line[-1:] == b"\\":
             parts.append(line[:-1])
         else:
-            yield number, b" ".join([*parts, line]) if parts else line
+            lines += [b" ".join([*parts, line]), *[b""] * len(parts)]
             parts = []
+    return b"\n".join([*lines, *parts, b""])
 
 
-def _words(body: bytes) -> list[bytes]:
-    return (body.partition(b"#")[0] if b"#" in body else body).split()
+def _begin_with(key: bytes, codes: npt.NDArray[np.uint8], starts: IntArray) -> BoolArray:
+    """The lines (n,) that have a keyword."""
+    last = len(codes) - 1
+    found = codes[np.minimum(starts + len(key), last)] <= _BLANK
+    for place, code in enumerate(key):
+        found &= codes[np.minimum(starts + place, last)] == code
+    return found
+
+
+def _words(key: bytes, codes: npt.NDArray[np.uint8]) -> _Rows:
+    """The words behind the keyword of lines that have it."""
+    starts = np.append(0, np.flatnonzero(codes[:-1] == _NEWLINE) + 1)[: len(codes)]
+    for place in range(len(key)):
+        codes[starts + place] = _BLANK
+    text = codes.tobytes()
+    if b"#" in text:
+        text = re.sub(rb"#.*", b"", text)
+        codes = np.frombuffer(text, np.uint8)
+    is_blank = codes <= _BLANK
+    ends = np.flatnonzero(is_blank[1:] & ~is_blank[:-1]) + 1
+    before = np.searchsorted(ends, np.flatnonzero(codes == _NEWLINE), side="right")
+    return text.replace(b"\n", b" "), np.diff(before, prepend=0)
 
 
 def _parse_rows(rows: _Rows, *, least: int = 1, padding: float = 0.0) -> FloatArray:
     """The numbers of statements that may differ in length, padded; (n, width) float."""
-    lengths = np.fromiter(map(len, rows), np.int64, len(rows))
+    text, lengths = rows
     width = int(lengths.max(initial=0))
     if (lengths < least).any() or width > _MAX_VALUES:
         raise ValueError("too few or too many numbers in a line")
-    values = parse_numbers(b" ".join(chain.from_iterable(rows)), int(lengths.sum()))
-    found = np.full((len(rows), width), padding)
+    values = parse_numbers(text, int(lengths.sum()))
+    found = np.full((len(lengths), width), padding)
     found[np.arange(width) < lengths[:, None]] = values
     return found
 
@@ -140,16 +172,16 @@ def _parse_vertices(rows: _Rows) -> tuple[FloatArray, FloatArray | None]:
 
 def _parse_faces(rows: _Rows) -> tuple[IntArray, IntArray]:
     """Corners (c, 2) as (vertex, texture coordinate or 0), as in the file, and faces' sizes."""
-    sizes = np.fromiter(map(len, rows), np.int64, len(rows))
+    text, sizes = rows
     if sizes.min() < 3:
         raise ValueError("a face has fewer than 3 corners")
-    total, text = int(sizes.sum()), b" ".join(chain.from_iterable(rows)).replace(b"//", b"/0/")
+    total, text = int(sizes.sum()), text.replace(b"//", b"/0/")
     # What stays when digits and signs go is the form of each corner: "", "/" or "//".
     forms = set(text.translate(None, _DIGITS).split())
     width = text.count(b"/") // total + 1
     is_even = forms == ({b"/" * (width - 1)} if width > 1 else set())
     corners = np.zeros((total, 2), dtype=np.int64)
-    if is_even and width <= 3 and b"/ " not in text and not text.endswith(b"/"):
+    if is_even and width <= 3 and b"/ " not in text:
         values = parse_numbers(text.replace(b"/", b" "), width * total, np.int64)
         corners[:, : min(width, 2)] = values.reshape(total, width)[:, :2]
     else:
@@ -173,10 +205,11 @@ def _first_malformed(data: bytes) -> DataError:
         b"vt": _parse_rows,
         b"f": _parse_faces,
     }
-    for number, line in _logical_lines(data):
-        key, _, body = line.partition(b" ")
+    for number, line in enumerate(data.split(b"\n"), start=1):
+        key = line.partition(b" ")[0]
         try:
-            parsers.get(key, len)([_words(body)])
+            if key in parsers:
+                parsers[key](_words(key, np.frombuffer(bytearray(line + b"\n"), np.uint8)))
         except (ValueError, OverflowError):
             shown = line[:60].decode("ascii", errors="replace")
             return damaged(f"cannot read {shown!r}", f"line {number}")

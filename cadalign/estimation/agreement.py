@@ -40,6 +40,7 @@ _MORE_AGREE = 2.0  # of -2 log likelihood, that is gained where more keypoints a
 _AS_MANY_ARE_FOUND = 2 * math.log(100)  # the same after a robust search, where as many do
 _FEW_REJECTED = 0.1  # share of the keypoints, up to which an uncertain shape is not doubted
 _MOST_REJECTED = 1 / 3  # share of the keypoints that are outliers; more are none
+_UNUSUAL = 0.05  # probability by chance of the squares that a piece of evidence adds
 _CHANCE_OF_RATIO = 1e-3  # that residuals of an unknown noise differ by as much
 _UPRIGHT = 0.5  # cosine between the model's up axis and the photo's upwards, at least
 _SEEN_ALONG = 0.3  # of the up axis in the photo, which is seen end-on
@@ -65,7 +66,8 @@ class Rule(NamedTuple):
 class Agreement(NamedTuple):
     """Agreement of all evidence with an estimate.
 
-    The ``score`` is -2 log likelihood of all keypoints, of which outliers lie anywhere.
+    The ``score`` is -2 log likelihood of all keypoints, of which outliers lie anywhere; that of
+    ``integrated`` shapes is known where none are. Both are known but for constants.
     """
 
     result: Result
@@ -78,6 +80,7 @@ class Agreement(NamedTuple):
     squares: Sequence[float]
     posture: str  # what is unlikely of the object's pose; empty if nothing is
     is_low: bool  # the camera is hardly above the ground, if at all
+    integrated: float | None
 
     @property
     def ratio(self) -> float:
@@ -119,6 +122,7 @@ class DiagnosisCase:
     size: Size | None = None
     has_rows: bool = False  # the ids of keypoints are their rows
     labels: Sequence[Hashable] = ()  # what the user calls the keypoints of these rows
+    has_photo: bool = False  # of the camera's size
     is_tolerant: bool = False  # a robust loss leaves large residuals out of account
 
     @property
@@ -193,7 +197,10 @@ class DiagnosisCase:
         posture, is_low = _posture(result, self.model.up_axis)
         if posture and not self.is_exact:
             score += _UNLIKELY
-        agreed = inliers, count, noise, squares, posture, is_low
+        integrated = None
+        if ransac is None and inliers == count and result.posterior.score is not None:
+            integrated = score + result.posterior.score
+        agreed = inliers, count, noise, squares, posture, is_low, integrated
         return Agreement(result, score + chi_square, chi_square, redundancy, *agreed)
 
     def has_chance(self, found: Agreement) -> bool:
@@ -241,15 +248,28 @@ class DiagnosisCase:
 
     def gain(self, rule: Rule, found: Agreement, given: Agreement) -> float:
         """Fall of -2 log likelihood without a cause, less the price of what was left out."""
-        if not rule.price:
-            return given.score - found.score
+        fall = given.score - found.score
+        if not self.is_exact and given.integrated is not None and found.integrated is not None:
+            fall = given.integrated - found.integrated
+        elif rule.price:
+            fall = given.chi_square - found.chi_square
         fewer = max(given.redundancy - found.redundancy, 0)
-        price = rule.price * max(found.ratio, 1.0) ** 2  # where sigma is too small
-        return given.chi_square - found.chi_square - price * fewer
+        return fall - rule.price * max(found.ratio, 1.0) ** 2 * fewer  # where sigma is too small
+
+    def _may_be_wrong(self, found: Agreement, given: Agreement) -> bool:
+        """True if a piece of evidence adds more squares than right ones do.
+
+        What is integrated out grows with every piece, also with right ones.
+        """
+        fewer, noise = given.redundancy - found.redundancy, self.inflation * max(found.ratio, 1.0)
+        squares, freedom = given.chi_square - found.chi_square, found.result.degrees_of_freedom
+        return chance_of(squares / noise**2, max(fewer, 1), freedom) < _UNUSUAL
 
     def explains(self, rule: Rule, found: Agreement, given: Agreement) -> bool:
         """True if the data without a cause fit, and much better than as they were ``given``."""
         gain, is_piece = self.gain(rule, found, given), rule.price > 0
+        if is_piece and not self.is_exact and not self._may_be_wrong(found, given):
+            return False
         is_robust = self.ransac is not None and not is_piece
         if is_robust and (self.is_exact or given.inliers < given.keypoints):
             more = found.inliers > given.inliers or found.inliers == found.keypoints

@@ -145,7 +145,9 @@ def align(
         return _estimate(compile_problem(model, views, size, some, own, ransac), start)
 
     seen = [given[number] for number in problem.numbers]
-    case = DiagnosisCase(model, seen, again, ransac, size, is_tolerant=loss != FitOptions.loss)
+    case = DiagnosisCase(model, seen, again, ransac, size)
+    has_photo, is_tolerant = any(view.has_photo for view in given), loss != FitOptions.loss
+    case = replace(case, has_photo=has_photo, is_tolerant=is_tolerant)
     try:
         result = _estimate(problem, start)
     except (NoConsensusError, DegenerateError) as error:
@@ -199,8 +201,8 @@ def _align_plain(
     problems = pack_one(points[rows], view.pixels, view.camera)
     scores = view.scores if ransac is not None else None
     labels = () if view.is_numbered else view.keypoint_ids
-    search = ransac, scores, model.symmetry, start
-    return fit_one(problems, own, *search, labels=labels, model=model, view=view)
+    search = ransac, scores, model.symmetry, start, labels, view.has_photo
+    return fit_one(problems, own, *search, model=model, view=view)
 
 
 def _align_single(problem: Problem, start: float) -> Result:
@@ -238,6 +240,7 @@ def _align_single(problem: Problem, start: float) -> Result:
         is_curved=bool(covariances.any()),
         redundancy=2 * len(rows) - POSE_UNKNOWNS,
         cost=cost,
+        score=float(minima.scores[0]),
         stats=stats,
         component=component,
         stretched_axes="",

@@ -61,7 +61,7 @@ def diagnose(case: DiagnosisCase, *, result: Result | None = None) -> EstimateWa
     if not any(len(view.keypoint_ids) for view in case.views):
         return None
     given = None if result is None else case.agreement(result)
-    if given is not None and not case.is_doubtful(given):
+    if given is not None and not (case.is_doubtful(given) or _contradicts(case, given)):
         return _of_another_size(case, given)
     if given is None or any(view.has_outline for view in case.views):
         case = replace(case, views=_without_outlines(case.views))
@@ -118,7 +118,7 @@ def _measures_of(case: DiagnosisCase) -> list[str]:
 
 
 def diagnose_fit(
-    fitted: FittedKeypoints, labels: Sequence[Hashable] = ()
+    fitted: FittedKeypoints, *, labels: Sequence[Hashable] = (), has_photo: bool = False
 ) -> EstimateWarning | None:
     """As `diagnose`, of keypoints in one view; after a robust search also of its inliers.
 
@@ -134,7 +134,7 @@ def diagnose_fit(
         drawn = None if fitted.inliers[counted].all() else ransac
         seen = fitted.points_3d, fitted.observed, fitted.camera
         case = case_of_fit(*seen, options, drawn, np.flatnonzero(kept).tolist())
-        if cause := diagnose(replace(case, ransac=ransac, labels=labels)):
+        if cause := diagnose(replace(case, ransac=ransac, labels=labels, has_photo=has_photo)):
             return cause
     return None
 
@@ -280,6 +280,7 @@ def _rules_for(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
     if fails or case.has_contradiction(given):
         least = OUTLIERS.gain if case.is_exact else AS_MANY_AGREE
         yield from () if case.ransac else (OUTLIERS._replace(gain=least),)
+    if fails or not case.is_exact or case.has_contradiction(given):
         yield from _pieces_of(case, given)
 
 
@@ -326,7 +327,7 @@ def _other_sizes(case: DiagnosisCase) -> Iterator[Rule]:
     camera, points = case.views[0].camera, np.concatenate([view.pixels for view in case.views])
     sizes = {(view.camera.width, view.camera.height) for view in case.views}
     # Another size leaves much open, so that other evidence which is wrong would pass for it.
-    if len(sizes) > 1 or any(view.sources for view in case.views):
+    if len(sizes) > 1 or case.has_photo or any(view.sources for view in case.views):
         return
 
     def holds_most(factor: float) -> bool:
@@ -346,6 +347,15 @@ def _other_sizes(case: DiagnosisCase) -> Iterator[Rule]:
         for noise in sorted({1.0, 1.0 if is_inside else max(factor, 1.0)}):
             undo = partial(_resized, size=(width, height), noise=noise)
             yield Rule("mistake", clause, undo, gain=_CAMERA_GAIN)
+
+
+def _contradicts(case: DiagnosisCase, given: Agreement) -> bool:
+    """True if a shape that bends to a piece of evidence is much likelier without it."""
+    return not case.is_exact and any(
+        found is not None and case.explains(piece, found, given)
+        for piece in _pieces_of(case, given)
+        for found in [case.without(piece)]
+    )
 
 
 def _pieces_of(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:

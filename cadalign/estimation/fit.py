@@ -171,11 +171,13 @@ def fit_one(
     symmetry: Symmetry | None,
     start: float,
     labels: Sequence[Hashable] = (),
+    has_photo: bool = False,
     **seen: Any,
 ) -> Result:
     """Fit the only problem, begun at ``start`` [s]; ``seen`` as of `result_of_keypoints`.
 
-    Warnings name the keypoints by their ``labels``, by default their rows.
+    Warnings name the keypoints by their ``labels``, by default their rows, and suppose no other
+    size of images if the camera ``has_photo``.
     """
     try:
         fitted = fit_once(problems, options, ransac, scores, start)
@@ -189,18 +191,16 @@ def fit_one(
     return result_of_keypoints(
         problems.points_2d,
         fitted,
-        diagnosis=partial(diagnosis_of_fit, labels=tuple(labels)),
+        diagnosis=partial(diagnosis_of_fit, labels=tuple(labels), has_photo=has_photo),
         symmetry=symmetry,
         **seen,
     )
 
 
-def diagnosis_of_fit(
-    fitted: FittedKeypoints, labels: Sequence[Hashable] = ()
-) -> EstimateWarning | None:
+def diagnosis_of_fit(fitted: FittedKeypoints, **given: Any) -> EstimateWarning | None:
     from cadalign.estimation.diagnose import diagnose_fit  # rarely asked
 
-    return diagnose_fit(fitted, labels)
+    return diagnose_fit(fitted, **given)
 
 
 def fit_once(

@@ -78,6 +78,7 @@ def result_of(
     is_curved: bool,
     evidence: Sequence[EvidenceSummary] = (),
     redundancy: int,
+    score: float | None = None,
     notes: OutlineNotes = NO_NOTES,
     **of_result: Any,
 ) -> Result:
@@ -160,6 +161,7 @@ def result_of(
         evidence=(*summaries, *notes.evidence),
         degrees_of_freedom=prior.degrees_of_freedom,
         redundancy=redundancy,
+        score=score,
     )
     of_views[0] = replace(of_views[0], posterior=posterior)
     has_length = prior.lengths > 0
@@ -229,6 +231,7 @@ def result_of_minima(
         evidence=summaries_of(minimum.evidence, minimum.state),
         redundancy=redundancy_of(minimum.evidence),
         cost=minimum.cost,
+        score=minimum.score,
         stats=stats,
         component=minimum.component,
         stretched_axes=stretched_axes(held),

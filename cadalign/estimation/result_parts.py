@@ -234,6 +234,8 @@ class Posterior:
     redundancy: int = 0
     warnings: Warnings = ()
     evidence: tuple[EvidenceSummary, ...] = ()
+    score: float | None = None
+    """-2 log probability, its shape integrated out, but for constants; None of exact models."""
 
 
 class OutlineNotes(NamedTuple):

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.mistaken import CAMERA, CATEGORIES, Sighting, examples, learned, said, seen, sighting
+from support.scenes import turned
 
 from cadalign import Camera, Model, RansacOptions, Result, Size, View, align, fit
 from cadalign.estimation import align as align_module
@@ -105,9 +106,22 @@ def test_wrong_gravity_is_named_of_learned_shapes(real_data: Path) -> None:
     for seed in SEEDS:
         category, given = of_category(real_data, seed)
         up = given.pose.rotation[:, 1]
-        for wrong in (-up, up[[0, 2, 1]]):
+        tilted = turned(up, 20.0, np.random.default_rng(seed))
+        for wrong in (-up, up[[0, 2, 1]], tilted):
             warnings = of_shape(real_data, category, given, up=wrong).warnings
             named.append(any("`up`" in each.text or ".up " in each.text for each in warnings))
+    assert np.mean(named) >= 0.8
+
+
+@pytest.mark.long
+def test_depths_of_the_background_are_named(real_data: Path) -> None:
+    named = []
+    for seed in SEEDS:
+        category, given = of_category(real_data, seed)
+        depth = given.pose.apply(given.points_3d)[:, 2].max() + 1.0
+        behind = depth * np.random.default_rng(seed).normal(1.0, 0.005, len(given.ids))
+        warnings = of_shape(real_data, category, given, depth=behind).warnings
+        named.append(any(".depth " in each.text for each in warnings))
     assert np.mean(named) >= 0.8
 
 
@@ -117,7 +131,8 @@ def test_right_evidence_of_learned_shapes_is_not_doubted(real_data: Path) -> Non
     for seed in range(40):
         category, given = of_category(real_data, seed)
         up = given.pose.rotation[:, 1]
-        for evidence in ({}, {"up": up}):
+        depth = given.pose.apply(given.points_3d)[:, 2]
+        for evidence in ({}, {"up": up}, {"depth": depth}):
             kinds = {
                 each.kind for each in of_shape(real_data, category, given, **evidence).warnings
             }
@@ -211,6 +226,17 @@ def test_no_hypothesis_contradicts_where_the_keypoints_lie(real_data: Path) -> N
         assert camera.contains(shown).all()
         for width, height in ((1707, 960), (1920, 1080), (2560, 1440), (3840, 2160)):
             assert f"images of {width} x {height}" not in text
+
+
+def test_no_hypothesis_contradicts_the_size_of_a_photo(real_data: Path) -> None:
+    supposed = [False, False]
+    for seed in range(8):
+        given = seen(real_data, "chair", seed, distance=(1.2, 1.6))
+        for has_photo in (False, True):
+            view = View(CAMERA, given.points_2d / 2, has_photo=has_photo)
+            text = said(partial(align, Model(points_3d=given.points_3d), view))
+            supposed[has_photo] |= "images of 320 x 240 px" in text
+    assert supposed == [True, False]
 
 
 def test_implausible_stretches_and_units_are_questioned(real_data: Path) -> None:

@@ -85,18 +85,19 @@ _LEAST_REGION = 3.0  # px across; smaller ones are hidden by the markers
 
 @dataclass(frozen=True, eq=False)
 class KeypointMarks:
-    """Keypoints to be drawn [px]; None for what is not.
+    """Keypoints to be drawn [px], each empty where there is none.
 
-    ``seen`` (k, 2), ``back`` (m, 2), ``unseen`` (n, 2) and ``outliers`` (o, 2) are points,
-    ``residuals`` (r, 2, 2) lines from one to another, and ``regions`` (q, j, 2) closed curves.
+    ``observed`` (k, 2), ``reprojected`` (m, 2), ``unseen`` (n, 2) and ``outliers`` (o, 2) are
+    points, ``residuals`` (r, 2, 2) lines from one to another, and ``regions`` (q, j, 2) closed
+    curves.
     """
 
-    seen: FloatArray | None = None
-    back: FloatArray | None = None
-    residuals: FloatArray | None = None
-    unseen: FloatArray | None = None
-    regions: FloatArray | None = None
-    outliers: FloatArray | None = None
+    observed: FloatArray
+    reprojected: FloatArray
+    unseen: FloatArray
+    regions: FloatArray
+    outliers: FloatArray
+    residuals: FloatArray
 
     @classmethod
     def checked(
@@ -108,71 +109,63 @@ class KeypointMarks:
         outliers: npt.ArrayLike | None,
     ) -> KeypointMarks:
         """The marks of `draw_overlay`'s arguments; raises InputError where they don't match."""
-        seen = None if observed is None else as_points(observed, name="observed", dimension=2)
-        back = None
+        given = {"observed": observed, "unseen": unseen, "outliers": outliers}
+        points = {
+            name: as_points(np.empty((0, 2)) if each is None else each, name=name, dimension=2)
+            for name, each in given.items()
+        }
+        seen = points["observed"]
+        back = np.full_like(seen, np.inf)
         if reprojected is not None:
             back = as_floats(reprojected, name="reprojected", shape=(None, 2), finite=False)
-        if seen is not None and back is not None and len(seen) != len(back):
-            raise InputError(
-                f"{len(back)} keypoints, but {len(seen)} observed ones", where="reprojected"
-            )
-        pairs = None if seen is None or back is None else _finite(np.stack([seen, back], axis=1))
+            if observed is None:
+                seen = np.full_like(back, np.inf)
+        if len(seen) != len(back):
+            what = f"{len(back)} keypoints, but {len(seen)} observed ones"
+            raise InputError(what, where="reprojected")
+        curves = np.empty((0, 1, 2)) if regions is None else regions
         return cls(
-            seen,
-            None if back is None else _finite(back),
-            pairs,
-            None if unseen is None else as_points(unseen, name="unseen", dimension=2),
-            None if regions is None else as_floats(regions, name="regions", shape=(None, None, 2)),
-            None if outliers is None else as_points(outliers, name="outliers", dimension=2),
+            **points,
+            reprojected=_finite(back),
+            regions=as_floats(curves, name="regions", shape=(None, None, 2)),
+            residuals=_finite(np.stack([seen, back], axis=1)),
         )
 
-    def placed(self, canvas: Canvas) -> KeypointMarks:
-        """The same marks in pixels of a canvas."""
-        return KeypointMarks(
-            **{
-                name: each if each is None else canvas.place(each)
-                for name, each in vars(self).items()
-            }
-        )
+    @property
+    def _markers(self) -> list[tuple[FloatArray, LegendEntry, float]]:
+        """Points, their line of the legend, and their radius, in the order they are drawn."""
+        return [
+            (self.observed, ("observed", OBSERVED_COLOR, "ring"), 5),
+            (self.reprojected, ("reprojected", REPROJECTED_COLOR, "cross"), 3.5),
+            (self.outliers, ("left out", OUTLIER_COLOR, "ring"), 5),
+            (self.unseen, ("not observed", UNSEEN_COLOR, "ring"), 2.5),
+        ]
 
     def draw(self, canvas: Canvas) -> None:
-        """Draw regions, then unobserved keypoints, residuals, rings and crosses."""
+        """Draw regions, residuals, rings and crosses."""
         before = canvas.image.copy()
-        for region in () if self.regions is None else self.regions:
+        for region in self.regions:
             canvas.line(np.concatenate([region, region[:1]]), UNSEEN_COLOR, width=0.7)
         canvas.blend_from(before, opacity=_REGION_OPACITY)
-        for point in () if self.unseen is None else self.unseen:
-            canvas.ring(point, UNSEEN_COLOR, radius=2.5)
-        for pair in () if self.residuals is None else self.residuals:
+        for pair in self.residuals:
             canvas.line(pair, REPROJECTED_COLOR, width=1.0)
-        for point in () if self.seen is None else self.seen:
-            canvas.ring(point, OBSERVED_COLOR, radius=5)
-        for point in () if self.outliers is None else self.outliers:
-            canvas.ring(point, OUTLIER_COLOR, radius=5)
-        for point in () if self.back is None else self.back:
-            canvas.cross(point, REPROJECTED_COLOR, radius=3.5)
+        for points, (_, color, marker), radius in self._markers:
+            draw = canvas.ring if marker == "ring" else canvas.cross
+            for point in points:
+                draw(point, color, radius=radius)
 
     @property
     def legend(self) -> list[LegendEntry]:
         """Names and colours of what is drawn."""
-        entries: list[LegendEntry] = []
-        if self.seen is not None:
-            entries.append(("observed", OBSERVED_COLOR, "ring"))
-        if self.back is not None:
-            entries.append(("reprojected", REPROJECTED_COLOR, "cross"))
-        if self.outliers is not None and len(self.outliers):
-            entries.append(("left out", OUTLIER_COLOR, "ring"))
-        if self.unseen is not None and len(self.unseen):
-            entries.append(("not observed", UNSEEN_COLOR, "ring"))
-        if self.regions is not None and len(self.regions):
+        entries = [entry for points, entry, _ in self._markers if len(points)]
+        if len(self.regions):
             entries.append((f"{100 * REGION_SHARE:.0f} % region", UNSEEN_COLOR, "line"))
         return entries
 
     @property
     def pixels(self) -> FloatArray:
         """Pixels of the keypoints, (n, 2)."""
-        points = [each for each in (self.seen, self.back, self.unseen) if each is not None]
-        return np.concatenate([np.empty((0, 2)), *points])
+        return np.concatenate([points for points, *_ in self._markers])
 
 
 def confidence_regions(points_2d: FloatArray, covariances: FloatArray) -> FloatArray:

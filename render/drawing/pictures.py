@@ -97,7 +97,7 @@ def keypoint_picture(
     # The seen ones last, on top of the others.
     for row in sorted(np.flatnonzero(inside), key=lambda row: bool(shown[row])):
         color = _SEEN_COLOR if shown[row] else _HIDDEN_COLOR
-        place = canvas.place(camera.project(in_camera[row : row + 1]))[0]
+        (place,) = camera.project(in_camera[row : row + 1])
         canvas.ring(place, color, radius=4)
         canvas.label(str(row), place + np.array([11, -9]) * canvas.unit, color)
     return canvas.finished()

@@ -11,7 +11,6 @@ import threading
 from contextlib import suppress
 from functools import cache, partial
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -20,13 +19,14 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import RenderError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.conventions import OPENGL_AXES, opengl_from_model, opengl_projection
+from cadalign.geometry.conventions import OPENGL_AXES, opengl_from_model
 from cadalign.geometry.mesh import Material
-from cadalign.render.drawing.canvas import ByteImage, LinearArray, linear_from_srgb
+from cadalign.geometry.pixels import PIXEL_CENTRE
+from cadalign.render.drawing.canvas import ByteImage, LinearArray
 from cadalign.render.raycast.occlusion import darken_corners
 from cadalign.render.raycast.posed import Rectangle, pose_scene
 from cadalign.render.raycast.renderer import RaycastRenderer, check_samples, geometry_of
-from cadalign.render.raycast.surface import DARKEST, Studio, color_channels
+from cadalign.render.raycast.surface import DARKEST, Studio, color_channels, linear_colors
 from cadalign.render.scene import Frame, Scene, check_image_size
 
 # pyrender and PyOpenGL read these when they are imported.
@@ -93,15 +93,14 @@ class PyrenderRenderer:
         color: ByteImage = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
         if posed is not None:
             block = posed.block.slices
-            self._stage.place(scene, cam_from_model, posed.seen_sides(geometry.face_id[block]))
-            color[block] = straight_color(self._draw(camera, posed.block))
+            self._stage.place(scene, camera, cam_from_model, (posed.block.left, posed.block.top))
+            color[block] = straight_color(self._draw(posed.block))
             darken_corners(color, geometry, posed, self.studio)
         return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
 
-    def _draw(self, camera: Camera, block: Rectangle) -> ByteImage:
+    def _draw(self, block: Rectangle) -> ByteImage:
         """Draw a block of an image, premultiplied (h, w, 4)."""
         width, height = (-(-n // _SIZE_STEP) * _SIZE_STEP for n in (block.width, block.height))
-        self._stage.look(camera, (block.left, block.top, width, height))
         drawn = self._context.draw(self._stage.scene, width=width, height=height)
         return drawn[: block.height, : block.width]
 
@@ -221,8 +220,7 @@ def _mesh(scene: Scene, faces: IntArray, *, turned: bool) -> Any:
 def _primitive(scene: Scene, material: Material, faces: IntArray, *, turned: bool) -> Any:
     mesh = scene.mesh
     textured = material.texture is not None and mesh.corner_uv is not None
-    factor = np.asarray(material.color, dtype=np.float32)
-    factor[:3] = linear_from_srgb(factor[:3])
+    (factor,) = linear_colors(np.array([material.color]))
     attributes: list[FloatArray | LinearArray] = [
         scene.triangles[faces],
         scene.corner_normals[faces] * (-1 if turned else 1),
@@ -230,8 +228,8 @@ def _primitive(scene: Scene, material: Material, faces: IntArray, *, turned: boo
     if textured and mesh.corner_uv is not None:
         attributes.append(mesh.corner_uv[faces])
     if mesh.vertex_colors is not None:
-        colors = mesh.vertex_colors.astype(np.float32)
-        colors[:, :3] = _lifted(linear_from_srgb(colors[:, :3]))
+        colors = linear_colors(mesh.vertex_colors)
+        colors[:, :3] = _lifted(colors[:, :3])
         attributes.append(colors[mesh.faces[faces]])
         # Vertex colours take the place of the material's.
         factor = np.ones(4, dtype=np.float32)
@@ -273,19 +271,6 @@ def _texture(image: npt.NDArray[np.uint8] | None) -> Any:
     return pyrender.Texture(source=rgba, source_channels="RGBA")
 
 
-class WindowCamera(pyrender.Camera):  # type: ignore[misc]
-    """A camera with a projection matrix of ours."""
-
-    def __init__(self) -> None:
-        super().__init__(znear=0.1, zfar=1.0)
-        self.near, self.far = 0.1, 1.0
-        self.projection: FloatArray = np.eye(4)
-
-    def get_projection_matrix(self, width: object = None, height: object = None) -> FloatArray:
-        """The projection matrix, in pyrender's terms."""
-        return self.projection
-
-
 class GlStage:
     """A `pyrender.Scene`: lights and camera that stand still, a mesh that stays loaded.
 
@@ -301,35 +286,32 @@ class GlStage:
         for direction, power in ((studio.key, studio.key_power), (studio.fill, studio.fill_power)):
             self._add_light(power, _pose_towards(OPENGL_AXES * direction))
         self._sky = self._add_light(_SKY_SHARE * sky, np.eye(4))
-        self._camera = WindowCamera()
+        self._camera = pyrender.IntrinsicsCamera(1, 1, 0, 0)
         self.scene.add(self._camera, pose=np.eye(4))
-        self._meshes: WeakKeyDictionary[Scene, tuple[Any, Any]] = WeakKeyDictionary()
+        self._shown: Scene | None = None
         self._nodes: tuple[Any, ...] = ()
 
-    def place(self, scene: Scene, cam_from_model: Alignment, sides: tuple[bool, bool]) -> None:
-        """Put a scene's mesh where it is seen; ``sides``: draw front faces, draw back faces."""
-        if scene not in self._meshes:
-            self._meshes[scene] = gl_meshes(scene)
-        meshes = self._meshes[scene]
-        if tuple(node.mesh for node in self._nodes) != meshes:
+    def place(
+        self, scene: Scene, camera: Camera, cam_from_model: Alignment, corner: tuple[int, int]
+    ) -> None:
+        """Put a scene's mesh where it is seen, in the part of an image that begins at a pixel."""
+        if scene is not self._shown:
             for node in self._nodes:
                 self.scene.remove_node(node)
-            self._nodes = tuple(self.scene.add(mesh) for mesh in meshes)
-        for node, drawn in zip(self._nodes, sides, strict=True):
-            self.scene.set_pose(node, opengl_from_model(cam_from_model))
-            node.mesh.is_visible = drawn
-        up = opengl_from_model(cam_from_model)[:3, 1]
-        self.scene.set_pose(self._sky, _pose_towards(up))
+            self._nodes = tuple(self.scene.add(mesh) for mesh in gl_meshes(scene))
+            self._shown = scene
+        pose = opengl_from_model(cam_from_model)
+        for node in self._nodes:
+            self.scene.set_pose(node, pose)
+        self.scene.set_pose(self._sky, _pose_towards(pose[:3, 1]))
         depth = scene.used_vertices @ cam_from_model.linear[2] + cam_from_model.translation[2]
         slack = _CLEARANCE * scene.diagonal * float(cam_from_model.scale.max())
-        self._camera.far = float(depth.max()) + slack
-        self._camera.near = max(float(depth.min()) - slack, _NEAR_SHARE * self._camera.far)
-
-    def look(self, camera: Camera, window: tuple[int, int, int, int]) -> None:
-        """Choose the part of an image that is drawn: left, top, width, height [px]."""
-        self._camera.projection = opengl_projection(
-            camera, near=self._camera.near, far=self._camera.far, window=window
-        )
+        lens = self._camera
+        lens.zfar = float(depth.max()) + slack
+        lens.znear = max(float(depth.min()) - slack, _NEAR_SHARE * lens.zfar)
+        lens.fx, lens.fy = camera.fx, camera.fy
+        lens.cx = camera.cx + PIXEL_CENTRE - corner[0]
+        lens.cy = camera.cy + PIXEL_CENTRE - corner[1]
 
     def _add_light(self, power: float, pose: FloatArray) -> Any:
         # The shader divides by pi, as a surface spreads its light over the hemisphere.

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
 from cadalign.render.drawing.canvas import ByteImage
-from cadalign.render.raycast.posed import PosedScene, Rectangle, in_threads
+from cadalign.render.raycast.posed import PosedScene, in_threads
 from cadalign.render.raycast.surface import Studio
 from cadalign.render.scene import Geometry
 
@@ -26,6 +24,12 @@ _LIFT = 2e-3
 _SAME_SIDE = 0.85
 _FEW_ALIKE = 6
 _POINTS_AT_ONCE = 1 << 12
+# Points of the unit sphere, evenly spread, (16, 8, 3): each neighbour takes every 16th, so that
+# each has some of all heights.
+_NUMBER = np.arange(_RAYS * _TILE * _TILE) + 0.5
+_HEIGHT = 1 - 2 * _NUMBER / len(_NUMBER)
+_TURN = np.exp(1j * _NUMBER * np.pi * (3 - np.sqrt(5))) * np.sqrt(1 - _HEIGHT**2)
+_SPHERE = np.column_stack([_TURN.real, _TURN.imag, _HEIGHT]).reshape(_RAYS, -1, 3).swapaxes(0, 1)
 # Encoded values are about the 2.2th root of light.
 _ENCODING = 1 / 2.2
 
@@ -44,14 +48,11 @@ def darken_corners(color: ByteImage, geometry: Geometry, posed: PosedScene, stud
 
 def _openness(geometry: Geometry, posed: PosedScene, reach: float) -> SingleImage | None:
     """Share of the sky that the block's pixels see, (h, w) float32; None without pixels."""
-    block, camera = posed.block, posed.camera
+    block = posed.block
     covered = int(geometry.mask[block.slices].sum())
-    if not covered:
-        return None
     step = max(1, int(np.ceil(np.sqrt(covered / _MAX_POINTS))))
-    rows = np.arange(block.top + step // 2, max(block.bottom, block.top + step // 2 + 1), step)
-    columns = np.arange(block.left + step // 2, max(block.right, block.left + step // 2 + 1), step)
-    rows, columns = rows[rows < camera.height], columns[columns < camera.width]
+    rows = np.arange(block.top + step // 2, block.bottom, step)
+    columns = np.arange(block.left + step // 2, block.right, step)
     grid = np.ix_(rows, columns)
     hit = geometry.face_id[grid] >= 0
     depth = geometry.depth[grid].astype(np.float32)
@@ -60,14 +61,14 @@ def _openness(geometry: Geometry, posed: PosedScene, reach: float) -> SingleImag
     if not len(inside):
         return None
     pixels = np.column_stack([columns[inside[:, 1]], rows[inside[:, 0]]]).astype(float)
-    rays, _ = camera.rays_where_valid(pixels)
+    rays, _ = posed.camera.rays_where_valid(pixels)
     points = rays * depth[hit][:, None]
     points += _LIFT * posed.diagonal * normal[hit]
     sky = np.zeros(hit.shape, dtype=np.float32)
     tile = (inside[:, 0] % _TILE) * _TILE + inside[:, 1] % _TILE
 
     def look(part: slice) -> None:
-        directions = _around(normal[hit][part], _sky_directions()[tile[part]])
+        directions = _sky_directions(normal[hit][part], tile[part]).reshape(-1, 3)
         blocked = posed.blocked(np.repeat(points[part], _RAYS, axis=0), directions, reach=reach)
         rows_of, columns_of = inside[part].T
         sky[rows_of, columns_of] = 1 - blocked.reshape(-1, _RAYS).mean(axis=1)
@@ -77,37 +78,15 @@ def _openness(geometry: Geometry, posed: PosedScene, reach: float) -> SingleImag
     smooth, alike = _share_with_neighbours(sky, hit, depth, normal, posed.diagonal)
     # A groove or a bevel narrower than the grid is hit here and there: its dashes would show.
     filled = _filled(smooth, hit & (alike >= _FEW_ALIKE))
-    coarse = np.where(np.isnan(filled), np.where(hit, smooth, 1), filled).astype(np.float32)
-    return coarse if step == 1 else _enlarge(coarse, block, step)
+    size = block.width, block.height
+    return np.asarray(cv2.resize(filled, size, interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-@cache
-def _sky_directions() -> SingleImage:
-    """Directions about +z, dense where light falls straight; (16, 8, 3) float32."""
-    count = _RAYS * _TILE * _TILE
-    # Evenly spread over the disc below and lifted to the hemisphere: cosine-weighted.
-    number = np.arange(count) + 0.5
-    radius = np.sqrt(number / count)
-    angle = number * np.pi * (3 - np.sqrt(5))
-    up = np.sqrt(1 - radius**2)
-    spread = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), up])
-    # Each neighbour takes every 16th, so that each has some of all heights.
-    return spread.reshape(_RAYS, _TILE * _TILE, 3).transpose(1, 0, 2).astype(np.float32)
-
-
-def _around(normal: SingleImage, directions: SingleImage) -> FloatArray:
-    """Turn directions (n, r, 3) about +z to be about unit normals (n, 3); (n r, 3).
-
-    A frame without branches: T. Duff et al., "Building an Orthonormal Basis, Revisited", JCGT 2017.
-    """
-    x, y, z = normal.T
-    sign = np.where(z < 0, np.float32(-1), np.float32(1))
-    a = -1 / (sign + z)
-    b = x * y * a
-    first = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1)
-    second = np.stack([b, sign + y * y * a, -y], axis=1)
-    frame = np.stack([first, second, normal], axis=1)
-    return np.asarray((directions @ frame).reshape(-1, 3))
+def _sky_directions(normal: SingleImage, tile: npt.NDArray[np.int64]) -> FloatArray:
+    """Unit directions (n, 8, 3) about normals (n, 3), dense where light falls straight."""
+    # A point of the unit sphere about the normal's tip is that dense: cosine-weighted.
+    towards = normal[:, None] + _SPHERE[tile]
+    return np.asarray(towards / np.linalg.norm(towards, axis=2, keepdims=True))
 
 
 def _share_with_neighbours(
@@ -134,11 +113,12 @@ def _share_with_neighbours(
             alike &= np.abs(wide_depth[near] - depth) < 0.03 * diagonal
             total += np.where(alike, wide_sky[near], 0)
             weight += alike
-    return np.asarray(total / np.maximum(weight, 1), dtype=np.float32), np.asarray(weight)
+    mean = np.where(hit, total / np.maximum(weight, 1), 1)
+    return np.asarray(mean, dtype=np.float32), np.asarray(weight)
 
 
 def _filled(sky: SingleImage, known: npt.NDArray[np.bool_]) -> SingleImage:
-    """Spread known values to the places beside them; NaN where none is near."""
+    """Spread known values to the places beside them, in place of what is there."""
     filled = np.where(known, sky, 0).astype(np.float32)
     weight = known.astype(np.float32)
     # Twice: the border of the object too takes the value beside it, or a bright rim would be left.
@@ -148,13 +128,4 @@ def _filled(sky: SingleImage, known: npt.NDArray[np.bool_]) -> SingleImage:
         empty = weight == 0
         filled = np.where(empty, total / np.maximum(count, 1), filled)
         weight = np.where(empty, count > 0, weight).astype(np.float32)
-    return np.where(weight > 0, filled, np.float32(np.nan))
-
-
-def _enlarge(sky: SingleImage, block: Rectangle, step: int) -> SingleImage:
-    """Bring the coarse grid to the block's pixels."""
-    rows = (np.arange(block.height, dtype=np.float32) - step // 2) / step
-    columns = (np.arange(block.width, dtype=np.float32) - step // 2) / step
-    at_x, at_y = np.meshgrid(columns, rows)
-    enlarged = cv2.remap(sky, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(enlarged, dtype=np.float32)
+    return np.where(weight > 0, filled, sky)

@@ -91,8 +91,8 @@ class RaycastRenderer:
             light = posed.light_of_hits(rays, face, depth, self.studio)
             color[band.slices] = _encode(light).reshape(band.height, band.width, 4)
 
-        if posed is not None:
-            posed.prepare_color()
+        # Made now, before several threads ask for them at once.
+        _ = scene.surface, scene.corner_normals
         geometry = geometry_of(camera, posed, shade)
         if posed is not None:
             if samples > 1:
@@ -111,10 +111,9 @@ class RaycastRenderer:
         step = max(1, _RAYS_AT_ONCE // samples)
 
         def draw(part: IntArray) -> None:
-            pixels = (part[:, None] + offsets).reshape(-1, 2)
-            rays, valid = posed.camera.rays_where_valid(pixels)
-            light = posed.mean_light(rays, valid, self.studio, samples=samples)
-            color[part[:, 1], part[:, 0]] = _encode(light)
+            hits = posed.hits((part[:, None] + offsets).reshape(-1, 2))
+            light = posed.light_of_hits(*hits, self.studio).reshape(-1, samples, 4)
+            color[part[:, 1], part[:, 0]] = _encode(light.mean(axis=1))
 
         in_threads(draw, [pixels[begin : begin + step] for begin in range(0, len(pixels), step)])
 
@@ -178,9 +177,7 @@ def geometry_of(camera: Camera, posed: PosedScene | None, shade: _Shade | None =
         return geometry
 
     def draw(band: Rectangle) -> None:
-        rays, valid = posed.camera.rays_where_valid(band.pixels)
-        face, depth = posed.cast(rays)
-        face[~valid] = -1
+        rays, face, depth = posed.hits(band.pixels)
         hit = np.flatnonzero(face >= 0)
         shape = (band.height, band.width)
         geometry.face_id[band.slices] = face.reshape(shape)
@@ -191,7 +188,7 @@ def geometry_of(camera: Camera, posed: PosedScene | None, shade: _Shade | None =
         if shade is not None:
             shade(posed, band, rays, face, depth)
 
-    in_threads(draw, posed.block.tiles(posed.block.width, _RAYS_AT_ONCE // posed.block.width))
+    in_threads(draw, posed.block.bands(_RAYS_AT_ONCE // posed.block.width))
     return geometry
 
 

@@ -7,13 +7,7 @@ from cadalign.names import lazy_names
 if TYPE_CHECKING:
     from cadalign.render.drawing.model_overlay import overlay_model
     from cadalign.render.drawing.overlay import draw_overlay
-    from cadalign.render.drawing.pictures import (
-        Angles,
-        contact_sheet,
-        feature_lines,
-        keypoint_picture,
-        pose_in_view,
-    )
+    from cadalign.render.drawing.pictures import Angles, pose_in_view
     from cadalign.render.probe import Probe, make_renderer, probe_renderer
     from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry
     from cadalign.render.raycast.surface import Studio
@@ -37,11 +31,8 @@ __all__ = [
     "Studio",
     "Viewpoint",
     "cast_geometry",
-    "contact_sheet",
     "draw_overlay",
-    "feature_lines",
     "frame_object",
-    "keypoint_picture",
     "look_at",
     "make_renderer",
     "overlay_model",

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from trimesh.geometry import align_vectors
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import RenderError
@@ -23,9 +24,13 @@ from cadalign.geometry.conventions import OPENGL_AXES, opengl_from_model
 from cadalign.geometry.mesh import Material
 from cadalign.geometry.pixels import PIXEL_CENTRE
 from cadalign.render.drawing.canvas import ByteImage, LinearArray
-from cadalign.render.raycast.occlusion import darken_corners
 from cadalign.render.raycast.posed import Rectangle, pose_scene
-from cadalign.render.raycast.renderer import RaycastRenderer, check_samples, geometry_of
+from cadalign.render.raycast.renderer import (
+    RaycastRenderer,
+    check_samples,
+    darken_corners,
+    geometry_of,
+)
 from cadalign.render.raycast.surface import DARKEST, Studio, color_channels, linear_colors
 from cadalign.render.scene import Frame, Scene, check_image_size
 
@@ -219,53 +224,45 @@ def _mesh(scene: Scene, faces: IntArray, *, turned: bool) -> Any:
 
 def _primitive(scene: Scene, material: Material, faces: IntArray, *, turned: bool) -> Any:
     mesh = scene.mesh
-    textured = material.texture is not None and mesh.corner_uv is not None
+    texture = None if mesh.corner_uv is None else material.texture
     (factor,) = linear_colors(np.array([material.color]))
-    attributes: list[FloatArray | LinearArray] = [
-        scene.triangles[faces],
-        scene.corner_normals[faces] * (-1 if turned else 1),
-    ]
-    if textured and mesh.corner_uv is not None:
-        attributes.append(mesh.corner_uv[faces])
+    colors: LinearArray | None = None
     if mesh.vertex_colors is not None:
-        colors = linear_colors(mesh.vertex_colors)
+        # They take the place of the material's colour.
+        colors, factor = linear_colors(mesh.vertex_colors), np.ones(4, dtype=np.float32)
         colors[:, :3] = _lifted(colors[:, :3])
-        attributes.append(colors[mesh.faces[faces]])
-        # Vertex colours take the place of the material's.
-        factor = np.ones(4, dtype=np.float32)
-    elif not textured:
+    elif texture is None:
         factor[:3] = _lifted(factor[:3])
-    rows = iter([_corners(attribute, turned=turned) for attribute in attributes])
+
+    def corners(values: npt.NDArray[Any] | None) -> LinearArray | None:
+        """Values (m, 3, k) of triangles' corners one after the other, (3 f, k) float32."""
+        if values is None:
+            return None
+        chosen = values[faces][:, ::-1] if turned else values[faces]
+        return np.ascontiguousarray(chosen.reshape(-1, values.shape[2]), dtype=np.float32)
+
     return pyrender.Primitive(
-        positions=next(rows),
-        normals=next(rows),
-        texcoord_0=next(rows) if textured else None,
-        color_0=next(rows) if mesh.vertex_colors is not None else None,
+        positions=corners(scene.triangles),
+        normals=corners(scene.corner_normals * (-1 if turned else 1)),
+        texcoord_0=None if texture is None else corners(mesh.corner_uv),
+        color_0=None if colors is None else corners(colors[mesh.faces]),
         material=pyrender.MetallicRoughnessMaterial(
             alphaMode="OPAQUE",
             baseColorFactor=factor,
             metallicFactor=0.0,
             roughnessFactor=_ROUGHNESS,
-            baseColorTexture=_texture(material.texture) if textured else None,
+            baseColorTexture=None if texture is None else _texture(texture),
         ),
         mode=_TRIANGLES,
     )
-
-
-def _corners(values: FloatArray | LinearArray, *, turned: bool) -> LinearArray:
-    """Values (f, 3, k) of triangles' corners one after the other, (3 f, k) float32."""
-    ordered = values[:, ::-1] if turned else values
-    return np.ascontiguousarray(ordered.reshape(-1, values.shape[2]), dtype=np.float32)
 
 
 def _lifted(color: LinearArray) -> LinearArray:
     return np.asarray(DARKEST + (1 - DARKEST) * color, dtype=np.float32)
 
 
-def _texture(image: npt.NDArray[np.uint8] | None) -> Any:
+def _texture(image: npt.NDArray[np.uint8]) -> Any:
     """An opaque RGBA texture: rows of other widths than 4 bytes a pixel would be misread."""
-    if image is None:
-        return None
     rgba = np.full((*image.shape[:2], 4), 255, dtype=np.uint8)
     rgba[:, :, :3] = color_channels(image)
     return pyrender.Texture(source=rgba, source_channels="RGBA")
@@ -284,8 +281,8 @@ class GlStage:
         ambient = np.full(3, studio.ground_power + (1 - _SKY_SHARE) * sky + around)
         self.scene: Any = pyrender.Scene(bg_color=np.zeros(4), ambient_light=ambient)
         for direction, power in ((studio.key, studio.key_power), (studio.fill, studio.fill_power)):
-            self._add_light(power, _pose_towards(OPENGL_AXES * direction))
-        self._sky = self._add_light(_SKY_SHARE * sky, np.eye(4))
+            self._turn(self._add_light(power), OPENGL_AXES * direction)
+        self._sky = self._add_light(_SKY_SHARE * sky)
         self._camera = pyrender.IntrinsicsCamera(1, 1, 0, 0)
         self.scene.add(self._camera, pose=np.eye(4))
         self._shown: Scene | None = None
@@ -303,7 +300,7 @@ class GlStage:
         pose = opengl_from_model(cam_from_model)
         for node in self._nodes:
             self.scene.set_pose(node, pose)
-        self.scene.set_pose(self._sky, _pose_towards(pose[:3, 1]))
+        self._turn(self._sky, pose[:3, 1])
         depth = scene.used_vertices @ cam_from_model.linear[2] + cam_from_model.translation[2]
         slack = _CLEARANCE * scene.diagonal * float(cam_from_model.scale.max())
         lens = self._camera
@@ -313,17 +310,11 @@ class GlStage:
         lens.cx = camera.cx + PIXEL_CENTRE - corner[0]
         lens.cy = camera.cy + PIXEL_CENTRE - corner[1]
 
-    def _add_light(self, power: float, pose: FloatArray) -> Any:
+    def _add_light(self, power: float) -> Any:
         # The shader divides by pi, as a surface spreads its light over the hemisphere.
-        light = pyrender.DirectionalLight(color=np.ones(3), intensity=np.pi * power)
-        return self.scene.add(light, pose=pose)
+        return self.scene.add(pyrender.DirectionalLight(color=np.ones(3), intensity=np.pi * power))
 
-
-def _pose_towards(direction: npt.NDArray[np.float64]) -> FloatArray:
-    """A pose (4, 4) whose +z axis, from where pyrender's lights shine, has this direction."""
-    axis = direction / np.linalg.norm(direction)
-    aside = np.cross([0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0], axis)
-    aside /= np.linalg.norm(aside)
-    pose = np.eye(4)
-    pose[:3, :3] = np.column_stack([aside, np.cross(axis, aside), axis])
-    return pose
+    def _turn(self, light: Any, direction: FloatArray) -> None:
+        """Let a light shine from a direction (3,): along its +z axis."""
+        pose = align_vectors(np.array([0.0, 0.0, 1.0]), direction)  # type: ignore[no-untyped-call]
+        self.scene.set_pose(light, pose)

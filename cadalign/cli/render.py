@@ -65,12 +65,13 @@ class Render:
             keypoints = None
             if self.keypoints is not None:
                 keypoints = ModelKeypoints.load(self.keypoints, model=self.model).xyz
-            images = [
-                self._draw(scene, renderer, camera, each, keypoints) for each in views.values()
-            ]
-            picture = images[0]
-            if len(images) > 1:
-                picture = contact_sheet(images, list(views))
+            pictures = {
+                name: self._draw(scene, renderer, camera, view, keypoints)
+                for name, view in views.items()
+            }
+            (picture, *further) = pictures.values()
+            if further:
+                picture = contact_sheet(pictures)
             make_folder_of(self.out)
             write_image(self.out, picture)
         say(f"Written: {self.out}")
@@ -123,4 +124,4 @@ class Render:
         if keypoints is None:
             return image
         visible = visible_keypoints(scene, keypoints, camera, pose)
-        return keypoint_picture(image, camera, keypoints, pose, visible=visible)
+        return keypoint_picture(image, camera, keypoints, pose, visible)

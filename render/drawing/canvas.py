@@ -217,8 +217,10 @@ def linear_from_srgb(encoded: LinearArray) -> LinearArray:
 
 
 _DECODED = linear_from_srgb(np.arange(256, dtype=np.float32) / np.float32(255))
-# Light between that of neighbouring bytes.
+# The bytes of the squares of 0 to 1, which spread the dark values about as sRGB does.
+_STEPS = 1 << 14
 _LIMITS = linear_from_srgb((np.arange(255, dtype=np.float32) + np.float32(0.5)) / np.float32(255))
+_ENCODED = np.searchsorted(_LIMITS, np.linspace(0, 1, _STEPS + 1) ** 2).astype(np.uint8)
 
 
 def linear_from_bytes(image: ByteImage) -> LinearArray:
@@ -228,7 +230,8 @@ def linear_from_bytes(image: ByteImage) -> LinearArray:
 
 def bytes_from_linear(linear: LinearArray) -> ByteImage:
     """Encode linear light (any shape) to sRGB bytes."""
-    return np.searchsorted(_LIMITS, linear).astype(np.uint8)
+    place = np.sqrt(np.clip(linear, 0, 1)) * np.float32(_STEPS) + np.float32(0.5)
+    return np.asarray(_ENCODED[place.astype(np.int32)])
 
 
 def composite(color: ByteImage, background: npt.ArrayLike) -> ByteImage:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
 import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
-from cadalign.arrays import as_points
+from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -41,9 +41,7 @@ _FILL = 0.88  # of the image, by a still's model
 def feature_lines(geometry: Geometry) -> npt.NDArray[np.bool_]:
     """Pixels on the outline of the object, or beside a fold or a step in its surface, (h, w)."""
     lines = np.zeros(geometry.depth.shape, dtype=bool)
-    for axis in (0, 1):
-        first = tuple(slice(None, -1) if k == axis else slice(None) for k in (0, 1))
-        second = tuple(slice(1, None) if k == axis else slice(None) for k in (0, 1))
+    for first, second in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
         one, other = geometry.mask[first], geometry.mask[second]
         both = one & other
         cosine = np.einsum("rck,rck->rc", geometry.normal[first], geometry.normal[second])
@@ -61,42 +59,17 @@ def feature_lines(geometry: Geometry) -> npt.NDArray[np.bool_]:
 def keypoint_picture(
     image: ByteImage,
     camera: Camera,
-    points_3d: npt.ArrayLike,
+    points_3d: FloatArray,
     cam_from_model: Alignment,
-    *,
-    visible: npt.ArrayLike | None = None,
+    visible: npt.NDArray[np.bool_],
 ) -> ByteImage:
-    """Draw numbered keypoints over a picture: those that are seen yellow, hidden ones grey.
-
-    Parameters
-    ----------
-    image : (h, w, 3) uint8
-    camera : Camera
-    points_3d : (k, 3) float
-        In model coordinates.
-    cam_from_model : Alignment
-    visible : (k,) bool, optional
-        Which of them are seen; by default all.
-
-    Returns
-    -------
-    (h, w, 3) uint8
-
-    Raises
-    ------
-    InputError
-        If an array has the wrong shape.
-    """
-    points = as_points(points_3d, name="points_3d", dimension=3)
-    shown = np.ones(len(points), dtype=bool) if visible is None else np.asarray(visible, dtype=bool)
-    if shown.shape != (len(points),):
-        raise InputError(f"shape {shown.shape}, expected ({len(points)},)", where="visible")
+    """Draw numbered keypoints (k, 3) over a picture: ``visible`` ones (k,) yellow, others grey."""
     canvas = Canvas(image)
-    in_camera = cam_from_model.apply(points)
+    in_camera = cam_from_model.apply(points_3d)
     inside = seen_in_image(camera, in_camera)
     # The seen ones last, on top of the others.
-    for row in sorted(np.flatnonzero(inside), key=lambda row: bool(shown[row])):
-        color = _SEEN_COLOR if shown[row] else _HIDDEN_COLOR
+    for row in sorted(np.flatnonzero(inside), key=lambda row: bool(visible[row])):
+        color = _SEEN_COLOR if visible[row] else _HIDDEN_COLOR
         (place,) = camera.project(in_camera[row : row + 1])
         canvas.ring(place, color, radius=4)
         canvas.label(str(row), place + np.array([11, -9]) * canvas.unit, color)
@@ -154,37 +127,18 @@ def pose_in_view(
     return frame_object(scene.bounds, camera, rotation=rotation, fill=_FILL, scale=scale)
 
 
-def contact_sheet(images: Sequence[ByteImage], labels: Sequence[str]) -> ByteImage:
-    """Put pictures of one size side by side, each with a label beneath.
-
-    Parameters
-    ----------
-    images : sequence of (h, w, 3) uint8
-    labels : sequence of str
-
-    Returns
-    -------
-    (H, W, 3) uint8
-
-    Raises
-    ------
-    InputError
-        If there are no images, they differ in size, or there is not a label for each.
-    """
-    if not images or len(images) != len(labels):
-        raise InputError(f"{len(images)} images and {len(labels)} labels", where="images")
-    if len({image.shape for image in images}) > 1:
-        raise InputError("all must have the same size", where="images")
-    height, width = images[0].shape[:2]
-    across = int(np.ceil(np.sqrt(len(images))))
-    down = -(-len(images) // across)
+def contact_sheet(pictures: Mapping[str, ByteImage]) -> ByteImage:
+    """Put pictures of one size side by side, each with its name beneath."""
+    height, width = next(iter(pictures.values())).shape[:2]
+    across = int(np.ceil(np.sqrt(len(pictures))))
+    down = -(-len(pictures) // across)
     gap = max(4, min(height, width) // 40)
     line = max(14, height // 16)
     size = (across * (width + gap) + gap, down * (height + line + gap) + gap)
     sheet = Image.new("RGB", size, LIGHT_GREY)
     pen = ImageDraw.Draw(sheet)
     font = ImageFont.load_default(size=0.72 * line)
-    for number, (image, label) in enumerate(zip(images, labels, strict=True)):
+    for number, (label, image) in enumerate(pictures.items()):
         left = gap + number % across * (width + gap)
         top = gap + number // across * (height + line + gap)
         sheet.paste(Image.fromarray(image), (left, top))

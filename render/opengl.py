@@ -12,6 +12,7 @@ from contextlib import suppress
 from functools import cache, partial
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from trimesh.geometry import align_vectors
@@ -31,7 +32,7 @@ from cadalign.render.raycast.renderer import (
     darken_corners,
     geometry_of,
 )
-from cadalign.render.raycast.surface import DARKEST, Studio, color_channels, linear_colors
+from cadalign.render.raycast.surface import DARKEST, Studio, linear_colors
 from cadalign.render.scene import Frame, Scene, check_image_size
 
 # pyrender and PyOpenGL read these when they are imported.
@@ -99,7 +100,7 @@ class PyrenderRenderer:
         if posed is not None:
             block = posed.block.slices
             self._stage.place(scene, camera, cam_from_model, (posed.block.left, posed.block.top))
-            color[block] = straight_color(self._draw(posed.block))
+            color[block] = cv2.cvtColor(self._draw(posed.block), cv2.COLOR_mRGBA2RGBA)
             darken_corners(color, geometry, posed, self.studio)
         return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
 
@@ -180,16 +181,6 @@ def shared_context() -> GlContext:
     return GlContext()
 
 
-def straight_color(premultiplied: ByteImage) -> ByteImage:
-    """Divide colours (h, w, 4) by their opacity, where that is neither none nor full."""
-    result = np.array(premultiplied)
-    opacity = result[:, :, 3]
-    partial = (opacity > 0) & (opacity < 255)
-    share = opacity[partial, None] / np.float32(255)
-    result[partial, :3] = np.minimum(result[partial, :3] / share + 0.5, 255).astype(np.uint8)
-    return result
-
-
 def _beginning(error: Exception) -> str:
     """The beginning of a message on one line; PyOpenGL's go on for dozens."""
     return " ".join(str(error).split())[:160] or "no reason given"
@@ -264,7 +255,7 @@ def _lifted(color: LinearArray) -> LinearArray:
 def _texture(image: npt.NDArray[np.uint8]) -> Any:
     """An opaque RGBA texture: rows of other widths than 4 bytes a pixel would be misread."""
     rgba = np.full((*image.shape[:2], 4), 255, dtype=np.uint8)
-    rgba[:, :, :3] = color_channels(image)
+    rgba[:, :, :3] = image[:, :, :3]
     return pyrender.Texture(source=rgba, source_channels="RGBA")
 
 

@@ -95,7 +95,9 @@ class PosedScene:
         alike, opposite = scene.coincident_faces
         self._shown = np.where(side < 0, opposite, alike).astype(np.int32)
         self._normal_matrix = cam_from_model.rotation / cam_from_model.scale
-        self.normals = self._to_camera(scene.face_normals)
+        normals = scene.face_normals @ self._normal_matrix.T
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        self.normals: LinearArray = (normals * self._side[:, None]).astype(np.float32)
         """The faces' unit normals in the camera frame, (m, 3) float32, on the side that is seen."""
 
     def hits(self, pixels: FloatArray) -> tuple[FloatArray, FaceArray, FloatArray]:
@@ -196,11 +198,6 @@ class PosedScene:
     def _directions(self, rays: FloatArray) -> FloatArray:
         """Directions (n, 3) in the model frame of the camera's."""
         return np.asarray(rays @ self._model_from_ray.T)
-
-    def _to_camera(self, normals: FloatArray) -> LinearArray:
-        rows = normals @ self._normal_matrix.T
-        rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-30)
-        return (rows * self._side[:, None]).astype(np.float32)
 
 
 def pose_scene(

@@ -84,18 +84,11 @@ def sample_texture(texture: LinearArray, uv: LinearArray) -> LinearArray:
 
 
 def _linear_texture(texture: npt.NDArray[np.uint8]) -> LinearArray:
-    """Turn an image (h, w), (h, w, 3) or (h, w, 4) into linear light with opacity (h, w, 4)."""
+    """Turn an image (h, w, 3 or 4) into linear light with opacity (h, w, 4)."""
     result = np.ones((*texture.shape[:2], 4), dtype=np.float32)
-    result[:, :, :3] = linear_from_bytes(color_channels(texture))
-    if texture.ndim == 3 and texture.shape[2] in (2, 4):
-        result[:, :, 3] = texture[:, :, -1] / np.float32(255)
+    result[:, :, : texture.shape[2]] = texture / np.float32(255)
+    result[:, :, :3] = linear_from_bytes(texture[:, :, :3])
     return result
-
-
-def color_channels(texture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Red, green and blue (h, w, 3), or grey (h, w, 1), of an image with or without opacity."""
-    image = texture[:, :, None] if texture.ndim == 2 else texture
-    return image[:, :, :3] if image.shape[2] >= 3 else image[:, :, :1]
 
 
 def coincident_faces(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, IntArray]:

@@ -17,8 +17,8 @@ from cadalign.io.images import JPEG_ENDING
 if TYPE_CHECKING:
     from cadalign.arrays import FloatArray
     from cadalign.render.drawing.canvas import ByteImage
-    from cadalign.render.drawing.pictures import Angles
     from cadalign.render.scene import Renderer, Scene
+    from cadalign.render.viewpoints import Angles
 
 _ENDINGS = (".png", JPEG_ENDING)
 
@@ -55,7 +55,7 @@ class Render:
         from cadalign.datasets.models.model_keypoints import ModelKeypoints
         from cadalign.io.images import write_image
         from cadalign.io.meshes.files import load_mesh
-        from cadalign.render.drawing.pictures import contact_sheet
+        from cadalign.render.drawing.layers import contact_sheet
         from cadalign.render.probe import make_renderer
         from cadalign.render.scene import Scene
 
@@ -97,7 +97,7 @@ class Render:
         return camera
 
     def _views(self) -> dict[str, Angles]:
-        from cadalign.render.drawing.pictures import VIEWS, Angles
+        from cadalign.render.viewpoints import VIEWS, Angles
 
         views: dict[str, Angles] = {}
         for word in self.view:
@@ -116,8 +116,8 @@ class Render:
         keypoints: FloatArray | None,
     ) -> ByteImage:
         """One picture, (h, w, 3) uint8."""
-        from cadalign.render.drawing.pictures import keypoint_picture, pose_in_view
-        from cadalign.render.viewpoints import visible_keypoints
+        from cadalign.render.drawing.layers import keypoint_picture
+        from cadalign.render.viewpoints import pose_in_view, visible_keypoints
 
         pose = pose_in_view(scene, camera, view, scale=self.scale)
         image = renderer.render(scene, camera, pose, samples=self.samples).composite()

@@ -1,15 +1,19 @@
-"""Layers of an overlay: the model, and keypoints with their uncertainty."""
+"""Layers of pictures: the model, its lines, keypoints and their uncertainty; sheets of pictures."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from PIL import Image, ImageDraw, ImageFont
 
 from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.errors import InputError
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
 from cadalign.render.drawing.canvas import (
     CASING,
     ByteImage,
@@ -18,14 +22,18 @@ from cadalign.render.drawing.canvas import (
     LegendEntry,
     composite,
 )
-from cadalign.render.drawing.pictures import feature_lines
-from cadalign.render.scene import Frame, Geometry
+from cadalign.render.scene import LIGHT_GREY, Frame, Geometry
+from cadalign.render.viewpoints import seen_in_image
 
 _SHADED_OPACITY, _VEIL_OPACITY = 0.6, 0.5
 # How much of the veil's colour is the model's own, so that its parts can be told apart.
 _OWN_SHARE = 0.45
 _LINE_OPACITY = 0.9
 _CASING_OPACITY = 0.45
+# Neighbouring pixels whose normals differ by more than this [degrees] lie on both sides of an edge.
+_EDGE_ANGLE = 25.0
+# And those whose depths differ by more than this share of what the slope explains.
+_DEPTH_STEP = 0.02
 
 
 def with_model(image: ByteImage, geometry: Geometry, color: Color) -> ByteImage:
@@ -52,6 +60,24 @@ def with_model(image: ByteImage, geometry: Geometry, color: Color) -> ByteImage:
     front = _OWN_SHARE * 255 * grey + (1 - _OWN_SHARE) * tinted
     share = _VEIL_OPACITY * geometry.mask.astype(np.float32)[:, :, None]
     return np.asarray(image * (1 - share) + front * share + 0.5, dtype=np.uint8)
+
+
+def feature_lines(geometry: Geometry) -> npt.NDArray[np.bool_]:
+    """Pixels on the outline of the object, or beside a fold or a step in its surface, (h, w)."""
+    lines = np.zeros(geometry.depth.shape, dtype=bool)
+    for first, second in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
+        one, other = geometry.mask[first], geometry.mask[second]
+        both = one & other
+        cosine = np.einsum("rck,rck->rc", geometry.normal[first], geometry.normal[second])
+        near, far = geometry.depth[first], geometry.depth[second]
+        # A surface that is seen edge-on changes its depth quickly without having a step.
+        slope = np.maximum(np.abs(geometry.normal[first][:, :, 2]), 0.05)
+        step = np.abs(near - far) * slope > _DEPTH_STEP * np.minimum(near, far)
+        changes = both & ((cosine < np.cos(np.radians(_EDGE_ANGLE))) | step)
+        # Of a step the line belongs to the nearer side, of an outline to the object's.
+        lines[first] |= (one & ~other) | (changes & (near <= far))
+        lines[second] |= (other & ~one) | (changes & (near > far))
+    return lines
 
 
 def draw_lines(canvas: Canvas, geometry: Geometry, color: Color) -> None:
@@ -193,3 +219,49 @@ def confidence_regions(points_2d: FloatArray, covariances: FloatArray) -> FloatA
 def _finite(points: FloatArray) -> FloatArray:
     """The rows that are finite, those behind the camera left out."""
     return np.asarray(points[np.isfinite(points).all(axis=tuple(range(1, points.ndim)))])
+
+
+# Pictures of the model alone ----------------------------------------------------------------------
+
+_TEXT_COLOR = (70, 76, 84)
+_HIDDEN_COLOR = (150, 160, 175)
+
+
+def keypoint_picture(
+    image: ByteImage,
+    camera: Camera,
+    points_3d: FloatArray,
+    cam_from_model: Alignment,
+    visible: npt.NDArray[np.bool_],
+) -> ByteImage:
+    """Draw numbered keypoints (k, 3) over a picture: ``visible`` ones (k,) yellow, others grey."""
+    canvas = Canvas(image)
+    in_camera = cam_from_model.apply(points_3d)
+    inside = seen_in_image(camera, in_camera)
+    # The seen ones last, on top of the others.
+    for row in sorted(np.flatnonzero(inside), key=lambda row: bool(visible[row])):
+        color = REPROJECTED_COLOR if visible[row] else _HIDDEN_COLOR
+        (place,) = camera.project(in_camera[row : row + 1])
+        canvas.ring(place, color, radius=4)
+        canvas.label(str(row), place + np.array([11, -9]) * canvas.unit, color)
+    return canvas.finished()
+
+
+def contact_sheet(pictures: Mapping[str, ByteImage]) -> ByteImage:
+    """Put pictures of one size side by side, each with its name beneath."""
+    height, width = next(iter(pictures.values())).shape[:2]
+    across = int(np.ceil(np.sqrt(len(pictures))))
+    down = -(-len(pictures) // across)
+    gap = max(4, min(height, width) // 40)
+    line = max(14, height // 16)
+    size = (across * (width + gap) + gap, down * (height + line + gap) + gap)
+    sheet = Image.new("RGB", size, LIGHT_GREY)
+    pen = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(size=0.72 * line)
+    for number, (label, image) in enumerate(pictures.items()):
+        left = gap + number % across * (width + gap)
+        top = gap + number // across * (height + line + gap)
+        sheet.paste(Image.fromarray(image), (left, top))
+        middle = (left + width / 2, top + height + line / 2)
+        pen.text(middle, label, fill=_TEXT_COLOR, font=font, anchor="mm")
+    return np.array(sheet)

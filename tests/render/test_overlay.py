@@ -191,21 +191,14 @@ def test_background_stays_as_it_was():
     np.testing.assert_array_equal(draw_overlay(photo, CAMERA), photo)
 
 
-@pytest.mark.slow
-def test_legend_names_what_is_drawn_and_avoids_it():
-    # The box sits in the top left: the legend goes elsewhere.
-    box = Box([-0.75, -0.55, 3.0], np.eye(3), [0.8, 0.5, 0.5])
-    plain = draw_overlay(_blank(value=200), CAMERA, gt_box=box, legend=False)
-    image = draw_overlay(_blank(value=200), CAMERA, gt_box=box)
-    rows, columns = np.nonzero((plain != image).any(axis=2))
-    assert columns.min() > 320 or rows.min() > 240
-    assert _near_color(
-        image[rows.min() : rows.max(), columns.min() : columns.max()], GT_COLOR
-    ).any()
+def test_legend_names_what_is_drawn():
     heights = []
-    for options in ({"gt_box": box}, {"gt_box": box, "est_box": box, "observed": [[50.0, 50.0]]}):
-        plain = draw_overlay(_blank(value=200), CAMERA, **options, legend=False)
-        legend = (plain != draw_overlay(_blank(value=200), CAMERA, **options)).any(axis=2)
+    for options in (
+        {"gt_box": _box()},
+        {"gt_box": _box(), "est_box": _box(), "observed": [[9, 9]]},
+    ):
+        plain = draw_overlay(_blank(), CAMERA, **options, legend=False)
+        legend = (plain != draw_overlay(_blank(), CAMERA, **options)).any(axis=2)
         heights.append(np.ptp(np.nonzero(legend)[0]))
     assert heights[1] > heights[0] + 20
 

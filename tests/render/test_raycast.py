@@ -320,12 +320,3 @@ def test_scene_survives_pickling_and_prepares_once():
     again = pickle.loads(pickle.dumps(scene))
     after = cast_geometry(again, CAMERA, _front_view())
     np.testing.assert_array_equal(before.depth, after.depth)
-
-
-def test_render_and_cast_geometry_agree():
-    scene = Scene(_mesh(trimesh.creation.icosphere(subdivisions=2)))
-    frame = RaycastRenderer().render(scene, CAMERA, _front_view())
-    geometry = cast_geometry(scene, CAMERA, _front_view())
-    np.testing.assert_array_equal(frame.face_id, geometry.face_id)
-    np.testing.assert_array_equal(frame.depth, geometry.depth)
-    np.testing.assert_array_equal(frame.normal, geometry.normal)

@@ -7,21 +7,16 @@ from cadalign.names import lazy_names
 if TYPE_CHECKING:
     from cadalign.render.drawing.model_overlay import overlay_model
     from cadalign.render.drawing.overlay import draw_overlay
-    from cadalign.render.drawing.pictures import (
-        Angles,
-        contact_sheet,
-        feature_lines,
-        keypoint_picture,
-        pose_in_view,
-    )
     from cadalign.render.probe import Probe, make_renderer, probe_renderer
     from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry
     from cadalign.render.raycast.surface import Studio
     from cadalign.render.scene import Frame, Geometry, Renderer, Scene
     from cadalign.render.viewpoints import (
+        Angles,
         Viewpoint,
         frame_object,
         look_at,
+        pose_in_view,
         sample_view,
         visible_keypoints,
     )
@@ -37,11 +32,8 @@ __all__ = [
     "Studio",
     "Viewpoint",
     "cast_geometry",
-    "contact_sheet",
     "draw_overlay",
-    "feature_lines",
     "frame_object",
-    "keypoint_picture",
     "look_at",
     "make_renderer",
     "overlay_model",

@@ -11,22 +11,28 @@ import threading
 from contextlib import suppress
 from functools import cache, partial
 from typing import Any
-from weakref import WeakKeyDictionary
 
+import cv2
 import numpy as np
 import numpy.typing as npt
+from trimesh.geometry import align_vectors
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import RenderError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.conventions import OPENGL_AXES, opengl_from_model, opengl_projection
+from cadalign.geometry.conventions import OPENGL_AXES, opengl_from_model
 from cadalign.geometry.mesh import Material
-from cadalign.render.drawing.canvas import ByteImage, LinearArray, linear_from_srgb
-from cadalign.render.raycast.occlusion import darken_corners
+from cadalign.geometry.pixels import PIXEL_CENTRE
+from cadalign.render.drawing.canvas import ByteImage, LinearArray
 from cadalign.render.raycast.posed import Rectangle, pose_scene
-from cadalign.render.raycast.renderer import RaycastRenderer, check_samples, geometry_of
-from cadalign.render.raycast.surface import DARKEST, Studio, color_channels
+from cadalign.render.raycast.renderer import (
+    RaycastRenderer,
+    check_samples,
+    darken_corners,
+    geometry_of,
+)
+from cadalign.render.raycast.surface import DARKEST, Studio, linear_colors
 from cadalign.render.scene import Frame, Scene, check_image_size
 
 # pyrender and PyOpenGL read these when they are imported.
@@ -93,15 +99,14 @@ class PyrenderRenderer:
         color: ByteImage = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
         if posed is not None:
             block = posed.block.slices
-            self._stage.place(scene, cam_from_model, posed.seen_sides(geometry.face_id[block]))
-            color[block] = straight_color(self._draw(camera, posed.block))
+            self._stage.place(scene, camera, cam_from_model, (posed.block.left, posed.block.top))
+            color[block] = cv2.cvtColor(self._draw(posed.block), cv2.COLOR_mRGBA2RGBA)
             darken_corners(color, geometry, posed, self.studio)
         return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
 
-    def _draw(self, camera: Camera, block: Rectangle) -> ByteImage:
+    def _draw(self, block: Rectangle) -> ByteImage:
         """Draw a block of an image, premultiplied (h, w, 4)."""
         width, height = (-(-n // _SIZE_STEP) * _SIZE_STEP for n in (block.width, block.height))
-        self._stage.look(camera, (block.left, block.top, width, height))
         drawn = self._context.draw(self._stage.scene, width=width, height=height)
         return drawn[: block.height, : block.width]
 
@@ -176,16 +181,6 @@ def shared_context() -> GlContext:
     return GlContext()
 
 
-def straight_color(premultiplied: ByteImage) -> ByteImage:
-    """Divide colours (h, w, 4) by their opacity, where that is neither none nor full."""
-    result = np.array(premultiplied)
-    opacity = result[:, :, 3]
-    partial = (opacity > 0) & (opacity < 255)
-    share = opacity[partial, None] / np.float32(255)
-    result[partial, :3] = np.minimum(result[partial, :3] / share + 0.5, 255).astype(np.uint8)
-    return result
-
-
 def _beginning(error: Exception) -> str:
     """The beginning of a message on one line; PyOpenGL's go on for dozens."""
     return " ".join(str(error).split())[:160] or "no reason given"
@@ -220,70 +215,48 @@ def _mesh(scene: Scene, faces: IntArray, *, turned: bool) -> Any:
 
 def _primitive(scene: Scene, material: Material, faces: IntArray, *, turned: bool) -> Any:
     mesh = scene.mesh
-    textured = material.texture is not None and mesh.corner_uv is not None
-    factor = np.asarray(material.color, dtype=np.float32)
-    factor[:3] = linear_from_srgb(factor[:3])
-    attributes: list[FloatArray | LinearArray] = [
-        scene.triangles[faces],
-        scene.corner_normals[faces] * (-1 if turned else 1),
-    ]
-    if textured and mesh.corner_uv is not None:
-        attributes.append(mesh.corner_uv[faces])
+    texture = None if mesh.corner_uv is None else material.texture
+    (factor,) = linear_colors(np.array([material.color]))
+    colors: LinearArray | None = None
     if mesh.vertex_colors is not None:
-        colors = mesh.vertex_colors.astype(np.float32)
-        colors[:, :3] = _lifted(linear_from_srgb(colors[:, :3]))
-        attributes.append(colors[mesh.faces[faces]])
-        # Vertex colours take the place of the material's.
-        factor = np.ones(4, dtype=np.float32)
-    elif not textured:
+        # They take the place of the material's colour.
+        colors, factor = linear_colors(mesh.vertex_colors), np.ones(4, dtype=np.float32)
+        colors[:, :3] = _lifted(colors[:, :3])
+    elif texture is None:
         factor[:3] = _lifted(factor[:3])
-    rows = iter([_corners(attribute, turned=turned) for attribute in attributes])
+
+    def corners(values: npt.NDArray[Any] | None) -> LinearArray | None:
+        """Values (m, 3, k) of triangles' corners one after the other, (3 f, k) float32."""
+        if values is None:
+            return None
+        chosen = values[faces][:, ::-1] if turned else values[faces]
+        return np.ascontiguousarray(chosen.reshape(-1, values.shape[2]), dtype=np.float32)
+
     return pyrender.Primitive(
-        positions=next(rows),
-        normals=next(rows),
-        texcoord_0=next(rows) if textured else None,
-        color_0=next(rows) if mesh.vertex_colors is not None else None,
+        positions=corners(scene.triangles),
+        normals=corners(scene.corner_normals * (-1 if turned else 1)),
+        texcoord_0=None if texture is None else corners(mesh.corner_uv),
+        color_0=None if colors is None else corners(colors[mesh.faces]),
         material=pyrender.MetallicRoughnessMaterial(
             alphaMode="OPAQUE",
             baseColorFactor=factor,
             metallicFactor=0.0,
             roughnessFactor=_ROUGHNESS,
-            baseColorTexture=_texture(material.texture) if textured else None,
+            baseColorTexture=None if texture is None else _texture(texture),
         ),
         mode=_TRIANGLES,
     )
-
-
-def _corners(values: FloatArray | LinearArray, *, turned: bool) -> LinearArray:
-    """Values (f, 3, k) of triangles' corners one after the other, (3 f, k) float32."""
-    ordered = values[:, ::-1] if turned else values
-    return np.ascontiguousarray(ordered.reshape(-1, values.shape[2]), dtype=np.float32)
 
 
 def _lifted(color: LinearArray) -> LinearArray:
     return np.asarray(DARKEST + (1 - DARKEST) * color, dtype=np.float32)
 
 
-def _texture(image: npt.NDArray[np.uint8] | None) -> Any:
+def _texture(image: npt.NDArray[np.uint8]) -> Any:
     """An opaque RGBA texture: rows of other widths than 4 bytes a pixel would be misread."""
-    if image is None:
-        return None
     rgba = np.full((*image.shape[:2], 4), 255, dtype=np.uint8)
-    rgba[:, :, :3] = color_channels(image)
+    rgba[:, :, :3] = image[:, :, :3]
     return pyrender.Texture(source=rgba, source_channels="RGBA")
-
-
-class WindowCamera(pyrender.Camera):  # type: ignore[misc]
-    """A camera with a projection matrix of ours."""
-
-    def __init__(self) -> None:
-        super().__init__(znear=0.1, zfar=1.0)
-        self.near, self.far = 0.1, 1.0
-        self.projection: FloatArray = np.eye(4)
-
-    def get_projection_matrix(self, width: object = None, height: object = None) -> FloatArray:
-        """The projection matrix, in pyrender's terms."""
-        return self.projection
 
 
 class GlStage:
@@ -299,49 +272,40 @@ class GlStage:
         ambient = np.full(3, studio.ground_power + (1 - _SKY_SHARE) * sky + around)
         self.scene: Any = pyrender.Scene(bg_color=np.zeros(4), ambient_light=ambient)
         for direction, power in ((studio.key, studio.key_power), (studio.fill, studio.fill_power)):
-            self._add_light(power, _pose_towards(OPENGL_AXES * direction))
-        self._sky = self._add_light(_SKY_SHARE * sky, np.eye(4))
-        self._camera = WindowCamera()
+            self._turn(self._add_light(power), OPENGL_AXES * direction)
+        self._sky = self._add_light(_SKY_SHARE * sky)
+        self._camera = pyrender.IntrinsicsCamera(1, 1, 0, 0)
         self.scene.add(self._camera, pose=np.eye(4))
-        self._meshes: WeakKeyDictionary[Scene, tuple[Any, Any]] = WeakKeyDictionary()
+        self._shown: Scene | None = None
         self._nodes: tuple[Any, ...] = ()
 
-    def place(self, scene: Scene, cam_from_model: Alignment, sides: tuple[bool, bool]) -> None:
-        """Put a scene's mesh where it is seen; ``sides``: draw front faces, draw back faces."""
-        if scene not in self._meshes:
-            self._meshes[scene] = gl_meshes(scene)
-        meshes = self._meshes[scene]
-        if tuple(node.mesh for node in self._nodes) != meshes:
+    def place(
+        self, scene: Scene, camera: Camera, cam_from_model: Alignment, corner: tuple[int, int]
+    ) -> None:
+        """Put a scene's mesh where it is seen, in the part of an image that begins at a pixel."""
+        if scene is not self._shown:
             for node in self._nodes:
                 self.scene.remove_node(node)
-            self._nodes = tuple(self.scene.add(mesh) for mesh in meshes)
-        for node, drawn in zip(self._nodes, sides, strict=True):
-            self.scene.set_pose(node, opengl_from_model(cam_from_model))
-            node.mesh.is_visible = drawn
-        up = opengl_from_model(cam_from_model)[:3, 1]
-        self.scene.set_pose(self._sky, _pose_towards(up))
+            self._nodes = tuple(self.scene.add(mesh) for mesh in gl_meshes(scene))
+            self._shown = scene
+        pose = opengl_from_model(cam_from_model)
+        for node in self._nodes:
+            self.scene.set_pose(node, pose)
+        self._turn(self._sky, pose[:3, 1])
         depth = scene.used_vertices @ cam_from_model.linear[2] + cam_from_model.translation[2]
         slack = _CLEARANCE * scene.diagonal * float(cam_from_model.scale.max())
-        self._camera.far = float(depth.max()) + slack
-        self._camera.near = max(float(depth.min()) - slack, _NEAR_SHARE * self._camera.far)
+        lens = self._camera
+        lens.zfar = float(depth.max()) + slack
+        lens.znear = max(float(depth.min()) - slack, _NEAR_SHARE * lens.zfar)
+        lens.fx, lens.fy = camera.fx, camera.fy
+        lens.cx = camera.cx + PIXEL_CENTRE - corner[0]
+        lens.cy = camera.cy + PIXEL_CENTRE - corner[1]
 
-    def look(self, camera: Camera, window: tuple[int, int, int, int]) -> None:
-        """Choose the part of an image that is drawn: left, top, width, height [px]."""
-        self._camera.projection = opengl_projection(
-            camera, near=self._camera.near, far=self._camera.far, window=window
-        )
-
-    def _add_light(self, power: float, pose: FloatArray) -> Any:
+    def _add_light(self, power: float) -> Any:
         # The shader divides by pi, as a surface spreads its light over the hemisphere.
-        light = pyrender.DirectionalLight(color=np.ones(3), intensity=np.pi * power)
-        return self.scene.add(light, pose=pose)
+        return self.scene.add(pyrender.DirectionalLight(color=np.ones(3), intensity=np.pi * power))
 
-
-def _pose_towards(direction: npt.NDArray[np.float64]) -> FloatArray:
-    """A pose (4, 4) whose +z axis, from where pyrender's lights shine, has this direction."""
-    axis = direction / np.linalg.norm(direction)
-    aside = np.cross([0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0], axis)
-    aside /= np.linalg.norm(aside)
-    pose = np.eye(4)
-    pose[:3, :3] = np.column_stack([aside, np.cross(axis, aside), axis])
-    return pose
+    def _turn(self, light: Any, direction: FloatArray) -> None:
+        """Let a light shine from a direction (3,): along its +z axis."""
+        pose = align_vectors(np.array([0.0, 0.0, 1.0]), direction)  # type: ignore[no-untyped-call]
+        self.scene.set_pose(light, pose)

@@ -112,20 +112,15 @@ def load_renderer(name: str, studio: Studio | None) -> Renderer:
 
 def _try(name: str) -> Probe:
     renderer = load_renderer(name, None)
-    scene, camera = Scene(ball(1)), Camera.from_fov(64, 48, fov_x=50.0)
-    frame = renderer.render(scene, camera, Alignment(np.eye(3), np.array([0, 0, 4.5]), np.ones(3)))
+    corners = np.array([[-1.0, 0, 0], [0, 1, 0], [1, 0, 0], [0, -2, 0]])
+    kite = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    camera = Camera.from_fov(64, 48, fov_x=50.0)
+    pose = Alignment(np.eye(3), np.array([0, 0, 4.5]), np.ones(3))
+    frame = renderer.render(Scene(kite), camera, pose)
     seen = float((frame.color[:, :, 3] > 127).mean())
     if not (frame.mask.any() and abs(seen - frame.mask.mean()) < 0.1):
-        return Probe(name, False, "it draws a ball wrongly")
+        return Probe(name, False, "it draws a kite wrongly")
     return Probe(name, True, str(getattr(renderer, "device", "processor")))
-
-
-def ball(subdivisions: int) -> Mesh:
-    """A ball of radius 1 with 20 * 4**subdivisions triangles."""
-    import trimesh
-
-    shape = trimesh.creation.icosphere(subdivisions=subdivisions)
-    return Mesh(np.array(shape.vertices), np.array(shape.faces))
 
 
 logger = logging.getLogger("cadalign")
@@ -187,13 +182,11 @@ def make_renderer(name: str = AUTO, *, studio: Studio | None = None) -> Renderer
 def best_renderer() -> str:
     """The renderer that "auto" takes here, by name; ray casting needs no proof."""
     found = probe_renderer("pyrender")
-    is_imitation = any(name in found.detail.lower() for name in _IMITATIONS)
-    if found.works and not is_imitation:
-        logger.info("renderer: pyrender (%s)", found.detail)
-        return "pyrender"
-    if found.works:
-        reason = f"OpenGL has no graphics card here but {found.detail}"
+    if not found.works:
+        name, reason = "raycast", f"pyrender does not work here: {found.detail}"
+    elif any(name in found.detail.lower() for name in _IMITATIONS):
+        name, reason = "raycast", f"OpenGL has no graphics card here but {found.detail}"
     else:
-        reason = f"pyrender does not work here: {found.detail}"
-    logger.info("renderer: raycast (%s)", reason)
-    return "raycast"
+        name, reason = "pyrender", found.detail
+    logger.info("renderer: %s (%s)", name, reason)
+    return name

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -31,8 +31,6 @@ class Scene:
     ----------
     mesh : Mesh
         The mesh in model coordinates.
-    crease_angle : float
-        Neighbouring faces at a smaller angle than this [degrees] look like one smooth surface.
 
     Examples
     --------
@@ -42,13 +40,12 @@ class Scene:
     5.0
     """
 
-    def __init__(self, mesh: Mesh, *, crease_angle: float = 40.0) -> None:
+    def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
-        self.crease_angle = float(crease_angle)
 
     def __reduce__(self) -> tuple[object, ...]:
         # The ray hierarchy cannot be pickled; worker processes build their own.
-        return partial(Scene, crease_angle=self.crease_angle), (self.mesh,)
+        return Scene, (self.mesh,)
 
     @cached_property
     def bounds(self) -> FloatArray:
@@ -90,39 +87,15 @@ class Scene:
         return face_normals(self.triangles)
 
     @cached_property
-    def corner_normals(self) -> FloatArray:
-        """Smooth normals at the triangles' corners, (m, 3, 3) float, on their face's side."""
-        return corner_normals(
-            self.mesh.vertices, self.mesh.faces, self.face_normals, crease_angle=self.crease_angle
-        )
-
-    @cached_property
-    def single_corner_normals(self) -> npt.NDArray[np.float32]:
-        """`corner_normals` in single precision, for shading."""
-        return self.corner_normals.astype(np.float32)
+    def corner_normals(self) -> npt.NDArray[np.float32]:
+        """Smooth normals at the triangles' corners, (m, 3, 3) float32, on their face's side."""
+        normals = corner_normals(self.mesh.vertices, self.mesh.faces, self.face_normals)
+        return normals.astype(np.float32)
 
     @cached_property
     def coincident_faces(self) -> tuple[IntArray, IntArray]:
         """The triangle to show of those in one place; see `coincident_faces`."""
         return coincident_faces(self.mesh.vertices, self.mesh.faces)
-
-    @cached_property
-    def barycentric_gradients(self) -> FloatArray:
-        """Gradients of the barycentric weights of corners 1 and 2, (m, 2, 3) float.
-
-        The weight of corner i at x is ``gradient[i - 1] @ (x - corner 0)``.
-        """
-        corners = self.triangles
-        edges = corners[:, 1:] - corners[:, :1]
-        gram = edges @ edges.transpose(0, 2, 1)
-        a, b, c = gram[:, 0, 0], gram[:, 0, 1], gram[:, 1, 1]
-        determinant = a * c - b * b
-        # A triangle without area has no such gradients: its first corner stands for all of it.
-        solid = determinant > 1e-18 * a * c
-        inverse = np.divide(1.0, determinant, out=np.zeros_like(a), where=solid)
-        first = c[:, None] * edges[:, 0] - b[:, None] * edges[:, 1]
-        second = a[:, None] * edges[:, 1] - b[:, None] * edges[:, 0]
-        return np.asarray(np.stack([first, second], axis=1) * inverse[:, None, None])
 
     @cached_property
     def surface(self) -> SurfaceColors:

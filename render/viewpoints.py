@@ -1,8 +1,8 @@
-"""Views of an object: cameras placed on a sphere about it."""
+"""Views of an object: cameras placed on a sphere about it, named ones, and what they see."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,7 @@ from cadalign.render.scene import Scene
 _ATTEMPTS = 100
 _DISTANCE_STEPS = 50
 _FILL_TOLERANCE = 1e-3
+_STILL_FILL = 0.88  # of the image, by a still's model
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,6 +235,69 @@ def _check_range(value: tuple[float, float], *, name: str, low: float, high: flo
         raise InputError(
             f"{first:g} to {last:g} is not a range within {low:g} to {high:g}", where=name
         )
+
+
+VIEWS: dict[str, tuple[float, float]] = {
+    "iso": (145.0, 25.0),
+    "front": (180.0, 0.0),
+    "right": (90.0, 0.0),
+    "back": (0.0, 0.0),
+    "left": (-90.0, 0.0),
+    "top": (180.0, 90.0),
+    "bottom": (180.0, -90.0),
+}
+"""Azimuth and elevation [degrees] of the named views, see `look_at`; ShapeNet's models face -z."""
+
+
+@dataclass(frozen=True)
+class Angles:
+    """Viewing angles of a model [degrees]; see `look_at`."""
+
+    azimuth: float
+    elevation: float
+    roll: float = 0.0
+
+    @classmethod
+    def parse(cls, text: str) -> Angles:
+        """Read a view's name, or ``azimuth,elevation`` or ``azimuth,elevation,roll``.
+
+        Raises
+        ------
+        InputError
+            If it is neither.
+
+        Examples
+        --------
+        >>> Angles.parse("30,-10")
+        Angles(azimuth=30.0, elevation=-10.0, roll=0.0)
+        """
+        if text in VIEWS:
+            return cls(*VIEWS[text])
+        try:
+            values = [float(word) for word in text.split(",")]
+        except ValueError:
+            values = []
+        if len(values) not in (2, 3) or not np.isfinite(values).all():
+            raise InputError(
+                f"{text!r} is not a view",
+                where="view",
+                fix=f"give one of {', '.join(VIEWS)}, or azimuth,elevation[,roll] in degrees",
+            )
+        return cls(*values)
+
+
+def pose_in_view(
+    scene: Scene, camera: Camera, angles: Angles, *, scale: npt.ArrayLike = (1.0, 1.0, 1.0)
+) -> Alignment:
+    """Place a model so that it fills the image, looked at from some angles.
+
+    Raises
+    ------
+    InputError
+        If an angle or a scale is out of its range.
+    """
+    rotation = look_at(**asdict(angles), distance=1.0, scale=scale).rotation
+    return frame_object(scene.bounds, camera, rotation=rotation, fill=_STILL_FILL, scale=scale)
 
 
 # The centre, then four around it: keypoints like to sit on corners and edges, where a ray to the

@@ -17,8 +17,8 @@ from cadalign.io.images import JPEG_ENDING
 if TYPE_CHECKING:
     from cadalign.arrays import FloatArray
     from cadalign.render.drawing.canvas import ByteImage
-    from cadalign.render.drawing.pictures import Angles
     from cadalign.render.scene import Renderer, Scene
+    from cadalign.render.viewpoints import Angles
 
 _ENDINGS = (".png", JPEG_ENDING)
 
@@ -55,7 +55,7 @@ class Render:
         from cadalign.datasets.models.model_keypoints import ModelKeypoints
         from cadalign.io.images import write_image
         from cadalign.io.meshes.files import load_mesh
-        from cadalign.render.drawing.pictures import contact_sheet
+        from cadalign.render.drawing.layers import contact_sheet
         from cadalign.render.probe import make_renderer
         from cadalign.render.scene import Scene
 
@@ -65,12 +65,13 @@ class Render:
             keypoints = None
             if self.keypoints is not None:
                 keypoints = ModelKeypoints.load(self.keypoints, model=self.model).xyz
-            images = [
-                self._draw(scene, renderer, camera, each, keypoints) for each in views.values()
-            ]
-            picture = images[0]
-            if len(images) > 1:
-                picture = contact_sheet(images, list(views))
+            pictures = {
+                name: self._draw(scene, renderer, camera, view, keypoints)
+                for name, view in views.items()
+            }
+            (picture, *further) = pictures.values()
+            if further:
+                picture = contact_sheet(pictures)
             make_folder_of(self.out)
             write_image(self.out, picture)
         say(f"Written: {self.out}")
@@ -96,7 +97,7 @@ class Render:
         return camera
 
     def _views(self) -> dict[str, Angles]:
-        from cadalign.render.drawing.pictures import VIEWS, Angles
+        from cadalign.render.viewpoints import VIEWS, Angles
 
         views: dict[str, Angles] = {}
         for word in self.view:
@@ -115,12 +116,12 @@ class Render:
         keypoints: FloatArray | None,
     ) -> ByteImage:
         """One picture, (h, w, 3) uint8."""
-        from cadalign.render.drawing.pictures import keypoint_picture, pose_in_view
-        from cadalign.render.viewpoints import visible_keypoints
+        from cadalign.render.drawing.layers import keypoint_picture
+        from cadalign.render.viewpoints import pose_in_view, visible_keypoints
 
         pose = pose_in_view(scene, camera, view, scale=self.scale)
         image = renderer.render(scene, camera, pose, samples=self.samples).composite()
         if keypoints is None:
             return image
         visible = visible_keypoints(scene, keypoints, camera, pose)
-        return keypoint_picture(image, camera, keypoints, pose, visible=visible)
+        return keypoint_picture(image, camera, keypoints, pose, visible)

@@ -21,7 +21,6 @@ from cadalign.report.runs import by_spec, read_runs
 _MOST_REASONS = 200
 _REFERENCES = {LIMIT, TRUTH, "exact"}
 """Methods that know what nobody does: the bound, the object's own model, the true pose."""
-OTHER_REASONS = "other reasons"
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,6 @@ class HeadlineRow:
 
 Failure = dict[str, Any]
 """A ``reason`` of failures or of skipped instances, their ``count``, run, category and method."""
-_FAILURE = ("run", "category", "method", "reason", "count")
 
 
 @dataclass(frozen=True)
@@ -105,44 +103,34 @@ def headline_of(runs: Sequence[Run]) -> Headline:
 
 def _with_best(rows: Sequence[HeadlineRow], columns: Sequence[Metric]) -> list[HeadlineRow]:
     """The rows with the best ones marked, among methods on the same that one could use."""
-    best: dict[tuple[str, str], float] = {}
-    rivals = [row for row in rows if row.method not in _REFERENCES]
-    for column in columns:
-        choose = max if column.better == HIGH else min
-        for row in rivals:
-            value = row.cells[column.key]
-            if column.better is not None and value is not None:
-                place = (row.category, column.key)
-                best[place] = choose(best.get(place, value), value)
-    counts = Counter(row.category for row in rivals)
-
-    def marked(row: HeadlineRow) -> tuple[str, ...]:
-        if row.method in _REFERENCES or counts[row.category] < 2:
-            return ()
-        return tuple(
-            column.key
-            for column in columns
-            if row.cells[column.key] is not None
-            and row.cells[column.key] == best.get((row.category, column.key))
-        )
-
-    return [replace(row, best=marked(row)) for row in rows]
+    rivals: dict[str, list[HeadlineRow]] = {}
+    for row in rows:
+        if row.method not in _REFERENCES:
+            rivals.setdefault(row.category, []).append(row)
+    marked: dict[int, tuple[str, ...]] = {}
+    for group in rivals.values():
+        best = {}
+        for column in columns if len(group) > 1 else ():
+            values = [v for row in group if (v := row.cells[column.key]) is not None]
+            if column.better is not None and values:
+                best[column.key] = max(values) if column.better == HIGH else min(values)
+        for row in group:
+            marked[id(row)] = tuple(key for key, value in best.items() if row.cells[key] == value)
+    return [replace(row, best=marked.get(id(row), ())) for row in rows]
 
 
 def _reasons(index: int, run: Run, group: Metric, wanted: str) -> list[Failure]:
-    """Reasons with their numbers, the most frequent first; rare ones beyond a number as one."""
+    """Reasons with their numbers, the most frequent first."""
     chosen = [run.results[name].to_pylist() for name in (group.key, "method", "status", "reason")]
     counts = Counter(
         (group_name(group, value), method, reason)
         for value, method, status, reason in zip(*chosen, strict=True)
         if status == wanted
     )
-    listed = counts.most_common(_MOST_REASONS)
-    rest: Counter[tuple[str, str, str]] = Counter()
-    for (category, method, _), count in counts.most_common()[_MOST_REASONS:]:
-        rest[category, method, OTHER_REASONS] += count
-    rows = ((index, *names, count) for names, count in (*listed, *rest.items()))
-    return [dict(zip(_FAILURE, row, strict=True)) for row in rows]
+    return [
+        {"run": index, "category": category, "method": method, "reason": reason, "count": count}
+        for (category, method, reason), count in counts.most_common(_MOST_REASONS)
+    ]
 
 
 # As text ------------------------------------------------------------------------------------------
@@ -181,17 +169,16 @@ def table_text(headline: Headline, names: Sequence[str], *, format: str) -> str:
     """The table as text; ``names`` are those of the runs. See `headline_text`."""
     headings = (column.heading for column in headline.columns)
     head = [*(["run"] if len(names) > 1 else []), headline.group, "method", *headings]
-    rows = _rows(headline, names)
+    rows = [
+        (row, [*([names[row.run]] if len(names) > 1 else []), row.category, row.method])
+        for row in headline.rows
+    ]
     if format == "csv":  # a cell that is None is empty
-        cells = [
-            [*labels, row.method, *(row.cells[column.key] for column in headline.columns)]
-            for row, labels in rows
-        ]
-        return csv_text([head, *cells])
+        keys = [column.key for column in headline.columns]
+        return csv_text([head, *([*labels, *map(row.cells.get, keys)] for row, labels in rows)])
     marks = ["---"] * (len(head) - len(headline.columns)) + ["---:"] * len(headline.columns)
     lines = [[text.translate(_MARKDOWN) for text in head], marks]
-    for row, names_of_row in rows:
-        labels = [*names_of_row, row.method]
+    for row, labels in rows:
         line = [label.translate(_MARKDOWN) for label in labels]
         for column in headline.columns:
             text = column.rounded(row.cells[column.key]).translate(_MARKDOWN)
@@ -199,9 +186,3 @@ def table_text(headline: Headline, names: Sequence[str], *, format: str) -> str:
         lines.append(line)
     table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     return f"{table}\n\n{headline.note.translate(_MARKDOWN)}\n"
-
-
-def _rows(headline: Headline, names: Sequence[str]) -> list[tuple[HeadlineRow, list[str]]]:
-    """The rows with run, where there are several, and category."""
-    several = len(names) > 1
-    return [(r, [*([names[r.run]] if several else []), r.category]) for r in headline.rows]

@@ -99,9 +99,8 @@ def _cells(run: Run, metrics: Sequence[Metric]) -> dict[str, list[Any]]:
     """The columns of a run's results as lists, without what was left out or skipped."""
     without = pc.is_in(run.results["status"], value_set=pa.array([LEFT_OUT, SKIPPED]))
     table = run.results.filter(pc.invert(without))
-    cells: dict[str, list[Any]] = {}
-    for name in ("category", "model_id", "view", "method", "status", "reason", "keypoints"):
-        cells[name] = table[name].to_pylist()
+    named = ("category", "model_id", "view", "method", "status", "reason", "keypoints")
+    cells = {name: table[name].to_pylist() for name in named}
     for name in (metric.key for metric in metrics):
         cells[name] = [None] * len(table)
         if name in table.column_names:
@@ -129,9 +128,9 @@ class Media:
         """Take in the pictures and records of runs, and enter their keys in the table."""
         for index, run in enumerate(runs):
             folder = run.folder
-            names = {
-                path: _names(path) for path in (folder.pictures, folder.thumbs, folder.previews)
-            }
+            folders = folder.pictures, folder.thumbs, folder.previews
+            # The names in a folder are read once: asking for thousands takes seconds.
+            there = {path for each in folders if each.is_dir() for path in listed(each)}
             for row in run.records(RECORD_COLUMNS):
                 name = (row["category"], row["model_id"], row["view"])
                 place = table.places.get((index, name))
@@ -141,13 +140,11 @@ class Media:
                     self.left_out += 1
                     continue
                 view, model = f"{record_stem(*name)}.webp", f"{record_stem(*name[:2])}.json"
+                paths = folder.pictures / view, folder.thumbs / view, folder.previews / model
+                stores = self.pictures, self.thumbs, self.meshes
                 picture, thumb, mesh = (
-                    self._key_of(path / file, store) if file in names[path] else None
-                    for path, file, store in (
-                        (folder.pictures, view, self.pictures),
-                        (folder.thumbs, view, self.thumbs),
-                        (folder.previews, model, self.meshes),
-                    )
+                    self._key_of(path, store) if path in there else None
+                    for path, store in zip(paths, stores, strict=True)
                 )
                 table.instances["thumb"][place] = -1 if thumb is None else int(thumb)
                 table.instances["exhibit"][place] = place
@@ -171,11 +168,6 @@ class Media:
             is_mesh = store is self.meshes
             store[key] = _object(data, path) if is_mesh else code + b64encode(data).decode()
         return self._known[digest]
-
-
-def _names(folder: Path) -> set[str]:
-    """The names in a folder, read once: asking for thousands takes seconds."""
-    return {path.name for path in listed(folder)} if folder.is_dir() else set()
 
 
 def _object(text: str | bytes, path: Path) -> dict[str, Any]:

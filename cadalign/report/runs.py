@@ -21,19 +21,13 @@ BATCHES.update(fit="cadalign.batch.spec", retrieve="cadalign.batch.retrievals")
 _LABELS = {
     "root": "dataset",
     "path": "dataset",
-    "noise_px": "noise",
-    "noises_px": "noise",
     "min_visible": "least visible keypoints",
     "max_models": "most models per category",
     "render": "pictures",
     "max_reproj_error": "inliers within",
     "max_iterations": "most samples",
 }
-_UNITS = {
-    "noise_px": " px",
-    "noises_px": " px",
-    "max_reproj_error": " px",
-}
+_PIXELS = ("noise_px", "noises_px", "max_reproj_error")
 
 
 def read_runs(folders: Sequence[str | os.PathLike[str]]) -> list[Run]:
@@ -152,11 +146,11 @@ def settings_of(run: Run) -> list[tuple[str, str]]:
     # Data first, methods and seed last.
     names = [field.name for field in fields(spec_of(run).options)]
     names.sort(key=lambda name: {"root": -1, "path": -1, "methods": 1, "seed": 2}.get(name, 0))
-    found = [
-        (_LABELS.get(name, name.replace("_", " ")), f"{_text(config[name])}{_UNITS.get(name, '')}")
-        for name in names
-        if config.get(name) is not None and not isinstance(config[name], dict)
-    ]
+    found = []
+    for name in names:
+        if config.get(name) is not None and not isinstance(config[name], dict):
+            label = _LABELS.get(name, name.removesuffix("_px").replace("_", " "))
+            found.append((label, _text(config[name]) + (" px" if name in _PIXELS else "")))
     version = run.config.get("versions", {}).get("cadalign")
     return [*found, ("cadalign", str(version))] if version else found
 

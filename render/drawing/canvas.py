@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -35,14 +33,14 @@ LegendEntry = tuple[str, Color, str]
 class Canvas:
     """An image that is drawn on, a small one at twice its size, for finer lines.
 
-    The image (h, w, 3) uint8 is copied. All methods take pixels of the canvas: see `place`.
+    The image (h, w, 3) uint8 is copied. All methods take its pixels.
 
     Attributes
     ----------
     image : (h, w, 3) uint8
         The canvas.
     unit : float
-        The width of a thin line [canvas px], which grows with the image.
+        The width of a thin line [px], which grows with the image.
     """
 
     def __init__(self, image: ByteImage) -> None:
@@ -51,11 +49,7 @@ class Canvas:
         size = (columns * self._zoom, rows * self._zoom)
         enlarged = cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_NEAREST)
         self.image: ByteImage = np.asarray(enlarged, dtype=np.uint8)
-        self.unit = float(self._zoom * max(0.5, min(rows, columns) / 480))
-
-    def place(self, points: FloatArray) -> FloatArray:
-        """Take pixels (n, 2) of the image to those of the canvas."""
-        return rescaled_pixels(points, self._zoom)
+        self.unit = max(0.5, min(rows, columns) / 480)
 
     def finished(self) -> ByteImage:
         """The drawn image at its own size; where nothing was drawn it is what it was."""
@@ -67,7 +61,8 @@ class Canvas:
 
     def _strokes(self, color: Color, *, width: float, casing: float) -> _Strokes:
         """Colour and thickness [canvas px] of a line's dark border, then of the line itself."""
-        inner, border = (max(1, round(value * self.unit)) for value in (width, casing))
+        scale = self.unit * self._zoom
+        inner, border = (max(1, round(value * scale)) for value in (width, casing))
         return (CASING, inner + 2 * border), (color, inner)
 
     def blend_from(self, before: ByteImage, *, opacity: float) -> None:
@@ -78,12 +73,14 @@ class Canvas:
 
     def line(self, points: FloatArray, color: Color, *, width: float, dashed: bool = False) -> None:
         """Draw a line through (n, 2) pixels; its width is in units."""
-        parts = _dashes(points, 7 * self.unit, 5 * self.unit) if dashed else [points]
-        fixed = np.split(
-            _fixed_point(np.concatenate(parts)), np.cumsum([len(part) for part in parts[:-1]])
-        )
-        for shade, thickness in self._strokes(color, width=width, casing=_LINE_CASING):
-            cv2.polylines(self.image, fixed, False, shade, thickness, cv2.LINE_AA, _SHIFT)
+        parts = _dashes(points, 7 * self.unit, 5 * self.unit) if dashed else points[None]
+        self._lines(parts, self._strokes(color, width=width, casing=_LINE_CASING))
+
+    def _lines(self, parts: FloatArray, strokes: _Strokes) -> None:
+        """Draw lines through (m, n, 2) pixels, the dark borders of all of them first."""
+        for shade, thickness in strokes:
+            whole = list(self._whole(parts))
+            cv2.polylines(self.image, whole, False, shade, thickness, cv2.LINE_AA, _SHIFT)
 
     def dot(self, point: FloatArray, color: Color, *, radius: float) -> None:
         """Draw a disc without casing."""
@@ -95,17 +92,14 @@ class Canvas:
             self._circle(point, shade, radius, thickness)
 
     def _circle(self, point: FloatArray, color: Color, radius: float, thickness: int) -> None:
-        x, y = (int(value) for value in _fixed_point(point))
-        fixed = int(radius * self.unit * (1 << _SHIFT))
-        cv2.circle(self.image, (x, y), fixed, color, thickness, cv2.LINE_AA, _SHIFT)
+        x, y = (int(value) for value in self._whole(point))
+        reach = int(radius * self.unit * self._zoom * (1 << _SHIFT))
+        cv2.circle(self.image, (x, y), reach, color, thickness, cv2.LINE_AA, _SHIFT)
 
     def cross(self, point: FloatArray, color: Color, *, radius: float) -> None:
         """Draw an upright cross."""
-        reach = radius * self.unit
-        arms = [point + np.array(arm) * reach for arm in ([[-1, 0], [1, 0]], [[0, -1], [0, 1]])]
-        fixed = [_fixed_point(arm) for arm in arms]
-        for shade, thickness in self._strokes(color, width=1.5, casing=_MARKER_CASING):
-            cv2.polylines(self.image, fixed, False, shade, thickness, cv2.LINE_AA, _SHIFT)
+        arms = point + radius * self.unit * np.array([[[-1, 0], [1, 0]], [[0, -1], [0, 1]]])
+        self._lines(arms, self._strokes(color, width=1.5, casing=_MARKER_CASING))
 
     def arrow(self, start: FloatArray, end: FloatArray, color: Color, *, width: float) -> None:
         """Draw an arrow between two pixels (2,)."""
@@ -114,44 +108,37 @@ class Canvas:
         if length < 1e-6:
             return
         along = along / length
-        head = min(4.5 * width * self.unit, length)
-        aside = np.array([-along[1], along[0]]) * head * 0.42
-        neck = end - along * head
-        triangle = _fixed_point(np.array([end, neck + aside, neck - aside]))
         (_, outer), (_, inner) = self._strokes(color, width=width, casing=_LINE_CASING)
-        casing = outer - inner
-        self.line(np.array([start, neck]), color, width=width)
-        cv2.polylines(self.image, [triangle], True, CASING, casing, cv2.LINE_AA, _SHIFT)
-        cv2.fillPoly(self.image, [triangle], color, cv2.LINE_AA, _SHIFT)
-        # The shaft again, over the head's casing.
-        joint = _fixed_point(np.array([neck - along * casing, neck + along * head * 0.3]))
-        cv2.polylines(self.image, [joint], False, color, inner, cv2.LINE_AA, _SHIFT)
+        half, head = inner / 2 / self._zoom, min(4.5 * width * self.unit, length)
+        # One side of its outline from the tip on, along the arrow and across; then the other side.
+        side = np.array([[0, 0], [-head, 0.42 * head], [-head, half], [-length, half]])
+        outline = np.concatenate([side, side[:0:-1] * (1, -1)])
+        whole = self._whole(end + outline @ [along, [-along[1], along[0]]])
+        cv2.polylines(self.image, [whole], True, CASING, outer - inner, cv2.LINE_AA, _SHIFT)
+        cv2.fillPoly(self.image, [whole], color, cv2.LINE_AA, _SHIFT)
 
     def label(self, text: str, middle: FloatArray, color: Color) -> None:
         """Write a short text about a point."""
-        height, width = self.image.shape[:2]
-        if not ((middle >= 0) & (middle < (width, height))).all():
+        rows, columns = self.image.shape[:2]
+        x, y = rescaled_pixels(middle, self._zoom)
+        if not (0 <= x < columns and 0 <= y < rows):
             return
-        font = ImageFont.load_default(size=15 * self.unit)
-        # Only a part of the image goes through Pillow, which copies it twice.
-        reach = 20 * self.unit
-        left, top = np.maximum(np.floor(middle - reach), 0).astype(int)
-        right, bottom = np.ceil(middle + reach).astype(int)
-        part = Image.fromarray(self.image[top:bottom, left:right])
-        ImageDraw.Draw(part).text(
-            (float(middle[0]) - left, float(middle[1]) - top),
+        scale = self.unit * self._zoom
+        picture = Image.fromarray(self.image)
+        ImageDraw.Draw(picture).text(
+            (float(x), float(y)),
             text,
             fill=color,
-            font=font,
+            font=ImageFont.load_default(size=15 * scale),
             anchor="mm",
-            stroke_width=max(1, round(self.unit)),
+            stroke_width=max(1, round(scale)),
             stroke_fill=CASING,
         )
-        self.image[top:bottom, left:right] = np.asarray(part)
+        self.image = np.array(picture)
 
     def legend(self, entries: list[LegendEntry], *, keep_clear: FloatArray) -> None:
         """Write a legend into the corner that covers the fewest of some pixels (n, 2)."""
-        size = round(12.5 * self.unit)
+        size = round(12.5 * self.unit * self._zoom)
         font = ImageFont.load_default(size=size)
         pad, swatch, pitch = 0.7 * size, 1.9 * size, 1.45 * size
         width = round(3 * pad + swatch + max(font.getlength(text) for text, _, _ in entries))
@@ -159,32 +146,29 @@ class Canvas:
         rows, columns = self.image.shape[:2]
         if width + size > columns or height + size > rows:
             return
-        left, top = self._emptiest_corner(width, height, round(0.7 * size), keep_clear)
+        clear = rescaled_pixels(keep_clear, self._zoom)
+        left, top = self._emptiest_corner(width, height, round(0.7 * size), clear)
         plate = Image.new("L", (width, height), 0)
         ImageDraw.Draw(plate).rounded_rectangle(
             (0, 0, width - 1, height - 1), radius=0.4 * size, fill=round(255 * _PLATE_OPACITY)
         )
-        block = (slice(top, top + height), slice(left, left + width))
-        part = Image.fromarray(self.image[block])
-        part.paste(CASING, (0, 0), plate)
-        pen = ImageDraw.Draw(part)
-        middles = [pad + size / 2 + pitch * number for number in range(len(entries))]
+        picture = Image.fromarray(self.image)
+        picture.paste(CASING, (left, top), plate)
+        pen = ImageDraw.Draw(picture)
+        middles = [top + pad + size / 2 + pitch * number for number in range(len(entries))]
         for (text, _, _), y in zip(entries, middles, strict=True):
-            pen.text((2 * pad + swatch, y), text, fill=(245,) * 3, font=font, anchor="lm")
-        self.image[block] = np.asarray(part)
-        self._draw_swatches(entries, left + pad, swatch, top + np.array(middles))
-
-    def _draw_swatches(
-        self, entries: list[LegendEntry], left: float, width: float, middles: FloatArray
-    ) -> None:
+            at = (left + 2 * pad + swatch, y)
+            pen.text(at, text, fill=(245,) * 3, font=font, anchor="lm")
+        self.image = np.array(picture)
         for (_, color, marker), y in zip(entries, middles, strict=True):
-            middle = np.array([left + width / 2, y])
+            places = np.array([[0.0, y], [swatch / 2, y], [swatch, y]]) + [left + pad, 0.0]
+            begin, middle, end = rescaled_pixels(places, 1 / self._zoom)
             if marker == "ring":
                 self.ring(middle, color, radius=4.5)
             elif marker == "cross":
                 self.cross(middle, color, radius=4)
             else:
-                self.line(np.array([[left, y], [left + width, y]]), color, width=2.5)
+                self.line(np.array([begin, end]), color, width=2.5)
 
     def _emptiest_corner(
         self, width: int, height: int, gap: int, keep_clear: FloatArray
@@ -196,45 +180,33 @@ class Canvas:
             for top in (gap, rows - height - gap)
             for left in (gap, columns - width - gap)
         ]
-        covered = [
-            ((keep_clear >= corner) & (keep_clear <= (corner[0] + width, corner[1] + height)))
-            .all(axis=1)
-            .sum()
-            for corner in corners
-        ]
-        return corners[int(np.argmin(covered))]
+
+        def covered(corner: tuple[int, int]) -> int:
+            inside = (keep_clear >= corner) & (keep_clear <= np.add(corner, (width, height)))
+            return int(inside.all(axis=1).sum())
+
+        return min(corners, key=covered)
+
+    def _whole(self, points: FloatArray) -> np.ndarray[tuple[int, ...], np.dtype[np.int32]]:
+        """Pixels in OpenCV's whole numbers with a fraction, of the canvas."""
+        held = np.clip(rescaled_pixels(points, self._zoom), -_FARTHEST, _FARTHEST)
+        return np.asarray(np.rint(held * (1 << _SHIFT)), dtype=np.int32)
 
 
-def _fixed_point(points: FloatArray) -> np.ndarray[tuple[int, ...], np.dtype[np.int32]]:
-    """Pixels in OpenCV's whole numbers with a fraction."""
-    held = np.clip(points, -_FARTHEST, _FARTHEST)
-    return np.asarray(np.rint(held * (1 << _SHIFT)), dtype=np.int32)
-
-
-def _dashes(points: FloatArray, dash: float, gap: float) -> list[FloatArray]:
-    """Cut a line (n, 2) into dashes [px], the first and last of which are whole."""
+def _dashes(points: FloatArray, dash: float, gap: float) -> FloatArray:
+    """Cut a line (n, 2) into straight dashes [px], (m, 2, 2); the first and last are whole."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     reached = np.concatenate([[0.0], np.cumsum(steps)])
-    total = reached[-1]
-    count = min(max(1, round((total + gap) / (dash + gap))), 1000)
-    pitch = (total + gap) / count
+    count = min(max(1, round((reached[-1] + gap) / (dash + gap))), 1000)
+    pitch = (reached[-1] + gap) / count
     begins = np.arange(count) * pitch
     ends = np.maximum(begins + (pitch - gap), begins)
-    first = np.searchsorted(reached, begins, side="right")
-    last = np.searchsorted(reached, ends, side="left")
-    at = [
-        np.concatenate([[begin], reached[low:high], [end]])
-        for begin, end, low, high in zip(begins, ends, first, last, strict=True)
-    ]
-    every = np.concatenate(at)
-    drawn = np.column_stack([np.interp(every, reached, points[:, axis]) for axis in (0, 1)])
-    return np.split(drawn, np.cumsum([len(part) for part in at[:-1]]))
+    at = np.stack([begins, ends], axis=1)
+    return np.stack([np.interp(at, reached, points[:, axis]) for axis in (0, 1)], axis=2)
 
 
 LinearArray = npt.NDArray[np.float32]
 ByteImage = npt.NDArray[np.uint8]
-
-_STEPS = 1 << 14
 
 
 def linear_from_srgb(encoded: LinearArray) -> LinearArray:
@@ -244,34 +216,22 @@ def linear_from_srgb(encoded: LinearArray) -> LinearArray:
     return np.asarray(np.where(encoded <= 0.04045, low, high), dtype=np.float32)
 
 
-def srgb_from_linear(linear: LinearArray) -> LinearArray:
-    """Encode linear light (any shape) to sRGB values from 0 to 1; float32."""
-    value = np.clip(linear, 0, 1)
-    high = np.float32(1.055) * value ** np.float32(1 / 2.4) - np.float32(0.055)
-    return np.asarray(np.where(value <= 0.0031308, value * np.float32(12.92), high), np.float32)
-
-
-def bytes_from_linear(linear: LinearArray) -> ByteImage:
-    """Encode linear light (any shape) to sRGB bytes."""
-    index = (np.sqrt(np.clip(linear, 0, 1)) * np.float32(_STEPS) + np.float32(0.5)).astype(np.int32)
-    return np.asarray(_encoded_squares()[index])
+_DECODED = linear_from_srgb(np.arange(256, dtype=np.float32) / np.float32(255))
+# The bytes of the squares of 0 to 1, which spread the dark values about as sRGB does.
+_STEPS = 1 << 14
+_LIMITS = linear_from_srgb((np.arange(255, dtype=np.float32) + np.float32(0.5)) / np.float32(255))
+_ENCODED = np.searchsorted(_LIMITS, np.linspace(0, 1, _STEPS + 1) ** 2).astype(np.uint8)
 
 
 def linear_from_bytes(image: ByteImage) -> LinearArray:
     """Decode sRGB bytes (any shape) to linear light; float32."""
-    return np.asarray(_decoded_bytes()[image])
+    return np.asarray(_DECODED[image])
 
 
-@cache
-def _encoded_squares() -> ByteImage:
-    """The bytes of the squares of 0 to 1, which spread the dark values about as sRGB does."""
-    grid = (np.arange(_STEPS + 1, dtype=np.float32) / np.float32(_STEPS)) ** 2
-    return np.asarray((srgb_from_linear(grid) * 255 + np.float32(0.5)).astype(np.uint8))
-
-
-@cache
-def _decoded_bytes() -> LinearArray:
-    return linear_from_srgb(np.arange(256, dtype=np.float32) / np.float32(255))
+def bytes_from_linear(linear: LinearArray) -> ByteImage:
+    """Encode linear light (any shape) to sRGB bytes."""
+    place = np.sqrt(np.clip(linear, 0, 1)) * np.float32(_STEPS) + np.float32(0.5)
+    return np.asarray(_ENCODED[place.astype(np.int32)])
 
 
 def composite(color: ByteImage, background: npt.ArrayLike) -> ByteImage:
@@ -284,18 +244,11 @@ def composite(color: ByteImage, background: npt.ArrayLike) -> ByteImage:
         raise InputError("not whole numbers from 0 to 255", where="background")
     result: ByteImage = np.empty(shape, dtype=np.uint8)
     result[:] = behind
-    left, top, width, height = cv2.boundingRect(np.ascontiguousarray(color[:, :, 3]))
-    block = slice(top, top + height), slice(left, left + width)
-    _put_before(result[block], color[block])
-    return result
-
-
-def _put_before(behind: ByteImage, color: ByteImage) -> None:
-    """Put an image with opacity (h, w, 4) before a picture (h, w, 3), in place."""
     opacity = color[:, :, 3]
-    np.copyto(behind, color[:, :, :3], where=(opacity == 255)[:, :, None])
+    np.copyto(result, color[:, :, :3], where=(opacity == 255)[:, :, None])
     mixed = (opacity > 0) & (opacity < 255)
     share = opacity[mixed, None] / np.float32(255)
     light = linear_from_bytes(color[mixed, :3]) * share
-    light += linear_from_bytes(behind[mixed]) * (1 - share)
-    behind[mixed] = bytes_from_linear(np.asarray(light, dtype=np.float32))
+    light += linear_from_bytes(result[mixed]) * (1 - share)
+    result[mixed] = bytes_from_linear(np.asarray(light, dtype=np.float32))
+    return result

@@ -1,15 +1,19 @@
-"""Layers of an overlay: the model, and keypoints with their uncertainty."""
+"""Layers of pictures: the model, its lines, keypoints and their uncertainty; sheets of pictures."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from PIL import Image, ImageDraw, ImageFont
 
 from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.errors import InputError
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
 from cadalign.render.drawing.canvas import (
     CASING,
     ByteImage,
@@ -18,14 +22,18 @@ from cadalign.render.drawing.canvas import (
     LegendEntry,
     composite,
 )
-from cadalign.render.drawing.pictures import feature_lines
-from cadalign.render.scene import Frame, Geometry
+from cadalign.render.scene import LIGHT_GREY, Frame, Geometry
+from cadalign.render.viewpoints import seen_in_image
 
 _SHADED_OPACITY, _VEIL_OPACITY = 0.6, 0.5
 # How much of the veil's colour is the model's own, so that its parts can be told apart.
 _OWN_SHARE = 0.45
 _LINE_OPACITY = 0.9
 _CASING_OPACITY = 0.45
+# Neighbouring pixels whose normals differ by more than this [degrees] lie on both sides of an edge.
+_EDGE_ANGLE = 25.0
+# And those whose depths differ by more than this share of what the slope explains.
+_DEPTH_STEP = 0.02
 
 
 def with_model(image: ByteImage, geometry: Geometry, color: Color) -> ByteImage:
@@ -52,6 +60,24 @@ def with_model(image: ByteImage, geometry: Geometry, color: Color) -> ByteImage:
     front = _OWN_SHARE * 255 * grey + (1 - _OWN_SHARE) * tinted
     share = _VEIL_OPACITY * geometry.mask.astype(np.float32)[:, :, None]
     return np.asarray(image * (1 - share) + front * share + 0.5, dtype=np.uint8)
+
+
+def feature_lines(geometry: Geometry) -> npt.NDArray[np.bool_]:
+    """Pixels on the outline of the object, or beside a fold or a step in its surface, (h, w)."""
+    lines = np.zeros(geometry.depth.shape, dtype=bool)
+    for first, second in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
+        one, other = geometry.mask[first], geometry.mask[second]
+        both = one & other
+        cosine = np.einsum("rck,rck->rc", geometry.normal[first], geometry.normal[second])
+        near, far = geometry.depth[first], geometry.depth[second]
+        # A surface that is seen edge-on changes its depth quickly without having a step.
+        slope = np.maximum(np.abs(geometry.normal[first][:, :, 2]), 0.05)
+        step = np.abs(near - far) * slope > _DEPTH_STEP * np.minimum(near, far)
+        changes = both & ((cosine < np.cos(np.radians(_EDGE_ANGLE))) | step)
+        # Of a step the line belongs to the nearer side, of an outline to the object's.
+        lines[first] |= (one & ~other) | (changes & (near <= far))
+        lines[second] |= (other & ~one) | (changes & (near > far))
+    return lines
 
 
 def draw_lines(canvas: Canvas, geometry: Geometry, color: Color) -> None:
@@ -85,18 +111,19 @@ _LEAST_REGION = 3.0  # px across; smaller ones are hidden by the markers
 
 @dataclass(frozen=True, eq=False)
 class KeypointMarks:
-    """Keypoints to be drawn [px]; None for what is not.
+    """Keypoints to be drawn [px], each empty where there is none.
 
-    ``seen`` (k, 2), ``back`` (m, 2), ``unseen`` (n, 2) and ``outliers`` (o, 2) are points,
-    ``residuals`` (r, 2, 2) lines from one to another, and ``regions`` (q, j, 2) closed curves.
+    ``observed`` (k, 2), ``reprojected`` (m, 2), ``unseen`` (n, 2) and ``outliers`` (o, 2) are
+    points, ``residuals`` (r, 2, 2) lines from one to another, and ``regions`` (q, j, 2) closed
+    curves.
     """
 
-    seen: FloatArray | None = None
-    back: FloatArray | None = None
-    residuals: FloatArray | None = None
-    unseen: FloatArray | None = None
-    regions: FloatArray | None = None
-    outliers: FloatArray | None = None
+    observed: FloatArray
+    reprojected: FloatArray
+    unseen: FloatArray
+    regions: FloatArray
+    outliers: FloatArray
+    residuals: FloatArray
 
     @classmethod
     def checked(
@@ -108,71 +135,63 @@ class KeypointMarks:
         outliers: npt.ArrayLike | None,
     ) -> KeypointMarks:
         """The marks of `draw_overlay`'s arguments; raises InputError where they don't match."""
-        seen = None if observed is None else as_points(observed, name="observed", dimension=2)
-        back = None
+        given = {"observed": observed, "unseen": unseen, "outliers": outliers}
+        points = {
+            name: as_points(np.empty((0, 2)) if each is None else each, name=name, dimension=2)
+            for name, each in given.items()
+        }
+        seen = points["observed"]
+        back = np.full_like(seen, np.inf)
         if reprojected is not None:
             back = as_floats(reprojected, name="reprojected", shape=(None, 2), finite=False)
-        if seen is not None and back is not None and len(seen) != len(back):
-            raise InputError(
-                f"{len(back)} keypoints, but {len(seen)} observed ones", where="reprojected"
-            )
-        pairs = None if seen is None or back is None else _finite(np.stack([seen, back], axis=1))
+            if observed is None:
+                seen = np.full_like(back, np.inf)
+        if len(seen) != len(back):
+            what = f"{len(back)} keypoints, but {len(seen)} observed ones"
+            raise InputError(what, where="reprojected")
+        curves = np.empty((0, 1, 2)) if regions is None else regions
         return cls(
-            seen,
-            None if back is None else _finite(back),
-            pairs,
-            None if unseen is None else as_points(unseen, name="unseen", dimension=2),
-            None if regions is None else as_floats(regions, name="regions", shape=(None, None, 2)),
-            None if outliers is None else as_points(outliers, name="outliers", dimension=2),
+            **points,
+            reprojected=_finite(back),
+            regions=as_floats(curves, name="regions", shape=(None, None, 2)),
+            residuals=_finite(np.stack([seen, back], axis=1)),
         )
 
-    def placed(self, canvas: Canvas) -> KeypointMarks:
-        """The same marks in pixels of a canvas."""
-        return KeypointMarks(
-            **{
-                name: each if each is None else canvas.place(each)
-                for name, each in vars(self).items()
-            }
-        )
+    @property
+    def _markers(self) -> list[tuple[FloatArray, LegendEntry, float]]:
+        """Points, their line of the legend, and their radius, in the order they are drawn."""
+        return [
+            (self.observed, ("observed", OBSERVED_COLOR, "ring"), 5),
+            (self.reprojected, ("reprojected", REPROJECTED_COLOR, "cross"), 3.5),
+            (self.outliers, ("left out", OUTLIER_COLOR, "ring"), 5),
+            (self.unseen, ("not observed", UNSEEN_COLOR, "ring"), 2.5),
+        ]
 
     def draw(self, canvas: Canvas) -> None:
-        """Draw regions, then unobserved keypoints, residuals, rings and crosses."""
+        """Draw regions, residuals, rings and crosses."""
         before = canvas.image.copy()
-        for region in () if self.regions is None else self.regions:
+        for region in self.regions:
             canvas.line(np.concatenate([region, region[:1]]), UNSEEN_COLOR, width=0.7)
         canvas.blend_from(before, opacity=_REGION_OPACITY)
-        for point in () if self.unseen is None else self.unseen:
-            canvas.ring(point, UNSEEN_COLOR, radius=2.5)
-        for pair in () if self.residuals is None else self.residuals:
+        for pair in self.residuals:
             canvas.line(pair, REPROJECTED_COLOR, width=1.0)
-        for point in () if self.seen is None else self.seen:
-            canvas.ring(point, OBSERVED_COLOR, radius=5)
-        for point in () if self.outliers is None else self.outliers:
-            canvas.ring(point, OUTLIER_COLOR, radius=5)
-        for point in () if self.back is None else self.back:
-            canvas.cross(point, REPROJECTED_COLOR, radius=3.5)
+        for points, (_, color, marker), radius in self._markers:
+            draw = canvas.ring if marker == "ring" else canvas.cross
+            for point in points:
+                draw(point, color, radius=radius)
 
     @property
     def legend(self) -> list[LegendEntry]:
         """Names and colours of what is drawn."""
-        entries: list[LegendEntry] = []
-        if self.seen is not None:
-            entries.append(("observed", OBSERVED_COLOR, "ring"))
-        if self.back is not None:
-            entries.append(("reprojected", REPROJECTED_COLOR, "cross"))
-        if self.outliers is not None and len(self.outliers):
-            entries.append(("left out", OUTLIER_COLOR, "ring"))
-        if self.unseen is not None and len(self.unseen):
-            entries.append(("not observed", UNSEEN_COLOR, "ring"))
-        if self.regions is not None and len(self.regions):
+        entries = [entry for points, entry, _ in self._markers if len(points)]
+        if len(self.regions):
             entries.append((f"{100 * REGION_SHARE:.0f} % region", UNSEEN_COLOR, "line"))
         return entries
 
     @property
     def pixels(self) -> FloatArray:
         """Pixels of the keypoints, (n, 2)."""
-        points = [each for each in (self.seen, self.back, self.unseen) if each is not None]
-        return np.concatenate([np.empty((0, 2)), *points])
+        return np.concatenate([points for points, *_ in self._markers])
 
 
 def confidence_regions(points_2d: FloatArray, covariances: FloatArray) -> FloatArray:
@@ -200,3 +219,49 @@ def confidence_regions(points_2d: FloatArray, covariances: FloatArray) -> FloatA
 def _finite(points: FloatArray) -> FloatArray:
     """The rows that are finite, those behind the camera left out."""
     return np.asarray(points[np.isfinite(points).all(axis=tuple(range(1, points.ndim)))])
+
+
+# Pictures of the model alone ----------------------------------------------------------------------
+
+_TEXT_COLOR = (70, 76, 84)
+_HIDDEN_COLOR = (150, 160, 175)
+
+
+def keypoint_picture(
+    image: ByteImage,
+    camera: Camera,
+    points_3d: FloatArray,
+    cam_from_model: Alignment,
+    visible: npt.NDArray[np.bool_],
+) -> ByteImage:
+    """Draw numbered keypoints (k, 3) over a picture: ``visible`` ones (k,) yellow, others grey."""
+    canvas = Canvas(image)
+    in_camera = cam_from_model.apply(points_3d)
+    inside = seen_in_image(camera, in_camera)
+    # The seen ones last, on top of the others.
+    for row in sorted(np.flatnonzero(inside), key=lambda row: bool(visible[row])):
+        color = REPROJECTED_COLOR if visible[row] else _HIDDEN_COLOR
+        (place,) = camera.project(in_camera[row : row + 1])
+        canvas.ring(place, color, radius=4)
+        canvas.label(str(row), place + np.array([11, -9]) * canvas.unit, color)
+    return canvas.finished()
+
+
+def contact_sheet(pictures: Mapping[str, ByteImage]) -> ByteImage:
+    """Put pictures of one size side by side, each with its name beneath."""
+    height, width = next(iter(pictures.values())).shape[:2]
+    across = int(np.ceil(np.sqrt(len(pictures))))
+    down = -(-len(pictures) // across)
+    gap = max(4, min(height, width) // 40)
+    line = max(14, height // 16)
+    size = (across * (width + gap) + gap, down * (height + line + gap) + gap)
+    sheet = Image.new("RGB", size, LIGHT_GREY)
+    pen = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(size=0.72 * line)
+    for number, (label, image) in enumerate(pictures.items()):
+        left = gap + number % across * (width + gap)
+        top = gap + number // across * (height + line + gap)
+        sheet.paste(Image.fromarray(image), (left, top))
+        middle = (left + width / 2, top + height + line / 2)
+        pen.text(middle, label, fill=_TEXT_COLOR, font=font, anchor="mm")
+    return np.array(sheet)

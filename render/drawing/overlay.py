@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,12 +12,8 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import BOX_EDGES, Box
 from cadalign.geometry.camera import Camera
-from cadalign.render.drawing.canvas import ByteImage, Canvas, Color, LegendEntry
-from cadalign.render.drawing.layers import (
-    KeypointMarks,
-    draw_lines,
-    with_model,
-)
+from cadalign.render.drawing.canvas import ByteImage, Canvas, Color, LegendEntry, composite
+from cadalign.render.drawing.layers import KeypointMarks, draw_lines, with_model
 from cadalign.render.raycast.posed import within_lens_field
 from cadalign.render.scene import LIGHT_GREY, Geometry, check_image_size
 
@@ -27,11 +23,9 @@ EST_COLOR: Color = (240, 50, 50)
 AXIS_COLORS: tuple[Color, Color, Color] = ((255, 150, 60), (110, 235, 205), (95, 150, 255))
 
 _HIDDEN_OPACITY = 0.6
-# The near plane, in diagonals of the box.
-_NEAR = 1e-3
-# Lines are cut off this many half images from the middle.
-_CUT_OFF = 4.0
-_BENT_LINE_POINTS = 33
+# Lines are cut off this many images away.
+_CUT_OFF = 20
+_LINE_POINTS = 65
 
 
 @dataclass(frozen=True)
@@ -130,15 +124,20 @@ def draw_overlay(
     main_box = (est_box or gt_box) if axes else None
     if main_box is not None:
         strokes += _axis_strokes(main_box, camera)
-    strokes = [replace(stroke, points=canvas.place(stroke.points)) for stroke in strokes]
-    marks = marks.placed(canvas)
     _draw_strokes(canvas, strokes)
     marks.draw(canvas)
-    predicted = est_box is not None or est_frame is not None
-    entries = _legend_entries(gt_box, predicted, axes=main_box is not None)
+    entries: list[LegendEntry] = []
+    if gt_box is not None:
+        entries.append(("ground truth", GT_COLOR, "line"))
+    if est_box is not None or est_frame is not None:
+        entries.append(("prediction", EST_COLOR, "line"))
+    if main_box is not None:
+        names = zip("xyz", AXIS_COLORS, strict=True)
+        entries += [(f"{name} axis", color, "line") for name, color in names]
     entries += marks.legend
     if legend and entries:
-        canvas.legend(entries, keep_clear=np.concatenate([_drawn_pixels(strokes), marks.pixels]))
+        lines = [stroke.points for stroke in strokes]
+        canvas.legend(entries, keep_clear=np.concatenate([*lines, marks.pixels]))
     return canvas.finished()
 
 
@@ -163,9 +162,7 @@ def _as_rgb(image: Any, camera: Camera) -> ByteImage:
     if pixels.shape[2] == 1:
         return np.repeat(pixels, 3, axis=2)
     if pixels.shape[2] == 4:
-        share = pixels[:, :, 3:] / np.float32(255)
-        mixed = pixels[:, :, :3] * share + np.array(LIGHT_GREY, dtype=np.float32) * (1 - share)
-        return np.asarray(mixed + 0.5, dtype=np.uint8)
+        return composite(pixels, LIGHT_GREY)
     return pixels
 
 
@@ -182,7 +179,7 @@ def _edge_strokes(box: Box, color: Color, camera: Camera) -> list[_Stroke]:
         across = [k for k in range(3) if not (first ^ second) >> k & 1]
         faces = [(k, 1 if first >> k & 1 else -1) for k in across]
         is_hidden = not (inside or any(shows[face] for face in faces))
-        strokes += _strokes(box, corners[[first, second]], camera, color, is_hidden=is_hidden)
+        strokes += _strokes(corners[[first, second]], camera, color, is_hidden=is_hidden)
     return strokes
 
 
@@ -190,55 +187,23 @@ def _axis_strokes(box: Box, camera: Camera) -> list[_Stroke]:
     strokes: list[_Stroke] = []
     for k, (name, color) in enumerate(zip("xyz", AXIS_COLORS, strict=True)):
         tip = box.center + box.rotation[:, k] * box.extents[k] / 2
-        strokes += _strokes(box, np.array([box.center, tip]), camera, color, arrow=name)
+        strokes += _strokes(np.array([box.center, tip]), camera, color, arrow=name)
     return strokes
 
 
-def _strokes(
-    box: Box, ends: FloatArray, camera: Camera, color: Color, **style: Any
-) -> list[_Stroke]:
+def _strokes(ends: FloatArray, camera: Camera, color: Color, **style: Any) -> list[_Stroke]:
     """Project a segment (2, 3); none if it is not seen, several if a lens cuts it up."""
-    clipped: FloatArray | None = ends
-    if not camera.is_wide:
-        clipped = _clip(ends, camera, _NEAR * (float(np.linalg.norm(box.extents)) or 1.0))
-    if clipped is None:
-        return []
-    depth = float((np.linalg.norm(clipped, axis=1) if camera.is_wide else clipped[:, 2]).mean())
-    count = _BENT_LINE_POINTS if camera.distortion else 2
-    share = np.linspace(0, 1, count)[:, None]
-    points = clipped[0] + share * (clipped[1] - clipped[0])
+    points = ends[0] + np.linspace(0, 1, _LINE_POINTS)[:, None] * (ends[1] - ends[0])
+    pixels = camera.project_where_ahead(points)
     kept = within_lens_field(camera, points)
-    pixels = camera.pixels_of_rays(points)
-    runs = np.split(np.arange(count), np.flatnonzero(np.diff(kept)) + 1)
+    kept &= np.abs(pixels).max(axis=1) < _CUT_OFF * max(camera.width, camera.height)
+    runs = np.split(np.arange(_LINE_POINTS), np.flatnonzero(np.diff(kept)) + 1)
+    depth = np.linalg.norm(points, axis=1)
     return [
-        _Stroke(depth, pixels[run], color, **style) for run in runs if kept[run[0]] and len(run) > 1
+        _Stroke(float(depth[run].mean()), pixels[run], color, **style)
+        for run in runs
+        if kept[run[0]] and len(run) > 1
     ]
-
-
-def _clip(ends: FloatArray, camera: Camera, near_plane: float) -> FloatArray | None:
-    """Cut a segment (2, 3) to what lies before the camera and not far outside the image."""
-    reach_x = _CUT_OFF * camera.width / camera.fx
-    reach_y = _CUT_OFF * camera.height / camera.fy
-    # Each row a half-space: normal and offset, positive inside.
-    planes = np.array(
-        [
-            [0, 0, 1, -near_plane],
-            [1, 0, reach_x, 0],
-            [-1, 0, reach_x, 0],
-            [0, 1, reach_y, 0],
-            [0, -1, reach_y, 0],
-        ]
-    )
-    first, second = (planes[:, :3] @ ends.T + planes[:, 3:]).T
-    if ((first < 0) & (second < 0)).any():
-        return None
-    with np.errstate(divide="ignore", invalid="ignore"):
-        crossing = first / (first - second)
-    low = crossing.max(initial=0.0, where=first < 0)
-    high = crossing.min(initial=1.0, where=second < 0)
-    if low >= high:
-        return None
-    return np.asarray(ends[0] + np.array([[low], [high]]) * (ends[1] - ends[0]))
 
 
 def _draw_strokes(canvas: Canvas, strokes: list[_Stroke]) -> None:
@@ -264,21 +229,3 @@ def _draw_strokes(canvas: Canvas, strokes: list[_Stroke]) -> None:
             along = stroke.points[-1] - stroke.points[0]
             ahead = along / max(float(np.linalg.norm(along)), 1e-9) * 11 * canvas.unit
             canvas.label(stroke.arrow, stroke.points[-1] + ahead, stroke.color)
-
-
-def _legend_entries(gt_box: Box | None, predicted: bool, *, axes: bool) -> list[LegendEntry]:
-    entries: list[LegendEntry] = []
-    if gt_box is not None:
-        entries.append(("ground truth", GT_COLOR, "line"))
-    if predicted:
-        entries.append(("prediction", EST_COLOR, "line"))
-    if axes:
-        names = zip("xyz", AXIS_COLORS, strict=True)
-        entries += [(f"{name} axis", color, "line") for name, color in names]
-    return entries
-
-
-def _drawn_pixels(strokes: list[_Stroke]) -> FloatArray:
-    share = np.linspace(0, 1, 41)[:, None]
-    lines = [s.points[0] + share * (s.points[-1] - s.points[0]) for s in strokes]
-    return np.concatenate([np.empty((0, 2)), *lines])

@@ -11,6 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from trimesh.triangles import points_to_barycentric
 
 from cadalign.arrays import FloatArray
 from cadalign.geometry.alignment import Alignment, model_rays
@@ -29,7 +30,6 @@ _LAYER_GAP = 2e-5
 # Pixels left about the object.
 _MARGIN = 2
 _POINTS_PER_SIDE = 65
-_LEAST_COSINE = 0.05  # of a cone about the object
 
 
 @dataclass(frozen=True)
@@ -56,22 +56,20 @@ class Rectangle:
         """The block's rows and columns, to index images with."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
-    def tiles(self, width: int, height: int) -> list[Rectangle]:
-        """Cut the block into tiles of at most this size, which is at least a pixel."""
-        width, height = max(1, width), max(1, height)
+    def bands(self, rows: int) -> list[Rectangle]:
+        """Cut the block into bands of at most so many rows, which is at least one."""
+        step = max(1, rows)
         return [
-            Rectangle(left, top, min(left + width, self.right), min(top + height, self.bottom))
-            for top in range(self.top, self.bottom, height)
-            for left in range(self.left, self.right, width)
+            Rectangle(self.left, top, self.right, min(top + step, self.bottom))
+            for top in range(self.top, self.bottom, step)
         ]
 
     @property
     def pixels(self) -> FloatArray:
         """Pixel centres, row by row, (n, 2)."""
-        pixels = np.empty((self.height, self.width, 2))
-        pixels[:, :, 0] = np.arange(self.left, self.right)
-        pixels[:, :, 1] = np.arange(self.top, self.bottom)[:, None]
-        return pixels.reshape(-1, 2)
+        columns = np.arange(self.left, self.right, dtype=float)
+        rows = np.arange(self.top, self.bottom, dtype=float)
+        return np.stack(np.meshgrid(columns, rows), axis=2).reshape(-1, 2)
 
 
 class PosedScene:
@@ -97,13 +95,17 @@ class PosedScene:
         alike, opposite = scene.coincident_faces
         self._shown = np.where(side < 0, opposite, alike).astype(np.int32)
         self._normal_matrix = cam_from_model.rotation / cam_from_model.scale
-        self.normals = self._to_camera(scene.face_normals)
+        normals = scene.face_normals @ self._normal_matrix.T
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        self.normals: LinearArray = (normals * self._side[:, None]).astype(np.float32)
         """The faces' unit normals in the camera frame, (m, 3) float32, on the side that is seen."""
 
-    def prepare_color(self) -> None:
-        """Make now what `light_of_hits` needs, before several threads ask for it at once."""
-        _ = self.scene.surface, self.scene.single_corner_normals
-        _ = self.scene.barycentric_gradients
+    def hits(self, pixels: FloatArray) -> tuple[FloatArray, FaceArray, FloatArray]:
+        """Rays (n, 3) of pixels (n, 2) and what is seen along them; see `cast`."""
+        rays, valid = self.camera.rays_where_valid(pixels)
+        face, depth = self.cast(rays)
+        face[~valid] = -1
+        return rays, face, depth
 
     def cast(
         self, rays: FloatArray, *, start: FloatArray | None = None
@@ -114,19 +116,8 @@ class PosedScene:
         """
         directions = self._directions(rays)
         face, depth = self._caster.first_hits(self._origin, directions, start=start)
-        return self._as_shown(face), depth
-
-    def _as_shown(self, face: FaceArray) -> FaceArray:
-        """Triangles that were hit, (n,): of coincident ones those wound to the camera."""
-        return np.where(face >= 0, self._shown[face], np.int32(-1))
-
-    def seen_sides(self, face_id: npt.NDArray[np.int32]) -> tuple[bool, bool]:
-        """Tell if any triangle in an image is seen from its front, and any from its back."""
-        seen = np.zeros(len(self._side) + 1, dtype=bool)
-        # Where nothing is, -1 marks the last place, which is no triangle's.
-        seen[face_id.ravel()] = True
-        side = self._side[seen[:-1]]
-        return bool((side > 0).any()), bool((side < 0).any())
+        # Of coincident triangles those wound to the camera are shown.
+        return np.where(face >= 0, self._shown[face], np.int32(-1)), depth
 
     @cached_property
     def diagonal(self) -> float:
@@ -146,24 +137,6 @@ class PosedScene:
             (points_cam - self._alignment.translation) @ columns, directions @ columns, reach=reach
         )
 
-    def mean_light(
-        self,
-        rays: FloatArray,
-        valid: npt.NDArray[np.bool_],
-        studio: Studio,
-        *,
-        samples: int,
-    ) -> LinearArray:
-        """Mean colour of each ``samples`` successive rays (n, 3) of the camera, cast anew.
-
-        Linear light, premultiplied, and opacity: (n / samples, 4) float32. Rays that are not
-        ``valid`` see nothing.
-        """
-        face, depth = self.cast(rays)
-        face[~valid] = -1
-        light = self.light_of_hits(rays, face, depth, studio)
-        return np.asarray(light.reshape(-1, samples, 4).mean(axis=1))
-
     def light_of_hits(
         self, rays: FloatArray, face: FaceArray, depth: FloatArray, studio: Studio
     ) -> LinearArray:
@@ -173,13 +146,8 @@ class PosedScene:
         """
         result = np.zeros((len(face), 4), dtype=np.float32)
         active = np.flatnonzero(face >= 0)
-        if self.scene.surface.opaque:
-            result[active] = self._shade(rays[active], face[active], depth[active], studio)
-            return result
         rays, face, depth = rays[active], face[active], depth[active]
         for _ in range(_MAX_LAYERS):
-            if not len(active):
-                break
             color = self._shade(rays, face, depth, studio)
             seen = result[active]
             through = (1 - seen[:, 3]) * color[:, 3]
@@ -187,6 +155,8 @@ class PosedScene:
             seen[:, 3] += through
             result[active] = seen
             going = np.flatnonzero(seen[:, 3] < 1 - _SEEN_THROUGH)
+            if not len(going):
+                break
             rays, depth = rays[going], depth[going]
             along = self._directions(rays)
             speed = np.sqrt(np.einsum("nk,nk->n", along, along))
@@ -210,19 +180,16 @@ class PosedScene:
 
     def _weights(self, rays: FloatArray, face: FaceArray, depth: FloatArray) -> LinearArray:
         """Barycentric coordinates of hits, (n, 3)."""
-        points = self._directions(rays) * depth[:, None]
-        points += self._origin - self.scene.triangles[face, 0]
-        later = np.einsum("nck,nk->nc", self.scene.barycentric_gradients[face], points)
-        weights = np.column_stack([1 - later.sum(axis=1), later])
+        points = self._origin + self._directions(rays) * depth[:, None]
+        with np.errstate(divide="ignore", invalid="ignore"):  # triangles without area
+            triangles = self.scene.triangles[face]
+            weights = points_to_barycentric(triangles, points)  # type: ignore[no-untyped-call]
         # The float32 caster may hit a triangle a hair outside of it.
-        return np.asarray(np.clip(weights, 0, 1), dtype=np.float32)
+        return np.asarray(np.clip(np.nan_to_num(weights), 0, 1), dtype=np.float32)
 
     def _smooth_normals(self, face: FaceArray, weights: LinearArray) -> LinearArray:
         """Unit normals (n, 3) in the camera frame, blended between the corners of triangles."""
-        corners = self.scene.single_corner_normals[face]
-        blended = weights[:, :1] * corners[:, 0]
-        blended += weights[:, 1:2] * corners[:, 1]
-        blended += weights[:, 2:] * corners[:, 2]
+        blended = np.einsum("nc,nck->nk", weights, self.scene.corner_normals[face])
         turned = blended @ self._normal_matrix.T.astype(np.float32)
         length = np.sqrt(np.einsum("nk,nk->n", turned, turned))
         side = self._side[face].astype(np.float32)
@@ -231,11 +198,6 @@ class PosedScene:
     def _directions(self, rays: FloatArray) -> FloatArray:
         """Directions (n, 3) in the model frame of the camera's."""
         return np.asarray(rays @ self._model_from_ray.T)
-
-    def _to_camera(self, normals: FloatArray) -> LinearArray:
-        rows = normals @ self._normal_matrix.T
-        rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-30)
-        return (rows * self._side[:, None]).astype(np.float32)
 
 
 def pose_scene(
@@ -253,17 +215,14 @@ def _object_rectangle(scene: Scene, camera: Camera, cam_from_model: Alignment) -
     points = scene.used_vertices @ cam_from_model.linear.T + cam_from_model.translation
     whole = Rectangle(0, 0, camera.width, camera.height)
     if camera.is_wide:
-        outline = _cone_about(points)
-    else:
-        if points[:, 2].max() <= 0:
-            return None
-        if points[:, 2].min() <= 0:
-            return whole
-        normalized = perspective(points)
-        if not np.isfinite(normalized).all():
-            return whole
-        outline = _outline(normalized.min(axis=0), normalized.max(axis=0))
-    if not len(outline) or not within_lens_field(camera, outline).all():
+        return whole
+    if points[:, 2].max() <= 0:
+        return None
+    if points[:, 2].min() <= 0:
+        return whole
+    normalized = perspective(points)
+    outline = _outline(normalized.min(axis=0), normalized.max(axis=0))
+    if not np.isfinite(outline).all() or not within_lens_field(camera, outline).all():
         return whole
     pixels = camera.pixels_of_rays(outline)
     size = (camera.width, camera.height)
@@ -273,24 +232,6 @@ def _object_rectangle(scene: Scene, camera: Camera, cam_from_model: Alignment) -
     if (first >= last).any():
         return None
     return Rectangle(int(first[0]), int(first[1]), int(last[0]), int(last[1]))
-
-
-def _cone_about(points: FloatArray) -> FloatArray:
-    """Directions (n, 3) along the border of a cone that holds all points; none of half a space.
-
-    Nor of a cone about the direction straight behind, where a wide lens sees nothing.
-    """
-    rays = points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-300)
-    axis = rays.mean(axis=0)
-    axis /= max(float(np.linalg.norm(axis)), 1e-300)
-    cosine = float((rays @ axis).min())
-    if cosine < _LEAST_COSINE or -axis[2] > cosine:
-        return np.empty((0, 3))
-    across = np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.9 else [0.0, 1.0, 0.0])
-    across /= np.linalg.norm(across)
-    angles = np.linspace(0, 2 * np.pi, 4 * _POINTS_PER_SIDE)[:, None]
-    ring = np.cos(angles) * across + np.sin(angles) * np.cross(axis, across)
-    return np.asarray(cosine * axis + np.sqrt(1 - cosine**2) * ring)
 
 
 def _outline(low: FloatArray, high: FloatArray) -> FloatArray:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import map_coordinates
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.geometry.mesh import Mesh
@@ -23,17 +25,10 @@ class SurfaceColors:
 
     def __init__(self, mesh: Mesh) -> None:
         plain = np.array([material.color for material in mesh.materials], dtype=np.float32)
-        plain[:, :3] = linear_from_srgb(plain[:, :3])
-        self._face_color: LinearArray = plain[mesh.face_material]
+        self._face_color = linear_colors(plain)[mesh.face_material]
         self._corner_color: LinearArray | None = None
         if mesh.vertex_colors is not None:
-            color = mesh.vertex_colors.astype(np.float32)
-            color[:, :3] = linear_from_srgb(color[:, :3])
-            corners = color[mesh.faces]
-            if (corners == corners[:, :1]).all():
-                self._face_color = corners[:, 0]
-            else:
-                self._corner_color = corners
+            self._corner_color = linear_colors(mesh.vertex_colors)[mesh.faces]
         self._face_material = mesh.face_material
         self._corner_uv = None if mesh.corner_uv is None else mesh.corner_uv.astype(np.float32)
         self._textures: dict[int, LinearArray] = {}
@@ -72,34 +67,28 @@ class SurfaceColors:
         return color
 
 
+def linear_colors(color: npt.NDArray[Any]) -> LinearArray:
+    """Decode sRGB colours (n, 4) from 0 to 1, whose opacity stays, to linear light; float32."""
+    linear = color.astype(np.float32)
+    linear[:, :3] = linear_from_srgb(linear[:, :3])
+    return linear
+
+
 def sample_texture(texture: LinearArray, uv: LinearArray) -> LinearArray:
     """Read a texture (h, w, 4) bilinearly at (n, 2) texture coordinates; (n, 4) float32."""
     height, width = texture.shape[:2]
-    uv = np.where(np.isfinite(uv), uv, 0.0)
-    x = (uv[:, 0] % 1.0) * width - 0.5
-    y = (1.0 - uv[:, 1] % 1.0) * height - 0.5
-    left, top = np.floor(x), np.floor(y)
-    right_share, low_share = (x - left)[:, None], (y - top)[:, None]
-    x0, y0 = left.astype(np.int64) % width, top.astype(np.int64) % height
-    x1, y1 = (x0 + 1) % width, (y0 + 1) % height
-    upper = texture[y0, x0] * (1 - right_share) + texture[y0, x1] * right_share
-    lower = texture[y1, x0] * (1 - right_share) + texture[y1, x1] * right_share
-    return np.asarray(upper * (1 - low_share) + lower * low_share, dtype=np.float32)
+    u, v = np.where(np.isfinite(uv), uv % 1.0, 0.0).T
+    at = [(1 - v) * height - 0.5, u * width - 0.5]
+    channels = [map_coordinates(texture[:, :, k], at, order=1, mode="grid-wrap") for k in range(4)]
+    return np.stack(channels, axis=1)
 
 
 def _linear_texture(texture: npt.NDArray[np.uint8]) -> LinearArray:
-    """Turn an image (h, w), (h, w, 3) or (h, w, 4) into linear light with opacity (h, w, 4)."""
+    """Turn an image (h, w, 3 or 4) into linear light with opacity (h, w, 4)."""
     result = np.ones((*texture.shape[:2], 4), dtype=np.float32)
-    result[:, :, :3] = linear_from_bytes(color_channels(texture))
-    if texture.ndim == 3 and texture.shape[2] in (2, 4):
-        result[:, :, 3] = texture[:, :, -1] / np.float32(255)
+    result[:, :, : texture.shape[2]] = texture / np.float32(255)
+    result[:, :, :3] = linear_from_bytes(texture[:, :, :3])
     return result
-
-
-def color_channels(texture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Red, green and blue (h, w, 3), or grey (h, w, 1), of an image with or without opacity."""
-    image = texture[:, :, None] if texture.ndim == 2 else texture
-    return image[:, :, :3] if image.shape[2] >= 3 else image[:, :, :1]
 
 
 def coincident_faces(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, IntArray]:
@@ -125,17 +114,16 @@ def coincident_faces(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, I
 # A point at which more triangles meet than this is left faceted: pairs grow with the square.
 _MAX_VALENCE = 1024
 _PAIRS_AT_ONCE = 1 << 20
+_SMOOTH_COSINE = np.cos(np.radians(40.0))
 
 
-def corner_normals(
-    vertices: FloatArray, faces: IntArray, face_normals: FloatArray, *, crease_angle: float
-) -> FloatArray:
+def corner_normals(vertices: FloatArray, faces: IntArray, face_normals: FloatArray) -> FloatArray:
     """Average, at each face's corners, the normals of faces that continue it smoothly, (m, 3, 3).
 
     Faces meet where their vertices have the same position, whether they share the vertex or not.
     Those that are turned the other way count with their normal reversed, since the faces of many
-    CAD models are turned at random. Each counts by its angle at the corner. Faces at a larger angle
-    than ``crease_angle`` [degrees] meet in an edge. The unit normals are on the side of their face.
+    CAD models are turned at random. Each counts by its angle at the corner. Faces at an angle of
+    more than 40 degrees meet in an edge. The unit normals are on the side of their face.
     """
     point = number_rows(vertices)[faces].ravel()
     weight = _corner_angles(vertices[faces]).ravel()
@@ -151,16 +139,14 @@ def corner_normals(
         step = max(1, _PAIRS_AT_ONCE // int(count) ** 2)
         for begin in range(0, len(first), step):
             corners = order[first[begin : begin + step, None] + np.arange(count)]
-            result[corners] = _smooth(normals[corners], weight[corners], crease_angle)
+            result[corners] = _smooth(normals[corners], weight[corners])
     return result.reshape(-1, 3, 3)
 
 
-def _smooth(normals: FloatArray, weight: FloatArray, crease_angle: float) -> FloatArray:
+def _smooth(normals: FloatArray, weight: FloatArray) -> FloatArray:
     """Average within groups of corners (g, c, 3) that share a point."""
     cosine = normals @ normals.transpose(0, 2, 1)
-    share = np.where(
-        np.abs(cosine) >= np.cos(np.radians(crease_angle)), np.sign(cosine) * weight[:, None, :], 0
-    )
+    share = np.where(np.abs(cosine) >= _SMOOTH_COSINE, np.sign(cosine) * weight[:, None, :], 0)
     total = share @ normals
     length = np.linalg.norm(total, axis=2, keepdims=True)
     return np.where(length > 1e-9, total / np.where(length > 0, length, 1.0), normals)

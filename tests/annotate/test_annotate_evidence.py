@@ -14,7 +14,6 @@ from cadalign import Size, Symmetry
 from cadalign.annotate.actions import perform
 from cadalign.annotate.page_state import page_state
 from cadalign.errors import CadalignError
-from cadalign.geometry.camera import Camera
 from cadalign.io.evidence import ImageEvidence
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
@@ -129,17 +128,3 @@ def test_several_views_are_refused(case: Case) -> None:
     with pytest.raises(CadalignError, match="has 2 views, the annotator opens files of one photo"):
         case.open()
     assert case.observation.read_bytes() == before
-
-
-def test_unknown_focal_length_is_estimated_beside_evidence(case: Case) -> None:
-    whole = observed(case, "up")
-    camera = whole.camera
-    unknown = Camera.without_focal(camera.width, camera.height)
-    replace(whole, camera=unknown).save(case.observation)
-    session = case.open(camera=None)
-    shown = page_state(session, 0)["alignment"]
-    facts = {fact["label"]: fact for fact in shown["facts"]}
-    assert facts["Focal length"]["note"] == "estimated"
-    assert not any("focal length is assumed" in note for note in shown["notes"])
-    perform(session, 0, {"do": "focal", "pixels": camera.fx})
-    assert "gravity" in page_state(session, 0)["alignment"]["also_used"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from support.problems import problem_of
 
-from cadalign import Alignment, Camera, fit
+from cadalign import Camera, fit
 from cadalign.annotate.keypoints import KeypointRegistry, ObjectShape
 from cadalign.annotate.live import LiveAlignment, Suggestion, live_alignment, missing_text, suggest
 from cadalign.annotate.model import Wireframe
@@ -20,12 +19,10 @@ from cadalign.annotate.observations import LIKELY_STRETCH
 from cadalign.annotate.page_state import facts_of
 from cadalign.annotate.problem import Known, LiveEstimate, LiveProblem
 from cadalign.datasets import ModelKeypoint
-from cadalign.errors import DegenerateError, InputError
+from cadalign.errors import DegenerateError
 from cadalign.evaluation.simulation import SimulatedProblem
-from cadalign.geometry.camera import projection_jacobian
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.evidence import ImageEvidence
-from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 from cadalign.render import visible_keypoints
 from cadalign.render.scene import Scene
@@ -114,24 +111,6 @@ def test_clicks_without_a_stated_noise_have_it_found_beside_other_evidence() -> 
         assert LiveProblem.of(Known(STRETCHED, BOX), seen).settles == settles
 
 
-@pytest.mark.parametrize("pairs", [1, 2])
-def test_a_similar_model_needs_pairs_beside_a_mask(tmp_path: Path, pairs: int) -> None:
-    problem = problem_of(3, points=8)
-    mask = np.zeros((problem.camera.height, problem.camera.width), dtype=np.uint8)
-    mask[200:280, 250:400] = 255
-    write_image(tmp_path / "mask.png", mask)
-    seen = Observation(
-        problem.points_3d[:pairs],
-        problem.points_2d[:pairs],
-        problem.camera,
-        ids=np.arange(pairs),
-        evidence=ImageEvidence(mask=tmp_path / "mask.png"),
-    )
-    live = LiveProblem.of(Known(ObjectShape(sigma=0.05), BOX), seen)
-    with pytest.raises(DegenerateError, match="give at least 3 keypoints"):
-        live.align()
-
-
 def test_pairs_that_leave_the_stretch_open_have_its_prior() -> None:
     problem = problem_of(1, points=6, noise_px=1.0)
     flat = problem.points_3d * [1, 1, 0]
@@ -141,6 +120,17 @@ def test_pairs_that_leave_the_stretch_open_have_its_prior() -> None:
     facts = {fact["label"]: fact for fact in facts_of(live, STRETCHED, prior=LIKELY_STRETCH)}
     assert facts["Stretch z"]["value"] == "not determined"
     assert facts["Stretch z"]["note"] == "these pairs leave it open: 1 ± 25 % is assumed"
+
+
+@pytest.mark.parametrize("points", [4, 6, 8])
+def test_few_pairs_give_no_absurd_stretch(points: int) -> None:
+    errors = []
+    for seed in range(12):
+        problem = problem_of(seed, points=points, noise_px=0.5)
+        scale = estimate_of(problem, stretch=LIKELY_STRETCH).result.alignment.scale
+        errors.append(np.abs(np.log(scale / problem.alignment.scale)).max())
+    assert np.exp(max(errors)) < 2  # the objects' own stretches are 0.5 to 2
+    assert np.expm1(np.median(errors)) < {4: 0.7, 6: 0.45, 8: 0.35}[points]
 
 
 def test_coinciding_pairs_give_no_alignment() -> None:
@@ -184,20 +174,6 @@ def test_pairs_that_agree_are_not_suspected(camera: Camera | None) -> None:
             live = estimate_of(problem_of(seed, points=points, noise_px=noise), camera=camera)
             suspected += len(live.outliers)
     assert suspected <= 0.005 * seeds * 36
-
-
-@pytest.mark.long
-def test_one_wrong_pair_is_found_among_few() -> None:
-    found = alone = 0
-    for seed in range(40):
-        problem = problem_of(seed, points=8, noise_px=1.0)
-        points_2d = problem.points_2d.copy()
-        points_2d[3] += [0, 60]
-        outliers = estimate_of(problem, points_2d=points_2d).outliers
-        found += 3 in outliers
-        alone += set(outliers) == {3}
-    assert found >= 32
-    assert alone >= 30
 
 
 def test_too_few_pairs_accuse_nobody() -> None:
@@ -260,17 +236,6 @@ def test_without_visible_keypoints_none_is_suggested() -> None:
     assert suggest(found, Wireframe.of_scene(Scene(BOX)), hidden, STRETCHED) is None
 
 
-# --- derivatives -----------------------------------------------------------------------------
-
-
-def test_projection_jacobian_refuses_what_it_cannot_do() -> None:
-    pose = Alignment(np.eye(3), [0, 0, 4], [1, 1, 1])
-    with pytest.raises(InputError, match=r"^points_3d: a point lies behind the camera$"):
-        projection_jacobian(
-            np.array([[0, 0, -5.0]]), Camera(640, 480, 300.0, 310.0, 310.0, 250.0), pose
-        )
-
-
 # --- text -----------------------------------------------------------------------------------
 
 
@@ -290,13 +255,6 @@ def test_facts_give_stretch_pose_and_residuals_with_standard_deviations() -> Non
     assert facts["Focal length"]["value"] == "150 px"
     assert facts["Rotation"]["value"].startswith("± ")
     assert facts["Residuals"]["value"].endswith(" px")
-
-
-def test_estimated_focal_length_has_a_standard_deviation() -> None:
-    live = live_of(problem_of(7, points=15, noise_px=1.0), camera=UNKNOWN)
-    facts = {fact["label"]: fact for fact in facts_of(live, STRETCHED)}
-    assert " ± " in facts["Focal length"]["value"]
-    assert facts["Focal length"]["note"] == "estimated"
 
 
 def test_text_names_the_point_and_what_is_known_of_it() -> None:

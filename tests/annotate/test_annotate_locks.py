@@ -1,4 +1,4 @@
-"""One annotator a folder: what a second one is told, and what outlives a killed one."""
+"""One annotator a folder: what a second one is told, and what a stopped one leaves."""
 
 from __future__ import annotations
 
@@ -7,42 +7,28 @@ import json
 import re
 import shutil
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
-from support.annotating import Case, place
+from support.annotating import Case, place, place_all
 from support.forked import MAIN, Program
 from support.refusals import refusal_line
 
 from cadalign.annotate.actions import perform
 from cadalign.annotate.page_state import page_state
+from cadalign.io import files
 from cadalign.io.observation import Observation
 
 pytestmark = pytest.mark.long
-
-BUSY = f"""
-import cv2
-import numpy as np
-from cadalign.annotate.session import Session
-
-def warm_up(session):
-    while not session.ended.is_set():
-        cv2.GaussianBlur(np.zeros((300, 300, 3), np.uint8), (0, 0), 15)
-
-Session.warm_up = warm_up
-{MAIN}
-"""
 
 
 class Annotator:
     """A process of `cadalign annotate`."""
 
-    def __init__(self, process: Program | subprocess.Popen[str]) -> None:
+    def __init__(self, process: Program) -> None:
         assert process.stdout is not None
         self.process = process
         url = process.stdout.readline().strip()
@@ -67,16 +53,10 @@ class Annotator:
 
 
 @contextmanager
-def annotator(case: Case, *arguments: object, program: str = "") -> Iterator[Annotator]:
-    """An annotator; a ``program`` in place of the command has an interpreter of its own."""
+def annotator(case: Case, *arguments: object) -> Iterator[Annotator]:
+    """An annotator in a process of its own."""
     given = ["annotate", "--no-open", "--model", case.model, "--camera", case.camera, *arguments]
-    process: Program | subprocess.Popen[str]
-    if program:
-        command = [sys.executable, "-c", program, *map(str, given)]
-        pipe = subprocess.PIPE
-        process = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True)
-    else:
-        process = Program(MAIN, *given)
+    process = Program(MAIN, *given)
     try:
         yield Annotator(process)
     finally:
@@ -114,13 +94,6 @@ def test_second_process_is_refused_and_a_killed_one_leaves_no_lock(
         pairs = third.act({"do": "place_uv", "uv": [50, 60]})["pairs"]
         assert [pair["uv"] for pair in pairs] == [[10, 20], [30, 40], [50, 60]]
         code, err = third.end(signal.SIGTERM)
-    assert (code, err.strip().splitlines()[-1]) == (0, f"Saved in {case.folder}")
-
-
-def test_what_warms_up_in_an_extension_ends_with_the_program(case: Case) -> None:
-    """OpenCV gives control back to Python where C++ allows no exception, as of a thread's end."""
-    with annotator(case, "--image", case.photo, program=BUSY) as first:
-        code, err = first.end(signal.SIGTERM)
     assert (code, err.strip().splitlines()[-1]) == (0, f"Saved in {case.folder}")
 
 
@@ -196,3 +169,79 @@ def test_pairs_of_a_renamed_photo_go_on(case: Case) -> None:
     assert len(page_state(again, 0)["pairs"]) == 2
     perform(again, 0, {"do": "delete", "pair": 2})
     assert Observation.load(case.observation).image == renamed
+
+
+# --- stopped in the middle of an action ----------------------------------------------------------
+
+
+class Stop(BaseException):
+    """The end of a process in the middle of a write."""
+
+
+def content(state: dict[str, Any]) -> dict[str, Any]:
+    """What a person has put in, of a state of the page."""
+    pairs = [[pair["uv"], pair["keypoint"], pair["name"]] for pair in state["pairs"]]
+    evidence = state["evidence"]
+    return {
+        "pairs": sorted(map(json.dumps, pairs)),
+        "evidence": [evidence["mask"] is not None, evidence["photo"]],
+    }
+
+
+@pytest.mark.parametrize(
+    "action",
+    [
+        "place_keypoint",
+        "release",
+        "move",
+        "delete",
+        "undo",
+        "rename",
+        "mask_cut",
+        "use_photo",
+    ],
+)
+def test_stopped_before_any_write_an_action_is_done_or_not(
+    case: Case, action: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every file that an action writes is the last one, in turn."""
+    arguments: dict[str, dict[str, Any]] = {
+        "place_keypoint": {"keypoint": case.clicks[4][0]},
+        "release": {"pair": 2},
+        "move": {"pair": 5, "uv": [50.0, 60.0]},
+        "delete": {"pair": 5},
+        "rename": {"pair": 1, "name": "knee"},
+        "mask_cut": {"corners": [[150, 80], [450, 420]]},
+        "use_photo": {"on": True},
+    }
+    write, written = files.write_whole, [0]
+
+    def stopping(path: Path, how: Any, *, after: int = -1) -> None:
+        if written[0] == after:
+            raise Stop
+        written[0] += 1
+        write(path, how)
+
+    for number in range(9):
+        for path in case.folder.glob("photo*.json"):
+            path.unlink()
+        session = case.open(prepared=False)
+        place_all(session, case, count=4)
+        perform(session, 0, {"do": "place_uv", "uv": case.clicks[4][1]})
+        before = content(page_state(session, 0))
+        written[0] = 0
+        with monkeypatch.context() as patched:
+            patched.setattr(
+                files, "write_whole", lambda path, how, n=number: stopping(path, how, after=n)
+            )
+            stopped = False
+            try:
+                perform(session, 0, {"do": action, **arguments.get(action, {})})
+            except Stop:
+                stopped = True
+        after = content(page_state(session, 0))
+        found = content(page_state(case.open(prepared=False), 0))
+        assert found in (before, after), (number, json.dumps([before, found, after], indent=1))
+        if not stopped:
+            return
+    pytest.fail("it never came to an end")

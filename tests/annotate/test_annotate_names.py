@@ -13,10 +13,8 @@ from support.annotating import Case, place
 from support.refusals import refusal_text
 
 from cadalign.annotate.actions import perform
-from cadalign.annotate.files import observation_file, refuse_collisions
-from cadalign.annotate.options import SessionOptions
+from cadalign.annotate.files import observation_file
 from cadalign.annotate.page_state import page_state
-from cadalign.annotate.session import find_session_files
 from cadalign.datasets import ModelKeypoints
 from cadalign.io.observation import Observation
 
@@ -116,12 +114,6 @@ def test_photos_of_one_name_in_two_folders_do_not_share_a_file(case: Case) -> No
     )
 
 
-@pytest.mark.long
-def test_observation_whose_photo_was_renamed_with_it_is_kept(case: Case) -> None:
-    write_observation(case.observation, case, case.folder / "former name.png")
-    assert len(page_state(case.open(), 0)["pairs"]) == len(case.clicks)
-
-
 @pytest.mark.parametrize("name", ["sample_chair_000.keypoints.json", "camera.json", "photo.png"])
 def test_observation_in_another_files_place_is_refused(case: Case, name: str) -> None:
     path = case.folder / name
@@ -140,19 +132,6 @@ def test_folders_and_pipes_in_a_files_place_are_refused(
 ) -> None:
     make(case.folder / name)
     assert refusal_text(case.open).startswith(f"{case.folder / name}: not a regular file; ")
-
-
-def test_files_are_compared_by_place(tmp_path: Path) -> None:
-    link = tmp_path / "link"
-    link.symlink_to(tmp_path)
-    refuse_collisions([tmp_path / "a.json"], [tmp_path / "b.json"])
-    message = refusal_text(lambda: refuse_collisions([tmp_path / "a"], [link / "a"]))
-    assert message.startswith(f"{tmp_path / 'a'}: would be written twice")
-
-
-def test_written_files_are_named_before_anything_is_read(case: Case) -> None:
-    options = SessionOptions(image=case.photo, model=case.folder / "nowhere.obj")
-    assert [path.name for _, path in find_session_files(options)] == ["photo.json"]
 
 
 @pytest.mark.long

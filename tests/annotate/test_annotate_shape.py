@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,14 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.annotating import Case, fitted, flat, place, place_all
+from support.annotating import Case, agree_with_fit, place, place_all
 
-from cadalign import CadalignError, Camera, Result, ShapeModel
+from cadalign import CadalignError, ShapeModel
 from cadalign.annotate.actions import perform
 from cadalign.annotate.live import LiveAlignment
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
-from cadalign.cli import main
 from cadalign.datasets import KeypointNet, ModelKeypoints
 from cadalign.io.observation import Observation
 from cadalign.shapes.examples import Example
@@ -81,21 +79,7 @@ def test_fit_of_the_observation_gives_the_pages_numbers(
     given.save(case.observation)
     session = case.open(**options_of(kind, shape_file))
     perform(session, 0, {"do": "move", "pair": 2, "uv": instance.points_2d[1].tolist()})
-    page = live_shape(session).result
-    assert page is not None
-    command = Result.from_dict(fitted(case, capsys))
-    for read in (command,):
-        np.testing.assert_allclose(read.covariance, page.covariance, rtol=1e-9, atol=1e-15)
-        ours, theirs = flat(page.alignment.to_dict()), flat(read.alignment.to_dict())
-        np.testing.assert_allclose(theirs, ours, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(read.bounds, page.bounds, atol=1e-9)
-        np.testing.assert_allclose(read.stretch, page.stretch, rtol=1e-9)
-        assert read.warnings == page.warnings
-        rows = [page.ids.index(label) for label in read.ids]
-        np.testing.assert_allclose(read.points_3d, page.points_3d[rows], atol=1e-9)
-        np.testing.assert_allclose(
-            read.points_cam_covariance, page.points_cam_covariance[rows], rtol=1e-9, atol=1e-15
-        )
+    agree_with_fit(session, case, capsys)
 
 
 def test_page_shows_box_lines_keypoints_and_regions(case: Case, shape_file: Path) -> None:
@@ -174,7 +158,9 @@ def test_points_of_the_model_can_be_identified(
     assert not page_state(session, 0)["pairs"][0]["counts"]
 
 
-def test_shape_of_named_keypoints(case: Case, tmp_path: Path) -> None:
+def test_shape_of_named_keypoints(
+    case: Case, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     keypoints = ModelKeypoints.load(case.keypoints)
     named = replace(
         keypoints,
@@ -187,17 +173,13 @@ def test_shape_of_named_keypoints(case: Case, tmp_path: Path) -> None:
     by_name = {point.name: number for number, point in session.model.registry}
     for semantic_id, uv in case.clicks:
         place(session, by_name[f"keypoint {semantic_id}"], uv)
-    page = live_shape(session)
-    assert page.counts.all()
-    assert main(["fit", str(case.observation), "--out", str(tmp_path / "x")]) == 0
-    fitted = Result.from_dict(json.loads((tmp_path / "x/fit.json").read_text()))
-    assert page.result is not None
-    np.testing.assert_allclose(fitted.covariance, page.result.covariance, rtol=1e-9, atol=1e-15)
+    assert live_shape(session).counts.all()
+    agree_with_fit(session, case, capsys)
 
 
 @pytest.mark.parametrize("kind", ["learned", "similar"])
 def test_unknown_focal_length_is_estimated_with_the_shape(
-    case: Case, tmp_path: Path, shape_file: Path, kind: str
+    case: Case, capsys: pytest.CaptureFixture[str], shape_file: Path, kind: str
 ) -> None:
     session = case.open(**options_of(kind, shape_file), camera=None)
     shown = place_all(session, case)["alignment"]
@@ -212,37 +194,12 @@ def test_unknown_focal_length_is_estimated_with_the_shape(
     off = np.log(found.camera.fx / case.instance.camera.fx)
     assert abs(off) < 3 * found.std.focal
     assert not Observation.load(case.observation).camera.focal_known
-    assert main(["fit", str(case.observation), "--out", str(tmp_path / "x")]) == 0
-    fitted = Result.from_dict(json.loads((tmp_path / "x/fit.json").read_text()))
-    assert fitted.camera.fx == pytest.approx(found.camera.fx, rel=1e-9)
-    np.testing.assert_allclose(fitted.covariance, found.covariance, rtol=1e-6, atol=1e-12)
+    agree_with_fit(session, case, capsys, rtol=1e-6)
     perform(session, 0, {"do": "focal", "pixels": 900})
     assert Observation.load(case.observation).camera.focal_known
     known = live_shape(session).result
     assert known is not None
     assert known.focal == "known"
-
-
-def test_three_pairs_without_a_prior_leave_an_unknown_focal_length_assumed(
-    case: Case, shape_file: Path
-) -> None:
-    rows = slice(LACKING, LACKING + 3)
-    ids = case.instance.ids[rows]
-    of_model = {p.semantic_id: p.xyz for p in ModelKeypoints.load(case.keypoints).keypoints}
-    camera = Camera.without_focal(case.instance.camera.width, case.instance.camera.height)
-    Observation(
-        np.array([of_model[number] for number in ids.tolist()]),
-        case.instance.points_2d[rows],
-        camera,
-        ids=ids,
-        fit_options={"focal_prior": None},
-    ).save(case.observation)
-    session = case.open(shape=shape_file, camera=None)
-    live = live_shape(session)
-    assert live.estimate is not None
-    assert live.estimate.message.startswith("The focal length is assumed: add a pair")
-    likely = session.photos[0].photo.likely_focal
-    assert live.estimate.result.camera.fx == pytest.approx(likely.focal)
 
 
 def test_contradicting_pair_is_named(case: Case, shape_file: Path) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page
-from support.annotating import Case, corners_of, fitted, flat, opened_page, place, place_all
+from support.annotating import Case, agree_with_fit, corners_of, opened_page, place, place_all
 
 from cadalign.annotate.actions import perform
 from cadalign.annotate.page_state import page_state
@@ -70,9 +70,7 @@ def test_gravity_is_that_of_the_up_axis(case: Case, capsys: pytest.CaptureFixtur
     wanted = case.instance.cam_from_model.rotation @ FROM_Y_UP["z"].T
     error = np.trace(wanted.T @ live.result.alignment.rotation)
     assert np.degrees(np.arccos(np.clip((error - 1) / 2, -1, 1))) < 3
-    page = live.result.to_dict()["alignment"]
-    command = fitted(z_up, capsys)["alignment"]
-    np.testing.assert_allclose(flat(command), flat(page), rtol=1e-9, atol=1e-12)
+    agree_with_fit(session, z_up, capsys)
     wrong = z_up.open(up_axis="y")
     notes = page_state(wrong, 0)["alignment"]["notes"]
     assert any("give up_axis='z'" in note for note in notes)

@@ -25,7 +25,7 @@ def test_a_legend_stands_in_the_corner_that_is_free(right: bool, below: bool) ->
     x, y = np.meshgrid(np.arange(0, 640, 8.0), np.arange(0, 480, 8.0))
     free = ((x > 320) == right) & ((y > 240) == below)
     drawn = np.stack([x[~free], y[~free]], axis=1)
-    canvas.legend([("found", RED, "line")], keep_clear=canvas.place(drawn))
+    canvas.legend([("found", RED, "line")], keep_clear=drawn)
     rows, columns = np.nonzero(canvas.finished().any(axis=2))
     assert ((columns > 320) == right).all()
     assert ((rows > 240) == below).all()
@@ -51,7 +51,7 @@ def test_dashes_are_spread_over_a_line_and_end_with_it() -> None:
 @pytest.mark.parametrize("size", [(480, 640), (1920, 2560)])
 def test_a_cross_is_as_large_as_its_radius_in_any_photo(size: tuple[int, int]) -> None:
     canvas = Canvas(np.zeros((*size, 3), np.uint8))
-    canvas.cross(canvas.place(np.array([[200.0, 150.0]]))[0], RED, radius=8.0)
+    canvas.cross(np.array([200.0, 150.0]), RED, radius=8.0)
     picture = canvas.finished().astype(int)
     rows, columns = np.nonzero(picture[:, :, 0] - picture[:, :, 1] > 100)  # without its casing
     reach = 8.0 * size[0] / 480

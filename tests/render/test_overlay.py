@@ -1,4 +1,4 @@
-"""Overlays: what is drawn where, in which colour, on which background."""
+"""Overlays: what is drawn where, in which colour, on which background; the placed model."""
 
 from __future__ import annotations
 
@@ -6,23 +6,43 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
 
-from cadalign import Alignment, Box, Camera, Mesh
+from cadalign import Box, Camera, Mesh
 from cadalign.errors import InputError
-from cadalign.render import (
-    Geometry,
-    RaycastRenderer,
-    Scene,
-    draw_overlay,
-    look_at,
+from cadalign.render import Geometry, Scene, cast_geometry, draw_overlay, look_at, overlay_model
+from cadalign.render.drawing.canvas import linear_from_bytes
+from cadalign.render.drawing.layers import (
+    OBSERVED_COLOR,
+    OUTLIER_COLOR,
+    REGION_SHARE,
+    REPROJECTED_COLOR,
+    UNSEEN_COLOR,
+    confidence_regions,
 )
-from cadalign.render.drawing.layers import OBSERVED_COLOR, OUTLIER_COLOR, REPROJECTED_COLOR
 from cadalign.render.drawing.overlay import AXIS_COLORS, EST_COLOR, GT_COLOR
 
 CAMERA = Camera.from_fov(640, 480, fov_x=50)
 LARGE = Camera.from_fov(1600, 1200, fov_x=50)
 BENT = Camera(640, 480, 600.0, 600.0, 319.5, 239.5, (-0.25, 0.05, 0, 0))
+LENS = Camera(64, 48, 60.0, 70.0, 31.5, 23.5, (-0.2, 0.05, 0.01, 0.002))
 BACKGROUNDS = {"black": 0, "grey": 120, "white": 255}
+
+
+def chair():
+    """A seat, a back and a leg."""
+    parts = [
+        trimesh.creation.box((1, 0.2, 1)),
+        trimesh.creation.box((1, 0.8, 0.1)).apply_translation((0, 0.5, -0.45)),
+        trimesh.creation.cylinder(0.1, 0.8).apply_translation((0.1, -0.1, -0.3)),
+    ]
+    whole = trimesh.util.concatenate(parts)
+    return Mesh(np.asarray(whole.vertices), np.asarray(whole.faces))
+
+
+CHAIR = chair()
+POSE = look_at(azimuth=35, elevation=30, distance=5, scale=(1, 1.8, 0.6))
 
 
 def _box(azimuth=30, elevation=25, distance=4.0, size=1.0):
@@ -171,21 +191,14 @@ def test_background_stays_as_it_was():
     np.testing.assert_array_equal(draw_overlay(photo, CAMERA), photo)
 
 
-@pytest.mark.slow
-def test_legend_names_what_is_drawn_and_avoids_it():
-    # The box sits in the top left: the legend goes elsewhere.
-    box = Box([-0.75, -0.55, 3.0], np.eye(3), [0.8, 0.5, 0.5])
-    plain = draw_overlay(_blank(value=200), CAMERA, gt_box=box, legend=False)
-    image = draw_overlay(_blank(value=200), CAMERA, gt_box=box)
-    rows, columns = np.nonzero((plain != image).any(axis=2))
-    assert columns.min() > 320 or rows.min() > 240
-    assert _near_color(
-        image[rows.min() : rows.max(), columns.min() : columns.max()], GT_COLOR
-    ).any()
+def test_legend_names_what_is_drawn():
     heights = []
-    for options in ({"gt_box": box}, {"gt_box": box, "est_box": box, "observed": [[50.0, 50.0]]}):
-        plain = draw_overlay(_blank(value=200), CAMERA, **options, legend=False)
-        legend = (plain != draw_overlay(_blank(value=200), CAMERA, **options)).any(axis=2)
+    for options in (
+        {"gt_box": _box()},
+        {"gt_box": _box(), "est_box": _box(), "observed": [[9, 9]]},
+    ):
+        plain = draw_overlay(_blank(), CAMERA, **options, legend=False)
+        legend = (plain != draw_overlay(_blank(), CAMERA, **options)).any(axis=2)
         heights.append(np.ptp(np.nonzero(legend)[0]))
     assert heights[1] > heights[0] + 20
 
@@ -246,43 +259,26 @@ def test_other_images_are_refused(image, message):
         draw_overlay(image, CAMERA)
 
 
-def test_keypoints_that_do_not_match_are_refused():
-    with pytest.raises(InputError, match="reprojected: 1 keypoints, but 2 observed"):
-        draw_overlay(_blank(), CAMERA, observed=[[1, 1], [2, 2]], reprojected=[[1, 1]])
-    with pytest.raises(InputError, match="observed"):
-        draw_overlay(_blank(), CAMERA, observed=[[1, np.nan]])
-    with pytest.raises(InputError, match="observed"):
-        draw_overlay(_blank(), CAMERA, observed=[[1, 1, 1]])
-
-
-def test_true_and_predicted_box_may_differ_in_stretch():
-    pose = look_at(azimuth=20, elevation=20, distance=5)
-    stretched = Alignment(pose.rotation, pose.translation, [1, 1.5, 0.7])
-    bounds = np.array([[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]])
-    image = draw_overlay(
-        _blank(),
-        CAMERA,
-        gt_box=Box.from_model(bounds, pose),
-        est_box=Box.from_model(bounds, stretched),
-        axes=False,
-        legend=False,
-    )
-    assert _near_color(image, GT_COLOR).sum() > 200
-    assert _near_color(image, EST_COLOR).sum() > 200
-
-
-def _model_frame():
-    camera = Camera.from_fov(320, 240, fov_x=60)
-    shape = trimesh.creation.box((1.0, 1.2, 0.8))
-    scene = Scene(Mesh(np.array(shape.vertices), np.array(shape.faces)))
-    frame = RaycastRenderer().render(scene, camera, look_at(azimuth=30, elevation=20, distance=3))
-    return camera, frame, np.full((240, 320, 3), 120, np.uint8)
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            {"observed": [[1, 1], [2, 2]], "reprojected": [[1, 1]]},
+            "reprojected: 1 keypoints, but 2 observed",
+        ),
+        ({"observed": [[1, np.nan]]}, "observed"),
+        ({"unseen": [[1.0, 2.0, 3.0]]}, r"unseen: shape \(1, 3\), expected \(n, 2\)"),
+        ({"regions": [[1.0, 2.0]]}, r"regions: shape \(1, 2\), expected \(n, n, 2\)"),
+    ],
+)
+def test_keypoints_that_do_not_match_are_refused(arguments, message):
+    with pytest.raises(InputError, match=message):
+        draw_overlay(_blank(), CAMERA, **arguments)
 
 
 def test_the_predicted_model_lies_over_the_photo_as_a_red_veil():
-    camera, frame, photo = _model_frame()
-    geometry = Geometry(depth=frame.depth, face_id=frame.face_id, normal=frame.normal)
-    drawn = draw_overlay(photo, camera, est_frame=geometry, legend=False)
+    frame, photo = cast_geometry(Scene(CHAIR), CAMERA, POSE), _blank(value=120)
+    drawn = draw_overlay(photo, CAMERA, est_frame=frame, legend=False)
     inner = cv2.erode(frame.mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
     tint = drawn[inner].astype(int)
     assert np.median(tint[:, 0] - tint[:, 1]) > 10
@@ -292,7 +288,71 @@ def test_the_predicted_model_lies_over_the_photo_as_a_red_veil():
 
 
 def test_frames_of_another_size_are_refused():
-    camera, frame, photo = _model_frame()
+    frame = cast_geometry(Scene(CHAIR), CAMERA, POSE)
     small = Geometry(frame.depth[1:], frame.face_id[1:], frame.normal[1:])
-    with pytest.raises(InputError, match="est_frame: it is 320 x 239 px, the image 320 x 240"):
-        draw_overlay(photo, camera, est_frame=small)
+    with pytest.raises(InputError, match="est_frame: it is 640 x 479 px, the image 640 x 480"):
+        draw_overlay(_blank(), CAMERA, est_frame=small)
+
+
+# The shaded model ---------------------------------------------------------------------------------
+
+
+def cover_of(camera, mesh, pose):
+    """Share of each pixel that the shaded model covers: what shows on white and not on black."""
+    black, white = (
+        linear_from_bytes(overlay_model(_blank(camera, value), camera, mesh, pose))
+        for value in (0, 255)
+    )
+    return 1 - (white - black).mean(axis=2)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, BENT])
+def test_the_shaded_silhouette_is_that_of_ray_casting(camera):
+    mask = cast_geometry(Scene(CHAIR), camera, POSE).mask
+    covered = cover_of(camera, CHAIR, POSE) > 0.3
+    assert (covered & mask).sum() >= 0.99 * mask.sum()
+
+
+def test_the_model_covers_its_share_and_box_and_axes_are_drawn():
+    mask = cast_geometry(Scene(CHAIR), CAMERA, POSE).mask
+    assert np.median(cover_of(CAMERA, CHAIR, POSE)[mask]) == pytest.approx(0.6, abs=0.01)
+    picture = overlay_model(_blank(), CAMERA, CHAIR, POSE)
+    for color in (EST_COLOR, *AXIS_COLORS):
+        assert _near_color(picture, color, 60).any()
+
+
+# Uncertain keypoints ------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 10_000))
+def test_regions_hold_their_share(seed):
+    rng = np.random.default_rng(seed)
+    center, root = rng.normal(0, 100, 2), 10 * rng.normal(size=(2, 2))
+    covariance = root @ root.T + 9 * np.eye(2)
+    (region,) = confidence_regions(center[None], covariance[None])
+    offsets = region - center
+    squares = np.einsum("ni,ij,nj->n", offsets, np.linalg.inv(covariance), offsets)
+    np.testing.assert_allclose(1 - np.exp(-squares / 2), REGION_SHARE)  # chi-square, 2 degrees
+    # Those that the markers hide are left out.
+    assert len(confidence_regions(np.zeros((2, 2)), np.array([0.1 * np.eye(2), np.eye(2)]))) == 1
+
+
+@pytest.mark.parametrize("camera", [Camera(64, 48, 60.0, 70.0, 31.5, 23.5), LENS])
+@given(seed=st.integers(0, 10_000))
+def test_projected_covariances_are_propagated(camera, seed):
+    rng = np.random.default_rng(seed)
+    point, covariance = rng.uniform([-1, -1, 4], [1, 1, 8]), np.diag(rng.uniform(0.1, 2, 3))
+    steps = 1e-6 * np.eye(3)
+    slopes = (camera.project(point + steps) - camera.project(point - steps)).T / 2e-6
+    (found,) = camera.projected_covariances(point[None], covariance[None])
+    np.testing.assert_allclose(found, slopes @ covariance @ slopes.T, rtol=1e-4, atol=1e-4)
+
+
+def test_unobserved_keypoints_and_regions_are_drawn():
+    regions = confidence_regions(np.array([[400.0, 200.0]]), 400 * np.eye(2)[None])
+    drawn = draw_overlay(_blank(), CAMERA, unseen=[[100.0, 300.0]], regions=regions, legend=False)
+    near = (np.abs(drawn.astype(int) - UNSEEN_COLOR).max(axis=2) < 60).nonzero()
+    assert np.hypot(near[1] - 100, near[0] - 300).max() < 6
+    on_curve = drawn[200, 400 + 48 : 400 + 51].max()
+    assert on_curve > 80
+    assert not drawn[200, 380:420].any()

@@ -118,15 +118,6 @@ def test_normals_face_the_camera_however_the_faces_are_wound():
     assert cosine.min() > np.cos(np.radians(6))
 
 
-def test_no_ray_slips_between_triangles_that_share_an_edge():
-    # Vertices and diagonals of the grid project exactly onto pixel centres.
-    box = trimesh.creation.box().subdivide().subdivide().subdivide()
-    camera = Camera(width=161, height=161, fx=160, fy=160, cx=80, cy=80)
-    frame = cast_geometry(Scene(_mesh(box)), camera, _front_view(2.5))
-    inner = frame.depth[41:120, 41:120]
-    np.testing.assert_allclose(inner, 2.0, rtol=1e-9)
-
-
 def test_no_ray_from_inside_a_sphere_escapes_through_edges_or_vertices():
     sphere = trimesh.creation.icosphere(subdivisions=5)
     vertices, edges = np.array(sphere.vertices), np.array(sphere.edges_unique)
@@ -239,29 +230,6 @@ def test_materials_belong_to_faces():
         assert median.argmax() == channel
 
 
-@pytest.mark.parametrize("crease_angle", [5, 60])
-def test_triangles_of_one_colour_are_drawn_as_if_every_sample_were_shaded(crease_angle):
-    sphere = trimesh.creation.icosphere(subdivisions=2)
-    colors = np.random.default_rng(0).uniform(0, 1, (len(sphere.faces), 4))
-    colors[:, 3] = 1
-    vertices = np.array(sphere.triangles).reshape(-1, 3)
-    colors = np.repeat(colors, 3, axis=0)
-    hidden, mixed = (
-        np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]),
-        np.eye(4)[[3, 1, 2]] + [0, 0, 0, 1],
-    )
-    drawn = []
-    for more, of_more in ((hidden, np.ones((3, 4))), (hidden, np.clip(mixed, 0, 1))):
-        corners, all_colors = np.concatenate([vertices, more]), np.concatenate([colors, of_more])
-        mesh = Mesh(corners, np.arange(len(corners)).reshape(-1, 3), vertex_colors=all_colors)
-        scene = Scene(mesh, crease_angle=crease_angle)
-        drawn.append(RaycastRenderer().render(scene, CAMERA, _front_view()))
-    one, every = (frame.color.astype(int) for frame in drawn)
-    np.testing.assert_array_equal(one[:, :, 3], every[:, :, 3])
-    assert np.abs(one - every).max() <= (1 if crease_angle == 5 else 6)
-    assert np.abs(one - every).mean() < 0.1
-
-
 def test_a_transparent_sheet_lets_what_is_behind_show():
     front = _facing_quad().vertices + np.array([0, 0, 0.5])
     vertices = np.concatenate([_facing_quad().vertices, front])
@@ -309,7 +277,7 @@ def test_a_fan_of_very_many_triangles_stays_faceted():
     following = np.roll(np.arange(1, count + 1), -1)
     faces = np.column_stack([np.zeros(count, int), np.arange(1, count + 1), following])
     scene = Scene(Mesh(vertices, faces))
-    normals = corner_normals(vertices, faces, scene.face_normals, crease_angle=40)
+    normals = corner_normals(vertices, faces, scene.face_normals)
     np.testing.assert_array_equal(normals[:, 0], scene.face_normals)
 
 
@@ -346,19 +314,9 @@ def test_srgb_bytes_survive_the_way_to_linear_light_and_back():
 
 
 def test_scene_survives_pickling_and_prepares_once():
-    scene = Scene(_facing_quad(), crease_angle=12)
+    scene = Scene(_facing_quad())
     before = cast_geometry(scene, CAMERA, _front_view())
     assert scene.caster is scene.caster
     again = pickle.loads(pickle.dumps(scene))
-    assert again.crease_angle == 12
     after = cast_geometry(again, CAMERA, _front_view())
     np.testing.assert_array_equal(before.depth, after.depth)
-
-
-def test_render_and_cast_geometry_agree():
-    scene = Scene(_mesh(trimesh.creation.icosphere(subdivisions=2)))
-    frame = RaycastRenderer().render(scene, CAMERA, _front_view())
-    geometry = cast_geometry(scene, CAMERA, _front_view())
-    np.testing.assert_array_equal(frame.face_id, geometry.face_id)
-    np.testing.assert_array_equal(frame.depth, geometry.depth)
-    np.testing.assert_array_equal(frame.normal, geometry.normal)

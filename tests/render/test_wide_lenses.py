@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 from support.renderers import renderer_or_skip
 
-from cadalign import Alignment, Camera, Mesh, Model, Result, View, align, fit
-from cadalign.cli import main
+from cadalign import Alignment, Camera, Mesh, Model, View, align
 from cadalign.export.glb import photo_plane
-from cadalign.geometry.alignment import Box
 from cadalign.geometry.rotations import rotation_from_vector
-from cadalign.io.observation import Observation
-from cadalign.render import Scene, cast_geometry, draw_overlay
+from cadalign.render import Scene, cast_geometry
 from cadalign.render.drawing.model_overlay import draw_result, photo_of
 from cadalign.render.raycast.renderer import RaycastRenderer
 from cadalign.render.scene import LIGHT_GREY
@@ -87,26 +81,6 @@ def test_an_object_around_the_axis_behind_is_not_seen() -> None:
     assert drawn.mask.any()
 
 
-def test_a_frame_in_colour_and_its_overlay() -> None:
-    pose = placed(88, np.pi)
-    frame = RaycastRenderer().render(BOX, FISHEYE, pose, samples=4)
-    assert (frame.color[frame.mask][:, 3] > 50).all()
-    noise = np.random.default_rng(0).normal(scale=0.3, size=(8, 2))
-    result = fit(CORNERS, FISHEYE.project(pose.apply(CORNERS)) + noise, FISHEYE)
-    picture = draw_overlay(
-        frame.composite((30, 30, 30)),
-        FISHEYE,
-        est_box=Box.from_model(result.bounds, result.alignment),
-        est_frame=cast_geometry(BOX, FISHEYE, result.alignment),
-        observed=FISHEYE.project(pose.apply(CORNERS)),
-        reprojected=FISHEYE.project(result.alignment.apply(CORNERS)),
-    )
-    changed = (picture != frame.composite((30, 30, 30))).any(axis=2)
-    assert changed[:, :120].sum() > 300  # the box lies at the left border, 88 degrees off the axis
-    axes = result.plot()
-    assert axes is not None
-
-
 def test_the_picture_of_a_result_shows_model_box_and_regions() -> None:
     pose, points = placed(93, np.pi), CORNERS[[0, 1, 2, 4, 5, 7]]
     seen = FISHEYE.project(pose.apply(points))
@@ -138,18 +112,3 @@ def test_the_photo_of_a_wide_lens_is_exported_as_a_pinholes() -> None:
         ((column, row),) = FISHEYE.project([[u, v, 1.0]])
         shown = flat[round(float(y)), round(float(x))].astype(float)
         np.testing.assert_allclose(shown[:2], [row, column], atol=1.5)
-
-
-@pytest.mark.slow
-def test_the_command_fits_and_draws_an_observation_of_a_fisheye(tmp_path: Path) -> None:
-    pose = placed(95)
-    noise = np.random.default_rng(0).normal(scale=0.3, size=(8, 2))
-    pixels = FISHEYE.project(pose.apply(CORNERS)) + noise
-    path = tmp_path / "box.json"
-    Observation(CORNERS, pixels, FISHEYE).save(path)
-    assert json.loads(path.read_text())["camera"]["model"] == "OPENCV_FISHEYE"
-    assert main(["fit", str(path), "--out", str(tmp_path)]) == 0
-    found = Result.load(tmp_path / "fit.json")
-    assert found.camera == FISHEYE
-    np.testing.assert_allclose(found.alignment.translation, pose.translation, atol=0.3)
-    assert (tmp_path / "overlay.png").is_file()

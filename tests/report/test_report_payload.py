@@ -6,8 +6,6 @@ import base64
 import io
 import json
 import shutil
-from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +16,17 @@ import pytest
 from PIL import Image
 from support.pages import embedded_payload
 
-from cadalign import Alignment, Box, Camera, fit
+from cadalign import Alignment, Box, Camera
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.api import run as do_run
-from cadalign.evaluation.experiments.correspondences import CorrespondenceOptions
 from cadalign.evaluation.experiments.keypointnet import (
     KeypointNetOptions,
     KeypointTasks,
     keypointnet_benchmark,
 )
-from cadalign.evaluation.experiments.retrieval import RetrievalRunOptions
 from cadalign.evaluation.experiments.simulation import SweepOptions
 from cadalign.evaluation.instances.record import record_stem
-from cadalign.evaluation.methods import fit_options
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import read_table
 from cadalign.geometry.metrics import alignment_box_iou, rotation_error
@@ -201,26 +196,6 @@ def test_exhibits_hold_what_the_errors_were_made_of(payload: dict[str, Any]) -> 
             assert (estimate["std"] is None) == (estimate["method"] != "optimal")
 
 
-def test_estimates_say_what_the_fit_says(payload: dict[str, Any]) -> None:
-    for exhibit in payload["exhibits"].values():
-        camera = Camera(**exhibit["camera"])
-        # The pixels are stored to 1e-4.
-        fitted = fit(
-            exhibit["points_3d"],
-            exhibit["points_2d"],
-            camera,
-            **fit_options("optimal", sigma=1.0, ransac=None),
-        )
-        estimate = exhibit["estimates"][0]
-        assert estimate["sigma"] == fitted.sigma == 1.0
-        assert fitted.std is not None
-        expected = asdict(fitted.std)
-        assert estimate["std"]["rotation_deg"] == pytest.approx(expected["rotation_deg"], rel=1e-3)
-        assert estimate["std"]["scale"] == pytest.approx(expected["scale"], rel=1e-3)
-        assert len(estimate["warnings"]) == len(fitted.warnings)
-        assert estimate["rms_px"] == pytest.approx(fitted.rms, abs=1e-3)
-
-
 def test_warnings_and_alternatives_are_kept(tmp_path: Path) -> None:
     root = annotations(tmp_path / "data", [f"four_{k}" for k in range(8)], points=4)
     run = evaluate(root, tmp_path / "run", methods=("optimal",), min_visible=4)
@@ -262,28 +237,6 @@ def pixels(url: str) -> Any:
     assert kind == "data:image/webp;base64"
     with Image.open(io.BytesIO(base64.b64decode(data))) as image:
         return np.asarray(image.convert("RGB"))
-
-
-def test_meshes_are_light_and_in_the_coordinates_of_the_dataset(
-    payload: dict[str, Any], sample_root: Path
-) -> None:
-    assert len(payload["meshes"]) == 4  # the views of a model share one
-    strings, instances, _ = columns(payload)
-    dataset = KeypointNet(sample_root)
-    for place in range(8):
-        mesh = payload["meshes"][payload["exhibits"][str(place)]["mesh"]]
-        key = strings[instances["category"][place]], strings[instances["model"][place]]
-        counts = np.frombuffer(base64.b64decode(mesh["vertices"]), "<u2").reshape(-1, 3)
-        vertices = np.array(mesh["lo"]) + counts * mesh["step"]
-        index = "<u4" if mesh["wide"] else "<u2"
-        faces = np.frombuffer(base64.b64decode(mesh["faces"]), index).reshape(-1, 3)
-        edges = np.frombuffer(base64.b64decode(mesh["edges"]), index).reshape(-1, 2)
-        assert 100 < len(faces) <= 1500
-        assert 50 < len(edges) <= 1500
-        assert max(faces.max(), edges.max()) < len(vertices)
-        full = dataset[key].load_mesh().bounds
-        size = np.linalg.norm(full[1] - full[0])
-        assert np.abs([vertices.min(axis=0), vertices.max(axis=0)] - full).max() < 0.02 * size
 
 
 def test_pictures_that_are_gone_leave_the_page_right(drawn: Path, tmp_path: Path) -> None:
@@ -371,14 +324,6 @@ def test_a_run_whose_views_show_too_few_keypoints_says_so_and_counts_no_failure(
     skipped = found["headline"]["skipped"]
     assert [(f["method"], f["count"]) for f in skipped] == [("optimal", 2), ("aepnp", 2)]
     assert all("13 keypoints should be visible" in each["reason"] for each in skipped)
-
-
-def test_one_instance_is_a_report(tmp_path: Path) -> None:
-    run = evaluate(annotations(tmp_path / "data", ["a"]), tmp_path / "run", methods=("optimal",))
-    found = report(tmp_path, run)
-    assert found["summary"].startswith("One method on views of models of data (1), with")
-    assert len(found["exhibits"]) == 1
-    assert [row["best"] for row in found["headline"]["rows"]] == [[]]  # without rivals
 
 
 @pytest.mark.long
@@ -476,100 +421,30 @@ def test_a_simulation_has_lines_and_no_gallery(tmp_path: Path) -> None:
     assert "problems of the AEPnP paper's simulation" in found["summary"]
 
 
-def test_correspondences_have_success_against_outliers(real_data: Path, tmp_path: Path) -> None:
-    options = CorrespondenceOptions(
-        real_data / "sfm" / "maupertuis_colmap",
-        outliers=(0.0, 0.5),
-        draws=1,
-        methods=("ransac-optimal", "epnp"),
-    )
-    do_run(options, RunFolder(tmp_path / "run"), workers=0, dask=None)
-    found = report(tmp_path, tmp_path / "run")
-    assert found["headline"]["group"] == "outliers [%]"
-    assert [row["category"] for row in found["headline"]["rows"]] == ["0", "0", "50", "50"]
-    success = found["plots"][0]
-    assert success["id"] == "success"
-    robust, epnp = success["traces"]
-    assert robust["y"] == [100, 100]
-    assert max(epnp["y"]) < 50
-    assert "draws of real correspondences of maupertuis_colmap" in found["summary"]
-    assert found["title"] == "Correspondences on maupertuis_colmap"
-
-
-@pytest.mark.long
-def test_retrieval_has_rates_against_keypoints(tmp_path: Path) -> None:
-    root = annotations(tmp_path / "data", [f"m{k}" for k in range(4)])
-    # Shapes that no stretch makes equal.
-    file = root / "annotations" / "knife.json"
-    entries = json.loads(file.read_text())
-    for row, entry in enumerate(entries):
-        xyz = np.random.default_rng(row).uniform(-0.3, 0.3, (12, 3)).tolist()
-        for keypoint, point in zip(entry["keypoints"], xyz, strict=True):
-            keypoint["xyz"] = point
-    file.write_text(json.dumps(entries))
-    options = RetrievalRunOptions(root, keypoints=(8, 10), noises_px=(1.0,), methods=("optimal",))
-    do_run(options, RunFolder(tmp_path / "run"), workers=0, dask=None)
-    found = report(tmp_path, tmp_path / "run")
-    assert found["title"] == "Retrieval on data"
-    assert "views of models of data" in found["summary"]
-    (run,) = found["runs"]
-    assert run["what"] == "retrieval"
-    groups = [row["category"] for row in found["headline"]["rows"]]
-    assert groups[0].endswith(", leave-in, 1 px, 8 keypoints")
-    assert len(set(groups)) == len(groups) == 4
-    first = found["plots"][0]
-    assert (first["id"], first["traces"][0]["x"]) == ("leave_in_rank_1_1", [8, 10])
-    rates = [row["cells"]["rank_1"] for row in found["headline"]["rows"][:2]]
-    assert first["traces"][0]["y"] == rates
-    assert min(rates) >= 75
-
-
 # --- refusals --------------------------------------------------------------------------------
 
 
-def missing(path: Path) -> None:
-    pass
-
-
-def empty(path: Path) -> None:
-    path.mkdir()
-
-
-def foreign(path: Path) -> None:
-    path.mkdir()
-    (path / "run.json").write_text('{"experiment": "brewing"}')
-
-
-def damaged(path: Path) -> None:
-    path.mkdir()
-    (path / "run.json").write_text("{")
-
-
-def begun(path: Path) -> None:
-    path.mkdir()
-    (path / "run.json").write_text('{"experiment": "keypointnet", "tasks": 3, "chunk_size": 1}')
-
-
-def unreadable(path: Path) -> None:
-    begun(path)
-    (path / "results.parquet").write_text("not a table")
+BEGUN = '{"experiment": "keypointnet", "tasks": 3, "chunk_size": 1}'
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("files", "message"),
     [
-        (missing, "no such folder; give a folder that cadalign demo, evaluate or simulate"),
-        (empty, "not the folder of a run: it has no run.json; give a folder"),
-        (foreign, "no report on a run of 'brewing'; known are keypointnet, demo, simulate, c"),
-        (damaged, "not valid JSON"),
-        (begun, "nothing of the run is finished yet; wait, or start the command"),
-        (unreadable, "not a table that can be read"),
+        (None, "no such folder; give a folder that cadalign demo, evaluate or simulate"),
+        ({}, "not the folder of a run: it has no run.json; give a folder"),
+        ({"run.json": '{"experiment": "brewing"}'}, "no report on a run of 'brewing'; known are k"),
+        ({"run.json": "{"}, "not valid JSON"),
+        ({"run.json": BEGUN}, "nothing of the run is finished yet; wait, or start the command"),
+        ({"run.json": BEGUN, "results.parquet": "no table"}, "not a table that can be read"),
     ],
 )
 def test_what_is_no_run_is_refused(
-    tmp_path: Path, make: Callable[[Path], None], message: str
+    tmp_path: Path, files: dict[str, str] | None, message: str
 ) -> None:
-    make(tmp_path / "run")
+    if files is not None:
+        (tmp_path / "run").mkdir()
+    for name, text in (files or {}).items():
+        (tmp_path / "run" / name).write_text(text)
     with pytest.raises(DataError, match=message) as error:
         write_report([tmp_path / "run"], tmp_path / "report.html")
     assert str(tmp_path / "run") in str(error.value)

@@ -172,24 +172,6 @@ def test_the_scene_is_drawn_and_orbits(shown: Shown) -> None:
     assert page.locator("dialog h2").inner_text() == title  # arrows did not walk on
 
 
-def test_the_scene_orbits_by_touch(opened: Opened, plain: str) -> None:
-    phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True}
-    page = opened(plain + "#order=best", **phone)
-    canvas = open_first(page).locator("canvas")
-    canvas.scroll_into_view_if_needed()
-    before = look(canvas)
-    box = canvas.bounding_box()
-    assert box is not None
-    touch = page.context.new_cdp_session(page)
-    at = {"x": box["x"] + box["width"] / 3, "y": box["y"] + box["height"] / 2}
-    touch.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [at]})
-    for step in range(1, 5):
-        moved = {**at, "x": at["x"] + 30 * step}
-        touch.send("Input.dispatchTouchEvent", {"type": "touchMove", "touchPoints": [moved]})
-    touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
-    assert changed(before, look(canvas)) > 0.01
-
-
 def test_without_webgl_there_is_a_word(opened: Opened, plain: str) -> None:
     page = opened(plain, script=NO_WEBGL, allowed="WebGL")
     dialog = open_first(page)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Browser, ConsoleMessage, Page
 
 from cadalign import Result, View, align
 from cadalign.annotate.actions import perform
@@ -28,7 +28,7 @@ from cadalign.datasets import KeypointNet, ModelKeypoints
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.evaluation.instances.instance import Instance, load_scene, make_instance
 from cadalign.io.images import write_image
-from cadalign.render import RaycastRenderer, visible_keypoints
+from cadalign.render import RaycastRenderer
 
 IDLE = "!!(annotator.state && annotator.model.mesh && annotator.photo.picture && annotator.idle)"
 """Condition that all is loaded and nothing is under way."""
@@ -131,32 +131,6 @@ def aligned_once(session: Session) -> Iterator[None]:
         session.warm_up()
 
 
-def place_twenty(session: Session, case: Case) -> None:
-    """Place all visible keypoints, and corners of the surface up to 20 pairs."""
-    place_all(session, case)
-    rng = np.random.default_rng(0)
-    corners = corners_of(session)
-    seen = visible_keypoints(
-        session.model.cad.scene,
-        np.array([point.xyz for point in corners]),
-        case.instance.camera,
-        case.instance.cam_from_model,
-    )
-    for point in (p for p, is_seen in zip(corners, seen, strict=True) if is_seen):
-        if len(session.photos[0].marks.pairs) >= 20:
-            return
-        if (
-            min(np.linalg.norm(np.subtract(p.xyz, point.xyz)) for _, p in session.model.registry)
-            > 1e-3
-        ):
-            ((u, v),) = case.instance.camera.project(
-                case.instance.cam_from_model.apply([point.xyz])
-            )
-            noise = rng.normal(size=2)
-            u, v = float(u + noise[0]), float(v + noise[1])
-            place(session, session.model.registry.add(point), [u, v])
-
-
 def corners_of(session: Session, count: int = 96) -> list[ModelKeypoint]:
     """Vertices of the model that are far from each other."""
     points = np.unique(session.model.cad.scene.mesh.vertices, axis=0)
@@ -199,19 +173,23 @@ def opened_page(
     *,
     width: int = 1366,
     height: int = 768,
-    scripts: Sequence[str] = (),
+    **options: Any,
 ) -> Iterator[Page]:
     """Serve a session and open its page, in which no error may occur until it is closed.
 
-    ``scripts`` run before those of the page.
+    What the server refuses (4xx) is none. ``options`` are a browser context's.
     """
-    context = browser.new_context(viewport={"width": width, "height": height})
+    context = browser.new_context(viewport={"width": width, "height": height}, **options)
     errors: list[str] = []
+
+    def note(message: ConsoleMessage) -> None:
+        if message.type == "error" and "status of 4" not in message.text:
+            errors.append(message.text)
+
     with served(session) as access:
         page = context.new_page()
         page.on("pageerror", lambda error: errors.append(str(error)))
-        for script in scripts:
-            page.add_init_script(script)
+        page.on("console", note)
         page.goto(access.url)
         wait(page, IDLE)
         yield page

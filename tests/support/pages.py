@@ -9,9 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from playwright.sync_api import Browser, BrowserContext, Locator, Page, expect
-
-from support.timing import Yardstick
+from playwright.sync_api import Browser, Locator, Page, expect
 
 Opened = Callable[..., Page]
 """Opens an address: ``script`` runs before the page's, console errors with ``allowed`` pass."""
@@ -93,27 +91,6 @@ def views_of(browser: Browser, address: str) -> Iterator[Shown]:
             return page
 
         yield show
-
-
-_USUAL_WORK = """() => {
-    const begin = performance.now();
-    const names = Array.from({ length: 40_000 }, (_, k) => ({ name: `${(k * 7919) % 40_000}` }));
-    const again = JSON.parse(JSON.stringify(names)).sort((a, b) => (a.name < b.name ? -1 : 1));
-    const list = document.createElement("div");
-    for (const { name } of again.slice(0, 3000)) {
-        list.append(Object.assign(document.createElement("p"), { textContent: name }));
-    }
-    document.body.append(list);
-    list.getBoundingClientRect();
-    list.remove();
-    return (performance.now() - begin) / 1000;
-}"""
-
-
-def page_yardstick(context: BrowserContext) -> Yardstick:
-    """Work of the kinds that a page does, in an empty one of its own: objects, text, layout."""
-    page = context.new_page()
-    return Yardstick(lambda: float(page.evaluate(_USUAL_WORK)), 0.2)
 
 
 _SHOW_PLOT = """(number) => {

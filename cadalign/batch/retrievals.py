@@ -54,8 +54,7 @@ class RetrieveRunOptions(ManyOptions):
     def learned(self) -> Path | None:
         return self.estimate.shape[0] if len(self.estimate.shape) == 1 else None
 
-    @property
-    def keypoints(self) -> ModelKeypoints:
+    def own_keypoints(self) -> ModelKeypoints:
         return self.estimate.opened()[0].keypoints
 
     def read(self, data: Any, where: str, *, folder: Path) -> Observation:
@@ -81,9 +80,8 @@ class RetrieveRunOptions(ManyOptions):
         }
         return Estimated(best.observation(seen), best.result, cells)
 
-    def contents(self) -> dict[str, Any]:
-        self.estimate.opened()  # which refuses what cannot be read
-        return super().contents()
+    def check_files(self) -> None:
+        self.estimate.opened()
 
 
 SPEC = replace(

@@ -10,22 +10,23 @@ import numpy as np
 import tyro
 
 from cadalign.cli.common import answer, make_folder_of, say
-from cadalign.cli.options import EvidenceOptions, named_as_flags
+from cadalign.cli.options import CameraOptions, named_as_flags
 from cadalign.datasets import ModelKeypoints, choose_object, read_image_keypoints
 from cadalign.datasets.detections.coco import decode_segmentation
 from cadalign.datasets.detections.image_keypoints import ImageKeypoints, observed_in
 from cadalign.errors import DataError
 from cadalign.geometry.plausible_camera import camera_doubts
-from cadalign.io.documents import in_file
+from cadalign.io.documents import convert, in_file
 from cadalign.io.evidence import ImageEvidence
 from cadalign.io.files import keeping
 from cadalign.io.images import write_image
 from cadalign.io.meshes.files import check_keypoints
-from cadalign.io.observation import Observation
+from cadalign.io.observation import Observation, ObservationChanges
+from cadalign.io.observation_file import SizeFields, read_size
 
 
 @dataclass(frozen=True)
-class Observe(EvidenceOptions):
+class Observe(CameraOptions):
     """Pair the keypoints of a detector in a photo with a model's.
 
     Writes an observation for `cadalign fit`, which takes a whole file of many objects itself.
@@ -54,6 +55,20 @@ class Observe(EvidenceOptions):
     """Leave out keypoints that the model does not have."""
     segmentation: bool = True
     """Take the mask beside the keypoints, COCO's polygons or run lengths."""
+    mask: Path | None = None
+    """Mask of the object, a grey PNG of the photo's size."""
+    size: Annotated[dict[str, float] | None, tyro.conf.arg(metavar="NAME LENGTH ...")] = None
+    """Known lengths of the object: width, height, length (along the model's x, y, z) and sigma,
+    their relative standard deviation, as in --size height 0.91 sigma 0.005."""
+
+    @property
+    def changes(self) -> ObservationChanges:
+        """Camera and evidence that the options give."""
+        evidence = {} if self.mask is None else {"mask": self.mask.resolve()}
+        size = None
+        if self.size is not None:
+            size = read_size(convert(self.size, SizeFields, where="--size"))
+        return replace(super().changes, evidence=evidence, size=size)
 
     def run(self) -> int:
         """Write the observation; returns the exit code."""

@@ -272,7 +272,7 @@ class DetectorOptions:
     model: Path | None = None
     """The model, whose keypoints those of a detector's file are paired with, by name, otherwise by
     semantic id, otherwise by order: NAME.keypoints.json, or the mesh that this lies beside. With
-    --shape, the shape's by default. Of `fit --mask` without an observation, the mesh."""
+    --shape, the shape's by default."""
     images: Path | None = None
     """Folder of the photos that a detector's file names."""
     min_score: float = 0.0

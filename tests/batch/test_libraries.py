@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 
 import pytest
-from support.refusals import refusal_line
 
 from cadalign import Library
 from cadalign.cli import main
@@ -51,15 +50,6 @@ def test_models_that_cannot_be_read_are_left_out(
     assert "Left out: 2 models with malformed annotations" in said
     assert "7 models: 4 bottle, 3 chair; 1 without a mesh" in said
     assert len(Library.open(tmp_path / "lib")) == 7
-
-
-def test_a_library_of_no_model_is_refused(
-    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (root / "annotations" / "chair.json").write_text("[]")
-    chairs = ["library", "build", root, "--categories", "chair"]
-    line = refusal_line(capsys, *chairs, "--out", tmp_path / "lib")
-    assert line == f"{root}: the data set has no such models"
 
 
 def test_a_library_that_is_written_can_be_opened(root: Path, tmp_path: Path) -> None:

@@ -18,7 +18,6 @@ from cadalign.datasets import write_sample_dataset
 from cadalign.errors import InputError
 from cadalign.evaluation.api import run as do_run
 from cadalign.evaluation.experiments.keypointnet import KeypointNetOptions
-from cadalign.evaluation.instances.pictures import cut_out
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.io.images import read_photo, write_image
 from cadalign.report import headline_text, write_report
@@ -113,14 +112,3 @@ def test_failed_fits_show_their_photos_and_keypoints(tmp_path: Path, opened: Ope
         for each in shown:
             middle = read_photo(each)[5, 5].astype(int)
             assert np.abs(middle - (40, 140, 90)).max() < 12
-
-
-def test_thumbnails_show_the_middle_of_the_object() -> None:
-    photo = np.zeros((480, 640, 3), dtype=np.uint8)
-    photo[300:340, 400:460] = 200
-    camera = Camera(640, 480, 600.0, 600.0, 319.5, 239.5)
-    thumb, _ = cut_out(photo, camera, np.array([[390.0, 290.0], [470.0, 350.0]]))
-    rows, columns = np.nonzero(thumb[:, :, 0] > 100)
-    middle = np.array(thumb.shape[:2]) / 2
-    np.testing.assert_allclose([rows.mean(), columns.mean()], middle, atol=2)
-    assert 0.1 < len(rows) / thumb[:, :, 0].size < 0.7

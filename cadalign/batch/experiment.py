@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
@@ -17,11 +17,7 @@ import numpy as np
 from cadalign.batch.observation_fit import ObservationFit, opened_shape
 from cadalign.batch.outputs import COLUMNS, RECORD_COLUMNS, draw_fit, naming_row, result_row
 from cadalign.batch.sources import ObservationTask, ObservationTasks
-from cadalign.datasets.detections.image_keypoints import (
-    ImageKeypoints,
-    observed_in,
-    photo_in,
-)
+from cadalign.datasets.detections.image_keypoints import ImageKeypoints, observed_in, photo_in
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.estimation.result import Result
@@ -42,12 +38,8 @@ _LEAST_CHUNKS = 64  # of a run, such that workers share the last ones evenly
 _ENCODER = msgspec.json.Encoder(enc_hook=np.generic.item)
 
 
-class Estimated(NamedTuple):
-    """Result of an observation, what it is the alignment of, and further cells of the tables."""
-
-    observation: Observation
-    result: Result
-    cells: Row
+Estimated = tuple[Observation, Result, Row]
+"""What is aligned, its result, and further cells of the tables."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +52,7 @@ class ManyOptions(ExperimentOptions):
     """Columns of the records beside those of every run."""
 
     inputs: tuple[Path, ...]
-    """Observation files, folders and patterns of such, JSON lines, files of detectors."""
+    """Observation files, folders of such, JSON lines, files of detectors."""
     changes: ObservationChanges = field(default_factory=ObservationChanges)
     """Takes the place of the observations' own."""
     detector: DetectorOptions = field(default_factory=DetectorOptions)
@@ -129,7 +121,7 @@ class FitRunOptions(ManyOptions):
         return self.estimate.read(data, where, folder=folder, changes=self.changes)
 
     def estimate_of(self, seen: Observation, where: str) -> Estimated:
-        return Estimated(seen, self.estimate.fit(seen, where), {})
+        return seen, self.estimate.fit(seen, where), {}
 
     def check_files(self) -> None:
         if self.estimate.shape is not None:

@@ -50,8 +50,8 @@ def fit_many(
     Parameters
     ----------
     observations : path, or iterable of path or of Observation
-        Observation files, folders and patterns of such, JSON lines, and detectors' files (COCO's
-        JSON or CSV); or observations, for example of a generator, which are first written to
+        Observation files, folders of such, JSON lines, and detectors' files (COCO's JSON or CSV);
+        or observations, for example of a generator, which are first written to
         ``observations.jsonl`` in the run's folder.
     out : path-like, optional
         The run's folder: ``results.parquet`` and ``results.csv``, and what `Results.open` needs.

@@ -78,7 +78,7 @@ class RetrieveRunOptions(ManyOptions):
             "top_scores": [match.score for match in matches],
             "matches": dense_json([match.to_dict() for match in matches]),
         }
-        return Estimated(best.observation(seen), best.result, cells)
+        return best.observation(seen), best.result, cells
 
     def check_files(self) -> None:
         self.estimate.opened()

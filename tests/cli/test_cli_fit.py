@@ -83,12 +83,6 @@ def test_json_goes_to_standard_output_and_nothing_else_does(
     assert len(data["views"][0]["residuals"]) == 10
 
 
-def test_method_is_chosen_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write_observation(tmp_path / "chair.json")
-    assert main(["fit", str(path), "--method", "aepnp"]) == 0
-    assert capsys.readouterr().out.startswith("aepnp: 10 keypoints, rms ")
-
-
 @pytest.mark.parametrize(
     ("stored", "flags", "options"),
     [
@@ -98,11 +92,6 @@ def test_method_is_chosen_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[
         ({"sigma": 3.0}, ["--sigma", "none"], {"sigma": None}),
         ({}, ["--similar", "--sigma", "2"], {"sigma": 2.0, "stretch_sigma": 0.2}),
         ({}, [], {"sigma": SIGMA}),
-        (
-            {},
-            ["--sigma", "2", "--loss", "cauchy", "--stretch", "y"],
-            {"sigma": 2.0, "loss": "cauchy", "stretch": "y"},
-        ),
     ],
 )
 def test_options_are_those_of_the_command_or_of_the_file(
@@ -266,30 +255,12 @@ def test_photo_that_cannot_be_used(tmp_path: Path, capsys: pytest.CaptureFixture
     )
 
 
-def test_model_that_cannot_be_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    model = tmp_path / "model.obj"
-    path = write_observation(tmp_path / "chair.json", model=model)
-    assert refusal_line(capsys, "fit", path) == f"{model}: no such file"
-
-
-def test_photo_sizes_that_cannot_be_drawn(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    size, path = 10**30, write_observation(tmp_path / "chair.json")
-    edit(path, lambda data: data["camera"].update(width=size))
-    assert refusal_line(capsys, "fit", str(path)) == (
-        f"camera: {size} x 480 px is too large to be drawn; the limits are 16384 px a side and "
-        "100 megapixels; scale the camera down"
-    )
-
-
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
         (("fit", "a\0b.json"), r"'a\x00b.json': the path holds a NUL character"),
         (("fit", "{file}", "--out", "a\0b"), r"'a\x00b': the path holds a NUL character"),
         (("report", "a\0b"), r"'a\x00b': the path holds a NUL character"),
-        (("report", "a\0b", "--format", "md"), r"'a\x00b': the path holds a NUL character"),
     ],
 )
 def test_paths_with_a_nul(

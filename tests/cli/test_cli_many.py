@@ -102,28 +102,6 @@ def test_a_detectors_file_needs_no_observations(
     assert "--model: the keypoints of the model are not known; give the" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", ["K.txt", "model.keypoints.json"])
-def test_a_run_does_not_go_on_with_another_camera_or_model(
-    folder: Path, capsys: pytest.CaptureFixture[str], name: str
-) -> None:
-    arguments = ["fit", str(folder / "found.json"), "--camera", str(folder / "K.txt")]
-    arguments += ["--model", str(folder / "model.keypoints.json"), "--no-picture"]
-    assert main([*arguments, "--out", str(folder / "out")]) == 0
-    if name == "K.txt":
-        np.savetxt(folder / name, np.diag([2, 2, 1]) @ CAMERA.matrix)
-    else:
-        rows = zip(NAMES, (1.5 * POINTS).tolist(), strict=True)
-        moved = (ModelKeypoint(each, tuple(xyz)) for each, xyz in rows)
-        ModelKeypoints(tuple(moved)).save(folder / name)
-    capsys.readouterr()
-    assert main([*arguments, "--out", str(folder / "out")]) == 1
-    text = capsys.readouterr().err
-    assert f"holds a run with another configuration: files.{folder / name} is " in text
-    main([*arguments, "--out", str(folder / "again")])  # what this process has read is not kept
-    row = next(csv.DictReader((folder / "again" / "results.csv").open()))
-    assert float(row["focal_length"]) == (1400 if name == "K.txt" else 700)
-
-
 def test_a_camera_that_cannot_be_read_is_refused_before_the_run(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -140,7 +118,6 @@ def test_what_is_wrong_with_the_inputs_is_one_line(
 ) -> None:
     out = ["--out", str(folder / "out")]
     for arguments, text in [
-        (["no such*.json"], "no such*.json: no file matches"),
         ([str(folder / "a.png"), "b.json"], "a photo, not an observation"),
         ([str(folder / "gone.jsonl")], "gone.jsonl: no such file"),
     ]:
@@ -148,13 +125,6 @@ def test_what_is_wrong_with_the_inputs_is_one_line(
         shown = capsys.readouterr().err
         assert text in shown
         assert "Traceback" not in shown
-
-
-def test_several_files_are_fitted_as_a_folder_is(folder: Path) -> None:
-    written = write_observations(folder)
-    files = [str(written / f"{name}.json") for name in ("a_0", "b")]
-    assert main(["fit", *files, "--out", str(folder / "out"), "--stretch", "y"]) == 0
-    assert [found.stretched_axes for found in Results.open(folder / "out")] == ["y", "y"]
 
 
 def test_matrix_takes_the_place_of_the_camera(folder: Path) -> None:

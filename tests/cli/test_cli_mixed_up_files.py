@@ -10,7 +10,6 @@ import pytest
 from support.files import TETRAHEDRON
 from support.refusals import refusal_line
 
-import cadalign
 from cadalign.cli import main
 from cadalign.evaluation.simulation import simulate_problem
 from cadalign.io.images import write_image
@@ -56,11 +55,6 @@ def test_mesh_is_no_observation(
     line = refusal_line(capsys, name, mesh, *options)
     assert line.startswith(f"{mesh}: a mesh, not an observation")
     assert f"cadalign annotate PHOTO {mesh}" in line
-
-
-def test_photo_is_no_query(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    line = refusal_line(capsys, "retrieve", "photo.png", "--library", "none.library")
-    assert line.startswith("photo.png: a photo, not an observation")
 
 
 def test_observation_and_fit_are_told_apart(
@@ -137,9 +131,8 @@ def test_unknown_field_is_answered_by_fields(
     assert "--" not in line
 
 
-def test_folder_is_no_mesh(folder: Path) -> None:
-    with pytest.raises(cadalign.errors.DataError, match="a folder, not a mesh file"):
-        cadalign.load_mesh(folder)
+def test_folder_is_no_mesh(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "a folder, not a mesh file" in refusal_line(capsys, "render", folder)
 
 
 def test_exchanged_arguments_are_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

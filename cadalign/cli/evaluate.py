@@ -61,7 +61,6 @@ class RunCommand(JsonOption, RunOptions):
         """Do the run, showing its progress; gives its specification and its tables."""
         from cadalign.evaluation.api import prepared
         from cadalign.evaluation.runs.engine import execute
-        from cadalign.evaluation.runs.folder import RunFolder
 
         kind = self.options_type
         # What modules of users print is not the command's output.

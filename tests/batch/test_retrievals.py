@@ -136,18 +136,6 @@ def test_a_query_that_fails_is_a_row(
     assert "1 of 5 retrieved, 4 failed" in capsys.readouterr().err
 
 
-def test_another_library_is_another_run(
-    case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "lib"
-    run = ["--library", str(path), "--out", str(tmp_path / "run"), "--no-picture"]
-    case.library.save(path)
-    assert main(["retrieve", str(case.queries), *run]) == 0
-    Library.from_models(list(case.library)[:5]).save(path)
-    assert main(["retrieve", str(case.queries), *run]) == 1
-    assert f"another configuration: files.{path} is" in capsys.readouterr().err
-
-
 def test_a_match_is_a_result(case: Case, tmp_path: Path) -> None:
     model = case.library["chair", "sample_chair_001"]
     pose = look_at(azimuth=40.0, elevation=20.0, distance=2.6, scale=(1.0, 1.2, 0.9))

@@ -15,7 +15,6 @@ import cadalign
 from cadalign import Alignment, Camera, Observation
 from cadalign.batch.spec import SPEC, FitRun
 from cadalign.datasets import write_sample_dataset
-from cadalign.errors import InputError
 from cadalign.evaluation.api import run as do_run
 from cadalign.evaluation.experiments.keypointnet import KeypointNetOptions
 from cadalign.evaluation.runs.folder import RunFolder
@@ -86,14 +85,6 @@ def test_a_run_stands_beside_one_with_truth(
     assert "truth" in headline_text(chosen, format="md")
     page = opened(path.as_uri(), viewport={"width": 1280, "height": 900})
     expect(page.locator("table.headline").first).to_be_visible()
-
-
-def test_runs_without_instances_are_for_a_page_of_their_own(
-    runs: dict[str, Path], tmp_path: Path
-) -> None:
-    cadalign.simulate(sweep="points", runs=1, values=(10,), out=tmp_path / "sim", workers=0)
-    with pytest.raises(InputError, match=r"sim is a run of .*, plain one of fit; write a report"):
-        write_report([runs["plain"], tmp_path / "sim"], tmp_path / "r.html")
 
 
 def test_failed_fits_show_their_photos_and_keypoints(tmp_path: Path, opened: Opened) -> None:

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from support.exported import CAMERA, KEYPOINTS, POSE, photo_of, turned, wedge
 
-from cadalign import Model, Result, ShapeModel, View, align, fit
+from cadalign import Result, ShapeModel, View, align
 from cadalign.cli import main
 from cadalign.datasets import load_mesh
 from cadalign.errors import InputError
@@ -131,28 +131,6 @@ def test_views_and_warped_mesh_of_a_joint_fit(tmp_path: Path, observed: Path) ->
     assert np.linalg.norm(mesh.vertices[[0, 1]] - placed[[0, 1]], axis=1).max() < 0.02
     assert (
         np.linalg.norm(POSE.apply(wedge().vertices)[[0, 1]] - placed[[0, 1]], axis=1).max() > 0.02
-    )
-
-
-def test_results_export_themselves(tmp_path: Path) -> None:
-    pixels = CAMERA.project(POSE.apply(MORE))
-    plain = fit(MORE, pixels, CAMERA)
-    path = plain.export(tmp_path / "plain.ply", mesh=wedge())
-    np.testing.assert_allclose(
-        load_mesh(path).vertices, plain.alignment.apply(wedge().vertices), atol=1e-5
-    )
-    again = Result.from_dict(plain.to_dict())
-    again.export(tmp_path / "again.ply", mesh=wedge(), frame="model")
-    np.testing.assert_allclose(
-        load_mesh(tmp_path / "again.ply").vertices,
-        wedge().vertices * plain.alignment.scale,
-        atol=1e-5,
-    )
-    view = View(CAMERA, pixels)
-    joint = align(Model(points_3d=MORE, mesh=wedge()), view)
-    path = joint.export(tmp_path / "joint.obj")
-    np.testing.assert_allclose(
-        load_mesh(path).vertices, joint.alignment.apply(wedge().vertices), atol=1e-5
     )
 
 

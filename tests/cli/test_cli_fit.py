@@ -113,9 +113,7 @@ def test_options_are_those_of_the_command_or_of_the_file(
     [
         ([], {}, 0.2),
         ([], {"stretch_sigma": 0.1}, 0.1),
-        ([], {"stretch_sigma": None}, None),
         (["--stretch", "none"], {}, None),
-        (["--method", "aepnp"], {}, None),
     ],
 )
 def test_similar_model_has_similar_proportions(
@@ -128,15 +126,8 @@ def test_similar_model_has_similar_proportions(
     path = write_observation(tmp_path / "chair.json", fit_options=stored)
     assert main(["fit", str(path), "--similar", *flags]) == 0
     options: dict[str, Any] = {"stretch": "none"} if "none" in flags else {}
-    options |= {"method": "aepnp"} if "aepnp" in flags else {}
-    expected = fit(
-        PROBLEM.points_3d,
-        PROBLEM.points_2d,
-        PROBLEM.camera,
-        sigma=None,
-        stretch_sigma=prior,
-        **options,
-    )
+    options |= {"sigma": None, "stretch_sigma": prior}
+    expected = fit(PROBLEM.points_3d, PROBLEM.points_2d, PROBLEM.camera, **options)
     assert capsys.readouterr().out == f"{expected}\n"
 
 
@@ -282,15 +273,24 @@ def test_output_folder_that_cannot_be_made(
 
 
 @pytest.mark.parametrize(
-    "arguments", [[], ["fit"], ["fit", "a.json", "--nonsense"], ["align", "a.json"]]
+    ("arguments", "text"),
+    [
+        ([], "fit"),
+        (["fit"], "OBSERVATION: no observation is given"),
+        (["fit", "a.json", "--nonsense"], "--nonsense"),
+        (["align", "a.json"], "align"),
+        (["annotate", "photo.jpg"], "MODEL"),
+    ],
 )
 def test_wrong_command_lines_exit_with_2(
-    arguments: list[str], capsys: pytest.CaptureFixture[str]
+    arguments: list[str], text: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as caught:
         main(arguments)
     assert caught.value.code == 2
-    assert "Traceback" not in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert text in said
+    assert "Traceback" not in said
 
 
 # --- as a process ----------------------------------------------------------------------------

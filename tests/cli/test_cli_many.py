@@ -113,20 +113,6 @@ def test_a_camera_that_cannot_be_read_is_refused_before_the_run(
     assert not (folder / "out").exists()
 
 
-def test_what_is_wrong_with_the_inputs_is_one_line(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = ["--out", str(folder / "out")]
-    for arguments, text in [
-        ([str(folder / "a.png"), "b.json"], "a photo, not an observation"),
-        ([str(folder / "gone.jsonl")], "gone.jsonl: no such file"),
-    ]:
-        assert main(["fit", *arguments, *out]) == 1
-        shown = capsys.readouterr().err
-        assert text in shown
-        assert "Traceback" not in shown
-
-
 def test_matrix_takes_the_place_of_the_camera(folder: Path) -> None:
     path = write_observations(folder) / "b.json"
     np.save(folder / "K.npy", CAMERA.matrix * [[1.1], [1.1], [1]])
@@ -140,8 +126,6 @@ def test_matrix_takes_the_place_of_the_camera(folder: Path) -> None:
     ("option", "text"),
     [
         ("--min-score 0.5", "--min-score: has no effect on one observation; leave it out"),
-        ("--model m.keypoints.json", "--model: has no effect on one observation; leave it out"),
-        ("--images photos", "--images: has no effect on one observation; leave it out"),
         ("--workers 2", "--workers: has no effect on one observation; leave it out"),
     ],
 )
@@ -211,20 +195,3 @@ def test_messages_name_what_the_user_typed(
     assert main([word.format(folder=folder) for word in arguments]) == 1
     shown = capsys.readouterr().err
     assert text.format(folder=folder) in shown
-
-
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (["annotate"], "PHOTO"),
-        (["annotate", "photo.jpg"], "MODEL"),
-        (["fit"], "OBSERVATION"),
-    ],
-)
-def test_missing_arguments_exit_with_2(
-    arguments: list[str], text: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main(arguments)
-    assert stop.value.code == 2
-    assert text in capsys.readouterr().err

@@ -30,7 +30,6 @@ from cadalign.io.observation import DetectorOptions, Observation, ObservationCha
 
 _FEW = 200  # observations, which are aligned sooner than processes start
 _SPOOL = "observations.jsonl"
-_NO_OPTIONS = ("fitting", "evidence", "size")  # evidence stands in observations
 
 Observed = str | os.PathLike[str] | Iterable[str | os.PathLike[str]] | Iterable[Observation]
 
@@ -139,10 +138,9 @@ def options_of(given: dict[str, Any]) -> FitRunOptions:
     """The options of a run by their names, without inputs; see `fit_many`."""
     kinds: tuple[Any, ...] = (ObservationFit, FitOptions, DetectorOptions, ObservationChanges)
     owners = {each.name: kind for kind in reversed(kinds) for each in fields(kind)}
-    owners = {name: kind for name, kind in owners.items() if name not in _NO_OPTIONS}
     parts: dict[Any, dict[str, Any]] = {kind: {} for kind in kinds}
     for name, value in given.items():
-        if name not in owners:
+        if name not in owners or name == "fitting":
             raise unknown("option", name, owners, where=name)
         if value is not None:
             is_length = name == "focal" and is_number(value)

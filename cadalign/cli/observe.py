@@ -16,13 +16,12 @@ from cadalign.datasets.detections.coco import decode_segmentation
 from cadalign.datasets.detections.image_keypoints import ImageKeypoints, observed_in
 from cadalign.errors import DataError
 from cadalign.geometry.plausible_camera import camera_doubts
-from cadalign.io.documents import convert, in_file
+from cadalign.io.documents import in_file
 from cadalign.io.evidence import ImageEvidence
 from cadalign.io.files import keeping
 from cadalign.io.images import write_image
 from cadalign.io.meshes.files import check_keypoints
-from cadalign.io.observation import Observation, ObservationChanges
-from cadalign.io.observation_file import SizeFields, read_size
+from cadalign.io.observation import Observation
 
 
 @dataclass(frozen=True)
@@ -48,27 +47,8 @@ class Observe(CameraOptions):
     """Number of the object in the photo, from 0; by default the one with the highest score."""
     min_score: float = 0.0
     """Least score of a keypoint that is kept."""
-    weigh: float | None = None
-    """Use the scores as weights: standard deviation of a keypoint with score 1 [px]; half the score
-    is twice that."""
     ignore_unknown: bool = False
     """Leave out keypoints that the model does not have."""
-    segmentation: bool = True
-    """Take the mask beside the keypoints, COCO's polygons or run lengths."""
-    mask: Path | None = None
-    """Mask of the object, a grey PNG of the photo's size."""
-    size: Annotated[dict[str, float] | None, tyro.conf.arg(metavar="NAME LENGTH ...")] = None
-    """Known lengths of the object: width, height, length (along the model's x, y, z) and sigma,
-    their relative standard deviation, as in --size height 0.91 sigma 0.005."""
-
-    @property
-    def changes(self) -> ObservationChanges:
-        """Camera and evidence that the options give."""
-        evidence = {} if self.mask is None else {"mask": self.mask.resolve()}
-        size = None
-        if self.size is not None:
-            size = read_size(convert(self.size, SizeFields, where="--size"))
-        return replace(super().changes, evidence=evidence, size=size)
 
     def run(self) -> int:
         """Write the observation; returns the exit code."""
@@ -86,13 +66,11 @@ class Observe(CameraOptions):
                 image=None if self.image is None else self.image.resolve(),
                 min_score=self.min_score,
                 ignore_unknown=self.ignore_unknown,
-                sigma_from_scores=self.weigh,
             )
         out = self.out or self.keypoints.with_suffix(".observation.json")
-        inputs = [self.keypoints, self.model, model.model, self.camera, self.image]
-        with keeping([*inputs, self.mask]):
+        with keeping([self.keypoints, self.model, model.model, self.camera, self.image]):
             make_folder_of(out)
-            if self.mask is None and found.segmentation is not None and self.segmentation:
+            if found.segmentation is not None:
                 mask = self._write_mask(observation, found, out.with_suffix(".mask.png"))
                 observation = replace(observation, evidence=ImageEvidence(mask=mask))
             observation.save(out)

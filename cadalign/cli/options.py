@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 
-_FLAGS = {"fov_x": "--fov", "number": "--object", "sigma_from_scores": "--weigh"}
+_FLAGS = {"fov_x": "--fov", "number": "--object"}
 """Arguments of the library's functions that have another name on the command line."""
 
 

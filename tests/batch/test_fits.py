@@ -275,9 +275,8 @@ def test_names_of_numpy_are_texts() -> None:
 
 
 def test_the_contents_are_those_of_every_file_that_options_name(tmp_path: Path) -> None:
-    names = ("K.txt", "mask.png", "depth.npy", "model.keypoints.json")
-    camera, mask, depth, model = paths = [tmp_path / name for name in names]
-    changes = ObservationChanges(camera=camera, evidence={"mask": mask, "depth": depth})
+    camera, model = paths = [tmp_path / name for name in ("K.txt", "model.keypoints.json")]
+    changes = ObservationChanges(camera=camera)
     detector = DetectorOptions(model=model, images=tmp_path)
     options = FitRunOptions(inputs=(tmp_path / "o.json",), changes=changes, detector=detector)
     seen = [options.contents()]

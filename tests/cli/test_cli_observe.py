@@ -144,16 +144,6 @@ def test_focal_length_or_field_of_view_is_given_in_the_command(
         assert message in capsys.readouterr().err
 
 
-def test_scores_can_weigh_instead(folder: Path) -> None:
-    observe(folder, "--image", str(folder / "photo.jpg"), "--weigh", "2", "--min-score", ".5")
-    observation = Observation.load(folder / "found.observation.json")
-    assert observation.scores is None
-    assert observation.sigma is not None
-    assert observation.sigma.min() >= 2.0
-    assert observation.sigma.max() <= 4.0
-    assert len(observation.points_2d) < 24
-
-
 @pytest.mark.parametrize(
     ("options", "text"),
     [
@@ -219,37 +209,6 @@ def test_mask_that_a_fit_cannot_use_is_left_out(
     assert observe(masked, "--image", str(masked / "photo.jpg")) == 0
     assert capsys.readouterr().err == "The mask is left out: a fit to it needs --camera.\n"
     assert Observation.load(masked / "found.observation.json").is_plain
-    camera = ["--camera", str(masked / "camera.json")]
-    assert observe(masked, *camera, "--no-segmentation") == 0
-    assert Observation.load(masked / "found.observation.json").is_plain
-
-
-def test_options_give_mask_and_size(masked: Path) -> None:
-    Image.fromarray(np.full((480, 640), 255, dtype=np.uint8)).save(masked / "mask.png")
-    options = ["--camera", masked / "camera.json", "--mask", masked / "mask.png"]
-    assert observe(masked, *map(str, options), "--size", "height", ".9", "sigma", ".02") == 0
-    observation = Observation.load(masked / "found.observation.json")
-    assert observation.evidence.mask == masked / "mask.png"
-    assert observation.size is not None
-    assert observation.size.given == {"height": 0.9, "sigma": 0.02}
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        (["--mask", "{folder}/small.png"], "{folder}/small.png: the image has 8 x 6 pixels, "),
-        (["--mask", "{folder}/photo.jpg"], "{folder}/photo.jpg: the image has the mode RGB; give"),
-        (["--size", "height", "-1"], "--size.height: -1.0 is not a positive number"),
-        (["--size", "depth", "1"], "--size: unknown field 'depth'; known are height, length, "),
-    ],
-)
-def test_evidence_that_cannot_be_used_is_refused(
-    masked: Path, capsys: pytest.CaptureFixture[str], options: list[str], text: str
-) -> None:
-    Image.new("L", (8, 6)).save(masked / "small.png")
-    given = [option.format(folder=masked) for option in options]
-    line = refusal_line(capsys, *observing(masked, "--camera", str(masked / "camera.json"), *given))
-    assert line.startswith(text.format(folder=masked))
 
 
 def coco(folder: Path, **changes: Any) -> Path:

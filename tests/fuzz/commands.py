@@ -22,7 +22,7 @@ _VALUES = [
 _COMMANDS: dict[str, list[str]] = {
     "fit": ["--method", "--loss", "--stretch", "--focal", "--sigma", "--robust", "--similar",
             "--json", "--out", "--shape", "--shape-sigma", "--use-photo", "--model"],
-    "observe": ["--image", "--out", "--object", "--min-score", "--weigh", "--mask"],
+    "observe": ["--image", "--out", "--object", "--min-score"],
     "retrieve": ["--library", "--out", "--top", "--category", "--json", "--loss"],
     "render": ["--out", "--width", "--height", "--view", "--keypoints"],
     "report": ["--out", "--format"],

@@ -48,8 +48,6 @@ class ManyOptions(ExperimentOptions):
 
     columns: ClassVar[Columns] = ()
     """Columns of the table beside those of every run."""
-    record_columns: ClassVar[Columns] = ()
-    """Columns of the records beside those of every run."""
 
     inputs: tuple[Path, ...]
     """Observation files, folders of such, JSON lines, files of detectors."""
@@ -173,16 +171,13 @@ class ManyEstimates:
     """The keypoints that a detector's are paired with."""
     folder: RunFolder | None = field(default=None, repr=False)
     """The folder that pictures go to; none are drawn without."""
+    record_columns: Columns = RECORD_COLUMNS
+    """The columns of the table of observations and results."""
 
     @property
     def columns(self) -> Columns:
         """The columns of the table."""
         return COLUMNS + self.options.columns
-
-    @property
-    def record_columns(self) -> Columns:
-        """The columns of the table of observations and results."""
-        return (RECORD_COLUMNS[0], *self.options.record_columns, *RECORD_COLUMNS[1:])
 
     def evaluate(self, tasks: Sequence[ObservationTask]) -> list[Row]:
         """The rows of some observations."""

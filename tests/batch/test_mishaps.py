@@ -98,16 +98,6 @@ def test_a_photo_that_cannot_be_read_is_a_warning_of_its_row(
     assert "; 2 with warnings: picture 2" in page
 
 
-def test_a_mask_that_cannot_be_read_fails_its_row_alone(tmp_path: Path) -> None:
-    (tmp_path / "broken.png").write_bytes(b"no mask")
-    source = lines(tmp_path / "o.jsonl", 1, mask="broken.png")
-    source.write_text(source.read_text() + lines(tmp_path / "p.jsonl", 1).read_text())
-    assert main(["fit", str(source), "--no-picture", "--out", str(tmp_path / "run")]) == 3
-    bad, good = rows_of(tmp_path / "run")
-    assert (bad["status"], good["status"]) == ("failed", "ok")
-    assert "broken.png" in bad["reason"]
-
-
 def test_a_wrong_model_name_is_a_warning_of_its_row_and_refused_for_all(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -165,10 +165,6 @@ def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
         ),
         (["fit", "{folder}/empty"], "{folder}/empty: the folder holds no observation; "),
         (
-            ["observe", "{folder}/found.json", "{folder}/model.keypoints.json"],
-            "--image: 2 images; choose one of a.png, b.png",
-        ),
-        (
             ["observe", "{folder}/found.json", "{folder}/model.keypoints.json", "--image", "a.png"],
             "--object: 2 objects in the image, and no scores to choose by; choose one, 0 to 1",
         ),

@@ -99,11 +99,6 @@ def test_present_folder_is_fitted(folder: Path, monkeypatch: pytest.MonkeyPatch)
     assert (folder / "here_fit" / "results.csv").is_file()
 
 
-def test_only_file_that_fails_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["fit", "seen.json", "gone.json", "--no-picture"]) == 3
-    assert "failed 1: gone.json: no such file" in capsys.readouterr().err
-
-
 def test_keypoints_of_the_model_are_none_of_a_photo(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -212,15 +212,13 @@ class ObservationFit:
         from cadalign.estimation.align import align
 
         model = self._model(observation, where, options)
-        stated, has_photos = self.stated_sigma(observation), self.uses_photos(observation)
+        has_photos = self.uses_photos(observation)
         if has_photos and all(image.image is None for image in observation.views):
             fix = "write its path as image into the file, or leave the option away"
             raise InputError("the observation names no photo", where="use_photo", fix=fix)
         with in_file(where):
-            sigma = stated.get("sigma")
-            views = views_of(observation, model, sigma=sigma, with_photos=has_photos)
-        if stated and sigma is None:
-            views = tuple(replace(view, sigma=None) for view in views)
+            stated = self.stated_sigma(observation)
+            views = views_of(observation, model, with_photos=has_photos, **stated)
         with self._located(where):
             return align(
                 model,

@@ -55,10 +55,10 @@ def views_of(
     observation: Observation,
     model: Model | ShapeModel,
     *,
-    sigma: Sigma | None = None,
     with_photos: bool = False,
+    **stated: Sigma | None,
 ) -> tuple[View, ...]:
-    """Evidence of an observation's images about a model, at its sigma or at that given [px].
+    """Evidence of an observation's images about a model, at a stated ``sigma`` or at its own [px].
 
     A learned shape's keypoints are found by semantic id or by name, as the shape has them; a sigma
     is 1 where none is known. Photos themselves are evidence where these are asked for.
@@ -66,23 +66,22 @@ def views_of(
     Raises InputError if the shape has no such keypoints, the observation has no ids or names, one
     occurs twice, or what is said of an image is invalid; DataError if a file cannot be read.
     """
-    own = own_ids(observation.views)
+    labels = own_ids(observation.views)
     views = []
     for number, image in enumerate(observation.views):
         with within(f"views[{number}]") if observation.others else nullcontext():
-            ids = shape_ids(image, model) if isinstance(model, ShapeModel) else own[number]
+            ids = shape_ids(image, model) if isinstance(model, ShapeModel) else labels[number]
             evidence = image.evidence.given
             if image.depths is not None:
                 evidence["depth"] = image.depths
-            own_sigma = 1.0 if image.sigma is None else image.sigma
+            own = {"sigma": 1.0 if image.sigma is None else image.sigma}
             view = View(
                 image.camera,
                 image.points_2d,
                 ids=ids,
-                sigma=own_sigma if sigma is None else sigma,
                 scores=image.scores,
                 image=image.image if with_photos else None,
-                **evidence,
+                **evidence | own | stated,
             )
             views.append(view)
     return tuple(views)

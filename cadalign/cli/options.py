@@ -44,7 +44,8 @@ def named_as_flags(*options: DataclassInstance, **others: str) -> Iterator[None]
 
 def flags_of(*options: DataclassInstance) -> dict[str, str]:
     """The command line's options by the names of fields."""
-    return {field.name: flag_of(field.name) for each in options for field in fields(each)}
+    names = [field.name for each in options for field in fields(each)]
+    return {name: "--" + name.replace("_", "-") for name in names}
 
 
 def with_flags(text: str | None, flags: Mapping[str, str]) -> str | None:
@@ -55,11 +56,6 @@ def with_flags(text: str | None, flags: Mapping[str, str]) -> str | None:
             if "_" in name:
                 text = re.sub(rf"(?<![\w-]){name}(?!\w)", flag, text)
     return text
-
-
-def flag_of(name: str) -> str:
-    """The command line's option for a field."""
-    return "--" + name.replace("_", "-")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -203,6 +203,19 @@ def test_warped_mesh_is_drawn(tmp_path: Path, numbered: ShapeModel) -> None:
     assert (drawn[0] != drawn[1]).any(axis=2).mean() > 0.01  # the box takes 0.07 of the image
 
 
+def test_a_shape_that_was_replaced_is_not_exported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
+) -> None:
+    numbered.save(tmp_path / "box.shape")
+    path = write(tmp_path, shape=tmp_path / "box.shape")
+    assert main(["fit", str(path), "--no-picture"]) == 0
+    boxes(range(1, 9)).save(tmp_path / "box.shape")
+    capsys.readouterr()
+    line = refusal_line(capsys, "export", tmp_path / "box_fit", "--to", tmp_path / "box.glb")
+    what = f"{tmp_path / 'box.shape'}: 8 keypoints that are not the fit's 8; fit the observation"
+    assert what in line
+
+
 # --- what it refuses -------------------------------------------------------------------------
 
 

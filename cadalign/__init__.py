@@ -7,7 +7,6 @@ from cadalign.names import lazy_names
 if TYPE_CHECKING:
     from cadalign import datasets, errors, geometry, metrics, render, retrieval, shapes, solvers
     from cadalign.batch.fits import fit_many
-    from cadalign.batch.observed import views_from
     from cadalign.errors import CadalignError
     from cadalign.estimation.align import align, align_batch
     from cadalign.estimation.fit import fit, fit_batch
@@ -70,7 +69,6 @@ __all__ = [
     "shapes",
     "simulate",
     "solvers",
-    "views_from",
 ]
 
 __getattr__ = lazy_names(__name__)

@@ -8,9 +8,13 @@ from typing import Literal
 
 
 @dataclass(frozen=True, kw_only=True)
-class FileOptions:
-    """The files beside photos and model, and the object's shape."""
+class SessionOptions:
+    """Photos, model, the files beside them, and the object's shape."""
 
+    image: Path
+    """A photo, or a folder of photos."""
+    model: Path
+    """OBJ, PLY, GLB, glTF, STL or OFF file."""
     observation: Path | None = None
     """Observation file of a single photo, continued if it exists; by default beside the photo."""
     out: Path | None = None
@@ -33,13 +37,3 @@ class FileOptions:
     shape_sigma: float | None = None
     """Estimate the object's own shape from the model's: standard deviation of the keypoints'
     positions on the object about those on the stretched model [model units]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SessionOptions(FileOptions):
-    """Photos, model, and the files beside them."""
-
-    image: Path
-    """A photo, or a folder of photos."""
-    model: Path
-    """OBJ, PLY, GLB, glTF, STL or OFF file."""

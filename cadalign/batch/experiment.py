@@ -5,22 +5,19 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
 
-from cadalign.batch.observation_fit import ObservationFit
-from cadalign.batch.outputs import COLUMNS, RECORD_COLUMNS, naming_row, result_row
+from cadalign.batch.observation_fit import ObservationFit, opened_shape
+from cadalign.batch.outputs import COLUMNS, RECORD_COLUMNS, draw_fit, naming_row, result_row
 from cadalign.batch.sources import ObservationTask, ObservationTasks
-from cadalign.datasets.detections.image_keypoints import (
-    ImageKeypoints,
-    observed_in,
-    photo_in,
-)
+from cadalign.datasets.detections.image_keypoints import ImageKeypoints, observed_in, photo_in
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.estimation.result import Result
@@ -30,10 +27,9 @@ from cadalign.evaluation.runs.work import Columns, Plan, Row, fingerprint
 from cadalign.export.tables import failed_row
 from cadalign.io.documents import in_file, parse_json
 from cadalign.io.evidence import ObservedImage
-from cadalign.io.files import read_bytes, read_text
+from cadalign.io.files import read_bytes
 from cadalign.io.images import photo_size, require_one_size
 from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
-from cadalign.shapes.model import ShapeModel
 
 LARGEST_CHUNK = 256
 """Most observations that a worker gets at a time, as of every long run."""
@@ -42,12 +38,8 @@ _LEAST_CHUNKS = 64  # of a run, such that workers share the last ones evenly
 _ENCODER = msgspec.json.Encoder(enc_hook=np.generic.item)
 
 
-class Estimated(NamedTuple):
-    """Result of an observation, what it is the alignment of, and further cells of the tables."""
-
-    observation: Observation
-    result: Result
-    cells: Row
+Estimated = tuple[Observation, Result, Row]
+"""What is aligned, its result, and further cells of the tables."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,11 +48,9 @@ class ManyOptions(ExperimentOptions):
 
     columns: ClassVar[Columns] = ()
     """Columns of the table beside those of every run."""
-    record_columns: ClassVar[Columns] = ()
-    """Columns of the records beside those of every run."""
 
     inputs: tuple[Path, ...]
-    """Observation files, folders and patterns of such, JSON lines, files of detectors."""
+    """Observation files, folders of such, JSON lines, files of detectors."""
     changes: ObservationChanges = field(default_factory=ObservationChanges)
     """Takes the place of the observations' own."""
     detector: DetectorOptions = field(default_factory=DetectorOptions)
@@ -81,10 +71,18 @@ class ManyOptions(ExperimentOptions):
         """The learned shape that keypoints of detectors may be named after."""
         raise NotImplementedError
 
-    @property
-    def keypoints(self) -> ModelKeypoints | None:
+    def own_keypoints(self) -> ModelKeypoints:
         """Those that a detector's are paired with, where no model's are given."""
-        return None if self.learned is None else _keypoints_of_shape(self.learned)
+        if self.learned is None:
+            fix = "give the model's NAME.keypoints.json, or a learned shape"
+            what = "the keypoints of the model are not known"
+            raise InputError(what, where="model", fix=fix)
+        shape = opened_shape(self.learned)
+        named = isinstance(shape.ids[0], str)
+        pairs = zip(shape.ids, shape.components[0].mean.tolist(), strict=False)
+        return ModelKeypoints(
+            tuple(ModelKeypoint(str(k), tuple(xyz), None if named else int(k)) for k, xyz in pairs)
+        )
 
     def read(self, data: Any, where: str, *, folder: Path) -> Observation:
         """Read the parsed form of an observation, which messages call ``where``."""
@@ -93,6 +91,9 @@ class ManyOptions(ExperimentOptions):
     def estimate_of(self, seen: Observation, where: str) -> Estimated:
         """Estimate the object of an observation; raises CadalignError if it cannot be."""
         raise NotImplementedError
+
+    def check_files(self) -> None:
+        """Refuse files of the estimate that cannot be read."""
 
     def contents(self) -> dict[str, Any]:
         """Entries of a run's configuration that change with the contents of the options' files."""
@@ -118,29 +119,37 @@ class FitRunOptions(ManyOptions):
         return self.estimate.read(data, where, folder=folder, changes=self.changes)
 
     def estimate_of(self, seen: Observation, where: str) -> Estimated:
-        result, _ = self.estimate.fit(seen, where)
-        return Estimated(seen, result, {})
+        return seen, self.estimate.fit(seen, where), {}
 
-    def contents(self) -> dict[str, Any]:
-        shape = self.estimate.shape
-        category = None if shape is None else ShapeModel.open(shape).category
-        return super().contents() | {"shapes": category}
+    def check_files(self) -> None:
+        if self.estimate.shape is not None:
+            opened_shape(self.estimate.shape)
+
+
+def _add_warnings(row: Row, seen: Observation, undrawn: Sequence[str]) -> None:
+    """Add what is wrong with an aligned observation's photos to the warnings of its row."""
+    troubles = {
+        "picture": undrawn,
+        "camera": [_photo_doubt(view) for view in seen.views],
+        "left-out": [view.text_of_not_found for view in seen.views],
+    }
+    told = [(kind, text) for kind, texts in troubles.items() for text in texts if text]
+    row["warning_count"] += len(told)
+    for column, name in enumerate(("warning_kinds", "warnings")):
+        row[name] = "; ".join(filter(None, (row[name], *(each[column] for each in told))))
 
 
 def _photo_doubt(view: ObservedImage) -> str:
-    """Warning about a photo, if it is there, of another size than its camera's images."""
-    if view.image is None or not view.image.is_file():
+    """Warning about a photo, if it can be read, of another size than its camera's images."""
+    if view.image is None:
         return ""
-    camera = view.camera
-    try:
-        size = photo_size(view.image)
-    except DataError:  # which whoever draws it will name
-        return ""
-    try:
-        named = {"its camera": (camera.width, camera.height), view.image.name: size}
-        require_one_size(named, view.image)
-    except DataError as error:
-        return f"{error} (`Camera.resized`, `Camera.cropped`)"
+    with suppress(DataError):  # which whoever draws it will name
+        size, camera = photo_size(view.image), view.camera
+        try:
+            named = {"its camera": (camera.width, camera.height), view.image.name: size}
+            require_one_size(named, view.image)
+        except DataError as error:
+            return f"{error} (`Camera.resized`, `Camera.cropped`)"
     return ""
 
 
@@ -162,16 +171,13 @@ class ManyEstimates:
     """The keypoints that a detector's are paired with."""
     folder: RunFolder | None = field(default=None, repr=False)
     """The folder that pictures go to; none are drawn without."""
+    record_columns: Columns = RECORD_COLUMNS
+    """The columns of the table of observations and results."""
 
     @property
     def columns(self) -> Columns:
         """The columns of the table."""
         return COLUMNS + self.options.columns
-
-    @property
-    def record_columns(self) -> Columns:
-        """The columns of the table of observations and results."""
-        return (RECORD_COLUMNS[0], *self.options.record_columns, *RECORD_COLUMNS[1:])
 
     def evaluate(self, tasks: Sequence[ObservationTask]) -> list[Row]:
         """The rows of some observations."""
@@ -179,39 +185,23 @@ class ManyEstimates:
 
     def failure(self, task: ObservationTask, reason: str) -> list[Row]:
         """The row of an observation whose worker died, or that raised what nobody foresaw."""
-        return [_failed(task, reason, None)]
+        return [naming_row(task.row, task.name, None) | failed_row(reason) | _record(None, None)]
 
     def _evaluate(self, task: ObservationTask) -> Row:
-        start, seen = time.perf_counter(), None
+        start, seen, result = time.perf_counter(), None, None
         try:
             seen = self._observation(task)
-            found = self.options.estimate_of(seen, task.name)
+            seen, result, cells = self.options.estimate_of(seen, task.name)
+            found = result_row(result) | cells | {"seconds": time.perf_counter() - start}
         except CadalignError as error:
-            if seen is not None:
-                self._draw(task, naming_row(task.row, task.name, seen), seen, None)
-            return _failed(task, str(error), seen)
-        seen, result = found.observation, found.result
-        row = naming_row(task.row, task.name, seen) | result_row(result) | found.cells
-        troubles = {
-            "picture": self._draw(task, row, seen, result),
-            "camera": [_photo_doubt(view) for view in seen.views],
-            "left-out": [view.text_of_not_found for view in seen.views],
-        }
-        told = [(kind, text) for kind, texts in troubles.items() for text in texts if text]
-        row["warning_count"] += len(told)
-        for column, name in enumerate(("warning_kinds", "warnings")):
-            row[name] = "; ".join(filter(None, (row[name], *(each[column] for each in told))))
-        return row | _record(seen, result) | {"seconds": time.perf_counter() - start}
-
-    def _draw(
-        self, task: ObservationTask, row: Row, seen: Observation, result: Result | None
-    ) -> tuple[str, ...]:
-        """Write the pictures of an observation, if it is one of those; says what is not drawn."""
-        if self.folder is None or task.row >= self.options.pictures:
-            return ()
-        from cadalign.batch.outputs import draw_fit
-
-        return draw_fit(self.folder, row, seen, result)
+            found = failed_row(str(error))
+        row = naming_row(task.row, task.name, seen) | found | _record(seen, result)
+        undrawn: tuple[str, ...] = ()
+        if seen is not None and self.folder is not None and task.row < self.options.pictures:
+            undrawn = draw_fit(self.folder, row, seen, result)
+        if seen is not None and result is not None:
+            _add_warnings(row, seen, undrawn)
+        return row
 
     def _observation(self, task: ObservationTask) -> Observation:
         folder, shape = Path(task.folder), self.options.learned
@@ -220,8 +210,7 @@ class ManyEstimates:
         if isinstance(task.content, ImageKeypoints):
             seen = self._detected(task.content, folder)
         else:
-            data = _read(task) if task.content is None else parse_json(task.content, task.name)
-            seen = self.options.read(data, task.name, folder=folder)
+            seen = self.options.read(parse_json(task.content, task.name), task.name, folder=folder)
         return seen if shape is None else replace(seen, shape=shape.absolute())
 
     def _detected(self, found: ImageKeypoints, folder: Path) -> Observation:
@@ -248,12 +237,16 @@ def plan_run(options: ManyOptions, folder: RunFolder) -> Plan[ObservationTask]:
     is missing.
     """
     options.changes.read_camera((1, 1))  # whatever the size: else every row would say its error
+    options.check_files()
     tasks = ObservationTasks(options.inputs)
     photos = options.detector.images
     if photos is not None and not photos.is_dir():
         what = f"{photos} is not a folder of photos"
         raise InputError(what, where="images", fix="give the photos' folder, or leave it out")
-    model = _model_keypoints(options) if tasks.has_detections else None
+    model = None
+    if tasks.has_detections:
+        own = options.detector.model
+        model = options.own_keypoints() if own is None else ModelKeypoints.load(own)
     config = options.as_config() | {"contents": tasks.fingerprint()} | options.contents()
     drawn_in = folder.made_for_pictures() if options.pictures else None
     chunk = max(1, min(LARGEST_CHUNK, len(tasks) // _LEAST_CHUNKS))
@@ -261,41 +254,7 @@ def plan_run(options: ManyOptions, folder: RunFolder) -> Plan[ObservationTask]:
     return Plan(estimates, tasks, config, chunk)
 
 
-def _model_keypoints(options: ManyOptions) -> ModelKeypoints:
-    """The keypoints that a detector's are paired with: the model's, or else the options'."""
-    if options.detector.model is not None:
-        return ModelKeypoints.load(options.detector.model)
-    if (found := options.keypoints) is None:
-        raise InputError(
-            "the keypoints of the model are not known",
-            where="model",
-            fix="give the model's NAME.keypoints.json, or a learned shape",
-        )
-    return found
-
-
-def _keypoints_of_shape(path: Path) -> ModelKeypoints:
-    opened = ShapeModel.open(path)
-    named = isinstance(opened.ids[0], str)
-    pairs = zip(opened.ids, opened.components[0].mean.tolist(), strict=False)
-    keypoints = (ModelKeypoint(str(k), tuple(xyz), None if named else int(k)) for k, xyz in pairs)
-    return ModelKeypoints(tuple(keypoints))
-
-
 _photo_in = lru_cache(maxsize=1024)(photo_in)
-
-
-def _read(task: ObservationTask) -> Any:
-    """The JSON of a task's file, which errors name as the user did."""
-    try:
-        text = read_text(Path(task.folder) / Path(task.name).name)
-    except DataError as error:
-        raise DataError(error.what, where=task.name, fix=error.fix) from None
-    return parse_json(text, task.name)
-
-
-def _failed(task: ObservationTask, reason: str, seen: Observation | None) -> Row:
-    return naming_row(task.row, task.name, seen) | failed_row(reason) | _record(seen, None)
 
 
 def _record(seen: Observation | None, result: Result | None) -> Row:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from cadalign.arrays import FloatArray
-from cadalign.batch.observed import own_ids
 from cadalign.errors import CadalignError, DataError, InputError, all_left_out, unknown
 from cadalign.estimation.result import Result
 from cadalign.estimation.results import Results
@@ -21,63 +18,38 @@ from cadalign.io.documents import in_file, parse_json, read_json
 from cadalign.io.files import keeping
 from cadalign.io.kinds import FIT
 from cadalign.io.observation import Observation
+from cadalign.io.observation_file import fill_xyz
 from cadalign.render.drawing.model_overlay import mesh_of
 from cadalign.shapes.model import ShapeModel
 
-_FOLDER_ENDING = "_fit"
 
+def read_exported(fit: Path, *, metres: float = 1.0) -> AlignedObject:
+    """Read the result of `cadalign fit`, the file ``fit``, with the observation that it holds.
 
-def read_exported(
-    fit: Path,
-    *,
-    observation: Path | None = None,
-    shape: Path | None = None,
-    world_from_cam: FloatArray | None = None,
-    metres: float = 1.0,
-) -> AlignedObject:
-    """Read the result of `cadalign fit`, the file ``fit``, and what it was fitted to.
-
-    By default the ``observation`` and the learned ``shape`` are those that the fit's file states,
-    the observation otherwise ``photo.json`` beside the fit's folder ``photo_fit``.
-    Raises DataError if a file is missing or invalid, or the observation is not the one that was
-    fitted.
+    ``metres`` is the length of one unit of the model [m]. Raises DataError if a file is missing or
+    invalid.
     """
     data = read_json(fit, FIT)
-    if not isinstance(data, Mapping):
-        raise DataError("is not a fit's result", where=str(fit), fix="give a fit.json")
-    path = observation or _observation_of(fit, data)
-    seen = Observation.load(path, needs_xyz=False)
+    if not isinstance(data, Mapping) or not isinstance(data.get("observation"), Mapping):
+        what = "the file holds no fit with the observation that was fitted"
+        raise DataError(what, where=str(fit), fix="give the fit.json of `cadalign fit`")
     with in_file(fit):
-        result = Result.from_dict(data)
-    shape = shape or _stored(fit, data, "shape")
-    how = {"world_from_cam": world_from_cam, "metres": metres}
-    exported = exported_object(result, seen, path, shape=shape, **how)
-    sources = fit, path, *seen.files, *([] if shape is None else [shape])
-    return replace(exported, sources=sources)
+        seen = Observation.from_dict(fill_xyz(data["observation"]), folder=fit.parent)
+        exported = exported_object(Result.from_dict(data), seen, metres=metres)
+    return replace(exported, sources=(fit, *seen.files))
 
 
-def exported_object(
-    result: Result, seen: Observation, path: Path, *, shape: Path | None = None, **how: Any
-) -> AlignedObject:
-    """The aligned object of a result and its observation, which errors call ``path``."""
-    _require_same(len(result.views), len(seen.views), path, "views")
-    for view, image in zip(result.views, seen.views, strict=True):
-        _require_same(len(view.residuals), len(image.points_2d), path, "keypoints")
-    if result.method != "align":
-        own = _labels(seen)  # a fit of pairs knows rows, of which a photo may lack some
-        views = tuple(replace(view, ids=own) for view in result.views)
-        result = replace(result, ids=own, views=views)
-    else:
-        model = _shape(result, seen, shape)
-        pairs = zip(result.views, own_ids(seen.views), strict=True)
-        if model is None and any(tuple(view.ids) != own for view, own in pairs):
-            what, fix = "its keypoints are not the fit's", "give the observation that was fitted"
-            raise DataError(what, where=str(path), fix=fix)
+def exported_object(result: Result, seen: Observation, *, metres: float) -> AlignedObject:
+    """The aligned object of a result and its observation; see `read_exported`."""
+    if result.method == "align" and seen.shape is not None:
+        model = ShapeModel.open(seen.shape)
+        if tuple(model.ids) != result.ids:
+            what = f"{len(model.ids)} keypoints that are not the fit's {len(result.ids)}"
+            raise DataError(what, where=str(seen.shape), fix="fit the observation again")
         result = replace(result, model=model)
-    mesh = mesh_of(seen, result)
     name = "model" if seen.model is None else seen.model.stem
     images = [view.image for view in seen.views]
-    return object_of(result, mesh=mesh, images=images, name=name, **how)
+    return object_of(result, mesh=mesh_of(seen, result), images=images, name=name, metres=metres)
 
 
 def export_run(
@@ -86,8 +58,7 @@ def export_run(
     """Write a file of every alignment of a finished run to a folder, named by their rows.
 
     ``format`` is one of `cadalign.export.formats.FORMATS`, by default the folder's name; ``metres``
-    the length of one unit of the model [m]. Returns the number of objects, and why others are left
-    out.
+    as for `read_exported`. Returns the number of objects, and why others are left out.
 
     Raises InputError if the format is not known, or no object of the run can be written; and
     DataError if the run cannot be read.
@@ -101,15 +72,13 @@ def export_run(
     left_out: list[CadalignError] = []
     count = 0
     for table in read_groups(RunFolder(run).records, fix="do the run again"):
-        for record in table.to_pylist():
-            if not record["result"]:
-                continue
+        for record in filter(lambda each: each["result"], table.to_pylist()):
             where = f"{run}, row {record['row']}"
             seen = Observation.from_dict(parse_json(record["observation"], where))
             result = Result.from_dict(parse_json(record["result"], where))
             try:
                 with keeping([*inputs, *seen.files]):
-                    exported = exported_object(result, seen, Path(where), metres=metres)
+                    exported = exported_object(result, seen, metres=metres)
                     export_object(to / f"{record['row']:06d}.{name}", exported, format=name)
                 count += 1
             except CadalignError as error:
@@ -120,55 +89,3 @@ def export_run(
     if not count:
         raise InputError("no observation of the run is aligned", where=str(run))
     return count, left_out
-
-
-def _labels(seen: Observation) -> tuple[Hashable, ...]:
-    """Names of the only view's keypoints, or what else tells them apart."""
-    names = seen.names
-    return names if names is not None and len(set(names)) == len(names) else own_ids([seen])[0]
-
-
-def _stored(fit: Path, data: Mapping[str, Any], name: str) -> Path | None:
-    """A path that the fit's file states relative to itself; None where there is no such file."""
-    text = data.get(name)
-    path = fit.parent / text if isinstance(text, str) and text else None
-    return path if path is not None and path.is_file() else None
-
-
-def _observation_of(fit: Path, data: Mapping[str, Any]) -> Path:
-    """The observation that a fit's file states, or else the one beside the fit's folder."""
-    stated = _stored(fit, data, "observation")
-    if stated is not None:
-        return stated
-    folder = fit.resolve().parent
-    beside = folder.with_name(f"{folder.name.removesuffix(_FOLDER_ENDING)}.json")
-    if folder.name.endswith(_FOLDER_ENDING) and beside.is_file():
-        return beside
-    raise InputError(
-        f"{fit} does not tell which observation it is the fit of",
-        where="observation",
-        fix="give the observation file that was fitted",
-    )
-
-
-def _shape(aligned: Result, seen: Observation, shape: Path | None) -> ShapeModel | None:
-    """The learned shape that was fitted, None where the model's own keypoints were."""
-    path = shape or seen.shape
-    if path is None:
-        return None
-    opened = ShapeModel.open(path)
-    if tuple(opened.ids) != aligned.ids:
-        if shape is None:  # the file's shape was left out by a flag
-            return None
-        what = f"{len(opened.ids)} keypoints that are not the fit's {len(aligned.ids)}"
-        raise DataError(what, where=str(path), fix="give the shape that was fitted")
-    return opened
-
-
-def _require_same(count: int, expected: int, path: Path, what: str) -> None:
-    if count != expected:
-        raise DataError(
-            f"{expected} {what}, but the fit has {count}",
-            where=str(path),
-            fix="give the observation that was fitted, as it was then",
-        )

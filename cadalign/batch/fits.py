@@ -7,7 +7,7 @@ import os
 import tempfile
 from collections.abc import Iterable
 from contextlib import ExitStack
-from dataclasses import fields, replace
+from dataclasses import fields, is_dataclass, replace
 from itertools import chain, starmap
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -19,15 +19,13 @@ from cadalign.arrays import is_number
 from cadalign.batch.experiment import FitRunOptions, ManyOptions, plan_run
 from cadalign.batch.observation_fit import ObservationFit
 from cadalign.batch.outputs import write_csv
-from cadalign.errors import DataError, InputError, require_kind
+from cadalign.errors import DataError, InputError, require_kind, unknown
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.results import Results
 from cadalign.evaluation.runs.engine import OnProgress, execute, workers_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.io.documents import convert
-from cadalign.io.evidence import Size
 from cadalign.io.files import as_path, write_whole
-from cadalign.io.focal import FocalPrior
 from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
 
 _FEW = 200  # observations, which are aligned sooner than processes start
@@ -51,8 +49,8 @@ def fit_many(
     Parameters
     ----------
     observations : path, or iterable of path or of Observation
-        Observation files, folders and patterns of such, JSON lines, and detectors' files (COCO's
-        JSON or CSV); or observations, for example of a generator, which are first written to
+        Observation files, folders of such, JSON lines, and detectors' files (COCO's JSON or CSV);
+        or observations, for example of a generator, which are first written to
         ``observations.jsonl`` in the run's folder.
     out : path-like, optional
         The run's folder: ``results.parquet`` and ``results.csv``, and what `Results.open` needs.
@@ -139,13 +137,11 @@ def run_many(
 def options_of(given: dict[str, Any]) -> FitRunOptions:
     """The options of a run by their names, without inputs; see `fit_many`."""
     kinds: tuple[Any, ...] = (ObservationFit, FitOptions, DetectorOptions, ObservationChanges)
-    names = [(field.name, kind) for kind in kinds for field in fields(kind)]
-    owners = {name: kind for name, kind in reversed(names) if name != "fitting"}
+    owners = {each.name: kind for kind in reversed(kinds) for each in fields(kind)}
     parts: dict[Any, dict[str, Any]] = {kind: {} for kind in kinds}
     for name, value in given.items():
-        if name not in owners:
-            listed = ", ".join(dict.fromkeys(each for each, _ in names if each != "fitting"))
-            raise InputError("not a known option", where=name, fix=f"known are {listed}")
+        if name not in owners or name == "fitting":
+            raise unknown("option", name, owners, where=name)
         if value is not None:
             is_length = name == "focal" and is_number(value)
             owner = ObservationChanges if is_length else owners[name]
@@ -165,14 +161,11 @@ def _as_declared(value: Any, kind: type, name: str) -> Any:
 
     Raises InputError if it is of another one.
     """
-    if kind is FitOptions or isinstance(value, FocalPrior):  # which check their values themselves
-        return value
-    if name == "size":  # whose lengths are arrays, too
-        require_kind(value, Size, name)
-        return value
     declared = get_type_hints(kind, include_extras=True)[name]
     if Path in get_args(declared):
         return as_path(value, name)
+    if kind is FitOptions or is_dataclass(value):  # which check their values themselves
+        return value
     try:
         return convert(value, declared, name)
     except DataError as error:

@@ -10,9 +10,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+import tyro
 
 from cadalign.errors import InputError
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions, Sigma
@@ -25,7 +26,6 @@ from cadalign.io.observation_file import fill_xyz
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
     from cadalign.estimation.result import Result
-    from cadalign.estimation.view import View
     from cadalign.shapes.model import ShapeModel
 
 _NOT_OF_FIT = ("shape_sigma", "image", "focal_prior")  # stored options that are read apart
@@ -39,28 +39,30 @@ class ObservationFit:
     """Settings of an observation's alignment, in the place of those that its file stores."""
 
     sigma: float | Literal["none"] | None = None
-    """Standard deviation of the keypoints [px], or none: estimated from the residuals."""
+    """Standard deviation of the keypoints [px], by default the file's, or 1; none: estimated from
+    the residuals."""
     similar: bool = False
-    """The model is only similar to the object: sigma is estimated unless it is given, and
-    ``stretch_sigma`` is 0.2, unless the file or an option says otherwise."""
+    """For a model that is only similar to the object: sigma is none unless it is given, and
+    proportions are expected within 20 % of the model's, unless the file says otherwise."""
     robust: bool = False
     """Search for outliers among the keypoints (RANSAC) and fit to the inliers."""
     shape: Path | None = None
-    """File of `cadalign shape learn`: estimate the object's own shape, of that category. Of options
-    that the file stores, sigma, loss and focal length count."""
+    """File of `cadalign shape learn`: estimate the object's own shape, of that category, in place
+    of a stretch. Keypoints need the shape's semantic ids or names, and no xyz."""
     shape_sigma: float | None = None
     """Estimate the object's own shape from the model's: standard deviation of the keypoints'
     positions on the object about those on the stretched model [model units]."""
     use_photo: bool = False
-    """Take the photo itself as evidence; the model needs a mesh."""
+    """Take the photo itself as evidence: the model's outline is sought in it, from the estimate by
+    everything else. The model needs a mesh."""
     focal: Literal["known", "estimate"] | None = None
     """Focal length: known (the file's) or estimate; by default known, if every view has one."""
-    focal_prior: FocalPrior | Literal["usual", "none"] | None = None
+    focal_prior: Annotated[FocalPrior | Literal["usual", "none"] | None, tyro.conf.Suppress] = None
     """Prior on an estimated focal length; by default the file's, or that of the photo's EXIF data,
     or else that of usual lenses."""
-    fitting: FitOptions = field(default_factory=FitOptions)
+    fitting: Annotated[FitOptions, tyro.conf.Suppress] = field(default_factory=FitOptions)
     """Method and model; of sigma and focal length, the options above hold."""
-    ransac: RansacOptions = field(default_factory=RansacOptions)
+    ransac: Annotated[RansacOptions, tyro.conf.Suppress] = field(default_factory=RansacOptions)
     """The search for outliers, where it is asked for."""
 
     def shape_of(self, observation: Observation) -> Path | None:
@@ -153,131 +155,117 @@ class ObservationFit:
     ) -> Observation:
         """Read the parsed form of an observation, with changes; ``where`` is its name in messages.
 
-        Keypoints need no ``xyz`` where a learned shape is fitted.
+        Its shape is the learned one that is fitted, without which keypoints need ``xyz``.
         """
         own = data.get("shape") if isinstance(data, dict) else None
         if self.shape is not None or (own is not None and self.shape_sigma is None):
             data = fill_xyz(data)
         with in_file(where):
             seen = Observation.from_dict(data, folder=folder)
-        return changes.applied_to(seen, where)  # whose errors name options
+        seen = changes.applied_to(seen, where)  # whose errors name options
+        shape = self.shape_of(seen)
+        return replace(seen, shape=None if shape is None else shape.absolute())
 
     def fit(
-        self,
-        observation: Observation,
-        where: str,
-        *,
-        note: Note = lambda text: None,
-    ) -> tuple[Result, tuple[View, ...] | None]:
+        self, observation: Observation, where: str, *, note: Note = lambda text: None
+    ) -> Result:
         """Align an observation, ``where`` is its name in messages.
 
-        ``note`` is called with the source of a focal length. Returns the views that were aligned,
-        too; None for a stretched model's keypoints in one image. Raises CadalignError if options or
+        ``note`` is called with the source of a focal length. Raises CadalignError if options or
         observation are invalid, or there is no alignment.
         """
         notes = [text for view in observation.views if (text := view.text_of_not_found)]
         options = self.options_for(observation, where, notes.append)
-        is_exact = self.shape_of(observation) is None and self.shape_sigma_of(observation) is None
-        views: tuple[View, ...] | None = None
-        if observation.model is not None and self.shape_of(observation) is None:
+        shape, shape_sigma = self.shape_of(observation), self.shape_sigma_of(observation)
+        if observation.model is not None and shape is None:
             from cadalign.io.meshes.files import check_keypoints
 
             with in_file(where):
                 for view in observation.views:
                     check_keypoints(view.points_3d, observation.model, where="keypoints.xyz")
+        is_exact = shape is None and shape_sigma is None
         if observation.is_plain and is_exact and not self.uses_photos(observation):
-            from cadalign.estimation.fit import check_search, fit_one  # not for help of a command
-            from cadalign.estimation.problems import pack_one
-
-            start, seen = time.perf_counter(), observation
-            problem = pack_one(seen.points_3d, seen.points_2d, seen.camera)
-            ransac, scores = (self.ransac, seen.scores) if self.robust else (None, None)
-            check_search(ransac, scores, seen.symmetry)
-            with np.errstate(all="ignore"):
-                search = (ransac, scores, seen.symmetry, start)
-                result = fit_one(problem, options, *search, labels=seen.labels)
+            result = self._fit_keypoints(observation, options)
         else:
             self.check_for(observation)
-            result, views = _aligned(self, observation, where, options)
+            result = self._align(observation, where, options)
         for text in notes:
             note(text)
-        return result, views
+        return result
 
+    def _fit_keypoints(self, seen: Observation, options: FitOptions) -> Result:
+        """Fit a stretched model to the keypoints of one image."""
+        from cadalign.estimation.fit import check_search, fit_one  # not for help of a command
+        from cadalign.estimation.problems import pack_one
 
-def _aligned(
-    how: ObservationFit, observation: Observation, where: str, options: FitOptions
-) -> tuple[Result, tuple[View, ...]]:
-    """Align all evidence of an observation; returns its views, too."""
-    from cadalign.batch.observed import views_of
-    from cadalign.estimation.align import align
+        start = time.perf_counter()
+        problem = pack_one(seen.points_3d, seen.points_2d, seen.camera)
+        ransac, scores = (self.ransac, seen.scores) if self.robust else (None, None)
+        check_search(ransac, scores, seen.symmetry)
+        with np.errstate(all="ignore"):
+            search = (ransac, scores, seen.symmetry, start)
+            return fit_one(problem, options, *search, labels=seen.labels)
 
-    model = _model(how, observation, where, options)
-    stated, has_photos = how.stated_sigma(observation), how.uses_photos(observation)
-    if has_photos and all(image.image is None for image in observation.views):
-        raise InputError(
-            "the observation names no photo",
-            where="use_photo",
-            fix="write its path as image into the file, or leave the option away",
-        )
-    with in_file(where):
-        sigma = stated.get("sigma")
-        views = views_of(observation, model, sigma=sigma, with_photos=has_photos)
-    if stated and sigma is None:
-        views = tuple(replace(view, sigma=None) for view in views)
-    with _located(how, where):
-        result = align(
-            model,
-            views,
-            size=observation.size,
-            init=observation.init,
-            loss=options.loss,
-            loss_scale=options.loss_scale,
-            focal=options.focal,
-            focal_prior=options.focal_prior,
-            ransac=how.ransac if how.robust else None,
-        )
-    return result, views
+    def _align(self, observation: Observation, where: str, options: FitOptions) -> Result:
+        """Align all evidence of an observation."""
+        from cadalign.batch.observed import views_of
+        from cadalign.estimation.align import align
 
-
-def _model(
-    how: ObservationFit, observation: Observation, where: str, options: FitOptions
-) -> Model | ShapeModel:
-    from cadalign.batch.observed import model_of
-    from cadalign.io.meshes.files import mesh_at
-
-    shape = how.shape_of(observation)
-    if shape is not None:
-        if observation.symmetry is not None:
-            raise InputError(
-                "has no effect together with a learned shape",
-                where=f"{where}: symmetry",
-                fix="leave out one of the two",
+        model = self._model(observation, where, options)
+        has_photos = self.uses_photos(observation)
+        if has_photos and all(image.image is None for image in observation.views):
+            fix = "write its path as image into the file, or leave the option away"
+            raise InputError("the observation names no photo", where="use_photo", fix=fix)
+        with in_file(where):
+            stated = self.stated_sigma(observation)
+            views = views_of(observation, model, with_photos=has_photos, **stated)
+        with self._located(where):
+            return align(
+                model,
+                views,
+                size=observation.size,
+                init=observation.init,
+                loss=options.loss,
+                loss_scale=options.loss_scale,
+                focal=options.focal,
+                focal_prior=options.focal_prior,
+                ransac=self.ransac if self.robust else None,
             )
-        return _opened(shape)
-    mesh = None if observation.model is None else mesh_at(observation.model)
-    sigma = how.shape_sigma_of(observation)
-    with _located(how, where):
-        return model_of(observation, options=options, shape_sigma=sigma, mesh=mesh)
+
+    def _model(
+        self, observation: Observation, where: str, options: FitOptions
+    ) -> Model | ShapeModel:
+        from cadalign.batch.observed import model_of
+        from cadalign.io.meshes.files import mesh_at
+
+        if (shape := self.shape_of(observation)) is not None:
+            if observation.symmetry is not None:
+                what, place = "has no effect together with a learned shape", f"{where}: symmetry"
+                raise InputError(what, where=place, fix="leave out one of the two")
+            return opened_shape(shape)
+        mesh = None if observation.model is None else mesh_at(observation.model)
+        sigma = self.shape_sigma_of(observation)
+        with self._located(where):
+            return model_of(observation, options=options, shape_sigma=sigma, mesh=mesh)
+
+    @contextmanager
+    def _located(self, where: str) -> Iterator[None]:
+        """Let errors about arguments name the option, or else the observation."""
+        try:
+            yield
+        except InputError as error:
+            if error.where in {field.name for field in (*fields(self), *fields(self.ransac))}:
+                raise
+            with in_file(where):
+                raise
 
 
 @once_per_file(4)
-def _opened(path: Path) -> ShapeModel:
+def opened_shape(path: Path) -> ShapeModel:
     """Open a learned shape, which runs use again and again."""
     from cadalign.shapes.model import ShapeModel
 
     return ShapeModel.open(path)
-
-
-@contextmanager
-def _located(how: ObservationFit, where: str) -> Iterator[None]:
-    """Let errors about arguments name the option, or else the observation."""
-    try:
-        yield
-    except InputError as error:
-        if error.where in {field.name for field in (*fields(how), *fields(how.ransac))}:
-            raise
-        with in_file(where):
-            raise
 
 
 def _prior_of_photos(observation: Observation, note: Note) -> FocalPrior | None:

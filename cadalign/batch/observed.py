@@ -1,14 +1,11 @@
-"""Models and views of observation files, and views of reconstructed photos."""
+"""Models and views of observation files."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Sequence
 from contextlib import nullcontext
-from typing import Any
 
-import numpy.typing as npt
-
-from cadalign.errors import CadalignError, InputError, quote
+from cadalign.errors import InputError
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, Sigma
 from cadalign.estimation.view import View
@@ -58,10 +55,10 @@ def views_of(
     observation: Observation,
     model: Model | ShapeModel,
     *,
-    sigma: Sigma | None = None,
     with_photos: bool = False,
+    **stated: Sigma | None,
 ) -> tuple[View, ...]:
-    """Evidence of an observation's images about a model, at its sigma or at that given [px].
+    """Evidence of an observation's images about a model, at a stated ``sigma`` or at its own [px].
 
     A learned shape's keypoints are found by semantic id or by name, as the shape has them; a sigma
     is 1 where none is known. Photos themselves are evidence where these are asked for.
@@ -69,23 +66,22 @@ def views_of(
     Raises InputError if the shape has no such keypoints, the observation has no ids or names, one
     occurs twice, or what is said of an image is invalid; DataError if a file cannot be read.
     """
-    own = own_ids(observation.views)
+    labels = own_ids(observation.views)
     views = []
     for number, image in enumerate(observation.views):
         with within(f"views[{number}]") if observation.others else nullcontext():
-            ids = shape_ids(image, model) if isinstance(model, ShapeModel) else own[number]
+            ids = shape_ids(image, model) if isinstance(model, ShapeModel) else labels[number]
             evidence = image.evidence.given
             if image.depths is not None:
                 evidence["depth"] = image.depths
-            own_sigma = 1.0 if image.sigma is None else image.sigma
+            own = {"sigma": 1.0 if image.sigma is None else image.sigma}
             view = View(
                 image.camera,
                 image.points_2d,
                 ids=ids,
-                sigma=own_sigma if sigma is None else sigma,
                 scores=image.scores,
                 image=image.image if with_photos else None,
-                **evidence,
+                **evidence | own | stated,
             )
             views.append(view)
     return tuple(views)
@@ -130,54 +126,3 @@ def own_ids(images: Sequence[ObservedImage]) -> tuple[tuple[Hashable, ...], ...]
         tuple(numbers.setdefault(tuple(xyz), len(numbers)) for xyz in image.points_3d.tolist())
         for image in images
     )
-
-
-def views_from(
-    images: Any,
-    keypoints: Mapping[str, tuple[npt.ArrayLike, Sequence[Hashable] | None]],
-    **options: Any,
-) -> list[View]:
-    """Views with the cameras and the known poses of a reconstruction's photos.
-
-    The reconstruction's frame and unit are those of the result: `Result.rig_from_model` is the
-    alignment in its world.
-
-    Parameters
-    ----------
-    images : Colmap or another mapping
-        The reconstruction's photos, of `cadalign.datasets`.
-    keypoints : mapping of str to ((n, 2) float, sequence of n ids or None)
-        For each photo used, by its name: pixels of the object's keypoints, integers being pixel
-        centres, and their ids. One keypoint in a photo counts.
-    **options
-        Further arguments of every `View`, such as ``sigma``.
-
-    Returns
-    -------
-    list of View
-        In the order of ``keypoints``.
-
-    Raises
-    ------
-    InputError
-        If the keypoints of a photo are invalid.
-    DataError
-        If there is no such photo, or the reconstruction describes it wrongly.
-
-    Examples
-    --------
-    >>> from cadalign.datasets import Colmap
-    >>> images = Colmap("reconstruction")  # doctest: +SKIP
-    >>> views = views_from(images, {"00.jpg": (clicks, ["seat", "leg"])})  # doctest: +SKIP
-    >>> cadalign.align(chair, views).rig_from_model  # doctest: +SKIP
-    """
-    views = []
-    for name, (points_2d, ids) in keypoints.items():
-        image = images[name]
-        pose = image.cam_from_world.cam_from_model
-        try:
-            views.append(View(image.camera, points_2d, ids=ids, cam_from_rig=pose, **options))
-        except CadalignError as error:
-            where = f"keypoints[{quote(name)}]{'.' + error.where if error.where else ''}"
-            raise InputError(error.what, where=where, fix=error.fix) from None
-    return views

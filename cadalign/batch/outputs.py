@@ -77,12 +77,6 @@ def write_csv(folder: RunFolder) -> None:
     write_whole(folder.path / "results.csv", write)
 
 
-def read_rows(folder: RunFolder) -> list[Row]:
-    """The rows of a finished run, without the columns that are lists."""
-    groups = read_groups(folder.results, fix=DONE_ANEW)
-    return [row for table in groups for row in without_lists(table).to_pylist()]
-
-
 WARNED = {"warning_kinds": "with warnings", "uncertain": "uncertain"}
 """Columns that list what is said of a row, by name."""
 

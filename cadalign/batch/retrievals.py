@@ -1,7 +1,6 @@
 """Retrieval for many observations as a run: the tables are those of each one's best match.
 
-docs/how_to/many_photos.md describes the further columns. The records hold all matches as JSON
-(`cadalign.Match.to_dict`) in the column ``matches``.
+docs/how_to/many_photos.md describes the further columns.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.runs.work import Columns
 from cadalign.evaluation.summary import median
 from cadalign.io.documents import in_file
-from cadalign.io.files import dense_json
 from cadalign.io.observation import Observation
 from cadalign.io.observation_file import fill_xyz
 from cadalign.retrieval.query import ObservationRetrieval
@@ -41,7 +39,6 @@ class RetrieveRunOptions(ManyOptions):
         ("missing", int),
         *(("top_categories", list[str]), ("top_ids", list[str]), ("top_scores", list[float])),
     )
-    record_columns: ClassVar[Columns] = (("matches", str),)
 
     estimate: ObservationRetrieval
 
@@ -54,8 +51,7 @@ class RetrieveRunOptions(ManyOptions):
     def learned(self) -> Path | None:
         return self.estimate.shape[0] if len(self.estimate.shape) == 1 else None
 
-    @property
-    def keypoints(self) -> ModelKeypoints:
+    def own_keypoints(self) -> ModelKeypoints:
         return self.estimate.opened()[0].keypoints
 
     def read(self, data: Any, where: str, *, folder: Path) -> Observation:
@@ -77,13 +73,11 @@ class RetrieveRunOptions(ManyOptions):
             "top_categories": [match.category for match in matches],
             "top_ids": [match.model_id for match in matches],
             "top_scores": [match.score for match in matches],
-            "matches": dense_json([match.to_dict() for match in matches]),
         }
-        return Estimated(best.observation(seen), best.result, cells)
+        return best.observation(seen), best.result, cells
 
-    def contents(self) -> dict[str, Any]:
-        self.estimate.opened()  # which refuses what cannot be read
-        return super().contents()
+    def check_files(self) -> None:
+        self.estimate.opened()
 
 
 SPEC = replace(

@@ -1,7 +1,7 @@
 """Inputs of a run over many observations, as tasks of which memory holds few at a time.
 
-An input is an observation file, a folder or a pattern of such files, JSON lines (an observation in
-every line, ``.jsonl`` or ``.ndjson``), or a detector's file of keypoints
+An input is an observation file, a folder of such files, JSON lines (an observation in every line,
+``.jsonl`` or ``.ndjson``), or a detector's file of keypoints
 (`cadalign.datasets.read_image_keypoints`).
 """
 
@@ -13,7 +13,6 @@ from array import array
 from codecs import BOM_UTF8
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
-from glob import glob
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -24,16 +23,8 @@ from cadalign.datasets.detections.keypoint_files import read_image_keypoints
 from cadalign.errors import DataError
 from cadalign.evaluation.runs.work import fingerprint, fingerprint_of_files
 from cadalign.io.documents import read_json
-from cadalign.io.files import listed, open_input, read_bytes
-from cadalign.io.kinds import (
-    DETECTOR,
-    LINES,
-    OBSERVATION,
-    TABLE,
-    is_pattern,
-    kind_of,
-    refuse_other_file,
-)
+from cadalign.io.files import listed, open_input, read_bytes, read_text
+from cadalign.io.kinds import DETECTOR, LINES, OBSERVATION, TABLE, kind_of, refuse_other_file
 from cadalign.io.observation_file import named_files
 
 _INVALID = (msgspec.MsgspecError, UnicodeError, RecursionError)
@@ -47,9 +38,8 @@ class ObservationTask(NamedTuple):
     """Its number in the run."""
     name: str
     """Its file, with the line or the object where the file holds several."""
-    content: bytes | ImageKeypoints | DataError | None
-    """Its JSON, or a detector's keypoints, or why these cannot be read; None to read the file
-    ``name``."""
+    content: str | bytes | ImageKeypoints | DataError
+    """Its JSON, bytes of a line, or a detector's keypoints; or why these cannot be read."""
     folder: str
     """The folder that paths in it are relative to, the same for a worker elsewhere."""
 
@@ -102,6 +92,11 @@ class ObservationTasks(Sequence[ObservationTask]):
                 files[number] = opened.enter_context(open_input(path))
             files[number].seek(start)
             name, content = f"{path}, line {own}", files[number].readline()
+        else:
+            try:
+                content = read_text(path)
+            except DataError as error:
+                content = error
         return ObservationTask(row, name, content, str(path.absolute().parent))
 
     def _add(self, path: Path, data: Any) -> None:
@@ -124,7 +119,7 @@ class ObservationTasks(Sequence[ObservationTask]):
 
     def _add_lines(self, number: int, path: Path) -> None:
         """Find where the lines of a file begin; empty ones are passed over."""
-        place, digest = 0, hashlib.sha256()
+        place, digest, before = 0, hashlib.sha256(), len(self._cells)
         with open_input(path) as file:
             for own, line in enumerate(file, start=1):
                 mark = len(BOM_UTF8) if own == 1 and line.startswith(BOM_UTF8) else 0
@@ -135,6 +130,8 @@ class ObservationTasks(Sequence[ObservationTask]):
                         self._named.update(dict.fromkeys(named))
                 place += len(line)
                 digest.update(line)
+        if len(self._cells) == before:
+            raise DataError("the file holds no observation", where=str(path))
         self._marks.append(digest.hexdigest())
 
 
@@ -143,20 +140,11 @@ def _files_of(path: Path) -> Iterator[tuple[Path, Any]]:
     suffix = path.suffix.lower()
     if os.path.isdir(path):  # also of a name that no file can have
         yield from _files_in(path)
-    elif is_pattern(path):
-        found = [Path(name) for name in sorted(glob(str(path), recursive=True))]
-        if not found:
-            raise DataError("no file matches", where=str(path))
-        for each in found:
-            yield from _files_of(each)
-    elif suffix in LINES:
-        with open_input(path) as file:
-            if not any(line.strip() for line in file):
-                raise DataError("the file holds no observation", where=str(path))
+    elif suffix in (*LINES, TABLE):
         yield path, None
     else:
-        data = None if suffix == TABLE else _content(path)
-        if suffix != TABLE and kind_of(data) not in (DETECTOR, OBSERVATION):
+        data = _content(path)
+        if kind_of(data) not in (DETECTOR, OBSERVATION):
             refuse_other_file(path, OBSERVATION)
         yield path, data
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from typing import Any
+from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 
@@ -21,25 +19,19 @@ _POSE = Alignment(np.eye(3), np.array([0.0, 0.0, 2.0]), np.ones(3))
 _RANSAC = RansacOptions(max_iterations=10)
 
 
-def compile_ahead(*, progress: Callable[[str], object] | None = None) -> None:
-    """Compile what fits, alignments, retrieval and evaluations call, unless it is on disk.
-
-    ``progress`` is called with the name of each group of solvers that is ready.
-    """
-    groups: dict[str, tuple[Any, ...]] = {  # the longest first
-        "shapes in several views": (_align_shape, 2),
-        "fits": (_fits,),
-        "shapes in one view": (_align_shape, 1),
-        "masks": (_align_with_mask,),
-        "retrieval and boxes": (_retrieval_and_boxes,),
-    }
+def compile_ahead() -> None:
+    """Compile what fits, alignments, retrieval and evaluations call, unless it is on disk."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(2, mp_context=context) as pool:
-        jobs = {pool.submit(*group): name for name, group in groups.items()}
-        for job in as_completed(jobs):
-            job.result()
-            if progress:
-                progress(jobs[job])
+        jobs = [  # the longest first
+            pool.submit(_align_shape, 2),
+            pool.submit(_fits),
+            pool.submit(_align_shape, 1),
+            pool.submit(_align_with_mask),
+            pool.submit(_retrieval_and_boxes),
+        ]
+    for job in jobs:
+        job.result()
 
 
 def _points() -> tuple[np.ndarray, np.ndarray]:

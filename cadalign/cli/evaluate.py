@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import redirect_stdout
-from dataclasses import dataclass, field, fields, make_dataclass
+from dataclasses import dataclass, fields, make_dataclass
 from inspect import getdoc
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -18,6 +18,7 @@ from cadalign.cli.common import NOTHING_WORKED, SUCCESS, JsonOption, group_of, s
 from cadalign.cli.options import named_as_flags
 from cadalign.cli.runs import conclude, run_progress, write_run_report
 from cadalign.evaluation.experiments.demo import DemoOptions
+from cadalign.evaluation.experiments.simulation import SweepOptions
 from cadalign.evaluation.options import ExperimentOptions, RunOptions
 from cadalign.evaluation.registry import Spec, known_options, spec_named
 from cadalign.evaluation.runs.folder import RunFolder
@@ -32,13 +33,6 @@ _EXIT_CODES = (
     "Exit codes: 0 all rows are good, 3 finished but some rows failed, 1 refused, interrupted or "
     "all rows failed, 2 a wrong command line."
 )
-
-
-_SWEEPS = {
-    "noise": "Errors against the keypoints' noise, at 1,024 points.",
-    "points": "Errors against the number of points, at 2 px noise.",
-    "outliers": "Errors against the share of outliers, at 100 points and 2 px noise.",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,11 +55,10 @@ class RunCommand(JsonOption, RunOptions):
         """Do the run, showing its progress; gives its specification and its tables."""
         from cadalign.evaluation.api import prepared
         from cadalign.evaluation.runs.engine import execute
-        from cadalign.evaluation.runs.folder import RunFolder
 
         kind = self.options_type
         # What modules of users print is not the command's output.
-        with redirect_stdout(sys.stderr), named_as_flags(self):
+        with redirect_stdout(sys.stderr), named_as_flags(self, sweep="SWEEP"):
             options = kind(**{field.name: getattr(self, field.name) for field in fields(kind)})
             folder = RunFolder(self.out or Path("runs") / options.run_name)
             plan, pool = prepared(options, folder, workers=self.workers, dask=self.dask)
@@ -81,20 +74,14 @@ def command_of(
     base: type[RunCommand] = RunCommand,
     *,
     about: str | None = None,
-    **defaults: Any,
 ) -> Any:
     """The command of an experiment: its options, those of every run, and those of its ``base``.
 
-    ``about`` is its help, by default that of the options; ``defaults`` are options that it gives
-    and that cannot be typed.
+    ``about`` is its help, by default that of the options.
     """
-    given = [
-        (name, Annotated[str, tyro.conf.Suppress], field(default=value))
-        for name, value in defaults.items()
-    ]
     namespace = {"options_type": options, "__doc__": about or options.__doc__}
     return make_dataclass(
-        options.__name__, given, bases=(base, options), namespace=namespace, frozen=True
+        options.__name__, [], bases=(base, options), namespace=namespace, frozen=True
     )
 
 
@@ -107,18 +94,8 @@ def _evaluations() -> dict[str, Any]:
     }
 
 
-def _sweeps() -> dict[str, Any]:
-    from cadalign.evaluation.experiments.simulation import SweepOptions
-
-    return {
-        name: command_of(SweepOptions, about=about, sweep=name) for name, about in _SWEEPS.items()
-    }
-
-
 Evaluate = group_of("Evaluate methods on a dataset.", _evaluations)
-Simulate = group_of(
-    "Repeat the AEPnP paper's simulation: tables, a page, and figures as PNG and PDF.", _sweeps
-)
+Simulate: Any = command_of(SweepOptions)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,11 +7,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from cadalign.cli.common import JsonOption, answer, group_of, make_folder_of, print_json, say
+from cadalign.cli.common import answer, group_of, make_folder_of, say
 from cadalign.cli.options import named_as_flags
 from cadalign.errors import refuse_unused
 from cadalign.io.files import keeping, refuse_input, require_utf8
@@ -77,7 +77,7 @@ class LibraryBuild:
 
 
 @dataclass(frozen=True)
-class LibraryShow(JsonOption):
+class LibraryShow:
     """Check a library file and list its models by category."""
 
     library: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LIBRARY")]
@@ -87,26 +87,13 @@ class LibraryShow(JsonOption):
         """Open the library and describe it; returns the exit code."""
         from cadalign.retrieval import Library
 
-        library = Library.open(self.library)
-        if self.json:
-            print_json(_summary(library))
-        else:
-            answer(_describe(library))
+        answer(_describe(Library.open(self.library)))
         return 0
 
 
-def _summary(library: Library) -> dict[str, Any]:
-    counts = Counter(category for category, _ in library.keys)
-    return {
-        "models": len(library),
-        "with_mesh": library.with_mesh,
-        "categories": dict(sorted(counts.items())),
-    }
-
-
 def _describe(library: Library) -> str:
-    counts = _summary(library)["categories"]
-    listed = ", ".join(f"{count} {category}" for category, count in counts.items())
+    counts = Counter(category for category, _ in library.keys)
+    listed = ", ".join(f"{count} {category}" for category, count in sorted(counts.items()))
     without = len(library) - library.with_mesh
     text = f"{len(library)} models: {listed}" + (f"; {without} without a mesh" if without else "")
     return f"{text}\nKeypoints: {', '.join(library.names)}" if library.names else text

@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 
 from cadalign.cli.common import answer, make_folder_of, say
-from cadalign.cli.options import EvidenceOptions, named_as_flags
+from cadalign.cli.options import CameraOptions, named_as_flags
 from cadalign.datasets import ModelKeypoints, choose_object, read_image_keypoints
 from cadalign.datasets.detections.coco import decode_segmentation
 from cadalign.datasets.detections.image_keypoints import ImageKeypoints, observed_in
@@ -25,7 +25,7 @@ from cadalign.io.observation import Observation
 
 
 @dataclass(frozen=True)
-class Observe(EvidenceOptions):
+class Observe(CameraOptions):
     """Pair the keypoints of a detector in a photo with a model's.
 
     Writes an observation for `cadalign fit`, which takes a whole file of many objects itself.
@@ -47,13 +47,8 @@ class Observe(EvidenceOptions):
     """Number of the object in the photo, from 0; by default the one with the highest score."""
     min_score: float = 0.0
     """Least score of a keypoint that is kept."""
-    weigh: float | None = None
-    """Use the scores as weights: standard deviation of a keypoint with score 1 [px]; half the score
-    is twice that."""
     ignore_unknown: bool = False
     """Leave out keypoints that the model does not have."""
-    segmentation: bool = True
-    """Take the mask beside the keypoints, COCO's polygons or run lengths."""
 
     def run(self) -> int:
         """Write the observation; returns the exit code."""
@@ -71,13 +66,11 @@ class Observe(EvidenceOptions):
                 image=None if self.image is None else self.image.resolve(),
                 min_score=self.min_score,
                 ignore_unknown=self.ignore_unknown,
-                sigma_from_scores=self.weigh,
             )
         out = self.out or self.keypoints.with_suffix(".observation.json")
-        inputs = [self.keypoints, self.model, model.model, self.camera, self.image]
-        with keeping([*inputs, self.mask]):
+        with keeping([self.keypoints, self.model, model.model, self.camera, self.image]):
             make_folder_of(out)
-            if self.mask is None and found.segmentation is not None and self.segmentation:
+            if found.segmentation is not None:
                 mask = self._write_mask(observation, found, out.with_suffix(".mask.png"))
                 observation = replace(observation, evidence=ImageEvidence(mask=mask))
             observation.save(out)

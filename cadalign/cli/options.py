@@ -5,23 +5,21 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from cadalign.cli.common import JsonOption, UsageError
 from cadalign.errors import DataError, InputError, refuse_unused
-from cadalign.io.documents import convert
 from cadalign.io.observation import DetectorOptions, ObservationChanges
-from cadalign.io.observation_file import SizeFields, read_size
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 
-_FLAGS = {"fov_x": "--fov", "number": "--object", "sigma_from_scores": "--weigh"}
+_FLAGS = {"fov_x": "--fov", "number": "--object"}
 """Arguments of the library's functions that have another name on the command line."""
 
 
@@ -46,7 +44,8 @@ def named_as_flags(*options: DataclassInstance, **others: str) -> Iterator[None]
 
 def flags_of(*options: DataclassInstance) -> dict[str, str]:
     """The command line's options by the names of fields."""
-    return {field.name: flag_of(field.name) for each in options for field in fields(each)}
+    names = [field.name for each in options for field in fields(each)]
+    return {name: "--" + name.replace("_", "-") for name in names}
 
 
 def with_flags(text: str | None, flags: Mapping[str, str]) -> str | None:
@@ -57,11 +56,6 @@ def with_flags(text: str | None, flags: Mapping[str, str]) -> str | None:
             if "_" in name:
                 text = re.sub(rf"(?<![\w-]){name}(?!\w)", flag, text)
     return text
-
-
-def flag_of(name: str) -> str:
-    """The command line's option for a field."""
-    return "--" + name.replace("_", "-")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,8 +69,8 @@ class ManyCommand(JsonOption, DetectorOptions):
         tyro.conf.arg(metavar="OBSERVATION ...", help_behavior_hint="(required)"),
     ]
     """A JSON file with camera and keypoints, optionally image, model and further evidence. Or many:
-    several such files, folders, patterns in quotes, JSON lines (.jsonl), or a detector's file of
-    keypoints (COCO's JSON, or CSV) with --camera and --model or --shape."""
+    several such files, folders, JSON lines (.jsonl), or a detector's file of keypoints (COCO's
+    JSON, or CSV) with --camera and --model or --shape."""
     picture: bool = True
     """Draw box and keypoints over the photo, as overlay.png; of many observations, write a page."""
     workers: int | None = None
@@ -113,30 +107,8 @@ class CameraOptions:
     @property
     def changes(self) -> ObservationChanges:
         """Values of the options in the place of an observation's own."""
-        focal: Any = self.focal
-        if isinstance(focal, str):  # a word of the commands that estimate
-            if self.fov is not None:
-                what = f"given beside --focal {focal}"
-                raise InputError(what, where="fov", fix="give one of the two options")
-            focal = None
+        if self.focal is not None and self.fov is not None:
+            what = f"given beside --focal {self.focal}"
+            raise InputError(what, where="fov", fix="give one of the two options")
+        focal = None if isinstance(self.focal, str) else self.focal  # which a fit may estimate
         return ObservationChanges(self.camera, focal=focal, fov=self.fov)
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvidenceOptions(CameraOptions):
-    """Evidence beyond keypoints; the observation file holds further one."""
-
-    size: Annotated[dict[str, float] | None, tyro.conf.arg(metavar="NAME LENGTH ...")] = None
-    """Known lengths of the object: width, height, length (along the model's x, y, z) and sigma,
-    their relative standard deviation, as in --size height 0.91 sigma 0.005."""
-    mask: Path | None = None
-    """Mask of the object, a grey PNG of the photo's size."""
-
-    @property
-    def changes(self) -> ObservationChanges:
-        """See `CameraOptions`."""
-        evidence = {} if self.mask is None else {"mask": self.mask.resolve()}
-        size = None
-        if self.size is not None:
-            size = read_size(convert(self.size, SizeFields, where="--size"))
-        return replace(super().changes, evidence=evidence, size=size)

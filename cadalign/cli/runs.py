@@ -7,7 +7,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from rich.progress import (
     BarColumn,
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.tables import Run
 
-T = TypeVar("T")
 _MOST_REASONS, _MOST_OF_EVALUATIONS = 10, 3
 _SHOWN = 100
 """Observations, the first ones, whose photos the page shows."""
@@ -129,7 +128,7 @@ def run_command(command: ManyCommand, options: ManyOptions, *, done: str) -> int
     import pyarrow.parquet as pq
 
     from cadalign.batch.fits import run_many
-    from cadalign.batch.outputs import WARNED, read_rows, warnings_text
+    from cadalign.batch.outputs import WARNED, warnings_text, without_lists
 
     folder = run_folder(command, options)
     with run_progress(options.experiment) as on_progress:
@@ -141,7 +140,7 @@ def run_command(command: ManyCommand, options: ManyOptions, *, done: str) -> int
             on_progress=on_progress,
         )
     if command.json:
-        print_json(read_rows(folder))
+        print_json(without_lists(pq.read_table(folder.results)).to_pylist())
     total, reasons = _reasons(folder)
     failed = sum(count for _, count in reasons)
     _say_reasons([(_as_typed(reason, command), count) for reason, count in reasons])

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
 
-from cadalign.cli.common import JsonOption, answer, group_of, make_folder_of, print_json, say
+from cadalign.cli.common import answer, group_of, make_folder_of, say
 from cadalign.cli.options import named_as_flags
 from cadalign.cli.runs import progress_bar
 from cadalign.datasets import KeypointNet
@@ -65,7 +65,7 @@ class ShapeLearn:
 
 
 @dataclass(frozen=True)
-class ShapeShow(JsonOption):
+class ShapeShow:
     """Describe a shape model; with --out, draw its mean and its first modes."""
 
     shape: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SHAPE")]
@@ -83,46 +83,15 @@ class ShapeShow(JsonOption):
             make_folder_of(self.out)
             with keeping([self.shape]):
                 draw_shape(self.out, model)
-        if self.json:
-            picture = {} if self.out is None else {"picture": str(self.out)}
-            print_json(_summary(model) | picture)
-        else:
-            written = "" if self.out is None else f"\nWritten: {self.out}"
-            answer(f"{_text(model)}{written}")
+        answer(_text(model))
+        if self.out is not None:
+            say(f"Written: {self.out}")
         return 0
 
 
-def _summary(model: ShapeModel) -> dict[str, Any]:
-    training, mirror = model.training, model.reflection
-    counts = None
-    if training is not None:
-        seen = np.isfinite(training.points_3d[..., 0]).sum(axis=0)
-        counts = dict(zip(map(str, model.ids), seen.tolist(), strict=True))
-    components = [
-        {
-            "weight": each.weight,
-            "modes": len(each.modes),
-            "sigma": float(np.sqrt(np.diag(each.covariance).mean())),
-            "residual_sigma": each.residual_sigma,
-            "variance_shares": (each.variance / max(np.trace(each.covariance), 1e-300)).tolist(),
-        }
-        for each in model.components
-    ]
-    return {
-        "category": model.category,
-        "unit": model.unit,
-        "up_axis": model.up_axis,
-        "keypoints": len(model.ids),
-        "models": None if training is None else len(training),
-        "models_with_keypoint": counts,
-        "reflection": None if mirror is None else vars(mirror),
-        "components": components,
-    }
-
-
 def _text(model: ShapeModel) -> str:
-    summary, mirror = _summary(model), model.reflection
-    models = "given" if summary["models"] is None else f"learned from {summary['models']} models"
+    training, mirror = model.training, model.reflection
+    models = "given" if training is None else f"learned from {len(training)} models"
     lines = [
         f"{model.category}: {len(model.ids)} keypoints, {models}; lengths in {model.unit}",
         f"  up axis      {model.up_axis or 'unknown'}",
@@ -130,17 +99,20 @@ def _text(model: ShapeModel) -> str:
     if mirror is not None:
         pairs = ", ".join(f"{first}-{second}" for first, second in mirror.pairs)
         lines.append(f"  reflection   across {mirror.axis}, pairs {pairs or 'none'}")
-    for number, each in enumerate(summary["components"], start=1):
-        held = 100 * sum(each["variance_shares"][:_MODES])
+    for number, each in enumerate(model.components, start=1):
+        held = 100 * each.variance[:_MODES].sum() / max(np.trace(each.covariance), 1e-300)
+        sigma = np.sqrt(np.diag(each.covariance).mean())
         lines.append(
-            f"  component {number}  {100 * each['weight']:.0f} %, {each['modes']} modes, of which "
+            f"  component {number}  {100 * each.weight:.0f} %, {len(each.modes)} modes, of which "
             f"the first {_MODES} hold {held:.0f} % of the variance; standard deviation of a "
-            f"coordinate {each['sigma']:.3g}, {each['residual_sigma']:.2g} besides the modes"
+            f"coordinate {sigma:.3g}, {each.residual_sigma:.2g} besides the modes"
         )
-    counts = summary["models_with_keypoint"] or {}
-    rare = [f"{name} ({n})" for name, n in counts.items() if n < len(model.training or ()) / 4]
-    if rare:
-        lines.append(f"  rare keypoints (models that have it): {', '.join(rare)}")
+    if training is not None:
+        counts = np.isfinite(training.points_3d[..., 0]).sum(axis=0).tolist()
+        pairs_of = zip(model.ids, counts, strict=True)
+        rare = [f"{name} ({count})" for name, count in pairs_of if count < len(training) / 4]
+        if rare:
+            lines.append(f"  rare keypoints (models that have it): {', '.join(rare)}")
     return "\n".join(lines)
 
 

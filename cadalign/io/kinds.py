@@ -124,11 +124,5 @@ def refuse_other_file(path: Path, wanted: str) -> None:
 
 def is_of_many(path: Path, data: object = None) -> bool:
     """True for an input that may hold many observations; ``data`` is the content of a JSON file."""
-    if os.path.isdir(path) or path.suffix.lower() in (*LINES, TABLE):
-        return True
-    return kind_of(data) == DETECTOR or is_pattern(path)
-
-
-def is_pattern(path: Path) -> bool:
-    """True for what matches files, and is none."""
-    return not frozenset("*?[").isdisjoint(str(path)) and not os.path.exists(path)
+    is_container = os.path.isdir(path) or path.suffix.lower() in (*LINES, TABLE)
+    return is_container or kind_of(data) == DETECTOR

@@ -33,7 +33,7 @@ from cadalign.io.documents import (
     within,
     written_path,
 )
-from cadalign.io.evidence import ImageEvidence, ObservedImage, Size
+from cadalign.io.evidence import ObservedImage, Size
 from cadalign.io.files import as_path, once_per_file, read_bytes, read_text, write_json
 from cadalign.io.kinds import CAMERA, OBSERVATION, kind_of, other_kind, refuse_other_file
 from cadalign.io.observation_file import (
@@ -213,12 +213,10 @@ def with_lens(camera: Camera, focal: float | None = None, *, fov: float | None =
 
 @dataclass(frozen=True)
 class ObservationChanges:
-    """Camera, evidence and size in the place of those of observations."""
+    """A camera in the place of those of observations."""
 
     camera: Path | None = None  # file of the calibrated camera, see `camera_file.read_camera`
     pixel_origin: PixelOrigin | None = None  # of that camera
-    evidence: Mapping[str, Any] = field(default_factory=dict)  # fields of `ImageEvidence`
-    size: Size | None = None
     focal: Positive | None = None  # focal length of all cameras [px]
     fov: Positive | None = None  # or their horizontal field of view [degrees]
 
@@ -231,24 +229,14 @@ class ObservationChanges:
     def applied_to(self, observation: Observation, where: str | None = None) -> Observation:
         """The observation with all of this in the place of its own; ``where`` is its file.
 
-        Raises InputError if the observation has several views, which one camera or mask does not
-        fit.
+        Raises InputError if the observation has several views, which one camera does not fit.
         """
         own = observation.camera
         camera = self.read_camera((own.width, own.height))
-        changes: dict[str, Any] = {} if camera is None else {"camera": camera}
-        if self.evidence:
-            given = observation.evidence.given | dict(self.evidence)
-            changes["evidence"] = ImageEvidence(**given)
-        if self.size is not None:
-            changes["size"] = self.size
-        if changes and observation.others:
-            raise InputError(
-                f"the file has {len(observation.views)} views, the options are for one",
-                where=where,
-                fix="write camera, masks and other evidence into its `views`",
-            )
-        changed = replace(observation, **changes) if changes else observation
+        if camera is not None and observation.others:
+            what = f"the file has {len(observation.views)} views, the camera is for one"
+            raise InputError(what, where=where, fix="write cameras into its `views`")
+        changed = observation if camera is None else replace(observation, camera=camera)
         if self.focal is None and self.fov is None:
             return changed
         # Options of the fit about the focal length are left out.
@@ -272,7 +260,7 @@ class DetectorOptions:
     model: Path | None = None
     """The model, whose keypoints those of a detector's file are paired with, by name, otherwise by
     semantic id, otherwise by order: NAME.keypoints.json, or the mesh that this lies beside. With
-    --shape, the shape's by default. Of `fit --mask` without an observation, the mesh."""
+    --shape, the shape's by default."""
     images: Path | None = None
     """Folder of the photos that a detector's file names."""
     min_score: float = 0.0

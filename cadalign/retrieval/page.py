@@ -54,9 +54,10 @@ def write_retrieval(
         overlay, observation, fit = _files(folder, rank)
         write_image(overlay, draw_match(image, camera, match))
         if query is not None:
-            match.observation(query).save(observation)
-            made_folder(fit.parent)
-            match.result.save(fit)
+            seen = match.observation(query)
+            seen.save(observation)
+            fitted = seen.to_dict(folder=made_folder(fit.parent), states_origins=True)
+            write_json(fit, match.result.to_dict() | {"observation": fitted})
     none = none_text(matches)
     html = fill(
         "retrieval.html",

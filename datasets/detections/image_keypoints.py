@@ -14,7 +14,7 @@ from cadalign.datasets.models.model_keypoints import ModelKeypoints
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import check_pixels, unmeasured
-from cadalign.io.images import photo_size, read_mask, require_one_size
+from cadalign.io.images import photo_size, require_one_size
 from cadalign.io.kinds import PHOTO_ENDINGS
 from cadalign.io.observation import Observation, ObservationChanges
 
@@ -278,19 +278,15 @@ def observed_in(
     image: Path | None = None,
     **how: Any,
 ) -> Observation:
-    """Pair an image's keypoints with the model's, with the camera and the evidence of ``changes``.
+    """Pair an image's keypoints with the model's, with the camera of ``changes``.
 
     Without a camera it is one of the photo's size, whose focal length is unknown. ``how`` are
     further arguments of `join_keypoints`.
 
-    Raises CadalignError as that does; and if files cannot be read, or photo, mask, camera and
-    keypoints are of images of several sizes, or of none that is known.
+    Raises CadalignError as that does; and if files cannot be read, or photo, camera and keypoints
+    are of images of several sizes, or of none that is known.
     """
     sizes = {} if image is None else {str(image): photo_size(image)}
-    mask = changes.evidence.get("mask")
-    if mask is not None:  # read as a fit reads it, which refuses others
-        height, width = read_mask(mask).shape
-        sizes[str(mask)] = (width, height)
     if found.size is not None:
         sizes[found.source] = found.size
     camera = changes.read_camera(next(iter(sizes.values()), None))

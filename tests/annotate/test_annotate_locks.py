@@ -53,9 +53,9 @@ class Annotator:
 
 
 @contextmanager
-def annotator(case: Case, *arguments: object) -> Iterator[Annotator]:
+def annotator(case: Case, photo: Path, *arguments: object) -> Iterator[Annotator]:
     """An annotator in a process of its own."""
-    given = ["annotate", "--no-open", "--model", case.model, "--camera", case.camera, *arguments]
+    given = ["annotate", photo, case.model, "--no-open", "--camera", case.camera, *arguments]
     process = Program(MAIN, *given)
     try:
         yield Annotator(process)
@@ -64,11 +64,10 @@ def annotator(case: Case, *arguments: object) -> Iterator[Annotator]:
         process.communicate()
 
 
-def second(case: Case, capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+def second(case: Case, capsys: pytest.CaptureFixture[str], photo: Path, *arguments: object) -> str:
     """The line by which a second annotator is refused."""
-    return refusal_line(
-        capsys, "annotate", "--no-open", "--model", case.model, "--camera", case.camera, *arguments
-    )
+    given = photo, case.model, "--no-open", "--camera", case.camera, *arguments
+    return refusal_line(capsys, "annotate", *given)
 
 
 # --- processes -------------------------------------------------------------------------------
@@ -77,20 +76,20 @@ def second(case: Case, capsys: pytest.CaptureFixture[str], *arguments: object) -
 def test_second_process_is_refused_and_a_killed_one_leaves_no_lock(
     case: Case, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with annotator(case, "--image", case.photo) as first:
+    with annotator(case, case.photo) as first:
         first.act({"do": "place_uv", "uv": [10, 20]})
         first.act({"do": "pick", "origin": [0.02, 3, 0.03], "direction": [0, -1, 0]})
-        message = second(case, capsys, "--image", case.photo)
+        message = second(case, capsys, case.photo)
         assert message == (
             f"{case.folder}: another annotator has this folder open; "
             "go on in its page or end it, or give another --observation or --out"
         )
-        assert second(case, capsys, "--image", case.folder) == message
+        assert second(case, capsys, case.folder) == message
         first.act({"do": "place_uv", "uv": [30, 40]})
         first.process.send_signal(signal.SIGKILL)
         first.process.wait()
     assert Observation.load(case.observation).points_2d.tolist() == [[10, 20]]
-    with annotator(case, "--image", case.photo) as third:
+    with annotator(case, case.photo) as third:
         pairs = third.act({"do": "place_uv", "uv": [50, 60]})["pairs"]
         assert [pair["uv"] for pair in pairs] == [[10, 20], [30, 40], [50, 60]]
         code, err = third.end(signal.SIGTERM)
@@ -101,15 +100,15 @@ def test_folder_keeps_annotators_of_its_photos_out(
     case: Case, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = case.folder / "out"
-    with annotator(case, "--image", case.folder, "--out", out) as first:
-        for arguments in (
-            ("--image", case.folder, "--out", out),
-            ("--image", case.photo, "--out", out),
-            ("--image", case.photo, "--observation", out / "photo.json"),
+    with annotator(case, case.folder, "--out", out) as first:
+        for photo, *arguments in (
+            (case.folder, "--out", out),
+            (case.photo, "--out", out),
+            (case.photo, "--observation", out / "photo.json"),
         ):
-            message = second(case, capsys, *arguments)
+            message = second(case, capsys, photo, *arguments)
             assert message.startswith(f"{out}: another annotator has this folder open")
-        with annotator(case, "--image", case.photo) as elsewhere:  # another folder's files
+        with annotator(case, case.photo) as elsewhere:  # another folder's files
             elsewhere.act({"do": "undo"})
             assert elsewhere.end()[0] == 0
         first.act({"do": "undo"})
@@ -119,7 +118,7 @@ def test_folder_keeps_annotators_of_its_photos_out(
 
 def test_what_cannot_be_saved_is_said_at_the_end(case: Case) -> None:
     out = case.folder / "out"
-    with annotator(case, "--image", case.photo, "--out", out) as first:
+    with annotator(case, case.photo, "--out", out) as first:
         first.act({"do": "place_uv", "uv": [10, 20]})
         shutil.rmtree(out)
         state = first.act({"do": "place_uv", "uv": [30, 40]})
@@ -134,7 +133,7 @@ def test_folder_that_cannot_be_written_to_is_refused_before_any_work(
     case: Case, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = Path("/sys/kernel")
-    message = second(case, capsys, "--image", case.photo, "--out", out)
+    message = second(case, capsys, case.photo, "--out", out)
     assert re.fullmatch(
         r"/sys/kernel: cannot be written \(.+\); make room or choose another folder; .+",
         message,

@@ -1,4 +1,4 @@
-"""`cadalign library build`: models that cannot be read, and libraries that can be opened."""
+"""Libraries that are written can be opened, whatever the coordinates."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ import json
 from pathlib import Path
 
 import pytest
-from support.refusals import refusal_line
 
 from cadalign import Library
-from cadalign.cli import main
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.errors import InputError
 from cadalign.retrieval import LibraryModel
@@ -34,32 +32,6 @@ end_header
 0 1 0
 3 0 1 2
 """
-
-
-def test_models_that_cannot_be_read_are_left_out(
-    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = root / "annotations" / "chair.json"
-    entries = json.loads(path.read_text())
-    del entries[0]["keypoints"]
-    path.write_text(json.dumps([*entries, entries[1]]))
-    mesh = KeypointNet(root)["bottle"][0].mesh_path
-    assert mesh is not None
-    mesh.write_text("nonsense")
-    assert main(["library", "build", str(root), "--out", str(tmp_path / "lib")]) == 0
-    said = capsys.readouterr().err
-    assert "Left out: 2 models with malformed annotations" in said
-    assert "7 models: 4 bottle, 3 chair; 1 without a mesh" in said
-    assert len(Library.open(tmp_path / "lib")) == 7
-
-
-def test_a_library_of_no_model_is_refused(
-    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (root / "annotations" / "chair.json").write_text("[]")
-    chairs = ["library", "build", root, "--categories", "chair"]
-    line = refusal_line(capsys, *chairs, "--out", tmp_path / "lib")
-    assert line == f"{root}: the data set has no such models"
 
 
 def test_a_library_that_is_written_can_be_opened(root: Path, tmp_path: Path) -> None:

@@ -76,19 +76,14 @@ def test_the_table_holds_the_best_match_of_each(
         texts = list(csv.DictReader(file))
     assert [row["match_id"] for row in texts] == [model_id for _, model_id in found]
     assert "top_ids" not in texts[0]
-    results = Results.open(run)
-    records = pq.read_table(run / "records.parquet").to_pylist()
-    for number, (line, row, record) in enumerate(
-        zip(case.queries.read_text().splitlines(), rows, records, strict=True)
-    ):
+    texts_of = case.queries.read_text().splitlines()
+    for line, row, single in zip(texts_of, rows, Results.open(run), strict=True):
         seen = json.loads(line)["keypoints"]
         expected = case.library.retrieve(
             [each["uv"] for each in seen], [each["semantic_id"] for each in seen], CAMERA, top=4
         )
         assert row["top_ids"] == [match.model_id for match in expected]
         assert row["top_scores"] == [match.score for match in expected]
-        assert json.loads(record["matches"]) == [match.to_dict() for match in expected]
-        single = results[number]
         assert isinstance(single, Result)
         np.testing.assert_allclose(
             single.alignment.packed, expected[0].alignment.packed, rtol=1e-12
@@ -134,18 +129,6 @@ def test_a_query_that_fails_is_a_row(
     ):
         assert text in row["reason"]
     assert "1 of 5 retrieved, 4 failed" in capsys.readouterr().err
-
-
-def test_another_library_is_another_run(
-    case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "lib"
-    run = ["--library", str(path), "--out", str(tmp_path / "run"), "--no-picture"]
-    case.library.save(path)
-    assert main(["retrieve", str(case.queries), *run]) == 0
-    Library.from_models(list(case.library)[:5]).save(path)
-    assert main(["retrieve", str(case.queries), *run]) == 1
-    assert f"another configuration: files.{path} is" in capsys.readouterr().err
 
 
 def test_a_match_is_a_result(case: Case, tmp_path: Path) -> None:

@@ -15,10 +15,8 @@ import cadalign
 from cadalign import Alignment, Camera, Observation
 from cadalign.batch.spec import SPEC, FitRun
 from cadalign.datasets import write_sample_dataset
-from cadalign.errors import InputError
 from cadalign.evaluation.api import run as do_run
 from cadalign.evaluation.experiments.keypointnet import KeypointNetOptions
-from cadalign.evaluation.instances.pictures import cut_out
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.io.images import read_photo, write_image
 from cadalign.report import headline_text, write_report
@@ -89,14 +87,6 @@ def test_a_run_stands_beside_one_with_truth(
     expect(page.locator("table.headline").first).to_be_visible()
 
 
-def test_runs_without_instances_are_for_a_page_of_their_own(
-    runs: dict[str, Path], tmp_path: Path
-) -> None:
-    cadalign.simulate(sweep="points", runs=1, values=(10,), out=tmp_path / "sim", workers=0)
-    with pytest.raises(InputError, match=r"sim is a run of .*, plain one of fit; write a report"):
-        write_report([runs["plain"], tmp_path / "sim"], tmp_path / "r.html")
-
-
 def test_failed_fits_show_their_photos_and_keypoints(tmp_path: Path, opened: Opened) -> None:
     photo = tmp_path / "photo.png"
     write_image(photo, np.full((480, 640, 3), (40, 140, 90), dtype=np.uint8))
@@ -113,14 +103,3 @@ def test_failed_fits_show_their_photos_and_keypoints(tmp_path: Path, opened: Ope
         for each in shown:
             middle = read_photo(each)[5, 5].astype(int)
             assert np.abs(middle - (40, 140, 90)).max() < 12
-
-
-def test_thumbnails_show_the_middle_of_the_object() -> None:
-    photo = np.zeros((480, 640, 3), dtype=np.uint8)
-    photo[300:340, 400:460] = 200
-    camera = Camera(640, 480, 600.0, 600.0, 319.5, 239.5)
-    thumb, _ = cut_out(photo, camera, np.array([[390.0, 290.0], [470.0, 350.0]]))
-    rows, columns = np.nonzero(thumb[:, :, 0] > 100)
-    middle = np.array(thumb.shape[:2]) / 2
-    np.testing.assert_allclose([rows.mean(), columns.mean()], middle, atol=2)
-    assert 0.1 < len(rows) / thumb[:, :, 0].size < 0.7

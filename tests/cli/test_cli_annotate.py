@@ -21,7 +21,7 @@ def refusal(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
 def test_out_folder_is_made(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
     file = case.folder / "file"
     file.write_text("")
-    message = refusal(capsys, "--image", case.photo, "--model", case.model, "--out", file / "out")
+    message = refusal(capsys, case.photo, case.model, "--out", file / "out")
     reason = "the folder cannot be created (Not a directory); choose another --out"
     assert message == f"{file / 'out'}: {reason}"
 
@@ -31,16 +31,13 @@ def test_folder_of_the_observation_is_made(
 ) -> None:
     # Refused only after the folder was made: a model that is none.
     observation = tmp_path / "new" / "dir" / "obs.json"
-    refusal(capsys, "--image", case.photo, "--model", case.camera, "--observation", observation)
+    refusal(capsys, case.photo, case.camera, "--observation", observation)
     assert observation.parent.is_dir()
     file = tmp_path / "file"
     file.write_text("")
-    message = refusal(
-        capsys,
-        *("--image", case.photo, "--model", case.model),
-        *("--observation", file / "sub" / "obs.json"),
-    )
+    path = file / "sub" / "obs.json"
+    message = refusal(capsys, case.photo, case.model, "--observation", path)
     assert message == (
-        f"{file / 'sub' / 'obs.json'}: cannot be written (Not a directory); "
+        f"{path}: cannot be written (Not a directory); "
         "make room or choose another folder; what was written before is kept"
     )

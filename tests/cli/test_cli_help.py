@@ -15,8 +15,7 @@ PATHS = (
     *("demo", "fit", "observe", "annotate", "retrieve", "report", "export", "render", "doctor"),
     *("library build", "library show", "shape learn", "shape show"),
     *("evaluate keypointnet", "evaluate unseen", "evaluate photos"),
-    *("evaluate correspondences", "evaluate retrieval"),
-    *("simulate noise", "simulate points", "simulate outliers"),
+    *("evaluate correspondences", "evaluate retrieval", "simulate"),
 )
 
 

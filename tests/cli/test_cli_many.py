@@ -102,28 +102,6 @@ def test_a_detectors_file_needs_no_observations(
     assert "--model: the keypoints of the model are not known; give the" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", ["K.txt", "model.keypoints.json"])
-def test_a_run_does_not_go_on_with_another_camera_or_model(
-    folder: Path, capsys: pytest.CaptureFixture[str], name: str
-) -> None:
-    arguments = ["fit", str(folder / "found.json"), "--camera", str(folder / "K.txt")]
-    arguments += ["--model", str(folder / "model.keypoints.json"), "--no-picture"]
-    assert main([*arguments, "--out", str(folder / "out")]) == 0
-    if name == "K.txt":
-        np.savetxt(folder / name, np.diag([2, 2, 1]) @ CAMERA.matrix)
-    else:
-        rows = zip(NAMES, (1.5 * POINTS).tolist(), strict=True)
-        moved = (ModelKeypoint(each, tuple(xyz)) for each, xyz in rows)
-        ModelKeypoints(tuple(moved)).save(folder / name)
-    capsys.readouterr()
-    assert main([*arguments, "--out", str(folder / "out")]) == 1
-    text = capsys.readouterr().err
-    assert f"holds a run with another configuration: files.{folder / name} is " in text
-    main([*arguments, "--out", str(folder / "again")])  # what this process has read is not kept
-    row = next(csv.DictReader((folder / "again" / "results.csv").open()))
-    assert float(row["focal_length"]) == (1400 if name == "K.txt" else 700)
-
-
 def test_a_camera_that_cannot_be_read_is_refused_before_the_run(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -133,28 +111,6 @@ def test_a_camera_that_cannot_be_read_is_refused_before_the_run(
     assert main(["fit", str(folder / "found.json"), *camera, *model]) == 1
     assert f"{folder / 'K.txt'}: not a calibration matrix; give" in capsys.readouterr().err
     assert not (folder / "out").exists()
-
-
-def test_what_is_wrong_with_the_inputs_is_one_line(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = ["--out", str(folder / "out")]
-    for arguments, text in [
-        (["no such*.json"], "no such*.json: no file matches"),
-        ([str(folder / "a.png"), "b.json"], "a photo, not an observation"),
-        ([str(folder / "gone.jsonl")], "gone.jsonl: no such file"),
-    ]:
-        assert main(["fit", *arguments, *out]) == 1
-        shown = capsys.readouterr().err
-        assert text in shown
-        assert "Traceback" not in shown
-
-
-def test_several_files_are_fitted_as_a_folder_is(folder: Path) -> None:
-    written = write_observations(folder)
-    files = [str(written / f"{name}.json") for name in ("a_0", "b")]
-    assert main(["fit", *files, "--out", str(folder / "out"), "--stretch", "y"]) == 0
-    assert [found.stretched_axes for found in Results.open(folder / "out")] == ["y", "y"]
 
 
 def test_matrix_takes_the_place_of_the_camera(folder: Path) -> None:
@@ -170,8 +126,6 @@ def test_matrix_takes_the_place_of_the_camera(folder: Path) -> None:
     ("option", "text"),
     [
         ("--min-score 0.5", "--min-score: has no effect on one observation; leave it out"),
-        ("--model m.keypoints.json", "--model: has no effect on one observation; leave it out"),
-        ("--images photos", "--images: has no effect on one observation; leave it out"),
         ("--workers 2", "--workers: has no effect on one observation; leave it out"),
     ],
 )
@@ -211,10 +165,6 @@ def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
         ),
         (["fit", "{folder}/empty"], "{folder}/empty: the folder holds no observation; "),
         (
-            ["observe", "{folder}/found.json", "{folder}/model.keypoints.json"],
-            "--image: 2 images; choose one of a.png, b.png",
-        ),
-        (
             ["observe", "{folder}/found.json", "{folder}/model.keypoints.json", "--image", "a.png"],
             "--object: 2 objects in the image, and no scores to choose by; choose one, 0 to 1",
         ),
@@ -241,21 +191,3 @@ def test_messages_name_what_the_user_typed(
     assert main([word.format(folder=folder) for word in arguments]) == 1
     shown = capsys.readouterr().err
     assert text.format(folder=folder) in shown
-
-
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (["annotate"], "--image: no photo is given; cadalign annotate PHOTO MODEL"),
-        (["annotate", "photo.jpg"], "--model: no model is given; cadalign annotate PHOTO MODEL"),
-        (["annotate", "a.jpg", "b.jpg", "m.obj"], "PHOTO MODEL: m.obj is one file too many"),
-        (["fit"], "OBSERVATION"),
-    ],
-)
-def test_missing_arguments_exit_with_2(
-    arguments: list[str], text: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main(arguments)
-    assert stop.value.code == 2
-    assert text in capsys.readouterr().err

@@ -10,7 +10,6 @@ import pytest
 from support.files import TETRAHEDRON
 from support.refusals import refusal_line
 
-import cadalign
 from cadalign.cli import main
 from cadalign.evaluation.simulation import simulate_problem
 from cadalign.io.images import write_image
@@ -58,11 +57,6 @@ def test_mesh_is_no_observation(
     assert f"cadalign annotate PHOTO {mesh}" in line
 
 
-def test_photo_is_no_query(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    line = refusal_line(capsys, "retrieve", "photo.png", "--library", "none.library")
-    assert line.startswith("photo.png: a photo, not an observation")
-
-
 def test_observation_and_fit_are_told_apart(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -105,11 +99,6 @@ def test_present_folder_is_fitted(folder: Path, monkeypatch: pytest.MonkeyPatch)
     assert (folder / "here_fit" / "results.csv").is_file()
 
 
-def test_only_file_that_fails_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["fit", "seen.json", "gone.json", "--no-picture"]) == 3
-    assert "failed 1: gone.json: no such file" in capsys.readouterr().err
-
-
 def test_keypoints_of_the_model_are_none_of_a_photo(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -137,9 +126,8 @@ def test_unknown_field_is_answered_by_fields(
     assert "--" not in line
 
 
-def test_folder_is_no_mesh(folder: Path) -> None:
-    with pytest.raises(cadalign.errors.DataError, match="a folder, not a mesh file"):
-        cadalign.load_mesh(folder)
+def test_folder_is_no_mesh(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "a folder, not a mesh file" in refusal_line(capsys, "render", folder)
 
 
 def test_exchanged_arguments_are_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

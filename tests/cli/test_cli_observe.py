@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -48,12 +47,6 @@ def folder(tmp_path: Path) -> Path:
         tmp_path / "model.keypoints.json"
     )
     return tmp_path
-
-
-def store(folder: Path, **options: Any) -> None:
-    """Write options of the fit into the observation."""
-    path = folder / "found.observation.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"fit": options}))
 
 
 def observing(folder: Path, *options: str) -> list[str]:
@@ -114,35 +107,9 @@ def test_fit_of_a_photo_without_focal_length_takes_exif_into_account(
     assert result.camera.fx == pytest.approx(expected.camera.fx, rel=1e-9)
     assert result.camera.fx == pytest.approx(620, rel=0.03)
     assert result.focal_prior == prior
-    store(folder, focal_prior="usual")
-    without = fitted(folder, "found.observation")
-    usual = FocalPrior.of_usual_lenses(640, 480)
-    assert without.focal_prior == usual
-    assert f"its prior: {usual}" in capsys.readouterr().err
-    store(folder, focal_prior=None)
+    path = folder / "found.observation.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"fit": {"focal_prior": None}}))
     assert fitted(folder, "found.observation").focal_prior is None
-    assert without.std is not None
-    assert result.std is not None
-    assert without.std.focal > result.std.focal
-
-
-def test_exif_that_lies_is_ignored_with_a_warning(
-    folder: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    photo = Image.new("RGB", (640, 480))
-    exif = photo.getexif()
-    exif[0x8769] = {0xA405: 60000}
-    photo.save(folder / "photo.jpg", exif=exif)
-    observe(folder, "--image", str(folder / "photo.jpg"))
-    with caplog.at_level(logging.WARNING, logger="cadalign"):
-        result = fitted(folder, "found.observation")
-    assert result.focal_prior == FocalPrior.of_usual_lenses(640, 480)
-    assert result.camera.fx == pytest.approx(620, rel=0.1)
-    (record,) = caplog.records
-    assert record.getMessage() == (
-        f"{folder / 'photo.jpg'}: the EXIF data state a focal length of 1.109e+06 px, "
-        "which no camera has; ignored"
-    )
 
 
 def test_known_focal_length_can_be_estimated_all_the_same(folder: Path) -> None:
@@ -168,46 +135,13 @@ def test_focal_length_or_field_of_view_is_given_in_the_command(
     assert Observation.load(folder / "found.observation.json").camera == TRUE
     capsys.readouterr()
     for options, message in (
-        (["--focal", "620", "--fov", "50"], "--fov: given beside the focal length"),
+        (["--focal", "620", "--fov", "50"], "--fov: given beside --focal 620"),
         (["--focal", "estimate", "--fov", "50"], "--fov: given beside --focal estimate"),
         (["--fov", "190"], "--fov: 190.0 is not between 0 and 180 degrees"),
         (["--focal", "-3"], "camera.fx: the focal length is -3"),
     ):
         assert main(["fit", str(folder / "found.observation.json"), *options]) == 1
         assert message in capsys.readouterr().err
-
-
-def test_scores_can_weigh_instead(folder: Path) -> None:
-    observe(folder, "--image", str(folder / "photo.jpg"), "--weigh", "2", "--min-score", ".5")
-    observation = Observation.load(folder / "found.observation.json")
-    assert observation.scores is None
-    assert observation.sigma is not None
-    assert observation.sigma.min() >= 2.0
-    assert observation.sigma.max() <= 4.0
-    assert len(observation.points_2d) < 24
-
-
-def test_camera_can_be_given(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (folder / "camera.json").write_text(json.dumps(TRUE.to_dict()))
-    out = folder / "elsewhere" / "a.json"
-    assert observe(folder, "--camera", str(folder / "camera.json"), "--out", str(out)) == 0
-    assert Observation.load(out).camera == TRUE
-
-
-def test_csv_goes_the_same_way(folder: Path) -> None:
-    lines = [f"{n},{u!r},{v!r}" for n, (u, v) in zip(NAMES, POINTS_2D.tolist(), strict=True)]
-    (folder / "found.csv").write_text("name,u,v\n" + "\n".join(reversed(lines)) + "\ntail,1,2\n")
-    arguments = [
-        "observe",
-        str(folder / "found.csv"),
-        str(folder / "model.keypoints.json"),
-        "--image",
-        str(folder / "photo.jpg"),
-    ]
-    assert main(arguments) == 1
-    assert main([*arguments, "--ignore-unknown"]) == 0
-    observation = Observation.load(folder / "found.observation.json")
-    np.testing.assert_allclose(observation.points_3d, POINTS_3D[::-1])
 
 
 @pytest.mark.parametrize(
@@ -222,7 +156,6 @@ def test_csv_goes_the_same_way(folder: Path) -> None:
             ["--image", "{folder}/found.json"],
             "{folder}/found.json: a detector's keypoints, not an image; give a picture",
         ),
-        (["--camera", "{folder}/none.json"], "{folder}/none.json: no such file"),
         (
             ["--camera", "{folder}/found.json"],
             "{folder}/found.json: a detector's keypoints, not a camera; give 3 x 3 numbers",
@@ -236,42 +169,6 @@ def test_what_cannot_be_used_is_refused_in_one_line(
     given = [option.format(folder=folder) for option in options]
     line = refusal_line(capsys, *observing(folder, *given))
     assert line.startswith(text.format(folder=folder))
-
-
-def test_observation_of_an_upright_photo_is_drawn_upright(folder: Path) -> None:
-    observe(folder, "--image", str(folder / "photo.jpg"))
-    fitted(folder, "found.observation")
-    with Image.open(folder / "found.observation_fit" / "overlay.png") as overlay:
-        assert overlay.size == (640, 480)
-
-
-def test_unknown_focal_length_survives_the_file(tmp_path: Path) -> None:
-    lens: Any = (-0.1, 0.02, 0.0, 0.0)
-    for camera in (
-        Camera.without_focal(640, 480),
-        Camera.without_focal(640, 480, cx=300.25, cy=251.5, distortion=lens),
-    ):
-        Observation(POINTS_3D, POINTS_2D, camera).save(tmp_path / "a.json")
-        assert Observation.load(tmp_path / "a.json").camera == camera
-    data = json.loads((tmp_path / "a.json").read_text())
-    assert data["camera"]["params"][:2] == [None, None]
-    data["camera"] = {"width": 640, "height": 480}
-    (tmp_path / "a.json").write_text(json.dumps(data))
-    assert Observation.load(tmp_path / "a.json").camera == Camera.without_focal(640, 480)
-
-
-def test_photo_and_camera_of_different_sizes_are_refused(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    camera = folder / "camera.json"
-    camera.write_text(json.dumps(Camera(100, 50, 60.0, 60.0, 50.0, 25.0).to_dict()))
-    photo = folder / "photo.jpg"
-    options = ("--image", str(photo), "--camera", str(camera))
-    text = refusal_line(capsys, *observing(folder, *options))
-    assert text == (
-        f"{photo}: the image has 640 x 480 pixels, that of {camera} 100 x 50; "
-        "give keypoints, photo and camera of one image"
-    )
 
 
 # --- evidence beyond keypoints -----------------------------------------------------------------
@@ -312,39 +209,6 @@ def test_mask_that_a_fit_cannot_use_is_left_out(
     assert observe(masked, "--image", str(masked / "photo.jpg")) == 0
     assert capsys.readouterr().err == "The mask is left out: a fit to it needs --camera.\n"
     assert Observation.load(masked / "found.observation.json").is_plain
-    camera = ["--camera", str(masked / "camera.json")]
-    assert observe(masked, *camera, "--no-segmentation") == 0
-    assert Observation.load(masked / "found.observation.json").is_plain
-
-
-def test_options_give_mask_and_size(masked: Path) -> None:
-    Image.fromarray(np.full((480, 640), 255, dtype=np.uint8)).save(masked / "mask.png")
-    options = ["--camera", masked / "camera.json", "--mask", masked / "mask.png"]
-    assert observe(masked, *map(str, options), "--size", "height", ".9", "sigma", ".02") == 0
-    observation = Observation.load(masked / "found.observation.json")
-    assert observation.evidence.mask == masked / "mask.png"
-    assert observation.size is not None
-    assert observation.size.given == {"height": 0.9, "sigma": 0.02}
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        (["--mask", "{folder}/none.png"], "{folder}/none.png: no such file"),
-        (["--mask", "{folder}/small.png"], "{folder}/small.png: the image has 8 x 6 pixels, "),
-        (["--mask", "{folder}/photo.jpg"], "{folder}/photo.jpg: the image has the mode RGB; give"),
-        (["--size", "height", "-1"], "--size.height: -1.0 is not a positive number"),
-        (["--size", "depth", "1"], "--size: unknown field 'depth'; known are height, length, "),
-        (["--size", "sigma", "1"], "--size: no length is given; give width, height or length"),
-    ],
-)
-def test_evidence_that_cannot_be_used_is_refused(
-    masked: Path, capsys: pytest.CaptureFixture[str], options: list[str], text: str
-) -> None:
-    Image.new("L", (8, 6)).save(masked / "small.png")
-    given = [option.format(folder=masked) for option in options]
-    line = refusal_line(capsys, *observing(masked, "--camera", str(masked / "camera.json"), *given))
-    assert line.startswith(text.format(folder=masked))
 
 
 def coco(folder: Path, **changes: Any) -> Path:

@@ -17,7 +17,7 @@ from cadalign.cli.doctor import Doctor, compiled_cache
 from cadalign.cli.render import Render
 from cadalign.compile.folder import kernel_folder
 from cadalign.errors import DataError, InputError, RenderError
-from cadalign.render.probe import RENDERERS, Probe
+from cadalign.render.probe import REMEDIES, Probe
 
 
 @pytest.fixture
@@ -51,17 +51,11 @@ def test_one_view_gives_a_still(model, tmp_path):
 
 @pytest.mark.parametrize("views", [["front", "top"], ["30,20", "-30,20,10", "left"], ["all"]])
 def test_several_views_give_a_contact_sheet(model, tmp_path, views):
-    _run(model, "--out", tmp_path / "s.png", "--resolution", "80x60", "--view", *views)
-    height, width = _pixels(tmp_path / "s.png").shape[:2]
+    _run(model, "--out", tmp_path / "s.jpg", "--resolution", "80x60", "--view", *views)
+    assert (tmp_path / "s.jpg").read_bytes()[:2] == b"\xff\xd8"
+    height, width = _pixels(tmp_path / "s.jpg").shape[:2]
     assert width > 160
     assert height > 60 * (1 if len(views) == 2 else 2)
-
-
-def test_a_jpg_is_a_still(model, tmp_path):
-    out = tmp_path / "s.jpg"
-    _run(model, "--out", out, "--resolution", "80x60")
-    assert out.read_bytes()[:2] == b"\xff\xd8"
-    assert _pixels(out).shape[:2] == (60, 80)
 
 
 @pytest.mark.long
@@ -103,15 +97,12 @@ def test_keypoints_from_their_file_and_from_annotations(model, tmp_path):
         (["--resolution", "0x0"], InputError, "'0x0' is no resolution"),
         (["--resolution", "640"], InputError, "give WIDTHxHEIGHT"),
         (["--resolution", "20000x20000"], RenderError, "the limits are 16384 px a side"),
-        (["--resolution", "999999999x1"], RenderError, "the limits are"),
         (["--view", "sideways"], InputError, "is not a view"),
-        (["--view", "nothing.json"], InputError, "is not a view"),
         (["--out", "picture.jpeg"], InputError, "neither a PNG nor a JPEG"),
         (["--scale", "1", "0", "1"], InputError, "is not positive"),
         (["--fov", "180"], InputError, "--fov: 180.0 is not between 0 and 180"),
         (["--view", "10,200"], InputError, "--view: 200 is not between -90 and 90"),
         (["--samples", "0"], InputError, "--samples: 0 is not from 1 to 256"),
-        (["--out", "t.mp4"], InputError, "neither a PNG nor a JPEG"),
     ],
 )
 def test_wrong_words_are_refused(model, tmp_path, monkeypatch, arguments, error, message):
@@ -119,28 +110,6 @@ def test_wrong_words_are_refused(model, tmp_path, monkeypatch, arguments, error,
     with pytest.raises(error, match=message):
         _run(model, *arguments)
     assert not [path for path in tmp_path.iterdir() if path.suffix in (".png", ".mp4", ".jpeg")]
-
-
-def test_a_bad_mesh_is_refused_by_name(tmp_path):
-    path = tmp_path / "bad.obj"
-    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n")
-    with pytest.raises(DataError, match=r"bad\.obj: .*names vertex 9"):
-        _run(path, "--out", tmp_path / "x.png")
-
-
-@pytest.mark.long
-def test_a_million_faces_are_drawn(tmp_path):
-    rows = 720
-    u, v = np.mgrid[:rows, :rows] / rows
-    waves = np.column_stack([u.ravel(), 0.1 * np.sin(9 * u * v).ravel(), v.ravel()])
-    corner = (np.arange(rows - 1)[:, None] * rows + np.arange(rows - 1)).ravel()
-    beside, above = corner + 1, corner + rows
-    faces = np.column_stack([corner, beside, above, above + 1, above, beside]).reshape(-1, 3)
-    assert len(faces) > 1_000_000
-    path = tmp_path / "fine.ply"
-    trimesh.Trimesh(waves, faces, process=False).export(path)
-    _run(path, "--out", tmp_path / "x.png", "--resolution", "160x120")
-    assert (_pixels(tmp_path / "x.png") != (228, 230, 233)).any(axis=2).mean() > 0.1
 
 
 def test_a_file_that_cannot_be_written_is_named(model, tmp_path):
@@ -152,40 +121,16 @@ def test_a_file_that_cannot_be_written_is_named(model, tmp_path):
 # doctor
 
 
-def _health(**changes):
-    good = Probe("raycast", True, "processor")
-    bad = Probe("pyrender", False, "OpenGL does not start")
-    values = {
-        "renderers": [vars(bad), vars(good)],
-        "best": "raycast",
-        "remedies": {"pyrender": "sudo apt-get install libegl1 libgl1"},
-        "cores": 8,
-        "usable_cores": 2,
-        "cache": "12 functions kept in /somewhere",
-        "python": "3.11",
-        "numpy": "2.4",
-        "numba": "0.68",
-    }
-    return {**values, **changes}
-
-
 def test_doctor_tells_what_works_and_how_to_enable_the_rest(monkeypatch, capsys):
-    monkeypatch.setattr("cadalign.cli.doctor.examine", _health)
-    monkeypatch.setenv("COLUMNS", "160")
-    assert Doctor().run() == 0
-    text = capsys.readouterr().out
-    assert "To enable pyrender: sudo apt-get install libegl1 libgl1" in text
-    assert "--renderer auto takes: raycast" in text
-    assert "OpenGL does not start" in text
-    assert "of which this process may use 2" in text
-    assert Doctor(json=True).run() == 0
-    assert json.loads(capsys.readouterr().out)["renderers"][1]["detail"] == "processor"
-
-
-def test_doctor_fails_where_not_even_ray_casting_works(monkeypatch, capsys):
-    broken = Probe("raycast", False, "embreex is gone")
-    monkeypatch.setattr("cadalign.cli.doctor.examine", lambda: _health(renderers=[vars(broken)]))
-    assert Doctor().run() == 1
+    good, bad = Probe("raycast", True, "processor"), Probe("pyrender", False, "no OpenGL")
+    for probed, code in (([bad, good], 0), ([Probe("raycast", False, "embreex is gone")], 1)):
+        monkeypatch.setattr("cadalign.cli.doctor.probed_renderers", lambda found=probed: found)
+        monkeypatch.setattr("cadalign.render.probe.best_renderer", lambda: "raycast")
+        assert Doctor().run() == code
+        text = capsys.readouterr().out
+    assert "raycast   fails: embreex is gone\n--renderer auto takes: raycast\n" in text
+    assert f"To enable raycast: {REMEDIES['raycast']}\n" in text
+    assert "Compiled solvers: " in text
 
 
 def test_the_state_of_the_cache_is_told(tmp_path, monkeypatch):
@@ -207,17 +152,6 @@ def test_nothing_is_compiled_ahead_that_could_not_be_kept(tmp_path, monkeypatch,
     fix = "set NUMBA_CACHE_DIR to a folder that can be"
     line = refusal_line(capsys, "doctor", "--compile")
     assert line == f"--compile: {kernel_folder()} cannot be written to; {fix}"
-
-
-@pytest.mark.long
-def test_doctor_runs_for_real(monkeypatch, capsys):
-    monkeypatch.delitem(RENDERERS, "open3d")  # which takes seconds to load
-    assert Doctor(json=True).run() == 0
-    health = json.loads(capsys.readouterr().out)
-    names = [renderer["name"] for renderer in health["renderers"]]
-    assert names == ["pyrender", "raycast"]
-    for renderer in health["renderers"]:
-        assert renderer["detail"]
 
 
 def test_textures_of_the_model_are_not_written_over(model, capsys) -> None:

@@ -21,8 +21,8 @@ _VALUES = [
 ]  # fmt: skip
 _COMMANDS: dict[str, list[str]] = {
     "fit": ["--method", "--loss", "--stretch", "--focal", "--sigma", "--robust", "--similar",
-            "--json", "--out", "--shape", "--shape-sigma", "--use-photo", "--mask", "--model"],
-    "observe": ["--image", "--out", "--object", "--min-score", "--weigh", "--mask"],
+            "--json", "--out", "--shape", "--shape-sigma", "--use-photo", "--model"],
+    "observe": ["--image", "--out", "--object", "--min-score"],
     "retrieve": ["--library", "--out", "--top", "--category", "--json", "--loss"],
     "render": ["--out", "--width", "--height", "--view", "--keypoints"],
     "report": ["--out", "--format"],

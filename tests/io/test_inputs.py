@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from PIL import Image
 from support.refusals import refusal_line
 
 from cadalign import Camera, FocalPrior, Library, Result, Results, ShapeModel
@@ -168,15 +167,3 @@ def test_texts_are_paths_of_cameras_and_observations(tmp_path: Path) -> None:
     seen.save(tmp_path / "seen.json")
     read = Observation.load(tmp_path / "seen.json")
     assert (read.image, read.evidence.mask) == (tmp_path / "photo.png", tmp_path / "mask.png")
-
-
-def test_a_photo_in_place_of_a_mask_is_named_once(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    photo, model = tmp_path / "photo.png", tmp_path / "model.obj"
-    Image.new("RGB", (64, 48)).save(photo)
-    model.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    alone = refusal_line(capsys, "fit", "--mask", photo, "--model", model, "--focal", 50)
-    assert alone == (
-        f"{photo}: the image has the mode RGB; give an image of one grey channel, of 8 or 16 bits"
-    )

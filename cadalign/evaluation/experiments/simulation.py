@@ -77,13 +77,14 @@ SWEEPS = {kind.name: kind for kind in (_NOISE, _POINTS, _OUTLIERS)}
 
 @dataclass(frozen=True)
 class SweepOptions(FunctionOptions):
-    """Repeat the AEPnP paper's simulation: a table, a page, and figures as PNG and PDF."""
+    """Repeat the AEPnP paper's simulation: tables, a page, and figures as PNG and PDF."""
 
     experiment = "simulate"
     command = "simulate"
 
-    sweep: Annotated[str, tyro.conf.Suppress]
-    """The quantity that is varied: noise, points or outliers."""
+    sweep: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SWEEP")]
+    """The quantity that is varied: noise, at 1,024 points; points, at 2 px of noise; or outliers,
+    at 100 points and 2 px."""
     _: KW_ONLY
     methods: tuple[str, ...] | None = None
     """Methods of `cadalign fit`, optimal-huber, optimal-cauchy, ransac-optimal, ransac-ap4p,

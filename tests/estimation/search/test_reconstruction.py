@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cadalign import Model, align, views_from
+from cadalign import Model, View, align
 from cadalign.datasets import Colmap
-from cadalign.errors import DataError, InputError
 
 
 def opened() -> Colmap:
@@ -35,26 +34,18 @@ def test_points_of_the_scene_are_aligned_in_its_frame() -> None:
         rows = [int(np.flatnonzero(numbers == each)[0]) for each in shared]
         errors += np.linalg.norm(image.residuals()[rows], axis=1)
     chosen = shared[np.argsort(errors)[:20]]
-    keypoints = {}
+    views = []
     for image, numbers in zip((first, second), ids, strict=True):
         rows = [int(np.flatnonzero(numbers == each)[0]) for each in chosen]
-        keypoints[image.id] = (image.points_2d[rows], [int(each) for each in chosen])
+        pose, names = image.cam_from_world.cam_from_model, [int(each) for each in chosen]
+        seen = image.points_2d[rows]
+        views.append(View(image.camera, seen, ids=names, sigma=0.3, cam_from_rig=pose))
     rows = [int(np.flatnonzero(ids[0] == each)[0]) for each in chosen]
     world = first.points_3d[rows]
     scale = np.array([0.5, 2.0, 1.3])
     model = Model(points_3d=world / scale, ids=[int(each) for each in chosen])
-    result = align(model, views_from(images, keypoints, sigma=0.3))
+    result = align(model, views)
     assert result.rig_from_model is not None
     size = np.linalg.norm(np.ptp(world, axis=0))
     assert np.abs(result.rig_from_model.apply(world / scale) - world).max() < 0.01 * size
     assert np.allclose(result.rig_from_model.scale, scale, rtol=0.02)
-
-
-def test_bad_keypoints_are_named() -> None:
-    images = opened()
-    name = images.names[0]
-    with pytest.raises(DataError, match="no image"):
-        views_from(images, {"nowhere.jpg": ([[1.0, 2.0]], [0])})
-    with pytest.raises(InputError, match="occurs twice") as caught:
-        views_from(images, {name: ([[1.0, 2.0], [3.0, 4.0]], [0, 0])})
-    assert str(caught.value).startswith(f"keypoints['{name}'].ids")

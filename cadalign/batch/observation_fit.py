@@ -195,6 +195,7 @@ class ObservationFit:
 
     def _fit_keypoints(self, seen: Observation, options: FitOptions) -> Result:
         """Fit a stretched model to the keypoints of one image."""
+        from cadalign.batch.observed import has_photo
         from cadalign.estimation.fit import check_search, fit_one  # not for help of a command
         from cadalign.estimation.problems import pack_one
 
@@ -204,7 +205,8 @@ class ObservationFit:
         check_search(ransac, scores, seen.symmetry)
         with np.errstate(all="ignore"):
             search = (ransac, scores, seen.symmetry, start)
-            return fit_one(problem, options, *search, labels=seen.labels)
+            named = seen.labels, has_photo(seen.views[0])
+            return fit_one(problem, options, *search, *named)
 
     def _align(self, observation: Observation, where: str, options: FitOptions) -> Result:
         """Align all evidence of an observation."""

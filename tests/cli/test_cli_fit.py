@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 from support.files import TETRAHEDRON
 from support.refusals import refusal_line
+from support.scenes import CAMERA, LOOK, keypoints
 
-from cadalign import Result, fit
+from cadalign import Alignment, Result, fit
 from cadalign.cli import main
 from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
 from cadalign.io.observation import Observation
@@ -291,3 +292,17 @@ def test_installed_command_runs_and_refuses(tmp_path: Path) -> None:
     assert refused.returncode == 1
     assert refused.stdout == ""
     assert refused.stderr == f"cadalign: {tmp_path / 'nothing.json'}: no such file\n"
+
+
+def test_no_other_size_is_supposed_of_a_photo_that_is_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points, photo, path = keypoints(12, seed=3), tmp_path / "photo.png", tmp_path / "half.json"
+    pixels = CAMERA.project(Alignment(LOOK, [0.05, -0.02, 1.5], np.ones(3)).apply(points))
+    cv2.imwrite(str(photo), np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8))
+    said = []
+    for image in (None, photo):
+        Observation(points, pixels / 2, CAMERA, image=image).save(path)
+        assert main(["fit", str(path)]) == 0
+        said.append("are of images of 320 x 240 px" in "".join(capsys.readouterr()))
+    assert said == [True, False]

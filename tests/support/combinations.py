@@ -34,7 +34,7 @@ from cadalign.shapes.parts import ShapeComponent, TrainingShapes
 MODELS = ("exact", "held", "symmetric", "similar", "learned", "mixture")
 EVIDENCE = (
     *("keypoints", "mask", "depth", "depth image", "camera height", "size"),
-    *("rig, mask", "motion, mask", "weak view", "everything"),
+    *("rig, mask", "motion, mask", "everything"),
 )
 FOCALS = ("known", "estimate", "prior")
 NOISES = ("number", "each", "covariance", "none")
@@ -211,21 +211,19 @@ def problem_of(cell: Cell, folder: Path) -> Problem:
     rng = np.random.default_rng(zlib.crc32(str(cell).encode()))
     scale, points = object_of(cell.model)
     truth = Alignment(LOOK, TRANSLATION, scale)
-    motions, shown = [np.eye(4)], [SHOWN]
-    if cell.evidence.startswith(("rig", "motion", "weak", "everything")):
-        motions, shown = [np.eye(4), _around(25.0)], [SHOWN, SHOWN]
-    if cell.evidence == "weak view":
-        motions, shown = [*motions, _around(-20.0)], [*shown, [1, 6]]
+    motions = [np.eye(4)]
+    if cell.evidence.startswith(("rig", "motion", "everything")):
+        motions.append(_around(25.0))
     truths, views = [], []
-    for number, (motion, rows) in enumerate(zip(motions, shown, strict=True)):
+    for number, motion in enumerate(motions):
         pose = Alignment(motion[:3, :3] @ LOOK, motion[:3, :3] @ TRANSLATION + motion[:3, 3], scale)
         truths.append(pose)
-        fields = _keypoints(cell, rng, CAMERA.project(pose.apply(points[rows])))
+        fields = _keypoints(cell, rng, CAMERA.project(pose.apply(points[SHOWN])))
         if cell.evidence.startswith(("rig", "everything")):
             fields["cam_from_rig"] = motion
         if number == 0:
-            fields |= _evidence(cell, rng, truth, points[rows])
-        views.append(View(CAMERA if cell.focal == "known" else UNKNOWN, ids=rows, **fields))
+            fields |= _evidence(cell, rng, truth, points[SHOWN])
+        views.append(View(CAMERA if cell.focal == "known" else UNKNOWN, ids=SHOWN, **fields))
     options: dict[str, Any] = _robust(cell)
     if cell.focal != "known":
         options["focal"] = "estimate"
@@ -254,7 +252,7 @@ def _keypoints(cell: Cell, rng: np.random.Generator, exact: np.ndarray) -> dict[
     elif cell.noise == "none":
         fields["sigma"] = None
     wrong = []
-    if cell.outliers != "linear" and count > 4:
+    if cell.outliers != "linear":
         wrong = [3] if cell.outliers == "huber" else [3, 9]
         noise[wrong] += 6.0 if cell.outliers == "huber" else [30.0, -25.0]
     if cell.outliers == "scores":

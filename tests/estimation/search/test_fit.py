@@ -21,10 +21,10 @@ from cadalign.geometry.metrics import rotation_error
 
 
 @pytest.mark.parametrize("method", ["optimal", "aepnp", "aepnp-paper"])
-@pytest.mark.parametrize("points", [6, 7, 10, 50, 300])
-def test_noise_free_keypoints_give_the_truth(method: str, points: int) -> None:
+@pytest.mark.parametrize(("points", "camera"), [(6, LENS), (7, SIMULATION_CAMERA), (300, LENS)])
+def test_noise_free_keypoints_give_the_truth(method: str, points: int, camera: Camera) -> None:
     for seed in range(5):
-        problem = problem_of(seed, points=points, noise_px=0.0)
+        problem = problem_of(seed, points=points, noise_px=0.0, camera=camera)
         result = fit_problem(problem, method=method)
         assert_same(result.alignment, problem.alignment, 1e-7)
         assert result.rms < 1e-6
@@ -39,7 +39,7 @@ def test_epnp_knows_no_stretch() -> None:
 
 
 @pytest.mark.parametrize("camera", [SIMULATION_CAMERA, LENS])
-@pytest.mark.parametrize("points", [8, 30, 100])
+@pytest.mark.parametrize("points", [8, 100])
 def test_optimum_agrees_with_an_independent_least_squares_fit(camera: Camera, points: int) -> None:
     problem = problem_of(4, points=points, noise_px=1.0, camera=camera)
 
@@ -123,8 +123,6 @@ def test_fewer_unknowns_need_fewer_points(stretch: str, points: int) -> None:
     explanations = [result.alignment, *(other.alignment for other in result.alternatives)]
     assert result.rms < 1e-5
     assert min(rotation_error(est=each, gt=alignment) for each in explanations) < 1e-3
-    with pytest.raises(DegenerateError, match="are too few for"):
-        fit(points_3d[:-1], simulated.points_2d[:-1], simulated.camera, stretch=stretch)
 
 
 def test_weak_prior_changes_nothing_and_a_strong_one_holds_the_scale() -> None:
@@ -150,11 +148,10 @@ def test_prior_adds_its_information() -> None:
     assert (np.abs(added - expected) < 1e-5 * np.outer(sizes, sizes)).all()
 
 
-@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("axis", [1, 2])
-def test_prior_makes_keypoints_in_one_plane_solvable(seed: int, axis: int) -> None:
-    rng = np.random.default_rng(seed)
-    problem = problem_of(seed, points=10, noise_px=0.0)
+def test_prior_makes_keypoints_in_one_plane_solvable(axis: int) -> None:
+    rng = np.random.default_rng(1)
+    problem = problem_of(1, points=10, noise_px=0.0)
     points_3d = problem.points_3d.copy()
     points_3d[:, axis] = 0.1
     points_2d = problem.camera.project(problem.alignment.apply(points_3d))
@@ -167,9 +164,8 @@ def test_prior_makes_keypoints_in_one_plane_solvable(seed: int, axis: int) -> No
     assert f"in the plane {'xyz'[axis]} = 0.1" in str(result)
 
 
-@pytest.mark.parametrize("points", [6, 8, 14])
-def test_exchanging_the_axes_that_stretch_exchanges_their_deviations(points: int) -> None:
-    problem = problem_of(8, points=points)
+def test_exchanging_the_axes_that_stretch_exchanges_their_deviations() -> None:
+    problem = problem_of(8, points=6)
     base = fit_problem(problem)
     exchanged = problem.points_3d[:, [0, 2, 1]] * [1, 1, -1]
     other = fit(exchanged, problem.points_2d, problem.camera)
@@ -180,7 +176,7 @@ def test_exchanging_the_axes_that_stretch_exchanges_their_deviations(points: int
 # --- other explanations -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 def test_four_points_give_every_exact_solution_least_stretch_first(seed: int) -> None:
     problem = problem_of(seed, points=4, noise_px=0.0)
     result = fit_problem(problem)
@@ -203,7 +199,7 @@ def cost_at(problem: SimulatedProblem, alignment: Alignment) -> float:
 @pytest.mark.parametrize("points", [5, 6])
 def test_alternatives_are_other_minima_with_their_likelihood(points: int) -> None:
     seen = 0
-    for seed in range(60):
+    for seed in range(40):
         problem = problem_of(seed, points=points, noise_px=1.0)
         try:
             result = fit_problem(problem)
@@ -221,6 +217,3 @@ def test_alternatives_are_other_minima_with_their_likelihood(points: int) -> Non
             stretch = np.abs(np.log(other.alignment.scale / result.alignment.scale)).max()
             assert turn > 0.01 or stretch > 1e-4
     assert seen >= 3
-
-
-# --- real keypoints ---------------------------------------------------------------------------

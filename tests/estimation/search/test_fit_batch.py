@@ -72,18 +72,19 @@ RAGGED = problems_of([6, 20, 7, 100, 10, 64])
     ],
     ids=str,
 )
-@pytest.mark.parametrize("workers", [1, 2])
-def test_batch_is_identical_to_single_fits(options: dict[str, Any], workers: int) -> None:
-    batch = run(RAGGED, workers=workers, **options)
-    assert batch.errors == {}
-    assert batch.solved.all()
+def test_batch_is_identical_to_single_fits_whatever_the_workers(options: dict[str, Any]) -> None:
+    for workers in (1, 2, 50):
+        batch = run(RAGGED, workers=workers, **options)
+        assert batch.errors == {}
+        assert batch.solved.all()
     assert_like_single_fits(batch, RAGGED, **options)
+    for name in ("rotation", "translation", "scale", "rms"):
+        assert (getattr(batch, name) == getattr(run(RAGGED, **options), name)).all()
 
 
-@pytest.mark.parametrize("workers", [1, 2])
 @pytest.mark.parametrize("ransac", [None, RansacOptions()])
-def test_results_go_to_other_processes(workers: int, ransac: RansacOptions | None) -> None:
-    batch = run(problems_of([20, 20, 20]), workers=workers, ransac=ransac)
+def test_results_go_to_other_processes(ransac: RansacOptions | None) -> None:
+    batch = run(problems_of([20, 20, 20]), ransac=ransac)
     again = pickle.loads(pickle.dumps(batch))
     for result, single in zip(again, batch, strict=True):
         assert isinstance(result, Result)
@@ -91,14 +92,14 @@ def test_results_go_to_other_processes(workers: int, ransac: RansacOptions | Non
         assert result.to_dict() | {"stats": None} == single.to_dict() | {"stats": None}
 
 
-def test_stacked_arrays_are_the_same_as_lists() -> None:
+def test_stacked_arrays_are_the_same_as_lists_and_are_not_changed() -> None:
     problems = problems_of([9] * 6)
     lists = run(problems)
-    stacked = fit_batch(
-        np.stack([p.points_3d for p in problems]),
-        np.stack([p.points_2d for p in problems]),
-        problems[0].camera,
-    )
+    given = [np.stack([getattr(p, name) for p in problems]) for name in ("points_3d", "points_2d")]
+    copies = [each.copy() for each in given]
+    stacked = fit_batch(*given, problems[0].camera)
+    np.testing.assert_array_equal(given[0], copies[0])
+    np.testing.assert_array_equal(given[1], copies[1])
     for name in ("rotation", "translation", "scale", "rms"):
         assert (getattr(stacked, name) == getattr(lists, name)).all()
 
@@ -113,14 +114,8 @@ def test_every_problem_may_have_its_own_camera() -> None:
 
 def test_every_problem_may_have_its_own_sigma() -> None:
     rng = np.random.default_rng(2)
-    sigmas = [
-        0.5,
-        2,
-        rng.uniform(0.5, 3, 7),
-        np.tile(np.diag([1.0, 4.0]), (100, 1, 1)),
-        np.full(10, 1.5),
-        1.0,
-    ]
+    sigmas: list[Any] = [0.5, 2, rng.uniform(0.5, 3, 7)]
+    sigmas += [np.tile(np.diag([1.0, 4.0]), (100, 1, 1)), np.full(10, 1.5), 1.0]
     each = [{"sigma": sigma} for sigma in sigmas]
     for workers in (1, 2):
         assert_like_single_fits(run(RAGGED, sigma=sigmas, workers=workers), RAGGED, each)
@@ -136,7 +131,7 @@ def test_sigmas_may_be_changed_afterwards() -> None:
     assert (np.asarray(view.sigma) == 1.0).all()
 
 
-@pytest.mark.parametrize("sigma", [np.float64(2.0), np.float32(2.0), np.array(2.0)])
+@pytest.mark.parametrize("sigma", [np.float32(2.0), np.array(2.0)])
 def test_sigma_may_be_a_numpy_number(sigma: Any) -> None:
     assert (run(RAGGED, sigma=sigma).scale == run(RAGGED, sigma=2.0).scale).all()
 
@@ -144,14 +139,20 @@ def test_sigma_may_be_a_numpy_number(sigma: Any) -> None:
 @pytest.mark.parametrize("workers", [1, 3])
 @pytest.mark.parametrize("method", ["optimal", "aepnp", "aepnp-paper", "epnp"])
 def test_errors_are_those_of_single_fits(method: str, workers: int) -> None:
-    problems = problems_of([10, 2, 9, 0, 12, 5])
+    problems = problems_of([10, 2, 9, 0, 12, 5, 8])
+    problems[-1].points_3d[:, 2] = 0.1
     batch = run(problems, method=method, workers=workers)
+    assert batch.solved.tolist() == [b not in batch.errors for b in range(7)]
     for b, problem in enumerate(problems):
         if b in batch.errors:
             with pytest.raises(CadalignError) as caught:
                 fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
             assert str(batch.errors[b]) == str(caught.value)
             assert type(batch.errors[b]) is type(caught.value)
+            for array in (batch.rotation, batch.translation, batch.scale, batch.rms):
+                assert np.isnan(array[b]).all()
+            with pytest.raises(type(caught.value)):
+                batch.alignment(b)
         else:
             single = fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
             assert batch.alignment(b) == single.alignment
@@ -170,7 +171,10 @@ def test_rms_does_not_suffer_from_other_problems() -> None:
 @pytest.mark.parametrize("lens", ["perspective", "fisheye"])
 def test_no_problems_give_no_results_with_any_option(options: dict[str, Any], lens: str) -> None:
     camera = Camera(640, 480, 400.0, 400.0, 319.5, 239.5, lens=lens)
-    assert len(fit_batch([], [], camera, **options)) == 0
+    batch = fit_batch([], [], camera, workers=-1, **options)
+    assert len(batch) == 0
+    assert batch.rotation.shape == (0, 3, 3)
+    assert batch.errors == {}
 
 
 def test_threads_agree_where_all_of_a_share_fail() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,6 @@ from cadalign import (
     fit,
     fit_batch,
 )
-from cadalign.datasets import Colmap
 from cadalign.errors import DegenerateError, NoConsensusError
 from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem
 from cadalign.geometry.metrics import rotation_error
@@ -79,10 +77,10 @@ def test_exact_keypoints_give_back_the_focal_length(seed: int, points: int, foca
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("points", [5, 6, 8, 50])
+@pytest.mark.parametrize("points", [5, 8])
 def test_no_better_explanation_is_missed(points: int) -> None:
     missed = 0
-    for seed in range(60):
+    for seed in range(40):
         problem = problem_of(seed, points=points, noise_px=1.0)
         result = fit_unknown(problem)
         at_truth = whitened(problem, problem.alignment, SIMULATION_CAMERA, np.zeros(9))
@@ -116,11 +114,12 @@ def test_result_is_a_minimum_over_all_nine_unknowns(loss: str, prior: FocalPrior
 def test_shape_of_pixels_and_principal_point_are_the_cameras() -> None:
     camera = Camera(640, 480, 500.0, 550.0, 280.0, 260.0)
     problem = problem_of(2, points=30, noise_px=0.0, camera=camera)
-    placeholder = dataclasses.replace(camera, fx=1000.0, fy=1100.0)
-    result = fit_unknown(problem, placeholder)
-    assert result.camera.fx == pytest.approx(500.0, rel=1e-6)
-    assert result.camera.fy == pytest.approx(550.0, rel=1e-6)
-    assert (result.camera.cx, result.camera.cy) == (280.0, 260.0)
+    for focal in (1000.0, 77.0):  # placeholders, which change nothing
+        placeholder = dataclasses.replace(camera, fx=focal, fy=1.1 * focal)
+        result = fit_unknown(problem, placeholder)
+        assert result.camera.fx == pytest.approx(500.0, rel=1e-6)
+        assert result.camera.fy == pytest.approx(550.0, rel=1e-6)
+        assert (result.camera.cx, result.camera.cy) == (280.0, 260.0)
 
 
 @pytest.mark.parametrize("stretch", [None, "none"])
@@ -183,6 +182,10 @@ def test_weak_focal_length_is_said_in_words() -> None:
     assert result.std.focal > 1.0
     assert "focal length" in result.uncertain
     assert f"  focal length {result.camera.fx:.4g} px (not determined)" in str(result)
+    strong = fit_unknown(problem_of(1, points=200, noise_px=0.1), sigma=0.1)
+    assert strong.std is not None
+    assert strong.std.focal < 0.01
+    assert strong.uncertain == ()
 
 
 @pytest.mark.parametrize("seed", [5, 13, 21])
@@ -192,6 +195,8 @@ def test_a_pose_that_fits_with_another_focal_length_is_found_beside_the_best(see
     known = fit(problem.points_3d, problem.points_2d, other.camera)
     poses = [known.alignment, *(each.alignment for each in known.alternatives)]
     assert min(rotation_error(est=pose, gt=other.alignment) for pose in poses) < 0.5
+    projected = other.camera.project(other.alignment.apply(problem.points_3d))
+    assert np.abs(projected - problem.points_2d).max() < 20
 
 
 def test_estimated_noise_comes_with_nine_unknowns() -> None:
@@ -274,30 +279,37 @@ def test_usual_lenses_of_a_batch_are_those_of_each_image() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("points", [8, 20])
-def test_focal_lengths_with_the_usual_prior_are_as_uncertain_as_stated(points: int) -> None:
+def test_focal_lengths_with_the_usual_prior_are_as_uncertain_as_stated() -> None:
     """Photos whose lenses are those of the distribution that the prior's docstring names."""
     rng = np.random.default_rng(5)
     inside = []
-    for seed in range(200):
+    for seed in range(120):
         focal = 640 / 36 * min(14 + 17 * float(np.exp(0.8 * rng.normal())), 140.0)
         distance = 2.5 * focal / 240  # fills a half of the image
         camera = Camera(640, 480, focal, focal, 319.5, 239.5)
         depth = (distance, distance + 1)
-        problem = problem_of(seed, points=points, noise_px=1.0, camera=camera, depth=depth)
+        problem = problem_of(seed, points=12, noise_px=1.0, camera=camera, depth=depth)
         result = fit(problem.points_3d, problem.points_2d, UNKNOWN, focal="estimate")
         assert result.std is not None
         inside.append(abs(np.log(result.camera.fx / focal)) < 1.96 * result.std.focal)
         assert 0.3 * 640 < result.camera.fx < 6 * 640
-    assert 0.90 <= np.mean(inside) <= 0.985
+    assert 0.88 <= np.mean(inside) <= 0.99
 
 
-def test_scale_prior_holds_a_scale_that_an_unknown_focal_length_leaves_open() -> None:
+@pytest.mark.parametrize(
+    "prior", [{"stretch_sigma": 0.05}, {"focal_prior": FocalPrior(150.0, 0.01)}], ids=str
+)
+def test_priors_count_by_their_own_deviations_where_noise_is_estimated(
+    prior: dict[str, Any],
+) -> None:
     problem = problem_of(5, points=30, noise_px=3.0)
     free = fit_unknown(problem, sigma=None)
-    result = fit_unknown(problem, sigma=None, stretch_sigma=0.05)
-    assert np.abs(np.log(result.alignment.scale)).sum() < np.abs(np.log(free.alignment.scale)).sum()
-    known = fit_unknown(problem, sigma=result.sigma, stretch_sigma=0.05)
+    result = fit_unknown(problem, sigma=None, **prior)
+    assert result.std is not None
+    assert free.std is not None
+    assert result.std.focal < free.std.focal
+    known = fit_unknown(problem, sigma=result.sigma, **prior)
+    assert result.camera.fx == pytest.approx(known.camera.fx, rel=1e-3)
     np.testing.assert_allclose(result.alignment.scale, known.alignment.scale, rtol=1e-3)
     np.testing.assert_allclose(
         result.fisher_covariance, known.fisher_covariance, rtol=1e-2, atol=1e-8
@@ -324,7 +336,7 @@ def test_robust_search_is_reproducible_and_guided() -> None:
 @pytest.mark.slow
 def test_noise_without_a_model_has_no_consensus() -> None:
     rng = np.random.default_rng(0)
-    for _ in range(5):
+    for _ in range(2):
         with pytest.raises(NoConsensusError, match="no alignment is supported"):
             fit(
                 rng.uniform(-1, 1, (40, 3)),
@@ -353,6 +365,8 @@ def test_batch_solves_each_problem_as_fit_does(ransac: RansacOptions | None) -> 
         ransac=ransac,
         workers=2,
     )
+    known = fit_batch([short.points_3d] * 2, [short.points_2d] * 2, short.camera)
+    assert known.focal_length.tolist() == [150.0, 150.0]
     for b, problem in enumerate(problems):
         single = fit_unknown(problem, ransac=ransac)
         assert batch.alignment(b) == single.alignment
@@ -360,37 +374,3 @@ def test_batch_solves_each_problem_as_fit_does(ransac: RansacOptions | None) -> 
         np.testing.assert_array_equal(batch[b].fisher_covariance, single.fisher_covariance)
     assert list(batch.errors) == [5]
     assert np.isnan(batch.focal_length[5])
-
-
-# --- real photos ------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_structure_from_motion_with_scales_drawn_at_random(real_data: Path) -> None:
-    rng = np.random.default_rng(0)
-    strong = weak = 0
-    for image in Colmap(real_data / "sfm" / "maupertuis_colmap"):
-        camera = Camera.without_focal(image.camera.width, image.camera.height)
-        for _ in range(3):
-            scale = np.array([1.0, *rng.uniform(0.5, 2, 2)])
-            result = fit(
-                image.points_3d / scale,
-                image.points_2d,
-                camera,
-                focal="estimate",
-                focal_prior=None,
-                sigma=None,
-            )
-            assert result.std is not None
-            off = abs(result.camera.fx / image.camera.fx - 1)
-            if result.std.focal < 0.005:
-                strong += 1
-                assert off < 0.01
-                np.testing.assert_allclose(result.alignment.scale, scale, rtol=0.01)
-            if result.std.focal > 0.02:
-                weak += 1
-                assert off < 5 * result.std.focal  # the lens is no pinhole, which its noise is not
-    assert (strong, weak) == (9, 3)
-
-
-# --- refusals ---------------------------------------------------------------------------------

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.scenes import CAMERA, truth_of
+from support.scenes import BOX, CAMERA, truth_of
 
-from cadalign import Alignment, Mesh
+from cadalign import Alignment
 from cadalign.estimation.contours import contour as contours
 from cadalign.estimation.contours.contour import (
     Sight,
@@ -19,9 +19,6 @@ from cadalign.estimation.contours.contour import (
 from cadalign.geometry.raycaster import RayCaster
 from cadalign.render import Scene, cast_geometry
 
-CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
-QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-BOX = Mesh(CORNERS, np.array([face for a, b, c, d in QUADS for face in ((a, b, c), (a, c, d))]))
 TRUTH = truth_of((0.6, 0.4, 0.8))
 
 

@@ -89,13 +89,13 @@ def test_no_result_costs_more_than_the_truth(points: int, noise_px: float) -> No
 @pytest.mark.long
 @pytest.mark.parametrize(("points", "noise_px"), [(5, 1.0), (12, 4.0)])
 def test_regions_hold_the_truth(points: int, noise_px: float) -> None:
-    """Of 300, a region of 95 % holds less than 0.89 with a chance of 1e-5.
+    """Of 180, a region of 95 % holds less than 0.87 with a chance of 1e-5.
 
     With five keypoints and more noise the truth is another minimum in some, see `alternatives`.
     """
     rows = {"rotation": [0, 1, 2], "translation": [3, 4, 5], "stretch": [7, 8]}
     held: dict[str, list[bool]] = {name: [] for name in rows}
-    for problem in flat_problems(100, points=points, noise_px=noise_px):
+    for problem in flat_problems(60, points=points, noise_px=noise_px):
         result = fit_problem(problem, sigma=noise_px)
         est, gt = result.alignment, problem.alignment
         turn = Rotation.from_matrix(gt.rotation @ est.rotation.T).as_rotvec()
@@ -107,7 +107,7 @@ def test_regions_hold_the_truth(points: int, noise_px: float) -> None:
             square = error[own] @ np.linalg.solve(covariance, error[own])
             held[name].append(bool(square < chdtri(len(own), 0.05)))
     shares = {name: np.mean(values) for name, values in held.items()}
-    assert min(shares.values()) > 0.89, shares
+    assert min(shares.values()) > 0.87, shares
     assert max(shares.values()) < 0.995, shares
 
 

@@ -14,13 +14,12 @@ from support.combinations import POINTS as ON_BOX
 from support.combinations import TRANSLATION, box_mask, model_of, of_box, wide_view
 from support.problems import LENS, problem_of
 from support.refusals import assert_messages
-from support.scenes import CAMERA, around, keypoints, rig, seen, truth_of
+from support.scenes import BOX, CAMERA, CORNERS, around, keypoints, rig, seen, truth_of
 
 from cadalign import (
     Camera,
     FocalPrior,
     Library,
-    Mesh,
     Model,
     RansacOptions,
     ShapeModel,
@@ -240,9 +239,6 @@ BATCHES = {
 
 # --- models and views -----------------------------------------------------------------------------
 
-CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
-QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-BOX = Mesh(CORNERS, [face for a, b, c, d in QUADS for face in ((a, b, c), (a, c, d))])
 BOX_MODEL = Model(points_3d=CORNERS, mesh=BOX)
 PIXELS = CAMERA.project(truth_of().apply(CORNERS))
 NOTHING, EVERYTHING = np.zeros((480, 640), dtype=bool), np.ones((480, 640), dtype=bool)

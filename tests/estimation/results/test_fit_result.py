@@ -144,6 +144,12 @@ def with_view(**changes: Any) -> str:
         (changed(focal="q"), "result: focal: 'q' is not one of 'estimate', 'known'"),
         (changed(sigma="1"), "result: sigma: '1' is not a finite number"),
         (changed(stats={"speed": 1}), "result: stats.iterations: missing"),
+        (
+            changed(fisher_covariance=[[1.0]]),
+            "result: fisher_covariance: shape (1, 1), expected (9, 9)",
+        ),
+        (changed(views=[]), "result: views: there are none"),
+        (changed(ids=[1]), "result: ids: 1 entries, but points_3d has 6"),
     ],
 )
 def test_malformed_json_is_refused(text: str, expected: str) -> None:

@@ -12,11 +12,11 @@ import struct
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fuzz.format import Format
 
 from cadalign import CadalignError
 
@@ -45,6 +45,27 @@ _NUMBERS = [
     )
     for value in values
 ]
+
+
+@dataclass(frozen=True)
+class Format:
+    """What is fuzzed: a small valid file of a format, and its reader.
+
+    Parameters
+    ----------
+    name : str
+    write : callable
+        Writes a valid file, and what goes with it, into a folder; returns the file to mutate.
+    read : callable
+        Reads that file.
+    seal : callable
+        Makes the checksum of mutated data right again, where the format has one.
+    """
+
+    name: str
+    write: Callable[[Path], Path]
+    read: Callable[[Path], object]
+    seal: Callable[[bytes], bytes] = bytes
 
 
 def mutate(data: bytes, rng: np.random.Generator) -> bytes:

@@ -34,7 +34,6 @@ fuzz: $(VENV)/.installed-dev  ## call fit, every reader and the commands with ra
 	PYTHONPATH=tests $(BIN)/python -m fuzz commands $$(($(or $(COUNT),20000) / 20))
 
 bench: $(VENV)/.installed-dev  ## measure accuracy and speed; fail where a ratio is 20 % worse than stored (SECTIONS="cold speed")
-	$(BIN)/python -m pytest tests/estimation/search/test_benchmarks.py --benchmark-enable --benchmark-columns=median,iqr
 	$(BIN)/python scripts/bench.py $(SECTIONS)
 
 lint: $(VENV)/.installed-dev  ## check style (ruff) and types (mypy)

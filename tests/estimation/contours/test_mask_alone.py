@@ -103,7 +103,6 @@ class TestOwnModel:
         assert rotation_error(est=found.alignment, gt=truth) < 1.0
         assert found.alignment.scale == pytest.approx(truth.scale, rel=0.02)
         assert not any(each.kind == "mask" for each in found.warnings)
-        assert found.std is not None
         assert found.std.scale[0] == 0.0  # it is the known length
         assert "stretch      (1, " in str(found)
 
@@ -132,7 +131,6 @@ class TestOwnModel:
         wide = cv2.dilate(mask, np.ones((13, 13), np.uint8)) > 0
         found = align(Model(mesh=body()), View(camera, mask=wide))
         assert rotation_error(est=found.alignment, gt=truth) < 1.0
-        assert found.std is not None
         off = np.abs(np.log(found.alignment.scale / truth.scale))
         assert (off < 0.05 + np.array(found.std.scale)).all()
 

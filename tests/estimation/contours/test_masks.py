@@ -32,14 +32,14 @@ class Case(NamedTuple):
     mask: np.ndarray
 
     def view(self, **options: object) -> View:
-        return View(CAMERA, self.points_2d, ids=self.ids, **options)  # type: ignore[arg-type]
+        return View(CAMERA, self.points_2d, ids=self.ids, **options)
 
 
 def case_of(model: object, seed: int, *, noise_px: float = 1.0) -> Case:
     """A random view of a stretched model with its exact mask."""
     rng = np.random.default_rng(seed)
-    scene = Scene(model.load_mesh())  # type: ignore[attr-defined]
-    points = model.keypoints.xyz  # type: ignore[attr-defined]
+    scene = Scene(model.load_mesh())
+    points = model.keypoints.xyz
     scale = np.array([1.0, *np.exp(rng.uniform(-0.6, 0.6, 2))])
     view = sample_view(scene, points, CAMERA, rng=rng, min_visible=6, scale=scale, roll=10.0)
     ids = np.flatnonzero(view.visible).tolist()

@@ -111,7 +111,6 @@ class TestPhoto:
         assert not any(each.kind == "photo" for each in joint.warnings)
         (summary,) = [each for each in joint.evidence if each.kind == "photo"]
         assert summary.name == "views[0].image"
-        assert summary.share is not None
         assert summary.share > 0.9
         assert summary.rms < 1.0
         names = [each.name for each in joint.evidence]
@@ -197,7 +196,6 @@ class TestSilhouette:
         mesh, truth = wedge(), scene(1).truth
         sight = Sight(RigidSurface(mesh).caster, CAMERA, truth)
         found = silhouette_of(sight, 150)
-        assert found is not None
         rows, columns = np.indices(found.inside.shape)
         pixels = found.corner + found.cell * np.stack([columns, rows], axis=-1)
         met = sight.covers(pixels)

@@ -24,7 +24,7 @@ def fitted(camera: Camera, **options: object) -> cadalign.Result:
     truth = Alignment(turn, [0.4, -0.3, 4.0], np.array([1.0, 1.3, 0.8]))
     noise = np.random.default_rng(6).normal(size=(9, 2))
     pixels = camera.project(truth.apply(POINTS)) + noise
-    return cadalign.fit(POINTS, pixels, camera, **{"sigma": 2.0, **options})  # type: ignore[arg-type]
+    return cadalign.fit(POINTS, pixels, camera, **{"sigma": 2.0, **options})
 
 
 def chart_of(result: cadalign.Result, widening: float = 1.0) -> Chart:

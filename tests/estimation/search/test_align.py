@@ -64,7 +64,6 @@ class TestExactModel:
         expected = fit(keypoints(), view.points_2d, CAMERA, stretch="none")
         assert np.allclose(result.alignment.rotation, expected.alignment.rotation, atol=1e-9)
         assert np.allclose(result.alignment.translation, expected.alignment.translation, atol=1e-8)
-        assert expected.covariance is not None
         assert np.allclose(result.covariance[:6, :6], expected.covariance[:6, :6], rtol=1e-5)
 
     def test_ids_say_which_keypoints_a_view_shows(self) -> None:
@@ -237,7 +236,6 @@ class TestUnknowns:
         square = sum(float((view.residuals**2).sum()) for view in result.views)
         assert result.sigma == pytest.approx(np.sqrt(square / (3 * (20 - 6) - 2)), rel=1e-3)
         learned = align(spreads(0.05), views[0])
-        assert learned.sigma is not None
         assert 1.0 < learned.sigma < 6.0
 
     def test_every_view_may_have_a_start(self) -> None:
@@ -306,7 +304,6 @@ def test_a_batch_is_its_single_results_and_keeps_errors() -> None:
     batch = align_batch(model, [*views, too_few], workers=2)
     assert isinstance(batch[3], DegenerateError)
     for view, result in zip(views, batch, strict=False):
-        assert isinstance(result, Result)
         assert result.alignment == align(model, view).alignment
 
 
@@ -328,11 +325,9 @@ def test_a_batch_takes_a_size_and_a_start_for_each_object() -> None:
         align(model, four, init=start),
     )
     for result, expected in zip(batch, alone, strict=False):
-        assert isinstance(result, Result)
         assert result.alignment == expected.alignment
     assert isinstance(batch[3], DegenerateError)  # two keypoints, whatever the start
     for result in align_batch(model, views, size=size, workers=2):
-        assert isinstance(result, Result)
         width = result.alignment.scale[0] * np.ptp(result.bounds[:, 0])
         assert width == pytest.approx(3.0, rel=0.1)
 

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from support.covariances import of_unknowns
-from support.problems import problem_of
+from support.problems import of_unknowns, problem_of
 
 from cadalign import Alignment, Camera, Result, fit
 from cadalign.errors import DegenerateError

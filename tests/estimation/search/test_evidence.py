@@ -25,10 +25,10 @@ from cadalign import Alignment, Model, ShapeModel, Size, View, align
 from cadalign.estimation.estimates import with_box
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.pack import evidence_of
-from cadalign.estimation.prior import Lenses, prior_of
+from cadalign.estimation.prior import Lenses, ShapePrior, prior_of, redundancy_of
 from cadalign.estimation.result import Result
 from cadalign.shapes.parts import BoxMargins
-from cadalign.solvers.joint.evidence import State
+from cadalign.solvers.joint.evidence import Evidence, State
 
 
 def box_of(points: np.ndarray, truth: Alignment) -> np.ndarray:
@@ -154,9 +154,10 @@ class TestDepth:
         points, truth = keypoints(), truth_of()
         depth = in_camera(points, truth, np.eye(4))[:, 2]
         depth[3] = np.nan
-        view = seen(points, truth, np.eye(4), depth=depth, depth_sigma=0.005)
-        result = align(Model(points_3d=points), view)
+        told = {"sigma": 0.01, "depth": depth, "depth_sigma": 0.005}
+        result = align(Model(points_3d=points), seen(points, truth, np.eye(4), **told))
         assert np.allclose(result.alignment.scale, truth.scale, rtol=1e-4)
+        assert result.std.scale[0] == pytest.approx(0.005 / np.sqrt(9), rel=0.02)
 
     def test_what_hides_keypoints_does_not_harm(self) -> None:
         points, truth, rng = keypoints(12), truth_of(), np.random.default_rng(0)
@@ -203,10 +204,12 @@ class TestUp:
         points, truth, rng = keypoints(6), truth_of(), np.random.default_rng(0)
         up = turned(truth.rotation[:, 1], 1.0, rng)
         across = np.eye(3) - np.outer(up, up)
-        view = seen(points, truth, np.eye(4), rng, up=up, up_sigma_deg=2.0)
-        same = View(CAMERA, view.points_2d, up=up, up_sigma_deg=4.0 * across)
+        view = seen(points, truth, np.eye(4), rng, up=up, up_sigma_deg=0.02)
+        same = View(CAMERA, view.points_2d, up=up, up_sigma_deg=4e-4 * across)
         first, second = (align(Model(points_3d=points), each) for each in (view, same))
         assert np.allclose(first.alignment.rotation, second.alignment.rotation, atol=1e-7)
+        variance = np.trace(across @ first.covariance[:3, :3] @ across) / 2
+        assert np.degrees(np.sqrt(variance)) == pytest.approx(0.02, rel=0.03)
 
 
 def test_each_piece_adds_and_is_printed() -> None:
@@ -244,11 +247,25 @@ def test_the_rig_frame_is_that_of_the_cameras() -> None:
     assert again.evidence == result.evidence
 
 
+def plain_evidence(prior: ShapePrior, views: list[View]) -> Evidence:
+    """Evidence about the first component, of cameras that are known and not turned."""
+    given = {"options": FitOptions(), "lenses": Lenses.of(views, "known", None), "noise": 1.0}
+    turns = [np.eye(3)] * len(views)
+    return evidence_of(prior, prior.components[0], views, None, turns=turns, **given)
+
+
+def test_equations_beyond_the_unknowns_are_counted() -> None:
+    points, truth = keypoints(12), truth_of()
+    views = [seen(points, truth, np.eye(4)), seen(points, truth, np.eye(4))]
+    prior = prior_of(Model(points_3d=points))
+    for poses in (1, 2):
+        assert redundancy_of(plain_evidence(prior, views[:poses])) == 24 * poses - 6 * poses - 2
+
+
 def test_points_that_are_no_keypoints_end_no_box() -> None:
     prior = prior_of(similar())
     views = [seen(keypoints(12), truth_of((1, 1, 1)), np.eye(4))]
-    given = {"options": FitOptions(), "lenses": Lenses.of(views, "known", None), "noise": 1.0}
-    evidence = evidence_of(prior, prior.components[0], views, None, turns=[np.eye(3)], **given)
+    evidence = plain_evidence(prior, views)
     modes, mean = evidence.shape.modes, evidence.shape.mean
     pose = truth_of((1, 1, 1)).packed[None, :12]
     state = State(pose, np.zeros(0), np.zeros(3), np.zeros(len(modes)), np.zeros_like(mean))

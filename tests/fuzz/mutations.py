@@ -51,15 +51,8 @@ _NUMBERS = [
 class Format:
     """What is fuzzed: a small valid file of a format, and its reader.
 
-    Parameters
-    ----------
-    name : str
-    write : callable
-        Writes a valid file, and what goes with it, into a folder; returns the file to mutate.
-    read : callable
-        Reads that file.
-    seal : callable
-        Makes the checksum of mutated data right again, where the format has one.
+    ``write`` gives the file to mutate, in a folder with what goes with it; ``seal`` makes the
+    checksum of mutated data right again, where the format has one.
     """
 
     name: str
@@ -78,14 +71,7 @@ def mutate(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 class MutatedFiles:
-    """Mutations of a format's file, each from a seed, in a folder of their own.
-
-    Parameters
-    ----------
-    kind : Format
-    folder : Path
-        An empty folder.
-    """
+    """Mutations of a format's file, each from a seed, in an empty folder of their own."""
 
     def __init__(self, kind: Format, folder: Path) -> None:
         self.kind = kind

@@ -19,20 +19,11 @@ class Failure(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What the cases of some seeds showed.
-
-    Parameters
-    ----------
-    failures : list of Failure
-    slowest : list of (float, str, int)
-        The longest cases: seconds of processor time, kind, seed.
-    memory : float
-        The largest memory of the process so far [MB].
-    """
+    """What the cases of some seeds showed."""
 
     failures: list[Failure]
-    slowest: list[tuple[float, str, int]]
-    memory: float
+    slowest: list[tuple[float, str, int]]  # seconds of processor time, kind, seed
+    memory: float  # the largest of the process so far [MB]
 
 
 @dataclass(frozen=True)

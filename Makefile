@@ -26,7 +26,7 @@ test: $(VENV)/.installed-dev  ## run the whole test suite (WORKERS=2)
 	$(BIN)/python -m pytest $(PARALLEL) -m "not timing" --durations=20; status=$$?; \
 	$(BIN)/python -m pytest -m timing $$(grep -rl mark.timing tests --include="test_*.py") && exit $$status
 
-test-fast: $(VENV)/.installed-dev  ## run the 4,100 tests that take a minute together
+test-fast: $(VENV)/.installed-dev  ## run the tests that take a minute together
 	$(BIN)/python -m pytest $(PARALLEL) -m "not slow and not long and not timing"
 
 fuzz: $(VENV)/.installed-dev  ## call fit, every reader and the commands with random input (COUNT=20000)

@@ -53,32 +53,16 @@ def chair() -> Mesh:
 
 @dataclass
 class Recipe:
-    """What a payload is to hold.
-
-    Parameters
-    ----------
-    instances : int
-    runs : int
-    failures : float
-        Share of fits that fail.
-    pictures : int
-        How many different pictures there are; instances share them in turn.
-    exhibits : bool
-    models : list of str
-        Model ids to begin with; others are made up.
-    categories : tuple of str
-    done : int, optional
-        How many are done of an unfinished run.
-    """
+    """What a payload is to hold."""
 
     instances: int = 24
     runs: int = 1
-    failures: float = 0.08
-    pictures: int = 6
+    failures: float = 0.08  # share of fits
+    pictures: int = 6  # different ones, which instances share in turn
     exhibits: bool = True
-    models: list[str] = field(default_factory=list)
+    models: list[str] = field(default_factory=list)  # the first ids; others are made up
     categories: tuple[str, ...] = ("bottle", "chair", "vessel")
-    done: int | None = None
+    done: int | None = None  # of an unfinished run
 
 
 def payload_of(recipe: Recipe) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from cadalign import (
     Library,
     Model,
     RansacOptions,
+    Result,
     ShapeModel,
     Size,
     View,
@@ -248,8 +249,13 @@ PHOTO = np.dstack([BODY * np.uint8(200)] * 3)
 POINTS = keypoints(9)
 PLAIN = Model(points_3d=POINTS)
 SHOWN = seen(POINTS, truth_of(), around(0))
-RESULT = align(PLAIN, SHOWN)
 POSE = truth_of()
+
+
+@cache
+def result() -> Result:
+    """A result, made when a test asks for it."""
+    return align(PLAIN, SHOWN)
 
 
 def view(*points: Any, **fields: Any) -> Callable[[], object]:
@@ -299,13 +305,13 @@ ARGUMENTS = {
     "negative width": lambda: Size(width=-1),
     "sigma of zero of a size": lambda: Size(width=1, sigma=0),
     "infinite sigma of a size": lambda: Size(width=1.0, sigma=np.inf),
-    "a number as mesh": lambda: RESULT.mesh(3),
-    "text as probability": lambda: RESULT.radius("a"),
-    "probability of one": lambda: RESULT.radius(1.0),
-    "text as dimension": lambda: RESULT.radius(0.9, dimension="a"),
-    "dimension of zero": lambda: RESULT.radius(0.5, dimension=0),
+    "a number as mesh": lambda: result().mesh(3),
+    "text as probability": lambda: result().radius("a"),
+    "probability of one": lambda: result().radius(1.0),
+    "text as dimension": lambda: result().radius(0.9, dimension="a"),
+    "dimension of zero": lambda: result().radius(0.5, dimension=0),
     "a category as examples": lambda: ShapeModel.learn("chairs"),
-    "a result as alignment": lambda: rotation_error(est=RESULT, gt=POSE),
+    "a result as alignment": lambda: rotation_error(est=result(), gt=POSE),
     "a model in a library": lambda: Library.from_models([PLAIN]),
 }
 VIEWS = {

@@ -83,17 +83,18 @@ def test_text_of_a_result_without_statistics() -> None:
 
 
 @pytest.mark.parametrize(
-    "result",
+    "options",
     [
-        MADE,
-        fit_problem(problem_of(0, points=5, noise_px=1.0), sigma=np.full(5, 1.5)),
-        fit_problem(problem_of(0), method="aepnp"),
-        fit_problem(problem_of(0), stretch="z"),
-        fit_problem(problem_of(0), focal="estimate", focal_prior=FocalPrior(140.0, 0.1)),
+        {"sigma": np.full(5, 1.5)},
+        {"method": "aepnp"},
+        {"stretch": "z"},
+        {"focal": "estimate", "focal_prior": FocalPrior(140.0, 0.1)},
     ],
-    ids=["made", "alternatives", "linear", "one stretch", "unknown focal length"],
+    ids=["alternatives", "linear", "one stretch", "unknown focal length"],
 )
-def test_json_brings_back_the_same_result(result: Result) -> None:
+def test_json_brings_back_the_same_result(options: dict[str, Any]) -> None:
+    points = 5 if "sigma" in options else 12
+    result = fit_problem(problem_of(0, points=points, noise_px=1.0), **options)
     text = json.dumps(result.to_dict())
     again = Result.from_dict(json.loads(text))
     assert json.dumps(again.to_dict()) == text

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from scipy.special import chdtri, fdtri
 from support.problems import (
     LENS,
     assert_same,
@@ -304,6 +305,22 @@ def test_nothing_is_more_certain_than_the_cramer_rao_bound() -> None:
 def test_many_keypoints_leave_the_inverse_fisher_information() -> None:
     result = fit_problem(problem_of(1, points=150, noise_px=1.0))
     np.testing.assert_array_equal(result.covariance, result.fisher_covariance)
+
+
+@pytest.mark.parametrize(("loss", "least"), [("linear", 1.0), ("cauchy", 1.001)])
+def test_estimated_noise_widens_the_covariance_as_the_f_distribution_does(
+    loss: str, least: float
+) -> None:
+    """Of 95 % ellipsoids; a robust loss leaves fewer keypoints to tell the noise."""
+    problem = problem_of(1, points=150, noise_px=1.0)
+    result = fit_problem(problem, sigma=None, loss=loss)
+    usual = 8 * fdtri(8, 2 * 150 - 8, 0.95) / chdtri(8, 0.05)
+    widened = result.covariance[0, 0] / result.fisher_covariance[0, 0]
+    assert least - 1e-4 < widened / usual < least + 0.02
+    few = problem_of(1, points=6, noise_px=1.0)
+    estimated = fit_problem(few, sigma=None, loss=loss)
+    known = fit_problem(few, sigma=estimated.sigma, loss=loss)
+    assert estimated.std.rotation_deg > 1.2 * known.std.rotation_deg
 
 
 @pytest.mark.slow

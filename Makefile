@@ -26,7 +26,7 @@ test: $(VENV)/.installed-dev  ## run the whole test suite (WORKERS=2)
 	$(BIN)/python -m pytest $(PARALLEL) -m "not timing" --durations=20; status=$$?; \
 	$(BIN)/python -m pytest -m timing $$(grep -rl mark.timing tests --include="test_*.py") && exit $$status
 
-test-fast: $(VENV)/.installed-dev  ## run the 4,100 tests that take a minute together
+test-fast: $(VENV)/.installed-dev  ## run the tests that take a minute together
 	$(BIN)/python -m pytest $(PARALLEL) -m "not slow and not long and not timing"
 
 fuzz: $(VENV)/.installed-dev  ## call fit, every reader and the commands with random input (COUNT=20000)
@@ -34,7 +34,6 @@ fuzz: $(VENV)/.installed-dev  ## call fit, every reader and the commands with ra
 	PYTHONPATH=tests $(BIN)/python -m fuzz commands $$(($(or $(COUNT),20000) / 20))
 
 bench: $(VENV)/.installed-dev  ## measure accuracy and speed; fail where a ratio is 20 % worse than stored (SECTIONS="cold speed")
-	$(BIN)/python -m pytest tests/estimation/search/test_benchmarks.py --benchmark-enable --benchmark-columns=median,iqr
 	$(BIN)/python scripts/bench.py $(SECTIONS)
 
 lint: $(VENV)/.installed-dev  ## check style (ruff) and types (mypy)

@@ -47,7 +47,7 @@ from IPython.core.completer import provisionalcompleter
 from IPython.core.interactiveshell import InteractiveShell
 
 shell = InteractiveShell.instance()
-shell.Completer.use_jedi = {use_jedi}
+shell.Completer.use_jedi = False
 shell.run_cell("import cadalign")
 with provisionalcompleter():
     for text in ("cadalign.fi", "cadalign.da"):
@@ -104,10 +104,9 @@ def test_jedi_completes_names_before_anything_runs(user: Environment) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("use_jedi", [False, True])
-def test_ipython_completes_names(user: Environment, use_jedi: bool) -> None:
+def test_ipython_completes_names(user: Environment) -> None:
     pytest.importorskip("IPython")
-    found = python(user, IPYTHON.format(use_jedi=use_jedi)).split()
+    found = python(user, IPYTHON).split()
     assert {"fit", "fit_batch", "datasets"} <= set(found)
 
 
@@ -119,9 +118,3 @@ def test_snippets_of_readme_and_site_run(user: Environment) -> None:
     assert [line for line in ran.splitlines() if line.startswith("ran ")] == [
         f"ran {page}" for page in PAGES
     ]
-
-
-@pytest.mark.long
-def test_first_command_of_the_readme_writes_its_page(user: Environment) -> None:
-    user.run("cadalign", ["demo", "--per-category", "1", "--out", "demo"])
-    assert (user.home / "demo" / "index.html").is_file()

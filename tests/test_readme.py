@@ -17,7 +17,6 @@ from cadalign.cli import main
 from cadalign.cli.sample import FOUND, KEYPOINTS
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = [*ROOT.glob("*.md")]  # those in docs: tests/docs/test_site.py
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
@@ -52,27 +51,10 @@ def test_snippets_run_in_an_empty_folder_and_find_the_stretch(
     assert (tmp_path / "chair.glb").stat().st_size > 10_000
 
 
-@pytest.mark.slow
-def test_named_commands_exist(capsys: pytest.CaptureFixture[str]) -> None:
-    commands = set(re.findall(r"^cadalign ([a-z]+)", "\n".join(blocks("sh")), flags=re.MULTILINE))
-    assert {"demo", "observe", "fit", "export"} <= commands
-    for command in commands:
-        with pytest.raises(SystemExit) as stop:
-            main([command, "--help"])
-        assert stop.value.code == 0
-        assert command in capsys.readouterr().out
-
-
 def test_named_make_targets_exist() -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     for target in set(re.findall(r"make ([a-z]+)", README)):
         assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE) or target == "nothing"
-
-
-@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: p.name)
-def test_linked_files_exist(path: Path) -> None:
-    for link in re.findall(r"\]\(([^)#:]+)[^):]*\)", path.read_text(encoding="utf-8")):
-        assert (path.parent / link).exists(), link
 
 
 @pytest.mark.parametrize("name", ["CONTRIBUTING.md", "docs/architecture.md"])

@@ -1,4 +1,4 @@
-"""The documentation site: its commands, links and examples; `make docs` builds it."""
+"""Documents and the site: their commands, links and examples; `make docs` builds the site."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from cadalign import Result
 from cadalign.cli import main
 from cadalign.datasets import ModelKeypoints
 
-DOCS = Path(__file__).parents[2] / "docs"
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
 sys.path.insert(0, str(DOCS))
-PAGES = sorted(DOCS.rglob("*.md"))
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted(DOCS.rglob("*.md"))]
 MADE = ("_build", "auto_tutorials")
 
 
 def pages() -> list[Path]:
-    return [page for page in PAGES if not set(page.relative_to(DOCS).parts) & set(MADE)]
+    return [page for page in PAGES if not set(page.relative_to(ROOT).parts) & set(MADE)]
 
 
 def text_of(page: Path) -> str:
@@ -36,7 +37,7 @@ def blocks(page: Path, language: str) -> list[str]:
 
 
 def named(page: Path) -> str:
-    return page.relative_to(DOCS).as_posix()
+    return page.relative_to(ROOT).as_posix()
 
 
 @pytest.mark.parametrize("page", pages(), ids=named)

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fuzz.format import Format
+from fuzz.mutations import Format
 from PIL import Image
 from support.gltf_files import write_gltf
 from support.photo_data import read_whole, write_text
 from support.photo_sets import WRITERS
 
-from cadalign import Alignment, Camera, Model, Result, ShapeModel, Size, View, align
+from cadalign import Alignment, Camera, ShapeModel
 from cadalign.datasets import load_mesh
 from cadalign.datasets.detections.coco import decode_segmentation
 from cadalign.io.documents import read_json
@@ -28,7 +28,7 @@ from cadalign.shapes.outputs import SEAL
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 POINTS = np.random.default_rng(3).uniform(-0.4, 0.4, (8, 3))
 POSE = Alignment(np.eye(3), np.array([0.0, 0.0, 3.0]), [1.0, 1.2, 0.8])
-_PIXELS = CAMERA.project(POSE.apply(POINTS))
+PIXELS = CAMERA.project(POSE.apply(POINTS))
 
 # Of each data set of photos the files that a mutation may stand in.
 _CHANGED = {
@@ -72,16 +72,6 @@ def sealed(seal: Seal) -> Callable[[bytes], bytes]:
         return struct.pack("<16sIIQ32s", *head) + payload
 
     return with_header
-
-
-def _write_result(folder: Path) -> Path:
-    """The result of two views of a model of known size."""
-    views = [
-        View(CAMERA, _PIXELS, sigma=1.0),
-        View(CAMERA, _PIXELS + 0.5, sigma=1.0),
-    ]
-    result = align(Model(points_3d=POINTS), views, size=Size(width=1.0, sigma=0.1))
-    return write_text(folder / "fit.json", json.dumps(result.to_dict()))
 
 
 _POLYGONS = [[1.0, 0.0, 30.0, 0.0, 30.0, 20.0, 1.0, 20.0], [40, 30, 50.5, 30, 45, 45]]
@@ -165,11 +155,6 @@ FORMATS = (
     *(_photo_set(kind, changed) for kind, names in _CHANGED.items() for changed in names),
     Format("shape", _write_shape, ShapeModel.open),
     Format("forged shape", _write_shape, ShapeModel.open, sealed(SEAL)),
-    Format(
-        "result of views",
-        _write_result,
-        lambda path: Result.load(path),
-    ),
     _mask("polygons", _POLYGONS, 64, 48),
     _mask("runs", _RUNS, 64, 48),
     _mask("compressed runs", _TEXT, 4, 2),
@@ -182,5 +167,5 @@ FORMATS = (
         for ending in ("webp", "bmp", "tiff", "gif", "tga", "ppm")
     ),
     Format("depth image", _write_depth, read_grey),
-    Format("scene", _write_scene, load_mesh),
+    Format("gltf", _write_scene, load_mesh),
 )

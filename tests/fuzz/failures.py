@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from fuzz import commands, fit_cases, fits, mutations, readers
-from fuzz.outcome import Failure, Outcome
+from fuzz.pool import Failure, Outcome
 
 LONGEST_FIT = 1.0  # seconds of processor time that one call of fit may take
 BATCH = 4

@@ -22,19 +22,10 @@ OPTIONS = (
 
 @dataclass(frozen=True)
 class Case:
-    """One call of `fit`.
+    """One call of `fit`, of which camera and options may be a `Call`.
 
-    Parameters
-    ----------
-    kind : str
-        The name of the function that drew it.
-    points_3d, points_2d, camera : as for `fit`
-    options : dict
-        As for `fit`; like the camera, these may be a `Call`.
-    truth : Alignment, optional
-        The answer, where the data are free of noise and determine it.
-    true_focal : float
-        The camera's focal length then.
+    ``kind`` names the function that drew it; ``truth`` and ``true_focal`` are the answer, where the
+    data are free of noise and determine it.
     """
 
     kind: str

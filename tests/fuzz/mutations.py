@@ -12,11 +12,11 @@ import struct
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fuzz.format import Format
 
 from cadalign import CadalignError
 
@@ -47,6 +47,20 @@ _NUMBERS = [
 ]
 
 
+@dataclass(frozen=True)
+class Format:
+    """What is fuzzed: a small valid file of a format, and its reader.
+
+    ``write`` gives the file to mutate, in a folder with what goes with it; ``seal`` makes the
+    checksum of mutated data right again, where the format has one.
+    """
+
+    name: str
+    write: Callable[[Path], Path]
+    read: Callable[[Path], object]
+    seal: Callable[[bytes], bytes] = bytes
+
+
 def mutate(data: bytes, rng: np.random.Generator) -> bytes:
     """Change a file in one place or a few: its bytes, or the values of a JSON document."""
     if rng.random() < 0.5 and (changed := _with_other_values(data, rng)) is not None:
@@ -57,14 +71,7 @@ def mutate(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 class MutatedFiles:
-    """Mutations of a format's file, each from a seed, in a folder of their own.
-
-    Parameters
-    ----------
-    kind : Format
-    folder : Path
-        An empty folder.
-    """
+    """Mutations of a format's file, each from a seed, in an empty folder of their own."""
 
     def __init__(self, kind: Format, folder: Path) -> None:
         self.kind = kind

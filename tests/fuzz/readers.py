@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import pickle
 import struct
@@ -14,8 +13,8 @@ from typing import Any
 import numpy as np
 import trimesh
 from fuzz import dataset_formats
-from fuzz.dataset_formats import CAMERA, POINTS, POSE, sealed, write_picture
-from fuzz.format import Format
+from fuzz.dataset_formats import CAMERA, PIXELS, POINTS, sealed, write_picture
+from fuzz.mutations import Format
 from PIL import Image
 
 import cadalign
@@ -79,40 +78,6 @@ def _export(name: str) -> Callable[[Path], Path]:
     return write
 
 
-def _write_gltf(folder: Path) -> Path:
-    """A triangle whose data stand in the document itself."""
-    data = np.array([0, 1, 2, 0], "<u2").tobytes() + np.eye(3, dtype="<f4").tobytes()
-    views = [
-        {"buffer": 0, "byteOffset": start, "byteLength": size} for start, size in ((0, 6), (8, 36))
-    ]
-    document = {
-        "asset": {"version": "2.0"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "scale": [1, 2, 1], "children": [1]}, {"mesh": 0}],
-        "meshes": [
-            {
-                "primitives": [
-                    {"attributes": {"POSITION": 1}, "indices": 0, "material": 0, "mode": 4}
-                ]
-            }
-        ],
-        "materials": [{"pbrMetallicRoughness": {"baseColorFactor": [1, 0.5, 0, 1]}}],
-        "accessors": [
-            {"bufferView": 0, "componentType": 5123, "count": 3, "type": "SCALAR"},
-            {"bufferView": 1, "componentType": 5126, "count": 3, "type": "VEC3"},
-        ],
-        "bufferViews": views,
-        "buffers": [
-            {
-                "byteLength": len(data),
-                "uri": "data:application/octet-stream;base64," + base64.b64encode(data).decode(),
-            }
-        ],
-    }
-    return _json("box.gltf", document)(folder)
-
-
 def _seal_png(data: bytes) -> bytes:
     """A PNG file whose chunks have right checksums."""
     sealed, place = data[:8], 8
@@ -152,35 +117,15 @@ def _write_run(changed: str) -> Callable[[Path], Path]:
 _OBSERVATION = {
     "camera": {"model": "PINHOLE", "width": 64, "height": 48, "params": [60, 60, 32, 24]},
     "keypoints": [
-        {
-            "xyz": xyz,
-            "uv": uv,
-            "sigma": 1.0,
-            "semantic_id": k,
-            "name": f"corner {k}",
-            "score": 0.5,
-        }
-        for k, (xyz, uv) in enumerate(
-            zip(POINTS.tolist(), CAMERA.project(POSE.apply(POINTS)).tolist(), strict=True)
-        )
+        {"xyz": xyz, "uv": uv, "sigma": 1.0, "semantic_id": k, "name": f"corner {k}", "score": 0.5}
+        for k, (xyz, uv) in enumerate(zip(POINTS.tolist(), PIXELS.tolist(), strict=True))
     ],
 }
+_IMAGES_TOLD = {"mask": "a.png", "mask_sigma": 1.5, "depth": "b.png", "depth_scale": 0.001}
+_NUMBERS_TOLD = {"depth_sigma": 0.01, "camera_height": 1.4, "camera_height_sigma": 0.02}
+_POSE_TOLD = {"up": [0, -1, 0], "up_sigma_deg": 1.0, "cam_from_rig": np.eye(4).tolist()}
 _EVIDENCE = {
-    "views": [
-        {
-            **_OBSERVATION,
-            "mask": "a.png",
-            "mask_sigma": 1.5,
-            "depth": "b.png",
-            "depth_scale": 0.001,
-            "depth_sigma": 0.01,
-            "up": [0.0, -1.0, 0.0],
-            "up_sigma_deg": 1.0,
-            "camera_height": 1.4,
-            "camera_height_sigma": 0.02,
-            "cam_from_rig": np.eye(4).tolist(),
-        },
-    ],
+    "views": [_OBSERVATION | _IMAGES_TOLD | _NUMBERS_TOLD | _POSE_TOLD],
     "size": {"width": 1.0, "sigma": [0.1, 0.1, 0.1]},
     "shape": "a.shape",
     "model": "a.obj",
@@ -189,13 +134,8 @@ _COCO = {
     "images": [{"id": 1, "file_name": "a.jpg", "width": 64, "height": 48}],
     "categories": [{"id": 1, "name": "chair", "keypoints": ["a", "b", "c"]}],
     "annotations": [
-        {
-            "id": 1,
-            "image_id": 1,
-            "category_id": 1,
-            "keypoints": [1, 2, 2, 3, 4, 1, 0, 0, 0],
-            "score": 0.5,
-        }
+        {"id": 1, "image_id": 1, "category_id": 1, "score": 0.5}
+        | {"keypoints": [1, 2, 2, 3, 4, 1, 0, 0, 0]}
     ],
 }
 _KEYPOINTNET = [
@@ -232,11 +172,8 @@ _SCENE_POINTS = "1 0.1 0.2 0.3 255 0 0 0.5 1 0\n2 -.1 .2 .1 0 0 255 0.1 1 1 2 0\
 
 def _colmap_text(changed: str) -> Callable[[Path], Path]:
     def write(folder: Path) -> Path:
-        for name, text in (
-            ("cameras", _CAMERAS),
-            ("images", _IMAGES),
-            ("points3D", _SCENE_POINTS),
-        ):
+        texts = ("cameras", _CAMERAS), ("images", _IMAGES), ("points3D", _SCENE_POINTS)
+        for name, text in texts:
             (folder / f"{name}.txt").write_text(text)
         return folder / f"{changed}.txt"
 
@@ -260,19 +197,15 @@ def _colmap_binary(changed: str) -> Callable[[Path], Path]:
 def _write_blind_pnp(folder: Path) -> Path:
     root = folder / "nyu_train"
     root.mkdir()
-    rays = CAMERA.normalize(CAMERA.project(POSE.apply(POINTS)))
-    values = {
-        "matches": [np.hstack([rays, POINTS])],
-        "R": [np.eye(3)],
-        "t": [np.array([0, 0, 3.0])],
-    }
+    rows = np.hstack([CAMERA.normalize(PIXELS), POINTS])
+    values = {"matches": [rows], "R": [np.eye(3)], "t": [np.array([0, 0, 3.0])]}
     for name, value in values.items():
         (root / f"{name}.pkl").write_bytes(pickle.dumps(value, protocol=2))
     return root / "matches.pkl"
 
 
 def _write_fit(folder: Path) -> Path:
-    result = fit(POINTS, CAMERA.project(POSE.apply(POINTS)), CAMERA)
+    result = fit(POINTS, PIXELS, CAMERA)
     return _text("fit.json", json.dumps(result.to_dict()))(folder)
 
 
@@ -285,7 +218,7 @@ def _write_library(folder: Path) -> Path:
 
 def _read_library(path: Path) -> object:
     library = Library.open(path)
-    return list(library), library.retrieve(CAMERA.project(POSE.apply(POINTS)), np.arange(8), CAMERA)
+    return list(library), library.retrieve(PIXELS, np.arange(8), CAMERA)
 
 
 def _read_annotations(path: Path) -> object:
@@ -298,20 +231,8 @@ def _write_annotations(folder: Path) -> Path:
     return _json("chair.json", _KEYPOINTNET)(folder / "annotations")
 
 
-def _drain(images: Any) -> object:
-    return list(images)
-
-
-def _read_colmap(path: Path) -> object:
-    return _drain(Colmap(path.parent))
-
-
-def _read_fit(path: Path) -> object:
-    return Result.load(path)
-
-
 def _read_run(path: Path) -> object:
-    return headline_text([path], format="csv")
+    return headline_text([path.parent], format="csv")
 
 
 FORMATS = {
@@ -322,7 +243,6 @@ FORMATS = {
         Format("ply", _export("box.ply"), load_mesh),
         Format("stl", _export("box.stl"), load_mesh),
         Format("glb", _export("box.glb"), load_mesh),
-        Format("gltf", _write_gltf, load_mesh),
         Format("off", _export("box.off"), load_mesh),
         Format("image", write_picture("png"), read_photo),
         Format("sealed image", write_picture("png"), read_photo, _seal_png),
@@ -334,16 +254,16 @@ FORMATS = {
         Format("keypointnet", _write_annotations, _read_annotations),
         Format("model keypoints", _json("m.keypoints.json", _MODEL_KEYPOINTS), ModelKeypoints.load),
         *(
-            Format(f"colmap {name} {kind}", write(name), _read_colmap)
+            Format(f"colmap {name} {kind}", write(name), lambda path: list(Colmap(path.parent)))
             for kind, write in (("text", _colmap_text), ("binary", _colmap_binary))
             for name in ("cameras", "images", "points3D")
         ),
-        Format("blind pnp", _write_blind_pnp, lambda path: _drain(BlindPnP(path.parent))),
-        Format("fit", _write_fit, _read_fit),
+        Format("blind pnp", _write_blind_pnp, lambda path: list(BlindPnP(path.parent))),
+        Format("fit", _write_fit, Result.load),
         Format("library", _write_library, _read_library),
         Format("forged library", _write_library, _read_library, sealed(SEAL)),
         *(
-            Format(f"run {name}", _write_run(f"{name}"), lambda path: _read_run(path.parent))
+            Format(f"run {name}", _write_run(name), _read_run)
             for name in ("run.json", "results.parquet", "timings.parquet")
         ),
         *dataset_formats.FORMATS,

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import signal
 
-from fuzz.outcome import Outcome
-from fuzz.pool import Job, run_jobs
+from fuzz.pool import Job, Outcome, run_jobs
 
 
 def end_at_seed_5(kind: str, start: int, stop: int) -> Outcome:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 from support.problems import problem_of
 
 from cadalign import Alignment
@@ -61,7 +60,7 @@ def test_no_solution_comes_twice_and_the_least_stretch_comes_first(seed: int) ->
 
 @pytest.mark.long
 def test_truth_is_among_the_solutions() -> None:
-    """At least 99.8 % of 2,000 random problems, to 1e-4."""
+    """At least 99.8 % of 2,000 random problems, to 1e-4; it may be any of the solutions."""
     missed = []
     for seed in range(2000):
         problem = problem_of(seed, points=4, noise_px=0.0)
@@ -69,38 +68,6 @@ def test_truth_is_among_the_solutions() -> None:
         if not solutions or min(distance(s, problem.alignment) for s in solutions) > 1e-4:
             missed.append(seed)
     assert len(missed) <= 4, f"missed in problems {missed}"
-
-
-@pytest.mark.long
-def test_solver_is_as_complete_as_an_exhaustive_search() -> None:
-    """No exact alignment that a local search from many starts finds is left out."""
-    from cadalign.solvers.alignment import Objective
-    from cadalign.solvers.constants import LINEAR, UNKNOWNS, ScalePrior
-    from cadalign.solvers.evidence import KeypointEvidence
-    from cadalign.solvers.search import refine
-
-    rng = np.random.default_rng(0)
-    found = missed = 0
-    for seed in range(25):
-        problem = problem_of(seed, points=4, noise_px=0.0)
-        rays = problem.camera.normalize(problem.points_2d)
-        whitening = np.array([[150.0, 0.0, 150.0]])
-        points = np.require(problem.points_3d, np.float64, ["C", "W"])
-        keypoints = KeypointEvidence(points, rays, whitening, LINEAR, 1.0)
-        objective = Objective(np.ones(UNKNOWNS), keypoints, ScalePrior(0.0, 0.0))
-        solutions = solve(problem)
-        for rotation in Rotation.random(60, random_state=seed).as_matrix():
-            scale = [1.0, *np.exp(rng.uniform(-1, 1, 2))]
-            pose = np.concatenate([rotation.ravel(), [0, 0, rng.uniform(3, 9)], scale])
-            cost, _, _ = refine(objective, 300, pose)
-            rotation = pose[:9].reshape(3, 3)
-            if cost > 1e-18 or pose[13:].min() < 0.02 or pose[13:].max() > 50:
-                continue  # no exact solution, or a model that has no thickness
-            exact = Alignment(rotation, pose[9:12], pose[12:])
-            found += 1
-            missed += not solutions or min(distance(s, exact) for s in solutions) > 1e-4
-    assert found > 200
-    assert missed <= 0.002 * found
 
 
 @given(seed=SEEDS)

@@ -26,9 +26,9 @@ from cadalign.solvers.joint.evidence import (
     points_of,
     unpacked,
 )
-from cadalign.solvers.joint.search import equations_at, reduce_modes, refine_joint
+from cadalign.solvers.joint.search import equations_at, refine_joint
 from cadalign.solvers.joint.system import joint_system
-from cadalign.solvers.search import evaluate, move, refine
+from cadalign.solvers.search import evaluate, move
 
 POINTS, MODES, VIEWS = 7, 3, 2
 
@@ -216,40 +216,6 @@ def shifts_of(evidence: Evidence, state: State) -> np.ndarray:
     plain = joint_room(evidence, system.layout)
     evaluate(joint_system(evidence, integrates=False), packed(state), plain)
     return np.asarray(room.rows[:-4] @ (shifted - plain.rows[-4]))
-
-
-@pytest.mark.parametrize("poses", [(0, 0), (0, 1)])
-def test_the_minimum_has_no_slope_in_displacements_either(poses: tuple[int, int]) -> None:
-    evidence = evidence_of(3, spread=0.05, poses=poses, loss=LINEAR)
-    evidence = seen_from(evidence, state_of(3, max(poses) + 1))
-    reduction = reduce_modes(evidence)
-    row = packed(reduction.reduced(state_of(3, max(poses) + 1)))
-    cost, _, converged = refine(joint_system(reduction.evidence, integrates=False), 300, row)
-    assert converged
-    state = reduction.state_of(row)
-    assert cost < np.inf
-    for i in range(POINTS):
-        for a in range(3):
-            state.displacements[i, a] += 1e-5
-            higher = displaced_cost(evidence, state)
-            state.displacements[i, a] -= 2e-5
-            lower = displaced_cost(evidence, state)
-            state.displacements[i, a] += 1e-5
-            assert abs(higher - lower) < 1e-4 * cost
-
-
-def displaced_cost(evidence: Evidence, state: State) -> float:
-    """The cost at a state, displacements taken as they are."""
-    shape = evidence.shape
-    still = evidence._replace(
-        shape=shape._replace(mean=shape.mean + state.displacements, spread=np.zeros(POINTS))
-    )
-    prior = float((state.displacements / shape.spread[:, None]).ravel() ** 2 @ np.ones(3 * POINTS))
-    rest = state._replace(displacements=np.zeros((POINTS, 3)))
-    others = evidence._replace(sightings=Sightings(*(c[:0] for c in evidence.sightings)))
-    named = cost_of(others, rest)
-    seen = cost_of(still, rest) - cost_of(others._replace(shape=still.shape), rest)
-    return named + seen + prior
 
 
 def test_eliminated_displacements_equal_modes_of_the_same_deviation() -> None:

@@ -17,7 +17,7 @@ from cadalign.solvers.joint.evidence import (
     packed,
     points_of,
 )
-from cadalign.solvers.joint.search import reduce_modes, search_joint, used_points
+from cadalign.solvers.joint.search import search_joint, used_points
 from cadalign.solvers.joint.system import joint_system
 from cadalign.solvers.search import evaluate
 
@@ -65,15 +65,6 @@ def best_of(evidence: Evidence, rank: int) -> tuple[State, float]:
 def mean_depth(evidence: Evidence, state: State) -> float:
     points = points_of(evidence.shape, state)[:SEEN]
     return float((points @ state.poses[0, 6:9] + state.poses[0, 11]).mean())
-
-
-def test_the_basis_spans_what_moves_the_seen_points(evidence: Evidence, rank: int) -> None:
-    reduced, basis, *_ = reduce_modes(evidence)
-    assert basis.shape == (MODES, min(rank, 3 * SEEN))
-    assert np.allclose(basis.T @ basis, np.eye(basis.shape[1]), atol=1e-12)
-    seen = evidence.shape.modes[:, :SEEN].reshape(MODES, -1)
-    assert np.allclose(basis @ basis.T @ seen, seen, atol=1e-8)
-    assert np.allclose(np.tensordot(basis.T, evidence.shape.modes, 1), reduced.shape.modes)
 
 
 def test_a_minimum_is_one_of_all_modes(evidence: Evidence, rank: int) -> None:

@@ -11,7 +11,13 @@ from scipy.spatial.transform import Rotation
 from cadalign import Alignment, Camera
 from cadalign.geometry.camera import projection_jacobian
 from cadalign.geometry.pixels import perspective
-from cadalign.solvers.alignment import Objective, evaluate_alignment, evaluate_cost, room_for
+from cadalign.solvers.alignment import (
+    Objective,
+    evaluate_alignment,
+    evaluate_cost,
+    room_for,
+    solve_damped,
+)
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR, UNKNOWNS
 from cadalign.solvers.evidence import KeypointEvidence, ScalePrior
 from cadalign.solvers.projection import project_point, ray_derivatives, scalars_of
@@ -132,3 +138,11 @@ def test_gradient_of_all_evidence_is_that_of_the_cost(
         ahead, behind = (evaluate_cost(objective, moved(pose, k, s)) for s in (STEP, -STEP))
         slope = free[k] * (ahead - behind) / (4 * STEP)  # the gradient is half that of the cost
         assert gradient[k] == pytest.approx(slope, rel=1e-5, abs=1e-4 * np.sqrt(cost))
+
+
+def test_an_unknown_without_evidence_stays_where_it_is() -> None:
+    equations, step = room_for(3), np.empty(3)
+    equations.hessian[:] = np.diag([4.0, 1e-3, 0.0])
+    equations.gradient[:] = 2.0, 1e-3, 0.0
+    assert solve_damped(equations, 3, 0.0, step) == pytest.approx(1.0 + 1e-3)
+    np.testing.assert_allclose(step, [-0.5, -1.0, 0.0])

@@ -91,8 +91,6 @@ def make_case(
     instance = make_instance(
         model, noise_px=1.0, min_visible=6, seed=0, view_index=0, scene=load_scene(model)
     )
-    assert instance.scene is not None
-    assert model.mesh_path is not None
     frame = RaycastRenderer().render(instance.scene, instance.camera, instance.cam_from_model)
     case = Case(
         folder,

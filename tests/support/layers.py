@@ -12,6 +12,5 @@ def layers() -> list[str]:
     """Packages and modules in the order of the README's list, such as ``solvers``, ``errors``."""
     text = README.read_text(encoding="utf-8")
     found = re.search(r"## How it is built\n\n```\n(.*?)```", text, re.S)
-    assert found is not None
     names = [re.split(r"/|\.py| ", line.strip())[0] for line in found[1].splitlines()]
     return [name for name in names if name != "cadalign"]

@@ -97,7 +97,7 @@ def seen(root: Path, category: str, seed: int, **options: object) -> Sighting:
     models, rng = examples(root, category), np.random.default_rng([seed, 3])
     model = models[7 * seed % len(models)]
     scale = np.exp([0.0, *rng.normal(0, 0.15, 2)])
-    found = sighting(model.points_3d * scale, tuple(model.ids), rng, **options)  # type: ignore[arg-type]
+    found = sighting(model.points_3d * scale, tuple(model.ids), rng, **options)
     return replace(found, points_3d=model.points_3d)
 
 

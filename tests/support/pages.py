@@ -21,7 +21,6 @@ def embedded_payload(page: Path) -> dict[str, Any]:
     """The payload that a page embeds, read as strict JSON."""
     text = page.read_text(encoding="utf-8")
     found = re.search(r'<script type="application/json" id="payload">(.*?)</script>', text, re.S)
-    assert found is not None
     payload: dict[str, Any] = json.loads(found[1], parse_constant=_refuse)
     return payload
 

@@ -128,8 +128,6 @@ def write_pascal3d(root: Path) -> Path:
     import cadalign.datasets
 
     truth = cadalign.datasets.open(root)[0].objects[0].truth
-    assert truth.camera is not None
-    assert truth.cam_from_model is not None
     pixels = truth.camera.project(truth.cam_from_model.apply(points)) + 1
     found["anchors"] = {
         name: {"location": pixel, "status": 1.0} for name, pixel in zip(NAMES, pixels, strict=True)

@@ -68,3 +68,9 @@ def with_outliers(
         while np.linalg.norm(moved_2d[i] - points_2d[i]) < 15:
             moved_2d[i] = rng.uniform(low, high)
     return moved_2d
+
+
+def of_unknowns(covariance: np.ndarray) -> np.ndarray:
+    """The rows and columns of a result's covariance that belong to what is not held."""
+    free = np.flatnonzero(covariance.diagonal())
+    return covariance[np.ix_(free, free)]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from PIL import Image, ImageDraw
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from cadalign import Alignment, Mesh
@@ -53,32 +53,16 @@ def chair() -> Mesh:
 
 @dataclass
 class Recipe:
-    """What a payload is to hold.
-
-    Parameters
-    ----------
-    instances : int
-    runs : int
-    failures : float
-        Share of fits that fail.
-    pictures : int
-        How many different pictures there are; instances share them in turn.
-    exhibits : bool
-    models : list of str
-        Model ids to begin with; others are made up.
-    categories : tuple of str
-    done : int, optional
-        How many are done of an unfinished run.
-    """
+    """What a payload is to hold."""
 
     instances: int = 24
     runs: int = 1
-    failures: float = 0.08
-    pictures: int = 6
+    failures: float = 0.08  # share of fits
+    pictures: int = 6  # different ones, which instances share in turn
     exhibits: bool = True
-    models: list[str] = field(default_factory=list)
+    models: list[str] = field(default_factory=list)  # the first ids; others are made up
     categories: tuple[str, ...] = ("bottle", "chair", "vessel")
-    done: int | None = None
+    done: int | None = None  # of an unfinished run
 
 
 def payload_of(recipe: Recipe) -> dict[str, Any]:
@@ -156,8 +140,8 @@ class _Maker:
             "headline": self._headline(rows, instances),
             "tables": {"strings": self.strings, "instances": instances, "rows": rows},
             "plots": [_plot(recipe.runs, metric) for metric in METRICS[:2]],
-            "pictures": {str(i): _picture(i, boxes=False) for i in shown},
-            "thumbs": {str(i): _picture(i, boxes=True) for i in shown},
+            "pictures": {str(i): _picture(i, (640, 480)) for i in shown},
+            "thumbs": {str(i): _picture(i, (240, 180)) for i in shown},
             "exhibits": exhibits,
             "meshes": {"0": preview_of(self.mesh).to_dict()},
         }
@@ -298,27 +282,11 @@ def _scene(rng: np.random.Generator) -> tuple[Alignment, np.ndarray]:
     return Alignment(seen.rotation, seen.translation, 1 / stretch), stretch
 
 
-# The same for all recipes, of which there are many.
 @cache
-def _picture(index: int, *, boxes: bool) -> str:
-    """A drawing of the chair by painter's algorithm; 640 x 480, thumbs 240 x 180."""
-    gt, stretch = _scenes(np.random.default_rng(_SEED), index + 1)[index]
-    mesh, camera = chair(), KEYPOINT_CAMERA
-    image = Image.new("RGB", (640, 480), (246, 246, 244))
-    draw = ImageDraw.Draw(image)
-    points = gt.apply(mesh.vertices * stretch)
-    pixels = camera.project(points)
-    for face in sorted(mesh.faces, key=lambda face: -points[face, 2].mean()):
-        a, b, c = points[face]
-        normal = np.cross(b - a, c - a)
-        shade = int(130 + 100 * abs(normal[2] / np.linalg.norm(normal)))
-        draw.polygon([tuple(pixel) for pixel in pixels[face]], fill=(shade, shade - 8, shade - 20))
-    if boxes:
-        (low, high) = pixels.min(axis=0), pixels.max(axis=0)
-        draw.rectangle([*low, *high], outline=(19, 122, 60), width=4)
-        image = image.resize((240, 180))
+def _picture(index: int, size: tuple[int, int]) -> str:
+    """A picture of one colour, another for every number."""
     buffer = io.BytesIO()
-    image.save(buffer, "WEBP", quality=80, method=0)
+    Image.new("RGB", size, (40 * index % 256, 120, 90)).save(buffer, "WEBP", quality=80, method=0)
     return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 

@@ -7,11 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from cadalign import Alignment, Camera, View
+from cadalign import Alignment, Camera, Mesh, View
 
 CAMERA = Camera(640, 480, 900, 900, 319.5, 239.5)
 LOOK = np.array([[0.8, 0.0, 0.6], [-0.36, -0.8, 0.48], [0.48, -0.6, -0.64]])
 DISTANCE = 5.0
+CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
+_QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+BOX = Mesh(CORNERS, [face for a, b, c, d in _QUADS for face in ((a, b, c), (a, c, d))])
 
 
 def keypoints(count: int = 10, seed: int = 0) -> np.ndarray:

@@ -9,7 +9,6 @@ import sys
 import sysconfig
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -26,26 +25,12 @@ def build_wheel(folder: Path) -> Path:
     ignored = shutil.ignore_patterns("__pycache__", "node_modules")
     for name, _ in PACKAGES:
         shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=ignored)
-    done = subprocess.run(
-        _build_command(source, folder / "out"), capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation"]
+    command += ["--outdir", str(folder / "out"), str(source)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     (path,) = (folder / "out").glob("*.whl")
     return path
-
-
-def _build_command(source: Path, out: Path) -> list[str]:
-    """Build with the setuptools at hand if it is new enough, otherwise fetch one."""
-    try:
-        recent = int(version("setuptools").split(".")[0]) >= 77
-        version("build")
-    except PackageNotFoundError:
-        recent = False
-    if recent:
-        options = ["build", "--wheel", "--no-isolation", "--outdir", str(out)]
-    else:
-        options = ["pip", "wheel", "--no-deps", "--quiet", "--wheel-dir", str(out)]
-    return [sys.executable, "-m", *options, str(source)]
 
 
 def source_files() -> dict[str, Path]:
@@ -78,15 +63,8 @@ class Environment:
         made = cls(folder, home)
         (made.site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
         pip = [sys.executable, "-m", "pip", "--python", str(folder / "bin" / "python")]
-        install = [
-            "install",
-            "--quiet",
-            "--no-index",
-            "--no-deps",
-            "--force-reinstall",
-            "--no-compile",
-        ]
-        subprocess.run([*pip, *install, str(wheel)], check=True)
+        options = ("--quiet", "--no-index", "--no-deps", "--force-reinstall", "--no-compile")
+        subprocess.run([*pip, "install", *options, str(wheel)], check=True)
         return made
 
     @property

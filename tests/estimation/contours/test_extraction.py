@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
-from support.scenes import CAMERA, truth_of
+from support.scenes import BOX, CAMERA, truth_of
 
-from cadalign import Alignment, Mesh
+from cadalign import Alignment
 from cadalign.estimation.contours import contour as contours
 from cadalign.estimation.contours.contour import (
     Sight,
@@ -19,9 +18,6 @@ from cadalign.estimation.contours.contour import (
 from cadalign.geometry.raycaster import RayCaster
 from cadalign.render import Scene, cast_geometry
 
-CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
-QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-BOX = Mesh(CORNERS, np.array([face for a, b, c, d in QUADS for face in ((a, b, c), (a, c, d))]))
 TRUTH = truth_of((0.6, 0.4, 0.8))
 
 
@@ -49,35 +45,6 @@ def test_a_displacement_is_no_part_of_it() -> None:
     assert 0.2 < outwards < 2
     assert abs(np.median(bias)) < 0.15
     assert np.abs(bias).max() < 2
-
-
-def test_pixels_that_cannot_differ_from_the_mask_are_not_cast(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    mask = cast_geometry(Scene(BOX), CAMERA, TRUTH).mask
-    turned = Alignment(TRUTH.rotation, TRUTH.translation + [0.0005, 0, 0.002], TRUTH.scale)
-    contour, cast = contour_of(mask), []
-    covers = Sight.covers
-
-    def counted(sight: Sight, pixels: np.ndarray) -> np.ndarray:
-        cast.append(pixels.size // 2)
-        return covers(sight, pixels)
-
-    monkeypatch.setattr(Sight, "covers", counted)
-
-    def distances() -> np.ndarray:
-        cast.clear()
-        sight = Sight(RayCaster(BOX), CAMERA, turned)
-        rims = find_rims(sight, contour, 4.0)
-        bias = extraction_bias(sight, mask_image(mask, contour), contour, rims)
-        return np.where(rims.found, rims.offset - bias, np.nan)
-
-    found, rays = distances(), sum(cast)
-    monkeypatch.setattr(contours, "_BAND", 9)
-    monkeypatch.setattr(contours, "_PRECISION", 0.01)
-    every = distances()
-    assert rays < 0.7 * sum(cast)
-    assert (np.abs(found - every) < 1e-3).mean() > 0.99
 
 
 def test_corners_that_are_rounded_off_are_not_steep() -> None:

@@ -24,7 +24,7 @@ def fitted(camera: Camera, **options: object) -> cadalign.Result:
     truth = Alignment(turn, [0.4, -0.3, 4.0], np.array([1.0, 1.3, 0.8]))
     noise = np.random.default_rng(6).normal(size=(9, 2))
     pixels = camera.project(truth.apply(POINTS)) + noise
-    return cadalign.fit(POINTS, pixels, camera, **{"sigma": 2.0, **options})  # type: ignore[arg-type]
+    return cadalign.fit(POINTS, pixels, camera, **{"sigma": 2.0, **options})
 
 
 def chart_of(result: cadalign.Result, widening: float = 1.0) -> Chart:
@@ -51,10 +51,13 @@ def moved(result: cadalign.Result, deviation: np.ndarray) -> tuple[Alignment, Ca
     )
 
 
-def cost_of(result: cadalign.Result, deviation: np.ndarray) -> float:
+def cost_of(
+    result: cadalign.Result, deviation: np.ndarray, weights: np.ndarray | float = 1.0
+) -> float:
     alignment, camera = moved(result, deviation)
     seen = result.camera.project(result.alignment.apply(POINTS)) - result.residuals
-    return float(((camera.project(alignment.apply(POINTS)) - seen) ** 2).sum()) / 2.0**2
+    squares = ((camera.project(alignment.apply(POINTS)) - seen) ** 2).sum(axis=1)
+    return float((weights * squares).sum()) / 2.0**2
 
 
 def test_costs_are_those_of_the_reprojection_errors() -> None:
@@ -69,6 +72,14 @@ def test_a_lens_counts_by_its_derivatives_at_the_estimate() -> None:
     deviations, costs, _ = weigh_draws(*chart_of(result), STEPS / 20)
     expected = [cost_of(result, each) for each in deviations]
     np.testing.assert_allclose(costs, expected, rtol=2e-3)
+
+
+def test_a_loss_counts_by_its_weights_at_the_estimate() -> None:
+    result = fitted(CAMERA, loss="cauchy", loss_scale=0.5)
+    weights = 1 / (1 + (result.residuals**2).sum(axis=1) / (2.0 * 0.5) ** 2)
+    deviations, costs, _ = weigh_draws(*chart_of(result), STEPS)
+    expected = [cost_of(result, each, weights) for each in deviations]
+    np.testing.assert_allclose(costs, expected, rtol=1e-9)
 
 
 def test_deviations_are_to_first_order_those_of_the_unknowns() -> None:

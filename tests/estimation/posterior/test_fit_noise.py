@@ -3,44 +3,49 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from support.covariances import of_unknowns
-from support.problems import LENS, assert_same, fit_problem, moved, problem_of, residuals_at
+from scipy.special import chdtri, fdtri
+from support.problems import (
+    LENS,
+    assert_same,
+    fit_problem,
+    moved,
+    of_unknowns,
+    problem_of,
+    residuals_at,
+)
 
 from cadalign import Alignment, Camera, Model, RansacOptions, View, align, fit
-from cadalign.errors import CadalignError, DegenerateError
+from cadalign.errors import DegenerateError
+from cadalign.estimation.warning import MISFIT_KINDS
 from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem, simulate_problem
 from cadalign.geometry.metrics import rotation_error
 
 # --- sigma ------------------------------------------------------------------------------------
 
 
-def test_forms_of_one_sigma_agree() -> None:
+@pytest.mark.parametrize(
+    "sigma", [np.full(12, 0.7), np.linspace(0.5, 3.0, 12)], ids=["one", "each"]
+)
+def test_forms_of_sigmas_agree(sigma: np.ndarray) -> None:
     problem = problem_of(1, camera=LENS)
-    scalar = fit_problem(problem, sigma=0.7)
-    forms = [np.full(12, 0.7), np.tile(0.49 * np.eye(2), (12, 1, 1)), np.float32(0.7)]
-    for sigma in forms:
-        other = fit_problem(problem, sigma=sigma)
-        assert_same(other.alignment, scalar.alignment, 1e-7)
+    expected = fit_problem(problem, sigma=sigma)
+    assert expected.sigma is None
+    forms: list[Any] = [sigma[:, None, None] ** 2 * np.eye(2)]
+    if np.ptp(sigma) == 0:
+        forms += [0.7, np.float32(0.7)]
+    for form in forms:
+        other = fit_problem(problem, sigma=form)
+        assert_same(other.alignment, expected.alignment, 1e-7)
         np.testing.assert_allclose(
-            other.fisher_covariance, scalar.fisher_covariance, rtol=1e-5, atol=1e-12
+            other.fisher_covariance, expected.fisher_covariance, rtol=1e-5, atol=1e-12
         )
-
-
-def test_forms_of_different_sigmas_agree() -> None:
-    problem = problem_of(1)
-    sigma = np.linspace(0.5, 3.0, 12)
-    each = fit_problem(problem, sigma=sigma)
-    full = fit_problem(problem, sigma=sigma[:, None, None] ** 2 * np.eye(2))
-    assert_same(full.alignment, each.alignment, 1e-7)
-    np.testing.assert_allclose(
-        full.fisher_covariance, each.fisher_covariance, rtol=1e-5, atol=1e-12
-    )
-    assert each.sigma is None
 
 
 def test_sigma_of_all_scales_the_covariance_and_nothing_else() -> None:
@@ -110,12 +115,12 @@ def said_of(problem: SimulatedProblem, points_2d: np.ndarray) -> list[bool]:
 
 def test_keypoints_in_random_order_are_warned_of_although_sigma_is_unknown() -> None:
     named = []
-    for seed in range(10):
+    for seed in range(3):
         problem = problem_of(seed)
         assert not any(said_of(problem, problem.points_2d))
         order = np.random.default_rng(seed).permutation(len(problem.points_2d))
         named += said_of(problem, problem.points_2d[order])
-    assert sum(named) >= 18  # of 20
+    assert sum(named) >= 5  # of 6
 
 
 def test_unknown_sigma_is_estimated_in_spite_of_outliers_where_the_loss_is_robust() -> None:
@@ -125,7 +130,6 @@ def test_unknown_sigma_is_estimated_in_spite_of_outliers_where_the_loss_is_robus
     robust = fit(problem.points_3d, wrong, problem.camera, sigma=None, loss="cauchy")
     plain = fit(problem.points_3d, wrong, problem.camera, sigma=None)
     assert robust.sigma == pytest.approx(1.0, rel=0.3)
-    assert plain.sigma is not None
     assert plain.sigma > 5
 
 
@@ -133,7 +137,7 @@ def test_unknown_sigma_is_estimated_in_spite_of_outliers_where_the_loss_is_robus
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_robust_loss_withstands_a_gross_outlier(loss: str, seed: int) -> None:
     problem = problem_of(seed, points=20, noise_px=0.5)
     wrong = problem.points_2d.copy()
@@ -169,13 +173,12 @@ def test_result_is_a_minimum_of_the_loss(loss: str) -> None:
 def test_hubers_loss_is_no_larger_than_at_the_truth() -> None:
     camera = Camera(640, 480, 935, 935, 319.5, 239.5)
     shown = {"noise_px": 1.0, "outlier_share": 0.2, "camera": camera, "stretch": (0.7, 1.4)}
-    for seed in range(60):
+    for seed in range(30):
         problem = simulate_problem(np.random.default_rng(seed), points=20, depth=(5, 9), **shown)
         result = fit(problem.points_3d, problem.points_2d, camera, loss="huber")
         off = camera.project(problem.alignment.apply(problem.points_3d)) - problem.points_2d
         lengths = np.linalg.norm(off, axis=1)
         at_truth = np.where(lengths <= 2, lengths**2, 4 * lengths - 4).sum()
-        assert result.cost is not None
         assert result.cost <= at_truth
 
 
@@ -189,8 +192,7 @@ def test_robust_loss_with_a_large_scale_is_the_linear_one(loss: str) -> None:
 # --- how well it is known ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("camera", [SIMULATION_CAMERA, LENS])
-@pytest.mark.parametrize("shift", [0.0, 30.0])
+@pytest.mark.parametrize(("camera", "shift"), [(SIMULATION_CAMERA, 30.0), (LENS, 0.0)])
 def test_covariance_is_the_inverse_information_at_the_optimum(camera: Camera, shift: float) -> None:
     problem = problem_of(9, points=15, noise_px=0.0, camera=camera)
     points_3d = problem.points_3d + [shift, -shift, shift]
@@ -240,7 +242,6 @@ def flattened(axis: int, thickness: float) -> SimulatedProblem:
 @pytest.mark.parametrize("axis", [1, 2])
 def test_text_names_the_plane_that_hides_a_stretch(axis: int) -> None:
     result = fit_problem(flattened(axis, 0.02))
-    assert result.std is not None
     name = "xyz"[axis]
     assert f"s_{name}" in result.uncertain
     assert f"s_{name} (the keypoints lie nearly in the plane {name} = 0.25)" in str(result)
@@ -264,7 +265,70 @@ def test_warning_says_that_four_points_always_fit() -> None:
 
 
 def test_many_good_keypoints_leave_nothing_to_warn_of() -> None:
-    assert fit_problem(problem_of(0, points=100)).warnings == ()
+    result = fit_problem(problem_of(0, points=100))
+    assert result.warnings == ()
+    assert result.alternatives == ()
+
+
+ALARMING = {
+    "lens": {"camera": LENS},
+    "stretch": {"stretch_sigma": 0.5},
+    "each": {"sigma": np.ones(8)},
+}
+ALARMING |= {loss: {"loss": loss} for loss in ("linear", "huber", "cauchy")}
+ALARMING["ransac"] = {"ransac": RansacOptions(max_iterations=200)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ALARMING)
+def test_right_data_raise_no_alarm(kind: str) -> None:
+    """Of 40, four false alarms have a chance of a thousandth at the allowed rate of 1 %."""
+    options = dict(ALARMING[kind])
+    camera, alarms = options.pop("camera", SIMULATION_CAMERA), 0
+    for seed in range(40):
+        problem = problem_of(seed, points=8, noise_px=1.0, camera=camera)
+        with suppress(DegenerateError):  # with few keypoints, the noise may leave no solution
+            result = fit_problem(problem, **options)
+            alarms += any(each.kind in MISFIT_KINDS for each in result.warnings)
+    assert alarms < 4
+
+
+def test_nothing_is_more_certain_than_the_cramer_rao_bound() -> None:
+    for seed in range(10):
+        result = fit_problem(problem_of(seed, points=7, noise_px=1.0))
+        bound = of_unknowns(result.fisher_covariance)
+        excess = of_unknowns(result.covariance) - bound
+        scale = np.sqrt(np.outer(bound.diagonal(), bound.diagonal()))
+        assert np.linalg.eigvalsh(excess / scale)[0] > -1e-6 * np.abs(excess / scale).max() - 1e-9
+
+
+def test_many_keypoints_leave_the_inverse_fisher_information() -> None:
+    result = fit_problem(problem_of(1, points=150, noise_px=1.0))
+    np.testing.assert_array_equal(result.covariance, result.fisher_covariance)
+
+
+@pytest.mark.parametrize(("loss", "least"), [("linear", 1.0), ("cauchy", 1.001)])
+def test_estimated_noise_widens_the_covariance_as_the_f_distribution_does(
+    loss: str, least: float
+) -> None:
+    """Of 95 % ellipsoids; a robust loss leaves fewer keypoints to tell the noise."""
+    problem = problem_of(1, points=150, noise_px=1.0)
+    result = fit_problem(problem, sigma=None, loss=loss)
+    usual = 8 * fdtri(8, 2 * 150 - 8, 0.95) / chdtri(8, 0.05)
+    widened = result.covariance[0, 0] / result.fisher_covariance[0, 0]
+    assert least - 1e-4 < widened / usual < least + 0.02
+    few = problem_of(1, points=6, noise_px=1.0)
+    estimated = fit_problem(few, sigma=None, loss=loss)
+    known = fit_problem(few, sigma=estimated.sigma, loss=loss)
+    assert estimated.std.rotation_deg > 1.2 * known.std.rotation_deg
+
+
+@pytest.mark.slow
+def test_robust_sigma_does_not_collapse() -> None:
+    problems = (problem_of(seed, points=8, noise_px=1.0) for seed in range(40))
+    sigmas = [fit_problem(each, sigma=None, loss="cauchy").sigma for each in problems]
+    assert min(sigmas) > 0.01
+    assert 0.5 < np.median(sigmas) < 1.5
 
 
 def test_stats_count_the_work() -> None:
@@ -275,10 +339,3 @@ def test_stats_count_the_work() -> None:
     assert stats.iterations > 0
     assert stats.hypotheses > 0
     assert 0 < stats.seconds <= elapsed
-
-
-@pytest.mark.parametrize("options", [{}, {"loss": "cauchy"}, {"ransac": RansacOptions()}])
-def test_no_keypoints_have_no_noise(options: dict[str, object]) -> None:
-    nothing = np.empty((0, 3)), np.empty((0, 2))
-    with pytest.raises(CadalignError, match="0 keypoints"):
-        fit(*nothing, SIMULATION_CAMERA, sigma=None, **options)  # type: ignore[arg-type]

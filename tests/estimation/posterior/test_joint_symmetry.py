@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from cadalign import Alignment, Camera, Model, Result, Size, Symmetry, View, align
-from cadalign.errors import InputError
 from cadalign.geometry.rotations import angle_between, rotation_from_vector
 from cadalign.geometry.symmetry_group import FACING
 
@@ -117,8 +116,3 @@ def test_of_a_round_model_rotations_about_its_axis_count_for_nothing():
     assert result.std.rotation_deg == pytest.approx(np.degrees(np.sqrt(variance)), rel=0.05)
     # What the order of two tilts turns about the axis is left.
     assert axis @ result.covariance[:3, :3] @ axis < 0.03 * variance
-
-
-def test_a_model_refuses_what_is_no_symmetry():
-    with pytest.raises(InputError, match=r"symmetry: expected a cadalign.Symmetry"):
-        Model(points_3d=CORNERS, symmetry="__SYM_ROTATE_UP_4")

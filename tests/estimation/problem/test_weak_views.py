@@ -7,7 +7,7 @@ import pytest
 from support.scenes import CAMERA, around, in_camera, keypoints, seen, truth_of
 
 from cadalign import Alignment, Model, Result, ShapeModel, View, align
-from cadalign.errors import DegenerateError, InputError
+from cadalign.errors import DegenerateError
 from cadalign.estimation import EstimateWarning
 from cadalign.metrics import rotation_error
 
@@ -94,9 +94,3 @@ def test_rounding_does_not_decide_on_a_started_view(seed: int) -> None:
         for view in (view_at(-25, [0, 1]), view_at(0, list(range(8))))
     ]
     assert len(align(MODEL, moved, init=truth_at(-25)).poses) == 2
-
-
-def test_errors_about_other_views_keep_their_numbers() -> None:
-    with pytest.raises(InputError, match=r"^views\[2\]: tells nothing") as caught:
-        align(MODEL, [view_at(0, list(range(8))), view_at(30, [0, 1]), View(CAMERA)])
-    assert caught.value.where == "views[2]"

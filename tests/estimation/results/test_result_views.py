@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from support.files import TETRAHEDRON
 
 import cadalign
 from cadalign import Alignment, Camera, Mesh, Model, Result, View
@@ -29,9 +30,7 @@ def aligned() -> Result:
     return cadalign.align(Model(points_3d=CORNERS, mesh=MESH), View(CAMERA, SEEN))
 
 
-def test_results_are_saved_and_loaded(fitted: Result, aligned: Result, tmp_path: Path) -> None:
-    fitted.save(tmp_path / "fit.json")
-    assert Result.load(tmp_path / "fit.json").to_dict() == fitted.to_dict()
+def test_results_are_saved_and_loaded(aligned: Result, tmp_path: Path) -> None:
     aligned.save(tmp_path / "align.json")
     again = Result.load(tmp_path / "align.json")
     assert again.to_dict() == aligned.to_dict()
@@ -46,7 +45,7 @@ def test_damaged_file_is_named(tmp_path: Path) -> None:
         Result.load(path)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("mesh", [None, MESH])
 def test_plot_gives_axes_in_pixels(fitted: Result, aligned: Result, mesh: Mesh | None) -> None:
     photo = np.zeros((480, 640, 3), dtype=np.uint8)
@@ -95,8 +94,6 @@ def test_data_frame_states_deviations_and_what_is_warned_of() -> None:
     results = cadalign.fit_batch([CORNERS[[0, 1, 2, 4]], flat], [SEEN[[0, 1, 2, 4]], seen], CAMERA)
     frame = results.to_dataframe()
     for number, single in enumerate(results):
-        assert isinstance(single, Result)
-        assert single.std is not None
         assert frame.scale_z_std[number] == single.std.scale[2]
         assert frame.rotation_std_deg[number] == single.std.rotation_deg
         assert frame.warnings[number] == "; ".join(map(str, single.warnings))
@@ -136,7 +133,6 @@ def test_of_several_views_a_row_has_the_first() -> None:
     assert frame.views.tolist()[:3] == [2, 1, 1]
     assert frame.keypoints.tolist()[:3] == [14, 8, 6]
     joint = results[0]
-    assert isinstance(joint, Result)
     assert frame.tz[0] == joint.alignment.translation[2]
     assert isinstance(results[3], InputError)
     assert len(results[:2]) == 2
@@ -161,6 +157,14 @@ def test_poses_of_all_views_have_their_covariance() -> None:
         second.covariance, carry @ first.covariance @ carry.T, rtol=1e-6, atol=1e-12
     )
     assert second.std.scale == pytest.approx(first.std.scale)
+
+
+def test_meshes_are_named_by_their_paths(fitted: Result, tmp_path: Path) -> None:
+    path = tmp_path / "one.obj"
+    path.write_text(TETRAHEDRON)
+    vertices = cadalign.load_mesh(path).vertices
+    np.testing.assert_array_equal(fitted.mesh(str(path)).vertices, vertices)
+    assert fitted.export(tmp_path / "chair.glb", mesh=path).stat().st_size > 500
 
 
 def test_a_file_is_plotted_and_exported_by_itself(

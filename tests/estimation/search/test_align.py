@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 from support.scenes import CAMERA, around, keypoints
 
-from cadalign import Alignment, Model, RansacOptions, Size, View, align, align_batch, fit
-from cadalign.errors import CadalignError, DegenerateError, InputError, NoConsensusError
+from cadalign import Alignment, Camera, Model, RansacOptions, Size, View, align, align_batch, fit
+from cadalign.errors import DegenerateError, NoConsensusError
 from cadalign.estimation.result import Result
 from cadalign.metrics import rotation_error
 from cadalign.shapes.model import ShapeModel
@@ -39,12 +39,16 @@ def spreads(deviation: float, count: int = 10, modes: int = 3) -> ShapeModel:
 
 
 class TestExactModel:
-    def test_equals_fit_bit_for_bit(self) -> None:
+    @pytest.mark.parametrize("focal", ["known", "estimate"])
+    def test_equals_fit_bit_for_bit(self, focal: Literal["known", "estimate"]) -> None:
         points, rng = keypoints(), np.random.default_rng(1)
         view = seen(points, truth_of(), np.eye(4), noise=rng.normal(0, 1, (10, 2)))
-        result = align(Model(points_3d=points), view)
-        expected = fit(points, view.points_2d, CAMERA)
+        if focal == "estimate":
+            view = replace(view, camera=Camera.without_focal(640, 480))
+        result = align(Model(points_3d=points), view, focal=focal)
+        expected = fit(points, view.points_2d, view.camera, focal=focal)
         assert result.alignment == expected.alignment
+        assert result.camera == expected.camera
         for name in ("covariance", "fisher_covariance", "points_covariance"):
             np.testing.assert_array_equal(getattr(result, name), getattr(expected, name))
         assert result.std == expected.std
@@ -60,7 +64,6 @@ class TestExactModel:
         expected = fit(keypoints(), view.points_2d, CAMERA, stretch="none")
         assert np.allclose(result.alignment.rotation, expected.alignment.rotation, atol=1e-9)
         assert np.allclose(result.alignment.translation, expected.alignment.translation, atol=1e-8)
-        assert expected.covariance is not None
         assert np.allclose(result.covariance[:6, :6], expected.covariance[:6, :6], rtol=1e-5)
 
     def test_ids_say_which_keypoints_a_view_shows(self) -> None:
@@ -86,22 +89,6 @@ class TestSimilarModel:
         honest = align(Model(points_3d=points, shape_sigma=0.03), view)
         assert honest.std.rotation_deg > 3 * naive.std.rotation_deg
         assert not any(each.kind == "misfit" for each in honest.warnings)
-
-    @pytest.mark.long
-    def test_stated_deviations_hold_the_truth(self) -> None:
-        points, inside = keypoints(12), 0
-        for seed in range(100):
-            rng = np.random.default_rng(seed)
-            moved = points + rng.normal(0, 0.02, points.shape)
-            view = seen(moved, truth_of(), np.eye(4), noise=rng.normal(0, 1, (12, 2)))
-            result = align(Model(points_3d=points, shape_sigma=0.02), view)
-            # The corners of the object's box vary as its keypoints do.
-            corners = np.diff(rng.normal(0, 0.02, (2, 3)), axis=0)[0] / np.ptp(points, axis=0)
-            error = np.log(result.stretch / (truth_of().scale * (1 + corners)))[1:]
-            covariance = result.covariance[7:, 7:]
-            # Half of the stretch's ellipses hold the truth: chi-square of two has the median 1.386.
-            inside += bool(error @ np.linalg.solve(covariance, error) < 1.386)
-        assert 35 <= inside <= 65
 
     def test_inflation_widens_the_deviations_alone(self) -> None:
         model = spreads(0.05)
@@ -134,18 +121,13 @@ class TestSimilarModel:
         assert tails.radius(0.5) < plain.radius(0.5)
         read = Result.from_dict(json.loads(json.dumps(tails.to_dict())))
         assert read.degrees_of_freedom == 4
-        for wrong in (0.0, 1.0, float("nan")):
-            with pytest.raises(InputError, match="probability"):
-                plain.radius(wrong)
-        with pytest.raises(InputError, match="dimension"):
-            plain.radius(0.5, dimension=0)
 
     @pytest.mark.parametrize("views", [1, 2])
     def test_a_box_that_is_not_given_is_the_extent_of_all_keypoints(self, views: int) -> None:
         """Its stated standard deviations are those of the errors; a linear box was 20 off."""
         model, errors = spreads(0.05), []
         component = model.components[0]
-        for seed in range(60):
+        for seed in range(40):
             rng = np.random.default_rng(seed)
             shape = component.mean + np.tensordot(rng.normal(size=3), component.modes, 1)
             some = np.sort(rng.permutation(10)[:7])  # others than these may be the outermost
@@ -227,14 +209,42 @@ class TestSeveralViews:
         assert np.abs(motion - around(30)[:3, :3]).max() < 0.02
 
 
-class TestOtherEvidence:
-    def test_depth_determines_the_size(self) -> None:
-        points, truth = keypoints(), truth_of((1.4, 0.7, 1.9))
-        depth = truth.apply(points)[:, 2]
-        depth[3] = np.nan
-        view = seen(points, truth, np.eye(4), depth=depth, depth_sigma=0.005)
-        result = align(Model(points_3d=points), view)
-        assert np.allclose(result.alignment.scale, truth.scale, rtol=1e-4)
+class TestUnknowns:
+    def test_views_share_a_focal_length_where_they_share_a_camera(self) -> None:
+        model, truth = spreads(0.02), truth_of((1.0, 1.0, 1.0))
+        wide = Camera(800, 600, 700.0, 700.0, 399.5, 299.5)
+        views = []
+        for camera, angle in ((CAMERA, 0.0), (wide, 30.0), (CAMERA, -30.0)):
+            motion = around(angle)
+            in_camera = truth.apply(keypoints()) @ motion[:3, :3].T + motion[:3, 3]
+            unknown = Camera.without_focal(camera.width, camera.height)
+            views.append(View(unknown, camera.project(in_camera), sigma=0.2))
+        result = align(model, views, focal="estimate")
+        assert result.cameras[0] == result.cameras[2]
+        focal_lengths = [camera.fx for camera in result.cameras]
+        assert focal_lengths == pytest.approx([900.0, 700.0, 900.0], rel=0.1)
+        assert result.std.focal == pytest.approx(np.sqrt(result.covariance[9, 9]))
+
+    def test_noise_that_is_not_given_is_that_of_the_residuals(self) -> None:
+        """Over the equations beyond the unknowns: those of each pose, and of two stretches."""
+        points, rng = keypoints(), np.random.default_rng(4)
+        views = [
+            seen(points, truth_of(), around(angle), noise=rng.normal(0, 3, (10, 2)), sigma=None)
+            for angle in (0, 30, 60)
+        ]
+        result = align(Model(points_3d=points), views)
+        square = sum(float((view.residuals**2).sum()) for view in result.views)
+        assert result.sigma == pytest.approx(np.sqrt(square / (3 * (20 - 6) - 2)), rel=1e-3)
+        learned = align(spreads(0.05), views[0])
+        assert 1.0 < learned.sigma < 6.0
+
+    def test_every_view_may_have_a_start(self) -> None:
+        points, truth = keypoints(), truth_of()
+        views = [seen(points, truth, around(angle)) for angle in (0, 30)]
+        expected = align(Model(points_3d=points), views)
+        for start in ([None, expected.poses[1]], [truth, None]):
+            result = align(Model(points_3d=points), views, init=start)
+            assert rotation_error(est=result.poses[1], gt=expected.poses[1]) < 1e-3
 
 
 class TestOutliers:
@@ -249,6 +259,16 @@ class TestOutliers:
         result = align(model, View(CAMERA, pixels), ransac=RansacOptions(max_reproj_error=4.0))
         assert np.flatnonzero(~result.inliers).tolist() == [1, 5, 11, 12]
         assert rotation_error(est=result.alignment, gt=truth) < 2.0
+
+    @pytest.mark.parametrize("minimal", ["ap4p", "aepnp"])
+    def test_samples_follow_confidences(self, minimal: Literal["ap4p", "aepnp"]) -> None:
+        model, wrong = spreads(0.01, count=16), [0, 3, 5, 8, 11]
+        pixels = CAMERA.project(truth_of((1.0, 1.0, 1.0)).apply(keypoints(16)))
+        pixels[wrong] += np.random.default_rng(0).uniform(60, 120, (5, 2))
+        scores = np.where(np.isin(np.arange(16), wrong), 0.1, 0.9)
+        view = View(CAMERA, pixels, sigma=0.5, scores=scores)
+        result = align(model, view, ransac=RansacOptions(minimal=minimal))
+        assert np.flatnonzero(~result.inliers).tolist() == wrong
 
     def test_inliers_are_in_the_order_of_the_view(self) -> None:
         model = spreads(0.01, count=16)
@@ -284,7 +304,6 @@ def test_a_batch_is_its_single_results_and_keeps_errors() -> None:
     batch = align_batch(model, [*views, too_few], workers=2)
     assert isinstance(batch[3], DegenerateError)
     for view, result in zip(views, batch, strict=False):
-        assert isinstance(result, Result)
         assert result.alignment == align(model, view).alignment
 
 
@@ -306,11 +325,9 @@ def test_a_batch_takes_a_size_and_a_start_for_each_object() -> None:
         align(model, four, init=start),
     )
     for result, expected in zip(batch, alone, strict=False):
-        assert isinstance(result, Result)
         assert result.alignment == expected.alignment
     assert isinstance(batch[3], DegenerateError)  # two keypoints, whatever the start
     for result in align_batch(model, views, size=size, workers=2):
-        assert isinstance(result, Result)
         width = result.alignment.scale[0] * np.ptp(result.bounds[:, 0])
         assert width == pytest.approx(3.0, rel=0.1)
 
@@ -332,12 +349,6 @@ def test_three_keypoints_suffice_with_a_prior() -> None:
     assert min(rotation_error(est=each, gt=truth) for each in likely) < 5
 
 
-def test_residuals_beyond_their_sigma_are_reported() -> None:
-    model, rng = spreads(0.01), np.random.default_rng(0)
-    view = seen(keypoints(), truth_of((1, 1, 1)), np.eye(4), noise=rng.normal(0, 20, (10, 2)))
-    assert any(each.kind == "misfit" for each in align(model, view).warnings)
-
-
 def test_keypoint_that_contradicts_a_learned_shape_is_named() -> None:
     model, rng = spreads(0.01), np.random.default_rng(0)
     noise = rng.normal(0, 1, (10, 2))
@@ -349,92 +360,6 @@ def test_keypoint_that_contradicts_a_learned_shape_is_named() -> None:
     ).warnings
     assert "keypoint 4 (36.2 px) does not fit the others" in warning.text
     assert (warning.kind, warning.view, warning.keypoints) == ("outlier", 0, (4,))
-
-
-def test_a_result_survives_json() -> None:
-    model, rng = spreads(0.05), np.random.default_rng(0)
-    noise = rng.normal(0, 3, (10, 2))
-    views = [seen(keypoints(), truth_of((1, 1, 1)), around(a), noise=noise) for a in (0, 20)]
-    result = align(model, views)
-    text = json.dumps(result.to_dict(), allow_nan=False)
-    again = Result.from_dict(json.loads(text))
-    assert json.dumps(again.to_dict()) == text
-    assert str(again) == str(result)
-
-
-def test_a_damaged_result_is_refused_by_field() -> None:
-    data = align(spreads(0.05), seen(keypoints(), truth_of((1, 1, 1)), np.eye(4))).to_dict()
-    for name, value, message in (
-        ("fisher_covariance", [[1.0]], "result: fisher_covariance: shape (1, 1), expected (9, 9)"),
-        ("views", [], "result: views: there are none"),
-        ("ids", [1], "result: ids: 1 entries, but points_3d has 10"),
-    ):
-        with pytest.raises(InputError) as caught:
-            Result.from_dict({**data, name: value})
-        assert str(caught.value).startswith(message)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (
-            lambda: align(
-                Model(points_3d=keypoints()), View(CAMERA, [[1, 2]] * 4, ids=[0, 1, 2, 77])
-            ),
-            "views[0].ids: the model has no keypoint 77; the model has 0, 1, 2",
-        ),
-        (
-            lambda: align(Model(points_3d=keypoints()), View(CAMERA, 9 + keypoints(9)[:, :2])),
-            "views[0].ids: 9 keypoints without ids, but the model has 10; give the model's id",
-        ),
-        (lambda: align(Model(points_3d=keypoints()), []), "views: none is given"),
-        (
-            lambda: align(Model(points_3d=keypoints()), [keypoints()]),  # type: ignore[list-item]
-            "views[0]: expected a cadalign.View, got ndarray",
-        ),
-        (
-            lambda: align(keypoints(), View(CAMERA, [[1, 2]])),  # type: ignore[arg-type]
-            "model: expected a cadalign.Model or a cadalign.ShapeModel, got ndarray",
-        ),
-        (lambda: View(CAMERA, [[1, 2], [3, 4]], ids=["a", "a"]), "ids: 'a' occurs twice"),
-        (lambda: View(CAMERA, [[1, 2]], ids=["a", "b"]), "ids: 2 ids for 1 keypoints"),
-        (lambda: View(CAMERA, [[1, 2]], depth=[-1.0]), "depth: has values that are not positive"),
-        (lambda: View(CAMERA, [[1, 2]], up=[0, 0, 0]), "up: a direction must not be zero"),
-        (lambda: Model(points_3d=keypoints(), shape_sigma=0.0), "shape_sigma: 0.0 is not positive"),
-        (lambda: Model(points_3d=np.empty((0, 3))), "points_3d: a model needs keypoints"),
-        (
-            lambda: align_batch(Model(points_3d=keypoints()), [], workers=0),
-            "workers: must be >= 1, or -1 for all cores, not 0",
-        ),
-        (
-            lambda: align_batch(
-                Model(points_3d=keypoints()), [View(CAMERA, [[1, 2]])], size=[Size(width=1.0)] * 2
-            ),
-            "size: 2 for 1 objects; give one for all, or one or None for each",
-        ),
-        (
-            lambda: align_batch(
-                Model(points_3d=keypoints()),
-                [View(CAMERA, [[1, 2]])],
-                init=[4],  # type: ignore[list-item]
-            ),
-            "init[0]: expected a cadalign.Alignment or None, got int",
-        ),
-        (
-            lambda: align_batch(
-                Model(points_3d=keypoints()),
-                [View(CAMERA, [[1, 2]])],
-                size=1.0,  # type: ignore[arg-type]
-            ),
-            "size: expected a cadalign.Size or a sequence of them, got float",
-        ),
-    ],
-)
-def test_bad_input_is_named(call: Any, message: str) -> None:
-    with pytest.raises(InputError) as caught:
-        call()
-    assert isinstance(caught.value, CadalignError)
-    assert str(caught.value).startswith(message)
 
 
 def test_a_blade_whose_edge_may_be_its_back_has_both_poses() -> None:
@@ -462,8 +387,6 @@ def test_a_batch_takes_any_iterable_of_objects() -> None:
     points = keypoints()
     view, model = seen(points, truth_of(), np.eye(4)), Model(points_3d=points)
     assert len(align_batch(model, (each for each in [view, view]))) == 2
-    with pytest.raises(InputError, match=r"objects: expected a sequence .* got View"):
-        align_batch(model, view)  # type: ignore[arg-type]
 
 
 def test_a_standard_deviation_that_all_keypoints_share_is_stated() -> None:

@@ -8,33 +8,33 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
-from support.covariances import of_unknowns
-from support.problems import LENS, assert_same, fit_problem, moved, problem_of, residuals_at
+from support.problems import (
+    LENS,
+    assert_same,
+    fit_problem,
+    moved,
+    of_unknowns,
+    problem_of,
+    residuals_at,
+)
 
 from cadalign import Alignment, Camera, fit
 from cadalign.errors import DegenerateError
 from cadalign.estimation.options import BOUNDING_PRIOR
 from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem
-from cadalign.geometry.metrics import rotation_error, scale_error, translation_error
+from cadalign.geometry.metrics import rotation_error
 
 # --- what it finds ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("method", ["optimal", "aepnp", "aepnp-paper"])
-@pytest.mark.parametrize("points", [6, 7, 10, 50, 300])
-def test_noise_free_keypoints_give_the_truth(method: str, points: int) -> None:
+@pytest.mark.parametrize(("points", "camera"), [(6, LENS), (7, SIMULATION_CAMERA), (300, LENS)])
+def test_noise_free_keypoints_give_the_truth(method: str, points: int, camera: Camera) -> None:
     for seed in range(5):
-        problem = problem_of(seed, points=points, noise_px=0.0)
+        problem = problem_of(seed, points=points, noise_px=0.0, camera=camera)
         result = fit_problem(problem, method=method)
         assert_same(result.alignment, problem.alignment, 1e-7)
         assert result.rms < 1e-6
-
-
-@pytest.mark.parametrize("method", ["optimal", "aepnp", "aepnp-paper"])
-def test_noise_free_keypoints_give_the_truth_through_a_lens(method: str) -> None:
-    problem = problem_of(0, points=12, noise_px=0.0, camera=LENS)
-    assert_same(fit_problem(problem, method=method).alignment, problem.alignment, 1e-7)
 
 
 def test_epnp_knows_no_stretch() -> None:
@@ -45,14 +45,8 @@ def test_epnp_knows_no_stretch() -> None:
     assert fit_problem(stretched, method="epnp").alignment.scale.tolist() == [1.0, 1.0, 1.0]
 
 
-def test_optimal_is_the_default() -> None:
-    problem = problem_of(0)
-    assert fit_problem(problem).method == "optimal"
-    assert fit_problem(problem).alignment == fit_problem(problem, method="optimal").alignment
-
-
 @pytest.mark.parametrize("camera", [SIMULATION_CAMERA, LENS])
-@pytest.mark.parametrize("points", [8, 30, 100])
+@pytest.mark.parametrize("points", [8, 100])
 def test_optimum_agrees_with_an_independent_least_squares_fit(camera: Camera, points: int) -> None:
     problem = problem_of(4, points=points, noise_px=1.0, camera=camera)
 
@@ -80,14 +74,6 @@ def test_residuals_are_projected_minus_observed(method: str, camera: Camera) -> 
     np.testing.assert_allclose(result.residuals, expected, rtol=0, atol=1e-9)
     assert result.rms == pytest.approx(np.sqrt((expected**2).sum(axis=1).mean()))
     assert result.inliers.tolist() == [True] * 12
-
-
-def test_optimum_explains_the_keypoints_better_than_the_linear_solvers() -> None:
-    for seed in range(10):
-        problem = problem_of(seed, noise_px=2.0)
-        best = fit_problem(problem).rms
-        assert best <= fit_problem(problem, method="aepnp").rms + 1e-9
-        assert best <= fit_problem(problem, method="aepnp-paper").rms + 1e-9
 
 
 def test_input_is_neither_changed_nor_kept() -> None:
@@ -124,12 +110,10 @@ def test_scales_that_do_not_stretch_stay_exactly_one(stretch: str, held: list[in
     assert (result.alignment.scale[held] == 1.0).all()
     assert result.stretched_axes == stretch.replace("none", "")
     covariance = result.fisher_covariance
-    assert covariance is not None
     fixed = [6 + axis for axis in held]
     assert (covariance[fixed] == 0).all()
     assert (covariance[:, fixed] == 0).all()
     assert np.linalg.matrix_rank(covariance) == 9 - len(fixed)
-    assert result.std is not None
     assert [s == 0.0 for s in result.std.scale] == [axis in held for axis in range(3)]
 
 
@@ -144,14 +128,6 @@ def test_fewer_unknowns_need_fewer_points(stretch: str, points: int) -> None:
     explanations = [result.alignment, *(other.alignment for other in result.alternatives)]
     assert result.rms < 1e-5
     assert min(rotation_error(est=each, gt=alignment) for each in explanations) < 1e-3
-    with pytest.raises(DegenerateError, match="are too few for"):
-        fit(points_3d[:-1], simulated.points_2d[:-1], simulated.camera, stretch=stretch)
-
-
-def test_true_scale_may_be_held() -> None:
-    problem = problem_of(2, points=8, noise_px=0.0, stretch=(1.0, 1.0))
-    for stretch in ("yz", "y", "z", "none"):
-        assert_same(fit_problem(problem, stretch=stretch).alignment, problem.alignment, 1e-6)
 
 
 def test_weak_prior_changes_nothing_and_a_strong_one_holds_the_scale() -> None:
@@ -177,26 +153,23 @@ def test_prior_adds_its_information() -> None:
     assert (np.abs(added - expected) < 1e-5 * np.outer(sizes, sizes)).all()
 
 
-@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("axis", [1, 2])
-def test_prior_makes_keypoints_in_one_plane_solvable(seed: int, axis: int) -> None:
-    rng = np.random.default_rng(seed)
-    problem = problem_of(seed, points=10, noise_px=0.0)
+def test_prior_makes_keypoints_in_one_plane_solvable(axis: int) -> None:
+    rng = np.random.default_rng(1)
+    problem = problem_of(1, points=10, noise_px=0.0)
     points_3d = problem.points_3d.copy()
     points_3d[:, axis] = 0.1
     points_2d = problem.camera.project(problem.alignment.apply(points_3d))
     points_2d += 0.2 * rng.standard_normal(points_2d.shape)
     result = fit(points_3d, points_2d, problem.camera, stretch_sigma=0.5)
     assert result.rms < 1.0
-    assert result.std is not None
     # Nothing but the prior knows this scale.
     assert result.std.scale[axis] == pytest.approx(0.5, rel=0.25)
     assert f"in the plane {'xyz'[axis]} = 0.1" in str(result)
 
 
-@pytest.mark.parametrize("points", [6, 8, 14])
-def test_exchanging_the_axes_that_stretch_exchanges_their_deviations(points: int) -> None:
-    problem = problem_of(8, points=points)
+def test_exchanging_the_axes_that_stretch_exchanges_their_deviations() -> None:
+    problem = problem_of(8, points=6)
     base = fit_problem(problem)
     exchanged = problem.points_3d[:, [0, 2, 1]] * [1, 1, -1]
     other = fit(exchanged, problem.points_2d, problem.camera)
@@ -207,7 +180,7 @@ def test_exchanging_the_axes_that_stretch_exchanges_their_deviations(points: int
 # --- other explanations -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 def test_four_points_give_every_exact_solution_least_stretch_first(seed: int) -> None:
     problem = problem_of(seed, points=4, noise_px=0.0)
     result = fit_problem(problem)
@@ -230,7 +203,7 @@ def cost_at(problem: SimulatedProblem, alignment: Alignment) -> float:
 @pytest.mark.parametrize("points", [5, 6])
 def test_alternatives_are_other_minima_with_their_likelihood(points: int) -> None:
     seen = 0
-    for seed in range(60):
+    for seed in range(40):
         problem = problem_of(seed, points=points, noise_px=1.0)
         try:
             result = fit_problem(problem)
@@ -248,36 +221,3 @@ def test_alternatives_are_other_minima_with_their_likelihood(points: int) -> Non
             stretch = np.abs(np.log(other.alignment.scale / result.alignment.scale)).max()
             assert turn > 0.01 or stretch > 1e-4
     assert seen >= 3
-
-
-def test_many_good_keypoints_leave_no_alternative() -> None:
-    assert fit_problem(problem_of(0, points=100)).alternatives == ()
-
-
-# --- real keypoints ---------------------------------------------------------------------------
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("method", ["optimal", "aepnp"])
-def test_real_keypoints_without_noise_are_exact(real_data: Any, method: str) -> None:
-    from cadalign.datasets import KeypointNet
-
-    dataset = KeypointNet(real_data / "keypointnet")
-    camera = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
-    rng = np.random.default_rng(0)
-    tried = 0
-    for category in ("chair", "airplane", "bottle", "mug", "bathtub"):
-        for key in dataset.ids(category)[:20]:
-            points_3d = dataset[key].keypoints.xyz
-            spread = np.linalg.svd(points_3d - points_3d.mean(axis=0), compute_uv=False)
-            if len(points_3d) < 7 or spread[2] < 0.05 * spread[0]:
-                continue
-            scale = [1.0, *rng.uniform(0.5, 2, 2)]
-            rotation = Rotation.random(random_state=int(rng.integers(1 << 30))).as_matrix()
-            gt = Alignment(rotation, [0.1, -0.1, 3.5], scale)
-            result = fit(points_3d, camera.project(gt.apply(points_3d)), camera, method=method)
-            tried += 1
-            assert rotation_error(est=result.alignment, gt=gt) < 1e-6 * 180
-            assert translation_error(est=result.alignment, gt=gt) < 1e-6
-            assert scale_error(est=result.alignment, gt=gt).max() < 1e-6
-    assert tried > 40

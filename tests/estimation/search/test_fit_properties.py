@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from support.covariances import of_unknowns
-from support.problems import problem_of
+from support.problems import of_unknowns, problem_of
 
 from cadalign import Alignment, Camera, Result, fit
 from cadalign.errors import DegenerateError
-from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem, random_rotation
+from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem
 from cadalign.geometry.metrics import rotation_error
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -81,60 +80,7 @@ def test_recovery_of_keypoints_near_a_plane(
     assert_aligned(result, problem.alignment, 1e-6 / thickness)
 
 
-@METHODS
-@given(seed=SEEDS, points=COUNTS, repeated=st.integers(1, 5))
-def test_recovery_in_spite_of_duplicated_points(
-    method: str, seed: int, points: int, repeated: int
-) -> None:
-    problem = problem_of(seed, points=points, noise_px=0.0)
-    rows = np.concatenate([np.arange(points), np.zeros(repeated, dtype=int)])
-    result = fit(problem.points_3d[rows], problem.points_2d[rows], problem.camera, method=method)
-    assert_aligned(result, problem.alignment)
-
-
-@METHODS
-@given(seed=SEEDS, points=COUNTS, unit=UNITS)
-def test_recovery_in_huge_and_tiny_units(method: str, seed: int, points: int, unit: float) -> None:
-    problem = problem_of(seed, points=points, noise_px=0.0)
-    result = fit(unit * problem.points_3d, problem.points_2d, problem.camera, method=method)
-    gt = problem.alignment
-    assert_aligned(result, Alignment(gt.rotation, unit * gt.translation, gt.scale))
-
-
-@METHODS
-@given(seed=SEEDS, points=COUNTS, size=st.sampled_from([10.0, 1e3]))
-def test_recovery_of_a_model_far_from_its_own_origin(
-    method: str, seed: int, points: int, size: float
-) -> None:
-    problem = problem_of(seed, points=points, noise_px=0.0)
-    shift = size * np.array([1.0, -0.5, 0.7])
-    result = fit(problem.points_3d + shift, problem.points_2d, problem.camera, method=method)
-    gt = problem.alignment
-    expected = Alignment(gt.rotation, gt.translation - gt.linear @ shift, gt.scale)
-    assert_aligned(result, expected, 1e-6 * size)
-
-
 # --- equivariance ----------------------------------------------------------------------------
-
-
-def in_front(alignment: Alignment, points_3d: np.ndarray) -> bool:
-    return bool((alignment.apply(points_3d)[:, 2] > 0.5).all())
-
-
-@METHODS
-@given(seed=SEEDS, points=COUNTS)
-def test_equivariance_under_camera_motion(method: str, seed: int, points: int) -> None:
-    problem = problem_of(seed, points=points, noise_px=0.0)
-    rng = np.random.default_rng(seed)
-    turn = Rotation.from_rotvec(rng.uniform(-0.3, 0.3, 3)).as_matrix()
-    motion = Alignment(turn, rng.uniform(-0.5, 0.5, 3), np.ones(3))
-    moved = motion @ problem.alignment
-    if not in_front(moved, problem.points_3d):
-        return
-    points_2d = problem.camera.project(moved.apply(problem.points_3d))
-    before = fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
-    after = fit(problem.points_3d, points_2d, problem.camera, method=method)
-    assert_aligned(after, motion @ before.alignment)
 
 
 @METHODS
@@ -165,22 +111,13 @@ def test_optimum_is_equivariant_under_stretching_the_model(seed: int, points: in
     )
 
 
-@given(seed=SEEDS, points=COUNTS)
-def test_linear_solver_is_equivariant_under_stretching_without_noise(
-    seed: int, points: int
-) -> None:
-    problem = problem_of(seed, points=points, noise_px=0.0)
-    factor = np.array([1.0, *np.random.default_rng(seed).uniform(0.3, 3, 2)])
-    result = fit(problem.points_3d * factor, problem.points_2d, problem.camera, method="aepnp")
-    gt = problem.alignment
-    assert_aligned(result, Alignment(gt.rotation, gt.translation, gt.scale / factor))
-
-
 @METHODS
-@given(seed=SEEDS, points=COUNTS)
-def test_equivariance_under_shifting_the_model(method: str, seed: int, points: int) -> None:
+@given(seed=SEEDS, points=COUNTS, size=st.sampled_from([5.0, 1e3]))
+def test_equivariance_under_shifting_the_model(
+    method: str, seed: int, points: int, size: float
+) -> None:
     problem = problem_of(seed, points=points, noise_px=0.5)
-    shift = np.random.default_rng(seed).uniform(-5, 5, 3)
+    shift = size * np.random.default_rng(seed).uniform(-1, 1, 3)
     before = fit(problem.points_3d, problem.points_2d, problem.camera, method=method).alignment
     after = fit(problem.points_3d + shift, problem.points_2d, problem.camera, method=method)
     expected = Alignment(before.rotation, before.translation - before.linear @ shift, before.scale)
@@ -299,30 +236,3 @@ def test_every_result_is_a_valid_alignment(
         assert (result.fisher_covariance == result.fisher_covariance.T).all() or np.allclose(
             result.fisher_covariance, result.fisher_covariance.T, rtol=1e-6
         )
-
-
-@example(seed=0, points=4)
-@given(seed=SEEDS, points=st.integers(4, 5))
-def test_every_result_of_few_points_is_a_valid_alignment(seed: int, points: int) -> None:
-    problem = problem_of(seed, points=points, noise_px=0.0)
-    result = fit(problem.points_3d, problem.points_2d, problem.camera)
-    assert_explains(result, problem)
-    for alignment in [result.alignment, *(other.alignment for other in result.alternatives)]:
-        assert_valid(alignment, problem.points_3d)
-
-
-@METHODS
-@given(seed=SEEDS, points=st.integers(10, 20))
-def test_fit_of_the_same_input_is_the_same(method: str, seed: int, points: int) -> None:
-    problem = problem_of(seed, points=points, noise_px=2.0)
-    first = fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
-    second = fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
-    assert first.alignment == second.alignment
-    assert (first.residuals == second.residuals).all()
-
-
-@given(seed=SEEDS)
-def test_random_rotations_are_rotations(seed: int) -> None:
-    rotation = random_rotation(np.random.default_rng(seed))
-    assert np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-14
-    assert np.linalg.det(rotation) > 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,8 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
-from support.covariances import of_unknowns
-from support.problems import assert_same, moved, problem_of, with_outliers
+from support.problems import assert_same, moved, of_unknowns, problem_of, with_outliers
 
 from cadalign import (
     Alignment,
@@ -27,10 +25,8 @@ from cadalign import (
     fit,
     fit_batch,
 )
-from cadalign.datasets import Colmap
-from cadalign.errors import DegenerateError, InputError, NoConsensusError
-from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, sample_limit
-from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem, simulate_problem
+from cadalign.errors import DegenerateError, NoConsensusError
+from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem
 from cadalign.geometry.metrics import rotation_error
 
 UNKNOWN = Camera.without_focal(640, 480)
@@ -80,51 +76,10 @@ def test_exact_keypoints_give_back_the_focal_length(seed: int, points: int, foca
 
 
 @pytest.mark.long
-def test_errors_reach_the_cramer_rao_bound_of_nine_unknowns() -> None:
-    rng = np.random.default_rng(3)
-    problems = [simulate_problem(rng, points=50, noise_px=1.0) for _ in range(500)]
-    batch = fit_batch(
-        [p.points_3d for p in problems],
-        [p.points_2d for p in problems],
-        UNKNOWN,
-        focal="estimate",
-        focal_prior=None,
-    )
-    assert batch.solved.all()
-    errors, limits = [], []
-    for b, problem in enumerate(problems):
-        gt = problem.alignment
-        bound = cramer_rao_bound(
-            problem.points_3d, SIMULATION_CAMERA, gt, sigma=1.0, focal="estimate"
-        )
-        limits.append(sample_limit(bound, rng=rng, draws=20))
-        est = batch.alignment(b)
-        errors.append(
-            (
-                rotation_error(est=est, gt=gt),
-                np.linalg.norm(est.translation - gt.translation),
-                *np.abs(est.scale / gt.scale - 1)[1:],
-                abs(batch.focal_length[b] / SIMULATION_CAMERA.fx - 1),
-            )
-        )
-    names = (
-        "rotation_error_deg",
-        "translation_error",
-        "scale_y_error",
-        "scale_z_error",
-        "focal_error",
-    )
-    medians = [np.median([draws[name] for draws in limits]) for name in names]
-    ratios = np.median(errors, axis=0) / medians
-    assert (ratios < 1.15).all(), ratios
-    assert (ratios > 0.85).all(), ratios
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("points", [5, 6, 8, 50])
+@pytest.mark.parametrize("points", [5, 8])
 def test_no_better_explanation_is_missed(points: int) -> None:
     missed = 0
-    for seed in range(60):
+    for seed in range(25):
         problem = problem_of(seed, points=points, noise_px=1.0)
         result = fit_unknown(problem)
         at_truth = whitened(problem, problem.alignment, SIMULATION_CAMERA, np.zeros(9))
@@ -148,7 +103,6 @@ def test_result_is_a_minimum_over_all_nine_unknowns(loss: str, prior: FocalPrior
         off = 0.0 if prior is None else np.log(result.camera.fx / prior.focal) + step[8]
         return float(squares.sum() + (off / (prior.relative_sigma if prior else 1.0)) ** 2)
 
-    assert result.fisher_covariance is not None
     here = cost(np.zeros(9))
     for k, deviation in enumerate(np.sqrt(of_unknowns(result.fisher_covariance).diagonal())):
         for sign in (1e-3, -1e-3):
@@ -158,19 +112,12 @@ def test_result_is_a_minimum_over_all_nine_unknowns(loss: str, prior: FocalPrior
 def test_shape_of_pixels_and_principal_point_are_the_cameras() -> None:
     camera = Camera(640, 480, 500.0, 550.0, 280.0, 260.0)
     problem = problem_of(2, points=30, noise_px=0.0, camera=camera)
-    placeholder = dataclasses.replace(camera, fx=1000.0, fy=1100.0)
-    result = fit_unknown(problem, placeholder)
-    assert result.camera.fx == pytest.approx(500.0, rel=1e-6)
-    assert result.camera.fy == pytest.approx(550.0, rel=1e-6)
-    assert (result.camera.cx, result.camera.cy) == (280.0, 260.0)
-
-
-def test_placeholder_changes_nothing() -> None:
-    problem = problem_of(1)
-    other = fit_unknown(problem, UNKNOWN.with_focal(77.0))
-    result = fit_unknown(problem)
-    assert other.camera.fx == pytest.approx(result.camera.fx, rel=1e-9)
-    assert_same(other.alignment, result.alignment, 1e-8)
+    for focal in (1000.0, 77.0):  # placeholders, which change nothing
+        placeholder = dataclasses.replace(camera, fx=focal, fy=1.1 * focal)
+        result = fit_unknown(problem, placeholder)
+        assert result.camera.fx == pytest.approx(500.0, rel=1e-6)
+        assert result.camera.fy == pytest.approx(550.0, rel=1e-6)
+        assert (result.camera.cx, result.camera.cy) == (280.0, 260.0)
 
 
 @pytest.mark.parametrize("stretch", [None, "none"])
@@ -185,8 +132,6 @@ def test_held_scales_are_honoured(stretch: str | None) -> None:
     assert result.camera.fx == pytest.approx(150.0, rel=1e-5)
     known = fit(problem.points_3d, problem.points_2d, problem.camera, stretch=stretch)
     assert_same(result.alignment, known.alignment, 1e-5)
-    assert result.fisher_covariance is not None
-    assert known.fisher_covariance is not None
     where_known = result.fisher_covariance.diagonal()[:9] == 0
     assert (where_known == (known.fisher_covariance.diagonal() == 0)).all()
 
@@ -202,15 +147,12 @@ def test_covariance_is_that_of_the_nine_unknowns() -> None:
         np.zeros(9),
         max_nfev=1,
     )
-    assert result.fisher_covariance is not None
     np.testing.assert_allclose(
         of_unknowns(result.fisher_covariance),
         np.linalg.inv(found.jac.T @ found.jac),
         rtol=2e-3,
         atol=1e-9,
     )
-    assert result.std is not None
-    assert result.covariance is not None
     assert result.std.focal == pytest.approx(np.sqrt(result.covariance[9, 9]))
     assert result.std.focal >= np.sqrt(result.fisher_covariance[9, 9])
 
@@ -220,49 +162,19 @@ def test_known_focal_length_has_eight_unknowns_and_no_deviation() -> None:
     result = fit(problem.points_3d, problem.points_2d, problem.camera)
     assert result.camera == problem.camera
     assert result.focal == "known"
-    assert result.fisher_covariance is not None
     assert result.fisher_covariance.shape == (9, 9)
-    assert result.std is not None
     assert result.std.focal == 0.0
 
 
 def test_weak_focal_length_is_said_in_words() -> None:
     problem = problem_of(1, points=40, noise_px=3.0, camera=LONG, depth=(12.0, 14.0))
     result = fit_unknown(problem, sigma=3.0)
-    assert result.std is not None
     assert result.std.focal > 1.0
     assert "focal length" in result.uncertain
     assert f"  focal length {result.camera.fx:.4g} px (not determined)" in str(result)
-
-
-def test_strong_focal_length_is_not_uncertain() -> None:
-    problem = problem_of(1, points=200, noise_px=0.1)
-    result = fit_unknown(problem, sigma=0.1)
-    assert result.std is not None
-    assert result.std.focal < 0.01
-    assert result.uncertain == ()
-
-
-def test_focal_length_that_nothing_determines_is_said_so() -> None:
-    # Seen along its normal, a plane looks the same at any focal length.
-    plane = np.random.default_rng(0).uniform(-1, 1, (20, 3)) * [1, 1, 0]
-    facing = Alignment(np.eye(3), [0.1, 0.0, 5.0], [1, 1, 1])
-    points_2d = LONG.project(facing.apply(plane))
-    with pytest.raises(DegenerateError, match="the points lie in the plane z = 0"):
-        fit(plane, points_2d, UNKNOWN, focal="estimate", focal_prior=None, stretch="none")
-
-
-@pytest.mark.long
-@pytest.mark.long
-def test_other_explanations_have_cameras_of_their_own() -> None:
-    found = []
-    for seed in range(40):
-        problem = problem_of(seed, points=5, noise_px=0.5)
-        for other in fit_unknown(problem).alternatives:
-            projected = other.camera.project(other.alignment.apply(problem.points_3d))
-            found.append(np.abs(projected - problem.points_2d).max())
-    assert len(found) > 5
-    assert max(found) < 20
+    strong = fit_unknown(problem_of(1, points=200, noise_px=0.1), sigma=0.1)
+    assert strong.std.focal < 0.01
+    assert strong.uncertain == ()
 
 
 @pytest.mark.parametrize("seed", [5, 13, 21])
@@ -272,6 +184,8 @@ def test_a_pose_that_fits_with_another_focal_length_is_found_beside_the_best(see
     known = fit(problem.points_3d, problem.points_2d, other.camera)
     poses = [known.alignment, *(each.alignment for each in known.alternatives)]
     assert min(rotation_error(est=pose, gt=other.alignment) for pose in poses) < 0.5
+    projected = other.camera.project(other.alignment.apply(problem.points_3d))
+    assert np.abs(projected - problem.points_2d).max() < 20
 
 
 def test_estimated_noise_comes_with_nine_unknowns() -> None:
@@ -289,12 +203,10 @@ def test_estimated_noise_comes_with_nine_unknowns() -> None:
 def test_prior_takes_part_by_its_weight() -> None:
     problem = problem_of(2, points=20, noise_px=1.0)
     free = fit_unknown(problem)
-    assert free.std is not None
     tight = fit_unknown(problem, focal_prior=FocalPrior(150.0, 1e-4))
     assert tight.camera.fx == pytest.approx(150.0, rel=1e-3)
     known = fit(problem.points_3d, problem.points_2d, problem.camera)
     assert_same(tight.alignment, known.alignment, 1e-3)
-    assert tight.std is not None
     assert tight.std.focal == pytest.approx(1e-4, rel=1e-2)
     loose = fit_unknown(problem, focal_prior=FocalPrior(150.0, 1e3))
     assert loose.camera.fx == pytest.approx(free.camera.fx, rel=1e-4)
@@ -335,7 +247,6 @@ def test_prior_of_usual_lenses_is_the_default_and_is_told() -> None:
     (of_batch,) = align_batch(
         Model(points_3d=problem.points_3d), [view], focal="estimate", focal_prior=None
     )
-    assert isinstance(of_batch, Result)
     assert of_batch.focal_prior is None
 
 
@@ -354,41 +265,33 @@ def test_usual_lenses_of_a_batch_are_those_of_each_image() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("points", [8, 20])
-def test_focal_lengths_with_the_usual_prior_are_as_uncertain_as_stated(points: int) -> None:
+def test_focal_lengths_with_the_usual_prior_are_as_uncertain_as_stated() -> None:
     """Photos whose lenses are those of the distribution that the prior's docstring names."""
     rng = np.random.default_rng(5)
     inside = []
-    for seed in range(200):
+    for seed in range(80):
         focal = 640 / 36 * min(14 + 17 * float(np.exp(0.8 * rng.normal())), 140.0)
         distance = 2.5 * focal / 240  # fills a half of the image
         camera = Camera(640, 480, focal, focal, 319.5, 239.5)
         depth = (distance, distance + 1)
-        problem = problem_of(seed, points=points, noise_px=1.0, camera=camera, depth=depth)
+        problem = problem_of(seed, points=12, noise_px=1.0, camera=camera, depth=depth)
         result = fit(problem.points_3d, problem.points_2d, UNKNOWN, focal="estimate")
-        assert result.std is not None
         inside.append(abs(np.log(result.camera.fx / focal)) < 1.96 * result.std.focal)
         assert 0.3 * 640 < result.camera.fx < 6 * 640
-    assert 0.90 <= np.mean(inside) <= 0.985
+    assert 0.88 <= np.mean(inside) <= 0.99
 
 
-def test_prior_with_estimated_noise_counts_by_its_own_deviation() -> None:
+@pytest.mark.parametrize(
+    "prior", [{"stretch_sigma": 0.05}, {"focal_prior": FocalPrior(150.0, 0.01)}], ids=str
+)
+def test_priors_count_by_their_own_deviations_where_noise_is_estimated(
+    prior: dict[str, Any],
+) -> None:
     problem = problem_of(5, points=30, noise_px=3.0)
-    prior = FocalPrior(150.0, 0.01)
-    result = fit_unknown(problem, sigma=None, focal_prior=prior)
-    assert result.sigma is not None
-    known = fit_unknown(problem, sigma=result.sigma, focal_prior=prior)
-    assert result.camera.fx == pytest.approx(known.camera.fx, rel=1e-4)
-    assert result.std is not None
-    assert result.std.focal < 0.01
-
-
-def test_scale_prior_holds_a_scale_that_an_unknown_focal_length_leaves_open() -> None:
-    problem = problem_of(5, points=30, noise_px=3.0)
-    free = fit_unknown(problem, sigma=None)
-    result = fit_unknown(problem, sigma=None, stretch_sigma=0.05)
-    assert np.abs(np.log(result.alignment.scale)).sum() < np.abs(np.log(free.alignment.scale)).sum()
-    known = fit_unknown(problem, sigma=result.sigma, stretch_sigma=0.05)
+    result = fit_unknown(problem, sigma=None, **prior)
+    assert "focal_prior" not in prior or result.std.focal < 0.01
+    known = fit_unknown(problem, sigma=result.sigma, **prior)
+    assert result.camera.fx == pytest.approx(known.camera.fx, rel=1e-2)
     np.testing.assert_allclose(result.alignment.scale, known.alignment.scale, rtol=1e-3)
     np.testing.assert_allclose(
         result.fisher_covariance, known.fisher_covariance, rtol=1e-2, atol=1e-8
@@ -398,41 +301,13 @@ def test_scale_prior_holds_a_scale_that_an_unknown_focal_length_leaves_open() ->
 # --- robust -----------------------------------------------------------------------------------
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(("points", "share"), [(30, 0.0), (50, 0.3), (50, 0.5), (150, 0.75)])
-@pytest.mark.parametrize("camera", [SIMULATION_CAMERA, LONG], ids=["wide", "long"])
-def test_wrong_keypoints_are_found(camera: Camera, points: int, share: float) -> None:
-    depth = (4.0, 8.0) if camera is SIMULATION_CAMERA else (6.0, 9.0)
-    for seed in range(3):
-        problem = problem_of(seed, points=points, noise_px=1.0, camera=camera, depth=depth)
-        points_2d, wrong = spoiled(problem, share)
-        result = fit(
-            problem.points_3d,
-            points_2d,
-            UNKNOWN,
-            focal="estimate",
-            focal_prior=None,
-            ransac=RansacOptions(),
-        )
-        assert not result.inliers[wrong].any()
-        assert result.inliers[~wrong].mean() > 0.9
-        kept = result.inliers
-        alone = fit(
-            problem.points_3d[kept], points_2d[kept], UNKNOWN, focal="estimate", focal_prior=None
-        )
-        assert result.alignment.scale == pytest.approx(alone.alignment.scale, rel=1e-5)
-        assert result.camera.fx == pytest.approx(alone.camera.fx, rel=1e-5)
-
-
 def test_robust_search_is_reproducible_and_guided() -> None:
     problem = problem_of(2, points=100, noise_px=1.0)
     points_2d, wrong = spoiled(problem, 0.8)
-    few = RansacOptions(min_iterations=1, max_iterations=10)
-    arguments: Any = (problem.points_3d, points_2d, UNKNOWN)
-    options: Any = {"focal": "estimate", "focal_prior": None, "ransac": few}
+    arguments = problem.points_3d, points_2d, UNKNOWN
+    options = {"ransac": RansacOptions(min_iterations=1, max_iterations=10), "focal_prior": None}
     scores = np.where(wrong, 0.1, 0.9)
-    first = fit(*arguments, **options, scores=scores)
-    second = fit(*arguments, **options, scores=scores)
+    first, second = (fit(*arguments, focal="estimate", scores=scores, **options) for _ in range(2))
     assert first.alignment == second.alignment
     assert not first.inliers[wrong].any()
     assert first.inliers.sum() >= 18
@@ -441,16 +316,10 @@ def test_robust_search_is_reproducible_and_guided() -> None:
 @pytest.mark.slow
 def test_noise_without_a_model_has_no_consensus() -> None:
     rng = np.random.default_rng(0)
-    for _ in range(5):
-        with pytest.raises(NoConsensusError, match="no alignment is supported"):
-            fit(
-                rng.uniform(-1, 1, (40, 3)),
-                rng.uniform(0, 480, (40, 2)),
-                UNKNOWN,
-                focal="estimate",
-                focal_prior=None,
-                ransac=RansacOptions(max_iterations=500),
-            )
+    given = rng.uniform(-1, 1, (40, 3)), rng.uniform(0, 480, (40, 2)), UNKNOWN
+    unknown = {"focal": "estimate", "focal_prior": None}
+    with pytest.raises(NoConsensusError, match="no alignment is supported"):
+        fit(*given, **unknown, ransac=RansacOptions(max_iterations=200))
 
 
 # --- many at once -----------------------------------------------------------------------------
@@ -470,6 +339,8 @@ def test_batch_solves_each_problem_as_fit_does(ransac: RansacOptions | None) -> 
         ransac=ransac,
         workers=2,
     )
+    known = fit_batch([short.points_3d] * 2, [short.points_2d] * 2, short.camera)
+    assert known.focal_length.tolist() == [150.0, 150.0]
     for b, problem in enumerate(problems):
         single = fit_unknown(problem, ransac=ransac)
         assert batch.alignment(b) == single.alignment
@@ -477,104 +348,3 @@ def test_batch_solves_each_problem_as_fit_does(ransac: RansacOptions | None) -> 
         np.testing.assert_array_equal(batch[b].fisher_covariance, single.fisher_covariance)
     assert list(batch.errors) == [5]
     assert np.isnan(batch.focal_length[5])
-
-
-def test_batch_with_known_focal_lengths_names_them() -> None:
-    problem = problem_of(0)
-    batch = fit_batch([problem.points_3d] * 2, [problem.points_2d] * 2, problem.camera)
-    assert batch.focal_length.tolist() == [150.0, 150.0]
-
-
-# --- real photos ------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_structure_from_motion_with_scales_drawn_at_random(real_data: Path) -> None:
-    rng = np.random.default_rng(0)
-    strong = weak = 0
-    for image in Colmap(real_data / "sfm" / "maupertuis_colmap"):
-        camera = Camera.without_focal(image.camera.width, image.camera.height)
-        for _ in range(3):
-            scale = np.array([1.0, *rng.uniform(0.5, 2, 2)])
-            result = fit(
-                image.points_3d / scale,
-                image.points_2d,
-                camera,
-                focal="estimate",
-                focal_prior=None,
-                sigma=None,
-            )
-            assert result.std is not None
-            off = abs(result.camera.fx / image.camera.fx - 1)
-            if result.std.focal < 0.005:
-                strong += 1
-                assert off < 0.01
-                np.testing.assert_allclose(result.alignment.scale, scale, rtol=0.01)
-            if result.std.focal > 0.02:
-                weak += 1
-                assert off < 5 * result.std.focal  # the lens is no pinhole, which its noise is not
-    assert (strong, weak) == (9, 3)
-
-
-# --- refusals ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ({"focal": "guess"}, "focal: unknown focal 'guess'; known are known, estimate"),
-        (
-            {"focal": "estimate", "method": "aepnp"},
-            "method: the method 'aepnp' supports neither loss, stretch, scale prior ",
-        ),
-        (
-            {"focal_prior": FocalPrior(500.0)},
-            'focal_prior: given for a known focal length; give focal="estimate" with it',
-        ),
-        (
-            {"focal": "estimate", "focal_prior": 500.0},
-            "focal_prior: expected a cadalign.FocalPrior, 'usual' or None, got float",
-        ),
-        (
-            {"focal": "estimate", "focal_prior": np.ones(3)},
-            "focal_prior: expected a cadalign.FocalPrior, 'usual' or None, got ndarray",
-        ),
-        (
-            {},
-            'camera: the focal length is unknown; estimate it with focal="estimate", '
-            "or give it: camera.with_focal(...)",
-        ),
-        (
-            {"ransac": RansacOptions()},
-            'camera: the focal length is unknown; estimate it with focal="estimate", '
-            "or give it: camera.with_focal(...)",
-        ),
-        ({"focal": "estimate", "sigma": -1.0}, "sigma: -1.0 is not a standard deviation; "),
-    ],
-)
-def test_options_that_make_no_sense_are_refused(options: dict[str, Any], text: str) -> None:
-    problem = problem_of(0)
-    with pytest.raises(InputError) as caught:
-        fit(problem.points_3d, problem.points_2d, UNKNOWN, **options)
-    assert str(caught.value).startswith(text)
-
-
-def test_too_few_keypoints_are_refused() -> None:
-    problem = problem_of(0, points=4)
-    with pytest.raises(DegenerateError) as caught:
-        fit_unknown(problem)
-    assert str(caught.value) == (
-        "points_3d: 4 keypoints are too few for 9 unknowns; "
-        "give at least 5, fewer unknowns by stretch=, or a prior"
-    )
-
-
-def test_keypoints_in_one_place_are_refused() -> None:
-    with pytest.raises(DegenerateError):
-        fit(
-            np.ones((8, 3)),
-            np.arange(16.0).reshape(8, 2),
-            UNKNOWN,
-            focal="estimate",
-            focal_prior=None,
-        )

@@ -1,106 +1,89 @@
-"""`align` on photos of real cars and chairs, whose shapes are not the models'."""
+"""Estimates from keypoints in real photos."""
 
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from cadalign import Alignment, Camera, Model, ShapeModel, View, align, fit
+from cadalign import Alignment, Camera, Model, View, align, fit
+from cadalign.datasets import Colmap
+from cadalign.io.observation import Observation
 from cadalign.metrics import rotation_error
-from cadalign.shapes.parts import Reflection
-
-DATA = Path(os.environ.get("CADALIGN_DATA", "/nonexistent")) / "real"
-pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="CADALIGN_DATA has no real photos")
-
-CARS = DATA / "kitti_cars"
-LENGTH_SIGMAS = (0.05, 0.11, 0.08)  # of the logs of width, length, height of 13 cars of KITTI
-MODE_DEVIATION = 1.5  # of modes of unit norm, on a mean of about 8 units of length
 
 
-def car_shape(tracks: dict[str, Any]) -> ShapeModel:
-    """The 14-point car with its 5 modes, in metres, and the spread of real cars' dimensions."""
-    mean = np.loadtxt(CARS / "meanShape_2.txt")
-    points, names = np.array(tracks["model_xyz"]), tracks["names"]
-    in_metres = np.linalg.lstsq(mean - mean.mean(0), points - points.mean(0), rcond=None)[0]
-    modes = np.loadtxt(CARS / "vectors2.txt").reshape(5, 14, 3) @ in_metres
-    return ShapeModel.from_basis(
-        points,
-        modes,
-        np.full(5, MODE_DEVIATION),
-        ids=names,
-        residual_sigma=0.03,
-        size_sigma=LENGTH_SIGMAS,
-        reflection=Reflection("x", 0.0, tuple(zip(names[::2], names[1::2], strict=True))),
-        up_axis="z",
-        unit="m",
-    )
-
-
-def frames(tracks: dict[str, Any]) -> Any:
-    """Camera, names, pixels, network pixel [px] and truth of every frame with 6 good keypoints."""
-    for track in tracks["tracks"]:
-        calibration = np.array(track["K"])
-        fx, fy, cx, cy = calibration[[0, 1, 0, 1], [0, 1, 2, 2]]
-        camera = Camera(1242, 375, fx, fy, cx, cy)
-        for frame in track["frames"]:
-            good = np.array(frame["score"]) > 0.4
-            if good.sum() < 6:
-                continue
-            names = [name for name, kept in zip(tracks["names"], good, strict=True) if kept]
-            left, top, right, bottom = frame["bbox"]
-            cell = max(right - left, bottom - top) / 64
-            yield camera, names, np.array(frame["uv"])[good], good, cell, frame
-
-
-def errors(alignment: Alignment, center: np.ndarray, frame: dict[str, Any]) -> tuple[float, float]:
-    """Errors of yaw [degrees] and of the centre's depth, relative."""
-    front = -alignment.rotation[:, 1]
-    turn = np.arctan2(-front[2], front[0]) - frame["rotation_y"]
-    turn = (turn + np.pi) % (2 * np.pi) - np.pi
-    depth = alignment.apply(center[None])[0, 2] / frame["location_bottom_centre"][2]
-    return abs(float(np.degrees(turn))), abs(float(depth) - 1)
-
-
-def test_cars_have_their_yaw_and_metric_depth() -> None:
-    tracks = json.loads((CARS / "car_tracks.json").read_text())
-    shape, points = car_shape(tracks), np.array(tracks["model_xyz"])
-    ours, epnp = [], []
-    for camera, names, pixels, good, cell, frame in frames(tracks):
-        result = align(shape, View(camera, pixels, ids=names, sigma=cell))
-        ours.append(errors(result.alignment, result.bounds.mean(axis=0), frame))
-        rigid = fit(points[good], pixels, camera, method="epnp")
-        middle = (points.min(0) + points.max(0)) / 2
-        epnp.append(errors(rigid.alignment, middle, frame))
-    yaw, depth = np.array(ours).T
-    assert len(yaw) >= 20
-    assert np.median(yaw) <= 2.2
-    assert np.percentile(yaw, 90) <= 5
-    assert np.median(depth) <= 0.065
-    assert np.median(yaw) <= np.median([error for error, _ in epnp])
+@pytest.fixture
+def scene(real_data: Path) -> Colmap:
+    return Colmap(real_data / "sfm" / "maupertuis_colmap")
 
 
 @pytest.mark.parametrize("name", ["bdc89254", "b4371c35"])
-def test_chairs_that_are_only_similar_to_their_models(name: str) -> None:
-    folder = DATA / "scan2cad"
+def test_chairs_that_are_only_similar_to_their_models(real_data: Path, name: str) -> None:
+    folder = real_data / "real" / "scan2cad"
     truth = json.loads((folder / "truth.json").read_text())[name]
-    data = json.loads((folder / "observations" / f"{name}.json").read_text())
-    gt = Alignment(
-        np.array(truth["cam_from_model_rotation"]),
-        truth["translation_in_model_x_units"],
-        truth["stretch"],
-    )
-    points = [keypoint["xyz"] for keypoint in data["keypoints"]]
-    pixels = [keypoint["uv"] for keypoint in data["keypoints"]]
+    rotation, shift = truth["cam_from_model_rotation"], truth["translation_in_model_x_units"]
+    gt = Alignment(np.array(rotation), shift, truth["stretch"])
+    chair = Observation.load(folder / "observations" / f"{name}.json")
     # Annotators click to about 8 px there, and chair and model differ by about 5 cm of 80.
-    view = View(Camera.from_dict(data["camera"]), pixels, sigma=8.0)
-    result = align(Model(points_3d=points, shape_sigma=0.05), view)
-    assert rotation_error(est=result.alignment, gt=gt) <= 5
+    view = View(chair.camera, chair.points_2d, sigma=8.0)
+    result = align(Model(points_3d=chair.points_3d, shape_sigma=0.05), view)
+    assert rotation_error(est=result.alignment, gt=gt) < min(5, 2 * result.std.rotation_deg)
     assert (np.abs(result.stretch / gt.scale - 1) <= 0.2).all()
     logs = np.log(result.stretch / gt.scale) / np.array(result.std.scale)
     assert (np.abs(logs[1:]) < 2).all()
-    assert rotation_error(est=result.alignment, gt=gt) < 2 * result.std.rotation_deg
+    if name == "bdc89254":
+        given = chair.points_3d, chair.points_2d, chair.camera
+        robust = fit(*given, sigma=None, loss="cauchy")
+        assert robust.sigma > 1
+        assert robust.std.rotation_deg > 7.6
+
+
+def test_points_of_a_scene_are_aligned_in_its_frame(scene: Colmap) -> None:
+    images = scene[0], scene[1]
+    rows = [{int(each): k for k, each in enumerate(image.point_ids)} for image in images]
+    errors = [np.linalg.norm(image.residuals(), axis=1) for image in images]
+    # The points that the fewest pixels of error have in both photos stand for an object.
+    shared = sorted(
+        rows[0].keys() & rows[1].keys(),
+        key=lambda each: errors[0][rows[0][each]] + errors[1][rows[1][each]],
+    )[:20]
+    views = [
+        View(
+            image.camera,
+            image.points_2d[[places[each] for each in shared]],
+            ids=shared,
+            sigma=0.3,
+            cam_from_rig=image.cam_from_world.cam_from_model,
+        )
+        for image, places in zip(images, rows, strict=True)
+    ]
+    world = images[0].points_3d[[rows[0][each] for each in shared]]
+    scale = np.array([0.5, 2.0, 1.3])
+    model = Model(points_3d=world / scale, ids=shared)
+    result = align(model, views)
+    size = np.linalg.norm(np.ptp(world, axis=0))
+    assert np.abs(result.rig_from_model.apply(world / scale) - world).max() < 0.01 * size
+    assert np.allclose(result.rig_from_model.scale, scale, rtol=0.02)
+
+
+@pytest.mark.slow
+def test_unknown_focal_lengths_with_scales_drawn_at_random(scene: Colmap) -> None:
+    rng = np.random.default_rng(0)
+    strong = weak = 0
+    for image in scene:
+        camera = Camera.without_focal(image.camera.width, image.camera.height)
+        for _ in range(3):
+            scale = np.array([1.0, *rng.uniform(0.5, 2, 2)])
+            unknown = {"focal": "estimate", "focal_prior": None, "sigma": None}
+            result = fit(image.points_3d / scale, image.points_2d, camera, **unknown)
+            off = abs(result.camera.fx / image.camera.fx - 1)
+            if result.std.focal < 0.005:
+                strong += 1
+                assert off < 0.01
+                np.testing.assert_allclose(result.alignment.scale, scale, rtol=0.01)
+            if result.std.focal > 0.02:
+                weak += 1
+                assert off < 5 * result.std.focal  # the lens is no pinhole, which its noise is not
+    assert (strong, weak) == (9, 3)

@@ -12,22 +12,18 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError, require_kind
 from cadalign.geometry.alignment import Alignment, Box, oriented_box
-from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import angles_between, dots, lengths
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import group_of
 
 __all__ = [
-    "alignment_box_iou",
     "box_iou",
     "box_iou_up_to_scale",
     "nearest_truth",
-    "reprojection_error",
     "rotation_error",
     "scale_error",
     "translation_error",
@@ -141,33 +137,6 @@ def scale_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry | None = No
     return scale_errors(est=est, gt=_truth(est, gt, symmetry))
 
 
-def reprojection_error(
-    *, est: Alignment, points_3d: npt.ArrayLike, points_2d: npt.ArrayLike, camera: Camera
-) -> float:
-    """Root mean square distance between projected model points and their observations [px].
-
-    Parameters
-    ----------
-    est : Alignment
-    points_3d : (n, 3) float
-        Model points.
-    points_2d : (n, 2) float
-        Where they were observed [px].
-    camera : Camera
-
-    Raises
-    ------
-    InputError
-        If a point lies behind the camera, or lengths don't match.
-    """
-    observed = as_points(points_2d, name="points_2d", dimension=2)
-    projected = camera.project(est.apply(points_3d))
-    if len(projected) != len(observed) or not len(observed):
-        what = f"{len(projected)} model points, {len(observed)} observations"
-        raise InputError(what, where="points_2d")
-    return float(np.sqrt(((projected - observed) ** 2).sum(axis=1).mean()))
-
-
 def box_iou(*, est: Box, gt: Box) -> float:
     """Volume of the intersection of two oriented boxes over that of their union, 0 to 1.
 
@@ -224,19 +193,6 @@ def box_iou_up_to_scale(*, est: Box, gt: Box) -> float:
     bounds = float(np.log(low)), float(np.log(high))
     search = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-7})
     return -min(float(search.fun), *losses)
-
-
-def alignment_box_iou(
-    *,
-    est: Alignment,
-    gt: Alignment,
-    bounds: npt.ArrayLike,
-    symmetry: Symmetry | None = None,
-) -> float:
-    """Box IoU of one model, with bounds (2, 3), under two alignments; see `box_iou`."""
-    gt = _truth(est, gt, symmetry)
-    bounds = as_floats(bounds, name="bounds", shape=(2, 3))
-    return box_iou(est=Box.from_model(bounds, est), gt=Box.from_model(bounds, gt))
 
 
 def _check_volumes(est: Box, gt: Box) -> None:

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from benchmarks.evidence import damaged_mask
 
-from cadalign import Alignment, Camera, Model, Result, View, align
+from cadalign import Alignment, Box, Camera, Model, Result, View, align
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, DegenerateError, InputError
 from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
-from cadalign.metrics import alignment_box_iou, rotation_error
+from cadalign.metrics import box_iou, rotation_error
 from cadalign.render import Scene, cast_geometry, sample_view
 
 pytestmark = pytest.mark.long
@@ -97,8 +97,9 @@ class TestExactMasks:
                         rotation_error(est=result.alignment, gt=case.truth),
                         result.std.rotation_deg,
                         stretch_error(case, result.alignment),
-                        alignment_box_iou(
-                            est=result.alignment, gt=case.truth, bounds=case.scene.bounds
+                        box_iou(
+                            est=Box.from_model(case.scene.bounds, result.alignment),
+                            gt=Box.from_model(case.scene.bounds, case.truth),
                         ),
                     ]
                 )

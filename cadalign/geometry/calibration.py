@@ -31,21 +31,11 @@ COLMAP_PARAMS: dict[str, tuple[str, ...]] = {
     "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
     "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
-    "THIN_PRISM_FISHEYE": (
-        *("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
-    ),
-    "FOV": ("fx", "fy", "cx", "cy", "omega"),
 }
 _C = TypeVar("_C", bound="Calibration")  # which completion in editors follows, unlike Self
 _DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-# Written models of lenses, by kind and number of coefficients.
-_WRITTEN: dict[tuple[LensKind, int], str] = {
-    ("perspective", 0): "PINHOLE",
-    ("perspective", 4): "OPENCV",
-    ("fisheye", 4): "OPENCV_FISHEYE",
-    ("fisheye", 8): "THIN_PRISM_FISHEYE",
-    ("fov", 1): "FOV",
-}
+_FISHEYE_NAMES = ("k1", "k2", "k3", "k4")
+_WRITTEN = {0: "PINHOLE", 4: "OPENCV"}  # models, by the number of coefficients
 _NO_SKEW = 1e-9  # relative to the focal length
 _FORM_FIX = 'give {"model", "width", "height", "params"} as COLMAP does'
 
@@ -253,9 +243,10 @@ class Calibration:
         if self.turn:
             what = "a camera in a turned frame has no form in files"
             raise InputError(what, where="camera", fix="write the camera that was turned")
-        model = _WRITTEN.get((self.lens, len(self.distortion)), "FULL_OPENCV")
+        model, names = _WRITTEN.get(len(self.distortion), "FULL_OPENCV"), _DISTORTION_NAMES
+        if self.lens == "fisheye":
+            model, names = "OPENCV_FISHEYE", _FISHEYE_NAMES
         shift = shift_of(pixel_origin or "corner")
-        names = _DISTORTION_NAMES if self.lens == "perspective" else COLMAP_PARAMS[model][4:]
         values: dict[str, float | None] = dict(zip(names, self.distortion, strict=False))
         values |= {"cx": self.cx + shift, "cy": self.cy + shift}
         values |= {name: getattr(self, name) if self.focal_known else None for name in ("fx", "fy")}
@@ -275,12 +266,12 @@ class Calibration:
         ----------
         data : mapping
             ``model`` (SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV,
-            SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, OPENCV_FISHEYE, THIN_PRISM_FISHEYE or FOV),
-            ``width``, ``height``, and ``params`` in COLMAP's order and pixel convention. None in
-            the place of the focal lengths, or ``width`` and ``height`` alone, give a camera
-            `without_focal`. Or ``matrix`` (3, 3), ``width``, ``height`` and optionally
-            ``distortion`` and ``lens``, as for `from_matrix`. ``pixel_origin`` states where (0, 0)
-            lies: by default ``"corner"`` for ``params`` and ``"center"`` for ``matrix``.
+            SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE or OPENCV_FISHEYE), ``width``, ``height``, and
+            ``params`` in COLMAP's order and pixel convention. None in the place of the focal
+            lengths, or ``width`` and ``height`` alone, give a camera `without_focal`. Or ``matrix``
+            (3, 3), ``width``, ``height`` and optionally ``distortion`` and ``lens``, as for
+            `from_matrix`. ``pixel_origin`` states where (0, 0) lies: by default ``"corner"`` for
+            ``params`` and ``"center"`` for ``matrix``.
 
         Raises
         ------
@@ -363,7 +354,7 @@ def _read_form(data: Any) -> dict[str, Any]:
 def _read_params(model: Any, params: Any, shift: float) -> dict[str, Any]:
     """Read COLMAP's parameters, whose top-left pixel has its centre at ``shift``."""
     if not isinstance(model, str) or model not in COLMAP_PARAMS:
-        fix = f"known are {', '.join(COLMAP_PARAMS)}"
+        fix = f"known are {', '.join(COLMAP_PARAMS)}; for others undistort the images"
         raise InputError(f"unknown model {quote(model)}", where="camera.model", fix=fix)
     names = COLMAP_PARAMS[model]
     params = params.tolist() if isinstance(params, np.ndarray) else params
@@ -387,11 +378,7 @@ def _read_params(model: Any, params: Any, shift: float) -> dict[str, Any]:
 
 def _lens_of(model: str, values: Mapping[str, float]) -> tuple[LensKind, tuple[float, ...]]:
     """Kind and coefficients of a model's lens."""
-    if model == "FOV":
-        return "fov", (values["omega"],)
-    if model == "THIN_PRISM_FISHEYE":
-        return "fisheye", tuple(values[name] for name in COLMAP_PARAMS[model][4:])
     if model.endswith("FISHEYE"):
-        return "fisheye", tuple(values.get(name, 0.0) for name in ("k1", "k2", "k3", "k4"))
+        return "fisheye", tuple(values.get(name, 0.0) for name in _FISHEYE_NAMES)
     coefficients = tuple(values.get(name, 0.0) for name in _DISTORTION_NAMES)
     return "perspective", coefficients if any(coefficients[4:]) else coefficients[:4]

@@ -46,11 +46,10 @@ class Camera(Calibration):
     distortion : tuple of float, optional
         For a perspective lens OpenCV's coefficients in OpenCV's order and shapes: (k1, k2, p1, p2),
         or with k3, or with k3, k4, k5, k6; empty for none. Its further ones must be 0. For a
-        fisheye (k1, k2, k3, k4) as in ``cv2.fisheye``, 0 by default, or (k1, k2, p1, p2, k3, k4,
-        sx1, sy1) as in COLMAP's THIN_PRISM_FISHEYE. For a fov lens (omega,) as in COLMAP's FOV.
-    lens : {"perspective", "fisheye", "fov"}
-        Kind of lens. A fisheye or fov lens may see points beside and behind the camera's plane;
-        its focal length has to be known.
+        fisheye (k1, k2, k3, k4) as in ``cv2.fisheye``, 0 by default.
+    lens : {"perspective", "fisheye"}
+        Kind of lens. A fisheye may see points beside and behind the camera's plane; its focal
+        length has to be known.
     focal_known : bool
         False for a camera whose focal lengths are placeholders; see `without_focal`.
 
@@ -108,7 +107,7 @@ class Camera(Calibration):
         if not self.is_wide:
             return np.asarray(points[:, 2] > 0)
         angle = np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2])
-        return np.asarray((angle < largest_angle(self.lens, self.distortion)) & points.any(axis=1))
+        return np.asarray((angle < largest_angle(self.distortion)) & points.any(axis=1))
 
     def project(self, points_cam: npt.ArrayLike) -> FloatArray:
         """Project points (n, 3) of the camera frame to pixels (n, 2), in the image or beside it.
@@ -125,7 +124,7 @@ class Camera(Calibration):
         if len(unseen):
             what, first = f"{len(unseen)} of {len(points)} points lie", unseen[0]
             if self.is_wide:
-                limit = np.degrees(largest_angle(self.lens, self.distortion))
+                limit = np.degrees(largest_angle(self.distortion))
                 what += f" outside the lens's field, the first is point {first}"
                 fix = f"less than {limit:.4g} degrees off the axis"
             else:
@@ -202,7 +201,7 @@ class Camera(Calibration):
         points = as_points(points_2d, name="points_2d", dimension=2)
         with np.errstate(over="ignore", invalid="ignore"):
             image = (points - (self.cx, self.cy)) / (self.fx, self.fy)
-            rays, valid = rays_of_image(image, self.lens, self.distortion)
+            rays, valid = rays_of_image(image, self.distortion)
         return np.asarray(rays @ self.lens_from_camera), valid
 
     def normalize(self, points_2d: npt.ArrayLike) -> FloatArray:

@@ -132,6 +132,24 @@ class Alignment:
         points = as_points(points_cam, name="points_cam", dimension=3)
         return (points - self.translation) @ self.rotation / self.scale
 
+    def __matmul__(self, first: Alignment) -> Alignment:
+        """Compose: ``(second @ first).apply(x) == second.apply(first.apply(x))``.
+
+        Raises
+        ------
+        InputError
+            If ``second`` stretches its axes differently: the result would shear the model, which
+            is not an alignment any more.
+        """
+        if not isinstance(first, Alignment):
+            return NotImplemented
+        if np.ptp(self.scale) > 1e-12 * self.scale.max():
+            what = f"the outer alignment has the stretch {self.scale.tolist()}"
+            fix = "only an alignment with equal scales can follow another one"
+            raise InputError(what, where="second @ first", fix=fix)
+        (moved,) = self.apply(first.translation[None])
+        return Alignment(self.rotation @ first.rotation, moved, self.scale * first.scale)
+
     def to_dict(self) -> dict[str, list[Any]]:
         """Write the alignment as plain lists, for JSON."""
         return {name: getattr(self, name).tolist() for name in _FIELDS}

@@ -33,7 +33,7 @@ COLMAP_PARAMS: dict[str, tuple[str, ...]] = {
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
 _C = TypeVar("_C", bound="Calibration")  # which completion in editors follows, unlike Self
-_DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_DISTORTION_NAMES: tuple[str, ...] = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE_NAMES = ("k1", "k2", "k3", "k4")
 _WRITTEN = {0: "PINHOLE", 4: "OPENCV"}  # models, by the number of coefficients
 _NO_SKEW = 1e-9  # relative to the focal length

@@ -29,7 +29,9 @@ AXES = st.sampled_from([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]]) | st.integers(0,
 ROTATIONS = st.builds(lambda axis, angle: rotation_matrix(np.multiply(axis, angle)), AXES, ANGLES)
 TRANSLATIONS = st.lists(st.floats(-10.0, 10.0), min_size=3, max_size=3)
 SCALES = st.lists(st.floats(0.1, 10.0), min_size=3, max_size=3)
+EQUAL_SCALES = st.floats(0.1, 10.0).map(lambda s: [s, s, s])
 ALIGNMENTS = st.builds(Alignment, ROTATIONS, TRANSLATIONS, SCALES)
+SIMILARITIES = st.builds(Alignment, ROTATIONS, TRANSLATIONS, EQUAL_SCALES)
 POINTS = np.random.default_rng(0).uniform(-2, 2, (20, 3))
 
 
@@ -55,6 +57,27 @@ def test_matrix_does_what_apply_does(alignment: Alignment) -> None:
 def test_inverse_undoes_apply_on_either_side(alignment: Alignment) -> None:
     np.testing.assert_allclose(alignment.inverse(alignment.apply(POINTS)), POINTS, atol=1e-11)
     np.testing.assert_allclose(alignment.apply(alignment.inverse(POINTS)), POINTS, atol=1e-11)
+
+
+@pytest.mark.slow
+@given(outer=SIMILARITIES, inner=ALIGNMENTS)
+def test_composition_applies_the_inner_first(outer: Alignment, inner: Alignment) -> None:
+    np.testing.assert_allclose(
+        (outer @ inner).apply(POINTS), outer.apply(inner.apply(POINTS)), rtol=1e-11, atol=1e-9
+    )
+
+
+@pytest.mark.slow
+@given(outer=ALIGNMENTS.filter(lambda a: np.ptp(a.scale) > 1e-9), inner=ALIGNMENTS)
+def test_an_uneven_stretch_cannot_follow_another_alignment(
+    outer: Alignment, inner: Alignment
+) -> None:
+    with pytest.raises(InputError) as caught:
+        outer @ inner
+    assert str(caught.value) == (
+        f"second @ first: the outer alignment has the stretch {outer.scale.tolist()}; "
+        "only an alignment with equal scales can follow another one"
+    )
 
 
 @given(alignment=ALIGNMENTS)

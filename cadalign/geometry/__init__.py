@@ -1,4 +1,4 @@
-"""Cameras, alignments, boxes and meshes, their conventions and their metrics."""
+"""Cameras, alignments, boxes and meshes, and their conventions."""
 
 from typing import TYPE_CHECKING
 

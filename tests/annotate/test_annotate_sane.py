@@ -19,9 +19,9 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet, ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError
 from cadalign.evaluation.instances.instance import load_scene, make_instance
-from cadalign.geometry.metrics import box_iou
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
+from cadalign.metrics import box_iou
 
 MOUSE = 2.0  # standard deviation of a click [px]
 RENDERED = 17

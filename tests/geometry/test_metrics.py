@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from cadalign import Alignment, Box
 from cadalign.errors import InputError
 from cadalign.evaluation.simulation import random_rotation
-from cadalign.geometry.metrics import (
+from cadalign.metrics import (
     box_iou,
     box_iou_up_to_scale,
     rotation_error,

@@ -34,7 +34,7 @@ from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.methods import fit_options
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import read_table
-from cadalign.geometry.metrics import box_iou, rotation_error
+from cadalign.metrics import box_iou, rotation_error
 from cadalign.report import write_report
 from cadalign.report.instances import compact
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cadalign import Alignment, Camera, fit
-from cadalign.geometry.metrics import rotation_error
+from cadalign.metrics import rotation_error
 
 CAMERA = Camera(2000, 1500, 900.0, 880.0, 950.0, 720.0)
 

@@ -14,7 +14,7 @@ from support.problems import LENS, assert_same, fit_problem, moved, problem_of, 
 from cadalign import Alignment, Camera, Model, RansacOptions, View, align, fit
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem, simulate_problem
-from cadalign.geometry.metrics import rotation_error
+from cadalign.metrics import rotation_error
 
 # --- sigma ------------------------------------------------------------------------------------
 

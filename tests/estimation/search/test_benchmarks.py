@@ -16,7 +16,7 @@ from support.timing import ratio, timed
 
 from cadalign import Box, RansacOptions, fit, fit_batch
 from cadalign.evaluation.simulation import random_rotation
-from cadalign.geometry.metrics import box_iou
+from cadalign.metrics import box_iou
 from cadalign.solvers import aepnp, aepnp_paper, ap4p
 
 

@@ -31,7 +31,7 @@ from cadalign.datasets import Colmap
 from cadalign.errors import DegenerateError, InputError, NoConsensusError
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, sample_limit
 from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem, simulate_problem
-from cadalign.geometry.metrics import rotation_error
+from cadalign.metrics import rotation_error
 
 UNKNOWN = Camera.without_focal(640, 480)
 LONG = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)

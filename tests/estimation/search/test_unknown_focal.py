@@ -21,7 +21,7 @@ from cadalign import (
     fit,
 )
 from cadalign.errors import InputError
-from cadalign.geometry.metrics import rotation_error
+from cadalign.metrics import rotation_error
 
 POINTS = 14
 FOCAL = 900.0

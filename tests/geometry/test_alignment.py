@@ -138,26 +138,15 @@ NOT_A_ROTATION = "not a rotation matrix; its rows must be orthonormal and its de
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        ((np.eye(4), [0, 0, 0], [1, 1, 1]), "rotation: shape (4, 4), expected (3, 3)"),
         ((np.eye(3), [0, 0], [1, 1, 1]), "translation: shape (2,), expected (3)"),
         ((np.eye(3), [0, 0, 0], [[1, 1, 1]]), "scale: shape (1, 3), expected (3)"),
         ((np.diag([1, 1, -1]), [0, 0, 0], [1, 1, 1]), f"rotation: {NOT_A_ROTATION}"),
         ((1.01 * np.eye(3), [0, 0, 0], [1, 1, 1]), f"rotation: {NOT_A_ROTATION}"),
-        ((np.zeros((3, 3)), [0, 0, 0], [1, 1, 1]), f"rotation: {NOT_A_ROTATION}"),
-        (
-            (np.full((3, 3), np.nan), [0, 0, 0], [1, 1, 1]),
-            "rotation: NaN or infinite values in rows 0, 1, 2; remove or repair these",
-        ),
         (
             (np.eye(3), [0, np.nan, 0], [1, 1, 1]),
             "translation: NaN or infinite values in row 1; remove or repair these",
         ),
-        (
-            (np.eye(3), [0, 0, 0], [1, 1, np.inf]),
-            "scale: NaN or infinite values in row 2; remove or repair these",
-        ),
         ((np.eye(3), [0, 0, 0], [1, 0, 1]), "scale: [1.0, 0.0, 1.0] is not positive"),
-        ((np.eye(3), [0, 0, 0], [1, -2, 1]), "scale: [1.0, -2.0, 1.0] is not positive"),
     ],
 )
 def test_alignment_refuses_wrong_values(arguments: tuple[Any, ...], text: str) -> None:
@@ -178,11 +167,3 @@ def test_from_dict_refuses_malformed_alignments(data: Any, text: str) -> None:
     with pytest.raises(InputError) as caught:
         Alignment.from_dict(data)
     assert str(caught.value) == text
-
-
-@pytest.mark.parametrize("method", ["apply", "inverse"])
-def test_points_are_checked(method: str) -> None:
-    with pytest.raises(InputError, match=r"points.*: shape \(3,\), expected \(n, 3\)"):
-        getattr(Alignment.identity(), method)([1.0, 2.0, 3.0])
-    with pytest.raises(InputError, match="NaN or infinite values in row 0"):
-        getattr(Alignment.identity(), method)([[1.0, np.nan, 3.0]])

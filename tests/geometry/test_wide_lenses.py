@@ -48,17 +48,6 @@ def test_fisheye_projects_as_opencvs(name: str, seed: int) -> None:
     np.testing.assert_allclose(camera.project(points), expected[:, 0], rtol=0, atol=1e-8)
 
 
-@any_seed
-def test_fisheye_unprojects_as_opencvs(seed: int) -> None:
-    camera = LENSES["opencv"]
-    pixels = camera.project(directions(seed, widest=math.radians(80)))
-    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-14)
-    expected = cv2.fisheye.undistortPoints(
-        pixels[:, None], camera.matrix, np.array(camera.distortion), criteria=criteria
-    )
-    np.testing.assert_allclose(camera.normalize(pixels), expected[:, 0], rtol=0, atol=1e-7)
-
-
 @every_lens
 @any_seed
 def test_unproject_undoes_project(name: str, seed: int) -> None:
@@ -165,12 +154,6 @@ def test_a_turned_frame_is_not_written() -> None:
 def test_a_pinhole_is_not_turned() -> None:
     with pytest.raises(InputError, match="the frame of a pinhole is its own"):
         Camera(640, 480, 500, 500, 320, 240).turned(np.eye(3))
-
-
-def test_a_matrix_may_be_a_fisheyes() -> None:
-    camera = LENSES["opencv"]
-    data = {"matrix": camera.matrix, "width": 640, "height": 640, "distortion": camera.distortion}
-    assert Camera.from_dict(data | {"lens": "fisheye"}) == camera
 
 
 @every_lens

@@ -205,7 +205,7 @@ def largest_angle(coefficients: tuple[float, ...]) -> float:
     slope[np.abs(slope) < 1 / _MOST] = 0.0
     roots = np.roots(slope)
     ends = roots.real[(np.abs(roots.imag) < _REAL * np.abs(roots)) & (roots.real > 0)]
-    return min([math.pi, *np.sqrt(ends).tolist()])
+    return float(np.sqrt(ends).min(initial=math.pi))
 
 
 def image_of(

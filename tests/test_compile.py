@@ -97,7 +97,7 @@ def test_code_is_found_by_another_process_and_from_another_checkout(tmp_path: Pa
     assert call(tmp_path / "b", "kernels", 2.0, cache) == 1
 
 
-def test_the_folder_is_named_by_the_content_of_every_module_with_kernels(
+def test_the_folder_is_named_by_versions_and_every_module_with_kernels(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     package = Path(folder.__file__).parents[1]
@@ -119,6 +119,10 @@ def test_the_folder_is_named_by_the_content_of_every_module_with_kernels(
 
     before = named()
     assert named() == before
+    for version in ((folder.numba, "__version__"), (folder.sys.implementation, "cache_tag")):
+        with monkeypatch.context() as patched:
+            patched.setattr(*version, "another")
+            assert named() != before
     for path in users:
         (tmp_path / path).write_text("2")
         assert named() != before, f"{path} is not among the sources of kernels"
@@ -211,8 +215,10 @@ class Terminal(io.StringIO):
 
 @pytest.mark.parametrize("stream", [Terminal(), io.StringIO()])
 def test_a_terminal_is_told_once_that_compiling_takes_its_time(
-    stream: io.StringIO, monkeypatch: pytest.MonkeyPatch
+    stream: io.StringIO, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+
     @kernel
     def doubled(x: float) -> float:
         return 2.0 * x

@@ -23,7 +23,7 @@ _SOURCES = (
 
 
 def kernel_folder() -> Path:
-    """Folder in $NUMBA_CACHE_DIR, or in the user's cache, named by sources and Numba's version.
+    """Folder in $NUMBA_CACHE_DIR, or in the user's cache, named by sources and versions.
 
     Numba alone compiles a function anew when its own file changes, but not when one that it calls
     in another file does.
@@ -35,7 +35,8 @@ def kernel_folder() -> Path:
 
 @cache
 def _version(package: Path) -> str:
-    content = hashlib.sha256(numba.__version__.encode())
+    python = f"{sys.implementation.cache_tag}{getattr(sys, 'abiflags', '')}"
+    content = hashlib.sha256(f"{numba.__version__} {python}".encode())
     for name in _SOURCES:
         path = package / name
         for source in sorted(path.rglob("*.py")) if path.is_dir() else [path]:

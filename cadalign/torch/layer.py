@@ -181,9 +181,8 @@ class _Cost:
         turn = _crossed(step[:, :3])
         turned = self.rotation + turn @ self.rotation + turn @ turn @ self.rotation / 2
         scale = self.scale * step[:, 6:9].exp()
-        in_camera = (points * scale[:, None]) @ turned.mT + (self.translation + step[:, 3:6])[
-            :, None
-        ]
+        center = self.translation + step[:, 3:6]
+        in_camera = (points * scale[:, None]) @ turned.mT + center[:, None]
         rays = in_camera[..., :2] / in_camera[..., 2:].clamp(min=_LEAST_DEPTH)
         apart = step[:, 9, None, None].exp() * rays - self._rays
         errors = (self._by_rays @ apart[..., None])[..., 0] - (pixels - self._pixels)

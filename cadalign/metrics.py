@@ -1,4 +1,280 @@
-"""Errors between an estimate and the truth: the public names of `cadalign.geometry.metrics`."""
+"""Errors between an estimate and the truth.
 
-from cadalign.geometry.metrics import *  # noqa: F403
-from cadalign.geometry.metrics import __all__ as __all__
+All metrics take ``est`` and ``gt`` by keyword, score a perfect estimate as perfect, and refuse NaN.
+Errors of alignments take the model's ``symmetry``, too: the truth is then that of `nearest_truth`.
+Names in the plural are their formulas for stacks, whose arrays have leading dimensions (...) more:
+nothing is checked, and errors of a stack are those of its members, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.errors import InputError, require_kind
+from cadalign.geometry.alignment import Alignment, Box, oriented_box
+from cadalign.geometry.rotations import angles_between, dots, lengths
+from cadalign.geometry.symmetry import Symmetry
+from cadalign.geometry.symmetry_group import group_of
+
+__all__ = [
+    "box_iou",
+    "box_iou_up_to_scale",
+    "nearest_truth",
+    "rotation_error",
+    "scale_error",
+    "translation_error",
+    "translation_error_up_to_scale",
+]
+
+_SAME_STRETCH = 0.01  # relative difference of true scales that annotations do not tell from 0
+_LEAST_SIDE = 1e-9  # of the longest side of a box with a volume
+
+
+class Alignments(NamedTuple):
+    """Alignments of n models: their rotations (n, 3, 3), translations (n, 3) and scales (n, 3)."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    scale: FloatArray
+
+    @classmethod
+    def of(cls, alignments: Sequence[Alignment]) -> Alignments:
+        """Stack single alignments, at least one."""
+        return cls(
+            *(np.array([getattr(each, name) for each in alignments]) for name in cls._fields)
+        )
+
+
+class Boxes(NamedTuple):
+    """Boxes of n models: their centres (n, 3), axes (n, 3, 3) and side lengths (n, 3)."""
+
+    center: FloatArray
+    rotation: FloatArray
+    extents: FloatArray
+
+    @classmethod
+    def from_models(cls, bounds: FloatArray, alignments: Alignments) -> Boxes:
+        """The boxes of models with the bounds (n, 2, 3); see `Box.from_model`."""
+        return cls(*oriented_box(bounds, *alignments))
+
+
+_Poses = Alignment | Alignments
+_Boxes = Box | Boxes
+
+
+def nearest_truth(*, est: Alignment, gt: Alignment, symmetry: Symmetry) -> Alignment:
+    """The truth whose rotation is nearest to the estimate's, among those that are equal.
+
+    The model's symmetries take it to itself, so that several alignments place the same object; see
+    `cadalign.geometry.symmetry_group` for what a stretch leaves of them. True scales that differ
+    by up to 1 % count as equal. Raises InputError if the symmetry's motions make no group.
+
+    Examples
+    --------
+    >>> turned = Alignment(np.diag([-1.0, 1.0, -1.0]), [0, 0, 4], [1, 2, 3])
+    >>> gt = Alignment(np.eye(3), [0, 0, 4], [1, 2, 3])
+    >>> found = nearest_truth(est=turned, gt=gt, symmetry=Symmetry.around((0, 1, 0), fold=2))
+    >>> bool(np.allclose(found.rotation, turned.rotation))
+    True
+    """
+    return group_of(symmetry).nearest(gt, est.rotation, tolerance=_SAME_STRETCH).alignment
+
+
+def _truth(est: Alignment, gt: Alignment, symmetry: Symmetry | None) -> Alignment:
+    for name, given in (("est", est), ("gt", gt)):
+        require_kind(given, Alignment, name, fix="give the result's alignment")
+    return gt if symmetry is None else nearest_truth(est=est, gt=gt, symmetry=symmetry)
+
+
+def rotation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry | None = None) -> float:
+    """Angle of the rotation between estimate and truth [degrees], 0 to 180.
+
+    Examples
+    --------
+    >>> rotation_error(est=Alignment.identity(), gt=Alignment.identity())
+    0.0
+    """
+    return float(rotation_errors(est=est, gt=_truth(est, gt, symmetry)))
+
+
+def translation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry | None = None) -> float:
+    """Distance between the two translations [model units]."""
+    return float(translation_errors(est=est, gt=_truth(est, gt, symmetry)))
+
+
+def translation_error_up_to_scale(
+    *, est: Alignment, gt: Alignment, symmetry: Symmetry | None = None
+) -> float:
+    """Distance of the true translation from the ray through the estimated one [model units].
+
+    One image leaves open if a large object is far away or a small one nearby: the estimate may be
+    scaled about the camera centre by any factor from 0 up. This is the error that remains for the
+    best factor, the norm of the true translation times the sine of the angle between the two; all
+    of the norm beyond 90 degrees.
+
+    Examples
+    --------
+    >>> est = Alignment(np.eye(3), [0, 0, 8], np.ones(3))
+    >>> translation_error_up_to_scale(est=est, gt=Alignment(np.eye(3), [0, 3, 4], np.ones(3)))
+    3.0
+    """
+    return float(translation_errors_up_to_scale(est=est, gt=_truth(est, gt, symmetry)))
+
+
+def scale_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry | None = None) -> FloatArray:
+    """Relative error of the scale along each axis, (3,) float: ``|s_est - s_gt| / s_gt``.
+
+    Examples
+    --------
+    >>> est = Alignment(np.eye(3), np.zeros(3), [1, 1.5, 0.5])
+    >>> scale_error(est=est, gt=Alignment.identity()).tolist()
+    [0.0, 0.5, 0.5]
+    """
+    return scale_errors(est=est, gt=_truth(est, gt, symmetry))
+
+
+def box_iou(*, est: Box, gt: Box) -> float:
+    """Volume of the intersection of two oriented boxes over that of their union, 0 to 1.
+
+    Exact to rounding; see `cadalign.geometry.clipping.intersection_volume`. Raises InputError if a
+    box has no volume: the ratio means nothing then.
+
+    Examples
+    --------
+    >>> gt = Box([0, 0, 0], np.eye(3), [2, 2, 2])
+    >>> round(box_iou(est=Box([1, 0, 0], np.eye(3), [2, 2, 2]), gt=gt), 12)
+    0.333333333333
+    """
+    _check_volumes(est, gt)
+    return float(box_ious(est=est, gt=gt))
+
+
+def box_iou_up_to_scale(*, est: Box, gt: Box) -> float:
+    """Largest box IoU over all factors by which the estimate is scaled about the origin, 0 to 1.
+
+    The origin is the camera centre, from which one image does not determine an object's distance.
+    Unlike the IoU at equal distances of the two centres, this one does not change if estimate and
+    truth are exchanged, and a wrong length along the line of sight costs no more than it must.
+
+    Global, to 1e-6. Where the boxes s E and G intersect, the cube root of the intersection's volume
+    is a concave function of s (Brunn-Minkowski; the pairs of s and a point of s E form a convex
+    cone), and that of the sum of their volumes is convex. The IoU increases with the ratio of the
+    two, which therefore has no local maximum but the global one: a bounded scalar search finds it.
+    A linear program gives the range of s. Raises InputError as `box_iou` does.
+
+    Examples
+    --------
+    >>> gt = Box([0, 0, 4], np.eye(3), [2, 2, 2])
+    >>> half = Box([0, 0, 2], np.eye(3), [1, 1, 1])
+    >>> box_iou(est=half, gt=gt) < 0.01, round(box_iou_up_to_scale(est=half, gt=gt), 9)
+    (True, 1.0)
+    """
+    from scipy.optimize import minimize_scalar
+
+    _check_volumes(est, gt)
+    found = _common_factors(est, gt)
+    if found is None:
+        return 0.0
+    low, high = found
+
+    def loss(logarithm: float) -> float:
+        factor = np.exp(logarithm)
+        return -box_iou(est=Box(factor * est.center, est.rotation, factor * est.extents), gt=gt)
+
+    # A perfect estimate has its maximum in a kink, which the search only comes close to.
+    likely = [np.cbrt(gt.volume / est.volume)]
+    if est.center.any() and gt.center.any():
+        likely.append(np.linalg.norm(gt.center) / np.linalg.norm(est.center))
+    losses = [loss(float(np.log(factor))) for factor in likely]
+    bounds = float(np.log(low)), float(np.log(high))
+    search = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-7})
+    return -min(float(search.fun), *losses)
+
+
+def _check_volumes(est: Box, gt: Box) -> None:
+    for name, box in (("est", est), ("gt", gt)):
+        if not have_volume(box):
+            what, fix = f"the box {box.extents.tolist()} has no volume", "leave flat models out"
+            raise InputError(what, where=name, fix=f"{fix} of volume metrics")
+
+
+def _common_factors(est: Box, gt: Box) -> tuple[float, float] | None:
+    """Range of the factors at which the scaled estimate meets the truth; None if there are none.
+
+    Factors at which one volume is over 1e9 times the other are left out.
+    """
+    from scipy.optimize import linprog
+
+    equal = float(np.cbrt(gt.volume / est.volume))
+    unit = float(gt.extents.max())
+    # Points x [units], factors s [of equal volumes]: |E' (x - s c)| <= s h, |G' (x - d)| <= k.
+    scaled = equal / unit
+    offset, half = scaled * (est.rotation.T @ est.center), scaled * est.extents / 2
+    fixed, reach = gt.rotation.T @ gt.center / unit, gt.extents / (2 * unit)
+    factors = np.concatenate([-offset - half, offset - half, np.zeros(6)])
+    places = [est.rotation.T, -est.rotation.T, gt.rotation.T, -gt.rotation.T]
+    rows = np.column_stack([factors, np.concatenate(places)])
+    limits = np.concatenate([np.zeros(6), reach + fixed, reach - fixed])
+    bounds = [(1e-3, 1e3), (None, None), (None, None), (None, None)]
+    ends = []
+    for sign in (1.0, -1.0):
+        found = linprog([sign, 0.0, 0.0, 0.0], A_ub=rows, b_ub=limits, bounds=bounds)
+        if not found.success:
+            return None
+        ends.append(equal * float(found.x[0]))
+    return (ends[0], ends[1]) if ends[0] < ends[1] else None
+
+
+# Stacks ------------------------------------------------------------------------------------------
+
+
+def rotation_errors(*, est: _Poses, gt: _Poses) -> FloatArray:
+    """Angles (...) [degrees]; see `rotation_error`."""
+    return angles_between(est.rotation, gt.rotation)
+
+
+def translation_errors(*, est: _Poses, gt: _Poses) -> FloatArray:
+    """Distances (...) [model units]; see `translation_error`."""
+    return lengths(est.translation - gt.translation)
+
+
+def translation_errors_up_to_scale(*, est: _Poses, gt: _Poses) -> FloatArray:
+    """Distances (...); see `translation_error_up_to_scale`."""
+    squares = dots(est.translation, est.translation)
+    products = dots(est.translation, gt.translation)
+    factors = np.divide(products, squares, out=np.zeros_like(squares), where=squares > 0)
+    return lengths(np.maximum(factors, 0.0)[..., None] * est.translation - gt.translation)
+
+
+def scale_errors(*, est: _Poses, gt: _Poses) -> FloatArray:
+    """Relative errors (..., 3) along each axis; see `scale_error`."""
+    return np.asarray(np.abs(est.scale - gt.scale) / gt.scale)
+
+
+def have_volume(boxes: _Boxes) -> BoolArray:
+    """Mask (...) of the boxes that are not flat."""
+    extents = boxes.extents
+    return np.asarray(extents.min(axis=-1) > _LEAST_SIDE * extents.max(axis=-1))
+
+
+def box_ious(*, est: _Boxes, gt: _Boxes) -> FloatArray:
+    """Intersections over unions (...) of boxes that have a volume; see `box_iou`."""
+    from cadalign.geometry.clipping import intersection_volume  # `import cadalign` compiles nothing
+
+    # In a unit of about the boxes' own size no square under- or overflows.
+    unit = np.maximum(est.extents.max(axis=-1), gt.extents.max(axis=-1))
+    to_est = est.rotation.swapaxes(-1, -2)
+    centers = (to_est @ (gt.center - est.center)[..., None])[..., 0] / unit[..., None]
+    sides, gt_sides = est.extents / unit[..., None], gt.extents / unit[..., None]
+    turns = (to_est @ gt.rotation).reshape(-1, 3, 3)
+    vectors = (each.reshape(-1, 3) for each in (sides, gt_sides, centers))
+    pairs = ((a, b, turn, c) for a, b, c, turn in zip(*vectors, turns, strict=True))
+    shared = np.reshape([intersection_volume(*pair) for pair in pairs], unit.shape)
+    # Python's powers: NumPy rounds those of an array otherwise than that of a number.
+    cubes = np.reshape([side**3 for side in unit.ravel().tolist()], unit.shape)
+    total = (est.extents.prod(axis=-1) + gt.extents.prod(axis=-1)) / cubes
+    return np.asarray(np.clip(shared / (total - shared), 0.0, 1.0))

@@ -11,7 +11,7 @@ from cadalign.estimation.options import METHODS, RansacOptions
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.metrics import box_iou
+from cadalign.metrics import box_iou
 from cadalign.shapes.model import ShapeModel
 
 _CAMERA = Camera(640, 480, 900.0, 900.0, 319.5, 239.5)

@@ -78,7 +78,7 @@ def compiled_cache() -> str:
     from cadalign.compile.folder import can_write, kernel_folder
 
     folder = kernel_folder()
-    count = sum(1 for _ in folder.rglob("*.nbi")) if folder.is_dir() else 0
+    count = sum(1 for _ in folder.rglob("*.nbc")) if folder.is_dir() else 0
     if count:
         return f"{count} functions kept in {folder}"
     if can_write(folder):

@@ -1,17 +1,14 @@
-"""Compile kernels, keep their code on disk, and say so while it takes its time.
+"""Compile kernels, and keep their code on disk.
 
 Nothing else in cadalign calls Numba's compiler.
 """
 
 from __future__ import annotations
 
-import sys
-import time
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar, cast
 
 import numba
-from numba.core import event
 from numba.extending import overload
 
 try:
@@ -63,8 +60,6 @@ def _compiled(
     forceinline: bool = False,
     counts: bool = True,
 ) -> F:
-    if getattr(numba.config, "DISABLE_JIT", False):  # Numba's types do not know it
-        return function
     options: Any = {
         "nogil": True,
         "error_model": "numpy",
@@ -111,49 +106,3 @@ def kernel_family(name: str) -> KernelFamily:
     family.__name__ = name
     family.of = of  # type: ignore[attr-defined]
     return cast(KernelFamily, family)
-
-
-class CompileProgress(event.Listener):
-    """A line on a terminal's or a notebook's standard error, written anew for every function.
-
-    Elsewhere, in a file for one, nothing is written.
-    """
-
-    def __init__(self) -> None:
-        self._count = self._depth = self._width = 0
-        self._began = 0.0
-
-    def on_start(self, event: Any) -> None:
-        """Begin to count, if nothing was under way."""
-        if not self._depth:
-            self._count, self._began = 0, time.perf_counter()
-        self._depth += 1
-        self._write()
-
-    def on_end(self, event: Any) -> None:
-        """Count one more; clear the line after the last."""
-        self._depth -= 1
-        self._count += 1
-        if self._depth:
-            self._write()
-        else:
-            self._show("")
-
-    def _write(self) -> None:
-        counted = f"{self._count} functions, {time.perf_counter() - self._began:.0f} s"
-        self._show(f"Compiling solvers, once for this version: {counted}")
-
-    def _show(self, text: str) -> None:
-        stream = sys.stderr
-        if not (_is_notebook() or stream.isatty()):
-            return
-        stream.write(f"\r{text.ljust(self._width)}\r")
-        stream.flush()
-        self._width = len(text)
-
-
-def _is_notebook() -> bool:
-    return "ipykernel" in sys.modules
-
-
-event.register("numba:compile", CompileProgress())

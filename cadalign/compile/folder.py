@@ -1,11 +1,10 @@
-"""Folder of compiled kernels, named by their sources and by Numba's version."""
+"""Where compiled kernels are kept, and what is said while they are made."""
 
 from __future__ import annotations
 
 import hashlib
 import os
-import shutil
-import time
+import sys
 from functools import cache
 from pathlib import Path
 
@@ -21,36 +20,28 @@ _SOURCES = (
     "geometry/clipping.py",
 )
 """Folders and files of all kernels, and of what compiles them."""
-_UNUSED_DAYS = 60
 
 
 def kernel_folder() -> Path:
-    """Folder in $NUMBA_CACHE_DIR, the user's cache, or the package's own.
+    """Folder in $NUMBA_CACHE_DIR, or in the user's cache, named by sources and versions.
 
-    The first that can be written to; in the user's cache if none can. Numba alone compiles a
-    function anew when its own file changes, but not when one that it calls in another file does.
+    Numba alone compiles a function anew when its own file changes, but not when one that it calls
+    in another file does.
     """
-    return cache_folder() / _version(_PACKAGE)
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    users = Path(platformdirs.user_cache_dir("cadalign", appauthor=False)) / "kernels"
+    return (Path(chosen) if chosen else users) / _version(_PACKAGE)
 
 
 @cache
 def _version(package: Path) -> str:
-    content = hashlib.sha256(numba.__version__.encode())
+    python = f"{sys.implementation.cache_tag}{getattr(sys, 'abiflags', '')}"
+    content = hashlib.sha256(f"{numba.__version__} {python}".encode())
     for name in _SOURCES:
         path = package / name
         for source in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
             content.update(source.read_bytes())
     return content.hexdigest()[:16]
-
-
-def cache_folder() -> Path:
-    """Folder of the compiled kernels of all versions."""
-    chosen = os.environ.get("NUMBA_CACHE_DIR")
-    if chosen:
-        return Path(chosen)
-    users = Path(platformdirs.user_cache_dir("cadalign", appauthor=False)) / "kernels"
-    own = Path(__file__).parent / "__pycache__"
-    return next((folder for folder in (users, own) if can_write(folder)), users)
 
 
 def can_write(folder: Path) -> bool:
@@ -60,9 +51,9 @@ def can_write(folder: Path) -> bool:
 
 
 @cache
-def remove_unused(folder: Path) -> None:
-    """Remove folders of other versions that no process has written to for long."""
-    oldest = time.time() - _UNUSED_DAYS * 86400
-    for other in folder.parent.iterdir():
-        if other != folder and other.is_dir() and other.stat().st_mtime < oldest:
-            shutil.rmtree(other, ignore_errors=True)
+def tell_compiling() -> None:
+    """Say on a terminal or in a notebook, once in a process, that compiling takes its time."""
+    if sys.stderr.isatty() or "ipykernel" in sys.modules:
+        told = "Compiling cadalign's solvers, once for this version: this takes up to a minute\n"
+        sys.stderr.write(told)
+        sys.stderr.flush()

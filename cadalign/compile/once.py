@@ -7,29 +7,28 @@ level: a first call takes three times as long. This module alone uses private na
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import io
-import logging
 import os
 import pickle
-from functools import cache, cached_property
+from contextlib import suppress
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from llvmlite import binding
 from numba.core import compiler, types
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.core.codegen import JITCodeLibrary
 from numba.core.environment import Environment, lookup_environment
 from numba.core.registry import CPUDispatcher
 from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 
-from cadalign.compile.folder import kernel_folder, remove_unused
+from cadalign.compile.folder import kernel_folder, tell_compiling
 
-logger = logging.getLogger("cadalign")
 _KIND = "part"
+_DIGITS = 20  # of the code that names a form
+_CHECKSUM = hashlib.sha256().digest_size
 
 
 class KernelDispatcher(CPUDispatcher):
@@ -112,6 +111,7 @@ class KernelCompiler(compiler.Compiler):
 
     def compile_extra(self, function: Any) -> Any:
         """Compile a function; what it calls, Numba's own functions among it, becomes its parts."""
+        tell_compiling()
         codegen = self.state.targetctx.codegen()
         self.state.library = self.library(codegen, function.__qualname__)
         self.state.library.enable_object_caching()
@@ -134,46 +134,6 @@ class FastPartCompiler(KernelCompiler):
     library = type("FastPartLibrary", (PartLibrary,), {"optimized": True})
 
 
-_folder = cache(kernel_folder)
-
-
-class _Locator(_CacheLocator):
-    """Places of the files of a source's kernels, by its content."""
-
-    def __init__(self, function: Any, source: str) -> None:
-        content = Path(source).read_bytes() if Path(source).is_file() else source.encode()
-        self._hash = hashlib.sha256(content).hexdigest()
-
-    def get_cache_path(self) -> str:
-        return str(_folder())
-
-    def get_source_stamp(self) -> str:
-        return self._hash
-
-    def get_disambiguator(self) -> str:
-        return self._hash[:16]
-
-    @classmethod
-    def from_function(cls, function: Any, source: str) -> _Locator:
-        return cls(function, source)
-
-
-class _Code(CompileResultCacheImpl):
-    """Compiled code with its checksum: what a power failure left of it might crash."""
-
-    _locator_classes = [_Locator]  # noqa: RUF012
-
-    def reduce(self, data: Any) -> tuple[bytes, bytes]:
-        content = dumps(super().reduce(data))
-        return hashlib.sha256(content).digest(), content
-
-    def rebuild(self, target_context: Any, payload: tuple[bytes, bytes]) -> Any:
-        checksum, content = payload
-        if hashlib.sha256(content).digest() != checksum:
-            raise ValueError("damaged")
-        return super().rebuild(target_context, _CodeReader(io.BytesIO(content)).load())
-
-
 class _CodeReader(pickle.Unpickler):
     """A reader that imports nothing: Numba imports the module of every function in the code."""
 
@@ -193,44 +153,41 @@ def _environment(module: str, constants: list[Any], name: str) -> Any:
     return found
 
 
-class KernelCache(FunctionCache):
-    """Compiled forms of one kernel; ``use`` tells code for Python from code for other kernels."""
+class KernelCache:
+    """Compiled forms of one kernel, a file each, of code for Python or for other kernels.
 
-    _impl_class = _Code
+    A file begins with its checksum: what a power failure left of it might crash.
+    """
 
     def __init__(self, function: Any, use: str) -> None:
-        super().__init__(function)
-        self._use = use
+        self._name = f"{function.__module__}.{function.__name__}"
+        self._place = function.__code__.co_firstlineno, use
+        self.cache_path = str(kernel_folder())
 
-    def _index_key(self, signature: Any, codegen: Any) -> Any:
-        types, *others = super()._index_key(signature, codegen)
-        return repr(types), *others, self._use  # as text: classes would be imported
+    def _file(self, signature: Any, codegen: Any) -> Path:
+        form = repr((self._name, self._place, signature, codegen.magic_tuple()))
+        code = hashlib.sha256(form.encode()).hexdigest()[:_DIGITS]
+        return Path(self.cache_path) / f"{self._name}-{code}.nbc"
 
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Compiled code for a signature, None if there is none, or it is damaged."""
+    def load_overload(self, signature: Any, target_context: Any) -> Any:
+        """Compiled code for a signature; None if there is none, or it is damaged."""
         rtsys.initialize(target_context)  # all that code calls; Numba would import its front end
         try:
-            return self._load_overload(sig, target_context)
+            content = self._file(signature, target_context.codegen()).read_bytes()
         except OSError:
             return None
-        except Exception:  # whatever half a file makes pickle raise
-            _tell_damaged(self._cache_path)
-            Path(self._cache_file._index_path).unlink(missing_ok=True)
+        checksum, content = content[:_CHECKSUM], content[_CHECKSUM:]
+        if hashlib.sha256(content).digest() != checksum:
             return None
+        parts = _CodeReader(io.BytesIO(content)).load()
+        return compiler.CompileResult._rebuild(target_context, *parts)
 
-    def save_overload(self, sig: Any, data: Any) -> None:
-        """Save code, one process at a time: each reads the index, and adds to it."""
-        try:
-            os.makedirs(self._cache_path, exist_ok=True)
-            with open(Path(self._cache_path) / "lock", "a") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX)
-                super().save_overload(sig, data)
-            remove_unused(Path(self._cache_path))
-        except OSError:  # every process compiles for itself, `cadalign doctor` says so
-            return
-
-
-@cache
-def _tell_damaged(folder: str) -> None:
-    """Warn once in a process, however many files there are."""
-    logger.warning("%s: some of the compiled code is damaged; it is compiled anew", folder)
+    def save_overload(self, signature: Any, found: Any) -> None:
+        """Save code; where that is not possible every process compiles for itself."""
+        content = dumps(found._reduce())
+        file = self._file(signature, found.codegen)
+        written = file.with_suffix(f".{os.getpid()}")
+        with suppress(OSError):  # `cadalign doctor` says so
+            file.parent.mkdir(parents=True, exist_ok=True)
+            written.write_bytes(hashlib.sha256(content).digest() + content)
+            written.replace(file)

@@ -1,4 +1,4 @@
-"""Cameras, alignments, boxes and meshes, their conventions and their metrics."""
+"""Cameras, alignments, boxes and meshes, and their conventions."""
 
 from typing import TYPE_CHECKING
 
@@ -8,8 +8,6 @@ if TYPE_CHECKING:
     from cadalign.geometry.conventions import (
         opengl_from_model,
         opengl_projection,
-        up_from_gravity,
-        up_from_pose,
     )
     from cadalign.geometry.symmetry import SymmetryAxis
 
@@ -17,8 +15,6 @@ __all__ = [
     "SymmetryAxis",
     "opengl_from_model",
     "opengl_projection",
-    "up_from_gravity",
-    "up_from_pose",
 ]
 
 __getattr__ = lazy_names(__name__)

@@ -31,23 +31,19 @@ COLMAP_PARAMS: dict[str, tuple[str, ...]] = {
     "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
     "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
-    "THIN_PRISM_FISHEYE": (
-        *("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
-    ),
-    "FOV": ("fx", "fy", "cx", "cy", "omega"),
 }
 _C = TypeVar("_C", bound="Calibration")  # which completion in editors follows, unlike Self
-_DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-# Written models of lenses, by kind and number of coefficients.
-_WRITTEN: dict[tuple[LensKind, int], str] = {
-    ("perspective", 0): "PINHOLE",
-    ("perspective", 4): "OPENCV",
-    ("fisheye", 4): "OPENCV_FISHEYE",
-    ("fisheye", 8): "THIN_PRISM_FISHEYE",
-    ("fov", 1): "FOV",
+_COEFFICIENTS: dict[LensKind, tuple[str, ...]] = {
+    "perspective": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
 }
+_WRITTEN = {0: "PINHOLE", 4: "OPENCV"}  # models, by the number of coefficients
 _NO_SKEW = 1e-9  # relative to the focal length
-_FORM_FIX = 'give {"model", "width", "height", "params"} as COLMAP does'
+_FORMS = {
+    "params": ("model", "width", "height", "params"),
+    "matrix": ("matrix", "width", "height"),
+}
+_MATRIX_FIELDS = (*_FORMS["matrix"], "pixel_origin", "distortion", "lens")
 
 
 @dataclass(frozen=True)
@@ -139,7 +135,17 @@ class Calibration:
         >>> Camera.from_matrix(K, 640, 480, pixel_origin="corner").cx
         319.5
         """
-        return cls(width, height, *_read_matrix(matrix, pixel_origin), distortion, lens=lens)
+        shift = shift_of(pixel_origin, where="camera.pixel_origin")
+        values = as_floats(matrix, name="matrix", shape=(3, 3))
+        (fx, _, cx), (_, fy, cy), _ = values.tolist()
+        expected = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        if np.abs(values - expected).max() > _NO_SKEW * max(abs(fx), 1.0):
+            what = (
+                f"{quote(values.tolist())} is not of the form [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+            )
+            fix = "give the matrix of a camera without skew, by rows"
+            raise InputError(what, where="matrix", fix=fix)
+        return cls(width, height, fx, fy, cx - shift, cy - shift, distortion, lens=lens)
 
     @classmethod
     def without_focal(
@@ -253,9 +259,10 @@ class Calibration:
         if self.turn:
             what = "a camera in a turned frame has no form in files"
             raise InputError(what, where="camera", fix="write the camera that was turned")
-        model = _WRITTEN.get((self.lens, len(self.distortion)), "FULL_OPENCV")
+        model = _WRITTEN.get(len(self.distortion), "FULL_OPENCV")
+        model = "OPENCV_FISHEYE" if self.lens == "fisheye" else model
         shift = shift_of(pixel_origin or "corner")
-        names = _DISTORTION_NAMES if self.lens == "perspective" else COLMAP_PARAMS[model][4:]
+        names = _COEFFICIENTS[self.lens]
         values: dict[str, float | None] = dict(zip(names, self.distortion, strict=False))
         values |= {"cx": self.cx + shift, "cy": self.cy + shift}
         values |= {name: getattr(self, name) if self.focal_known else None for name in ("fx", "fy")}
@@ -275,12 +282,12 @@ class Calibration:
         ----------
         data : mapping
             ``model`` (SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV,
-            SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, OPENCV_FISHEYE, THIN_PRISM_FISHEYE or FOV),
-            ``width``, ``height``, and ``params`` in COLMAP's order and pixel convention. None in
-            the place of the focal lengths, or ``width`` and ``height`` alone, give a camera
-            `without_focal`. Or ``matrix`` (3, 3), ``width``, ``height`` and optionally
-            ``distortion`` and ``lens``, as for `from_matrix`. ``pixel_origin`` states where (0, 0)
-            lies: by default ``"corner"`` for ``params`` and ``"center"`` for ``matrix``.
+            SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE or OPENCV_FISHEYE), ``width``, ``height``, and
+            ``params`` in COLMAP's order and pixel convention. None in the place of the focal
+            lengths, or ``width`` and ``height`` alone, give a camera `without_focal`. Or ``matrix``
+            (3, 3), ``width``, ``height`` and optionally ``distortion`` and ``lens``, as for
+            `from_matrix`. ``pixel_origin`` states where (0, 0) lies: by default ``"corner"`` for
+            ``params`` and ``"center"`` for ``matrix``.
 
         Raises
         ------
@@ -297,8 +304,23 @@ class Calibration:
         >>> Camera.from_dict({"matrix": matrix, "width": 640, "height": 480}).cx
         319.5
         """
-        fields = _read_form(data)
-        return cls(**fields) if "fx" in fields else cls.without_focal(**fields)
+        if not isinstance(data, Mapping):
+            raise InputError(f"expected an object, got {type(data).__name__}", where="camera")
+        if set(data) - {"pixel_origin"} == {"width", "height"}:
+            return cls.without_focal(data["width"], data["height"])
+        kind = "matrix" if "matrix" in data and "params" not in data else "params"
+        missing = [key for key in _FORMS[kind] if key not in data]
+        if missing:
+            names = ", ".join(f'"{name}"' for name in _FORMS[kind])
+            fix = f"give {{{names}}}" + (" as COLMAP does" if kind == "params" else "")
+            raise InputError(f"missing {', '.join(missing)}", where="camera", fix=fix)
+        given = {name: data[name] for name in _MATRIX_FIELDS if name in data}
+        if kind == "matrix":
+            return cls.from_matrix(**given)
+        shift = shift_of(data.get("pixel_origin", "corner"), where="camera.pixel_origin")
+        fields = _read_params(data["model"], data["params"], shift)
+        make = cls if "fx" in fields else cls.without_focal
+        return make(width=data["width"], height=data["height"], **fields)
 
 
 def _listed(distortion: Any) -> tuple[float, ...]:
@@ -320,50 +342,10 @@ def _whole_size(size: Any, name: str) -> int:
     return int(size)
 
 
-def _read_matrix(matrix: Any, pixel_origin: object) -> tuple[float, float, float, float]:
-    """Focal lengths and principal point (fx, fy, cx, cy) of a matrix; see `Camera.from_matrix`."""
-    shift = shift_of(pixel_origin)
-    values = as_floats(matrix, name="matrix", shape=(3, 3))
-    (fx, _, cx), (_, fy, cy), _ = values.tolist()
-    expected = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    if np.abs(values - expected).max() > _NO_SKEW * max(abs(fx), 1.0):
-        form = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
-        fix = "give the matrix of a camera without skew, by rows"
-        raise InputError(
-            f"{quote(values.tolist())} is not of the form {form}", where="matrix", fix=fix
-        )
-    return fx, fy, cx - shift, cy - shift
-
-
-def _read_form(data: Any) -> dict[str, Any]:
-    """Read the fields of a camera, without the focal lengths where these are unknown.
-
-    They are arguments of `Camera`, or of `Camera.without_focal`; see `Camera.from_dict`.
-    """
-    if not isinstance(data, Mapping):
-        raise InputError(f"expected an object, got {type(data).__name__}", where="camera")
-    if set(data) - {"pixel_origin"} == {"width", "height"}:
-        return {"width": data["width"], "height": data["height"]}
-    is_matrix = "matrix" in data and "params" not in data
-    names = ("matrix", "width", "height") if is_matrix else ("model", "width", "height", "params")
-    missing = [key for key in names if key not in data]
-    if missing:
-        fix = 'give {"matrix", "width", "height"}' if is_matrix else _FORM_FIX
-        raise InputError(f"missing {', '.join(missing)}", where="camera", fix=fix)
-    fields = {"width": data["width"], "height": data["height"]}
-    origin = data.get("pixel_origin", "center" if is_matrix else "corner")
-    shift = shift_of(origin, where="camera.pixel_origin")
-    if not is_matrix:
-        return fields | _read_params(data["model"], data["params"], shift)
-    fields |= zip(("fx", "fy", "cx", "cy"), _read_matrix(data["matrix"], origin), strict=True)
-    lens = data.get("lens", "perspective")
-    return fields | {"distortion": data.get("distortion", ()), "lens": lens}
-
-
 def _read_params(model: Any, params: Any, shift: float) -> dict[str, Any]:
     """Read COLMAP's parameters, whose top-left pixel has its centre at ``shift``."""
     if not isinstance(model, str) or model not in COLMAP_PARAMS:
-        fix = f"known are {', '.join(COLMAP_PARAMS)}"
+        fix = f"known are {', '.join(COLMAP_PARAMS)}; for others undistort the images"
         raise InputError(f"unknown model {quote(model)}", where="camera.model", fix=fix)
     names = COLMAP_PARAMS[model]
     params = params.tolist() if isinstance(params, np.ndarray) else params
@@ -377,21 +359,11 @@ def _read_params(model: Any, params: Any, shift: float) -> dict[str, Any]:
         if not is_number(value) and (is_known or name not in focals):
             what = f"{name} is {quote(value)}, not a finite number"
             raise InputError(what, where="camera.params")
-    lens, distortion = _lens_of(model, values)
+    lens: LensKind = "fisheye" if model.endswith("FISHEYE") else "perspective"
+    distortion = tuple(values.get(name, 0.0) for name in _COEFFICIENTS[lens])
+    distortion = distortion if any(distortion[4:]) else distortion[:4]
     fields = {"cx": values["cx"] - shift, "cy": values["cy"] - shift, "distortion": distortion}
     if is_known:
         return fields | {"fx": values[focals[0]], "fy": values[focals[-1]], "lens": lens}
     require_perspective_lens(lens, where="camera.params")
     return fields
-
-
-def _lens_of(model: str, values: Mapping[str, float]) -> tuple[LensKind, tuple[float, ...]]:
-    """Kind and coefficients of a model's lens."""
-    if model == "FOV":
-        return "fov", (values["omega"],)
-    if model == "THIN_PRISM_FISHEYE":
-        return "fisheye", tuple(values[name] for name in COLMAP_PARAMS[model][4:])
-    if model.endswith("FISHEYE"):
-        return "fisheye", tuple(values.get(name, 0.0) for name in ("k1", "k2", "k3", "k4"))
-    coefficients = tuple(values.get(name, 0.0) for name in _DISTORTION_NAMES)
-    return "perspective", coefficients if any(coefficients[4:]) else coefficients[:4]

@@ -46,11 +46,10 @@ class Camera(Calibration):
     distortion : tuple of float, optional
         For a perspective lens OpenCV's coefficients in OpenCV's order and shapes: (k1, k2, p1, p2),
         or with k3, or with k3, k4, k5, k6; empty for none. Its further ones must be 0. For a
-        fisheye (k1, k2, k3, k4) as in ``cv2.fisheye``, 0 by default, or (k1, k2, p1, p2, k3, k4,
-        sx1, sy1) as in COLMAP's THIN_PRISM_FISHEYE. For a fov lens (omega,) as in COLMAP's FOV.
-    lens : {"perspective", "fisheye", "fov"}
-        Kind of lens. A fisheye or fov lens may see points beside and behind the camera's plane;
-        its focal length has to be known.
+        fisheye (k1, k2, k3, k4) as in ``cv2.fisheye``, 0 by default.
+    lens : {"perspective", "fisheye"}
+        Kind of lens. A fisheye may see points beside and behind the camera's plane; its focal
+        length has to be known.
     focal_known : bool
         False for a camera whose focal lengths are placeholders; see `without_focal`.
 
@@ -108,7 +107,7 @@ class Camera(Calibration):
         if not self.is_wide:
             return np.asarray(points[:, 2] > 0)
         angle = np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2])
-        return np.asarray((angle < largest_angle(self.lens, self.distortion)) & points.any(axis=1))
+        return np.asarray((angle < largest_angle(self.distortion)) & points.any(axis=1))
 
     def project(self, points_cam: npt.ArrayLike) -> FloatArray:
         """Project points (n, 3) of the camera frame to pixels (n, 2), in the image or beside it.
@@ -125,7 +124,7 @@ class Camera(Calibration):
         if len(unseen):
             what, first = f"{len(unseen)} of {len(points)} points lie", unseen[0]
             if self.is_wide:
-                limit = np.degrees(largest_angle(self.lens, self.distortion))
+                limit = np.degrees(largest_angle(self.distortion))
                 what += f" outside the lens's field, the first is point {first}"
                 fix = f"less than {limit:.4g} degrees off the axis"
             else:
@@ -144,10 +143,13 @@ class Camera(Calibration):
 
     def pixels_of_rays(self, rays: FloatArray) -> FloatArray:
         """Pixels (n, 2) of directions (n, 3) that the camera `sees`, of any length."""
-        if not self.is_wide:
-            return self.pixels_from_normalized(perspective(rays))
-        with np.errstate(over="ignore", invalid="ignore"):  # lens polynomials
-            image, _ = image_of(rays @ self.lens_from_camera.T, self.lens, self.distortion)
+        with np.errstate(over="ignore", invalid="ignore"):  # far outside the lens model's field
+            if self.is_wide:
+                image, _ = image_of(rays @ self.lens_from_camera.T, self.lens, self.distortion)
+            else:
+                image = perspective(rays)
+                if self.distortion:
+                    image, _ = distort(image, self.lens, self.distortion)
             return image * (self.fx, self.fy) + (self.cx, self.cy)
 
     def projection_slopes(self, points_cam: FloatArray) -> FloatArray:
@@ -196,14 +198,16 @@ class Camera(Calibration):
 
         They have z = 1 for a pinhole and the length 1 for a wide lens.
         """
-        if not self.is_wide:
-            normalized, valid = self.normalize_where_valid(points_2d)
-            return _homogeneous(normalized), valid
         points = as_points(points_2d, name="points_2d", dimension=2)
-        with np.errstate(over="ignore", invalid="ignore"):
+        valid = np.full(len(points), True)
+        with np.errstate(over="ignore", invalid="ignore"):  # lens polynomials
             image = (points - (self.cx, self.cy)) / (self.fx, self.fy)
-            rays, valid = rays_of_image(image, self.lens, self.distortion)
-        return np.asarray(rays @ self.lens_from_camera), valid
+            if self.is_wide:
+                rays, valid = rays_of_image(image, self.distortion)
+                return np.asarray(rays @ self.lens_from_camera), valid
+            if self.distortion:
+                image, valid = undistort(image, self.lens, self.distortion)
+        return _homogeneous(image), valid
 
     def normalize(self, points_2d: npt.ArrayLike) -> FloatArray:
         """Turn pixels (n, 2) into normalised image coordinates, the lens distortion removed.
@@ -218,42 +222,29 @@ class Camera(Calibration):
             unknown.
         """
         self.require_focal()
-        normalized, valid = self.normalize_where_valid(points_2d)
-        if self.is_wide and not valid.all():
-            _check_undone(self.rays_where_valid(points_2d)[1])
-            behind = np.flatnonzero(~valid)
-            what = f"the rays of {len(behind)} of {len(valid)} pixels are 90 degrees or more off "
+        rays, valid = self.rays_where_valid(points_2d)
+        _check_undone(valid)
+        behind = np.flatnonzero(rays[:, 2] <= 0)
+        if len(behind):
+            what = f"the rays of {len(behind)} of {len(rays)} pixels are 90 degrees or more off "
             what += f"the z axis, the first is point {behind[0]}"
             fix = "these have no normalised coordinates; use unproject"
             raise InputError(what, where="points_2d", fix=fix)
-        _check_undone(valid)
-        return normalized
+        return perspective(rays)
 
     def normalize_where_valid(self, points_2d: npt.ArrayLike) -> tuple[FloatArray, BoolArray]:
         """Turn pixels (n, 2) into normalised image coordinates where the lens can be inverted.
 
         Returns what `normalize` does, meaningless but finite elsewhere, and where it is valid (n,).
         """
-        if self.is_wide:
-            rays, valid = self.rays_where_valid(points_2d)
-            ahead = valid & (rays[:, 2] > 0)
-            rays[~ahead] = (0.0, 0.0, 1.0)
-            return perspective(rays), ahead
-        points = as_points(points_2d, name="points_2d", dimension=2)
-        with np.errstate(over="ignore", invalid="ignore"):  # lens polynomials
-            distorted = (points - (self.cx, self.cy)) / (self.fx, self.fy)
-            if not self.distortion:
-                return distorted, np.ones(len(points), dtype=bool)
-            return undistort(distorted, self.lens, self.distortion)
+        rays, valid = self.rays_where_valid(points_2d)
+        behind = rays[:, 2] <= 0
+        rays[behind] = (0.0, 0.0, 1.0)
+        return perspective(rays), np.asarray(valid & ~behind)
 
     def pixels_from_normalized(self, normalized: FloatArray) -> FloatArray:
         """Apply lens and calibration matrix to (n, 2) normalised coordinates; gives pixels."""
-        with np.errstate(over="ignore", invalid="ignore"):  # far outside the lens model's field
-            if self.is_wide:
-                return self.pixels_of_rays(_homogeneous(normalized))
-            if self.distortion:
-                normalized, _ = distort(normalized, self.lens, self.distortion)
-            return normalized * (self.fx, self.fy) + (self.cx, self.cy)
+        return self.pixels_of_rays(_homogeneous(normalized))
 
     def distortion_jacobian(self, normalized: FloatArray) -> FloatArray:
         """Derivatives (n, 2, 2) of pixels, over focal lengths, by normalised coordinates (n, 2)."""

@@ -5,11 +5,8 @@ a direction and the optical axis and n its unit vector across the axis, a lens f
 
 - ``perspective``: to tan(theta) n, for theta below 90 degrees,
 - ``fisheye``: to theta n (Kannala, Brandt, "A generic camera model and calibration method", 2006),
-- ``fov``: to atan(2 tan(omega / 2) tan(theta)) / omega n (Devernay, Faugeras, "Straight lines have
-  to be straight", 2001), continued beyond 90 degrees,
 
-and then adds distortion, for the first two: OpenCV's model with k1, k2, p1, p2, k3 to k6, its
-``cv2.fisheye`` model, and COLMAP's THIN_PRISM_FISHEYE, which has tangential terms in addition.
+and then adds distortion: OpenCV's model with k1, k2, p1, p2, k3 to k6, or that of ``cv2.fisheye``.
 """
 
 from __future__ import annotations
@@ -131,7 +128,7 @@ def perspective(points_cam: FloatArray) -> FloatArray:
 
 # Lenses ------------------------------------------------------------------------------------------
 
-LensKind = Literal["perspective", "fisheye", "fov"]
+LensKind = Literal["perspective", "fisheye"]
 """The kind of a lens, by the curve that its radius in the image follows."""
 
 # Numbers of coefficients that a lens of each kind may have, and how to give them.
@@ -140,13 +137,13 @@ _COEFFICIENTS = {
         (0, 4, 5, 8),
         "give (k1, k2, p1, p2), optionally followed by k3 or k3, k4, k5, k6",
     ),
-    "fisheye": ((0, 4, 8), "give (k1, k2, k3, k4), or (k1, k2, p1, p2, k3, k4, sx1, sy1)"),
-    "fov": ((1,), "give (omega,), an angle in rad between 0 and pi"),
+    "fisheye": ((0, 4), "give (k1, k2, k3, k4)"),
 }
 _WITH_MORE = (12, 14)  # numbers of OpenCV's, with thin prism terms, and with the sensor's tilt
 _NEWTON_STEPS = 50
 _TABLE = 257  # angles at which a fisheye's radius is tabulated
-_ROUNDS = 6  # of such tables, each within a step of the one before
+_REAL = 1e-9  # imaginary part, relative, of a root that is real
+_MOST = 1e30  # coefficient that stands for larger ones; those below its inverse count as 0
 
 
 def checked_coefficients(kind: object, coefficients: tuple[float, ...]) -> tuple[float, ...]:
@@ -168,8 +165,7 @@ def checked_coefficients(kind: object, coefficients: tuple[float, ...]) -> tuple
             fix = "calibrate without cv2.CALIB_THIN_PRISM_MODEL"
             raise InputError(what, where="camera.distortion", fix=fix)
         coefficients = coefficients[:8]
-    is_right = len(coefficients) in counts and bool(np.isfinite(coefficients).all())
-    if not is_right or (kind == "fov" and not 0 < coefficients[0] < math.pi):
+    if len(coefficients) not in counts or not np.isfinite(coefficients).all():
         what = f"{quote(coefficients)} are not distortion coefficients"
         raise InputError(what, where="camera.distortion", fix=fix)
     if kind == "perspective" and not any(coefficients):
@@ -186,42 +182,30 @@ def require_perspective_lens(kind: str, *, where: str) -> None:
 
 @lru_cache(maxsize=64)
 def _terms(kind: LensKind, coefficients: tuple[float, ...]) -> tuple[float, ...]:
-    """Terms of a distortion: four radial n over three d, two tangential p, and two thin prism s."""
-    if kind == "fisheye" and len(coefficients) == 4:
-        return (*coefficients, *(0.0,) * 7)
-    k1, k2, p1, p2, k3, k4, k5, k6 = coefficients + (0.0,) * (8 - len(coefficients))
+    """Terms of a distortion: four radial n over three d, and two tangential p."""
     if kind == "fisheye":
-        return k1, k2, k3, k4, 0.0, 0.0, 0.0, p1, p2, k5, k6
-    return k1, k2, k3, 0.0, k4, k5, k6, p1, p2, 0.0, 0.0
+        return (*coefficients, *(0.0,) * 5)
+    k1, k2, p1, p2, k3, k4, k5, k6 = coefficients + (0.0,) * (8 - len(coefficients))
+    return k1, k2, k3, 0.0, k4, k5, k6, p1, p2
 
 
 @lru_cache(maxsize=64)
-def largest_angle(kind: LensKind, coefficients: tuple[float, ...]) -> float:
-    """Angle off the axis [rad] up to which a wide lens maps outer directions farther out.
+def largest_angle(coefficients: tuple[float, ...]) -> float:
+    """Angle off the axis [rad] up to which a fisheye maps outer directions farther out.
 
     Examples
     --------
-    >>> round(largest_angle("fisheye", (-0.1, 0.0, 0.0, 0.0)), 6)  # 1 = 3 * 0.1 * theta^2
+    >>> round(largest_angle((-0.1, 0.0, 0.0, 0.0)), 6)  # 1 = 3 * 0.1 * theta^2
     1.825742
     """
-    if kind == "fov":
-        return math.pi
-    n1, n2, n3, n4, *_ = _terms(kind, coefficients)
-
-    def grows(theta: FloatArray) -> BoolArray:
-        """Say where theta (1 + n1 theta^2 + n2 theta^4 + ...) has a positive slope."""
-        s = theta * theta
-        return np.asarray(1 + s * (3 * n1 + s * (5 * n2 + s * (7 * n3 + s * 9 * n4))) > 0)
-
-    low, high = 0.0, math.pi
-    with np.errstate(all="ignore"):
-        for _ in range(_ROUNDS):
-            angles = np.linspace(low, high, _TABLE)
-            ends = np.flatnonzero(~grows(angles))
-            if not len(ends):
-                break
-            low, high = angles[[max(ends[0] - 1, 0), ends[0]]].tolist()
-    return high
+    n1, n2, n3, n4 = coefficients
+    with np.errstate(over="ignore"):
+        # The slope of theta (1 + n1 theta^2 + n2 theta^4 + ...), by the square of theta.
+        slope = np.array([9 * n4, 7 * n3, 5 * n2, 3 * n1, 1.0]).clip(-_MOST, _MOST)
+    slope[np.abs(slope) < 1 / _MOST] = 0.0
+    roots = np.roots(slope)
+    ends = roots.real[(np.abs(roots.imag) < _REAL * np.abs(roots)) & (roots.real > 0)]
+    return float(np.sqrt(ends).min(initial=math.pi))
 
 
 def image_of(
@@ -234,16 +218,12 @@ def image_of(
     >>> image_of(np.array([[1.0, 0.0, 0.0]]), "fisheye", (0.0,) * 4)[0].round(6).tolist()
     [[1.570796, 0.0]]
     """
-    plane, by_point = _plane_of(points, kind, coefficients)
-    if kind == "fov":
-        return plane, by_point
+    plane, by_point = _plane_of(points, kind)
     distorted, by_plane = distort(plane, kind, coefficients)
     return distorted, by_plane @ by_point
 
 
-def _plane_of(
-    points: FloatArray, kind: LensKind, coefficients: tuple[float, ...]
-) -> tuple[FloatArray, FloatArray]:
+def _plane_of(points: FloatArray, kind: LensKind) -> tuple[FloatArray, FloatArray]:
     """Place (n, 2) before distortion, and its derivatives (n, 2, 3)."""
     z = points[:, 2]
     if kind == "perspective":
@@ -252,60 +232,40 @@ def _plane_of(
         return plane, np.concatenate([ones, -plane[:, :, None]], axis=2) / z[:, None, None]
     r = np.hypot(points[:, 0], points[:, 1])
     theta = np.arctan2(r, z)
-    if kind == "fov":
-        (omega,) = coefficients
-        factor = 2 * math.tan(omega / 2)
-        radius = np.arctan2(factor * np.sin(theta), np.cos(theta)) / omega
-        slope = factor / (np.cos(theta) ** 2 + (factor * np.sin(theta)) ** 2) / omega
-    else:
-        radius, slope = theta, np.ones(len(points))
     on_axis = r == 0
     safe = np.where(on_axis, 1.0, r)
     across = np.where(on_axis[:, None], (1.0, 0.0), points[:, :2] / safe[:, None])
-    stretch = np.where(on_axis, slope, radius) / np.where(on_axis, z, safe)
-    turned = np.column_stack([across * z[:, None], -r])
-    outwards = slope[:, None] * turned / (r * r + z * z)[:, None]
+    stretch = np.where(on_axis, 1.0, theta) / np.where(on_axis, z, safe)
+    outwards = np.column_stack([across * z[:, None], -r]) / (r * r + z * z)[:, None]
     by_point = across[:, :, None] * outwards[:, None]
     sideways = np.eye(2) - across[:, :, None] * across[:, None]
     by_point[:, :, :2] += stretch[:, None, None] * sideways
-    return radius[:, None] * across, by_point
+    return theta[:, None] * across, by_point
 
 
 def rays_of_image(
-    image: FloatArray, kind: LensKind, coefficients: tuple[float, ...]
-) -> tuple[FloatArray, BoolArray]:
-    """Unit directions (n, 3) of places (n, 2) in the image of a wide lens, and where they exist."""
-    if kind == "fov":
-        (omega,) = coefficients
-        radius = np.hypot(image[:, 0], image[:, 1])
-        angle = radius * omega
-        valid = angle < math.pi
-        theta = np.arctan2(np.sin(angle), 2 * math.tan(omega / 2) * np.cos(angle))
-    else:
-        plane, valid = _undistort_fisheye(image, coefficients)
-        theta = radius = np.hypot(plane[:, 0], plane[:, 1])
-        valid &= theta < largest_angle(kind, coefficients)
-        image = plane
-    theta = np.where(valid, theta, 0.0)
-    across = image / np.where(radius == 0, 1.0, radius)[:, None]
-    return np.column_stack([np.sin(theta)[:, None] * across, np.cos(theta)]), valid
-
-
-def _undistort_fisheye(
     image: FloatArray, coefficients: tuple[float, ...]
 ) -> tuple[FloatArray, BoolArray]:
-    """Undo a fisheye's distortion, from a table of the radial part."""
+    """Unit directions (n, 3) of places (n, 2) in the image of a fisheye, and where they exist.
+
+    A table of the radial part gives the start of the search.
+    """
     radius = np.hypot(image[:, 0], image[:, 1])
     theta = np.interp(radius, *_radii(coefficients))
     start = image * (theta / np.where(radius == 0, 1.0, radius))[:, None]
-    return undistort(image, "fisheye", coefficients, start=start)
+    plane, valid = undistort(image, "fisheye", coefficients, start=start)
+    theta = radius = np.hypot(plane[:, 0], plane[:, 1])
+    valid &= theta < largest_angle(coefficients)
+    theta = np.where(valid, theta, 0.0)
+    across = plane / np.where(radius == 0, 1.0, radius)[:, None]
+    return np.column_stack([np.sin(theta)[:, None] * across, np.cos(theta)]), valid
 
 
 @lru_cache(maxsize=64)
 def _radii(coefficients: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
     """Radii in a fisheye's image, and their angles [rad], both (`_TABLE`,)."""
-    n1, n2, n3, n4, *_ = _terms("fisheye", coefficients)
-    angles = np.linspace(0.0, largest_angle("fisheye", coefficients), _TABLE)
+    n1, n2, n3, n4 = coefficients
+    angles = np.linspace(0.0, largest_angle(coefficients), _TABLE)
     s = angles * angles
     return angles * (1 + s * (n1 + s * (n2 + s * (n3 + s * n4)))), angles
 
@@ -314,7 +274,7 @@ def distort(
     normalized: FloatArray, kind: LensKind, coefficients: tuple[float, ...]
 ) -> tuple[FloatArray, FloatArray]:
     """Distorted coordinates (n, 2) of undistorted ones (n, 2), and their derivatives (n, 2, 2)."""
-    n1, n2, n3, n4, d1, d2, d3, p1, p2, s1, s2 = _terms(kind, coefficients)
+    n1, n2, n3, n4, d1, d2, d3, p1, p2 = _terms(kind, coefficients)
     x, y = normalized[:, 0], normalized[:, 1]
     r2 = x * x + y * y
     numerator = 1 + r2 * (n1 + r2 * (n2 + r2 * (n3 + r2 * n4)))
@@ -324,14 +284,13 @@ def distort(
     slope = (n1 + r2 * (2 * n2 + r2 * (3 * n3 + r2 * 4 * n4))) / denominator
     slope = slope - radial * (d1 + r2 * (2 * d2 + 3 * d3 * r2)) / denominator
     distorted = np.empty((len(x), 2))
-    distorted[:, 0] = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + s1 * r2
-    distorted[:, 1] = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + s2 * r2
+    distorted[:, 0] = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    distorted[:, 1] = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
     mixed = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
     jacobian = np.empty((len(x), 2, 2))
-    jacobian[:, 0, 0] = radial + 2 * x * x * slope + 2 * p1 * y + (6 * p2 + 2 * s1) * x
-    jacobian[:, 0, 1] = mixed + 2 * s1 * y
-    jacobian[:, 1, 0] = mixed + 2 * s2 * x
-    jacobian[:, 1, 1] = radial + 2 * y * y * slope + (6 * p1 + 2 * s2) * y + 2 * p2 * x
+    jacobian[:, 0, 0] = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+    jacobian[:, 0, 1] = jacobian[:, 1, 0] = mixed
+    jacobian[:, 1, 1] = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
     return distorted, jacobian
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,23 +26,8 @@ _FAR_ORIGIN = 8.0
 _GRAZING = 1e-3
 
 
-class RayEngine(Protocol):
-    """A library's ray hierarchy over triangles, in single precision; safe in several threads."""
-
-    def first_faces(self, origins: SingleArray, directions: SingleArray) -> FaceArray:
-        """The first triangle on each of n rays (n, 3), (n,) int32; -1 where there is none."""
-
-    def blocked(
-        self, origins: SingleArray, directions: SingleArray, reach: float
-    ) -> npt.NDArray[np.bool_]:
-        """Rays that hit anything before ``origin + reach * direction``, (n,) bool."""
-
-
-EngineMaker = Callable[[SingleArray, FaceArray], RayEngine]
-
-
 class EmbreeEngine:
-    """Embree by way of embreex, over vertices (n, 3) and faces (m, 3)."""
+    """Embree by way of embreex, over vertices (n, 3) and faces (m, 3); safe in several threads."""
 
     def __init__(self, vertices: SingleArray, faces: FaceArray) -> None:
         self._scene = EmbreeScene()
@@ -52,14 +36,14 @@ class EmbreeEngine:
         self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
 
     def first_faces(self, origins: SingleArray, directions: SingleArray) -> FaceArray:
-        """See `RayEngine`."""
+        """The first triangle on each of n rays (n, 3), (n,) int32; -1 where there is none."""
         found: FaceArray = self._scene.run(origins, directions)
         return found
 
     def blocked(
         self, origins: SingleArray, directions: SingleArray, reach: float
     ) -> npt.NDArray[np.bool_]:
-        """See `RayEngine`."""
+        """Rays that hit anything before ``origin + reach * direction``, (n,) bool."""
         far = np.full(len(origins), reach, dtype=np.float32)
         return np.asarray(self._scene.run(origins, directions, far, query="OCCLUDED") >= 0)
 
@@ -81,14 +65,14 @@ class Open3DEngine:
         self.first_faces(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
 
     def first_faces(self, origins: SingleArray, directions: SingleArray) -> FaceArray:
-        """See `RayEngine`."""
+        """See `EmbreeEngine`."""
         found = self._scene.cast_rays(self._rays(origins, directions))["primitive_ids"].numpy()
         return np.asarray(np.where(found == self._no_hit, -1, found.astype(np.int32)), np.int32)
 
     def blocked(
         self, origins: SingleArray, directions: SingleArray, reach: float
     ) -> npt.NDArray[np.bool_]:
-        """See `RayEngine`."""
+        """See `EmbreeEngine`."""
         rays = self._rays(origins, directions)
         return np.asarray(self._scene.test_occlusions(rays, tnear=0.0, tfar=reach).numpy(), bool)
 
@@ -103,7 +87,11 @@ class RayCaster:
     """
 
     def __init__(
-        self, mesh: Mesh, normals: FloatArray | None = None, *, engine: EngineMaker = EmbreeEngine
+        self,
+        mesh: Mesh,
+        normals: FloatArray | None = None,
+        *,
+        engine: type[EmbreeEngine | Open3DEngine] = EmbreeEngine,
     ) -> None:
         low, high = self.bounds = mesh.bounds
         self._center = (low + high) / 2

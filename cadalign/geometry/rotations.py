@@ -43,15 +43,6 @@ def rotation_from_vector(vector: FloatArray) -> FloatArray:
     return np.asarray(np.eye(3) + math.sin(angle) * cross + square)
 
 
-def rotations_from_vectors(vectors: FloatArray) -> FloatArray:
-    """The rotation matrices (n, 3, 3) of rotation vectors (n, 3), as `rotation_from_vector`."""
-    angles = np.linalg.norm(vectors, axis=1)
-    axes = vectors / np.where(angles > 0, angles, 1.0)[:, None]
-    cross = -by_rotation(axes)
-    squares = 2 * np.sin(angles / 2)[:, None, None] ** 2 * (cross @ cross)
-    return np.asarray(np.eye(3) + np.sin(angles)[:, None, None] * cross + squares)
-
-
 def by_rotation(points: FloatArray) -> FloatArray:
     """Derivatives (..., 3, 3) of points (..., 3) by a rotation vector: columns are axis x point."""
     x, y, z = np.moveaxis(points, -1, 0)

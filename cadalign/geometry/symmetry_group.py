@@ -29,14 +29,10 @@ from cadalign.geometry.conventions import OPENGL_AXES
 from cadalign.geometry.rotations import angle_between, nearest_rotation, rotation_from_vector
 from cadalign.geometry.symmetry import Symmetry
 
-_QUARTERS = (
-    ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
-    ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)),
-    ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
-)  # quarter turns about x, y and z
+_QUARTERS = [rotation_from_vector(np.pi / 2 * axis).round() for axis in np.eye(3)]
 FACING = np.diag(OPENGL_AXES)
 """Rotation of a model that stands upright, y up, and faces the camera with its z axis."""
-LIKE_FACING = tuple(FACING @ np.array(quarter) for quarter in _QUARTERS)
+LIKE_FACING = tuple(FACING @ quarter for quarter in _QUARTERS)
 """Rotations to compare with where `FACING` is as far from all."""
 _MOST_ROTATIONS = 240
 _SAME_DEG = 1.0  # rotations at a smaller angle are one, given with few digits
@@ -294,7 +290,7 @@ def _free_branches(scale: FloatArray, tolerance: float) -> list[_Branch]:
     same: BoolArray = np.abs(scale[:, None] - scale) <= tolerance * scale
     if same.all():
         return [(np.eye(3), np.eye(3))]
-    signed = _closure([np.array(quarter) for quarter in _QUARTERS])  # axes go to axes
+    signed = _closure(_QUARTERS)  # axes go to axes
     for axis in range(3):
         first, second = (other for other in range(3) if other != axis)
         if same[first, second]:

@@ -18,9 +18,9 @@ import cadalign
 from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign.arrays import FloatArray
-from cadalign.geometry.metrics import box_iou
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.images import photo_size
+from cadalign.metrics import box_iou
 from cadalign.shapes.basis import find_reflection
 
 _LEAST_KEYPOINTS, _SURE = 6, 0.4  # score of a keypoint

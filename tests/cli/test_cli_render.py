@@ -138,7 +138,7 @@ def test_the_state_of_the_cache_is_told(tmp_path, monkeypatch):
     assert compiled_cache() == f"none yet; they will be kept in {kernel_folder()}"
     assert kernel_folder().parent == tmp_path / "cache"
     kernel_folder().mkdir(parents=True)
-    (kernel_folder() / "one.nbi").write_text("")
+    (kernel_folder() / "one.nbc").write_text("")
     assert compiled_cache().startswith("1 functions kept")
     if hasattr(os, "getuid") and os.getuid():
         (tmp_path / "shut").mkdir(mode=0o500)

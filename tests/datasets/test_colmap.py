@@ -247,11 +247,12 @@ def test_observing_points_that_do_not_exist_names_file_image_and_point(tmp_path,
 
 
 @either
-def test_unknown_camera_model_concerns_its_images_only(tmp_path, write):
-    images = Colmap(write(Model(["RAD_TAN_THIN_PRISM_FISHEYE", "PINHOLE"]), tmp_path))
+@pytest.mark.parametrize("name", ["FOV", "RAD_TAN_THIN_PRISM_FISHEYE", "THIN_PRISM_FISHEYE"])
+def test_unknown_camera_model_concerns_its_images_only(tmp_path, write, name):
+    images = Colmap(write(Model([name, "PINHOLE"]), tmp_path))
     assert len(images[1]) == 25
     with pytest.raises(
-        DataError, match=r"camera 10.*unknown model 'RAD_TAN_THIN_PRISM_FISHEYE'.*known are SIMP"
+        DataError, match=rf"camera 10.*unknown model '{name}'.*for others undistort the images"
     ):
         images[0]
 

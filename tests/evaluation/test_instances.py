@@ -21,8 +21,8 @@ from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, limit_estim
 from cadalign.evaluation.simulation import simulate_problem
 from cadalign.geometry.alignment import Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.metrics import rotation_error
 from cadalign.geometry.symmetry_group import SymmetryGroup
+from cadalign.metrics import rotation_error
 
 CUBE = np.array([[x, y, z] for x in (-1.0, 1) for y in (-1.0, 1) for z in (-1.0, 1)]) / 4
 

@@ -28,7 +28,7 @@ from cadalign.evaluation.experiments.retrieval import (
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run, read_table
-from cadalign.geometry.metrics import box_iou, box_iou_up_to_scale
+from cadalign.metrics import box_iou, box_iou_up_to_scale
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.absence import distances
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from cadalign import Alignment, Camera, Results, fit, fit_batch
 from cadalign.errors import DegenerateError
 from cadalign.evaluation.simulation import SimulatedProblem, random_rotation, simulate_problem
-from cadalign.geometry.metrics import rotation_error, scale_error, translation_error
+from cadalign.metrics import rotation_error, scale_error, translation_error
 
 pytestmark = pytest.mark.slow
 

@@ -17,9 +17,9 @@ from cadalign.datasets.models.keypoints import (
     symmetry_group,
 )
 from cadalign.evaluation.simulation import random_rotation
-from cadalign.geometry.metrics import rotation_error, translation_error
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.geometry.symmetry_group import SymmetryGroup
+from cadalign.metrics import rotation_error, translation_error
 
 Y = np.array([0.0, 1.0, 0.0])
 SQUARE = np.array([[1.0, 0, 1], [1, 0, -1], [-1, 0, -1], [-1, 0, 1]])

@@ -24,7 +24,7 @@ from cadalign.evaluation.metrics.cramer_rao import probability_level
 from cadalign.evaluation.runs.engine import Progress
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run, read_table
-from cadalign.geometry.metrics import box_iou
+from cadalign.metrics import box_iou
 from cadalign.report import headline_text, write_report
 
 SYNSET = "03001627"

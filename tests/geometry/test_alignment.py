@@ -35,12 +35,6 @@ SIMILARITIES = st.builds(Alignment, ROTATIONS, TRANSLATIONS, EQUAL_SCALES)
 POINTS = np.random.default_rng(0).uniform(-2, 2, (20, 3))
 
 
-def assert_close(first: Alignment, second: Alignment) -> None:
-    np.testing.assert_allclose(first.rotation, second.rotation, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(first.translation, second.translation, rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(first.scale, second.scale, rtol=1e-12)
-
-
 @pytest.mark.slow
 @given(alignment=ALIGNMENTS)
 def test_apply_is_rotation_times_stretch_plus_translation(alignment: Alignment) -> None:
@@ -65,35 +59,12 @@ def test_inverse_undoes_apply_on_either_side(alignment: Alignment) -> None:
     np.testing.assert_allclose(alignment.apply(alignment.inverse(POINTS)), POINTS, atol=1e-11)
 
 
-@pytest.mark.long
-@given(similarity=SIMILARITIES, alignment=ALIGNMENTS)
-def test_identity_is_neutral_on_either_side(similarity: Alignment, alignment: Alignment) -> None:
-    assert_close(similarity @ Alignment.identity(), similarity)
-    assert_close(Alignment.identity() @ alignment, alignment)
-
-
 @pytest.mark.slow
 @given(outer=SIMILARITIES, inner=ALIGNMENTS)
 def test_composition_applies_the_inner_first(outer: Alignment, inner: Alignment) -> None:
     np.testing.assert_allclose(
         (outer @ inner).apply(POINTS), outer.apply(inner.apply(POINTS)), rtol=1e-11, atol=1e-9
     )
-
-
-@pytest.mark.slow
-@given(first=SIMILARITIES, second=SIMILARITIES, third=ALIGNMENTS)
-def test_composition_is_associative(first: Alignment, second: Alignment, third: Alignment) -> None:
-    assert_close((first @ second) @ third, first @ (second @ third))
-
-
-@pytest.mark.slow
-@given(similarity=SIMILARITIES)
-def test_every_similarity_has_an_inverse_among_similarities(similarity: Alignment) -> None:
-    size = similarity.scale[0]
-    turned = similarity.rotation.T
-    inverse = Alignment(turned, -turned @ similarity.translation / size, np.full(3, 1 / size))
-    np.testing.assert_allclose((inverse @ similarity).cam_from_model, np.eye(4), atol=1e-9)
-    np.testing.assert_allclose((similarity @ inverse).cam_from_model, np.eye(4), atol=1e-9)
 
 
 @pytest.mark.slow
@@ -107,11 +78,6 @@ def test_an_uneven_stretch_cannot_follow_another_alignment(
         f"second @ first: the outer alignment has the stretch {outer.scale.tolist()}; "
         "only an alignment with equal scales can follow another one"
     )
-
-
-def test_composition_with_something_else_is_a_type_error() -> None:
-    with pytest.raises(TypeError):
-        Alignment.identity() @ "alignment"
 
 
 @given(alignment=ALIGNMENTS)
@@ -172,26 +138,15 @@ NOT_A_ROTATION = "not a rotation matrix; its rows must be orthonormal and its de
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        ((np.eye(4), [0, 0, 0], [1, 1, 1]), "rotation: shape (4, 4), expected (3, 3)"),
         ((np.eye(3), [0, 0], [1, 1, 1]), "translation: shape (2,), expected (3)"),
         ((np.eye(3), [0, 0, 0], [[1, 1, 1]]), "scale: shape (1, 3), expected (3)"),
         ((np.diag([1, 1, -1]), [0, 0, 0], [1, 1, 1]), f"rotation: {NOT_A_ROTATION}"),
         ((1.01 * np.eye(3), [0, 0, 0], [1, 1, 1]), f"rotation: {NOT_A_ROTATION}"),
-        ((np.zeros((3, 3)), [0, 0, 0], [1, 1, 1]), f"rotation: {NOT_A_ROTATION}"),
-        (
-            (np.full((3, 3), np.nan), [0, 0, 0], [1, 1, 1]),
-            "rotation: NaN or infinite values in rows 0, 1, 2; remove or repair these",
-        ),
         (
             (np.eye(3), [0, np.nan, 0], [1, 1, 1]),
             "translation: NaN or infinite values in row 1; remove or repair these",
         ),
-        (
-            (np.eye(3), [0, 0, 0], [1, 1, np.inf]),
-            "scale: NaN or infinite values in row 2; remove or repair these",
-        ),
         ((np.eye(3), [0, 0, 0], [1, 0, 1]), "scale: [1.0, 0.0, 1.0] is not positive"),
-        ((np.eye(3), [0, 0, 0], [1, -2, 1]), "scale: [1.0, -2.0, 1.0] is not positive"),
     ],
 )
 def test_alignment_refuses_wrong_values(arguments: tuple[Any, ...], text: str) -> None:
@@ -212,11 +167,3 @@ def test_from_dict_refuses_malformed_alignments(data: Any, text: str) -> None:
     with pytest.raises(InputError) as caught:
         Alignment.from_dict(data)
     assert str(caught.value) == text
-
-
-@pytest.mark.parametrize("method", ["apply", "inverse"])
-def test_points_are_checked(method: str) -> None:
-    with pytest.raises(InputError, match=r"points.*: shape \(3,\), expected \(n, 3\)"):
-        getattr(Alignment.identity(), method)([1.0, 2.0, 3.0])
-    with pytest.raises(InputError, match="NaN or infinite values in row 0"):
-        getattr(Alignment.identity(), method)([[1.0, np.nan, 3.0]])

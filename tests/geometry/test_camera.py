@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 from cadalign import Camera
@@ -58,30 +58,6 @@ def test_normalize_undoes_project(lens: str, seed: int) -> None:
     np.testing.assert_allclose(rays, points[:, :2] / points[:, 2:], rtol=0, atol=1e-9)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("lens", LENSES)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_project_undoes_normalize(lens: str, seed: int) -> None:
-    camera = camera_with(LENSES[lens])
-    pixels = np.random.default_rng(seed).uniform([20, 20], [620, 460], (40, 2))
-    rays = camera.normalize(pixels)
-    again = camera.project(np.column_stack([rays, np.ones(len(rays))]))
-    np.testing.assert_allclose(again, pixels, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("lens", LENSES)
-def test_normalize_agrees_with_opencv(lens: str) -> None:
-    camera = camera_with(LENSES[lens])
-    pixels = np.random.default_rng(0).uniform([100, 100], [540, 380], (40, 2))
-    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-14)
-    coefficients = np.array(camera.distortion) if camera.distortion else np.zeros(4)
-    undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # OpenCV 4 has both
-    expected = undistort(
-        pixels[:, None], camera.matrix, coefficients, R=np.eye(3), P=np.eye(3), criteria=criteria
-    )
-    np.testing.assert_allclose(camera.normalize(pixels), expected[:, 0], rtol=0, atol=1e-7)
-
-
 @pytest.mark.parametrize("lens", LENSES)
 def test_distortion_jacobian_is_the_derivative_of_the_lens(lens: str) -> None:
     camera = camera_with(LENSES[lens])
@@ -96,24 +72,10 @@ def test_distortion_jacobian_is_the_derivative_of_the_lens(lens: str) -> None:
     np.testing.assert_allclose(camera.distortion_jacobian(rays), expected, rtol=0, atol=1e-8)
 
 
-def test_optical_axis_meets_the_principal_point() -> None:
-    assert PLAIN.project([[0.0, 0.0, 3.0]]).tolist() == [[PLAIN.cx, PLAIN.cy]]
-
-
 def test_x_goes_right_and_y_goes_down() -> None:
     right, down = PLAIN.project([[1.0, 0.0, 5.0], [0.0, 1.0, 5.0]])
     assert right.tolist() == [PLAIN.cx + 100.0, PLAIN.cy]
     assert down.tolist() == [PLAIN.cx, PLAIN.cy + 104.0]
-
-
-@pytest.mark.parametrize("lens", LENSES)
-def test_projection_ignores_the_unit_of_length(lens: str) -> None:
-    camera = camera_with(LENSES[lens])
-    points = points_in_view(3)
-    for unit in (1e-6, 1e6):
-        np.testing.assert_allclose(
-            camera.project(unit * points), camera.project(points), rtol=0, atol=1e-9
-        )
 
 
 @pytest.mark.parametrize(
@@ -133,11 +95,6 @@ def test_image_reaches_half_a_pixel_beyond_the_outer_centres(
     assert PLAIN.contains(np.array([pixel])).tolist() == [inside]
 
 
-def test_contains_keeps_a_margin() -> None:
-    pixels = np.array([[9.6, 240.0], [9.4, 240.0], [629.4, 240.0], [629.6, 240.0]])
-    assert PLAIN.contains(pixels, margin=10.0).tolist() == [True, False, True, False]
-
-
 @given(
     width=st.integers(1, 8000),
     height=st.integers(1, 8000),
@@ -153,12 +110,6 @@ def test_from_fov_sees_exactly_the_field_of_view(width: int, height: int, fov: f
     assert camera.cy == (height - 1) / 2
 
 
-@pytest.mark.parametrize("fov", [0.0, 180.0, -10.0, np.nan, np.inf, "60"])
-def test_from_fov_refuses_what_is_no_angle(fov: Any) -> None:
-    with pytest.raises(InputError, match=r"fov_x: .* is not between 0 and 180 degrees"):
-        Camera.from_fov(640, 480, fov_x=fov)
-
-
 # --- COLMAP's form ---------------------------------------------------------------------------
 
 PARAMS = {
@@ -171,8 +122,6 @@ PARAMS = {
     "SIMPLE_RADIAL_FISHEYE": [200.0, 320.0, 240.0, 0.1],
     "RADIAL_FISHEYE": [200.0, 320.0, 240.0, 0.1, -0.05],
     "OPENCV_FISHEYE": [200.0, 210.0, 320.0, 240.0, 0.1, -0.05, 0.01, -0.02],
-    "THIN_PRISM_FISHEYE": [200.0, 210.0, 320.0, 240.0, 0.1, 0, 0.01, -0.02, 0.3, 0.4, -0.5, 0.6],
-    "FOV": [200.0, 210.0, 320.0, 240.0, 0.9],
 }
 EXPECTED = {
     "SIMPLE_PINHOLE": Camera(640, 480, 500.0, 500.0, 319.5, 239.5),
@@ -192,11 +141,15 @@ EXPECTED = {
     "OPENCV_FISHEYE": Camera(
         640, 480, 200.0, 210.0, 319.5, 239.5, (0.1, -0.05, 0.01, -0.02), lens="fisheye"
     ),
-    "THIN_PRISM_FISHEYE": Camera(
-        *(640, 480, 200.0, 210.0, 319.5, 239.5, (0.1, 0, 0.01, -0.02, 0.3, 0.4, -0.5, 0.6)),
-        lens="fisheye",
-    ),
-    "FOV": Camera(640, 480, 200.0, 210.0, 319.5, 239.5, (0.9,), lens="fov"),
+}
+
+
+WRITTEN = {
+    "SIMPLE_PINHOLE": "PINHOLE",
+    "SIMPLE_RADIAL": "OPENCV",
+    "RADIAL": "OPENCV",
+    "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE",
+    "RADIAL_FISHEYE": "OPENCV_FISHEYE",
 }
 
 
@@ -205,54 +158,15 @@ def test_every_colmap_model_that_is_known_is_tested() -> None:
 
 
 @pytest.mark.parametrize("model", PARAMS)
-def test_from_dict_reads_colmaps_order_and_takes_off_half_a_pixel(model: str) -> None:
-    data = {"model": model, "width": 640, "height": 480, "params": PARAMS[model]}
-    assert Camera.from_dict(data) == EXPECTED[model]
-
-
-@pytest.mark.parametrize("model", PARAMS)
-def test_from_dict_undoes_to_dict(model: str) -> None:
-    camera = EXPECTED[model]
-    assert Camera.from_dict(camera.to_dict()) == camera
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("lens", LENSES)
-@given(
-    values=st.tuples(
-        st.floats(1.0, 1e5), st.floats(1.0, 1e5), st.floats(-1e4, 1e4), st.floats(-1e4, 1e4)
-    )
-)
-def test_round_trip_through_colmaps_form_keeps_every_pixel(
-    lens: str, values: tuple[float, float, float, float]
+def test_colmaps_models_are_read_and_written_as_the_smallest_that_holds_the_lens(
+    model: str,
 ) -> None:
-    camera = Camera(640, 480, *values, LENSES[lens])
-    again = Camera.from_dict(camera.to_dict())
-    points = points_in_view(0, 5)
-    np.testing.assert_allclose(again.project(points), camera.project(points), rtol=1e-12, atol=1e-9)
-    assert again.to_dict() == camera.to_dict()
-
-
-@pytest.mark.parametrize(
-    ("model", "written"),
-    [
-        ("SIMPLE_PINHOLE", "PINHOLE"),
-        ("PINHOLE", "PINHOLE"),
-        ("SIMPLE_RADIAL", "OPENCV"),
-        ("RADIAL", "OPENCV"),
-        ("OPENCV", "OPENCV"),
-        ("FULL_OPENCV", "FULL_OPENCV"),
-        ("SIMPLE_RADIAL_FISHEYE", "OPENCV_FISHEYE"),
-        ("RADIAL_FISHEYE", "OPENCV_FISHEYE"),
-        ("OPENCV_FISHEYE", "OPENCV_FISHEYE"),
-        ("THIN_PRISM_FISHEYE", "THIN_PRISM_FISHEYE"),
-        ("FOV", "FOV"),
-    ],
-)
-def test_to_dict_writes_the_smallest_model_of_the_lens(model: str, written: str) -> None:
-    data = EXPECTED[model].to_dict()
-    assert data["model"] == written
-    assert len(data["params"]) == len(COLMAP_PARAMS[written])
+    data = {"model": model, "width": 640, "height": 480, "params": PARAMS[model]}
+    camera = Camera.from_dict(data)
+    assert camera == EXPECTED[model]
+    written = camera.to_dict()
+    assert written["model"] == WRITTEN.get(model, model)
+    assert Camera.from_dict(written) == camera
 
 
 # --- values ----------------------------------------------------------------------------------
@@ -272,14 +186,6 @@ def test_camera_takes_numpy_numbers_and_keeps_python_ones() -> None:
     assert kinds == [int, int, float, float, float, float]
 
 
-@example(seed=0)
-@given(seed=st.integers(0, 1000))
-def test_matrix_is_the_calibration_matrix(seed: int) -> None:
-    points = points_in_view(seed, 5)
-    homogeneous = points @ PLAIN.matrix.T
-    np.testing.assert_allclose(PLAIN.project(points), homogeneous[:, :2] / homogeneous[:, 2:])
-
-
 # --- refusals --------------------------------------------------------------------------------
 
 GOOD: dict[str, Any] = {"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240}
@@ -293,24 +199,13 @@ LENGTH_FIX = "give (k1, k2, p1, p2), optionally followed by k3 or k3, k4, k5, k6
             {"fx": 0},
             "camera.fx: the focal length is 0; give the calibrated focal length in pixels",
         ),
-        (
-            {"fy": -500},
-            "camera.fy: the focal length is -500; give the calibrated focal length in pixels",
-        ),
         ({"fx": None}, "camera.fx: None is not a finite number"),
-        ({"fx": np.nan}, "camera.fx: nan is not a finite number"),
         ({"cx": np.inf}, "camera.cx: inf is not a finite number"),
-        ({"cy": "240"}, "camera.cy: '240' is not a finite number"),
         ({"fx": True}, "camera.fx: True is not a finite number"),
         ({"width": 0}, "camera.width: 0 is not a size; give the image size in whole pixels"),
-        ({"height": -1}, "camera.height: -1 is not a size; give the image size in whole pixels"),
         (
             {"width": 640.5},
             "camera.width: 640.5 is not a size; give the image size in whole pixels",
-        ),
-        (
-            {"width": np.nan},
-            "camera.width: nan is not a size; give the image size in whole pixels",
         ),
         (
             {"distortion": (0.1, 0.2)},
@@ -322,7 +217,6 @@ LENGTH_FIX = "give (k1, k2, p1, p2), optionally followed by k3 or k3, k4, k5, k6
             + LENGTH_FIX,
         ),
         ({"distortion": 0.1}, "camera.distortion: not a sequence of numbers"),
-        ({"distortion": ("a",) * 4}, "camera.distortion: not a sequence of numbers"),
         ({"distortion": np.full(4, 0.1j)}, "camera.distortion: not a sequence of numbers"),
         (
             {"distortion": np.ma.masked_equal(np.array([0.1, 0.0, 0.0, 0.0]), 0.1)},
@@ -354,19 +248,14 @@ COLMAP_DATA: dict[str, Any] = {
             "as COLMAP does",
         ),
         (
-            COLMAP_DATA | {"model": "FISHEYE"},
-            "camera.model: unknown model 'FISHEYE'; known are SIMPLE_PINHOLE, PINHOLE, "
+            COLMAP_DATA | {"model": "FOV"},
+            "camera.model: unknown model 'FOV'; known are SIMPLE_PINHOLE, PINHOLE, "
             "SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, "
-            "OPENCV_FISHEYE, THIN_PRISM_FISHEYE, FOV",
+            "OPENCV_FISHEYE; for others undistort the images",
         ),
         (
             COLMAP_DATA | {"params": [500, 320, 240]},
             "camera.params: [500, 320, 240] are not the parameters of PINHOLE; give fx, fy, cx, cy",
-        ),
-        (
-            COLMAP_DATA | {"params": "500 500 320 240"},
-            "camera.params: '500 500 320 240' are not the parameters of PINHOLE; "
-            "give fx, fy, cx, cy",
         ),
         (
             COLMAP_DATA | {"params": [500, None, 320, 240]},
@@ -386,12 +275,6 @@ def test_from_dict_refuses_malformed_cameras(data: Any, text: str) -> None:
     with pytest.raises(InputError) as caught:
         Camera.from_dict(data)
     assert str(caught.value) == text
-
-
-@pytest.mark.parametrize("model", [["PINHOLE"], {"a": 1}, None, 3])
-def test_from_dict_refuses_a_model_that_is_no_name(model: Any) -> None:
-    with pytest.raises(InputError, match=r"camera\.model: unknown model"):
-        Camera.from_dict(COLMAP_DATA | {"model": model})
 
 
 def test_points_behind_the_camera_are_refused() -> None:
@@ -472,20 +355,6 @@ def test_camera_without_focal_length_is_not_used_as_if_it_had_one(use: str) -> N
 
 
 @pytest.mark.parametrize(
-    ("size", "text"),
-    [
-        ((0, 480), "camera.width: 0 is not a size; give the image size in whole pixels"),
-        ((640, "high"), "camera.height: 'high' is not a size; "),
-        ((640.5, 480), "camera.width: 640.5 is not a size; "),
-    ],
-)
-def test_sizes_that_are_none_are_refused_without_a_focal_length_too(size: Any, text: str) -> None:
-    with pytest.raises(InputError) as caught:
-        Camera.without_focal(*size)
-    assert str(caught.value).startswith(text)
-
-
-@pytest.mark.parametrize(
     "data",
     [
         {"width": 640, "height": 480},
@@ -513,24 +382,6 @@ def test_unknown_focal_length_is_null_in_files(data: dict[str, Any]) -> None:
         "params": [None, None, 320.0, 240.0],
     }
     assert Camera.from_dict(camera.to_dict()) == camera
-
-
-@pytest.mark.parametrize(
-    ("params", "text"),
-    [
-        ([500.0, None, 320, 240], "camera.params: fy is None, not a finite number"),
-        ([None, None, None, 240], "camera.params: cx is None, not a finite number"),
-    ],
-)
-def test_half_a_focal_length_is_refused(params: list[Any], text: str) -> None:
-    with pytest.raises(InputError) as caught:
-        Camera.from_dict({"model": "PINHOLE", "width": 640, "height": 480, "params": params})
-    assert str(caught.value) == text
-
-
-def test_whole_numbers_beyond_all_floats_are_refused() -> None:
-    with pytest.raises(InputError, match="not a finite number"):
-        Camera(640, 480, 10**400, 500.0, 320.0, 240.0)
 
 
 COEFFICIENTS = (0.1, -0.05, 0.001, 0.002, 0.03, 0.02, -0.01, 0.005, *(0.0,) * 6)

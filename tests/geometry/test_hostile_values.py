@@ -80,13 +80,6 @@ def test_texts_are_no_numbers(value: Any) -> None:
     )
 
 
-def test_a_focal_length_and_a_size_must_be_numbers() -> None:
-    assert refusal_text(lambda: CAMERA.with_focal("1")) == "focal: '1' is not a finite number"  # type: ignore[arg-type]
-    assert refusal_text(lambda: Camera.from_fov("1", 480, fov_x=50)) == (  # type: ignore[arg-type]
-        "camera.width: '1' is not a size; give the image size in whole pixels"
-    )
-
-
 def test_an_overflowing_rotation_is_refused() -> None:
     rotation = np.full((3, 3), 1e200)
     assert refusal_text(lambda: Alignment(rotation, np.zeros(3), np.ones(3))) == (

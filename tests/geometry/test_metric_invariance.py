@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cadalign import Alignment, Symmetry
-from cadalign.geometry.metrics import (
+from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.metrics import (
     rotation_error,
     scale_error,
     translation_error,
 )
-from cadalign.geometry.rotations import rotation_from_vector
 
 pytestmark = pytest.mark.long
 

@@ -12,7 +12,6 @@ from cadalign.geometry.rotations import (
     quat_wxyz_from_rotation,
     rotation_from_quat_wxyz,
     rotation_from_vector,
-    rotations_from_vectors,
     spread_rotations,
 )
 
@@ -39,13 +38,6 @@ def test_rotation_keeps_its_axis_and_is_orthonormal(vector) -> None:
 def test_quaternion_without_direction_is_refused(quaternion) -> None:
     with pytest.raises(InputError, match=r"quaternion: .* is not a rotation"):
         rotation_from_quat_wxyz(quaternion)
-
-
-def test_many_vectors_give_the_rotations_of_each() -> None:
-    vectors = np.random.default_rng(0).normal(0, 2, (20, 3))
-    vectors[0] = 0.0
-    expected = [rotation_from_vector(each) for each in vectors]
-    np.testing.assert_allclose(rotations_from_vectors(vectors), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("count", [60, 500])

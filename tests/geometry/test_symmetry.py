@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from cadalign.errors import InputError
 from cadalign.evaluation.metrics.photos import scan2cad_errors
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.metrics import rotation_error
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.geometry.symmetry import Symmetry, SymmetryAxis
+from cadalign.metrics import rotation_error
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 

@@ -1,4 +1,4 @@
-"""Fisheye and fov lenses: projection, inverse and derivatives, beyond 90 degrees too."""
+"""Fisheye lenses: projection, inverse and derivatives, beyond 90 degrees too."""
 
 from __future__ import annotations
 
@@ -23,12 +23,6 @@ LENSES = {
     "opencv": Camera(
         640, 640, 180.0, 185.0, 320.25, 318.5, (0.05, -0.02, 0.01, -0.001), lens="fisheye"
     ),
-    "thin prism": Camera(
-        *(640, 640, 180.0, 185.0, 320.25, 318.5),
-        (0.02, -0.005, 0.002, -0.003, 0.001, -1e-4, 0.001, -0.002),
-        lens="fisheye",
-    ),
-    "fov": Camera(640, 640, 180.0, 185.0, 320.25, 318.5, (0.9,), lens="fov"),
 }
 WIDEST = math.radians(110)  # of the lenses above, at which all can be inverted
 every_lens = pytest.mark.parametrize("name", LENSES)
@@ -44,7 +38,7 @@ def directions(seed: int, *, widest: float = WIDEST, count: int = 40) -> np.ndar
     return np.stack(rows, axis=1) * rng.uniform(0.1, 20, (count, 1))
 
 
-@pytest.mark.parametrize("name", ["equidistant", "opencv"])
+@every_lens
 @any_seed
 def test_fisheye_projects_as_opencvs(name: str, seed: int) -> None:
     camera, points = LENSES[name], directions(seed, widest=math.radians(89.5))
@@ -52,44 +46,6 @@ def test_fisheye_projects_as_opencvs(name: str, seed: int) -> None:
         points[:, None], np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.distortion)
     )
     np.testing.assert_allclose(camera.project(points), expected[:, 0], rtol=0, atol=1e-8)
-
-
-@any_seed
-def test_fisheye_unprojects_as_opencvs(seed: int) -> None:
-    camera = LENSES["opencv"]
-    pixels = camera.project(directions(seed, widest=math.radians(80)))
-    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-14)
-    expected = cv2.fisheye.undistortPoints(
-        pixels[:, None], camera.matrix, np.array(camera.distortion), criteria=criteria
-    )
-    np.testing.assert_allclose(camera.normalize(pixels), expected[:, 0], rtol=0, atol=1e-7)
-
-
-def by_colmap(camera: Camera, point: np.ndarray) -> tuple[float, float]:
-    """Pixel of a point by the formulas of COLMAP's ``src/colmap/sensor/models.h``, written out."""
-    u, v = point[0] / point[2], point[1] / point[2]
-    r = math.hypot(u, v)
-    if camera.lens == "fov":
-        (omega,) = camera.distortion
-        factor = math.atan(r * 2 * math.tan(omega / 2)) / (r * omega)
-        du, dv = u * factor, v * factor
-    else:
-        k1, k2, p1, p2, k3, k4, sx1, sy1 = camera.distortion
-        u, v = u * math.atan(r) / r, v * math.atan(r) / r
-        u2, uv, v2 = u * u, u * v, v * v
-        r2 = u2 + v2
-        radial = k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4
-        du = u + u * radial + 2 * p1 * uv + p2 * (r2 + 2 * u2) + sx1 * r2
-        dv = v + v * radial + 2 * p2 * uv + p1 * (r2 + 2 * v2) + sy1 * r2
-    return camera.fx * du + camera.cx, camera.fy * dv + camera.cy
-
-
-@pytest.mark.parametrize("name", ["thin prism", "fov"])
-@any_seed
-def test_projection_follows_colmaps_formulas(name: str, seed: int) -> None:
-    points = directions(seed, widest=math.radians(89.5))[1:]
-    expected = [by_colmap(LENSES[name], point) for point in points]
-    np.testing.assert_allclose(LENSES[name].project(points), expected, rtol=0, atol=1e-8)
 
 
 @every_lens
@@ -137,7 +93,7 @@ def test_a_perspective_lens_has_the_slopes_of_finite_differences() -> None:
 
 def test_beyond_the_fold_nothing_is_seen() -> None:
     camera = Camera(640, 640, 180, 180, 320, 320, (-0.1, 0, 0, 0), lens="fisheye")
-    limit = largest_angle("fisheye", camera.distortion)
+    limit = largest_angle(camera.distortion)
     assert limit == pytest.approx(math.sqrt(1 / 0.3))
     angles = np.array([limit - 0.01, limit + 0.01])
     points = np.stack([np.sin(angles), np.zeros(2), np.cos(angles)], axis=1)
@@ -173,8 +129,6 @@ def test_normalize_refuses_rays_beside_the_plane() -> None:
             {"lens": "fisheye", "distortion": (0.1,)},
             r"camera.distortion: \(0.1,\) are not distortion coefficients; give \(k1, k2, k3, k4\)",
         ),
-        ({"lens": "fov"}, r"camera.distortion: \(\) are not .*; give \(omega,\), an angle in rad"),
-        ({"lens": "fov", "distortion": (4.0,)}, r"\(4.0,\) are not distortion coefficients"),
         (
             {"lens": "fisheye", "focal_known": False},
             "camera.lens: the focal length of a fisheye lens is unknown; calibrate the camera",
@@ -187,25 +141,19 @@ def test_impossible_lenses_are_refused(given: dict[str, object], text: str) -> N
 
 
 def test_files_of_wide_lenses_want_a_focal_length() -> None:
-    data = {"model": "FOV", "width": 640, "height": 480, "params": [None, None, 320, 240, 0.9]}
-    with pytest.raises(InputError, match=r"camera.params: the focal length of a fov lens is unkn"):
+    data = {"model": "RADIAL_FISHEYE", "width": 9, "height": 9, "params": [None, 4, 4, 0, 0]}
+    with pytest.raises(InputError, match=r"camera.params: the focal length of a fisheye lens"):
         Camera.from_dict(data)
 
 
 def test_a_turned_frame_is_not_written() -> None:
     with pytest.raises(InputError, match="a camera in a turned frame has no form in files"):
-        LENSES["fov"].turned(np.eye(3)).to_dict()
+        LENSES["opencv"].turned(np.eye(3)).to_dict()
 
 
 def test_a_pinhole_is_not_turned() -> None:
     with pytest.raises(InputError, match="the frame of a pinhole is its own"):
         Camera(640, 480, 500, 500, 320, 240).turned(np.eye(3))
-
-
-def test_a_matrix_may_be_a_fisheyes() -> None:
-    camera = LENSES["opencv"]
-    data = {"matrix": camera.matrix, "width": 640, "height": 640, "distortion": camera.distortion}
-    assert Camera.from_dict(data | {"lens": "fisheye"}) == camera
 
 
 @every_lens

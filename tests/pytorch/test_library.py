@@ -21,6 +21,7 @@ def test_nothing_loads_pytorch_unasked() -> None:
 
 
 def test_without_pytorch_the_message_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "cadalign.torch.layer", raising=False)
     monkeypatch.setitem(sys.modules, "torch", None)
     camera = cadalign.Camera(640, 480, 900, 900, 319.5, 239.5)
     with pytest.raises(CadalignError) as refused:

@@ -1,4 +1,4 @@
-"""Rendering and overlays with fisheye and fov lenses, beside and behind the camera's plane too."""
+"""Rendering and overlays with fisheye lenses, beside and behind the camera's plane too."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from cadalign.render.scene import LIGHT_GREY
 from cadalign.render.viewpoints import visible_keypoints
 
 FISHEYE = Camera(241, 241, 70.0, 72.0, 120.0, 119.0, (0.01, -0.003, 0.0, 0.0), lens="fisheye")
-FOV = Camera(241, 241, 70.0, 72.0, 120.0, 119.0, (0.9,), lens="fov")
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 FACES = np.array(
     [
@@ -41,9 +40,8 @@ def placed(angle: float, about: float = 0.7, *, distance: float = 4.0) -> Alignm
 
 @pytest.mark.parametrize("about", [0.0, 0.7, np.pi / 2])
 @pytest.mark.parametrize("angle", [0, 60, 90, 104])
-@pytest.mark.parametrize("camera", [FISHEYE, FOV], ids=["fisheye", "fov"])
-def test_every_pixel_shows_what_projects_to_it(camera: Camera, angle: float, about: float) -> None:
-    pose = placed(angle, about)
+def test_every_pixel_shows_what_projects_to_it(angle: float, about: float) -> None:
+    camera, pose = FISHEYE, placed(angle, about)
     drawn = cast_geometry(BOX, camera, pose)
     rows, columns = np.nonzero(drawn.mask)
     assert len(rows) > 200

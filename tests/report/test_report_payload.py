@@ -29,7 +29,7 @@ from cadalign.evaluation.experiments.simulation import SweepOptions
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import read_table
-from cadalign.geometry.metrics import alignment_box_iou, rotation_error
+from cadalign.metrics import box_iou, rotation_error
 from cadalign.report import write_report
 from cadalign.report.instances import compact
 
@@ -191,7 +191,8 @@ def test_exhibits_hold_what_the_errors_were_made_of(payload: dict[str, Any]) -> 
             assert rotation_error(est=found, gt=truth) == pytest.approx(
                 rows["rotation_error_deg"][row], rel=1e-4
             )
-            iou = alignment_box_iou(est=found, gt=truth, bounds=exhibit["bounds"])
+            boxes = (Box.from_model(exhibit["bounds"], each) for each in (found, truth))
+            iou = box_iou(**dict(zip(("est", "gt"), boxes, strict=True)))
             assert iou == pytest.approx(rows["box_iou"][row], rel=1e-4)
             assert (estimate["std"] is None) == (estimate["method"] != "optimal")
 

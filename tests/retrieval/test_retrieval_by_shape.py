@@ -15,8 +15,8 @@ from support.refusals import refusal_line
 from cadalign import Alignment, Box, Camera, FocalPrior, Library, ShapeModel, View, align
 from cadalign.cli import main
 from cadalign.errors import InputError
-from cadalign.geometry.metrics import box_iou_up_to_scale
 from cadalign.io.observation import Observation
+from cadalign.metrics import box_iou_up_to_scale
 from cadalign.render.scene import LIGHT_GREY
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.page import draw_match

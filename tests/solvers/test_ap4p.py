@@ -10,7 +10,7 @@ from support.problems import problem_of
 
 from cadalign import Alignment
 from cadalign.evaluation.simulation import SimulatedProblem
-from cadalign.geometry.metrics import rotation_error
+from cadalign.metrics import rotation_error
 from cadalign.solvers.minimal import ap4p
 
 SEEDS = st.integers(0, 2**32 - 1)

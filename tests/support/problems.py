@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from cadalign import Alignment, Camera, Result, fit
 from cadalign.datasets import Correspondences
 from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
-from cadalign.geometry.metrics import rotation_error
+from cadalign.metrics import rotation_error
 
 LENS = Camera(640, 480, 500.0, 520.0, 310.0, 250.0, (-0.25, 0.08, 0.004, -0.003))
 

@@ -47,7 +47,7 @@ from cadalign.evaluation.summary import (
     summarize,
 )
 from cadalign.geometry.alignment import Alignment, Box
-from cadalign.geometry.metrics import rotation_error
+from cadalign.metrics import rotation_error
 
 if TYPE_CHECKING:
     # Only where a run needs them: they load the compiled solvers.

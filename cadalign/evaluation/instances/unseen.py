@@ -34,12 +34,12 @@ from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
 from cadalign.evaluation.runs.work import Outcome, Row
 from cadalign.evaluation.shape_files import LearnedFiles
 from cadalign.geometry.alignment import Alignment, Box
-from cadalign.geometry.metrics import (
+from cadalign.geometry.rotations import vector_from_rotation
+from cadalign.metrics import (
     rotation_error,
     translation_error,
     translation_error_up_to_scale,
 )
-from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.shapes.model import ShapeModel
 
 _LEAST_SIGMA = 0.5  # of retrieval [px]: keypoints without noise would leave no model any chance

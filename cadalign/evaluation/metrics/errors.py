@@ -12,7 +12,8 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.evaluation.runs.work import Row
 from cadalign.geometry.alignment import Alignment, Box
-from cadalign.geometry.metrics import (
+from cadalign.geometry.symmetry_group import SymmetryGroup
+from cadalign.metrics import (
     Alignments,
     Boxes,
     box_iou,
@@ -27,7 +28,6 @@ from cadalign.geometry.metrics import (
     translation_errors,
     translation_errors_up_to_scale,
 )
-from cadalign.geometry.symmetry_group import SymmetryGroup
 
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.instance import Instance

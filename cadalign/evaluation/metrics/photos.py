@@ -26,8 +26,8 @@ from cadalign.evaluation.metrics.errors import overlap_up_to_scale
 from cadalign.evaluation.runs.work import Columns, Row
 from cadalign.evaluation.summary import Group, known, medians
 from cadalign.geometry.alignment import Alignment, Box
-from cadalign.geometry.metrics import box_iou, rotation_error, scale_error
 from cadalign.geometry.symmetry import Symmetry
+from cadalign.metrics import box_iou, rotation_error, scale_error
 
 if TYPE_CHECKING:
     from cadalign.evaluation.photos.target import PhotoTarget

@@ -11,9 +11,8 @@ import pytest
 
 from cadalign import Alignment, Camera, FocalPrior, Mesh, Model, Size, Symmetry, View, align
 from cadalign.estimation.contours.silhouettes import distinct
-from cadalign.geometry.metrics import nearest_truth
 from cadalign.geometry.rotations import rotation_from_vector
-from cadalign.metrics import rotation_error
+from cadalign.metrics import nearest_truth, rotation_error
 from cadalign.render import Scene, cast_geometry
 
 pytestmark = pytest.mark.long

@@ -25,7 +25,7 @@ from cadalign import Alignment, Camera, Model, RansacOptions, View, align, fit
 from cadalign.errors import DegenerateError
 from cadalign.estimation.warning import MISFIT_KINDS
 from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem, simulate_problem
-from cadalign.geometry.metrics import rotation_error
+from cadalign.metrics import rotation_error
 
 # --- sigma ------------------------------------------------------------------------------------
 

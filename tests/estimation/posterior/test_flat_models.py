@@ -12,7 +12,7 @@ from scipy.special import chdtri
 from cadalign import Alignment, Camera, Model, Result, View, align, align_batch, fit, fit_batch
 from cadalign.estimation.options import USUAL_STRETCH
 from cadalign.evaluation.simulation import SimulatedProblem, random_rotation
-from cadalign.geometry.metrics import rotation_error
+from cadalign.metrics import rotation_error
 
 CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 THICKNESS = 0.02

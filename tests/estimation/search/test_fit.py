@@ -22,7 +22,7 @@ from cadalign import Alignment, Camera, fit
 from cadalign.errors import DegenerateError
 from cadalign.estimation.options import BOUNDING_PRIOR
 from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem
-from cadalign.geometry.metrics import rotation_error
+from cadalign.metrics import rotation_error
 
 # --- what it finds ----------------------------------------------------------------------------
 

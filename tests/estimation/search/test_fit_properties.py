@@ -12,7 +12,7 @@ from support.problems import of_unknowns, problem_of
 from cadalign import Alignment, Camera, Result, fit
 from cadalign.errors import DegenerateError
 from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem
-from cadalign.geometry.metrics import rotation_error
+from cadalign.metrics import rotation_error
 
 SEEDS = st.integers(0, 2**32 - 1)
 COUNTS = st.integers(7, 60)

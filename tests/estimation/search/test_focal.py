@@ -27,7 +27,7 @@ from cadalign import (
 )
 from cadalign.errors import DegenerateError, NoConsensusError
 from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem
-from cadalign.geometry.metrics import rotation_error
+from cadalign.metrics import rotation_error
 
 UNKNOWN = Camera.without_focal(640, 480)
 LONG = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)

@@ -12,7 +12,7 @@ from support.problems import with_outliers
 from cadalign import Camera, RansacOptions, fit, fit_batch
 from cadalign.errors import NoConsensusError
 from cadalign.evaluation.simulation import simulate_problem
-from cadalign.geometry.metrics import rotation_error
+from cadalign.metrics import rotation_error
 
 CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)
 

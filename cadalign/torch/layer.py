@@ -1,0 +1,281 @@
+"""Optima of many problems at once, with their derivatives by the data.
+
+The search is that of `cadalign.fit_batch`, in the compiled kernels. The optimum t of data d solves
+``g(t, d) = 0``, g half the gradient of the cost. So ``dt/dd = -H^-1 dg/dd`` with ``H = dg/dt`` (the
+implicit function theorem; of PnP: Chen et al., *End-to-end learnable geometric vision by
+backpropagating PnP optimization*, CVPR 2020). One Newton step, ``t - H^-1 g(t, d)`` with H held,
+has these derivatives, and removes what the search's tolerance leaves: PyTorch differentiates it.
+
+The unknowns t are those of `cadalign.Result.covariance`: rotation vector in the camera frame,
+translation, logarithms of the scales, logarithm of the focal length.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.errors import CadalignError, InputError
+from cadalign.estimation.fit import fit_once
+from cadalign.estimation.options import FitOptions
+from cadalign.estimation.prior import log_focal_range
+from cadalign.estimation.problems import Problems, in_threads, joined, rays_of
+from cadalign.estimation.solve import are_solved_at_once, solve
+from cadalign.geometry.camera import Camera
+from cadalign.solvers.constants import OK
+
+try:
+    import torch
+    from torch import Tensor
+except ImportError:
+    raise CadalignError(
+        "PyTorch is not installed", where="cadalign.torch", fix="pip install 'cadalign[torch]'"
+    ) from None
+
+_UNKNOWNS = 10
+_LARGEST_POLISH = 0.02  # turn [rad] or change of a logarithm beyond which a step is no polish
+_AT_BOUND = 1e-9
+_HELD = 1e12  # information about a log focal length at its bound
+_NO_POSE = np.array([1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1, 1, 1, 1])
+_LEAST_DEPTH = 1e-9  # of points behind the camera
+_LEAST_SHARE = 1e-10  # of an unknown's information that the others must leave
+
+
+class Optima(NamedTuple):
+    """Fits of B problems; the covariance (B, 10, 10) and the mask have no derivatives."""
+
+    rotation: Tensor  # (B, 3, 3)
+    translation: Tensor  # (B, 3)
+    scale: Tensor  # (B, 3)
+    focal: Tensor  # (B,)
+    covariance: Tensor
+    valid: Tensor  # (B,) bool
+
+
+@dataclass(frozen=True, eq=False)
+class FitTask:
+    """Input of a batch's fits beside tensors: one camera, or one for each problem.
+
+    Raises InputError for cameras that the derivatives don't know.
+    """
+
+    cameras: tuple[Camera, ...]
+    options: FitOptions
+    workers: int
+
+    def __post_init__(self) -> None:
+        if any(each.is_wide for each in self.cameras):
+            what = "wide lenses have no gradients"
+            raise InputError(what, where="camera", fix="undistort keypoints and camera first")
+        if self.options.focal == "known":
+            for each in self.cameras:
+                each.require_focal()
+            return
+        if len({(each.width, each.height) for each in self.cameras}) > 1:
+            what = "with an unknown focal length all images must have one size"
+            raise InputError(what, where="camera", fix="call fit for each size")
+        if any(each.distortion for each in self.cameras):
+            what = "an unknown focal length and lens distortion have no gradients together"
+            raise InputError(what, where="focal", fix="undistort keypoints and camera first")
+
+
+class _Once(torch.autograd.Function):
+    """The same numbers, whose derivatives can be taken once: the Newton step holds H."""
+
+    @staticmethod
+    def forward(ctx: Any, data: Tensor) -> Tensor:
+        return data.clone()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, slopes: Tensor) -> Tensor:
+        return slopes
+
+
+@np.errstate(all="ignore")
+def optima_of(
+    task: FitTask, points: Tensor, pixels: Tensor, sigmas: Tensor, mask: Tensor
+) -> Optima:
+    """The optima of points (B, n, 3), pixels (B, n, 2), sigmas and mask (B, n), of double numbers.
+
+    The derivatives are those before the Newton step: it is far below the noise.
+    """
+    options, cameras = task.options, task.cameras
+    points, pixels, sigmas = map(_Once.apply, (points, pixels, sigmas))
+    if options.focal == "estimate":
+        options = options.for_camera(cameras[0])
+    present = mask & points.isfinite().all(2) & pixels.isfinite().all(2)
+    present &= sigmas.isfinite() & (sigmas > 0)
+    points, pixels = (torch.where(present[..., None], each, 0.0) for each in (points, pixels))
+    sigmas = torch.where(present, sigmas, 1.0)
+    given = [each.detach().numpy() for each in (points, pixels, sigmas, present)]
+    poses, focals, found = _searched(task, options, *given)
+    cost = _Cost(task, options, poses, focals, given[1], given[3])
+    with torch.enable_grad():  # by the step, also where the caller wants none
+        step = torch.zeros(len(poses), _UNKNOWNS, dtype=torch.float64, requires_grad=True)
+        total = cost.half_of(step, points, pixels, sigmas)
+        (gradient,) = torch.autograd.grad(total, step, create_graph=True)
+        free = torch.as_tensor(options.estimated_unknowns)
+        rows = [
+            torch.autograd.grad(gradient[:, k].sum(), step, retain_graph=True)[0]
+            for k in free.tolist()
+        ]
+    inverse, determined = _inverted(torch.stack(rows, 1)[:, :, free])
+    valid = determined & torch.as_tensor(found)
+    covariance = torch.zeros(len(poses), _UNKNOWNS, _UNKNOWNS, dtype=torch.float64)
+    covariance[:, free[:, None], free] = inverse
+    covariance[~valid] = 0.0
+    gradient = torch.where(valid[:, None], gradient, 0.0)
+    if not any(each.requires_grad for each in (points, pixels, sigmas)):
+        gradient = gradient.detach()
+    polish = -(covariance @ gradient[..., None])[..., 0]
+    is_small = polish.detach()[:, [0, 1, 2, 6, 7, 8, 9]].abs().amax(1) < _LARGEST_POLISH
+    # Of a larger one the derivatives remain.
+    polish = polish - torch.where(is_small[:, None], 0.0, polish.detach())
+    return Optima(
+        torch.linalg.matrix_exp(_crossed(polish[:, :3])) @ cost.rotation,
+        cost.translation + polish[:, 3:6],
+        cost.scale * polish[:, 6:9].exp(),
+        torch.as_tensor(focals) * polish[:, 9].exp(),
+        covariance,
+        valid,
+    )
+
+
+class _Cost:
+    """Half the cost of problems as a function of a step from their optima, and of the data."""
+
+    def __init__(
+        self,
+        task: FitTask,
+        options: FitOptions,
+        poses: FloatArray,
+        focals: FloatArray,
+        pixels: FloatArray,
+        present: BoolArray,
+    ) -> None:
+        self._options, cameras = options, task.cameras
+        packed, self._present = torch.as_tensor(poses), torch.as_tensor(present)
+        self.rotation, self.translation = packed[:, :9].reshape(-1, 3, 3), packed[:, 9:12]
+        self.scale = packed[:, 12:]
+        rays, by_rays = _rays(pixels, present, cameras)
+        ratio = (focals / np.array([camera.fx for camera in cameras]))[:, None, None]
+        self._rays = torch.as_tensor(rays / ratio)
+        self._by_rays = torch.as_tensor(by_rays * ratio[..., None])
+        self._pixels = torch.as_tensor(pixels)
+        offset = weight = np.zeros(len(focals))
+        if options.focal == "estimate":
+            low, high, mean, of_prior = log_focal_range(cameras[0], options.focal_prior)
+            logs = np.log(focals)
+            is_held = (logs < low + _AT_BOUND) | (logs > high - _AT_BOUND)
+            weight = np.where(is_held, _HELD, of_prior)
+            offset = np.where(is_held, 0.0, logs - mean)
+        self._offset, self._weight = torch.as_tensor(offset), torch.as_tensor(weight)
+
+    def half_of(self, step: Tensor, points: Tensor, pixels: Tensor, sigmas: Tensor) -> Tensor:
+        """Half the cost of all problems; exact in the step (B, 10) to the second order."""
+        turn = _crossed(step[:, :3])
+        turned = self.rotation + turn @ self.rotation + turn @ turn @ self.rotation / 2
+        scale = self.scale * step[:, 6:9].exp()
+        center = self.translation + step[:, 3:6]
+        in_camera = (points * scale[:, None]) @ turned.mT + center[:, None]
+        rays = in_camera[..., :2] / in_camera[..., 2:].clamp(min=_LEAST_DEPTH)
+        apart = step[:, 9, None, None].exp() * rays - self._rays
+        errors = (self._by_rays @ apart[..., None])[..., 0] - (pixels - self._pixels)
+        squares = (errors**2).sum(-1) / sigmas**2
+        total = torch.where(self._present, self._lost(squares), 0.0).sum()
+        prior = self._options.scale_prior
+        logs = scale.log()
+        beyond = logs - logs.clamp(-prior.width, prior.width)
+        total = total + prior.weight * (beyond**2).sum()
+        return (total + (self._weight * (self._offset + step[:, 9]) ** 2).sum()) / 2
+
+    def _lost(self, squares: Tensor) -> Tensor:
+        bend = self._options.loss_scale
+        if self._options.loss == "huber":
+            outer = 2 * bend * squares.clamp(min=bend**2).sqrt() - bend**2
+            return torch.where(squares > bend**2, outer, squares)
+        if self._options.loss == "cauchy":
+            return bend**2 * (squares / bend**2).log1p()
+        return squares
+
+
+def _crossed(vectors: Tensor) -> Tensor:
+    """Matrices (B, 3, 3) that take the cross product with vectors (B, 3) from the left."""
+    x, y, z = vectors.unbind(1)
+    rows = [torch.zeros_like(x), -z, y, z, torch.zeros_like(x), -x, -y, x, torch.zeros_like(x)]
+    return torch.stack(rows, 1).reshape(-1, 3, 3)
+
+
+def _inverted(hessian: Tensor) -> tuple[Tensor, Tensor]:
+    """Inverses of H (B, u, u), and where the data determine all unknowns (B,).
+
+    The inverse is 0 where they do not, H being nearly singular or not positive.
+    """
+    diagonal = hessian.diagonal(dim1=1, dim2=2)
+    usable = (diagonal > 0).all(1) & hessian.isfinite().all(2).all(1)
+    root = torch.where(usable[:, None], diagonal, 1.0).sqrt()
+    scales = root[:, :, None] * root[:, None, :]
+    scaled = torch.where(usable[:, None, None], hessian / scales, torch.eye(hessian.shape[1]))
+    inverse, failed = torch.linalg.inv_ex(scaled)
+    shares = inverse.diagonal(dim1=1, dim2=2)
+    determined = usable & (failed == 0) & ((shares > 0) & (shares < 1 / _LEAST_SHARE)).all(1)
+    return torch.where(determined[:, None, None], inverse / scales, 0.0), determined
+
+
+def _rays(
+    pixels: FloatArray, present: BoolArray, cameras: tuple[Camera, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Rays (B, n, 2) of pixels, and the derivatives (B, n, 2, 2) of the pixels by these."""
+    rays, by_rays = np.zeros_like(pixels), np.zeros((*present.shape, 2, 2))
+    for b, camera in enumerate(cameras):
+        own = slice(None) if len(cameras) == 1 else slice(b, b + 1)
+        flat = np.ascontiguousarray(pixels[own].reshape(-1, 2))
+        if camera.distortion:
+            flat[~present[own].ravel()] = camera.cx, camera.cy
+        seen = rays_of(flat, camera)
+        slopes = np.diag([camera.fx, camera.fy]) @ camera.distortion_jacobian(seen)
+        rays[own], by_rays[own] = seen.reshape(rays[own].shape), slopes.reshape(by_rays[own].shape)
+    return rays, by_rays
+
+
+def _searched(
+    task: FitTask,
+    options: FitOptions,
+    points: FloatArray,
+    pixels: FloatArray,
+    sigmas: FloatArray,
+    present: BoolArray,
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Poses (B, 15) and focal lengths (B,) of the best minima, and for which problems (B,)."""
+    cameras = task.cameras * (len(points) if len(task.cameras) == 1 else 1)
+    problems = [
+        Problems(points[b, kept], pixels[b, kept], np.array([0, kept.sum()]), cameras[b])
+        for b, kept in enumerate(present)
+    ]
+    focals = np.array([camera.fx for camera in task.cameras]) * np.ones(len(points))
+    poses, valid = np.tile(_NO_POSE, (len(points), 1)), np.zeros(len(points), dtype=bool)
+
+    def fit_alone(b: int) -> None:
+        part = replace(options, sigma=sigmas[b, present[b]])
+        with suppress(CadalignError):
+            found = fit_once(problems[b], part, None, None, 0.0)
+            poses[b], focals[b], valid[b] = found.alignment.packed, found.camera.fx, True
+
+    @np.errstate(all="ignore")  # holds for one thread only
+    def run(first: int, last: int) -> None:
+        if not are_solved_at_once(problems, options):
+            for b in range(first, last):
+                fit_alone(b)
+            return
+        part = replace(options, sigma=sigmas[first:last][present[first:last]])
+        found = solve(joined(problems[first:last]), part)
+        solved = first + np.flatnonzero(found.statuses == OK)
+        poses[solved], valid[solved] = found.poses[solved - first, 0], True
+
+    in_threads(run, len(points), task.workers)
+    return poses, focals, valid

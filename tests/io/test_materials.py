@@ -14,7 +14,6 @@ from trimesh.visual.material import PBRMaterial
 
 from cadalign import Camera
 from cadalign.datasets import load_mesh
-from cadalign.io.meshes.materials import _without_options
 from cadalign.render import Scene, frame_object, look_at, make_renderer
 
 CAMERA = Camera.from_fov(320, 240, fov_x=45)
@@ -206,18 +205,3 @@ def test_real_models_are_recognisable_alike_by_every_renderer(renderer):
         difference = frame.color[both][:, :3].astype(int) - expected.color[both][:, :3]
         # Lights without size and another filter of textures make some difference.
         assert np.abs(difference).mean() < 20, path
-
-
-@pytest.mark.parametrize(
-    ("words", "file"),
-    [
-        ("stripes.png", "stripes.png"),
-        ("-s 2 2 1 stripes.png", "stripes.png"),
-        ("-o 0.5 -clamp on my stripes.png", "my stripes.png"),
-        ("-MM 0 1 -bm 0.2 stripes.png", "stripes.png"),
-        ("-clamp", "-clamp"),
-    ],
-)
-def test_the_file_of_a_texture_stands_behind_its_options(words: str, file: str) -> None:
-    """The last word is the file, whatever it looks like."""
-    assert " ".join(_without_options(words.split())) == file

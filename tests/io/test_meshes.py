@@ -13,7 +13,7 @@ from PIL import Image
 from support.refusals import refusal_text
 
 from cadalign import Mesh
-from cadalign.datasets import check_solid, flat_axes, load_mesh
+from cadalign.datasets import check_solid, load_mesh
 from cadalign.errors import DataError
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
@@ -271,7 +271,7 @@ def test_ply_polygons_keep_their_number(write, faces, binary):
 
 
 @pytest.mark.parametrize("order", ["little", "big"])
-def test_binary_ply_polygons_of_several_sizes_keep_their_colors(write, order):
+def test_binary_ply_polygons_of_several_sizes_are_read(write, order):
     """Also beside lists of other things, and before further elements."""
     sign = "<" if order == "little" else ">"
     header = (
@@ -287,8 +287,6 @@ def test_binary_ply_polygons_of_several_sizes_keep_their_colors(write, order):
     mesh = load_mesh(write(header.encode() + body + struct.pack(f"{sign}2i", 0, 1), "a.ply"))
     assert mesh.faces.tolist() == [[3, 0, 1], [0, 1, 2], [0, 2, 3]]
     assert mesh.polygon.tolist() == [0, 1, 1]
-    colors = [mesh.materials[number].color[:3] for number in mesh.face_material]
-    assert colors == [(1, 0, 0), (0, 1, 0), (0, 1, 0)]
 
 
 def test_ply_without_faces_is_a_data_error(write):
@@ -371,7 +369,6 @@ def test_flat_models_are_told_by_their_axis(axis):
     thin = np.array(box.vertices)
     thin[:, axis] *= 1e-7
     mesh = Mesh(thin, box.faces, source="bottle")
-    assert flat_axes(mesh) == ("xyz"[axis],)
     with pytest.raises(
         DataError, match=f"bottle: the model has zero thickness along {'xyz'[axis]}"
     ):
@@ -416,8 +413,8 @@ def test_forms_of_off_give_the_same_cube(write, header, vertex, face):
         ("OFF\n30 1 0\n", "the header announces 30 vertices, but only 20 are there; the file is"),
         ("OFF\n7 13 0\n", "face 0 is '0.5 0.5 0.5', behind the 7 vertices announced; the file is"),
         ("OFF\n-8 12 0\n", "the header announces -8 vertices and 12 faces; the file is cut short"),
-        ("4OFF\n8 12 0\n", "an OFF file that is of more than three dimensions is not read; save"),
-        ("OFF BINARY\n8 12 0\n", "an OFF file that is binary is not read; save it as text of th"),
+        ("4OFF\n8 12 0\n", "not an OFF file of text and of three dimensions; does it begin"),
+        ("OFF BINARY\n8 12 0\n", "not an OFF file of text and of three dimensions; does it begin"),
     ],
 )
 def test_counts_of_off_that_lie_are_named(write, text, message):

@@ -23,23 +23,6 @@ from cadalign.io.images import photo_size, read_grey, read_mask, read_photo
 ROOT = Path(__file__).resolve().parents[2]
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 4 4\n%%EndComments\nshowpage\n%%EOF\n"
 FACE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl a\nf 1/1 2/2 3/3\n"
-PLY = """ply
-format ascii 1.0
-comment TextureFile x.png
-element vertex 3
-property float x
-property float y
-property float z
-property float s
-property float t
-element face 1
-property list uchar int vertex_indices
-end_header
-0 0 0 0 0
-1 0 0 1 0
-0 1 0 0 1
-3 0 1 2
-"""
 
 
 def write_obj(folder: Path, picture: bytes) -> Path:
@@ -47,12 +30,6 @@ def write_obj(folder: Path, picture: bytes) -> Path:
     (folder / "a.mtl").write_text("newmtl a\nmap_Kd x.png\n")
     (folder / "x.png").write_bytes(picture)
     return folder / "a.obj"
-
-
-def write_ply(folder: Path, picture: bytes) -> Path:
-    (folder / "a.ply").write_text(PLY)
-    (folder / "x.png").write_bytes(picture)
-    return folder / "a.ply"
 
 
 def gltf(picture: dict[str, object], points: bytes) -> dict[str, object]:
@@ -101,7 +78,7 @@ def write_gltf_in_buffer(folder: Path, picture: bytes) -> Path:
     return folder / "a.gltf"
 
 
-MODELS = [write_obj, write_ply, write_gltf_beside, write_gltf_embedded, write_gltf_in_buffer]
+MODELS = [write_obj, write_gltf_beside, write_gltf_embedded, write_gltf_in_buffer]
 READERS = [
     read_photo,
     photo_size,

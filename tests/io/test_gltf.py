@@ -61,12 +61,6 @@ def test_nodes_are_placed_from_the_root_down(tmp_path: Path) -> None:
     assert (normals[:, 2] > 0).all()
 
 
-def test_a_file_without_a_scene_shows_all_its_nodes(tmp_path: Path) -> None:
-    nodes = [{"mesh": 0, "translation": [5, 0, 0]}, {"translation": [1, 0, 0], "children": [0]}]
-    mesh = read(tmp_path, nodes=nodes, scenes=[])
-    np.testing.assert_allclose(mesh.vertices, SQUARE + [6, 0, 0])
-
-
 @pytest.mark.parametrize(
     ("changes", "name"),
     [
@@ -82,18 +76,6 @@ def test_what_places_vertices_elsewhere_is_warned_of(
     assert not caplog.text
     read(tmp_path, **changes)
     assert f"a.gltf: not read are {name}, by which its vertices lie elsewhere" in caplog.text
-
-
-@pytest.mark.parametrize(
-    ("mode", "expected"),
-    [
-        (4, [[0, 1, 2], [0, 2, 3]]),
-        (5, [[0, 1, 2], [1, 0, 2], [2, 0, 2], [0, 3, 2]]),
-        (6, [[1, 2, 0], [2, 0, 0], [0, 2, 0], [2, 3, 0]]),
-    ],
-)
-def test_lists_strips_and_fans(tmp_path: Path, mode: int, expected: list[list[int]]) -> None:
-    assert read(tmp_path, meshes=primitive(mode=mode)).faces.tolist() == expected
 
 
 def test_colours_of_vertices_without_a_material_are_not_tinted(tmp_path: Path) -> None:
@@ -159,6 +141,10 @@ def test_vertices_that_primitives_share_are_not_repeated(tmp_path: Path) -> None
             {"extensionsRequired": ["KHR_materials_unlit", "KHR_draco_mesh_compression"]},
             "extensionsRequired: KHR_draco_mesh_compression is needed to read this file, and not "
             "known; export it without this extension; of compressed geometry, uncompressed",
+        ),
+        (
+            {"meshes": primitive(mode=5)},
+            "meshes: strips and fans of triangles are not read; export single triangles",
         ),
         ({"asset": {"version": "1.0"}}, "asset: version '1.0' of glTF; only version 2 is read"),
         (

@@ -302,7 +302,7 @@ def _record(seen: Observation | None, result: Result | None) -> Row:
     """Observation and result as JSON, but for its time, on which no two runs agree."""
     record: Row = {"observation": "", "result": ""}
     if seen is not None:
-        record["observation"] = _ENCODER.encode(seen.to_dict(states_origins=True)).decode()
+        record["observation"] = _ENCODER.encode(seen.to_dict()).decode()
     if result is not None:
         data = result.to_dict()
         data["stats"]["seconds"] = 0.0

@@ -20,7 +20,6 @@ from cadalign.io.documents import in_file, within
 from cadalign.io.files import once_per_file
 from cadalign.io.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
 from cadalign.io.observation import Observation, ObservationChanges
-from cadalign.io.observation_file import fill_xyz
 
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
@@ -155,11 +154,11 @@ class ObservationFit:
 
         Keypoints need no ``xyz`` where a learned shape is fitted.
         """
-        own = data.get("shape") if isinstance(data, dict) else None
-        if self.shape is not None or (own is not None and self.shape_sigma is None):
-            data = fill_xyz(data)
+        needs_xyz = None if self.shape_sigma is None else True
+        if self.shape is not None:
+            needs_xyz = False
         with in_file(where):
-            seen = Observation.from_dict(data, folder=folder)
+            seen = Observation.from_dict(data, folder=folder, needs_xyz=needs_xyz)
         return changes.applied_to(seen, where)  # whose errors name options
 
     def fit(

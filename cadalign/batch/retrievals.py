@@ -21,7 +21,6 @@ from cadalign.evaluation.summary import median
 from cadalign.io.documents import in_file
 from cadalign.io.files import dense_json
 from cadalign.io.observation import Observation
-from cadalign.io.observation_file import fill_xyz
 from cadalign.retrieval.query import ObservationRetrieval
 
 SCORE = Metric("match_score", "score", "%", 0, better="high", factor=100.0, log=False)
@@ -60,7 +59,7 @@ class RetrieveRunOptions(ManyOptions):
 
     def read(self, data: Any, where: str, *, folder: Path) -> Observation:
         with in_file(where):
-            seen = Observation.from_dict(fill_xyz(data), folder=folder)
+            seen = Observation.from_dict(data, folder=folder, needs_xyz=False)
         return self.changes.applied_to(seen, where)
 
     def estimate_of(self, seen: Observation, where: str) -> Estimated:

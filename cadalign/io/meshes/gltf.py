@@ -22,7 +22,7 @@ from urllib.parse import unquote, unquote_to_bytes
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import FloatArray
 from cadalign.errors import DataError, brief, quote
 from cadalign.geometry.mesh import GREY, Material, Mesh, join
 from cadalign.geometry.rotations import rotation_from_quat_wxyz

@@ -137,10 +137,6 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
             "object, pixel_origin, shape, size, symmetry, unfinished, up, up_axis, up_sigma_deg, "
             "views",
         ),
-        (
-            DATA | {"x` - at `$.y": 3},
-            "{path}: y: unknown field 'x'",
-        ),
         (changed("keypoints.2", 7), "{path}: keypoints[2]: 7 is not an object"),
         (changed("keypoints.2.xyz", ...), "{path}: keypoints[2].xyz: missing"),
         (changed("keypoints.3.uv", ...), "{path}: keypoints[3].uv: missing"),

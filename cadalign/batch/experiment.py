@@ -27,7 +27,7 @@ from cadalign.estimation.result import Result
 from cadalign.evaluation.options import ExperimentOptions, absolute_paths
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import Columns, Plan, Row, fingerprint
-from cadalign.export.tables import failed_row
+from cadalign.export.results import failed_row
 from cadalign.io.documents import in_file, parse_json
 from cadalign.io.evidence import ObservedImage
 from cadalign.io.files import read_bytes, read_text

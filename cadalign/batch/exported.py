@@ -7,15 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cadalign.arrays import FloatArray
 from cadalign.batch.observed import own_ids
 from cadalign.errors import CadalignError, DataError, InputError, all_left_out, unknown
 from cadalign.estimation.result import Result
 from cadalign.estimation.results import Results
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import read_groups
-from cadalign.export.aligned_object import AlignedObject
-from cadalign.export.formats import FORMATS, export_object
+from cadalign.export.aligned_object import FORMATS, AlignedObject, export_object
 from cadalign.export.results import object_of
 from cadalign.io.documents import in_file, parse_json, read_json
 from cadalign.io.files import keeping
@@ -32,7 +30,6 @@ def read_exported(
     *,
     observation: Path | None = None,
     shape: Path | None = None,
-    world_from_cam: FloatArray | None = None,
     metres: float = 1.0,
 ) -> AlignedObject:
     """Read the result of `cadalign fit`, the file ``fit``, and what it was fitted to.
@@ -50,8 +47,7 @@ def read_exported(
     with in_file(fit):
         result = Result.from_dict(data)
     shape = shape or _stored(fit, data, "shape")
-    how = {"world_from_cam": world_from_cam, "metres": metres}
-    exported = exported_object(result, seen, path, shape=shape, **how)
+    exported = exported_object(result, seen, path, shape=shape, metres=metres)
     sources = fit, path, *seen.files, *([] if shape is None else [shape])
     return replace(exported, sources=sources)
 
@@ -85,7 +81,7 @@ def export_run(
 ) -> tuple[int, list[CadalignError]]:
     """Write a file of every alignment of a finished run to a folder, named by their rows.
 
-    ``format`` is one of `cadalign.export.formats.FORMATS`, by default the folder's name; ``metres``
+    ``format`` is one of `cadalign.export.FORMATS`, by default the folder's name; ``metres``
     the length of one unit of the model [m]. Returns the number of objects, and why others are left
     out.
 

@@ -10,10 +10,8 @@ import tyro
 
 from cadalign.cli.common import SOME_FAILED, SUCCESS, say
 from cadalign.cli.options import named_as_flags
-from cadalign.datasets.photos.scannet import read_matrix
 from cadalign.errors import refuse_unused
-from cadalign.export.aligned_object import Frame
-from cadalign.export.formats import FORMATS, export_object, format_of
+from cadalign.export.aligned_object import FORMATS, Frame, export_object, format_of
 
 _MOST_LISTED = 10
 
@@ -42,10 +40,7 @@ class Export:
     """Length of one unit of the model [m]. Written are metres."""
     frame: Frame = "camera"
     """Frame of the exported coordinates: the first photo's camera, the frame that cameras of known
-    motion share, the world, or the stretched model's own."""
-    world: Path | None = None
-    """Text file of the first camera's pose in the world, 4 x 4, as ScanNet's pose files; for
-    --frame world."""
+    motion share, or the stretched model's own."""
 
     def run(self) -> int:
         """Write the file; returns the exit code."""
@@ -56,15 +51,12 @@ class Export:
             fit = fit / "fit.json"
         if fit.is_dir():
             return self._export_run()
-        with named_as_flags(self, world_from_cam="--world"):
-            if self.frame != "world":
-                refuse_unused(self, ["world"], "without --frame world")
+        with named_as_flags(self):
             name = self.format or format_of(self.to)
             exported = read_exported(
                 fit,
                 observation=self.observation,
                 shape=self.shape,
-                world_from_cam=None if self.world is None else read_matrix(self.world, (4, 4)),
                 metres=self.metres,
             )
             path = export_object(self.to, exported, format=name, frame=self.frame)
@@ -76,7 +68,7 @@ class Export:
         from cadalign.batch.exported import export_run
 
         with named_as_flags(self):
-            refuse_unused(self, ["observation", "shape", "world", "frame"], "on a run")
+            refuse_unused(self, ["observation", "shape", "frame"], "on a run")
             count, left_out = export_run(self.fit, self.to, format=self.format, metres=self.metres)
         for error in left_out[:_MOST_LISTED]:
             say(f"left out: {error}")

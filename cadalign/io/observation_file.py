@@ -170,16 +170,15 @@ def read_image_fields(
     """
     for field in ("name", "semantic_id"):
         require_unique(read.keypoints, field)
-    columns = {name: _column(read.keypoints, name) for name in _COLUMNS}
+    columns = [_column(read.keypoints, name) for name in _COLUMNS]
     for row, each in enumerate(read.keypoints):
         if needs_xyz and each.xyz is None:
             raise DataError("missing", where=f"keypoints[{row}].xyz")
     camera, points_2d = Camera.from_dict(read.camera), _pixels(read.keypoints)
     kept = np.flatnonzero(~unmeasured(points_2d)).tolist()
     lost = tuple(sorted(set(range(len(points_2d))).difference(kept)))
-    names, ids, sigma, scores = (
-        None if column is None else [column[row] for row in kept] for column in columns.values()
-    )
+    given: list[Any] = [column and [column[row] for row in kept] for column in columns]
+    names, ids, sigma, scores = given
     keypoints, points_2d = [read.keypoints[row] for row in kept], points_2d[kept]
     check_pixels(points_2d, camera.width, camera.height, where="keypoints.uv")
     depths = np.array([each.depth for each in keypoints], dtype=float)  # NaN for None

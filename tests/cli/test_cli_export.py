@@ -85,14 +85,6 @@ def test_the_command_says_what_is_missing(
     assert "--frame: the views have no known motion" in refusal(
         capsys, result, *to, *given, "--frame", "rig"
     )
-    said = refusal(capsys, result, *to, *given, "--frame", "world")
-    assert "--frame: the camera's pose in the world is not known; give --world" in said
-    pose = tmp_path / "pose.txt"
-    pose.write_text("1 0 0 0\n0 1 0\n")
-    said = refusal(capsys, result, *to, *given, "--world", pose)
-    assert "--world: has no effect without --frame world; leave it out" in said
-    said = refusal(capsys, result, *to, *given, "--frame", "world", "--world", pose)
-    assert f"{pose}: " in said
     result.write_text(result.read_text()[:200])
     assert f"{result}, line" in refusal(capsys, result, *to, *given)
     assert "no such file" in refusal(capsys, tmp_path / "gone.json", *to, *given)

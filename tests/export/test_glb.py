@@ -176,12 +176,10 @@ def test_every_view_has_a_camera_where_it_stands(tmp_path: Path) -> None:
     np.testing.assert_allclose(second, flip @ np.linalg.inv(cam_from_first) @ flip, atol=1e-9)
 
 
-def test_world_frame_places_camera_and_object(tmp_path: Path) -> None:
-    world = np.eye(4)
-    world[:3, 3] = 1, 2, 3
-    exported = aligned(tmp_path, world_from_cam=world)
-    path = tmp_path / "world.glb"
-    export_object(path, exported, frame="world")
+def test_rig_frame_places_camera_and_object(tmp_path: Path) -> None:
+    moved = replace(POSE, translation=POSE.translation + [1, 2, 3])
+    path = tmp_path / "rig.glb"
+    export_object(path, aligned(tmp_path, rig_from_model=moved), frame="rig")
     camera = next(each for each in tree_of(path)["nodes"] if "camera" in each)
     place = np.reshape(camera["matrix"], (4, 4)).T[:3, 3]
     np.testing.assert_allclose(place, [1, 2, 3], rtol=1e-14)  # a rotation and back rounds

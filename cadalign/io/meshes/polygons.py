@@ -107,7 +107,7 @@ def _blocks(
     while left:
         kind = _row_type(data, place, element, form)
         count = 0 if kind is None else min(left, wanted, (len(data) - place) // kind.itemsize)
-        rows = np.frombuffer(data, kind, count, place) if count else np.empty(0)
+        rows: Any = np.frombuffer(data, kind, count, place) if count else np.empty(0)
         if not len(rows):
             what = {"vertex": "vertices", "face": "faces"}.get(element.name, element.name)
             require_count(what, element.count, element.count - left, 0, path)

@@ -125,12 +125,12 @@ def remove_earlier(folder: Path, files: Iterable[Path]) -> None:
     paths = list(files)
     for path in paths:
         refuse_input(path)
-    for path in paths:
-        with writing(folder):
+    with writing(folder):
+        for path in paths:
             path.unlink(missing_ok=True)
-        if path.parent != folder:
             with suppress(OSError):  # something else is in it
-                path.parent.rmdir()
+                if path.parent != folder:
+                    path.parent.rmdir()
 
 
 def refuse_folder(path: Path) -> None:

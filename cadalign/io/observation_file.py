@@ -170,23 +170,22 @@ def read_image_fields(
     """
     for field in ("name", "semantic_id"):
         require_unique(read.keypoints, field)
-    columns = [_column(read.keypoints, name) for name in _COLUMNS]
-    for row, each in enumerate(read.keypoints):
-        if needs_xyz and each.xyz is None:
-            raise DataError("missing", where=f"keypoints[{row}].xyz")
     camera, points_2d = Camera.from_dict(read.camera), _pixels(read.keypoints)
     kept = np.flatnonzero(~unmeasured(points_2d)).tolist()
-    lost = tuple(sorted(set(range(len(points_2d))).difference(kept)))
-    given: list[Any] = [column and [column[row] for row in kept] for column in columns]
-    names, ids, sigma, scores = given
-    keypoints, points_2d = [read.keypoints[row] for row in kept], points_2d[kept]
+    keypoints = {row: read.keypoints[row] for row in kept}
+    points_2d = points_2d[kept]
+    names, ids, sigma, scores = (_column(keypoints, name) for name in _COLUMNS)
+    for row, each in keypoints.items():
+        if needs_xyz and each.xyz is None:
+            raise DataError("missing", where=f"keypoints[{row}].xyz")
     check_pixels(points_2d, camera.width, camera.height, where="keypoints.uv")
-    depths = np.array([each.depth for each in keypoints], dtype=float)  # NaN for None
+    places = [each.xyz or (0, 0, 0) for each in keypoints.values()]
+    depths = np.array([each.depth for each in keypoints.values()], dtype=float)  # NaN for None
     evidence = {name: getattr(read, name) for name in EVIDENCE}
     for name in _PATHS:
         evidence[name] = evidence[name] and path_from(evidence[name], folder)
     return ObservedImage(
-        points_3d=np.array([each.xyz or (0, 0, 0) for each in keypoints]).reshape(-1, 3),
+        points_3d=np.array(places, dtype=float).reshape(-1, 3),
         points_2d=points_2d - shift_of(read.pixel_origin),
         camera=camera,
         sigma=sigma,
@@ -195,7 +194,7 @@ def read_image_fields(
         scores=scores,
         image=None if read.image is None else path_from(read.image, folder),
         depths=depths if np.isfinite(depths).any() else None,
-        not_found=lost,
+        not_found=tuple(sorted(set(range(len(read.keypoints))).difference(kept))),
         evidence=ImageEvidence(**evidence),
     )
 
@@ -252,10 +251,10 @@ def write_image_fields(image: ObservedImage, folder: Path | None) -> dict[str, A
     return data
 
 
-def _column(keypoints: Sequence[KeypointFields], name: str) -> Any:
-    """One optional field of all keypoints as a list; None where none has it."""
-    values = [getattr(keypoint, name) for keypoint in keypoints]
-    missing = [row for row, value in enumerate(values) if value is None]
+def _column(keypoints: Mapping[int, KeypointFields], name: str) -> Any:
+    """One optional field of all keypoints, by rows, as a list; None where none has it."""
+    values = {row: getattr(keypoint, name) for row, keypoint in keypoints.items()}
+    missing = [row for row, value in values.items() if value is None]
     if len(missing) == len(values):
         return None
     if missing:
@@ -264,4 +263,4 @@ def _column(keypoints: Sequence[KeypointFields], name: str) -> Any:
             where=f"keypoints[{missing[0]}].{name}",
             fix="give it for all keypoints or for none",
         )
-    return values
+    return list(values.values())

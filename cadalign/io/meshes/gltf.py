@@ -41,18 +41,16 @@ _EXTENSIONS = (
     "KHR_xmp_json_ld",
 )
 _LOOKS = "KHR_materials_"
-_INSTANCES = "EXT_mesh_gpu_instancing"
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6  # a primitive's modes; points and lines have others
-# A node of some 20 bytes repeats a whole mesh: what all take together is bounded by the file.
-_FREE_BYTES, _EXPANSION = 2**27, 64
-_VERTEX_BYTES, _FACE_BYTES = 24 + 32, 24 + 48 + 8 + 8  # colours, texture coordinates included
+_FREE_FACES = 2**20  # of a scene; each takes up to 256 bytes
 
 
 def read_gltf(data: bytes, path: Path) -> Mesh:
     """Read the content of a glTF or GLB file as one mesh, each node placed by its transform.
 
     Raises DataError if it is no glTF 2.0 file, has no faces, is no tree of nodes, needs an
-    extension that is not read, or repeats its meshes to more than 128 MB and 64 times its bytes.
+    extension that is not read, or repeats its meshes to more than a million faces and one for every
+    two bytes.
     """
     text, binary = _chunks(data, path) if data[:4] == b"glTF" else (data, b"")
     with reading(path):
@@ -67,7 +65,11 @@ def read_gltf(data: bytes, path: Path) -> Mesh:
     ]
     if not placed:
         raise DataError("the file has no faces", fix="is it whole?")
-    _check_size(file, [primitive for primitive, _ in placed])
+    # A node of some 20 bytes repeats a whole mesh.
+    faces = sum(_count_faces(document, primitive) for primitive, _ in placed)
+    if faces > _FREE_FACES + file.size // 2:
+        what = f"its nodes repeat meshes to {faces} faces, from {file.size} bytes"
+        raise DataError(what, fix="simplify it, or leave copies out")
     _warn_of_what_moves(file)
     distinct = {id(primitive): primitive for primitive, _ in placed}
     surfaces = {key: _surface(file, primitive) for key, primitive in distinct.items()}
@@ -213,16 +215,13 @@ def _check(document: _Part) -> None:
 
 def _warn_of_what_moves(file: _GltfFile) -> None:
     """Warn of what places vertices elsewhere in viewers, and is not read."""
-    document = file.document
     found = {
-        "skins": any("skin" in node for node in document["nodes"]),
-        "morph targets": any(any(each.get("weights", [])) for each in document["meshes"]),
-        _INSTANCES: _INSTANCES in document.get("extensionsUsed", []),
+        "skins": any("skin" in node for node in file.document["nodes"]),
+        "morph targets": any(any(each.get("weights", [])) for each in file.document["meshes"]),
     }
-    if any(found.values()):
-        names = " and ".join(name for name, is_there in found.items() if is_there)
-        said = "%s: not read are %s, by which its vertices lie elsewhere; export it with them"
-        logger.warning(f"{said} applied", file.path, names)
+    for name in (name for name, is_there in found.items() if is_there):
+        said = "%s: %s are not read, by which its vertices lie elsewhere; export it with them"
+        logger.warning(f"{said} applied", file.path, name)
 
 
 def _placements(document: _Part) -> Iterator[tuple[int, FloatArray]]:
@@ -268,25 +267,10 @@ def _count_faces(document: _Part, primitive: _Part) -> int:
     return count // 3
 
 
-def _check_size(file: _GltfFile, primitives: list[_Part]) -> None:
-    """Refuse a scene that repeats its meshes to far more than its file."""
-    faces = size = 0
-    for primitive in primitives:
-        count = _count_faces(file.document, primitive)
-        vertices = nth(file.document, "accessors", primitive["attributes"]["POSITION"])["count"]
-        faces += count
-        # Many primitives may share one array; files that are named count as well.
-        size += _VERTEX_BYTES * min(vertices, 3 * count) + _FACE_BYTES * count
-    if size > _FREE_BYTES + _EXPANSION * file.size:
-        what = f"its nodes repeat meshes to {faces} faces, from {file.size} bytes"
-        raise DataError(what, fix="simplify it, or leave copies out")
-
-
 def _surface(file: _GltfFile, primitive: _Part) -> Mesh:
     """The mesh of a primitive in its own frame."""
     material, use = Material(), _Part()
     if "material" in primitive:
-        nth(file.document, "materials", primitive["material"])
         material, use = file.looks[primitive["material"]]
     vertices = file.attribute(primitive, "POSITION", 3).astype(np.float64)
     corners = np.arange(len(vertices))

@@ -184,11 +184,7 @@ def written_path(path: Path, *, folder: Path | None) -> str:
     for base in (folder, folder.resolve()):
         if path.is_relative_to(base):
             return path.relative_to(base).as_posix()
-    there = path.resolve()
-    try:
-        return Path(os.path.relpath(there, folder.resolve())).as_posix()
-    except ValueError:  # on another drive
-        return there.as_posix()
+    return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
 
 
 _STEP = re.compile(r"\[(?P<row>\d+|\.\.\.)\]|\.?(?P<name>[^.\[\]]+)")

@@ -205,25 +205,17 @@ class ObservedImage:
         object.__setattr__(self, "points_3d", points_3d)
         object.__setattr__(self, "points_2d", points_2d)
         _keep_paths(self, "image")
-        for name in ("sigma", "scores"):
+        for name in ("sigma", "scores", "depths"):
             if (value := getattr(self, name)) is not None:
-                checked = as_floats(value, name=name, shape=(len(points_3d),))
+                shape, finite = (len(points_3d),), name != "depths"
+                checked = as_floats(value, name=name, shape=shape, finite=finite)
                 object.__setattr__(self, name, checked)
-        if self.depths is None:
-            if self.evidence.depth_sigma is not None and self.evidence.depth is None:
-                raise InputError("given without depth", where="depth_sigma", fix="give depth, too")
-            return
-        if self.evidence.depth is not None:
-            raise InputError(
+        if self.depths is not None and self.evidence.depth is not None:
+            what, fix = (
                 "a depth image and depths of keypoints are given",
-                where="depth",
-                fix="leave out one of the two",
+                "leave out one of the two",
             )
-        depths = np.asarray(self.depths, dtype=np.float64)
-        if depths.shape != (len(points_3d),):
-            what = f"shape {depths.shape}, expected ({len(points_3d)},)"
-            raise InputError(what, where="depths")
-        object.__setattr__(self, "depths", depths)
+            raise InputError(what, where="depth", fix=fix)
 
     @property
     def labels(self) -> tuple[str | int, ...]:

@@ -28,7 +28,6 @@ MESH_ENDINGS = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
 PHOTO_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 _HEAD_BYTES = 1024
-_MATRIX = 9  # numbers of a calibration matrix as text
 _MOST_BYTES = 2**26  # of a JSON file that is read to name its kind
 _STARTS = {
     PHOTO: (b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"II*\0", b"MM\0*"),
@@ -92,9 +91,6 @@ def kind_of_file(path: Path) -> str | None:
             file.seek(0)
             if (kind_found := kind_of(json.loads(file.read()))) is not None:
                 return kind_found
-        numbers = head.replace(b",", b" ").split() if suffix not in MESH_ENDINGS else []
-        if len(numbers) == _MATRIX and list(map(float, numbers)):
-            return CAMERA
     if is_there and suffix in MESH_ENDINGS:
         return MESH
     return PHOTO if is_there and suffix in (*PHOTO_ENDINGS, ".gif", ".heic") else None

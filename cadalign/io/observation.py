@@ -326,16 +326,14 @@ def _read_form(path: Path) -> dict[str, Any]:
         raise
     if error := other_kind(path, CAMERA, kind_of(data)):
         raise error
-    if isinstance(data, list):
-        return {"matrix": _square(data, path)}
-    if not isinstance(data, dict):
+    form = {"matrix": data} if isinstance(data, list) else data
+    if not isinstance(form, dict):
         what = f"camera: expected an object, got {type(data).__name__}"
         raise DataError(what, where=str(path), fix=_FIX)
-    for name in _MATRIX_NAMES:
-        if name in data and "params" not in data:
-            rest = {key: value for key, value in data.items() if key != name}
-            return {**rest, "matrix": _square(data[name], path)}
-    return dict(data)
+    name = next((name for name in _MATRIX_NAMES if name in form), None)
+    if name is not None and "params" not in form:
+        form["matrix"] = _square(form.pop(name), path)
+    return form
 
 
 def _read_array(path: Path) -> Any:

@@ -67,12 +67,6 @@ def test_readers_name_what_a_file_is(tmp_path: Path, kind: str, wanted: str) -> 
     assert str(caught.value).startswith(f"{path}: {kind}, not {wanted}; ")
 
 
-def test_a_matrix_as_text_is_a_camera(tmp_path: Path) -> None:
-    path = tmp_path / "K.txt"
-    path.write_text("900 0 320\n0 900 240\n0 0 1\n")
-    assert refusal_text(lambda: Observation.load(path)).startswith(f"{path}: a camera, not an ")
-
-
 def test_a_field_that_stands_twice_is_named() -> None:
     text = '{"keypoints": [{}, {"uv": [1, 2], "uv": [3, 4]}]}'
     wanted = "o.json: the field 'uv' stands twice in one object; leave one of the two out"

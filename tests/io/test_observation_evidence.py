@@ -218,7 +218,7 @@ def test_malformed_evidence_is_refused_by_file_and_field(
 def test_arrays_of_evidence_are_checked() -> None:
     camera = Camera.from_dict(CAMERA)
     points = np.zeros((2, 3)), np.zeros((2, 2))
-    with pytest.raises(InputError, match=r"depths: shape \(3,\), expected \(2,\)"):
+    with pytest.raises(InputError, match=r"depths: shape \(3,\), expected \(2\)"):
         ObservedImage(*points, camera, depths=np.ones(3))
     with pytest.raises(InputError, match="cam_from_rig: "):
         ImageEvidence(cam_from_rig=np.eye(3))

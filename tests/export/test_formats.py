@@ -43,14 +43,6 @@ def test_obj_keeps_materials_and_texture(tmp_path: Path) -> None:
     np.testing.assert_allclose(mesh.corner_uv, expected.corner_uv, atol=1e-6)
 
 
-def test_ply_keeps_colors(tmp_path: Path) -> None:
-    colors = np.round(np.random.default_rng(0).uniform(0, 1, (6, 4)) * 255) / 255
-    painted = replace(wedge(), vertex_colors=colors)
-    mesh = load_mesh(export_object(tmp_path / "wedge.ply", aligned(tmp_path, mesh=painted)))
-    assert mesh.vertex_colors is not None
-    np.testing.assert_allclose(mesh.vertex_colors, colors, atol=1e-6)
-
-
 def test_names_tell_formats() -> None:
     for name in FORMATS:
         assert format_of(f"folder/x.{name}") == name

@@ -40,12 +40,3 @@ def test_a_folder_that_cannot_be_made_is_named(
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match="file: cannot be written"):
         write(tmp_path / "file" / f"wedge.{ending}", wedge())
-
-
-def test_obj_faces_keep_their_materials(tmp_path: Path) -> None:
-    mesh = wedge()
-    write_obj_mesh(tmp_path / "wedge.obj", mesh)
-    read = load_mesh(tmp_path / "wedge.obj")
-    np.testing.assert_array_equal(read.face_material, mesh.face_material)
-    changes = 1 + int((np.diff(mesh.face_material) != 0).sum())
-    assert (tmp_path / "wedge.obj").read_text().count("usemtl") == changes

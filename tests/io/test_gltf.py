@@ -61,22 +61,6 @@ def test_nodes_are_placed_from_the_root_down(tmp_path: Path) -> None:
     assert (normals[:, 2] > 0).all()
 
 
-@pytest.mark.parametrize(
-    ("changes", "name"),
-    [
-        ({"nodes": [{"mesh": 0, "skin": 0}]}, "skins"),
-        ({"meshes": [{**primitive()[0], "weights": [0.5]}]}, "morph targets"),
-    ],
-)
-def test_what_places_vertices_elsewhere_is_warned_of(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, changes: dict[str, Any], name: str
-) -> None:
-    read(tmp_path)
-    assert not caplog.text
-    read(tmp_path, **changes)
-    assert f"a.gltf: {name} are not read, by which its vertices lie elsewhere" in caplog.text
-
-
 def test_colours_of_vertices_without_a_material_are_not_tinted(tmp_path: Path) -> None:
     """Nor are grey surfaces without either made white."""
     colored = read(tmp_path, meshes=primitive(attributes={"POSITION": 0, "COLOR_0": 0}))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 from collections.abc import Callable, Iterator
@@ -11,8 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from PIL import Image
-from support.refusals import refusal_line
 
 from cadalign import Camera, FocalPrior, Library, Result, Results, ShapeModel
 from cadalign.datasets import (
@@ -101,20 +98,6 @@ def test_files_without_end_are_no_inputs(tmp_path: Path, reader: Reader) -> None
         reader.read(path)
 
 
-def test_shape_that_an_observation_names_is_no_device(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    observation = {
-        "camera": {"width": 64, "height": 48},
-        "keypoints": [{"xyz": [0, 0, 0], "uv": [1, 1], "name": name} for name in "abcdefgh"],
-        "shape": "/dev/zero",
-    }
-    path = tmp_path / "o.json"
-    path.write_text(json.dumps(observation))
-    message = refusal_line(capsys, "fit", path, "--no-picture")
-    assert "/dev/zero: not a regular file; give a file, no pipe and no device" in message
-
-
 def test_runs_are_no_pipes(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "run.json")
     with pytest.raises(DataError, match=r"run\.json: not a regular file"):
@@ -168,15 +151,3 @@ def test_texts_are_paths_of_cameras_and_observations(tmp_path: Path) -> None:
     seen.save(tmp_path / "seen.json")
     read = Observation.load(tmp_path / "seen.json")
     assert (read.image, read.evidence.mask) == (tmp_path / "photo.png", tmp_path / "mask.png")
-
-
-def test_a_photo_in_place_of_a_mask_is_named_once(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    photo, model = tmp_path / "photo.png", tmp_path / "model.obj"
-    Image.new("RGB", (64, 48)).save(photo)
-    model.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    alone = refusal_line(capsys, "fit", "--mask", photo, "--model", model, "--focal", 50)
-    assert alone == (
-        f"{photo}: the image has the mode RGB; give an image of one grey channel, of 8 or 16 bits"
-    )

@@ -145,6 +145,12 @@ def test_formats_that_are_promised_are_read(tmp_path: Path, ending: str) -> None
     assert read_photo(path)[3, 3, 0] > 200
 
 
+def test_a_photo_is_no_mask(tmp_path: Path) -> None:
+    Image.new("RGB", (64, 48)).save(tmp_path / "a.png")
+    with pytest.raises(DataError, match=r"the image has the mode RGB; give an image of one grey"):
+        read_mask(tmp_path / "a.png")
+
+
 def test_one_module_decodes_pictures() -> None:
     others = re.compile(r"\bImage\.open\(|\bimread\(|\bimdecode\(|trimesh\.load\((?!io\.BytesIO)")
     files = [p for folder in ("cadalign", "datasets", "render", "scripts")

@@ -12,7 +12,6 @@ requires.
 from __future__ import annotations
 
 import base64
-import logging
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -30,8 +29,6 @@ from cadalign.io.documents import parse_json
 from cadalign.io.files import damaged, read_bytes, reading, require_count
 from cadalign.io.meshes.materials import WHITE, Texture, Textures
 
-logger = logging.getLogger("cadalign")
-
 _Part = dict[str, Any]
 _NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -47,6 +44,8 @@ _FREE_FACES = 2**20  # of a scene; each takes up to 256 bytes
 
 def read_gltf(data: bytes, path: Path) -> Mesh:
     """Read the content of a glTF or GLB file as one mesh, each node placed by its transform.
+
+    Skins and morph targets have no effect.
 
     Raises DataError if it is no glTF 2.0 file, has no faces, is no tree of nodes, needs an
     extension that is not read, or repeats its meshes to more than a million faces and one for every
@@ -70,7 +69,6 @@ def read_gltf(data: bytes, path: Path) -> Mesh:
     if faces > _FREE_FACES + file.size // 2:
         what = f"its nodes repeat meshes to {faces} faces, from {file.size} bytes"
         raise DataError(what, fix="simplify it, or leave copies out")
-    _warn_of_what_moves(file)
     distinct = {id(primitive): primitive for primitive, _ in placed}
     surfaces = {key: _surface(file, primitive) for key, primitive in distinct.items()}
     return join([_moved(surfaces[id(primitive)], at) for primitive, at in placed], str(path))
@@ -211,17 +209,6 @@ def _check(document: _Part) -> None:
             where="extensionsRequired",
             fix="export it without this extension; of compressed geometry, uncompressed",
         )
-
-
-def _warn_of_what_moves(file: _GltfFile) -> None:
-    """Warn of what places vertices elsewhere in viewers, and is not read."""
-    found = {
-        "skins": any("skin" in node for node in file.document["nodes"]),
-        "morph targets": any(any(each.get("weights", [])) for each in file.document["meshes"]),
-    }
-    for name in (name for name, is_there in found.items() if is_there):
-        said = "%s: %s are not read, by which its vertices lie elsewhere; export it with them"
-        logger.warning(f"{said} applied", file.path, name)
 
 
 def _placements(document: _Part) -> Iterator[tuple[int, FloatArray]]:

@@ -11,20 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.gltf_files import FACES, SQUARE, data_uri, write_gltf
+from support.gltf_files import CORNERS, FACES, POSITIONS, SQUARE, VIEWS, data_uri, write_gltf
 from support.timing import reference_seconds, timed
 
 from cadalign.datasets import load_mesh
 from cadalign.errors import DataError
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.meshes.materials import WHITE
-
-VIEWS = [
-    {"buffer": 0, "byteLength": 48},
-    {"buffer": 0, "byteOffset": 48, "byteLength": 12},
-]
-POSITIONS = {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"}
-CORNERS = {"bufferView": 1, "componentType": 5123, "count": 6, "type": "SCALAR"}
 
 
 def read(tmp_path: Path, **changes: Any) -> Mesh:

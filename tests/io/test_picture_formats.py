@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import base64
-import json
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import PIL.EpsImagePlugin
 import pytest
 from PIL import Image
+from support.gltf_files import CORNERS, POSITIONS, SQUARE, VIEWS, data_uri, write_gltf
 
 from cadalign import FocalPrior
 from cadalign.annotate.photos import PhotoFile
@@ -32,50 +32,33 @@ def write_obj(folder: Path, picture: bytes) -> Path:
     return folder / "a.obj"
 
 
-def gltf(picture: dict[str, object], points: bytes) -> dict[str, object]:
-    uv = np.array([[0, 0], [1, 0], [0, 1]], "<f4").tobytes()
-    data = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes() + uv + points
-    attributes = {"POSITION": 0, "TEXCOORD_0": 1}
-    return {
-        "asset": {"version": "2.0"},
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": attributes, "material": 0}]}],
-        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
-        "textures": [{"source": 0}],
-        "images": [picture],
-        "buffers": [{"byteLength": len(data), "uri": data_uri(data)}],
-        "bufferViews": [
-            {"buffer": 0, "byteLength": 36},
-            {"buffer": 0, "byteOffset": 36, "byteLength": 24},
-            {"buffer": 0, "byteOffset": 60, "byteLength": len(points)},
-        ],
-        "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
-            {"bufferView": 1, "componentType": 5126, "count": 3, "type": "VEC2"},
-        ],
-    }
-
-
-def data_uri(data: bytes) -> str:
-    return "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+def write_gltf_with(folder: Path, image: dict[str, Any], more: bytes = b"") -> Path:
+    views = [{"buffer": 0, "byteOffset": 60, "byteLength": 32}]
+    views += [{"buffer": 0, "byteOffset": 92, "byteLength": len(more)}]
+    attributes = {"POSITION": 0, "TEXCOORD_0": 2}
+    return write_gltf(
+        folder / "a.gltf",
+        more=SQUARE[:, :2].tobytes() + more,
+        bufferViews=VIEWS + views,
+        accessors=[POSITIONS, CORNERS, POSITIONS | {"bufferView": 2, "type": "VEC2"}],
+        meshes=[{"primitives": [{"attributes": attributes, "indices": 1, "material": 0}]}],
+        materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+        textures=[{"source": 0}],
+        images=[image],
+    )
 
 
 def write_gltf_beside(folder: Path, picture: bytes) -> Path:
     (folder / "x y.png").write_bytes(picture)
-    (folder / "a.gltf").write_text(json.dumps(gltf({"uri": "x%20y.png"}, b"")))
-    return folder / "a.gltf"
+    return write_gltf_with(folder, {"uri": "x%20y.png"})
 
 
 def write_gltf_embedded(folder: Path, picture: bytes) -> Path:
-    (folder / "a.gltf").write_text(json.dumps(gltf({"uri": data_uri(picture)}, b"")))
-    return folder / "a.gltf"
+    return write_gltf_with(folder, {"uri": data_uri(picture)})
 
 
 def write_gltf_in_buffer(folder: Path, picture: bytes) -> Path:
-    image: dict[str, object] = {"bufferView": 2, "mimeType": "image/png"}
-    (folder / "a.gltf").write_text(json.dumps(gltf(image, picture)))
-    return folder / "a.gltf"
+    return write_gltf_with(folder, {"bufferView": 3, "mimeType": "image/png"}, picture)
 
 
 MODELS = [write_obj, write_gltf_beside, write_gltf_embedded, write_gltf_in_buffer]

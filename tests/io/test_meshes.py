@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import logging
 import struct
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from support.exported import wedge
 from support.refusals import refusal_text
 
 from cadalign import Mesh
 from cadalign.datasets import check_solid, load_mesh
 from cadalign.errors import DataError
+from cadalign.io.meshes.files import write_obj_mesh, write_ply_mesh
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 
@@ -430,3 +434,33 @@ def test_what_is_cut_short_says_what_is_there(write, kind, cut, message):
     content = (content if isinstance(content, bytes) else content.encode()).rstrip()
     with pytest.raises(DataError, match=message):
         load_mesh(write(content[:cut], f"a.{kind.removesuffix('_ascii')}"))
+
+
+# --- written files
+
+WRITERS = {"obj": write_obj_mesh, "ply": write_ply_mesh}
+
+
+@pytest.mark.parametrize(("ending", "write"), WRITERS.items())
+def test_vertices_faces_and_colors_come_back(
+    tmp_path: Path, ending: str, write: Callable[[Path, Mesh], None]
+) -> None:
+    colors = np.round(np.random.default_rng(0).uniform(0, 1, (6, 4)) * 255) / 255
+    colors[:, 3] = 1
+    mesh = replace(wedge(), vertex_colors=colors)
+    path = tmp_path / "new" / "folder" / f"wedge.{ending}"
+    write(path, mesh)
+    read = load_mesh(path)
+    np.testing.assert_allclose(read.vertices, mesh.vertices, rtol=1e-6)
+    np.testing.assert_array_equal(read.faces, mesh.faces)
+    assert read.vertex_colors is not None
+    np.testing.assert_allclose(read.vertex_colors, colors, atol=1e-6)
+
+
+@pytest.mark.parametrize(("ending", "write"), WRITERS.items())
+def test_a_folder_that_cannot_be_made_is_named(
+    tmp_path: Path, ending: str, write: Callable[[Path, Mesh], None]
+) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="file: cannot be written"):
+        write(tmp_path / "file" / f"wedge.{ending}", wedge())

@@ -34,7 +34,15 @@ from cadalign.io.documents import (
 )
 from cadalign.io.evidence import ImageEvidence, ObservedImage, Size
 from cadalign.io.files import as_path, once_per_file, read_bytes, read_text, write_json
-from cadalign.io.kinds import CAMERA, OBSERVATION, kind_of, other_kind, refuse_other_file
+from cadalign.io.kinds import (
+    CAMERA,
+    CAMERA_FIX,
+    MATRIX_NAMES,
+    OBSERVATION,
+    kind_of,
+    other_kind,
+    refuse_other_file,
+)
 from cadalign.io.observation_file import (
     read_fields,
     read_image_fields,
@@ -276,8 +284,6 @@ class DetectorOptions:
 
 _ARRAY = ".npy"
 _MOST_BYTES = 2**20  # of an array, which has nine numbers
-_MATRIX_NAMES = ("matrix", "K", "camera_matrix", "cam_K")
-_FIX = "give 3 x 3 numbers, or a JSON file with model, width, height and params as COLMAP does"
 
 
 def read_camera(
@@ -291,7 +297,7 @@ def read_camera(
     ----------
     path : path-like
         A calibration matrix K: text of 3 x 3 numbers, a ``.npy`` array, or JSON, bare or as
-        ``matrix`` (also ``K``, ``camera_matrix``, ``cam_K``), by rows; or a camera in the form of
+        ``matrix`` (also ``K``, ``camera_matrix``), by rows; or a camera in the form of
         `Camera.from_dict` as JSON.
     size : tuple of 2 int, optional
         Width and height of the photo [px], for a matrix whose file lacks them.
@@ -329,8 +335,8 @@ def _read_form(path: Path) -> dict[str, Any]:
     form = {"matrix": data} if isinstance(data, list) else data
     if not isinstance(form, dict):
         what = f"camera: expected an object, got {type(data).__name__}"
-        raise DataError(what, where=str(path), fix=_FIX)
-    name = next((name for name in _MATRIX_NAMES if name in form), None)
+        raise DataError(what, where=str(path), fix=CAMERA_FIX)
+    name = next((name for name in MATRIX_NAMES if name in form), None)
     if name is not None and "params" not in form:
         form["matrix"] = _square(form.pop(name), path)
     return form
@@ -352,4 +358,4 @@ def _square(values: Any, path: Path) -> Any:
     try:
         return np.asarray(values, dtype=float).reshape(3, 3)
     except (TypeError, ValueError, OverflowError):
-        raise DataError("not a calibration matrix", where=str(path), fix=_FIX) from None
+        raise DataError("not a calibration matrix", where=str(path), fix=CAMERA_FIX) from None

@@ -28,7 +28,7 @@ def write(path: Path, content: object) -> Path:
         ("K.csv", "500, 0, 319.5\n0, 510, 239.5\n0, 0, 1\n"),
         ("K.json", MATRIX),
         ("K.json", {"K": MATRIX}),
-        ("K.json", {"cam_K": np.array(MATRIX).ravel().tolist()}),
+        ("K.json", {"K": np.array(MATRIX).ravel().tolist()}),
         ("K.json", {"camera_matrix": MATRIX, "width": 640, "height": 480}),
         ("K.json", {"matrix": MATRIX, "width": 640, "height": 480, "pixel_origin": "center"}),
         ("camera.json", CAMERA.to_dict()),

@@ -294,8 +294,10 @@ def test_binary_ply_polygons_of_several_sizes_are_read(write, order):
 
 
 def test_ply_without_faces_is_a_data_error(write):
-    with pytest.raises(DataError, match="no faces"):
-        load_mesh(write(_ply([], binary=False), "a.ply"))
+    content = _ply([], binary=False)
+    for number in (b"0", b"-2"):
+        with pytest.raises(DataError, match="no faces"):
+            load_mesh(write(content.replace(b"face 0", b"face " + number), "a.ply"))
 
 
 # --- scenes

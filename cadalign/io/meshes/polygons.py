@@ -104,7 +104,7 @@ def _blocks(
 ) -> tuple[list[Any], int]:
     """The rows of an element, in arrays of rows with equal lengths of lists, and their end."""
     blocks, left, wanted = list[Any](), element.count if element.properties else 0, element.count
-    while left:
+    while left > 0:
         kind = _row_type(data, place, element, form)
         count = 0 if kind is None else min(left, wanted, (len(data) - place) // kind.itemsize)
         rows: Any = np.frombuffer(data, kind, count, place) if count else np.empty(0)

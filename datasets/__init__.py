@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from cadalign.datasets.sfm.blind_pnp import BlindPnP
     from cadalign.datasets.sfm.colmap import Colmap
     from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet
-    from cadalign.io.meshes.files import check_solid, flat_axes, load_mesh
+    from cadalign.io.meshes.files import check_solid, load_mesh
 
 __all__ = [
     "CORRESPONDENCE_FORMATS",
@@ -64,7 +64,6 @@ __all__ = [
     "Truth",
     "check_solid",
     "choose_object",
-    "flat_axes",
     "join_keypoints",
     "load_mesh",
     "open_correspondences",

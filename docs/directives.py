@@ -20,11 +20,11 @@ from sphinx.util.nodes import nested_parse_with_titles
 from cadalign.cli import main
 from cadalign.datasets.models import model_keypoints
 from cadalign.estimation import document
-from cadalign.io.observation_file import OneView, SeveralViews
+from cadalign.io.observation_file import ObservationFields
 
 COLUMNS = "96"
 FORMATS: dict[str, tuple[Any, ...]] = {
-    "observation": (OneView, SeveralViews),
+    "observation": (ObservationFields,),
     "model_keypoints": (model_keypoints._File,),
     "fit": (document._Result,),
 }

@@ -24,7 +24,7 @@ from cadalign.estimation.result import Result
 from cadalign.evaluation.options import ExperimentOptions, absolute_paths
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import Columns, Plan, Row, fingerprint
-from cadalign.export.tables import failed_row
+from cadalign.export.results import failed_row
 from cadalign.io.documents import in_file, parse_json
 from cadalign.io.evidence import ObservedImage
 from cadalign.io.files import read_bytes
@@ -261,7 +261,7 @@ def _record(seen: Observation | None, result: Result | None) -> Row:
     """Observation and result as JSON, but for its time, on which no two runs agree."""
     record: Row = {"observation": "", "result": ""}
     if seen is not None:
-        record["observation"] = _ENCODER.encode(seen.to_dict(states_origins=True)).decode()
+        record["observation"] = _ENCODER.encode(seen.to_dict()).decode()
     if result is not None:
         data = result.to_dict()
         data["stats"]["seconds"] = 0.0

@@ -11,14 +11,12 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.results import Results
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import read_groups
-from cadalign.export.aligned_object import AlignedObject
-from cadalign.export.formats import FORMATS, export_object
+from cadalign.export.aligned_object import FORMATS, AlignedObject, export_object
 from cadalign.export.results import object_of
 from cadalign.io.documents import in_file, parse_json, read_json
 from cadalign.io.files import keeping
 from cadalign.io.kinds import FIT
 from cadalign.io.observation import Observation
-from cadalign.io.observation_file import fill_xyz
 from cadalign.render.drawing.model_overlay import mesh_of
 from cadalign.shapes.model import ShapeModel
 
@@ -34,7 +32,7 @@ def read_exported(fit: Path, *, metres: float = 1.0) -> AlignedObject:
         what = "the file holds no fit with the observation that was fitted"
         raise DataError(what, where=str(fit), fix="give the fit.json of `cadalign fit`")
     with in_file(fit):
-        seen = Observation.from_dict(fill_xyz(data["observation"]), folder=fit.parent)
+        seen = Observation.from_dict(data["observation"], folder=fit.parent, needs_xyz=False)
         exported = exported_object(Result.from_dict(data), seen, metres=metres)
     return replace(exported, sources=(fit, *seen.files))
 
@@ -57,7 +55,7 @@ def export_run(
 ) -> tuple[int, list[CadalignError]]:
     """Write a file of every alignment of a finished run to a folder, named by their rows.
 
-    ``format`` is one of `cadalign.export.formats.FORMATS`, by default the folder's name; ``metres``
+    ``format`` is one of `cadalign.export.FORMATS`, by default the folder's name; ``metres``
     as for `read_exported`. Returns the number of objects, and why others are left out.
 
     Raises InputError if the format is not known, or no object of the run can be written; and

@@ -203,5 +203,5 @@ def _inputs(observations: Observed, folder: RunFolder) -> tuple[Path, ...]:
 
 def _line(number: int, observation: Any) -> bytes:
     require_kind(observation, Observation, f"observations[{number}]")
-    data = observation.to_dict(states_origins=True)
+    data = observation.to_dict()
     return msgspec.json.encode(data, enc_hook=np.generic.item) + b"\n"  # names may be NumPy's

@@ -21,7 +21,6 @@ from cadalign.io.documents import in_file, within
 from cadalign.io.files import once_per_file
 from cadalign.io.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
 from cadalign.io.observation import Observation, ObservationChanges
-from cadalign.io.observation_file import fill_xyz
 
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
@@ -157,11 +156,11 @@ class ObservationFit:
 
         Its shape is the learned one that is fitted, without which keypoints need ``xyz``.
         """
-        own = data.get("shape") if isinstance(data, dict) else None
-        if self.shape is not None or (own is not None and self.shape_sigma is None):
-            data = fill_xyz(data)
+        needs_xyz = None if self.shape_sigma is None else True
+        if self.shape is not None:
+            needs_xyz = False
         with in_file(where):
-            seen = Observation.from_dict(data, folder=folder)
+            seen = Observation.from_dict(data, folder=folder, needs_xyz=needs_xyz)
         seen = changes.applied_to(seen, where)  # whose errors name options
         shape = self.shape_of(seen)
         return replace(seen, shape=None if shape is None else shape.absolute())
@@ -195,7 +194,6 @@ class ObservationFit:
 
     def _fit_keypoints(self, seen: Observation, options: FitOptions) -> Result:
         """Fit a stretched model to the keypoints of one image."""
-        from cadalign.batch.observed import has_photo
         from cadalign.estimation.fit import check_search, fit_one  # not for help of a command
         from cadalign.estimation.problems import pack_one
 
@@ -205,8 +203,7 @@ class ObservationFit:
         check_search(ransac, scores, seen.symmetry)
         with np.errstate(all="ignore"):
             search = (ransac, scores, seen.symmetry, start)
-            named = seen.labels, has_photo(seen.views[0])
-            return fit_one(problem, options, *search, *named)
+            return fit_one(problem, options, *search, seen.labels, seen.image)
 
     def _align(self, observation: Observation, where: str, options: FitOptions) -> Result:
         """Align all evidence of an observation."""

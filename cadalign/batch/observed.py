@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 
-from cadalign.errors import DataError, InputError
+from cadalign.errors import InputError
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, Sigma
 from cadalign.estimation.view import View
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import within
 from cadalign.io.evidence import ObservedImage
-from cadalign.io.images import photo_size
 from cadalign.io.observation import Observation
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import KeypointId
@@ -82,19 +81,11 @@ def views_of(
                 ids=ids,
                 scores=image.scores,
                 image=image.image if with_photos else None,
-                has_photo=has_photo(image),
+                photo=image.image,
                 **evidence | own | stated,
             )
             views.append(view)
     return tuple(views)
-
-
-def has_photo(image: ObservedImage) -> bool:
-    """True if the photo of an image is there, of its camera's size."""
-    size = image.camera.width, image.camera.height
-    with suppress(DataError):
-        return image.image is not None and photo_size(image.image) == size
-    return False
 
 
 def shape_ids(image: ObservedImage, shape: ShapeModel) -> tuple[KeypointId, ...]:

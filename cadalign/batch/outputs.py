@@ -26,7 +26,7 @@ from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
 from cadalign.evaluation.runs.work import Columns, Row
-from cadalign.export.tables import RESULT_COLUMNS, row_of
+from cadalign.export.results import RESULT_COLUMNS, row_of
 from cadalign.geometry.alignment import Box
 from cadalign.io.files import write_whole
 from cadalign.io.images import read_image

@@ -19,7 +19,6 @@ from cadalign.evaluation.runs.work import Columns
 from cadalign.evaluation.summary import median
 from cadalign.io.documents import in_file
 from cadalign.io.observation import Observation
-from cadalign.io.observation_file import fill_xyz
 from cadalign.retrieval.query import ObservationRetrieval
 
 SCORE = Metric("match_score", "score", "%", 0, better="high", factor=100.0, log=False)
@@ -56,7 +55,7 @@ class RetrieveRunOptions(ManyOptions):
 
     def read(self, data: Any, where: str, *, folder: Path) -> Observation:
         with in_file(where):
-            seen = Observation.from_dict(fill_xyz(data), folder=folder)
+            seen = Observation.from_dict(data, folder=folder, needs_xyz=False)
         return self.changes.applied_to(seen, where)
 
     def estimate_of(self, seen: Observation, where: str) -> Estimated:

@@ -11,7 +11,7 @@ import tyro
 from cadalign.cli.common import SOME_FAILED, SUCCESS, say
 from cadalign.cli.options import named_as_flags
 from cadalign.errors import refuse_unused
-from cadalign.export.formats import FORMATS, export_object, format_of
+from cadalign.export.aligned_object import FORMATS, export_object, format_of
 
 _MOST_LISTED = 10
 

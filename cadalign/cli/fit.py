@@ -90,7 +90,7 @@ class Fit(ManyCommand, ObservationFit, CameraOptions):
         )
         out = self.out or beside(path, "_fit")
         make_folder(out)
-        fitted = seen.to_dict(folder=out.absolute(), states_origins=True)
+        fitted = seen.to_dict(folder=out.absolute())
         text = json.dumps(result.to_dict() | {"observation": fitted}, indent=2) + "\n"
         with keeping([path, *seen.files]):
             # First what somebody names, which may be refused.

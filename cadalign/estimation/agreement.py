@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -122,7 +123,7 @@ class DiagnosisCase:
     size: Size | None = None
     has_rows: bool = False  # the ids of keypoints are their rows
     labels: Sequence[Hashable] = ()  # what the user calls the keypoints of these rows
-    has_photo: bool = False  # of the camera's size
+    photo: str | os.PathLike[str] | None = None  # of the first view
     is_tolerant: bool = False  # a robust loss leaves large residuals out of account
 
     @property

@@ -146,8 +146,7 @@ def align(
 
     seen = [given[number] for number in problem.numbers]
     case = DiagnosisCase(model, seen, again, ransac, size)
-    has_photo, is_tolerant = any(view.has_photo for view in given), loss != FitOptions.loss
-    case = replace(case, has_photo=has_photo, is_tolerant=is_tolerant)
+    case = replace(case, photo=given[0].photo, is_tolerant=loss != FitOptions.loss)
     try:
         result = _estimate(problem, start)
     except (NoConsensusError, DegenerateError) as error:
@@ -201,7 +200,7 @@ def _align_plain(
     problems = pack_one(points[rows], view.pixels, view.camera)
     scores = view.scores if ransac is not None else None
     labels = () if view.is_numbered else view.keypoint_ids
-    search = ransac, scores, model.symmetry, start, labels, view.has_photo
+    search = ransac, scores, model.symmetry, start, labels, view.photo
     return fit_one(problems, own, *search, model=model, view=view)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import quote
+from cadalign.errors import DataError, quote
 from cadalign.estimation.agreement import (
     AS_MANY_AGREE,
     Agreement,
@@ -118,7 +119,7 @@ def _measures_of(case: DiagnosisCase) -> list[str]:
 
 
 def diagnose_fit(
-    fitted: FittedKeypoints, *, labels: Sequence[Hashable] = (), has_photo: bool = False
+    fitted: FittedKeypoints, *, labels: Sequence[Hashable] = (), **of_case: Any
 ) -> EstimateWarning | None:
     """As `diagnose`, of keypoints in one view; after a robust search also of its inliers.
 
@@ -134,7 +135,7 @@ def diagnose_fit(
         drawn = None if fitted.inliers[counted].all() else ransac
         seen = fitted.points_3d, fitted.observed, fitted.camera
         case = case_of_fit(*seen, options, drawn, np.flatnonzero(kept).tolist())
-        if cause := diagnose(replace(case, ransac=ransac, labels=labels, has_photo=has_photo)):
+        if cause := diagnose(replace(case, ransac=ransac, labels=labels, **of_case)):
             return cause
     return None
 
@@ -327,8 +328,14 @@ def _other_sizes(case: DiagnosisCase) -> Iterator[Rule]:
     camera, points = case.views[0].camera, np.concatenate([view.pixels for view in case.views])
     sizes = {(view.camera.width, view.camera.height) for view in case.views}
     # Another size leaves much open, so that other evidence which is wrong would pass for it.
-    if len(sizes) > 1 or case.has_photo or any(view.sources for view in case.views):
+    if len(sizes) > 1 or any(view.sources for view in case.views):
         return
+    if case.photo is not None:
+        from cadalign.io.images import photo_size  # with Pillow
+
+        with suppress(DataError):
+            if photo_size(case.photo) in sizes:
+                return
 
     def holds_most(factor: float) -> bool:
         inside = camera.contains(rescaled_pixels(points, 1 / factor))

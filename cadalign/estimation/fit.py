@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Hashable, Sequence
 from dataclasses import replace
@@ -171,13 +172,13 @@ def fit_one(
     symmetry: Symmetry | None,
     start: float,
     labels: Sequence[Hashable] = (),
-    has_photo: bool = False,
+    photo: str | os.PathLike[str] | None = None,
     **seen: Any,
 ) -> Result:
     """Fit the only problem, begun at ``start`` [s]; ``seen`` as of `result_of_keypoints`.
 
     Warnings name the keypoints by their ``labels``, by default their rows, and suppose no other
-    size of images if the camera ``has_photo``.
+    size of images where the ``photo`` has the camera's.
     """
     try:
         fitted = fit_once(problems, options, ransac, scores, start)
@@ -191,7 +192,7 @@ def fit_one(
     return result_of_keypoints(
         problems.points_2d,
         fitted,
-        diagnosis=partial(diagnosis_of_fit, labels=tuple(labels), has_photo=has_photo),
+        diagnosis=partial(diagnosis_of_fit, labels=tuple(labels), photo=photo),
         symmetry=symmetry,
         **seen,
     )

@@ -403,7 +403,7 @@ class Result:
         format, frame
             As for `cadalign.export.export_object`.
         **of_the_object
-            ``mesh``, ``image`` or ``images``, ``world_from_cam``, ``name`` and ``metres`` of
+            ``mesh``, ``image`` or ``images``, ``name`` and ``metres`` of
             `cadalign.export.object_of`.
 
         Examples

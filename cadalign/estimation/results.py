@@ -142,7 +142,7 @@ class Results(Sequence[Result | CadalignError]):
         """
         import pandas as pd
 
-        from cadalign.export.tables import RESULT_COLUMNS, failed_row, row_of
+        from cadalign.export.results import RESULT_COLUMNS, failed_row, row_of
 
         rows = (
             {"row": number} | (row_of(each) if isinstance(each, Result) else failed_row(str(each)))

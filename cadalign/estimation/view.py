@@ -93,8 +93,8 @@ class View(BeyondKeypoints):
     image : (h, w, 3) uint8, or path, optional
         The photo in RGB, as evidence: the model's outline is sought in it, from the estimate by
         everything else; the model needs a mesh. It does not count beside a mask of the same view.
-    has_photo : bool
-        The camera has the size of a photo at hand, so that no warning supposes another one.
+    photo : path, optional
+        The photo, which is no evidence: of the camera's size, no warning supposes another one.
     number : int
         Its place among the views, which errors, warnings and evidence name; `align` counts them.
 
@@ -119,7 +119,7 @@ class View(BeyondKeypoints):
     sigma: Sigma | None = 1.0
     scores: npt.ArrayLike | None = None
     image: npt.ArrayLike | str | os.PathLike[str] | None = field(default=None, kw_only=True)
-    has_photo: bool = field(default=False, kw_only=True, repr=False)
+    photo: str | os.PathLike[str] | None = field(default=None, kw_only=True, repr=False)
     number: int = field(default=0, kw_only=True, repr=False)
 
     def __post_init__(self) -> None:

@@ -1,22 +1,25 @@
-"""An aligned object as all export formats take it: its shape, its views, and the frames."""
+"""An aligned object, its shape, views and frames; the export formats by their files' endings."""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
 from cadalign.arrays import FloatArray, as_positive
-from cadalign.errors import InputError
+from cadalign.errors import InputError, quote
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.geometry.rotations import nearest_rigid
+from cadalign.io.files import as_path, keeping, made_folder, printable, refuse_input, refuse_nul
 from cadalign.io.images import ByteImage, read_image
+from cadalign.io.meshes.files import write_obj_mesh, write_ply_mesh
 
-Frame = Literal["camera", "rig", "world", "model"]
+Frame = Literal["camera", "rig", "model"]
 FRAMES: tuple[Frame, ...] = get_args(Frame)
 
 _SAME = 1e-6
@@ -77,8 +80,6 @@ class AlignedObject:
         estimated.
     rig_from_model : Alignment, optional
         Pose and stretch in the frame that views of known motion share.
-    world_from_cam : (4, 4) float, optional
-        Pose of the first camera in a world of your own.
     name : str
         The model's name.
     metres : float
@@ -95,7 +96,6 @@ class AlignedObject:
     views: tuple[ExportView, ...]
     mesh: Mesh
     rig_from_model: Alignment | None = None
-    world_from_cam: FloatArray | None = None
     name: str = "model"
     metres: float = 1.0
     sources: tuple[Path, ...] = ()
@@ -104,9 +104,6 @@ class AlignedObject:
         if not self.views:
             raise InputError("give at least one view", where="views")
         object.__setattr__(self, "metres", as_positive(self.metres, name="metres"))
-        if self.world_from_cam is not None:
-            world = nearest_rigid(self.world_from_cam, where="world_from_cam")
-            object.__setattr__(self, "world_from_cam", world)
         poses = [view.cam_from_model for view in self.views]
         poses += [] if self.rig_from_model is None else [self.rig_from_model]
         for pose in poses:
@@ -115,30 +112,24 @@ class AlignedObject:
                 raise InputError(what, where="scale", fix="all views show one object")
 
     def frame_from_model(self, frame: Frame) -> Alignment:
-        """Pose and stretch in a frame: the first view's camera, the rig, the world, or the model's.
+        """Pose and stretch in a frame: the first view's camera, the rig, or the model's own.
 
         In the model's frame the object is stretched only.
 
         Raises
         ------
         InputError
-            If the frame is not known.
+            If the views have no rig.
         """
         first = self.views[0].cam_from_model
         if frame == "camera":
             return first
         if frame == "model":
             return Alignment(np.eye(3), np.zeros(3), first.scale)
-        if frame == "rig":
-            if self.rig_from_model is None:
-                what = "the views have no known motion, so there is no rig"
-                raise InputError(what, where="frame", fix="take camera, or give cam_from_rig")
-            return self.rig_from_model
-        if self.world_from_cam is None:
-            what = "the camera's pose in the world is not known"
-            raise InputError(what, where="frame", fix="give world_from_cam")
-        turn, shift = self.world_from_cam[:3, :3], self.world_from_cam[:3, 3]
-        return Alignment(turn @ first.rotation, turn @ first.translation + shift, first.scale)
+        if self.rig_from_model is None:
+            what = "the views have no known motion, so there is no rig"
+            raise InputError(what, where="frame", fix="take camera, or give cam_from_rig")
+        return self.rig_from_model
 
     def frame_from_cam(self, frame: Frame, number: int) -> FloatArray:
         """The rigid pose (4, 4) of a view's camera in a frame, by the object that both see."""
@@ -152,3 +143,105 @@ class AlignedObject:
         """The mesh, stretched and placed in a frame [units of the camera frame]."""
         placing = self.frame_from_model(frame)
         return replace(self.mesh, vertices=placing.apply(self.mesh.vertices))
+
+
+class Format(NamedTuple):
+    """An export format, whose name is the ending of its files."""
+
+    about: str  # what is written
+    write: Callable[[Path, AlignedObject, Frame], object]
+
+
+def _glb(path: Path, exported: AlignedObject, frame: Frame) -> None:
+    from cadalign.export.glb import write_glb  # loads trimesh
+
+    write_glb(path, exported, frame=frame)
+
+
+def _mesh_in_metres(exported: AlignedObject, frame: Frame) -> Mesh:
+    return exported.placed_mesh(frame).stretched(exported.metres)
+
+
+FORMATS: dict[str, Format] = {
+    "glb": Format("textured model, cameras and photos, for viewers", _glb),
+    "obj": Format(
+        "the mesh, with materials and textures",
+        lambda path, *given: write_obj_mesh(path, _mesh_in_metres(*given)),
+    ),
+    "ply": Format(
+        "the mesh, with vertex colours",
+        lambda path, *given: write_ply_mesh(path, _mesh_in_metres(*given)),
+    ),
+}
+"""The formats by name."""
+
+
+def format_of(path: str | os.PathLike[str]) -> str:
+    """Name of the format that a path's ending means.
+
+    Raises
+    ------
+    InputError
+        If none has this ending.
+
+    Examples
+    --------
+    >>> format_of("out/chair.glb")
+    'glb'
+    """
+    path = as_path(path)
+    name = path.suffix.lower().removeprefix(".")
+    if name not in FORMATS:
+        what, fix = "the name does not tell the format", f"give the format: {', '.join(FORMATS)}"
+        raise InputError(what, where=printable(path), fix=fix)
+    return name
+
+
+def export_object(
+    path: str | os.PathLike[str],
+    exported: AlignedObject,
+    *,
+    format: str | None = None,
+    frame: Frame = "camera",
+) -> Path:
+    """Write an aligned object for another tool.
+
+    Parameters
+    ----------
+    path : path-like
+        The file; folders above it are made.
+    exported : AlignedObject
+    format : {"glb", "obj", "ply"}, optional
+        By default what the path's ending means.
+    frame : {"camera", "rig", "model"}
+        Frame of the exported coordinates: the first photo's camera, the frame that cameras of known
+        motion share, or the stretched model's own.
+
+    Returns
+    -------
+    Path
+        What was written.
+
+    Raises
+    ------
+    InputError
+        If the format or frame is not known, or the object lacks what it needs.
+    DataError
+        If a photo cannot be read, or the file cannot be written or is one that the object was read
+        from.
+    """
+    path = as_path(path)
+    refuse_nul(path)
+    name = format_of(path) if format is None else format
+    if name not in FORMATS:
+        fix = f"known are {', '.join(FORMATS)}"
+        raise InputError(f"unknown format {quote(name)}", where="format", fix=fix)
+    if frame not in FRAMES:
+        fix = f"known are {', '.join(FRAMES)}"
+        raise InputError(f"unknown frame {quote(frame)}", where="frame", fix=fix)
+    made_folder(path.parent)
+    photos = (view.image for view in exported.views if isinstance(view.image, Path))
+    with keeping([*exported.sources, *photos]):
+        refuse_input(path)  # first: files beside it are written before it
+        FORMATS[name].write(path, exported, frame)
+    return path

@@ -49,7 +49,6 @@ _GROWTH = 2.0  # how much larger than the photo an undistorted one may become, e
 _AGREES = 1e-6
 _RIM = 1.5  # how far the border's colours go on beyond the photo [px]
 _BEHIND = 1.5  # depth of the photo over that of the object's farthest corner
-_FAR_OFF = 100.0  # coordinates over the extent
 _NEAR, _FAR = 1e-3, 10.0  # depths between which a viewer draws, over that of the photo
 
 
@@ -96,11 +95,12 @@ def write_glb(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -
     DataError
         If a photo cannot be read.
     """
-    mesh, placing = _placed_mesh(exported, frame)
+    placing = _root(frame) @ exported.frame_from_model(frame).cam_from_model
+    placing[:3] *= exported.metres
     photos = [_placed_photo(exported, frame, number) for number in range(len(exported.views))]
     nodes = [
         (f"{exported.name}_{number}", surface, material, placing)
-        for number, (surface, material) in enumerate(_parts(mesh))
+        for number, (surface, material) in enumerate(_parts(exported.mesh))
     ]
     nodes += [
         _photo_node(f"photo_{number}", photo)
@@ -219,23 +219,6 @@ def _add_cameras(tree: dict[str, Any], photos: Sequence[PlacedPhoto]) -> None:
         roots.append(len(tree["nodes"]))
         matrix = photo.pose.T.ravel().tolist()
         tree["nodes"].append({"name": name, "camera": number, "matrix": matrix})
-
-
-def _placed_mesh(exported: AlignedObject, frame: Frame) -> tuple[Mesh, FloatArray]:
-    """The mesh and its place (4, 4) in the scene.
-
-    A mesh far from its origin, whose vertices single precision would round, is moved there, and so
-    its place.
-    """
-    mesh = exported.mesh
-    placing = _root(frame) @ exported.frame_from_model(frame).cam_from_model
-    placing[:3] *= exported.metres
-    low, high = mesh.bounds
-    if np.abs(mesh.bounds).max() > _FAR_OFF * np.abs(high - low).max():
-        middle = (low + high) / 2
-        mesh = replace(mesh, vertices=mesh.vertices - middle)
-        placing[:3, 3] += placing[:3, :3] @ middle
-    return mesh, placing
 
 
 def _root(frame: Frame) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Results of estimates as text, as pictures on axes and as aligned objects."""
+"""Results of estimates as text, as rows of tables, on axes and as aligned objects."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.export.aligned_object import AlignedObject, ExportView
 from cadalign.geometry.alignment import (
@@ -21,6 +20,7 @@ from cadalign.geometry.alignment import (
     why_open,
 )
 from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.rotations import quat_wxyz_from_rotation
 from cadalign.io.images import ByteImage
 
 if TYPE_CHECKING:
@@ -74,6 +74,62 @@ def result_text(result: Any) -> str:
     return "\n".join(lines)
 
 
+RESULT_COLUMNS: tuple[tuple[str, type], ...] = (
+    *(("status", str), ("reason", str), ("method", str)),
+    *(("views", int), ("keypoints", int), ("inliers", int)),
+    *((f"q{axis}", float) for axis in "wxyz"),
+    *((f"t{axis}", float) for axis in "xyz"),
+    *((f"scale_{axis}", float) for axis in "xyz"),
+    *(("focal_length", float), ("sigma", float), ("rotation_std_deg", float)),
+    *((f"t{axis}_std", float) for axis in "xyz"),
+    *((f"scale_{axis}_std", float) for axis in "xyz"),
+    *(("focal_length_std", float), ("rms_px", float), ("cost", float)),
+    *(("alternatives", int), ("uncertain", str)),
+    *(("warning_count", int), ("warning_kinds", str), ("warnings", str)),
+)
+"""Names and types of the cells of a result in every table."""
+
+
+def failed_row(reason: str) -> dict[str, Any]:
+    """The cells of a problem without solution."""
+    texts = ("method", "uncertain", "warning_kinds", "warnings")
+    return {"status": "failed", "reason": reason, **dict.fromkeys(texts, "")}
+
+
+def row_of(result: Any) -> dict[str, Any]:
+    """The cells of a `cadalign.Result`, by the names of `RESULT_COLUMNS`."""
+    pose, std, warnings = result.alignment, result.std, result.warnings
+    sigma: Any = result.sigma
+    if sigma is None and result.options is not None:
+        sigma = result.options.sigma
+    row: dict[str, Any] = {
+        "status": "ok",
+        "reason": "",
+        "method": result.method,
+        "views": len(result.views),
+        "keypoints": len(result.inliers),
+        "inliers": int(result.inliers.sum()),
+        "focal_length": result.camera.fx,
+        "sigma": None if sigma is None or np.ndim(sigma) else float(sigma),
+        "rms_px": result.rms,
+        "cost": result.cost,
+        "alternatives": len(result.alternatives),
+        "uncertain": "; ".join(result.uncertain),
+        "warning_count": len(warnings),
+        "warning_kinds": "; ".join(each.kind for each in warnings),
+        "warnings": "; ".join(each.text for each in warnings),
+    }
+    by_axis: dict[str, Any] = {"t{}": pose.translation, "scale_{}": pose.scale}
+    if std is not None:
+        by_axis |= {"t{}_std": std.translation, "scale_{}_std": std.scale}
+        row |= {"rotation_std_deg": std.rotation_deg, "focal_length_std": std.focal}
+    for name, values in by_axis.items():
+        row |= {name.format(axis): float(each) for axis, each in zip("xyz", values, strict=True)}
+    quaternion = quat_wxyz_from_rotation(pose.rotation).tolist()
+    row |= {f"q{axis}": value for axis, value in zip("wxyz", quaternion, strict=True)}
+    return row
+
+
 def plot_result(
     result: Any,
     image: npt.ArrayLike | str | os.PathLike[str] | None = None,
@@ -111,7 +167,6 @@ def object_of(
     mesh: Mesh | str | os.PathLike[str] | None = None,
     image: Photo = None,
     images: Sequence[Photo] = (),
-    world_from_cam: FloatArray | None = None,
     name: str = "model",
     metres: float = 1.0,
 ) -> AlignedObject:
@@ -126,7 +181,7 @@ def object_of(
         The photo of the only view.
     images : sequence
         The photos of several views, in the place of ``image``.
-    world_from_cam, name, metres
+    name, metres
         As for `AlignedObject`.
 
     Raises
@@ -149,7 +204,6 @@ def object_of(
         tuple(ExportView(view.camera, view.alignment, photo) for view, photo in views),
         known,
         result.rig_from_model,
-        world_from_cam,
         name,
         metres,
     )

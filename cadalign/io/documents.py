@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
-from cadalign.errors import CadalignError, DataError, InputError, quote, unknown
+from cadalign.errors import CadalignError, DataError, InputError, brief, quote, unknown
 from cadalign.io.files import read_text
 from cadalign.io.kinds import kind_of, other_kind, refuse_other_file
 
@@ -86,53 +86,41 @@ def parse_json(text: str | bytes, where: str) -> Any:
 
     Raises DataError if it is no valid JSON, or a field stands twice in one object.
     """
-    reason, twice = "nested too deeply", dict[int, str]()
     is_line = isinstance(text, bytes)
     if isinstance(text, bytes):  # of hundreds of thousands, several times as fast
         with suppress(msgspec.MsgspecError, UnicodeError, RecursionError):
             line = msgspec.json.decode(text)
             if msgspec.json.encode(line).count(_FIELD_END) == text.count(_FIELD_END):
                 return line  # no field stands twice
-
-    def made(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        fields = dict(pairs)
-        if len(fields) != len(pairs):
-            names = [name for name, _ in pairs]
-            twice[id(fields)] = next(name for name in names if names.count(name) > 1)
-        return fields
-
     try:
         text = str(text, "utf-8") if isinstance(text, bytes) else text
-        data = json.loads(text, object_pairs_hook=made)
+        data = json.loads(text, object_pairs_hook=_distinct)
         if _HALF_CHARACTER.search(text):  # perhaps one half of two
             json.dumps(data, ensure_ascii=False).encode("utf-8")
-        if twice:
-            place, what = _place_of(data, twice), "the field stands twice in one object"
-            raise DataError(what, where=f"{where}: {place}", fix="leave one of the two out")
         return data
+    except InputError as error:
+        raise DataError(error.what, where=where, fix=error.fix) from None
     except json.JSONDecodeError as error:
         where = where if is_line else f"{where}, line {error.lineno}"
         reason = error.msg
     except UnicodeEncodeError:
         reason = _HALF_REASON
-    except ValueError as error:  # a whole number of thousands of digits, or bytes that are no text
-        reason = str(error)[:200]
     except RecursionError:
-        pass
+        reason = "nested too deeply"
+    except ValueError as error:  # a whole number of thousands of digits, or bytes that are no text
+        reason = brief(error)
     raise DataError(f"not valid JSON: {reason}", where=where)
 
 
-def _place_of(value: Any, twice: dict[int, str], place: str = "") -> str:
-    """The path of the first object with a field that stands twice, and that field."""
-    if id(value) in twice:
-        return f"{place}.{twice[id(value)]}".removeprefix(".")
-    parts = value.items() if isinstance(value, dict) else enumerate(value)
-    for name, part in parts:
-        if isinstance(part, dict | list):
-            step = f".{name}" if isinstance(value, dict) else f"[{name}]"
-            if found := _place_of(part, twice, f"{place}{step}".removeprefix(".")):
-                return found
-    return "" if place else next(iter(twice.values()))
+def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of fields, none of which may stand twice."""
+    fields = dict(pairs)
+    if len(fields) != len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        what = f"the field {quote(twice)} stands twice in one object"
+        raise InputError(what, fix="leave one of the two out")
+    return fields
 
 
 def convert(data: Any, kind: type[T] | Any, where: str = "") -> T | Any:
@@ -196,16 +184,11 @@ def written_path(path: Path, *, folder: Path | None) -> str:
     for base in (folder, folder.resolve()):
         if path.is_relative_to(base):
             return path.relative_to(base).as_posix()
-    there = path.resolve()
-    try:
-        return Path(os.path.relpath(there, folder.resolve())).as_posix()
-    except ValueError:  # on another drive
-        return there.as_posix()
+    return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
 
 
-_MESSAGE = re.compile(r"(?P<text>.*?)(?: - at `(?P<path>\$[^`]*)`)?", re.DOTALL)
 _STEP = re.compile(r"\[(?P<row>\d+|\.\.\.)\]|\.?(?P<name>[^.\[\]]+)")
-_FIELD = re.compile(r"Object (missing required|contains unknown) field `(.*)`", re.DOTALL)
+_FIELD = re.compile(r"Object (missing required|contains unknown) field `(.*)", re.DOTALL)
 _EXPECTED = re.compile(r"Expected `(?P<kinds>[^`]*)`(?P<rule>.*)", re.DOTALL)
 _WORDS = {
     "float": "a finite number",
@@ -227,32 +210,27 @@ def _plain(value: Any) -> Any:
 
 def _located(error: msgspec.ValidationError, data: Any, kind: Any, where: str) -> DataError:
     """The library's error as ours: the value and its problem, its path, the remedy."""
-    found = _MESSAGE.fullmatch(str(error))
-    text, path = (found["text"], found["path"]) if found else (str(error), None)
+    text, _, path = str(error).removesuffix("`").partition(" - at `$")
     value = data
-    for step in _STEP.finditer((path or "$")[1:]):
+    for step in _STEP.finditer(path):
         where += step[0] if step["row"] else f".{step['name']}" if where else step["name"]
         value = _entry(value, step)
     cause = error.__cause__
     if isinstance(cause, InputError):
         return _below(where, cause)
-    field = _FIELD.fullmatch(text)
-    if field and field[1] == "missing required":
-        return DataError("missing", where=f"{where}.{field[2]}" if where else field[2])
-    if field:
+    if field := _FIELD.fullmatch(text):
+        is_missing, name = field[1] == "missing required", field[2].removesuffix("`")
         fields = _parts_at(kind, path, "fields")
-        known = sorted(each.encode_name for each in fields)
         lacking = [each.encode_name for each in fields if each.required]
-        lacking = [name for name in lacking if isinstance(value, dict) and name not in value]
+        lacking = [name] if is_missing else [each for each in lacking if each not in value]
+        known = sorted(each.encode_name for each in fields)
         if lacking:
             place = f"{where}.{lacking[0]}" if where else lacking[0]
-            has = f"there is an unknown field {quote(field[2])}"
-            fix = f"known are {', '.join(known)}"
-            return DataError(f"missing, and {has}", where=place, fix=fix)
-        refused = unknown("field", field[2], known)
-        return DataError(
-            refused.what, where=where or "top level", fix=refused.fix if known else None
-        )
+            more = "" if is_missing else f", and there is an unknown field {quote(name)}"
+            fix = None if is_missing else f"known are {', '.join(known)}"
+            return DataError(f"missing{more}", where=place, fix=fix)
+        refused = unknown("field", name, known)
+        return DataError(refused.what, where=where or "top level", fix=refused.fix)
     if text.startswith("Invalid enum value"):
         allowed = ", ".join(map(repr, _parts_at(kind, path, "values")))
         return DataError(f"{quote(value)} is not one of {allowed}", where=where or None)
@@ -285,10 +263,10 @@ def _wanted(text: str) -> str:
     return "a positive number" if bound[0] == " > 0.0" else f"{words} {bound[1]} {bound[2]}"
 
 
-def _parts_at(kind: Any, path: str | None, name: str) -> list[Any]:
+def _parts_at(kind: Any, path: str, name: str) -> list[Any]:
     """The fields or values of the types declared at a path; none within a hostile field name."""
     kind = msgspec.inspect.type_info(kind)
-    for step in _STEP.finditer((path or "$")[1:]):
+    for step in _STEP.finditer(path):
         if isinstance(kind, msgspec.inspect.UnionType):  # an optional type
             kind = next(k for k in kind.types if not isinstance(k, msgspec.inspect.NoneType))
         if isinstance(kind, msgspec.inspect.StructType | msgspec.inspect.DataclassType):

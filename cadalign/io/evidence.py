@@ -69,11 +69,12 @@ EVIDENCE = tuple(BeyondKeypoints.__dataclass_fields__)
 class ImageEvidence(BeyondKeypoints):
     """Evidence of an image as an observation file holds it, with paths of mask and depth image.
 
+    `cadalign.View` checks their values.
+
     Raises
     ------
     InputError
-        If a number is not positive, a sigma or scale is given without its measurement, or an
-        array has a wrong shape.
+        If a sigma or scale is given without its measurement, or an array has a wrong shape.
     """
 
     mask: Path | None = None
@@ -85,19 +86,15 @@ class ImageEvidence(BeyondKeypoints):
 
     def __post_init__(self) -> None:
         given = self.given
-        for name, value in given.items():
+        for name in given:
             # depth_sigma may be that of depths of the keypoints
             if name != "depth_sigma" and (missing := REFINED.get(name, name)) not in given:
                 what, fix = f"given without {missing}", f"give {missing}, too"
                 raise InputError(what, where=name, fix=fix)
-            if name in REFINED or name == "camera_height":
-                object.__setattr__(self, name, as_positive(value, name=name))
         _keep_paths(self, "mask", "depth")
         for name, shape in (("up", (3,)), ("cam_from_rig", (4, 4))):
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, as_floats(value, name=name, shape=shape))
-        if self.up is not None and not self.up.any():
-            raise InputError("a direction must not be zero", where="up")
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,25 +205,17 @@ class ObservedImage:
         object.__setattr__(self, "points_3d", points_3d)
         object.__setattr__(self, "points_2d", points_2d)
         _keep_paths(self, "image")
-        for name in ("sigma", "scores"):
+        for name in ("sigma", "scores", "depths"):
             if (value := getattr(self, name)) is not None:
-                checked = as_floats(value, name=name, shape=(len(points_3d),))
+                shape, finite = (len(points_3d),), name != "depths"
+                checked = as_floats(value, name=name, shape=shape, finite=finite)
                 object.__setattr__(self, name, checked)
-        if self.depths is None:
-            if self.evidence.depth_sigma is not None and self.evidence.depth is None:
-                raise InputError("given without depth", where="depth_sigma", fix="give depth, too")
-            return
-        if self.evidence.depth is not None:
-            raise InputError(
+        if self.depths is not None and self.evidence.depth is not None:
+            what, fix = (
                 "a depth image and depths of keypoints are given",
-                where="depth",
-                fix="leave out one of the two",
+                "leave out one of the two",
             )
-        depths = np.asarray(self.depths, dtype=np.float64)
-        if depths.shape != (len(points_3d),):
-            what = f"shape {depths.shape}, expected ({len(points_3d)},)"
-            raise InputError(what, where="depths")
-        object.__setattr__(self, "depths", depths)
+            raise InputError(what, where="depth", fix=fix)
 
     @property
     def labels(self) -> tuple[str | int, ...]:

@@ -26,8 +26,6 @@ _MAX_NAME = 50  # such that the unfinished file's name stays below the 255 bytes
 _MAX_PATH = 1000  # of a path that is shown whole
 MOST_BYTES = 2**32
 """Size of the largest file that is read where its reader states no other."""
-# Opening a pipe would wait for its other end; Windows has none of this kind.
-_NOT_WAITING = getattr(os, "O_NONBLOCK", 0)
 _kept: ContextVar[set[str] | None] = ContextVar("kept", default=None)
 
 
@@ -125,12 +123,12 @@ def remove_earlier(folder: Path, files: Iterable[Path]) -> None:
     paths = list(files)
     for path in paths:
         refuse_input(path)
-    for path in paths:
-        with writing(folder):
+    with writing(folder):
+        for path in paths:
             path.unlink(missing_ok=True)
-        if path.parent != folder:
             with suppress(OSError):  # something else is in it
-                path.parent.rmdir()
+                if path.parent != folder:
+                    path.parent.rmdir()
 
 
 def refuse_folder(path: Path) -> None:
@@ -222,7 +220,8 @@ class InputFile(io.BufferedReader):
     """
 
     def __init__(self, path: Path) -> None:
-        super().__init__(io.FileIO(path, opener=lambda p, flags: os.open(p, flags | _NOT_WAITING)))
+        # Opening a pipe would wait for its other end.
+        super().__init__(io.FileIO(path, opener=lambda p, flags: os.open(p, flags | os.O_NONBLOCK)))
         self.status = os.fstat(self.fileno())
         self.size = self.status.st_size
 

@@ -24,16 +24,7 @@ _USUAL_SIGMA = 0.6
 _EXIF_SIGMA = 0.05  # roundings, focusing, and corrections of the lens inside the camera
 _SAME_LENS = 0.01
 _FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
-# EXIF tags, and the length of their units [mm].
-_EXIF_IFD = 0x8769
-_FOCAL_LENGTH = 0x920A
-_DIGITAL_ZOOM = 0xA404
-_FOCAL_LENGTH_35MM = 0xA405
-_PLANE_X_RESOLUTION = 0xA20E
-_PLANE_UNIT = 0xA210
-_PIXEL_X_DIMENSION = 0xA002
-_PIXEL_Y_DIMENSION = 0xA003
-_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of EXIF's focal plane
 
 
 @dataclass(frozen=True)
@@ -108,9 +99,8 @@ class FocalPrior:
         """Read a photo's focal length from its EXIF data.
 
         From the 35 mm equivalent (taken along the diagonal, as CIPA defines it), otherwise from the
-        focal length, times the digital zoom, and the pixels' size on the sensor. A photo turned
-        upright has the same focal length. One that no camera has is ignored with a warning (logger
-        "cadalign").
+        focal length and the pixels' size on the sensor. A photo turned upright has the same focal
+        length. One that no camera has is ignored with a warning (logger "cadalign").
 
         Parameters
         ----------
@@ -129,10 +119,13 @@ class FocalPrior:
         DataError
             If the file is missing or not an image.
         """
+        from PIL.ExifTags import IFD, TAGS
+
         from cadalign.io.images import open_photo  # a known focal length needs no reader of images
 
         with open_photo(path) as image:
-            tags, size = image.getexif().get_ifd(_EXIF_IFD), image.size
+            found, size = image.getexif().get_ifd(IFD.Exif), image.size
+        tags = {TAGS.get(tag, ""): value for tag, value in found.items()}
         focal, side = _focal_in_pixels(tags, *size), max(size)
         if focal is None or SHORTEST * side < focal < LONGEST * side:
             return None if focal is None else cls(focal, relative_sigma, "the photo's EXIF data")
@@ -168,23 +161,22 @@ def check_prior(prior: object, *, focal: str) -> None:
         )
 
 
-def _focal_in_pixels(tags: Mapping[int, Any], width: int, height: int) -> float | None:
+def _focal_in_pixels(tags: Mapping[str, Any], width: int, height: int) -> float | None:
     """The focal length [px] that EXIF tags state; None where they do not."""
-    equivalent = _positive(tags, _FOCAL_LENGTH_35MM)
-    if equivalent is not None:  # which has the digital zoom in it
+    equivalent = _positive(tags, "FocalLengthIn35mmFilm")
+    if equivalent is not None:
         return equivalent / _FULL_FRAME_DIAGONAL_MM * math.hypot(width, height)
-    millimetres, density = _positive(tags, _FOCAL_LENGTH), _positive(tags, _PLANE_X_RESOLUTION)
-    x = _positive(tags, _PIXEL_X_DIMENSION) or float(width)
-    y = _positive(tags, _PIXEL_Y_DIMENSION) or float(height)
+    millimetres, density = _positive(tags, "FocalLength"), _positive(tags, "FocalPlaneXResolution")
+    x = _positive(tags, "ExifImageWidth") or float(width)
+    y = _positive(tags, "ExifImageHeight") or float(height)
     is_cropped = abs(x * height - y * width) > 0.01 * y * width  # since it was taken
     if millimetres is None or density is None or is_cropped:
         return None
-    zoom = max(_positive(tags, _DIGITAL_ZOOM) or 1.0, 1.0)
-    unit = _UNIT_MM.get(tags.get(_PLANE_UNIT, 2), 25.4)
-    return millimetres * zoom * density / unit * width / x
+    unit = _UNIT_MM.get(tags.get("FocalPlaneResolutionUnit", 2), 25.4)
+    return millimetres * density / unit * width / x
 
 
-def _positive(tags: Mapping[int, Any], tag: int) -> float | None:
+def _positive(tags: Mapping[str, Any], tag: str) -> float | None:
     """A tag's value; None where it is missing or no positive number: 0 says that it is unknown."""
     try:
         value = float(tags.get(tag, 0.0))

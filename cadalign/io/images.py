@@ -182,14 +182,11 @@ def write_image(path: Path, image: ByteImage) -> None:
 
     As JPEG where the name ends in ``.jpg``, otherwise as PNG.
     """
-    import cv2  # on first use: it takes longer to import than all the rest
+    from PIL import Image
 
-    if image.ndim == 3:
-        colors = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
-        image = np.asarray(cv2.cvtColor(image, colors), dtype=np.uint8)
-    kind = JPEG_ENDING if path.suffix.lower() == JPEG_ENDING else ".png"
-    quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if kind == JPEG_ENDING else []
-    encoded, data = cv2.imencode(kind, image, quality)
-    if not encoded:
-        raise DataError(f"the picture cannot be encoded as {kind[1:].upper()}", where=str(path))
-    write_whole(path, lambda unfinished: unfinished.write_bytes(data.tobytes()))
+    kind: tuple[str, dict[str, int]] = ("PNG", {"compress_level": 1})
+    if path.suffix.lower() == JPEG_ENDING:
+        kind = ("JPEG", {"quality": _JPEG_QUALITY})
+    write_whole(
+        path, lambda unfinished: Image.fromarray(image).save(unfinished, kind[0], **kind[1])
+    )

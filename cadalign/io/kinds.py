@@ -28,7 +28,6 @@ MESH_ENDINGS = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
 PHOTO_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 _HEAD_BYTES = 1024
-_MATRIX = 9  # numbers of a calibration matrix as text
 _MOST_BYTES = 2**26  # of a JSON file that is read to name its kind
 _STARTS = {
     PHOTO: (b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"II*\0", b"MM\0*"),
@@ -36,15 +35,18 @@ _STARTS = {
     SHAPE: (b"cadalign shape",),
     LIBRARY: (b"cadalign library",),
 }
-_CAMERA_FIELDS = {"matrix", "K", "camera_matrix", "cam_K", "params"}
+MATRIX_NAMES = ("matrix", "K", "camera_matrix")
+"""Names of a calibration matrix in a JSON file."""
+CAMERA_FIX = (
+    "give 3 x 3 numbers, or a JSON file with model, width, height and params as COLMAP does"
+)
 _FIXES = {
     OBSERVATION: "give a JSON file with camera and keypoints, as `cadalign annotate PHOTO MODEL` "
     "and `cadalign observe` write it",
     DETECTOR: "give COCO's keypoint JSON, a detector's, or CSV",
     MODEL_KEYPOINTS: "give the model's NAME.keypoints.json",
     FIT: "give the fit.json that `cadalign fit` writes",
-    CAMERA: "give 3 x 3 numbers, or a JSON file with model, width, height and params as COLMAP "
-    "does",
+    CAMERA: CAMERA_FIX,
     MESH: f"give a file that ends in {', '.join(MESH_ENDINGS)}",
     IMAGE: "give a picture, such as a PNG or a JPEG",
 }
@@ -75,7 +77,7 @@ def kind_of(data: object) -> str | None:
         return OBSERVATION
     if {"asset", "meshes"} <= fields:
         return MESH
-    return CAMERA if _CAMERA_FIELDS & fields and "width" in fields else None
+    return CAMERA if {*MATRIX_NAMES, "params"} & fields and "width" in fields else None
 
 
 def kind_of_file(path: Path) -> str | None:
@@ -92,9 +94,6 @@ def kind_of_file(path: Path) -> str | None:
             file.seek(0)
             if (kind_found := kind_of(json.loads(file.read()))) is not None:
                 return kind_found
-        numbers = head.replace(b",", b" ").split() if suffix not in MESH_ENDINGS else []
-        if len(numbers) == _MATRIX and list(map(float, numbers)):
-            return CAMERA
     if is_there and suffix in MESH_ENDINGS:
         return MESH
     return PHOTO if is_there and suffix in (*PHOTO_ENDINGS, ".gif", ".heic") else None

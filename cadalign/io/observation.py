@@ -22,7 +22,6 @@ import numpy as np
 from cadalign.errors import DataError, InputError, brief
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.pixels import PixelOrigin
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.documents import (
     Positive,
@@ -35,9 +34,16 @@ from cadalign.io.documents import (
 )
 from cadalign.io.evidence import ObservedImage, Size
 from cadalign.io.files import as_path, once_per_file, read_bytes, read_text, write_json
-from cadalign.io.kinds import CAMERA, OBSERVATION, kind_of, other_kind, refuse_other_file
+from cadalign.io.kinds import (
+    CAMERA,
+    CAMERA_FIX,
+    MATRIX_NAMES,
+    OBSERVATION,
+    kind_of,
+    other_kind,
+    refuse_other_file,
+)
 from cadalign.io.observation_file import (
-    fill_xyz,
     read_fields,
     read_image_fields,
     read_size,
@@ -131,29 +137,32 @@ class Observation(ObservedImage):
         """
         path = as_path(path)
         data = read_json(path, OBSERVATION)
-        if needs_xyz is None:
-            needs_xyz = not (isinstance(data, dict) and data.get("shape"))
-        if not needs_xyz:
-            data = fill_xyz(data)
         with in_file(path):
-            return cls.from_dict(data, folder=path.parent)
+            return cls.from_dict(data, folder=path.parent, needs_xyz=needs_xyz)
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any], *, folder: Path | None = None) -> Observation:
-        """Read the parsed form of an observation file; paths are relative to ``folder``."""
+    def from_dict(
+        cls, data: Mapping[str, Any], *, folder: Path | None = None, needs_xyz: bool | None = None
+    ) -> Observation:
+        """Read the parsed form of an observation file; paths are relative to ``folder``.
+
+        ``needs_xyz`` is that of `load`.
+        """
         if error := other_kind(Path(), OBSERVATION, kind_of(data)):
             raise DataError(error.what, fix=error.fix)
         read, fields = read_fields(data)
+        if needs_xyz is None:
+            needs_xyz = read.shape is None
         images = []
         for number, each in enumerate(fields):
             with nullcontext() if each is read else within(f"views[{number}]"):
-                images.append(read_image_fields(each, folder))
+                images.append(read_image_fields(each, folder, needs_xyz=needs_xyz))
         first, *others = images
         options = msgspec.to_builtins(read.fit)
         if first.not_found and isinstance(options.get("sigma"), list):
             options["sigma"] = np.delete(options["sigma"], first.not_found).tolist()
         with within("init"):
-            init = None if read.init is None else read.init.alignment
+            init = None if read.init is None else Alignment.from_dict(read.init)
         return cls(
             **vars(first),
             model=None if read.model is None else path_from(read.model, folder),
@@ -168,35 +177,30 @@ class Observation(ObservedImage):
             unfinished=read.unfinished,
         )
 
-    def to_dict(
-        self, *, folder: Path | None = None, states_origins: bool = False
-    ) -> dict[str, Any]:
+    def to_dict(self, *, folder: Path | None = None) -> dict[str, Any]:
         """The parsed form of an observation file, its paths relative to ``folder``.
 
-        ``states_origins`` writes every ``pixel_origin``, too.
+        Every ``pixel_origin`` is stated.
         """
-        written = [
-            write_image_fields(view, folder, states_origins=states_origins) for view in self.views
-        ]
+        written = [write_image_fields(view, folder) for view in self.views]
         data: dict[str, Any] = {"views": written} if self.others else written[0]
         further = {
             "model": self.model and written_path(self.model, folder=folder),
             "shape": self.shape and written_path(self.shape, folder=folder),
             "object": self.object_name,
             "size": self.size and self.size.given,
-            **({} if self.up_axis == "y" else {"up_axis": self.up_axis}),
             "symmetry": self.symmetry and self.symmetry.to_dict(),
             "init": self.init and self.init.to_dict(),
             "unfinished": dict(self.unfinished or {}) or None,
             "fit": dict(self.fit_options) or None,
         }
-        known = (pair for pair in further.items() if pair[1] is not None or pair[0] == "up_axis")
-        return data | dict(known)
+        data |= {name: value for name, value in further.items() if value is not None}
+        return data if self.up_axis == "y" else data | {"up_axis": self.up_axis}
 
     def save(self, path: str | Path) -> None:
         """Write an observation file; paths are written relative to it."""
         path = as_path(path)
-        write_json(path, self.to_dict(folder=path.parent, states_origins=True))
+        write_json(path, self.to_dict(folder=path.parent))
 
 
 def with_lens(camera: Camera, focal: float | None = None, *, fov: float | None = None) -> Camera:
@@ -215,16 +219,13 @@ def with_lens(camera: Camera, focal: float | None = None, *, fov: float | None =
 class ObservationChanges:
     """A camera in the place of those of observations."""
 
-    camera: Path | None = None  # file of the calibrated camera, see `camera_file.read_camera`
-    pixel_origin: PixelOrigin | None = None  # of that camera
+    camera: Path | None = None  # file of the calibrated camera, see `read_camera`
     focal: Positive | None = None  # focal length of all cameras [px]
     fov: Positive | None = None  # or their horizontal field of view [degrees]
 
     def read_camera(self, size: tuple[int, int] | None) -> Camera | None:
         """The camera, if there is one; ``size`` is the photo's, for a file of a matrix alone."""
-        if self.camera is None:
-            return None
-        return _read_camera(self.camera, size=size, pixel_origin=self.pixel_origin)
+        return None if self.camera is None else _read_camera(self.camera, size=size)
 
     def applied_to(self, observation: Observation, where: str | None = None) -> Observation:
         """The observation with all of this in the place of its own; ``where`` is its file.
@@ -271,15 +272,12 @@ class DetectorOptions:
 
 _ARRAY = ".npy"
 _MOST_BYTES = 2**20  # of an array, which has nine numbers
-_MATRIX_NAMES = ("matrix", "K", "camera_matrix", "cam_K")
-_FIX = "give 3 x 3 numbers, or a JSON file with model, width, height and params as COLMAP does"
 
 
 def read_camera(
     path: str | os.PathLike[str],
     *,
     size: tuple[int, int] | None = None,
-    pixel_origin: PixelOrigin | None = None,
 ) -> Camera:
     """Read a camera from a file.
 
@@ -287,13 +285,10 @@ def read_camera(
     ----------
     path : path-like
         A calibration matrix K: text of 3 x 3 numbers, a ``.npy`` array, or JSON, bare or as
-        ``matrix`` (also ``K``, ``camera_matrix``, ``cam_K``), by rows; or a camera in the form of
+        ``matrix`` (also ``K``, ``camera_matrix``), by rows; or a camera in the form of
         `Camera.from_dict` as JSON.
     size : tuple of 2 int, optional
         Width and height of the photo [px], for a matrix whose file lacks them.
-    pixel_origin : {"center", "corner"}, optional
-        Where (0, 0) lies for the principal point; by default what the file states, or else the
-        centre for a matrix and the corner for COLMAP's form.
 
     Raises
     ------
@@ -302,8 +297,6 @@ def read_camera(
     """
     path = as_path(path)
     form = _read_form(path)
-    if pixel_origin is not None:
-        form["pixel_origin"] = pixel_origin
     if "matrix" in form and not {"width", "height"} <= set(form):
         if size is None:
             what = "the file has a matrix alone, and the size of the image is unknown"
@@ -327,16 +320,14 @@ def _read_form(path: Path) -> dict[str, Any]:
         raise
     if error := other_kind(path, CAMERA, kind_of(data)):
         raise error
-    if isinstance(data, list):
-        return {"matrix": _square(data, path)}
-    if not isinstance(data, dict):
+    form = {"matrix": data} if isinstance(data, list) else data
+    if not isinstance(form, dict):
         what = f"camera: expected an object, got {type(data).__name__}"
-        raise DataError(what, where=str(path), fix=_FIX)
-    for name in _MATRIX_NAMES:
-        if name in data and "params" not in data:
-            rest = {key: value for key, value in data.items() if key != name}
-            return {**rest, "matrix": _square(data[name], path)}
-    return dict(data)
+        raise DataError(what, where=str(path), fix=CAMERA_FIX)
+    name = next((name for name in MATRIX_NAMES if name in form), None)
+    if name is not None and "params" not in form:
+        form["matrix"] = _square(form.pop(name), path)
+    return form
 
 
 def _read_array(path: Path) -> Any:
@@ -355,4 +346,4 @@ def _square(values: Any, path: Path) -> Any:
     try:
         return np.asarray(values, dtype=float).reshape(3, 3)
     except (TypeError, ValueError, OverflowError):
-        raise DataError("not a calibration matrix", where=str(path), fix=_FIX) from None
+        raise DataError("not a calibration matrix", where=str(path), fix=CAMERA_FIX) from None

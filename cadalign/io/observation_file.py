@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, cast
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -15,7 +15,6 @@ from msgspec import UNSET, Meta, UnsetType
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DataError, quote
-from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PixelOrigin, check_pixels, shift_of, unmeasured
 from cadalign.io.documents import (
@@ -32,33 +31,11 @@ from cadalign.io.documents import (
     require_unique,
     written_path,
 )
-from cadalign.io.evidence import ImageEvidence, ObservedImage, Size
+from cadalign.io.evidence import EVIDENCE, ImageEvidence, ObservedImage, Size
 
 _Row4 = tuple[Finite, Finite, Finite, Finite]
-_EVIDENCE: dict[str, Any] = {
-    "mask": PathText,
-    "mask_sigma": Positive,
-    "depth": PathText,
-    "depth_scale": Positive,
-    "depth_sigma": Positive,
-    "up": Point3,
-    "up_sigma_deg": Positive,
-    "camera_height": Positive,
-    "camera_height_sigma": Positive,
-    "cam_from_rig": tuple[_Row4, _Row4, _Row4, _Row4],
-}
 _PATHS = ("mask", "depth")
 _COLUMNS = ("name", "semantic_id", "sigma", "score")  # of all keypoints, or of none
-Declared = TypeVar("Declared", bound=Document)
-
-
-def _with_evidence(fields: type[Declared]) -> type[Declared]:
-    """The declared fields with those of an image's evidence beyond keypoints."""
-    added: list[tuple[str, Any, Any]] = [
-        (name, each | None, None) for name, each in _EVIDENCE.items()
-    ]
-    extended = msgspec.defstruct(fields.__name__, added, bases=(fields,), kw_only=True)
-    return cast("type[Declared]", extended)
 
 
 class SeenKeypoint(Document, kw_only=True):
@@ -73,7 +50,7 @@ class SeenKeypoint(Document, kw_only=True):
 class KeypointFields(SeenKeypoint, kw_only=True):
     """One entry of ``keypoints``."""
 
-    xyz: Point3
+    xyz: Point3 | None = None  # needed with a mesh
     uv: tuple[float | None, float | None] | None  # null, or NaN, where it was not found
     name: Text | None = None
 
@@ -111,37 +88,30 @@ class SizeFields(Document):
     sigma: Positive | list[Positive] | None = None
 
 
-class StartFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The entry ``init``."""
-
-    rotation: tuple[Point3, Point3, Point3]
-    translation: Point3
-    scale: Point3 = (1.0, 1.0, 1.0)
-
-    @classmethod
-    def of(cls, alignment: Alignment) -> StartFields:
-        """The entry of an alignment."""
-        return cast("StartFields", convert(alignment.to_dict(), cls))
-
-    @property
-    def alignment(self) -> Alignment:
-        """The alignment; raises InputError if the rotation is none, or a scale is not positive."""
-        return Alignment(np.array(self.rotation), np.array(self.translation), np.array(self.scale))
-
-
-@_with_evidence
 class ViewFields(Document, kw_only=True):
-    """One entry of ``views``."""
+    """One entry of ``views``; its last fields are those of `ImageEvidence`."""
 
     camera: Any  # in the form of `Camera.from_dict`
     pixel_origin: PixelOrigin = "center"  # of the keypoints' uv
     image: PathText | None = None
     keypoints: list[KeypointFields] = msgspec.field(default_factory=list)
+    mask: PathText | None = None
+    mask_sigma: Positive | None = None
+    depth: PathText | None = None
+    depth_scale: Positive | None = None
+    depth_sigma: Positive | None = None
+    up: Point3 | None = None
+    up_sigma_deg: Positive | None = None
+    camera_height: Positive | None = None
+    camera_height_sigma: Positive | None = None
+    cam_from_rig: tuple[_Row4, _Row4, _Row4, _Row4] | None = None
 
 
-class _ObjectFields(Document, kw_only=True):
-    """Fields of a file beyond those of its images."""
+class ObservationFields(ViewFields, kw_only=True):
+    """A file: fields of its only image, or ``views``, and what is known of the object."""
 
+    camera: Any = UNSET
+    views: Annotated[list[ViewFields], Meta(min_length=1)] | None = None
     model: PathText | None = None
     shape: PathText | None = None
     size: SizeFields | None = None
@@ -149,51 +119,34 @@ class _ObjectFields(Document, kw_only=True):
     up_axis: Literal["x", "y", "z"] | None = "y"
     symmetry: Any = None  # in a form of `Symmetry.from_dict`
     unfinished: Any = None  # the annotator's
-    init: StartFields | None = None
+    init: Any = None  # in the form of `Alignment.from_dict`
     fit: FitFields = msgspec.field(default_factory=FitFields)
 
 
-@_with_evidence
-class OneView(_ObjectFields, kw_only=True):
-    """A file of one image."""
-
-    camera: Any  # as of `ViewFields`
-    pixel_origin: PixelOrigin = "center"
-    image: PathText | None = None
-    keypoints: Annotated[list[KeypointFields], Meta(min_length=1)]
-
-
-class StartedView(OneView, kw_only=True):
-    """A file of one image with a mask or a start, which needs no keypoints."""
-
-    keypoints: list[KeypointFields] = msgspec.field(default_factory=list)
-
-
-class SeveralViews(_ObjectFields, kw_only=True):
-    """A file of several images."""
-
-    views: Annotated[list[ViewFields], Meta(min_length=1)]
-
-
-def read_fields(data: Any) -> tuple[OneView | SeveralViews, tuple[ViewFields | OneView, ...]]:
+def read_fields(data: Any) -> tuple[ObservationFields, Sequence[ViewFields]]:
     """Check the parsed form of a file; returns its fields and those of its views.
 
     Raises DataError if a field is missing, unknown or invalid.
     """
-    if not isinstance(data, Mapping) or "views" not in data:
-        given = data if isinstance(data, Mapping) else {}
-        needs_none = given.get("init") is not None or given.get("mask") is not None
-        one: OneView = convert(data, StartedView if needs_none else OneView)
-        sigma = one.fit.sigma
-        if isinstance(sigma, list) and len(sigma) != len(one.keypoints):
-            what = f"{len(sigma)} numbers for {len(one.keypoints)} keypoints"
-            raise DataError(what, where="fit.sigma", fix="give one for each, or one for all")
-        return one, (one,)
-    several: SeveralViews = convert(data, SeveralViews)
-    if isinstance(several.fit.sigma, list):
-        fix = "give one for all, or `sigma` of every keypoint"
-        raise DataError("a list, but there are several views", where="fit.sigma", fix=fix)
-    return several, tuple(several.views)
+    read: ObservationFields = convert(data, ObservationFields)
+    sigma = read.fit.sigma
+    if read.views is not None:
+        for name in ViewFields.__struct_fields__:
+            if name in data:
+                fix = "give it in each of the views"
+                raise DataError("given beside `views`", where=name, fix=fix)
+        if isinstance(sigma, list):
+            fix = "give one for all, or `sigma` of every keypoint"
+            raise DataError("a list, but there are several views", where="fit.sigma", fix=fix)
+        return read, read.views
+    if read.camera is UNSET:
+        raise DataError("missing", where="camera")
+    if not read.keypoints and read.init is None and read.mask is None:
+        raise DataError("missing", where="keypoints", fix="give keypoints, `mask` or `init`")
+    if isinstance(sigma, list) and len(sigma) != len(read.keypoints):
+        what = f"{len(sigma)} numbers for {len(read.keypoints)} keypoints"
+        raise DataError(what, where="fit.sigma", fix="give one for each, or one for all")
+    return read, (read,)
 
 
 def named_files(data: Any, folder: Path) -> Iterator[Path]:
@@ -207,47 +160,54 @@ def named_files(data: Any, folder: Path) -> Iterator[Path]:
                 yield path_from(path, folder)
 
 
-def read_image_fields(read: ViewFields | OneView, folder: Path | None) -> ObservedImage:
+def read_image_fields(
+    read: ViewFields, folder: Path | None, *, needs_xyz: bool = True
+) -> ObservedImage:
     """An image from its checked fields; paths are relative to ``folder``.
 
-    Raises InputError if the camera is invalid, or fields contradict each other.
+    A missing ``xyz`` is zero, or refused where it is needed. Raises InputError if the camera is
+    invalid, or fields contradict each other.
     """
     for field in ("name", "semantic_id"):
         require_unique(read.keypoints, field)
-    columns = {name: _column(read.keypoints, name) for name in _COLUMNS}
-    camera = Camera.from_dict(read.camera)
-    pixels = [each.uv or (None, None) for each in read.keypoints]
-    points_2d = np.array(pixels, dtype=float).reshape(-1, 2)
-    bad = np.argwhere(np.isinf(points_2d) | (np.isnan(points_2d) != np.isnan(points_2d[:, ::-1])))
-    for row, column in bad:
-        if not np.isfinite(points_2d[row, column]):
-            what = f"{quote(pixels[row][column])} is not a finite number"
-            raise DataError(what, where=f"keypoints[{row}].uv[{column}]")
+    camera, points_2d = Camera.from_dict(read.camera), _pixels(read.keypoints)
     kept = np.flatnonzero(~unmeasured(points_2d)).tolist()
-    lost = tuple(sorted(set(range(len(pixels))).difference(kept)))
-    columns = {
-        name: None if column is None else [column[row] for row in kept]
-        for name, column in columns.items()
-    }
-    keypoints, points_2d = [read.keypoints[row] for row in kept], points_2d[kept]
-    ids, names = columns["semantic_id"], columns["name"]
+    keypoints = {row: read.keypoints[row] for row in kept}
+    points_2d = points_2d[kept]
+    names, ids, sigma, scores = (_column(keypoints, name) for name in _COLUMNS)
+    for row, each in keypoints.items():
+        if needs_xyz and each.xyz is None:
+            raise DataError("missing", where=f"keypoints[{row}].xyz")
     check_pixels(points_2d, camera.width, camera.height, where="keypoints.uv")
-    evidence = {name: getattr(read, name) for name in _EVIDENCE}
+    places = [each.xyz or (0, 0, 0) for each in keypoints.values()]
+    depths = np.array([each.depth for each in keypoints.values()], dtype=float)  # NaN for None
+    evidence = {name: getattr(read, name) for name in EVIDENCE}
     for name in _PATHS:
         evidence[name] = evidence[name] and path_from(evidence[name], folder)
     return ObservedImage(
-        points_3d=np.array([each.xyz for each in keypoints]).reshape(-1, 3),
+        points_3d=np.array(places, dtype=float).reshape(-1, 3),
         points_2d=points_2d - shift_of(read.pixel_origin),
         camera=camera,
-        sigma=columns["sigma"],
+        sigma=sigma,
         ids=None if ids is None else np.array(ids, dtype=np.int64),
         names=None if names is None else tuple(names),
-        scores=columns["score"],
+        scores=scores,
         image=None if read.image is None else path_from(read.image, folder),
-        depths=_depths(keypoints),
-        not_found=lost,
+        depths=depths if np.isfinite(depths).any() else None,
+        not_found=tuple(sorted(set(range(len(read.keypoints))).difference(kept))),
         evidence=ImageEvidence(**evidence),
     )
+
+
+def _pixels(keypoints: Sequence[KeypointFields]) -> FloatArray:
+    """Pixels (n, 2) of keypoints; NaN where they were not found."""
+    pixels = np.array([each.uv or (None, None) for each in keypoints], dtype=float).reshape(-1, 2)
+    half = np.isnan(pixels) & ~np.isnan(pixels[:, ::-1])
+    for row, column in np.argwhere(np.isinf(pixels) | half).tolist():
+        value = (keypoints[row].uv or ())[column]
+        what, where = f"{quote(value)} is not a finite number", f"keypoints[{row}].uv[{column}]"
+        raise DataError(what, where=where)
+    return pixels
 
 
 def read_size(read: SizeFields | None) -> Size | None:
@@ -258,13 +218,8 @@ def read_size(read: SizeFields | None) -> Size | None:
     return None if read is None else Size(**msgspec.structs.asdict(read))
 
 
-def write_image_fields(
-    image: ObservedImage, folder: Path | None, *, states_origins: bool = False
-) -> dict[str, Any]:
-    """Camera, keypoints, photo and evidence of an image as they are written.
-
-    ``states_origins`` writes the pixel conventions of camera and keypoints, which are the defaults.
-    """
+def write_image_fields(image: ObservedImage, folder: Path | None) -> dict[str, Any]:
+    """Camera, keypoints, photo and evidence of an image as they are written."""
     keypoints: list[dict[str, Any]] = [
         {"xyz": xyz, "uv": uv}
         for xyz, uv in zip(image.points_3d.tolist(), image.points_2d.tolist(), strict=True)
@@ -281,11 +236,11 @@ def write_image_fields(
             for keypoint, value in zip(keypoints, listed, strict=True):
                 if value == value:  # an unknown depth is NaN
                     keypoint[name] = value
-    camera = image.camera.to_dict(pixel_origin="corner" if states_origins else None)
-    data: dict[str, Any] = {"camera": camera}
-    if states_origins:
-        data["pixel_origin"] = "center"
-    data["keypoints"] = keypoints
+    data: dict[str, Any] = {
+        "camera": image.camera.to_dict(pixel_origin="corner"),
+        "pixel_origin": "center",
+        "keypoints": keypoints,
+    }
     if image.image is not None:
         data["image"] = written_path(image.image, folder=folder)
     for name, value in image.evidence.given.items():
@@ -296,26 +251,10 @@ def write_image_fields(
     return data
 
 
-def fill_xyz(data: Any) -> Any:
-    """The parsed form of a file, with zeros for the ``xyz`` of keypoints that have none."""
-    if not isinstance(data, Mapping):
-        return data
-    if isinstance(views := data.get("views"), list):
-        return {**data, "views": [fill_xyz(view) for view in views]}
-    keypoints = data.get("keypoints")
-    if not isinstance(keypoints, list):
-        return data
-    filled = [
-        {"xyz": [0.0, 0.0, 0.0], **each} if isinstance(each, Mapping) else each
-        for each in keypoints
-    ]
-    return {**data, "keypoints": filled}
-
-
-def _column(keypoints: Sequence[KeypointFields], name: str) -> Any:
-    """One optional field of all keypoints as a list; None where none has it."""
-    values = [getattr(keypoint, name) for keypoint in keypoints]
-    missing = [row for row, value in enumerate(values) if value is None]
+def _column(keypoints: Mapping[int, KeypointFields], name: str) -> Any:
+    """One optional field of all keypoints, by rows, as a list; None where none has it."""
+    values = {row: getattr(keypoint, name) for row, keypoint in keypoints.items()}
+    missing = [row for row, value in values.items() if value is None]
     if len(missing) == len(values):
         return None
     if missing:
@@ -324,10 +263,4 @@ def _column(keypoints: Sequence[KeypointFields], name: str) -> Any:
             where=f"keypoints[{missing[0]}].{name}",
             fix="give it for all keypoints or for none",
         )
-    return values
-
-
-def _depths(keypoints: Sequence[KeypointFields]) -> FloatArray | None:
-    """Depths of the keypoints, NaN where unknown; None where all are."""
-    depths = np.array([each.depth for each in keypoints], dtype=float)  # NaN for None
-    return depths if np.isfinite(depths).any() else None
+    return list(values.values())

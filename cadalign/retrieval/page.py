@@ -56,7 +56,7 @@ def write_retrieval(
         if query is not None:
             seen = match.observation(query)
             seen.save(observation)
-            fitted = seen.to_dict(folder=made_folder(fit.parent), states_origins=True)
+            fitted = seen.to_dict(folder=made_folder(fit.parent))
             write_json(fit, match.result.to_dict() | {"observation": fitted})
     none = none_text(matches)
     html = fill(

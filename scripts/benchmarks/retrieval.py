@@ -83,7 +83,7 @@ def _run(path: Path, models: Sequence[LibraryModel]) -> Row:
         for _, seen in islice(found, _RUN_QUERIES):
             points, ids = np.zeros((len(seen.points_2d), 3)), np.asarray(seen.ids)
             query = Observation(points, seen.points_2d, KEYPOINT_CAMERA, ids=ids)
-            queries.write(msgspec.json.encode(query.to_dict(states_origins=True)) + b"\n")
+            queries.write(msgspec.json.encode(query.to_dict()) + b"\n")
     command = ["retrieve", str(file), f"--library={path}", f"--out={path.with_name('run')}"]
     call = partial(section.used_by, [*COMMAND, *command, "--no-picture", "--workers=2"])
     used, reference = section.with_reference(call)

@@ -425,7 +425,7 @@ def test_observation_goes_with_one_photo(case: Case) -> None:
 
 def test_files_of_others_are_never_overwritten(case: Case) -> None:
     case.observation.write_text('{"images": []}')
-    assert refusal_text(case.open).startswith(f"{case.observation}: camera: missing, and ")
+    assert refusal_text(case.open).startswith(f"{case.observation}: top level: unknown field ")
     assert case.observation.read_text() == '{"images": []}'
     case.observation.unlink()
 

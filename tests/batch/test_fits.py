@@ -40,7 +40,7 @@ def observations(count: int) -> Iterator[Observation]:
 
 
 def lines(path: Path, count: int) -> Path:
-    texts = [json.dumps(each.to_dict(states_origins=True)) for each in observations(count)]
+    texts = [json.dumps(each.to_dict()) for each in observations(count)]
     path.write_text("\n".join(texts) + "\n")
     return path
 
@@ -126,7 +126,7 @@ def test_workers_may_have_been_started_elsewhere(
 
 
 def test_bad_observations_are_rows_and_stop_nothing(tmp_path: Path) -> None:
-    good = next(observations(1)).to_dict(states_origins=True)
+    good = next(observations(1)).to_dict()
     without_camera = {name: value for name, value in good.items() if name != "camera"}
     bad: list[Any] = [
         good,

@@ -36,7 +36,7 @@ def lines(path: Path, count: int, **fields: Any) -> Path:
     rng, texts = np.random.default_rng(0), []
     for _ in range(count):
         seen = Observation(POINTS, PIXELS + rng.normal(0, 1, PIXELS.shape), CAMERA)
-        data = seen.to_dict(states_origins=True) | fields
+        data = seen.to_dict() | fields
         given = {name: value for name, value in data.items() if value is not None}
         texts.append(json.dumps(given) + "\n")
     path.write_text("".join(texts))

@@ -52,7 +52,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
         pose = look_at(azimuth=rng.uniform(0, 360), elevation=20.0, distance=2.6, scale=stretch)
         seen = CAMERA.project(pose.apply(model.xyz)) + rng.normal(0, 0.5, (len(model.xyz), 2))
         query = Observation(np.zeros_like(model.xyz), seen, CAMERA, None, model.ids)
-        texts.append(json.dumps(query.to_dict(states_origins=True)))
+        texts.append(json.dumps(query.to_dict()))
         keys.append(model.key)
     (folder / "queries.jsonl").write_text("\n".join(texts) + "\n")
     return Case(folder, library, keys)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from fuzz.mutations import Format
 from PIL import Image
-from support.gltf_files import write_gltf
+from support.gltf_files import CORNERS, POSITIONS, VIEWS, write_gltf
 from support.photo_data import read_whole, write_text
 from support.photo_sets import WRITERS
 
@@ -124,11 +124,11 @@ def _write_depth(folder: Path) -> Path:
 
 
 def _write_scene(folder: Path) -> Path:
-    """A scene with a texture, a strip and copies of a mesh."""
+    """A scene with a texture and copies of a mesh."""
     more = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], "<f4").tobytes()
     write_picture("png")(folder)
     attributes = {"POSITION": 0, "TEXCOORD_0": 2}
-    primitive = {"attributes": attributes, "indices": 1, "material": 0, "mode": 5}
+    primitive = {"attributes": attributes, "indices": 1, "material": 0}
     return write_gltf(
         folder / "scene.gltf",
         more=more,
@@ -138,16 +138,8 @@ def _write_scene(folder: Path) -> Path:
             "KHR_texture_transform": {"offset": [0.5, 0], "rotation": 0.1, "scale": [2, 2]}}}}}],
         textures=[{"source": 0}],
         images=[{"uri": "photo.png"}],
-        bufferViews=[
-            {"buffer": 0, "byteLength": 48},
-            {"buffer": 0, "byteOffset": 48, "byteLength": 12},
-            {"buffer": 0, "byteOffset": 60, "byteLength": 32, "byteStride": 8},
-        ],
-        accessors=[
-            {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"},
-            {"bufferView": 1, "componentType": 5123, "count": 6, "type": "SCALAR"},
-            {"bufferView": 2, "componentType": 5126, "count": 4, "type": "VEC2"},
-        ],
+        bufferViews=[*VIEWS, {"buffer": 0, "byteOffset": 60, "byteLength": 32, "byteStride": 8}],
+        accessors=[POSITIONS, CORNERS, POSITIONS | {"bufferView": 2, "type": "VEC2"}],
     )  # fmt: skip
 
 

@@ -23,7 +23,6 @@ TAGS = {
     "unit": 0xA210,
     "width": 0xA002,
     "height": 0xA003,
-    "zoom": 0xA404,
 }
 DIAGONAL_MM = math.hypot(36, 24)
 
@@ -163,9 +162,6 @@ def test_errors_of_the_reader_are_not_taken_for_the_photos(tmp_path: Path) -> No
             {"focal": 4.0, "density": 3000.0, "unit": 2, "width": 1280, "height": 960},
             4 * 3000 / 25.4 / 2,
         ),
-        ({"focal": 4.0, "density": 300.0, "unit": 3, "zoom": 2.0}, 2 * 4 * 300 / 10),
-        ({"focal": 4.0, "density": 300.0, "unit": 3, "zoom": 0.0}, 4 * 300 / 10),
-        ({"equivalent": 52, "focal": 4.25, "zoom": 2.0}, 52 / DIAGONAL_MM * 800),
     ],
 )
 def test_focal_length_is_read(tmp_path: Path, tags: dict[str, Any], focal: float) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 from collections.abc import Callable, Iterator
@@ -11,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.refusals import refusal_line
 
 from cadalign import Camera, FocalPrior, Library, Result, Results, ShapeModel
 from cadalign.datasets import (
@@ -98,20 +96,6 @@ def test_files_without_end_are_no_inputs(tmp_path: Path, reader: Reader) -> None
     os.truncate(path, BYTES)
     with pytest.raises(DataError, match=f"{BYTES} bytes, more than the \\d+ that are read"):
         reader.read(path)
-
-
-def test_shape_that_an_observation_names_is_no_device(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    observation = {
-        "camera": {"width": 64, "height": 48},
-        "keypoints": [{"xyz": [0, 0, 0], "uv": [1, 1], "name": name} for name in "abcdefgh"],
-        "shape": "/dev/zero",
-    }
-    path = tmp_path / "o.json"
-    path.write_text(json.dumps(observation))
-    message = refusal_line(capsys, "fit", path, "--no-picture")
-    assert "/dev/zero: not a regular file; give a file, no pipe and no device" in message
 
 
 def test_runs_are_no_pipes(tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ from trimesh.visual.material import PBRMaterial
 
 from cadalign import Camera
 from cadalign.datasets import load_mesh
-from cadalign.io.meshes.materials import _without_options
 from cadalign.render import Scene, frame_object, look_at, make_renderer
 
 CAMERA = Camera.from_fov(320, 240, fov_x=45)
@@ -25,43 +24,8 @@ def renderer(request):
     return renderer_or_skip(request.param)
 
 
-def _moved(x, y, z, *, turn=0.0, mirror=False):
-    matrix = trimesh.transformations.rotation_matrix(np.radians(turn), [0, 1, 0])
-    if mirror:
-        matrix = matrix @ np.diag([-1.0, 1, 1, 1])
-    matrix[:3, 3] = (x, y, z)
-    return matrix
-
-
 def _plain(color):
     return PBRMaterial(baseColorFactor=color, metallicFactor=0.0, roughnessFactor=0.8)
-
-
-def write_table_glb(path: Path) -> Path:
-    """A red table top on four blue legs of one mesh, each leg a node, two of them mirrored."""
-    top = trimesh.creation.box((2.0, 0.12, 1.2))
-    top.visual = trimesh.visual.TextureVisuals(material=_plain([230, 40, 40, 255]))
-    leg = trimesh.creation.cylinder(0.07, 1.0)
-    leg.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
-    leg.visual = trimesh.visual.TextureVisuals(material=_plain([40, 60, 230, 255]))
-    scene = trimesh.Scene()
-    scene.add_geometry(top, geom_name="top", transform=_moved(0, 0.56, 0))
-    for number, (x, z) in enumerate([(-0.9, -0.5), (0.9, -0.5), (-0.9, 0.5), (0.9, 0.5)]):
-        scene.add_geometry(
-            leg, geom_name="leg", node_name=f"leg{number}", transform=_moved(x, 0, z, mirror=x > 0)
-        )
-    scene.export(path)
-    return path
-
-
-def write_painted_ply(path: Path) -> Path:
-    """A ball whose vertices are red to the left, blue to the right and bright at the top."""
-    ball = trimesh.creation.icosphere(subdivisions=3)
-    share = (ball.vertices + 1) / 2
-    colors = np.column_stack([1 - share[:, 0], 0.7 * share[:, 1], share[:, 0], np.ones(len(share))])
-    ball.visual = trimesh.visual.ColorVisuals(ball, vertex_colors=(255 * colors).astype(np.uint8))
-    ball.export(path)
-    return path
 
 
 def write_crate_obj(folder: Path) -> Path:
@@ -86,15 +50,6 @@ def write_crate_obj(folder: Path) -> Path:
         "usemtl checked\nf 2/1 6/2 7/3 3/4\nf 5/1 1/2 4/3 8/4\n"
         "usemtl lid\nf 4 3 7 8\nf 1 5 6 2\n"
     )
-    return path
-
-
-def write_turned_stl(path: Path) -> Path:
-    """A ring of which every other face is turned inside out; STL knows no materials."""
-    ring = trimesh.creation.torus(1.0, 0.35, major_sections=64, minor_sections=32)
-    faces = np.array(ring.faces)
-    faces[::2] = faces[::2, ::-1]
-    trimesh.Trimesh(ring.vertices, faces, process=False).export(path)
     return path
 
 
@@ -135,25 +90,6 @@ def _color_at(frame, pose, point):
     return part[:, :, :3].reshape(-1, 3).mean(axis=0)
 
 
-@pytest.mark.long
-def test_nodes_of_a_glb_stand_where_their_transforms_put_them(renderer, tmp_path):
-    _, pose, frame = _drawn(renderer, write_table_glb(tmp_path / "table.glb"))
-    red = _color_at(frame, pose, (0, 0.62, 0))
-    assert red[0] > red[1:].max() + 60
-    for x in (-0.9, 0.9):
-        blue = _color_at(frame, pose, (x, 0.0, 0.57))
-        assert blue[2] > blue[:2].max() + 40
-
-
-@pytest.mark.slow
-def test_vertex_colours_of_a_ply_blend(renderer, tmp_path):
-    _, pose, frame = _drawn(renderer, write_painted_ply(tmp_path / "ball.ply"), azimuth=0)
-    left = _color_at(frame, pose, (-0.7, 0, 0.7))
-    right = _color_at(frame, pose, (0.7, 0, 0.7))
-    assert left[0] > left[2] + 60
-    assert right[2] > right[0] + 60
-
-
 @pytest.mark.slow
 def test_an_obj_with_several_textures_shows_each_on_its_faces(renderer, tmp_path):
     _, pose, frame = _drawn(renderer, write_crate_obj(tmp_path))
@@ -167,18 +103,6 @@ def test_an_obj_with_several_textures_shows_each_on_its_faces(renderer, tmp_path
     assert blue[2] > blue[0] + 30
     green = _color_at(frame, pose, (0, 1, 0))
     assert green[1] > max(green[0], green[2]) + 60
-
-
-def test_turned_faces_of_an_stl_leave_no_patches(renderer, tmp_path):
-    scene, _, frame = _drawn(renderer, write_turned_stl(tmp_path / "ring.stl"))
-    normals = scene.mesh.faces[frame.face_id[frame.mask]]
-    assert len(normals) > 5000
-    inner = frame.mask.copy()
-    for _ in range(2):
-        inner[1:-1, 1:-1] &= inner[:-2, 1:-1] & inner[2:, 1:-1] & inner[1:-1, :-2] & inner[1:-1, 2:]
-    brightness = frame.color[:, :, 1].astype(int)
-    step = np.abs(np.diff(brightness, axis=1))[inner[:, 1:] & inner[:, :-1]]
-    assert np.percentile(step, 95) < 16
 
 
 def test_what_is_behind_glass_is_seen_through_it(renderer, tmp_path):
@@ -206,18 +130,3 @@ def test_real_models_are_recognisable_alike_by_every_renderer(renderer):
         difference = frame.color[both][:, :3].astype(int) - expected.color[both][:, :3]
         # Lights without size and another filter of textures make some difference.
         assert np.abs(difference).mean() < 20, path
-
-
-@pytest.mark.parametrize(
-    ("words", "file"),
-    [
-        ("stripes.png", "stripes.png"),
-        ("-s 2 2 1 stripes.png", "stripes.png"),
-        ("-o 0.5 -clamp on my stripes.png", "my stripes.png"),
-        ("-MM 0 1 -bm 0.2 stripes.png", "stripes.png"),
-        ("-clamp", "-clamp"),
-    ],
-)
-def test_the_file_of_a_texture_stands_behind_its_options(words: str, file: str) -> None:
-    """The last word is the file, whatever it looks like."""
-    assert " ".join(_without_options(words.split())) == file

@@ -114,7 +114,9 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
     else:
         assert read.sigma is None
         assert read.ids is None
-    assert read.to_dict() == written.to_dict()
+    data = written.to_dict()
+    assert read.to_dict() == data
+    assert (data["pixel_origin"], data["camera"]["pixel_origin"]) == ("center", "corner")
 
 
 @pytest.mark.parametrize(
@@ -122,19 +124,18 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
     [
         ([1], "{path}: [1] is not an object"),
         (changed("camera", ...), "{path}: camera: missing"),
-        (changed("keypoints", ...), "{path}: keypoints: missing"),
-        (changed("keypoints", []), "{path}: keypoints: [] is not a list of at least 1"),
+        (
+            changed("keypoints", ...),
+            "{path}: keypoints: missing; give keypoints, `mask` or `init`",
+        ),
         (changed("keypoints", {}), "{path}: keypoints: {{}} is not a list"),
         (
             DATA | {"cameras": 3},
             "{path}: top level: unknown field 'cameras', did you mean 'camera'?; "
             "known are cam_from_rig, camera, camera_height, camera_height_sigma, depth, "
             "depth_scale, depth_sigma, fit, image, init, keypoints, mask, mask_sigma, model, "
-            "object, pixel_origin, shape, size, symmetry, unfinished, up, up_axis, up_sigma_deg",
-        ),
-        (
-            DATA | {"x` - at `$.y": 3},
-            "{path}: y: unknown field 'x'",
+            "object, pixel_origin, shape, size, symmetry, unfinished, up, up_axis, up_sigma_deg, "
+            "views",
         ),
         (changed("keypoints.2", 7), "{path}: keypoints[2]: 7 is not an object"),
         (changed("keypoints.2.xyz", ...), "{path}: keypoints[2].xyz: missing"),
@@ -159,17 +160,8 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
         ),
         (changed("keypoints.1.sigma", 0), "{path}: keypoints[1].sigma: 0 is not a positive number"),
         (
-            changed("keypoints.1.sigma", -2),
-            "{path}: keypoints[1].sigma: -2 is not a positive number",
-        ),
-        (
             changed("keypoints.1.sigma", ...),
             "{path}: keypoints[1].sigma: missing, though other keypoints have it; "
-            "give it for all keypoints or for none",
-        ),
-        (
-            changed("keypoints.5.semantic_id", ...),
-            "{path}: keypoints[5].semantic_id: missing, though other keypoints have it; "
             "give it for all keypoints or for none",
         ),
         (
@@ -190,9 +182,8 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
             '{path}: camera: missing params; give {{"model", "width", "height", "params"}} '
             "as COLMAP does",
         ),
-        (changed("camera", "phone"), "{path}: camera: expected an object, got str"),
         (changed("camera", None), "{path}: camera: expected an object, got NoneType"),
-        ("", "{path}, line 1: not valid JSON: Expecting value"),
+        ('{\n"camera": ', "{path}, line 2: not valid JSON: Expecting value"),
         ("null", "{path}: None is not an object"),
     ],
 )
@@ -203,27 +194,6 @@ def test_malformed_files_are_refused_by_file_and_field(
     with pytest.raises(DataError) as caught:
         Observation.load(path)
     assert str(caught.value) == text.format(path=path)
-
-
-def test_file_cut_short_is_refused_with_its_line(tmp_path: Path) -> None:
-    whole = json.dumps(DATA, indent=1)
-    path = write_json(tmp_path / "observation.json", whole[: len(whole) // 2])
-    with pytest.raises(DataError, match=r"observation\.json, line \d+: not valid JSON: "):
-        Observation.load(path)
-
-
-def test_missing_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError) as caught:
-        Observation.load(tmp_path / "nothing.json")
-    assert str(caught.value) == f"{tmp_path / 'nothing.json'}: no such file"
-
-
-def test_folder_and_binary_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="cannot be read"):
-        Observation.load(tmp_path)
-    (tmp_path / "o.json").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(DataError, match=r"o\.json: cannot be read"):
-        Observation.load(tmp_path / "o.json")
 
 
 @pytest.mark.parametrize(
@@ -243,20 +213,6 @@ def test_arrays_that_do_not_match_are_refused(change: dict[str, Any], text: str)
     with pytest.raises(InputError) as caught:
         Observation(**arguments)
     assert str(caught.value) == text
-
-
-def test_saved_paths_still_name_the_same_files(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("photos").mkdir()
-    write_json(Path("photos/first.json"), DATA)
-    loaded = Observation.load("photos/first.json")
-    for again in ("photos/second.json", "third.json"):
-        loaded.save(again)
-        image = Observation.load(again).image
-        assert image is not None
-        assert image.resolve() == tmp_path / "photos" / "photo.png"
 
 
 @pytest.mark.parametrize("absolute", [False, True])
@@ -281,16 +237,23 @@ def test_saved_paths_outside_the_files_folder_name_the_same_files(
     assert not Path(written["image"]).is_absolute()
 
 
-def test_path_that_cannot_be_relative_is_written_absolute(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("name", "content", "text"),
+    [
+        ("gone.json", None, "no such file"),
+        ("o.json", b"\xff\xfe\x00", "cannot be read as text: byte 0 is not UTF-8"),
+        ("", None, "cannot be read (Is a directory)"),
+    ],
+)
+def test_what_is_no_text_file_is_refused(
+    tmp_path: Path, name: str, content: bytes | None, text: str
 ) -> None:
-    def other_drive(*_: object) -> str:
-        raise ValueError("path is on mount 'D:', start on mount 'C:'")
-
-    monkeypatch.setattr("os.path.relpath", other_drive)
-    model = tmp_path / "models" / "model.obj"
-    observation = Observation(POINTS_3D, POINTS_2D, CAMERA, model=model)
-    assert observation.to_dict(folder=tmp_path / "photos")["model"] == model.as_posix()
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(DataError) as caught:
+        Observation.load(path)
+    assert str(caught.value) == f"{path}: {text}"
 
 
 def test_save_cut_short_leaves_the_file_as_it_was(

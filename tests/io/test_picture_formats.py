@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import base64
-import json
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import PIL.EpsImagePlugin
 import pytest
 from PIL import Image
+from support.gltf_files import CORNERS, POSITIONS, SQUARE, VIEWS, data_uri, write_gltf
 
 from cadalign import FocalPrior
 from cadalign.annotate.photos import PhotoFile
@@ -23,23 +23,6 @@ from cadalign.io.images import photo_size, read_grey, read_mask, read_photo
 ROOT = Path(__file__).resolve().parents[2]
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 4 4\n%%EndComments\nshowpage\n%%EOF\n"
 FACE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl a\nf 1/1 2/2 3/3\n"
-PLY = """ply
-format ascii 1.0
-comment TextureFile x.png
-element vertex 3
-property float x
-property float y
-property float z
-property float s
-property float t
-element face 1
-property list uchar int vertex_indices
-end_header
-0 0 0 0 0
-1 0 0 1 0
-0 1 0 0 1
-3 0 1 2
-"""
 
 
 def write_obj(folder: Path, picture: bytes) -> Path:
@@ -49,59 +32,36 @@ def write_obj(folder: Path, picture: bytes) -> Path:
     return folder / "a.obj"
 
 
-def write_ply(folder: Path, picture: bytes) -> Path:
-    (folder / "a.ply").write_text(PLY)
-    (folder / "x.png").write_bytes(picture)
-    return folder / "a.ply"
-
-
-def gltf(picture: dict[str, object], points: bytes) -> dict[str, object]:
-    uv = np.array([[0, 0], [1, 0], [0, 1]], "<f4").tobytes()
-    data = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes() + uv + points
-    attributes = {"POSITION": 0, "TEXCOORD_0": 1}
-    return {
-        "asset": {"version": "2.0"},
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": attributes, "material": 0}]}],
-        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
-        "textures": [{"source": 0}],
-        "images": [picture],
-        "buffers": [{"byteLength": len(data), "uri": data_uri(data)}],
-        "bufferViews": [
-            {"buffer": 0, "byteLength": 36},
-            {"buffer": 0, "byteOffset": 36, "byteLength": 24},
-            {"buffer": 0, "byteOffset": 60, "byteLength": len(points)},
-        ],
-        "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
-            {"bufferView": 1, "componentType": 5126, "count": 3, "type": "VEC2"},
-        ],
-    }
-
-
-def data_uri(data: bytes) -> str:
-    return "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+def write_gltf_with(folder: Path, image: dict[str, Any], more: bytes = b"") -> Path:
+    views = [{"buffer": 0, "byteOffset": 60, "byteLength": 32}]
+    views += [{"buffer": 0, "byteOffset": 92, "byteLength": len(more)}]
+    attributes = {"POSITION": 0, "TEXCOORD_0": 2}
+    return write_gltf(
+        folder / "a.gltf",
+        more=SQUARE[:, :2].tobytes() + more,
+        bufferViews=VIEWS + views,
+        accessors=[POSITIONS, CORNERS, POSITIONS | {"bufferView": 2, "type": "VEC2"}],
+        meshes=[{"primitives": [{"attributes": attributes, "indices": 1, "material": 0}]}],
+        materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+        textures=[{"source": 0}],
+        images=[image],
+    )
 
 
 def write_gltf_beside(folder: Path, picture: bytes) -> Path:
     (folder / "x y.png").write_bytes(picture)
-    (folder / "a.gltf").write_text(json.dumps(gltf({"uri": "x%20y.png"}, b"")))
-    return folder / "a.gltf"
+    return write_gltf_with(folder, {"uri": "x%20y.png"})
 
 
 def write_gltf_embedded(folder: Path, picture: bytes) -> Path:
-    (folder / "a.gltf").write_text(json.dumps(gltf({"uri": data_uri(picture)}, b"")))
-    return folder / "a.gltf"
+    return write_gltf_with(folder, {"uri": data_uri(picture)})
 
 
 def write_gltf_in_buffer(folder: Path, picture: bytes) -> Path:
-    image: dict[str, object] = {"bufferView": 2, "mimeType": "image/png"}
-    (folder / "a.gltf").write_text(json.dumps(gltf(image, picture)))
-    return folder / "a.gltf"
+    return write_gltf_with(folder, {"bufferView": 3, "mimeType": "image/png"}, picture)
 
 
-MODELS = [write_obj, write_ply, write_gltf_beside, write_gltf_embedded, write_gltf_in_buffer]
+MODELS = [write_obj, write_gltf_beside, write_gltf_embedded, write_gltf_in_buffer]
 READERS = [
     read_photo,
     photo_size,
@@ -166,6 +126,12 @@ def test_formats_that_are_promised_are_read(tmp_path: Path, ending: str) -> None
     path = tmp_path / f"a.{ending}"
     Image.new("RGB", (8, 8), (250, 20, 20)).save(path)
     assert read_photo(path)[3, 3, 0] > 200
+
+
+def test_a_photo_is_no_mask(tmp_path: Path) -> None:
+    Image.new("RGB", (64, 48)).save(tmp_path / "a.png")
+    with pytest.raises(DataError, match=r"the image has the mode RGB; give an image of one grey"):
+        read_mask(tmp_path / "a.png")
 
 
 def test_one_module_decodes_pictures() -> None:

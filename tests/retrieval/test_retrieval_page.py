@@ -342,7 +342,7 @@ def test_malformed_queries_are_refused(
 
     camera = CAMERA.to_dict()
     assert refused([]) == "there are no keypoints"
-    assert refused({"camera": camera}) == "keypoints: missing"
+    assert refused({"camera": camera}).startswith("keypoints: missing; ")
     keypoint = {"uv": [1.0, 2.0], "semantic_id": 0}
     assert "keypoints[0].uv" in refused({"camera": camera, "keypoints": [{"semantic_id": 0}]})
     assert "keypoints[0]" in refused({"camera": camera, "keypoints": [3]})

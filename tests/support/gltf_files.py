@@ -11,6 +11,12 @@ import numpy as np
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4")
 FACES = np.array([0, 1, 2, 0, 2, 3], "<u2")
+VIEWS = [
+    {"buffer": 0, "byteLength": 48},
+    {"buffer": 0, "byteOffset": 48, "byteLength": 12},
+]
+POSITIONS = {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"}
+CORNERS = {"bufferView": 1, "componentType": 5123, "count": 6, "type": "SCALAR"}
 
 
 def data_uri(data: bytes) -> str:
@@ -27,14 +33,8 @@ def write_gltf(path: Path, *, more: bytes = b"", **changes: Any) -> Path:
         "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
         "buffers": [{"byteLength": len(data), "uri": data_uri(data)}],
-        "bufferViews": [
-            {"buffer": 0, "byteLength": 48},
-            {"buffer": 0, "byteOffset": 48, "byteLength": 12},
-        ],
-        "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"},
-            {"bufferView": 1, "componentType": 5123, "count": 6, "type": "SCALAR"},
-        ],
+        "bufferViews": VIEWS,
+        "accessors": [POSITIONS, CORNERS],
     }
     path.write_text(json.dumps(document | changes))
     return path

@@ -140,36 +140,11 @@ def as_mesh(given: object, *, where: str) -> Mesh:
     raise InputError(what, where=where, fix="read it with cadalign.load_mesh")
 
 
-def flat_axes(mesh: Mesh) -> tuple[str, ...]:
-    """Name the axes along which a mesh has no thickness: less than 1e-5 of its box's diagonal.
+def check_solid(mesh: Mesh) -> None:
+    """Refuse a mesh that has no thickness along an axis: less than 1e-5 of its box's diagonal.
 
     Such a model has no volume, no stretch along that axis can be told, and boxes around it have no
     overlap to measure.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        The model.
-
-    Returns
-    -------
-    tuple of str
-        Some of "x", "y", "z"; empty for a solid model.
-
-    Examples
-    --------
-    >>> square = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
-    >>> flat_axes(square)
-    ('z',)
-    """
-    low, high = mesh.bounds
-    extents = np.asarray(high - low)
-    flat = extents <= _FLAT * np.linalg.norm(extents)
-    return tuple(axis for axis, thin in zip("xyz", flat, strict=True) if thin)
-
-
-def check_solid(mesh: Mesh) -> None:
-    """Refuse a mesh that has no thickness along an axis; see `flat_axes`.
 
     Raises
     ------
@@ -182,13 +157,12 @@ def check_solid(mesh: Mesh) -> None:
     Traceback (most recent call last):
     cadalign.errors.DataError: square.obj: the model has zero thickness along z; leave it out
     """
-    flat = flat_axes(mesh)
-    if flat:
-        raise DataError(
-            f"the model has zero thickness along {' and '.join(flat)}",
-            where=mesh.source,
-            fix="leave it out",
-        )
+    extents = np.ptp(mesh.bounds, axis=0)
+    is_flat = extents <= _FLAT * np.linalg.norm(extents)
+    if is_flat.any():
+        names = " and ".join(axis for axis, flat in zip("xyz", is_flat, strict=True) if flat)
+        what = f"the model has zero thickness along {names}"
+        raise DataError(what, where=mesh.source, fix="leave it out")
 
 
 def write_obj_mesh(path: Path, mesh: Mesh) -> None:

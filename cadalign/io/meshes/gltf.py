@@ -5,15 +5,14 @@ that is missing or of another type ends in one of Python's errors, which `cadali
 into a DataError.
 
 trimesh takes normalized integers as they stand and sparse values without their changes, makes room
-for arrays without data, leaves out fans, and knows neither transforms of textures nor what a file
-says that it requires.
+for arrays without data, and knows neither transforms of textures nor what a file says that it
+requires.
 """
 
 from __future__ import annotations
 
 import base64
-import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,15 +21,13 @@ from urllib.parse import unquote, unquote_to_bytes
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import FloatArray
 from cadalign.errors import DataError, brief, quote
 from cadalign.geometry.mesh import GREY, Material, Mesh, join
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.io.documents import parse_json
 from cadalign.io.files import damaged, read_bytes, reading, require_count
 from cadalign.io.meshes.materials import WHITE, Texture, Textures
-
-logger = logging.getLogger("cadalign")
 
 _Part = dict[str, Any]
 _NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -41,18 +38,18 @@ _EXTENSIONS = (
     "KHR_xmp_json_ld",
 )
 _LOOKS = "KHR_materials_"
-_INSTANCES = "EXT_mesh_gpu_instancing"
-_TRIANGLES, _STRIP, _FAN = 4, 5, 6
-# A node of some 20 bytes repeats a whole mesh: what all take together is bounded by the file.
-_FREE_BYTES, _EXPANSION = 2**27, 64
-_VERTEX_BYTES, _FACE_BYTES = 24 + 32, 24 + 48 + 8 + 8  # colours, texture coordinates included
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6  # a primitive's modes; points and lines have others
+_FREE_FACES = 2**20  # of a scene; each takes up to 256 bytes
 
 
 def read_gltf(data: bytes, path: Path) -> Mesh:
     """Read the content of a glTF or GLB file as one mesh, each node placed by its transform.
 
+    Skins and morph targets have no effect.
+
     Raises DataError if it is no glTF 2.0 file, has no faces, is no tree of nodes, needs an
-    extension that is not read, or repeats its meshes to more than 128 MB and 64 times its bytes.
+    extension that is not read, or repeats its meshes to more than a million faces and one for every
+    two bytes.
     """
     text, binary = _chunks(data, path) if data[:4] == b"glTF" else (data, b"")
     with reading(path):
@@ -67,12 +64,13 @@ def read_gltf(data: bytes, path: Path) -> Mesh:
     ]
     if not placed:
         raise DataError("the file has no faces", fix="is it whole?")
-    _check_size(file, [primitive for primitive, _ in placed])
-    _warn_of_what_moves(file)
-    surfaces = dict[int, Mesh]()
-    for primitive, _ in placed:
-        if id(primitive) not in surfaces:
-            surfaces[id(primitive)] = _surface(file, primitive)
+    # A node of some 20 bytes repeats a whole mesh.
+    faces = sum(_count_faces(document, primitive) for primitive, _ in placed)
+    if faces > _FREE_FACES + file.size // 2:
+        what = f"its nodes repeat meshes to {faces} faces, from {file.size} bytes"
+        raise DataError(what, fix="simplify it, or leave copies out")
+    distinct = {id(primitive): primitive for primitive, _ in placed}
+    surfaces = {key: _surface(file, primitive) for key, primitive in distinct.items()}
     return join([_moved(surfaces[id(primitive)], at) for primitive, at in placed], str(path))
 
 
@@ -82,7 +80,6 @@ class _GltfFile:
     def __init__(self, path: Path, document: _Part, size: int, binary: bytes) -> None:
         self.path, self.document, self.size = path, document, size
         self._textures = Textures()
-        self._looks: dict[int | None, tuple[Material, _Part]] = {None: (Material(), {})}
         uris = [each.get("uri") for each in document.get("buffers", [])]
         named: dict[str | None, bytes] = {None: binary}
         for uri in uris:
@@ -91,6 +88,8 @@ class _GltfFile:
                 named[uri] = read_bytes(path.parent / unquote(uri)) if data is None else data
                 self.size += len(named[uri]) if data is None else 0
         self._buffers = [named[uri] for uri in uris]
+        self.looks = [self._look(part) for part in document.get("materials", [])]
+        """Materials, and their references to textures, empty where they have none."""
 
     def view(self, number: int) -> memoryview:
         """The bytes of a buffer view."""
@@ -132,22 +131,18 @@ class _GltfFile:
             raise damaged(what, f"accessors[{numbers[name]}]")
         return values
 
-    def look(self, number: int | None) -> tuple[Material, _Part]:
-        """A material, and its reference to a texture, empty if it has none."""
-        if number not in self._looks:
-            part = nth(self.document, "materials", number or 0)
-            metallic = part.get("pbrMetallicRoughness", {})
-            older = part.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
-            factor = metallic.get("baseColorFactor") or older.get("diffuseFactor")
-            use = metallic.get("baseColorTexture") or older.get("diffuseTexture") or {}
-            texture = self._texture(use["index"]) if use else None
-            color = GREY if texture is None else WHITE
-            if factor is not None:
-                red, green, blue, opacity = _encoded(np.clip(factor, 0, 1)).tolist()
-                color = (red, green, blue, opacity)
-            material = Material(str(part.get("name", "")), color, texture)
-            self._looks[number] = material, use if texture is not None else {}
-        return self._looks[number]
+    def _look(self, part: _Part) -> tuple[Material, _Part]:
+        metallic = part.get("pbrMetallicRoughness", {})
+        older = part.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
+        factor = metallic.get("baseColorFactor") or older.get("diffuseFactor")
+        use = metallic.get("baseColorTexture") or older.get("diffuseTexture") or {}
+        texture = self._texture(use["index"]) if use else None
+        color = GREY if texture is None else WHITE
+        if factor is not None:
+            red, green, blue, opacity = _encoded(np.clip(factor, 0, 1)).tolist()
+            color = (red, green, blue, opacity)
+        material = Material(str(part.get("name", "")), color, texture)
+        return material, use if texture is not None else {}
 
     def _texture(self, number: int) -> Texture | None:
         part = nth(self.document, "textures", number)
@@ -216,27 +211,9 @@ def _check(document: _Part) -> None:
         )
 
 
-def _warn_of_what_moves(file: _GltfFile) -> None:
-    """Warn of what places vertices elsewhere in viewers, and is not read."""
-    document = file.document
-    found = {
-        "skins": any("skin" in node for node in document["nodes"]),
-        "morph targets": any(any(each.get("weights", [])) for each in document["meshes"]),
-        _INSTANCES: _INSTANCES in document.get("extensionsUsed", []),
-    }
-    if any(found.values()):
-        names = " and ".join(name for name, is_there in found.items() if is_there)
-        said = "%s: not read are %s, by which its vertices lie elsewhere; export it with them"
-        logger.warning(f"{said} applied", file.path, names)
-
-
 def _placements(document: _Part) -> Iterator[tuple[int, FloatArray]]:
     """Meshes and their transforms, in the order of the nodes from the scene's roots down."""
-    if document.get("scenes"):
-        roots: Sequence[int] = nth(document, "scenes", document.get("scene", 0)).get("nodes", [])
-    else:  # a library of parts; shown are all
-        children = {k for node in document.get("nodes", []) for k in node.get("children", [])}
-        roots = [k for k in range(len(document.get("nodes", []))) if k not in children]
+    roots = nth(document, "scenes", document.get("scene", 0)).get("nodes", [])
     waiting = [(root, np.eye(4)) for root in reversed(roots)]
     seen: set[int] = set()
     while waiting:
@@ -268,34 +245,25 @@ def _local(node: _Part) -> FloatArray:
 def _count_faces(document: _Part, primitive: _Part) -> int:
     """The number of a primitive's triangles; 0 of points and lines."""
     position, mode = primitive["attributes"].get("POSITION"), primitive.get("mode", _TRIANGLES)
-    if position is None or mode not in (_TRIANGLES, _STRIP, _FAN):
+    if mode in (_STRIP, _FAN):
+        what = "strips and fans of triangles are not read"
+        raise DataError(what, where="meshes", fix="export single triangles")
+    if position is None or mode != _TRIANGLES:
         return 0
     count: int = nth(document, "accessors", primitive.get("indices", position))["count"]
-    return count // 3 if mode == _TRIANGLES else max(count - 2, 0)
-
-
-def _check_size(file: _GltfFile, primitives: list[_Part]) -> None:
-    """Refuse a scene that repeats its meshes to far more than its file."""
-    faces = size = 0
-    for primitive in primitives:
-        count = _count_faces(file.document, primitive)
-        vertices = nth(file.document, "accessors", primitive["attributes"]["POSITION"])["count"]
-        faces += count
-        # Many primitives may share one array; files that are named count as well.
-        size += _VERTEX_BYTES * min(vertices, 3 * count) + _FACE_BYTES * count
-    if size > _FREE_BYTES + _EXPANSION * file.size:
-        what = f"its nodes repeat meshes to {faces} faces, from {file.size} bytes"
-        raise DataError(what, fix="simplify it, or leave copies out")
+    return count // 3
 
 
 def _surface(file: _GltfFile, primitive: _Part) -> Mesh:
     """The mesh of a primitive in its own frame."""
-    material, use = file.look(primitive.get("material"))
+    material, use = Material(), _Part()
+    if "material" in primitive:
+        material, use = file.looks[primitive["material"]]
     vertices = file.attribute(primitive, "POSITION", 3).astype(np.float64)
     corners = np.arange(len(vertices))
     if "indices" in primitive:
         corners = file.array(primitive["indices"])[:, 0].astype(np.int64)
-    faces = _triangles(corners, primitive.get("mode", _TRIANGLES))
+    faces = corners[: len(corners) // 3 * 3].reshape(-1, 3)
     uv, colors = _texture_coordinates(file, primitive, use), _colors(file, primitive)
     if len(vertices) > faces.size:  # they are shared with other primitives
         kept, faces = np.unique(faces, return_inverse=True)
@@ -305,17 +273,6 @@ def _surface(file: _GltfFile, primitive: _Part) -> Mesh:
         material = Material(color=WHITE)
     uv = None if uv is None else uv[faces]
     return Mesh(vertices, faces, vertex_colors=colors, corner_uv=uv, materials=(material,))
-
-
-def _triangles(corners: IntArray, mode: int) -> IntArray:
-    """The triangles (m, 3) of a list of triangles, a strip or a fan."""
-    if mode == _TRIANGLES:
-        return corners[: len(corners) // 3 * 3].reshape(-1, 3)
-    first = np.arange(len(corners) - 2)
-    if mode == _FAN:
-        return corners[np.stack([first + 1, first + 2, np.zeros_like(first)], axis=1)]
-    odd = first % 2
-    return corners[np.stack([first, first + 1 + odd, first + 2 - odd], axis=1)]
 
 
 def _texture_coordinates(file: _GltfFile, primitive: _Part, use: _Part) -> FloatArray | None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import io
 import logging
+import math
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
@@ -28,7 +29,6 @@ logger = logging.getLogger("cadalign")
 _Entry = dict[str, list[str]]
 
 WHITE = (1.0, 1.0, 1.0, 1.0)
-_SWITCHES = ("on", "off")  # values of options of map_Kd
 
 
 def load_materials(
@@ -39,10 +39,12 @@ def load_materials(
     ``libraries`` is what the OBJ file's ``mtllib`` lines name; only the textures of ``names`` are
     read.
     """
-    paths = (path for library in dict.fromkeys(libraries) for path in _paths(obj_path, library))
     entries: dict[str, tuple[Path, _Entry]] = {}
-    for path in {path.resolve(): path for path in paths}.values():
-        entries |= {name: (path, entry) for name, entry in _parse_library(path).items()}
+    for library in dict.fromkeys(libraries):
+        if path := find_file(obj_path.parent, library):
+            entries |= {name: (path, entry) for name, entry in _parse_library(path).items()}
+        else:
+            logger.warning("%s: no material library %s beside it", obj_path, brief(library))
     found: dict[str, Material] = {}
     textures = Textures()
     for name in names:
@@ -54,16 +56,6 @@ def load_materials(
             logger.warning("%s: material %s is not defined; it becomes grey", obj_path, quote(name))
             found[name] = Material(name=name)
     return found
-
-
-def _paths(obj_path: Path, library: str) -> Iterator[Path]:
-    """The files that an ``mtllib`` line names: one with blanks in its name, or several."""
-    whole = find_file(obj_path.parent, library)
-    for name in library.split() if whole is None else [library]:
-        if path := find_file(obj_path.parent, name):
-            yield path
-        else:
-            logger.warning("%s: no material library %s beside it", obj_path, brief(name))
 
 
 def _parse_library(path: Path) -> dict[str, _Entry]:
@@ -88,47 +80,35 @@ def _parse_library(path: Path) -> dict[str, _Entry]:
 
 
 def _material(name: str, path: Path, entry: _Entry, textures: Textures) -> Material:
-    words = _without_options(entry.get("map_kd", []))
-    texture = textures.read(path, " ".join(words)) if words else None
-    color = _color(entry)
-    if texture is None and "map_kd" in entry:
-        color = (*GREY[:3], color[3])
-    elif texture is not None and not any(color[:3]):
-        # Exporters write a black Kd beside a texture; multiplied, the texture would vanish.
-        color = (1.0, 1.0, 1.0, color[3])
+    texture, color = None, _color(entry)
+    if words := entry.get("map_kd"):
+        # Options, such as "-s 1 1 1", stand before the file, whose name may have blanks.
+        files = [" ".join(words[start:]) for start in range(len(words))]
+        file = next((each for each in files if _find_texture(path.parent, each)), files[0])
+        texture = textures.read(path, file)
+        if texture is None:
+            color = (*GREY[:3], color[3])
+        elif not any(color[:3]):
+            # Exporters write a black Kd beside a texture; multiplied, the texture would vanish.
+            color = (1.0, 1.0, 1.0, color[3])
     return Material(name=name, color=color, texture=texture)
 
 
 def _color(entry: _Entry) -> tuple[float, float, float, float]:
-    values = [_number([word]) for word in entry.get("kd", [])]
-    rgb = values * 3 if len(values) == 1 else values[:3]
-    known = GREY[:3] if len(rgb) < 3 or None in values else rgb
-    opacity = _number(entry.get("d"))
-    if opacity is None:
-        transparency = _number(entry.get("tr"))
-        opacity = 1.0 if transparency is None else 1.0 - transparency
-    red, green, blue, alpha = (float(v) for v in np.clip([*known, opacity], 0.0, 1.0))
+    rgb, opacity, transparency = (_numbers(entry.get(key, ())) for key in ("kd", "d", "tr"))
+    alpha = opacity[-1] if opacity else 1.0 - transparency[-1] if transparency else 1.0
+    known = rgb[:3] if len(rgb) >= 3 else GREY[:3]
+    red, green, blue, alpha = np.clip([*known, alpha], 0.0, 1.0).tolist()
     return red, green, blue, alpha
 
 
-def _number(words: list[str] | None) -> float | None:
-    """The last of the words (``d -halo 0.5``), None if it is not a number."""
-    try:
-        value = float(words[-1]) if words else np.nan
-    except ValueError:
-        return None
-    return value if np.isfinite(value) else None
-
-
-def _without_options(words: Sequence[str]) -> Sequence[str]:
-    """The words of ``map_Kd`` without its options, such as ``-s 1 1 1`` and ``-clamp on``."""
-    position = 0
-    while position < len(words) - 1 and (
-        words[position].startswith("-")
-        or (position and (_number([words[position]]) is not None or words[position] in _SWITCHES))
-    ):
-        position += 1
-    return words[position:]
+def _numbers(words: Sequence[str]) -> list[float]:
+    """The finite numbers among words, such as those of ``d -halo 0.5``."""
+    found: list[float] = []
+    for word in words:
+        with suppress(ValueError):
+            found.append(float(word))
+    return [each for each in found if math.isfinite(each)]
 
 
 Texture = npt.NDArray[np.uint8]
@@ -151,56 +131,50 @@ class Textures:
 
         One that is not where it is named is looked for beside the file.
         """
-        folder = beside.parent
-        found = find_file(folder, name) or find_file(folder, PurePosixPath(name).name)
-        path = folder / name if found is None else found.resolve()
-        if path in self._known:
-            return self._known[path]
-        self._known[path] = None
-        if found is None:
-            logger.warning("%s: the texture %s is missing; drawn grey", beside, brief(name))
-            return None
-        keep(found)
-        with _left_out(beside, name), open_photo(found) as image:
-            self._known[path] = self._pixels(image)
+        found = _find_texture(beside.parent, name)
+        path = beside.parent / name if found is None else found.resolve()
+        if path not in self._known:
+            self._known[path] = None
+            if found is None:
+                logger.warning("%s: the texture %s is missing; drawn grey", beside, brief(name))
+            else:
+                keep(found)
+                self._known[path] = self._pixels(open_photo(found), beside, name)
         return self._known[path]
 
     def decode(self, data: bytes, *, within: Path, name: str) -> Texture | None:
         """Decode a picture that is a part of a file, (h, w, 3 or 4) uint8."""
         if name not in self._known:
-            file, self._known[name] = io.BytesIO(data), None
-            with _left_out(within, name), open_picture(file, len(data), where=str(within)) as image:
-                self._known[name] = self._pixels(image)
+            opened = open_picture(io.BytesIO(data), len(data), where=str(within))
+            self._known[name] = self._pixels(opened, within, name)
         return self._known[name]
 
-    def _pixels(self, image: Image) -> Texture:
-        transparent = "A" in image.getbands() or "transparency" in image.info
-        mode = "RGBA" if transparent else "RGB"
-        size = len(mode) * image.width * image.height
-        if size > self._bytes_left:
-            raise DataError("the textures of this mesh have more than a gigabyte of pixels")
-        self._bytes_left -= size
-        with warnings.catch_warnings(action="ignore"):
-            return np.asarray(image.convert(mode))
+    def _pixels(
+        self, opened: AbstractContextManager[Image], path: Path, name: str
+    ) -> Texture | None:
+        try:
+            with opened as image, warnings.catch_warnings(action="ignore"):
+                transparent = "A" in image.getbands() or "transparency" in image.info
+                mode = "RGBA" if transparent else "RGB"
+                self._bytes_left -= len(mode) * image.width * image.height
+                if self._bytes_left < 0:
+                    raise DataError("the textures of this mesh have more than a gigabyte of pixels")
+                return np.asarray(image.convert(mode))
+        except Exception as error:  # Pillow's decoders raise what they like on damaged files
+            reason = error.what if isinstance(error, CadalignError) else brief(error)
+            given = path, brief(name), reason
+            logger.warning("%s: the texture %s cannot be read (%s); drawn grey", *given)
+            return None
 
 
 def find_file(folder: Path, name: str) -> Path | None:
     """The file of this name relative to the folder, also if it is written with backslashes."""
     for spelling in (name, name.replace("\\", "/")):
-        try:
+        with suppress(OSError, ValueError):
             if spelling and (folder / spelling).is_file():
                 return folder / spelling
-        except (OSError, ValueError):
-            continue
     return None
 
 
-@contextmanager
-def _left_out(path: Path, name: str) -> Iterator[None]:
-    """Warn of a texture that cannot be read; what would return it returns None."""
-    try:
-        yield
-    except Exception as error:  # Pillow's decoders raise what they like on damaged files
-        reason = error.what if isinstance(error, CadalignError) else brief(error)
-        given = path, brief(name), reason
-        logger.warning("%s: the texture %s cannot be read (%s); drawn grey", *given)
+def _find_texture(folder: Path, name: str) -> Path | None:
+    return find_file(folder, name) or find_file(folder, PurePosixPath(name).name)

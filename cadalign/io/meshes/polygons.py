@@ -19,12 +19,11 @@ from cadalign.arrays import FloatArray, parse_numbers
 from cadalign.errors import DataError, brief
 from cadalign.geometry.mesh import GREY, Material, Mesh
 from cadalign.io.files import damaged, require_count
-from cadalign.io.meshes.materials import WHITE, Textures
+from cadalign.io.meshes.materials import WHITE
 
 _HEADER_END = re.compile(rb"^end_header[ \t]*(?:\r?\n|\Z)", re.MULTILINE)
 _LENGTH = "length of "  # of a list, a field beside it
 _INDICES = ("vertex_indices", "vertex_index")
-_COORDINATES = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
 _ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 # PLY's names of numbers, as NumPy has them.
 _CODES = {
@@ -37,7 +36,7 @@ _STL_HEADER = 84
 _STL_FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
 _STL_FACET = re.compile(rb"\bfacet\s+normal\b", re.IGNORECASE)
 _STL_CORNER = re.compile(rb"\bvertex\s+(\S+\s+\S+\s+\S+)", re.IGNORECASE)
-_OFF_WORD = re.compile(rb"(?:ST)?C?N?(4?n?)OFF(.*)", re.IGNORECASE)
+_OFF_WORD = re.compile(rb"(?:ST)?C?N?OFF(.*)", re.IGNORECASE)
 
 
 @dataclass
@@ -50,56 +49,43 @@ class _Element:
 
 
 def read_ply(data: bytes, path: Path) -> Mesh:
-    """Read the content of a PLY file; `cadalign.load_mesh` is the public way to it."""
+    """Read the content of a PLY file; `cadalign.load_mesh` is the public way to it.
+
+    Colours of vertices are read; textures, and colours of faces, are not.
+    """
     if data[:100].split(maxsplit=1)[:1] not in ([b"ply"], [b"PLY"]):
         raise DataError("not a PLY file", fix="does it begin with 'ply'?")
     end = _HEADER_END.search(data)
     if end is None:
         raise damaged("the PLY header has no end")
-    form, elements, texture_name = _header(data[: end.start()].decode("utf-8", errors="replace"))
-    kinds = {each.name: each.properties for each in elements}
+    form, elements = _header(data[: end.start()].decode("utf-8", errors="replace"))
     data, place = data[end.end() :], 0
     if form == "ascii":
         data = parse_numbers(data, len(data.split())).tobytes()
-        for each in elements:
-            each.properties = {name: ("d",) * len(code) for name, code in each.properties.items()}
-    read: dict[str, dict[str, Any]] = {}
+    read: dict[str, list[Any]] = {}
     for each in elements:
-        read[each.name], place = _columns(data, place, each, _ORDERS[form], path)
+        read[each.name], place = _blocks(data, place, each, form, path)
     require_count("bytes", place, len(data), len(data) - place, path)
-    vertex, face = read.get("vertex", {}), read.get("face", {})
-    polygons = next((face[name] for name in _INDICES if name in face), ())
-    if not len(polygons):
+    faces = read.get("face", [])
+    name = next((name for name in _INDICES if faces and name in faces[0].dtype.names), None)
+    if name is None:
         raise DataError("the PLY file has no faces")
-    sizes = np.fromiter(map(len, polygons), np.int64, len(polygons))
-    corners = _flat(polygons).astype(np.int64)
-    texture = Textures().read(path, texture_name) if texture_name else None
-    uv = None if texture is None else _texture_coordinates(vertex, face, corners)
-    colors = _colors(vertex, kinds["vertex"])
-    face_colors = None if colors is not None else _colors(face, kinds["face"])
-    materials: tuple[Material, ...] = (Material(color=GREY if colors is None else WHITE),)
-    material = None
-    if uv is not None:
-        materials = (Material(color=WHITE, texture=texture),)
-    elif face_colors is not None:
-        distinct, rows = np.unique(face_colors, axis=0, return_inverse=True)
-        materials = tuple(Material(color=tuple(color.tolist())) for color in distinct)
-        material = rows.reshape(-1)
+    vertices = read["vertex"]
+    (kinds,) = (each.properties for each in elements if each.name == "vertex")
+    colors = _colors(vertices, kinds)
     return Mesh.from_polygons(
-        np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float64),
-        corners,
-        sizes,
-        corner_uv=uv,
-        polygon_material=material,
+        np.stack([_column(vertices, axis) for axis in "xyz"], axis=1).astype(np.float64),
+        np.concatenate([block[name].ravel() for block in faces]).astype(np.int64),
+        np.concatenate([np.full(len(block), block[name].shape[1]) for block in faces]),
         vertex_colors=colors,
-        materials=materials,
+        materials=(Material(color=GREY if colors is None else WHITE),),
         source=str(path),
     )
 
 
-def _header(text: str) -> tuple[str, list[_Element], str]:
-    """The format, the elements, and the name of a texture."""
-    form, elements, texture = "", list[_Element](), ""
+def _header(text: str) -> tuple[str, list[_Element]]:
+    """The format and the elements."""
+    form, elements = "", list[_Element]()
     for line in text.splitlines():
         match line.split():
             case ["format", name, *_]:
@@ -110,100 +96,80 @@ def _header(text: str) -> tuple[str, list[_Element], str]:
                 elements[-1].properties[name] = (_CODES[counted], _CODES[kind])
             case ["property", kind, name]:
                 elements[-1].properties[name] = (_CODES[kind],)
-            case [comment, word, *_] if (comment, word.lower()) == ("comment", "texturefile"):
-                texture = line.split(maxsplit=2)[2].strip()
-    return form, elements, texture
+    return form, elements
 
 
-def _columns(
-    data: bytes, place: int, element: _Element, order: str, path: Path
-) -> tuple[dict[str, Any], int]:
-    """The values of an element's properties (n,), lists as rows, and the place of their end."""
-    if not element.count or not element.properties:
-        return {}, place
-    kind, rows = _row_type(data, place, element, order), list[Any]()
-    if kind is not None and place + element.count * kind.itemsize <= len(data):
-        read = np.frombuffer(data, kind, element.count, place)
-        lengths = [read[name] for name in read.dtype.names or () if name.startswith(_LENGTH)]
-        if all((each == each[0]).all() for each in lengths):
-            return {name: read[name] for name in element.properties}, place + read.nbytes
-    while len(rows) < element.count and kind is not None and place + kind.itemsize <= len(data):
-        rows.append(np.frombuffer(data, kind, 1, place)[0])
-        place += kind.itemsize
-        kind = _row_type(data, place, element, order)
-    what = {"vertex": "vertices", "face": "faces"}.get(element.name, element.name)
-    require_count(what, element.count, len(rows), 0, path)
-    return {name: [row[name] for row in rows] for name in element.properties}, place
+def _blocks(
+    data: bytes, place: int, element: _Element, form: str, path: Path
+) -> tuple[list[Any], int]:
+    """The rows of an element, in arrays of rows with equal lengths of lists, and their end."""
+    blocks, left, wanted = list[Any](), element.count if element.properties else 0, element.count
+    while left > 0:
+        kind = _row_type(data, place, element, form)
+        count = 0 if kind is None else min(left, wanted, (len(data) - place) // kind.itemsize)
+        rows: Any = np.frombuffer(data, kind, count, place) if count else np.empty(0)
+        if not len(rows):
+            what = {"vertex": "vertices", "face": "faces"}.get(element.name, element.name)
+            require_count(what, element.count, element.count - left, 0, path)
+        names = [name for name in rows.dtype.names or () if name.startswith(_LENGTH)]
+        differs = np.any([rows[name] != rows[name][0] for name in names], axis=0)
+        count = int(np.argmax(differs)) if np.any(differs) else len(rows)
+        blocks.append(rows[:count])
+        place, left, wanted = place + blocks[-1].nbytes, left - count, 2 * count
+    return blocks, place
 
 
-def _row_type(data: bytes, place: int, element: _Element, order: str) -> np.dtype[Any] | None:
+def _row_type(data: bytes, place: int, element: _Element, form: str) -> np.dtype[Any] | None:
     """The type of the row at a place, by the lengths of its lists; None where the data end."""
     fields: list[tuple[Any, ...]] = []
-    for name, (*counted, code) in element.properties.items():
-        if counted:
-            length, start = np.dtype(order + counted[0]), place + np.dtype(fields).itemsize
+    for name, codes in element.properties.items():
+        kinds = [_ORDERS[form] + ("d" if form == "ascii" else code) for code in codes]
+        if len(kinds) > 1:
+            length, start = np.dtype(kinds[0]), place + np.dtype(fields).itemsize
             if start + length.itemsize > len(data):
                 return None
             count = int(np.frombuffer(data, length, 1, start)[0])
-            fields += [(_LENGTH + name, length), (name, order + code, (count,))]
+            fields += [(_LENGTH + name, length), (name, kinds[1], (count,))]
         else:
-            fields.append((name, order + code))
+            fields.append((name, kinds[0]))
     return np.dtype(fields)
 
 
-def _flat(lists: Any) -> Any:
-    """The values of all lists of a column, one after the other."""
-    return lists.ravel() if isinstance(lists, np.ndarray) else np.concatenate(lists)
+def _column(blocks: list[Any], name: str) -> Any:
+    """A property of all rows (n,)."""
+    return np.concatenate([block[name] for block in blocks])
 
 
-def _colors(columns: dict[str, Any], kinds: dict[str, tuple[str, ...]]) -> FloatArray | None:
-    """Colours (n, 4) from 0 to 1."""
-    if not columns or not {"red", "green", "blue"} <= columns.keys():
+def _colors(blocks: list[Any], kinds: dict[str, tuple[str, ...]]) -> FloatArray | None:
+    """Colours (n, 4) of vertices from 0 to 1."""
+    if not {"red", "green", "blue"} <= kinds.keys():
         return None
-    colors = np.ones((len(columns["red"]), 4))
+    colors = np.ones((sum(map(len, blocks)), 4))
     for channel, name in enumerate(("red", "green", "blue", "alpha")):
-        if name in columns:
+        if name in kinds:
             code = kinds[name][-1]
             scale = 1 if code in "fd" else np.iinfo(np.dtype(code)).max
-            colors[:, channel] = np.asarray(columns[name], dtype=float) / scale
+            colors[:, channel] = _column(blocks, name) / scale
     return np.clip(colors, 0, 1)
-
-
-def _texture_coordinates(
-    vertex: dict[str, Any], face: dict[str, Any], corners: Any
-) -> FloatArray | None:
-    """Texture coordinates of all corners of faces (c, 2)."""
-    if "texcoord" in face:
-        uv = _flat(face["texcoord"]).astype(float).reshape(-1, 2)
-        return uv if len(uv) == len(corners) else None
-    for names in _COORDINATES:
-        if set(names) <= vertex.keys():
-            points = np.stack([vertex[name] for name in names], axis=1)
-            return np.asarray(points[corners], dtype=float)
-    return None
 
 
 def read_stl(data: bytes, path: Path) -> Mesh:
     """Read the content of an STL file, text or binary; each face has vertices of its own."""
     found = _STL_CORNER.findall(data) if data.lstrip()[:5].lower() == b"solid" else []
     if found:
-        announced = len(_STL_FACET.findall(data))
-        require_count("faces", announced, len(found) // 3, 0, path)
-        end = data.lower().rfind(b"endsolid")
+        announced, end = len(_STL_FACET.findall(data)), data.lower().rfind(b"endsolid")
         if end < 0 or len(found) != 3 * announced:
-            raise damaged(f"the text ends before 'endsolid', after {announced} faces")
-        behind = data[end:].partition(b"\n")[2].strip()
-        require_count("faces", announced, announced, len(behind), path)
+            raise damaged(f"the text ends before 'endsolid', after {len(found) // 3} faces")
+        surplus = len(data[end:].partition(b"\n")[2].strip())
+        require_count("faces", announced, announced, surplus, path)
         corners = parse_numbers(b" ".join(found), 3 * len(found))
     else:
         if len(data) < _STL_HEADER:
             raise damaged(f"{len(data)} bytes, but the header alone has {_STL_HEADER}")
         announced = int.from_bytes(data[80:_STL_HEADER], "little")
-        if not announced:
-            raise DataError("the file has no faces", fix="is it whole?")
-        size = announced * _STL_FACE.itemsize
-        there = (len(data) - _STL_HEADER) // _STL_FACE.itemsize
-        require_count("faces", announced, there, len(data) - _STL_HEADER - size, path)
+        size = len(data) - _STL_HEADER
+        surplus = size - announced * _STL_FACE.itemsize
+        require_count("faces", announced, size // _STL_FACE.itemsize, surplus, path)
         corners = np.frombuffer(data, _STL_FACE, announced, _STL_HEADER)["corners"]
     vertices = corners.reshape(-1, 3).astype(np.float64)
     return Mesh(vertices, np.arange(len(vertices)).reshape(-1, 3), source=str(path))
@@ -213,14 +179,11 @@ def read_off(data: bytes, path: Path) -> Mesh:
     """Read the content of an OFF file; colours of its vertices and faces are not read."""
     rows = [row for line in data.splitlines() if (row := line.partition(b"#")[0].split())]
     found = _OFF_WORD.fullmatch(rows[0][0]) if rows else None
-    if found is None:
-        raise DataError("not an OFF file", fix="does it begin with 'OFF'?")
-    if found[1] or rows[0][1:2] == [b"BINARY"]:
-        kind = "of more than three dimensions" if found[1] else "binary"
-        fix = "save it as text of three dimensions"
-        raise DataError(f"an OFF file that is {kind} is not read", fix=fix)
+    if found is None or rows[0][1:2] == [b"BINARY"]:
+        what = "not an OFF file of text and of three dimensions"
+        raise DataError(what, fix="does it begin with 'OFF'?")
     # Some files have the counts in the first line, even without a blank before them.
-    counts = [each for each in (found[2], *rows[0][1:]) if each]
+    counts = [each for each in (found[1], *rows[0][1:]) if each]
     if not counts:
         counts, rows = rows[1], rows[1:]
     vertices, faces = int(counts[0]), int(counts[1])

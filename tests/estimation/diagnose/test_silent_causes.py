@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from support.mistaken import CAMERA, CATEGORIES, Sighting, examples, learned, said, seen, sighting
@@ -228,14 +229,16 @@ def test_no_hypothesis_contradicts_where_the_keypoints_lie(real_data: Path) -> N
             assert f"images of {width} x {height}" not in text
 
 
-def test_no_hypothesis_contradicts_the_size_of_a_photo(real_data: Path) -> None:
+def test_no_hypothesis_contradicts_the_size_of_a_photo(real_data: Path, tmp_path: Path) -> None:
+    photo = tmp_path / "photo.png"
+    cv2.imwrite(str(photo), np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8))
     supposed = [False, False]
     for seed in range(8):
         given = seen(real_data, "chair", seed, distance=(1.2, 1.6))
-        for has_photo in (False, True):
-            view = View(CAMERA, given.points_2d / 2, has_photo=has_photo)
+        for own in (None, photo):
+            view = View(CAMERA, given.points_2d / 2, photo=own)
             text = said(partial(align, Model(points_3d=given.points_3d), view))
-            supposed[has_photo] |= "images of 320 x 240 px" in text
+            supposed[own is photo] |= "images of 320 x 240 px" in text
     assert supposed == [True, False]
 
 

@@ -13,11 +13,7 @@ if TYPE_CHECKING:
     from cadalign.datasets.detections.keypoint_files import read_image_keypoints
 
     # `open` is not in __all__: a star import must not hide the built-in function.
-    from cadalign.datasets.formats import (
-        CORRESPONDENCE_FORMATS,
-        open_correspondences,
-        open_photos,
-    )
+    from cadalign.datasets.formats import open_correspondences, open_photos
     from cadalign.datasets.formats import open_photos as open  # noqa: F401
     from cadalign.datasets.models.keypointnet import AnnotatedModel, KeypointNet
     from cadalign.datasets.models.keypoints import Circle, Keypoints, RotationalSymmetry, Symmetries
@@ -35,7 +31,6 @@ if TYPE_CHECKING:
     from cadalign.io.meshes.files import check_solid, flat_axes, load_mesh
 
 __all__ = [
-    "CORRESPONDENCE_FORMATS",
     "SYNSETS",
     "AnnotatedModel",
     "BlindPnP",

@@ -6,8 +6,6 @@ import base64
 import json
 import os
 import pickle
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,7 +23,6 @@ from cadalign.datasets import (
     load_mesh,
     read_image_keypoints,
 )
-from cadalign.datasets.sfm.unpickling import load_pickle
 from cadalign.errors import CadalignError, DataError
 from cadalign.io.documents import read_json
 from cadalign.io.images import read_photo
@@ -146,63 +143,7 @@ def test_materials_share_the_texture_that_they_name(tmp_path: Path) -> None:
     assert second is third
 
 
-# --- pickles ----------------------------------------------------------------------------------
-
-
-def doubled(levels: int) -> list[Any]:
-    """Lists that each hold the next one twice: 2^levels values in a few bytes."""
-    value: list[Any] = [0.0]
-    for _ in range(levels):
-        value = [value, value]
-    return value
-
-
-PICKLES = {
-    "itself": b"\x80\x02]q\x00(h\x00h\x00e.",
-    "doubled": pickle.dumps(doubled(40), protocol=2),
-    "tuples": b"\x80\x02" + b"(" * 1_000_000 + b"t" * 1_000_000 + b".",
-    "key": b"\x80\x02})" + b"\x85" * 1_000_000 + b"K\x01s.",
-    "member": b"\x80\x04\x8f()" + b"\x85" * 1_000_000 + b"\x90.",
-    "memory": b"\x80\x02]r\xff\xff\xff\x0f.",
-    "put": b"\x80\x02]p268435455\n.",
-    "integer": b"\x80\x02\x8b\xff\xff\xff\x7f.",
-    "bytes": b"\x80\x04\x8e\xff\xff\xff\xff\xff\xff\xff\x0f.",
-    "array": b"\x80\x05\x96\xff\xff\xff\xff\xff\xff\xff\x0f.",
-    "frame": b"\x80\x04\x95\xff\xff\xff\xff\xff\xff\xff\x0f].",
-    "stack": b"\x80\x02" + b"0" * 10 + b".",
-    "nothing": b"",
-}
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", PICKLES)
-def test_hostile_pickles_are_refused_quickly(tmp_path: Path, name: str) -> None:
-    (tmp_path / "a.pkl").write_bytes(PICKLES[name])
-    # In its own process, which may neither crash nor take more than 300 MB on top.
-    code = (
-        "import resource, sys\n"
-        "from cadalign.datasets.sfm.unpickling import load_pickle\n"
-        "from cadalign.errors import DataError\n"
-        "size = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()\n"
-        "resource.setrlimit(resource.RLIMIT_AS, (size + 300_000_000,) * 2)\n"
-        "try:\n"
-        "    load_pickle(sys.argv[1])\n"
-        "except DataError as error:\n"
-        "    sys.exit(7 if len(str(error)) < 500 + len(sys.argv[1]) else 8)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code, tmp_path / "a.pkl"], timeout=60, check=False)
-    assert done.returncode == 7
-
-
-def test_shared_and_nested_values_of_honest_pickles_are_loaded(tmp_path: Path) -> None:
-    shared = np.arange(6.0).reshape(2, 3)
-    value = {"a": [shared, shared, (1, (2.5, [None, {"b": "text"}]))], "c": {1, 2}}
-    for protocol in range(2, pickle.HIGHEST_PROTOCOL + 1):
-        (tmp_path / "a.pkl").write_bytes(pickle.dumps(value, protocol=protocol))
-        loaded = load_pickle(tmp_path / "a.pkl")
-        np.testing.assert_array_equal(loaded["a"][0], shared)
-        assert loaded["a"][2] == (1, (2.5, [None, {"b": "text"}]))
-        assert loaded["c"] == {1, 2}
+# --- numbers -----------------------------------------------------------------------------------
 
 
 @pytest.mark.filterwarnings("error")

@@ -10,7 +10,7 @@ import tyro
 
 from cadalign.cli.common import SOME_FAILED, SUCCESS, say
 from cadalign.cli.options import named_as_flags
-from cadalign.datasets.photos.scannet import read_matrix
+from cadalign.datasets.photos.dataset import read_matrix
 from cadalign.errors import refuse_unused
 from cadalign.export.aligned_object import Frame
 from cadalign.export.formats import FORMATS, export_object, format_of

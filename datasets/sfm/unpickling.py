@@ -14,7 +14,7 @@ import math
 import os
 import pickletools
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, ValuesView
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -28,6 +28,7 @@ from cadalign.io.files import as_path, damaged, read_bytes
 # Numbers and text; no records, whose fields can hide objects.
 _PLAIN_DTYPE = re.compile(r"b1|[iufc]\d{1,2}|[SU][1-9]\d{0,5}|O\d?")
 _MAX_DEPTH = 100
+_PARTS = (list, tuple, ValuesView)
 _FIX = (
     "only NumPy arrays and plain containers are loaded, a pickle can run code; get a trusted file"
 )
@@ -35,12 +36,18 @@ _ARRAY, _DTYPE, _NDARRAY = "numpy._core.multiarray._reconstruct", "numpy.dtype",
 _SCALAR, _BUFFER = "numpy._core.multiarray.scalar", "numpy._core.numeric._frombuffer"
 _BYTES, _ENCODE = "builtins.bytes", "_codecs.encode"
 _KNOWN = {_ARRAY, _DTYPE, _NDARRAY, _SCALAR, _BUFFER, _BYTES, _ENCODE}
-_CONTAINERS = (list, tuple, type({}.values()))
 _CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
 # Steps of containers, and how many values each takes; None for those from the last mark on.
-_COUNTS = {"EMPTY_LIST": 0, "EMPTY_TUPLE": 0, "EMPTY_DICT": 0, "TUPLE1": 1, "TUPLE2": 2}
-_COUNTS |= {"TUPLE3": 3, "APPEND": 1, "SETITEM": 2}
-_COUNTS |= dict.fromkeys(("LIST", "TUPLE", "DICT", "APPENDS", "SETITEMS"))
+_COUNTS: dict[str, int | None] = {
+    **dict.fromkeys(("EMPTY_LIST", "EMPTY_TUPLE", "EMPTY_DICT"), 0),
+    "TUPLE1": 1,
+    "TUPLE2": 2,
+    "TUPLE3": 3,
+    "APPEND": 1,
+    "SETITEM": 2,
+    **dict.fromkeys(("LIST", "TUPLE", "DICT", "APPENDS", "SETITEMS")),
+}
+_STEPS = {step.code.encode("latin-1"): step for step in pickletools.opcodes}
 _LITERALS = {
     step.name
     for step in pickletools.opcodes
@@ -68,7 +75,7 @@ def load_pickle(path: str | os.PathLike[str]) -> Any:
     """
     data = read_bytes(as_path(path))
     try:
-        with in_file(path):
+        with in_file(str(path)):
             value = _run(data)
         _check_size(value, most=10 * len(data))
         return value
@@ -134,7 +141,7 @@ def _steps(data: bytes) -> Iterator[tuple[str, Any]]:
     """A program's steps to its end, each with its argument."""
     stream = io.BytesIO(data)
     while (code := stream.read(1)) != b".":
-        step = pickletools.code2op[code.decode("latin-1")]
+        step = _STEPS[code]
         if step.name == "STRING":  # Python 2's, which need not be ASCII
             text = pickletools.read_stringnl(stream, decode=False)
             yield step.name, codecs.escape_decode(text)[0].decode("latin-1")
@@ -220,6 +227,6 @@ def _check_size(value: Any, *, most: int) -> None:
         if not level or count > most:
             break
         parts = [each.values() if isinstance(each, dict) else each for each in level]
-        level = [each for part in parts if isinstance(part, _CONTAINERS) for each in part]
+        level = [each for part in parts if isinstance(part, _PARTS) for each in part]
     if level:
         raise ValueError("its values are nested too deeply, or more than the file has bytes")

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from cadalign.cli import main
 from cadalign.datasets import BlindPnP, Correspondences, open_correspondences
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError
 from cadalign.estimation.fit import fit
 from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.result import Result

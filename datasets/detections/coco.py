@@ -44,7 +44,7 @@ class _ByAxis(ForeignDocument):
 
 
 class _Object(ForeignDocument):
-    """One object of any form, or one frame of a video with its objects."""
+    """One object of any form."""
 
     keypoints: list[Any] | _ByAxis | None = None
     keypoint_scores: list[float | None] | None = None
@@ -54,8 +54,6 @@ class _Object(ForeignDocument):
     image_id: _Id | None = None
     category_id: _Id | None = None
     num_keypoints: Any = None
-    frame_id: _Id | None = None
-    instances: list[_Object] | None = None
     segmentation: Any = None
 
 
@@ -91,6 +89,10 @@ class _Category(ForeignDocument):
 _Entry = TypeVar("_Entry", _Image, _Category)
 
 
+class _Meta(ForeignDocument):
+    keypoint_id2name: dict[str, Text] | None = None
+
+
 class _File(ForeignDocument):
     """COCO's annotations, or MMPose's predictions: the last two fields."""
 
@@ -98,7 +100,7 @@ class _File(ForeignDocument):
     images: list[_Image] | None = None
     categories: list[_Category] | None = None
     instance_info: list[_Object] = field(default_factory=list)
-    meta_info: dict[str, Any] | None = None
+    meta_info: _Meta = field(default_factory=_Meta)
 
 
 def read_coco_keypoints(
@@ -179,25 +181,13 @@ def _annotated(
 
 
 def _from_predictions(data: _File) -> Iterator[_Reader]:
-    names, given = None, (data.meta_info or {}).get("keypoint_id2name")
-    by_number = convert(given, dict[str, Text] | None, where="meta_info.keypoint_id2name")
+    names, by_number = None, data.meta_info.keypoint_id2name
     if by_number is not None:
         listed = [by_number.get(str(number)) for number in range(len(by_number))]
-        names = convert(listed, list[Text], where="meta_info.names")
+        names = convert(listed, list[Text], where="meta_info.keypoint_id2name")
     for row, entry in enumerate(data.instance_info):
         where = f"instance_info[{row}]"
-        if entry.instances is None:
-            yield where, partial(_image_keypoints, entry, where, names=names)
-        for number, instance in enumerate(entry.instances or []):
-            place = f"{where}.instances[{number}]"
-            yield place, partial(_in_frame, instance, place, names, entry.frame_id)
-
-
-def _in_frame(
-    entry: _Object, where: str, names: list[str] | None, frame: _Id | None
-) -> ImageKeypoints:
-    found = _image_keypoints(entry, where, names=names)
-    return found if frame is None else replace(found, image=str(frame))
+        yield where, partial(_image_keypoints, entry, where, names=names)
 
 
 def _image_keypoints(entry: _Object, where: str, *, names: list[str] | None) -> ImageKeypoints:

@@ -128,7 +128,6 @@ def test_splits(root):
     dataset = KeypointNet(root)
     assert dataset.splits == ("test", "train")
     assert dataset.split("test") == {("chair", "z")}
-    assert dataset.split("test") is KeypointNet(root).split("test")  # read once
     assert [model.key for model in dataset.subset(split="train")] == [("chair", "a"), ("mug", "m")]
     with pytest.raises(InputError, match="unknown split 'val'; known are test, train"):
         KeypointNet(root).split("val")
@@ -177,13 +176,13 @@ def test_meshes_of_every_layout_are_found(root, tmp_path):
     ply = tmp_path / f"ShapeNetCore.v2.ply/{CHAIR}/a.ply"
     write_ply_mesh(ply, load_mesh(KeypointNet(root)["chair", "a"].mesh_path))
     other = write_obj(tmp_path / f"elsewhere/{CHAIR}/a/model.obj")
-    below = root / f"models/{CHAIR}/a/models/model_normalized.obj"
-    assert KeypointNet(root).mesh_paths("chair", "a") == (ply, below)
     dataset = KeypointNet(root, shapenet_root=tmp_path / "elsewhere")
-    assert dataset.mesh_paths("chair", "a") == (other, ply, below)
     assert dataset["chair", "a"].mesh_path == other
-    for path in dataset.mesh_paths("chair", "a"):
-        assert len(load_mesh(path).faces) == 4
+    assert KeypointNet(root)["chair", "a"].mesh_path == ply
+    assert len(load_mesh(ply).faces) == 4
+    ply.unlink()
+    below = root / f"models/{CHAIR}/a/models/model_normalized.obj"
+    assert KeypointNet(root)["chair", "a"].mesh_path == below
 
 
 def test_mesh_that_does_not_belong_to_the_annotation_is_refused(root):
@@ -360,27 +359,25 @@ def test_real_annotations_load_whole(real):
 
 @pytest.mark.long
 def test_real_keypoints_lie_where_their_faces_say(real):
-    paths = [path for key in real.ids() for path in real.mesh_paths(*key)]
-    assert sorted({path.suffix for path in paths}) == [".obj", ".ply"]
-    checked = 0
-    for model in real.subset(with_mesh=True):
-        for path in real.mesh_paths(*model.key):
-            rebuilt = model.keypoints.on_mesh(load_mesh(path))
-            assert np.abs(rebuilt - model.keypoints.xyz).max() < 1e-6, path
-            checked += 1
-    assert checked >= 11
+    checked = set()
+    for root in (None, real.root / "models"):
+        for model in KeypointNet(real.root, shapenet_root=root).subset(with_mesh=True):
+            rebuilt = model.keypoints.on_mesh(load_mesh(model.mesh_path))
+            assert np.abs(rebuilt - model.keypoints.xyz).max() < 1e-6, model.mesh_path
+            checked.add(model.mesh_path)
+    assert len(checked) >= 11
+    assert {path.suffix for path in checked} == {".obj", ".ply"}
 
 
 @pytest.mark.timing
 def test_real_meshes_load_quickly(real):
-    path = max((p for k in real.ids() for p in real.mesh_paths(*k)), key=lambda p: p.stat().st_size)
+    path = max(real.root.glob("models/*/*/models/*.obj"), key=lambda path: path.stat().st_size)
     assert len(load_mesh(path).faces) > 60_000
     assert reference_seconds(timed(lambda: load_mesh(path)), below=0.5) < 0.5
 
 
 def test_real_textures_are_found(real):
-    key = ("chair", "88382b877be91b2a572f8e1c1caad99e")
-    path = next(path for path in real.mesh_paths(*key) if path.suffix == ".obj")
-    mesh = load_mesh(path)
+    model = f"models/{CHAIR}/88382b877be91b2a572f8e1c1caad99e/models/model_normalized.obj"
+    mesh = load_mesh(real.root / model)
     assert all(material.texture is not None for material in mesh.materials)
     assert mesh.corner_uv is not None

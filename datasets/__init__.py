@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from cadalign.datasets.photos.photo import CadModel, Photo, PhotoKeypoints, PhotoObject, Truth
     from cadalign.datasets.photos.pix3d import Pix3D
     from cadalign.datasets.photos.scan2cad import Scan2CAD
-    from cadalign.datasets.sample.writer import sample_models, write_sample_dataset
+    from cadalign.datasets.sample.writer import write_sample_dataset
     from cadalign.datasets.sfm.blind_pnp import BlindPnP
     from cadalign.datasets.sfm.colmap import Colmap
     from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet
@@ -65,7 +65,6 @@ __all__ = [
     "open_correspondences",
     "open_photos",
     "read_image_keypoints",
-    "sample_models",
     "write_sample_dataset",
 ]
 

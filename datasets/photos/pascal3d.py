@@ -254,7 +254,6 @@ class Pascal3DDetections(PhotoDataset):
         return PhotoKeypoints(
             points_2d=np.array([each.uv for each in found], dtype=float).reshape(-1, 2),
             names=tuple(each.name for each in found),
-            visible=np.ones(len(found), dtype=bool),
             scores=np.array(scores) if scores else None,
         )
 
@@ -298,7 +297,7 @@ def _anchors(anchors: dict[str, _Anchor | None]) -> PhotoKeypoints | None:
     if not marked:
         return None
     points = np.array(list(marked.values())) - _FIRST_PIXEL
-    return PhotoKeypoints(points, tuple(marked), np.ones(len(points), dtype=bool))
+    return PhotoKeypoints(points, tuple(marked))
 
 
 def _truth(viewpoint: dict[str, Any], camera: Camera) -> Truth:

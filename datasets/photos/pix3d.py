@@ -153,5 +153,4 @@ def _keypoints(entry: _Entry) -> PhotoKeypoints | None:
         return None
     marked = np.where(is_marked[:, :, None], given, 0.0)[:, rows]
     mean = marked.sum(axis=0) / is_marked[:, rows].sum(axis=0)[:, None] - PIXEL_CENTRE
-    names = tuple(str(row) for row in rows)
-    return PhotoKeypoints(mean, names, np.ones(len(rows), dtype=bool))
+    return PhotoKeypoints(mean, tuple(str(row) for row in rows))

@@ -236,8 +236,7 @@ def _keypoints(
     pixels = camera.project_where_ahead(cam_from_world.apply(on_scan))
     inside = np.isfinite(pixels).all(axis=1) & camera.contains(pixels)
     seen = tuple(name for name, is_seen in zip(names, inside, strict=True) if is_seen)
-    marked = PhotoKeypoints(pixels[inside], seen, np.ones(len(seen), dtype=bool))
-    return (marked if seen else None), points
+    return (PhotoKeypoints(pixels[inside], seen) if seen else None), points
 
 
 def _rectangle(box: Box, camera: Camera) -> FloatArray | None:

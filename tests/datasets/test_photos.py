@@ -75,7 +75,7 @@ def test_what_is_missing_is_told(tmp_path):
     with pytest.raises(DataError, match=r"gone\.obj"):
         CadModel("x", tmp_path / "gone.obj").load_mesh()
     with pytest.raises(DataError, match="2 keypoints, 1 names"):
-        PhotoKeypoints(np.zeros((2, 2)), ("a",), np.ones(2, dtype=bool))
+        PhotoKeypoints(np.zeros((2, 2)), ("a",))
 
 
 def test_folders_are_recognised_or_what_is_known_is_told(tmp_path):

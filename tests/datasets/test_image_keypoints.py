@@ -176,16 +176,10 @@ def test_flags_are_told_from_scores(
         ),
         ([], "{path}: there are no keypoints"),
         ({"annotations": []}, "{path}: there are no keypoints"),
-        ([7], "{path}: [0]: 7 is not an object"),
         (
             [{"bbox": [1, 2, 3, 4]}],
             "{path}: [0].keypoints: missing; is it COCO's keypoint JSON, or a detector's? "
             "see cadalign's page on keypoints of detectors",
-        ),
-        (
-            changed("annotations.0.keypoints", ...),
-            "{path}: annotations[0].keypoints: missing; is it COCO's keypoint JSON, or a "
-            "detector's? see cadalign's page on keypoints of detectors",
         ),
         (
             changed("annotations.0.keypoints", []),
@@ -204,28 +198,13 @@ def test_flags_are_told_from_scores(
             "{path}: annotations[0].keypoints[2]: 'two' is not a finite number",
         ),
         (
-            changed("annotations.0.keypoints", [1, "1", 2] * 3),
-            "{path}: annotations[0].keypoints[1]: '1' is not a finite number",
-        ),
-        (
             changed("annotations.0.image_id", 12),
             "{path}: annotations[0].image_id: there is no image 12",
         ),
         (changed("annotations.0.image_id", ...), "{path}: annotations[0].image_id: missing"),
         (
-            changed("annotations.0.category_id", [1]),
-            "{path}: annotations[0].category_id: [1] is not a whole number or a text",
-        ),
-        (changed("images.0.id", ...), "{path}: images[0].id: missing"),
-        (changed("images.0.file_name", 5), "{path}: images[0].file_name: 5 is not a text"),
-        (changed("images", 5), "{path}: images: 5 is not a list"),
-        (
             changed("categories.0.id", [1]),
             "{path}: categories[0].id: [1] is not a whole number or a text",
-        ),
-        (
-            changed("categories.0.keypoints", "nose"),
-            "{path}: categories[0].keypoints: 'nose' is not a list",
         ),
         (
             changed("categories.0.keypoints.2", "nose"),
@@ -234,11 +213,6 @@ def test_flags_are_told_from_scores(
         (
             {**ANNOTATIONS, "images": [*ANNOTATIONS["images"], {"id": 3, "file_name": "c"}]},
             "{path}: images[2].id: 3 is the id of another entry, too; ",
-        ),
-        (changed("annotations", 5), "{path}: annotations: 5 is not a list"),
-        (
-            [{"keypoints": {"x": [1, 2]}}],
-            "{path}: [0].keypoints.y: missing",
         ),
         (
             [{"keypoints": {"x": [1, 2], "y": [1]}}],
@@ -255,10 +229,6 @@ def test_flags_are_told_from_scores(
         (
             [{"keypoints": [[1, 2, -0.5]]}],
             "[0]: scores: keypoint 0 has the value -0.5, which is negative",
-        ),
-        (
-            {"instance_info": [{"keypoints": [[1, 2]]}], "meta_info": {"keypoint_id2name": [1]}},
-            "{path}: meta_info.keypoint_id2name: [1] is not an object",
         ),
         (
             {"instance_info": [{"keypoints": [[1, 2]]}], "meta_info": {"keypoint_id2name": {}}},

@@ -89,10 +89,6 @@ class _Category(ForeignDocument):
 _Entry = TypeVar("_Entry", _Image, _Category)
 
 
-class _Meta(ForeignDocument):
-    keypoint_id2name: dict[str, Text] | None = None
-
-
 class _File(ForeignDocument):
     """COCO's annotations, or MMPose's predictions: the last two fields."""
 
@@ -100,7 +96,7 @@ class _File(ForeignDocument):
     images: list[_Image] | None = None
     categories: list[_Category] | None = None
     instance_info: list[_Object] = field(default_factory=list)
-    meta_info: _Meta = field(default_factory=_Meta)
+    meta_info: dict[str, Any] | None = None
 
 
 def read_coco_keypoints(
@@ -181,10 +177,11 @@ def _annotated(
 
 
 def _from_predictions(data: _File) -> Iterator[_Reader]:
-    names, by_number = None, data.meta_info.keypoint_id2name
-    if by_number is not None:
-        listed = [by_number.get(str(number)) for number in range(len(by_number))]
-        names = convert(listed, list[Text], where="meta_info.keypoint_id2name")
+    names, given = None, (data.meta_info or {}).get("keypoint_id2name")
+    if given is not None:
+        place = "meta_info.keypoint_id2name"
+        by_number = convert(given, dict[str, Text], place)
+        names = convert([by_number.get(str(n)) for n in range(len(by_number))], list[Text], place)
     for row, entry in enumerate(data.instance_info):
         where = f"instance_info[{row}]"
         yield where, partial(_image_keypoints, entry, where, names=names)

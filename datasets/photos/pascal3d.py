@@ -63,22 +63,17 @@ _IMAGE_FOLDERS = ("Images", "images")
 _IMAGES = (".jpg", ".JPEG", ".jpeg", ".png")
 
 
-class _Size(ForeignDocument):
-    width: Positive
-    height: Positive
-
-
 class _Record(ForeignDocument):
     objects: Any = None
-    size: _Size | None = None
-    imgsize: tuple[Positive, Positive, Positive] | None = None
+    size: dict[str, Positive] | None = None
+    imgsize: list[Positive] | None = None
 
     @property
     def written_size(self) -> tuple[int, int] | None:
         """Width and height of the image, where they are known."""
-        if self.size is not None:
-            return int(self.size.width), int(self.size.height)
-        return None if self.imgsize is None else (int(self.imgsize[0]), int(self.imgsize[1]))
+        size = self.size or dict(zip(("width", "height"), self.imgsize or (), strict=False))
+        known = {"width", "height"} <= size.keys()
+        return (int(size["width"]), int(size["height"])) if known else None
 
 
 class _Anchor(ForeignDocument):
@@ -333,10 +328,6 @@ def _truth(viewpoint: dict[str, Any], camera: Camera) -> Truth:
 # z up. Models have numbers from 1, as in the annotations.
 
 
-class _Anchors(ForeignDocument):
-    pnames: list[Text] | Text | None
-
-
 def _load_mesh(path: Path, category: str, index: int) -> Mesh:
     found = _find_cad(path, category, index)
     where = f"{path}: model {index}"
@@ -350,8 +341,8 @@ def _load_mesh(path: Path, category: str, index: int) -> Mesh:
 def _load_keypoints(path: Path, category: str, index: int) -> NamedPoints | None:
     found = _find_cad(path, category, index)
     with in_file(f"{path}: model {index}"):
-        names = convert({"pnames": found.get("pnames")}, _Anchors).pnames or []
-        names = [names] if isinstance(names, str) else names
+        given = found.get("pnames") or []
+        names = convert([given] if isinstance(given, str) else given, list[Text], "pnames")
         anchors = {name: _rows(found, name) for name in names if found.get(name) is not None}
     present = {name: xyz[0] for name, xyz in anchors.items() if len(xyz) == 1}
     return NamedPoints(tuple(present), np.array(list(present.values()))) if present else None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,22 +15,15 @@ from cadalign.datasets.detections.coco import read_coco_keypoints
 from cadalign.datasets.detections.image_keypoints import ImageKeypoints
 from cadalign.datasets.photos.dataset import leaving_out
 from cadalign.errors import DataError, InputError, brief, quote
-from cadalign.io.documents import Finite, Text, convert, in_file
+from cadalign.io.documents import in_file
 from cadalign.io.files import as_path, read_text
 
+_NUMBERS = ("u", "v", "semantic_id", "score", "sigma")
+_COLUMNS = ("u", "v", "image", "name", "semantic_id", "score", "sigma")
 _OTHER_NAMES = {"x": "u", "y": "v"}
 _MISSING = ("", "nan", "none", "null", "na", "n/a")
 """What programs write as the pixel of a keypoint that was not found."""
 _OF_MISSING = {"u": "0", "v": "0", "score": "0", "sigma": "1"}
-_COLUMNS: dict[str, Any] = {
-    "u": Finite,
-    "v": Finite,
-    "image": str,
-    "name": Text,
-    "semantic_id": Finite,  # programs write whole numbers as 2.0 in columns with gaps
-    "score": Finite,
-    "sigma": Finite,
-}
 
 
 def read_image_keypoints(
@@ -122,21 +116,20 @@ def _row(
         cells = cells | {name: text for name, text in _OF_MISSING.items() if name in cells}
     with in_file(where):
         row = {
-            name: convert(_value(name, cell), _COLUMNS[name], where=name)
-            for name, cell in cells.items()
+            name: _number(name, cell) if name in _NUMBERS else cell for name, cell in cells.items()
         }
-        if row.get("semantic_id", 0) % 1:
+        if row.get("name") == "":
+            raise InputError("'' is not a text", where="name")
+        if row.get("semantic_id", 0) % 1:  # programs write 2.0 in columns with gaps
             raise InputError(f"{row['semantic_id']} is not a whole number", where="semantic_id")
     return row | dict.fromkeys(("u", "v"), np.nan) if is_missing else row
 
 
-def _value(name: str, cell: str) -> str | float:
-    """A cell as a number in the columns that hold numbers, where it is a finite one."""
-    try:
-        number = np.nan if name in ("image", "name") else float(cell)
-    except ValueError:
-        return cell
-    return number if np.isfinite(number) else cell
+def _number(name: str, cell: str) -> float:
+    with suppress(ValueError):
+        if np.isfinite(value := float(cell)):
+            return value
+    raise InputError(f"{quote(cell)} is not a finite number", where=name)
 
 
 def _place(path: Path, image: str | None) -> str:

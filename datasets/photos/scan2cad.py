@@ -83,11 +83,8 @@ class _Model(ForeignDocument):
     keypoints_scan: _Points | None = None
 
 
-class _Head(ForeignDocument):
+class _Scan(ForeignDocument):
     id_scan: Annotated[str, Meta(pattern=r"\Ascene[^/\\\0]+\Z")]
-
-
-class _Scan(_Head):
     trs: _Trs
     aligned_models: list[Any]
 
@@ -137,27 +134,25 @@ class Scan2CAD(PhotoDataset):
             what = f"neither {' nor '.join(self.marks)} is here"
             raise DataError(what, where=str(folder), fix="give the folder of the annotations")
         self._file = annotations
-        self._entries = read_list(annotations)
         self._models = [folder / name for name in _MODEL_FOLDERS]
-        self._records: list[tuple[int, _Frame]] = []  # with the row of the scan
+        self._records: list[tuple[_Scan, _Frame]] = []
         names: list[str] = []
         bad: dict[str, DataError] = {}
-        for number in range(len(self._entries)):
-            with leaving_out(f"[{number}]", bad):
-                scene = self._parse(number, _Head).id_scan
-                for frame in _frames_of(scene, [folder / name for name in _FRAME_FOLDERS]):
-                    self._records.append((number, frame))
-                    names.append(f"{scene}/{frame.frame_id}")
+        for number, entry in enumerate(entries := read_list(annotations)):
+            with leaving_out(f"[{number}]", bad), in_file(annotations):
+                scan: _Scan = convert(entry, _Scan, f"[{number}]")
+                for frame in _frames_of(scan.id_scan, [folder / name for name in _FRAME_FOLDERS]):
+                    self._records.append((scan, frame))
+                    names.append(f"{scan.id_scan}/{frame.frame_id}")
         if not names:
-            what = f"no frame of the {len(self._entries) - len(bad)} annotated scans is here"
+            what = f"no frame of the {len(entries) - len(bad)} annotated scans is here"
             fix = "link the folder of ScanNet's scenes to scans, beside this file"
             raise DataError(what, where=str(annotations), fix=fix)
         super().__init__(folder, names, bad)
 
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
-        row, frame = self._records[index]
-        scan = self._parse(row, _Scan)
+        scan, frame = self._records[index]
         camera, cam_from_scan = frame.camera(), frame.cam_from_scan()
         cam_from_world = cam_from_scan @ _inverse(scan.trs.alignment())
 
@@ -170,10 +165,6 @@ class Scan2CAD(PhotoDataset):
         objects, problems = read_each(scan.aligned_models, read_object, where=where)
         up = cam_from_scan.rotation[:, 2]  # scans are upright: z points up
         return Photo(name, frame.image_path, camera, objects, up=up, problems=problems)
-
-    def _parse(self, number: int, kind: Any) -> Any:
-        with in_file(self._file):
-            return convert(self._entries[number], kind, f"[{number}]")
 
 
 def _object(

@@ -105,7 +105,3 @@ def test_what_can_be_read_is_given_and_the_rest_is_told(tmp_path):
     photos = list(dataset)
     assert (dataset.kind, len(dataset), len(photos), len(dataset.problems)) == ("Scan2CAD", 4, 3, 1)
     assert [each.category for photo in photos for each in photo.objects] == ["chair"] * 3
-
-
-def test_open_is_a_public_name():
-    assert cadalign.datasets.open is cadalign.datasets.open_photos

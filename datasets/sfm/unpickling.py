@@ -28,6 +28,7 @@ from cadalign.io.files import as_path, damaged, read_bytes
 # Numbers and text; no records, whose fields can hide objects.
 _PLAIN_DTYPE = re.compile(r"b1|[iufc]\d{1,2}|[SU][1-9]\d{0,5}|O\d?")
 _MAX_DEPTH = 100
+_MOST_TIMES = 10  # as many values as the file has bytes
 _PARTS = (list, tuple, ValuesView)
 _FIX = (
     "only NumPy arrays and plain containers are loaded, a pickle can run code; get a trusted file"
@@ -77,7 +78,7 @@ def load_pickle(path: str | os.PathLike[str]) -> Any:
     try:
         with in_file(str(path)):
             value = _run(data)
-        _check_size(value, most=10 * len(data))
+        _check_size(value, most=_MOST_TIMES * len(data))
         return value
     except DataError:
         raise
@@ -91,6 +92,7 @@ def _run(data: bytes) -> Any:
     stack: list[Any] = []
     marks: list[int] = []
     memory: dict[int, Any] = {}
+    copied = 0
 
     def popped(count: int | None = None) -> list[Any]:
         """Take the last values, by default those from the last mark on."""
@@ -125,12 +127,16 @@ def _run(data: bytes) -> Any:
             stack.append(memory[int(argument)])
         elif name in ("GLOBAL", "STACK_GLOBAL"):
             stack.append(_named(*(argument.split(" ") if argument else popped(2))))
-        elif name == "REDUCE":
+        elif name in ("REDUCE", "BUILD"):
             (arguments,) = popped(1)
-            stack.append(_made(_of(_Named, stack.pop()).name, *_of(tuple, arguments)))
-        elif name == "BUILD":
-            (state,) = popped(1)
-            _fill(_of(_Named, stack[-1]), *_of(tuple, state))
+            copied += sum(len(each) for each in _of(tuple, arguments) if isinstance(each, str))
+            if copied > _MOST_TIMES * len(data):
+                raise ValueError("it copies a text again and again")
+            called = _of(_Named, stack[-1])
+            if name == "BUILD":
+                _fill(called, *arguments)
+            else:
+                stack[-1] = _made(called.name, *arguments)
         elif name not in ("PROTO", "FRAME"):
             raise ValueError(f"{name} is no step of arrays and plain containers")
     (value,) = popped(len(stack))
@@ -183,7 +189,7 @@ def _made(name: str, *arguments: Any) -> Any:
         return _array((), *arguments)[()]
     if name == _BUFFER:
         buffer, dtype, shape, order, *axes = arguments
-        array = _array(shape, dtype, bytes(buffer), order="F" if order == "F" else "C")
+        array = _array(shape, dtype, buffer, order="F" if order == "F" else "C")
         return array.transpose(axes[0]) if order == "K" and axes else array
     if name == _BYTES and not arguments:
         return b""
@@ -210,10 +216,11 @@ def _fill(made: _Named, *state: Any) -> None:
 def _array(
     shape: Any, dtype: np.dtype[Any], data: bytes | str, *, order: Literal["C", "F"] = "C"
 ) -> npt.NDArray[Any]:
+    """An array that looks at its bytes: one and the same may belong to many."""
     content = data.encode("latin1") if isinstance(data, str) else data
     if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(content):
         raise ValueError(f"an array of shape {quote(shape)} has other data than that")
-    return np.ndarray(shape, dtype, content, order=order).copy(order="K")
+    return np.ndarray(shape, dtype, content, order=order)
 
 
 def _check_size(value: Any, *, most: int) -> None:

@@ -13,11 +13,7 @@ if TYPE_CHECKING:
     from cadalign.datasets.detections.keypoint_files import read_image_keypoints
 
     # `open` is not in __all__: a star import must not hide the built-in function.
-    from cadalign.datasets.formats import (
-        CORRESPONDENCE_FORMATS,
-        open_correspondences,
-        open_photos,
-    )
+    from cadalign.datasets.formats import open_correspondences, open_photos
     from cadalign.datasets.formats import open_photos as open  # noqa: F401
     from cadalign.datasets.models.keypointnet import AnnotatedModel, KeypointNet
     from cadalign.datasets.models.keypoints import Circle, Keypoints, RotationalSymmetry, Symmetries
@@ -28,14 +24,13 @@ if TYPE_CHECKING:
     from cadalign.datasets.photos.photo import CadModel, Photo, PhotoKeypoints, PhotoObject, Truth
     from cadalign.datasets.photos.pix3d import Pix3D
     from cadalign.datasets.photos.scan2cad import Scan2CAD
-    from cadalign.datasets.sample.writer import sample_models, write_sample_dataset
+    from cadalign.datasets.sample.writer import write_sample_dataset
     from cadalign.datasets.sfm.blind_pnp import BlindPnP
     from cadalign.datasets.sfm.colmap import Colmap
     from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet
     from cadalign.io.meshes.files import check_solid, load_mesh
 
 __all__ = [
-    "CORRESPONDENCE_FORMATS",
     "SYNSETS",
     "AnnotatedModel",
     "BlindPnP",
@@ -69,7 +64,6 @@ __all__ = [
     "open_correspondences",
     "open_photos",
     "read_image_keypoints",
-    "sample_models",
     "write_sample_dataset",
 ]
 

@@ -246,7 +246,7 @@ def open_model(
     registry = KeypointRegistry(reserved=reserved, tolerance=_SAME_PLACE * cad.diagonal)
     for source in dict.fromkeys((keypoints or keypoints_file(path, path.parent), own)):
         if source == keypoints or source.exists():
-            read = ModelKeypoints.load(source, model=path)
+            read = ModelKeypoints.load(source)
             if source == own:
                 refuse_other_model(read.model, path, where=own)
             registry.merge(read.keypoints)

@@ -27,7 +27,7 @@ class SessionOptions:
     fov: float | None = None
     """Horizontal field of view of the photos [degrees], in the place of the focal length."""
     keypoints: Path | None = None
-    """The model's keypoints: model.keypoints.json, or KeypointNet's annotations."""
+    """The model's keypoints: model.keypoints.json."""
     up_axis: Literal["x", "y", "z"] | None = None
     """The model's axis that points up, for its view and for gravity; by default the observation
     file's, or y."""

@@ -40,7 +40,7 @@ class Render:
     resolution: str = "640x480"
     """Width and height in pixels; of a contact sheet, each picture's."""
     keypoints: Path | None = None
-    """Keypoints to draw: the model's NAME.keypoints.json, or KeypointNet's annotations."""
+    """Keypoints to draw: the model's NAME.keypoints.json."""
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Stretch along the model's axes."""
     fov: float = 35.0
@@ -64,7 +64,7 @@ class Render:
             scene, renderer = Scene(load_mesh(self.model)), make_renderer(self.renderer)
             keypoints = None
             if self.keypoints is not None:
-                keypoints = ModelKeypoints.load(self.keypoints, model=self.model).xyz
+                keypoints = ModelKeypoints.load(self.keypoints).xyz
             pictures = {
                 name: self._draw(scene, renderer, camera, view, keypoints)
                 for name, view in views.items()

@@ -275,6 +275,15 @@ def spread_colors(mesh: Mesh, palette: FloatArray | None = None) -> FloatArray:
     return colors
 
 
+def barycentric_of(triangles: FloatArray, points: FloatArray) -> FloatArray:
+    """Barycentric coordinates (n, 3) of points (n, 3) in triangles (n, 3, 3)."""
+    edges, offsets = triangles[:, 1:] - triangles[:, :1], points - triangles[:, 0]
+    a, b = np.einsum("nik,nk->in", edges, offsets)
+    (aa, ab), (_, bb) = np.einsum("nik,njk->ijn", edges, edges)
+    later = np.stack([bb * a - ab * b, aa * b - ab * a]) / (aa * bb - ab * ab)
+    return np.column_stack([1 - later.sum(axis=0), *later])
+
+
 def face_normals(triangles: FloatArray) -> FloatArray:
     """Unit normals of triangles (m, 3, 3), (m, 3) float; zero for one without area."""
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])

@@ -44,7 +44,7 @@ class _ByAxis(ForeignDocument):
 
 
 class _Object(ForeignDocument):
-    """One object of any form, or one frame of a video with its objects."""
+    """One object of any form."""
 
     keypoints: list[Any] | _ByAxis | None = None
     keypoint_scores: list[float | None] | None = None
@@ -54,8 +54,6 @@ class _Object(ForeignDocument):
     image_id: _Id | None = None
     category_id: _Id | None = None
     num_keypoints: Any = None
-    frame_id: _Id | None = None
-    instances: list[_Object] | None = None
     segmentation: Any = None
 
 
@@ -180,24 +178,13 @@ def _annotated(
 
 def _from_predictions(data: _File) -> Iterator[_Reader]:
     names, given = None, (data.meta_info or {}).get("keypoint_id2name")
-    by_number = convert(given, dict[str, Text] | None, where="meta_info.keypoint_id2name")
-    if by_number is not None:
-        listed = [by_number.get(str(number)) for number in range(len(by_number))]
-        names = convert(listed, list[Text], where="meta_info.names")
+    if given is not None:
+        place = "meta_info.keypoint_id2name"
+        by_number = convert(given, dict[str, Text], place)
+        names = convert([by_number.get(str(n)) for n in range(len(by_number))], list[Text], place)
     for row, entry in enumerate(data.instance_info):
         where = f"instance_info[{row}]"
-        if entry.instances is None:
-            yield where, partial(_image_keypoints, entry, where, names=names)
-        for number, instance in enumerate(entry.instances or []):
-            place = f"{where}.instances[{number}]"
-            yield place, partial(_in_frame, instance, place, names, entry.frame_id)
-
-
-def _in_frame(
-    entry: _Object, where: str, names: list[str] | None, frame: _Id | None
-) -> ImageKeypoints:
-    found = _image_keypoints(entry, where, names=names)
-    return found if frame is None else replace(found, image=str(frame))
+        yield where, partial(_image_keypoints, entry, where, names=names)
 
 
 def _image_keypoints(entry: _Object, where: str, *, names: list[str] | None) -> ImageKeypoints:

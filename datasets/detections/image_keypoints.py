@@ -48,8 +48,6 @@ class ImageKeypoints:
     """How sure the detector is of the whole object."""
     source: str = "keypoints"
     """The file and the place in it, for messages."""
-    camera: Camera | None = field(default=None, kw_only=True)
-    """The calibrated camera, where the file has it."""
     measured: BoolArray = field(init=False, repr=False)
     """Which keypoints (k,) have a pixel that is a measurement, whatever their score; see
     `cadalign.geometry.pixels.unmeasured`."""
@@ -98,14 +96,6 @@ class ImageKeypoints:
     def is_found(self) -> BoolArray:
         """Marks the keypoints (k,) that were found: with a measured pixel, and no score of 0."""
         return self.measured if self.scores is None else np.asarray(self.scores > 0)
-
-    def check_camera(self, camera: Camera) -> None:
-        """Refuse a camera of images of another size, or in whose image no such pixels are."""
-        if self.size not in (None, (camera.width, camera.height)):
-            what = "the image has {} x {} pixels".format(*self.size)
-            what += f", that of the camera {camera.width} x {camera.height}"
-            raise DataError(what, where=self.source, fix="give the camera of these images")
-        check_pixels(self.points_2d[self.measured], camera.width, camera.height, where=self.source)
 
     def is_of(self, photo: str) -> bool:
         """True if the image's name, or its id, is that of the photo's file."""
@@ -226,7 +216,12 @@ def join_keypoints(
     InputError
         If ``sigma_from_scores`` is not positive.
     """
-    found.check_camera(camera)
+    if found.size not in (None, (camera.width, camera.height)):
+        what = "the image has {} x {} pixels".format(*found.size)
+        what += f", that of the camera {camera.width} x {camera.height}"
+        raise DataError(what, where=found.source, fix="give the camera of these images")
+    pixels = found.points_2d[found.measured]
+    check_pixels(pixels, camera.width, camera.height, where=found.source)
     kept = np.flatnonzero(found.is_found).tolist()
     if found.scores is not None:
         kept = [row for row in kept if found.scores[row] >= min_score]

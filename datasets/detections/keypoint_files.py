@@ -5,32 +5,25 @@ from __future__ import annotations
 import csv
 import io
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cadalign.datasets.detections.coco import read_coco_keypoints
-from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
+from cadalign.datasets.detections.image_keypoints import ImageKeypoints
 from cadalign.datasets.photos.dataset import leaving_out
 from cadalign.errors import DataError, InputError, brief, quote
-from cadalign.io.documents import Finite, Text, convert, in_file
+from cadalign.io.documents import in_file
 from cadalign.io.files import as_path, read_text
 
+_NUMBERS = ("u", "v", "semantic_id", "score", "sigma")
+_COLUMNS = ("u", "v", "image", "name", "semantic_id", "score", "sigma")
 _OTHER_NAMES = {"x": "u", "y": "v"}
 _MISSING = ("", "nan", "none", "null", "na", "n/a")
 """What programs write as the pixel of a keypoint that was not found."""
-_OF_MISSING = {"u": "0", "v": "0", "score": "0", "visibility": "0", "sigma": "1"}
-_COLUMNS: dict[str, Any] = {
-    "u": Finite,
-    "v": Finite,
-    "image": str,
-    "name": Text,
-    "semantic_id": Finite,  # programs write whole numbers as 2.0 in columns with gaps
-    "score": Finite,
-    "visibility": Finite,
-    "sigma": Finite,
-}
+_OF_MISSING = {"u": "0", "v": "0", "score": "0", "sigma": "1"}
 
 
 def read_image_keypoints(
@@ -107,8 +100,6 @@ def _header(cells: list[str], where: str) -> list[str]:
         if name not in names:
             fix = "the first line names the columns, such as name,u,v"
             raise DataError(f"the column {name!r} is missing", where=where, fix=fix)
-    if {"score", "visibility"} <= set(names):
-        raise DataError("give score or visibility, not both", where=where)
     return names
 
 
@@ -125,23 +116,20 @@ def _row(
         cells = cells | {name: text for name, text in _OF_MISSING.items() if name in cells}
     with in_file(where):
         row = {
-            name: convert(_value(name, cell), _COLUMNS[name], where=name)
-            for name, cell in cells.items()
+            name: _number(name, cell) if name in _NUMBERS else cell for name, cell in cells.items()
         }
-        if row.get("semantic_id", 0) % 1:
+        if row.get("name") == "":
+            raise InputError("'' is not a text", where="name")
+        if row.get("semantic_id", 0) % 1:  # programs write 2.0 in columns with gaps
             raise InputError(f"{row['semantic_id']} is not a whole number", where="semantic_id")
-        if row.get("visibility", 0) not in (0, 1, 2):
-            raise InputError(f"{row['visibility']:g} is not 0, 1 or 2", where="visibility")
     return row | dict.fromkeys(("u", "v"), np.nan) if is_missing else row
 
 
-def _value(name: str, cell: str) -> str | float:
-    """A cell as a number in the columns that hold numbers, where it is a finite one."""
-    try:
-        number = np.nan if name in ("image", "name") else float(cell)
-    except ValueError:
-        return cell
-    return number if np.isfinite(number) else cell
+def _number(name: str, cell: str) -> float:
+    with suppress(ValueError):
+        if np.isfinite(value := float(cell)):
+            return value
+    raise InputError(f"{quote(cell)} is not a finite number", where=name)
 
 
 def _place(path: Path, image: str | None) -> str:
@@ -151,8 +139,6 @@ def _place(path: Path, image: str | None) -> str:
 def _object(path: Path, image: str | None, rows: list[dict[str, Any]]) -> ImageKeypoints:
     columns = {name: [row[name] for row in rows] for name in rows[0]}
     scores = columns.get("score")
-    if "visibility" in columns:
-        scores = [VISIBILITY_SCORES[int(flag)] for flag in columns["visibility"]]
     names, ids, sigma = (columns.get(name) for name in ("name", "semantic_id", "sigma"))
     return ImageKeypoints(
         points_2d=np.column_stack([columns["u"], columns["v"]]),

@@ -11,7 +11,6 @@ import logging
 import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import overload
 
@@ -31,7 +30,7 @@ from cadalign.datasets.models.shapenet import (
     synset_of_name,
 )
 from cadalign.datasets.photos.dataset import read_list
-from cadalign.errors import DataError, InputError, unknown
+from cadalign.errors import DataError, InputError, quote, unknown
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.files import as_path, listed, read_text
@@ -199,9 +198,15 @@ class KeypointNet:
         """
         if name not in self.splits:
             raise unknown("split", name, self.splits, where=str(self.root / "splits"))
-        path = self.root / "splits" / f"{name}.txt"
-        state = path.stat()
-        return _read_split(path, state.st_mtime_ns, state.st_size)
+        path, members = self.root / "splits" / f"{name}.txt", set()
+        for number, line in enumerate(read_text(path, errors="replace").splitlines(), start=1):
+            synset, _, model_id = line.strip().partition("-")
+            if synset and model_id:
+                members.add((name_of_synset(synset), model_id))
+            elif line.strip():
+                what = f"{quote(line.strip())} is not <synset>-<model id>"
+                raise DataError(what, where=f"{path}, line {number}")
+        return frozenset(members)
 
     def subset(
         self,
@@ -254,10 +259,6 @@ class KeypointNet:
             if isinstance(found, DataError)
         }
 
-    def mesh_paths(self, category: str, model_id: str) -> tuple[Path, ...]:
-        """All mesh files there are of a model, the one that `AnnotatedModel` names first."""
-        return self._mesh_paths(self._require(category), model_id)
-
     @overload
     def __getitem__(self, key: str) -> tuple[AnnotatedModel, ...]: ...
     @overload
@@ -304,23 +305,15 @@ class KeypointNet:
     def _has(self, category: str, model_id: str) -> bool:
         if self._allowed is not None and (category, model_id) not in self._allowed:
             return False
-        return not self._with_mesh or bool(self._mesh_paths(category, model_id))
-
-    def _mesh_paths(self, category: str, model_id: str) -> tuple[Path, ...]:
-        synset, model = synset_of_name(category), self._load(category).get(model_id)
-        if isinstance(model, AnnotatedModel):
-            synset = model.class_id
-        return self._locator.paths(synset, model_id)
+        found = self._load(category).get(model_id)
+        synset = found.class_id if isinstance(found, AnnotatedModel) else synset_of_name(category)
+        return not self._with_mesh or self._locator.path(synset, model_id) is not None
 
     def _load(self, category: str) -> _Models:
         """All models of a category, whose file is read once, also for subsets."""
-        if category not in self._loaded:
-            path = self._files[category]
-            self._loaded[category] = self._build(category, path)
-        return self._loaded[category]
-
-    def _build(self, category: str, path: Path) -> _Models:
-        models: _Models = {}
+        if category in self._loaded:
+            return self._loaded[category]
+        path, models = self._files[category], dict[str, AnnotatedModel | DataError]()
         for position, entry in enumerate(read_list(path)):
             model_id = entry_id(entry, position)
             where = f"{path.name}, model {model_id}"
@@ -329,25 +322,10 @@ class KeypointNet:
                     model_id = f"{model_id}#{position}"
                     raise DataError("the model occurs twice", where=where, fix="remove one entry")
                 annotation = parse_entry(entry, where=where)
-                mesh_path = next(iter(self._locator.paths(*annotation[:2])), None)
+                mesh_path = self._locator.path(*annotation[:2])
                 models[model_id] = AnnotatedModel(category, *annotation, mesh_path)
             except DataError as error:
                 logger.warning("left out: %s", error)
                 models[model_id] = error.with_traceback(None)
+        self._loaded[category] = models
         return models
-
-
-@lru_cache(maxsize=16)
-def _read_split(path: Path, _modified: int, _size: int) -> frozenset[ModelKey]:
-    """The members of a split, whose file is read once as long as it does not change."""
-    members = set()
-    lines = read_text(path, errors="replace").splitlines()
-    for number, line in enumerate(lines, start=1):
-        synset, dash, model_id = line.strip().partition("-")
-        if not line.strip():
-            continue
-        if not (synset and dash and model_id):
-            what = f"{line.strip()[:60]!r} is not <synset>-<model id>"
-            raise DataError(what, where=f"{path}, line {number}")
-        members.add((name_of_synset(synset), model_id))
-    return frozenset(members)

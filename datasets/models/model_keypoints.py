@@ -9,14 +9,13 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.keypointnet import AnnotatedModel
-from cadalign.datasets.models.keypoints import Keypoints, entry_id, parse_entry
-from cadalign.errors import DataError, InputError, quote
+from cadalign.errors import DataError, InputError
 from cadalign.io.documents import (
     Document,
     Index,
@@ -33,8 +32,6 @@ from cadalign.io.documents import (
 from cadalign.io.files import as_path, write_json
 from cadalign.io.kinds import MESH_ENDINGS, MODEL_KEYPOINTS
 
-FORMAT = "cadalign model keypoints"
-VERSION = 1
 SUFFIX = ".keypoints.json"
 """What the file of ``chair.obj`` ends in: ``chair.keypoints.json``."""
 
@@ -52,8 +49,8 @@ class _Entry(Document, kw_only=True):
 class _File(Document):
     """The file's only object."""
 
-    format: str
-    version: int
+    format: Literal["cadalign model keypoints"]
+    version: Literal[1]
     keypoints: list[_Entry]
     model: PathText | None = None
 
@@ -132,71 +129,40 @@ class ModelKeypoints:
         names : mapping of int to str, optional
             By semantic id; "keypoint 3" where there is none.
         """
-        return cls._of_keypoints(model.keypoints, model.mesh_path, names or {})
-
-    @classmethod
-    def _of_keypoints(
-        cls, annotated: Keypoints, model: Path | None, names: Mapping[int, str]
-    ) -> ModelKeypoints:
-        rows = zip(annotated.xyz.tolist(), annotated.ids.tolist(), strict=True)
+        names, found = names or {}, model.keypoints
+        rows = zip(found.xyz.tolist(), found.ids.tolist(), strict=True)
         keypoints = (ModelKeypoint(names.get(k, f"keypoint {k}"), tuple(xyz), k) for xyz, k in rows)
-        return cls(tuple(keypoints), model)
+        return cls(tuple(keypoints), model.mesh_path)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], *, model: Path | None = None) -> ModelKeypoints:
-        """Read a file of model keypoints, or one model's of KeypointNet's annotations.
+    def load(cls, path: str | os.PathLike[str]) -> ModelKeypoints:
+        """Read a file of model keypoints.
 
         Parameters
         ----------
         path : str or path-like
-            A file as described in docs/formats/model_keypoints.md, or KeypointNet's annotations of
-            a category; or a mesh, beside which such a file lies.
-        model : Path, optional
-            The mesh file; of KeypointNet's annotations those of the model are taken whose id
-            occurs in this path.
+            A file as described in docs/formats/model_keypoints.md; or a mesh, beside which such a
+            file lies.
 
         Raises
         ------
         DataError
             If the file is missing, is not JSON, of another format or version, or a field is
-            missing, unknown or invalid, or it has no annotations of the model; the message names
-            file and field.
+            missing, unknown or invalid; the message names file and field.
         """
         path = as_path(path)
         if path.suffix.lower() in MESH_ENDINGS:
             beside = path.with_suffix(SUFFIX)
             path = beside if os.path.isfile(beside) else path
         data = read_json(path, MODEL_KEYPOINTS)
-        if isinstance(data, list):
-            return cls._from_annotations(data, path, model)
-        with in_file(path):
-            return cls._from_data(data, path.parent)
-
-    @classmethod
-    def _from_annotations(cls, data: list[Any], path: Path, model: Path | None) -> ModelKeypoints:
-        if model is None:
+        if not isinstance(data, dict):
             what = "a list, not an object of model keypoints"
             raise DataError(what, where=str(path), fix=_WANTED)
-        parts = model.absolute().parts
-        ids = {*parts, Path(parts[-1]).stem, *(part.split(".")[0] for part in parts)}
-        for position, entry in enumerate(data):
-            model_id = entry_id(entry, position)
-            if model_id in ids:
-                _, _, keypoints, _ = parse_entry(entry, where=f"{path}, {model_id}")
-                return cls._of_keypoints(keypoints, model, {})
-        what = "has no annotations of a model whose id occurs in the model's path"
-        raise DataError(what, where=str(path), fix=f"is {model} of this category?")
-
-    @classmethod
-    def _from_data(cls, data: Any, folder: Path) -> ModelKeypoints:
-        other_version = "it was written by another version of cadalign"
-        for name, wanted, fix in (("format", FORMAT, _WANTED), ("version", VERSION, other_version)):
-            if isinstance(data, dict) and data.get(name) != wanted:
-                raise DataError(f"{quote(data.get(name))} is not {wanted!r}", where=name, fix=fix)
-        read: _File = convert(data, _File)
-        model = None if read.model is None else path_from(read.model, folder)
-        keypoints = (ModelKeypoint(e.name, e.xyz, e.semantic_id) for e in read.keypoints)
-        return cls(tuple(keypoints), model)
+        with in_file(path):
+            read: _File = convert(data, _File)
+            model = None if read.model is None else path_from(read.model, path.parent)
+            keypoints = (ModelKeypoint(e.name, e.xyz, e.semantic_id) for e in read.keypoints)
+            return cls(tuple(keypoints), model)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a file of model keypoints; the model's path is written relative to it.
@@ -210,7 +176,7 @@ class ModelKeypoints:
 
     def to_dict(self, *, folder: Path | None) -> dict[str, Any]:
         """Content of the file, the model's path relative to ``folder``."""
-        data: dict[str, Any] = {"format": FORMAT, "version": VERSION}
+        data: dict[str, Any] = {"format": "cadalign model keypoints", "version": 1}
         if self.model is not None:
             data["model"] = written_path(self.model.resolve(), folder=folder)
         data["keypoints"] = [_written(keypoint) for keypoint in self.keypoints]

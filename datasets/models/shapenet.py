@@ -166,20 +166,21 @@ class MeshLocator:
         self._given = [] if shapenet_root is None else [ShapeNet(shapenet_root)]
         below = [root / name for name in _SHAPENET_FOLDERS]
         self._below = [ShapeNet(folder) for folder in below if folder.is_dir()]
-        self._listings: dict[str, tuple[dict[str, Path], ...]] = {}
+        self._files: dict[str, dict[str, Path]] = {}
 
-    def paths(self, synset: str, model_id: str) -> tuple[Path, ...]:
-        """All mesh files of a model: of the given ShapeNetCore, KeypointNet's, of those below."""
-        if synset not in self._listings:
+    def path(self, synset: str, model_id: str) -> Path | None:
+        """A model's mesh: of the given ShapeNetCore, else KeypointNet's, else of those below."""
+        if synset not in self._files:
             folder = self._ply_folder / synset
             files = folder.glob("*.ply") if os.path.isdir(folder) else ()  # not of too long a name
-            ply = {path.name.removesuffix(".ply"): path for path in files}
-            given, below = (
-                [_list_models(shapenet, synset) for shapenet in places]
-                for places in (self._given, self._below)
-            )
-            self._listings[synset] = (*given, ply, *below)
-        return tuple(paths[model_id] for paths in self._listings[synset] if model_id in paths)
+            found: dict[str, Path] = {}
+            for shapenet in reversed(self._below):
+                found |= _list_models(shapenet, synset)
+            found |= {path.name.removesuffix(".ply"): path for path in files}
+            for shapenet in self._given:
+                found |= _list_models(shapenet, synset)
+            self._files[synset] = found
+        return self._files[synset].get(model_id)
 
 
 def _list_models(shapenet: ShapeNet, synset: str) -> dict[str, Path]:

@@ -7,11 +7,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
+from cadalign.arrays import FloatArray
 from cadalign.datasets.photos.photo import Photo, PhotoObject
 from cadalign.datasets.records import RecordSet
 from cadalign.errors import CadalignError, DataError, quote
 from cadalign.io.documents import read_json
-from cadalign.io.files import damaged
+from cadalign.io.files import damaged, read_text
 
 K = TypeVar("K", bound=Hashable)
 _Record = TypeVar("_Record")
@@ -97,3 +100,23 @@ def read_list(path: Path) -> list[Any]:
     if not isinstance(found, list):
         raise DataError(f"{quote(found)} is not a list", where=str(path))
     return found
+
+
+def read_matrix(path: Path, shape: tuple[int | None, int]) -> FloatArray:
+    """Read a text file of a matrix, a row on each line; None for any number of rows.
+
+    Raises DataError if it cannot be read, or is not a matrix of finite numbers of this shape.
+    """
+    text = read_text(path)
+    rows = [line.split() for line in text.splitlines() if line.strip()]
+    try:
+        matrix = np.array(rows, dtype=np.float64)
+    except ValueError:
+        raise damaged("not a table of numbers", path) from None
+    rows_wanted, columns = shape
+    if matrix.shape != (rows_wanted or len(matrix), columns):
+        wanted = f"{rows_wanted or 'some'} rows of {columns} numbers"
+        raise damaged(f"shape {matrix.shape}, expected {wanted}", path)
+    if not np.isfinite(matrix).all():
+        raise DataError("some of its numbers are not finite", where=str(path))
+    return matrix

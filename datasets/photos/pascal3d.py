@@ -9,12 +9,14 @@ from __future__ import annotations
 import os
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from msgspec import field
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import FloatArray, as_floats
 from cadalign.datasets.photos.dataset import PhotoDataset, read_each
-from cadalign.datasets.photos.mat_files import MatStruct, read_structs
+from cadalign.datasets.photos.mat_files import read_structs, structs_of
 from cadalign.datasets.photos.photo import (
     CadModel,
     NamedPoints,
@@ -34,8 +36,10 @@ from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.documents import (
     Finite,
     ForeignDocument,
+    Id,
     PathText,
     Point2,
+    Positive,
     Text,
     convert,
     in_file,
@@ -57,6 +61,43 @@ _CAD_FOLDERS = ("CAD", "CAD/mat", "cad")
 _CAD = "[Cc][Aa][Dd]/**/*.mat"  # files in any of these
 _IMAGE_FOLDERS = ("Images", "images")
 _IMAGES = (".jpg", ".JPEG", ".jpeg", ".png")
+
+
+class _Record(ForeignDocument):
+    objects: Any = None
+    size: dict[str, Positive] | None = None
+    imgsize: list[Positive] | None = None
+
+    @property
+    def written_size(self) -> tuple[int, int] | None:
+        """Width and height of the image, where they are known."""
+        size = self.size or dict(zip(("width", "height"), self.imgsize or (), strict=False))
+        known = {"width", "height"} <= size.keys()
+        return (int(size["width"]), int(size["height"])) if known else None
+
+
+class _Anchor(ForeignDocument):
+    location: Point2 | None = None
+    status: Finite | None = None
+
+
+class _Viewpoint(ForeignDocument):
+    azimuth: Finite
+    elevation: Finite
+    theta: Finite
+    distance: Finite
+    px: Finite
+    py: Finite
+    focal: Finite | None = None
+    viewport: Finite | None = None
+
+
+class _Object(ForeignDocument):
+    category: Id = field(name="class")
+    bbox: tuple[Finite, Finite, Finite, Finite]
+    cad_index: Finite | None = None
+    anchors: dict[str, _Anchor | None] | None = None
+    viewpoint: dict[str, Any] | None = None
 
 
 class Pascal3D(PhotoDataset):
@@ -100,19 +141,34 @@ class Pascal3D(PhotoDataset):
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
         path, taken = self._records[index]
-        found = read_structs(path, "record")[0]
+        with in_file(path):
+            found: _Record = convert(read_structs(path, "record")[0], _Record)
         name = self.names[index]
         image = find_image(self.root, name)
-        camera = Camera.without_focal(*_size(found, image))
+        size = found.written_size if image is None else photo_size(image)
+        if size is None:
+            what = "the image is missing, and its size is unknown"
+            raise DataError(what, where=str(path))
+        camera = Camera.without_focal(*size)
 
-        def read_object(number: int, each: MatStruct) -> PhotoObject | None:
-            category = each.text("class")
-            if taken not in (None, category):
+        def read_object(number: int, each: Any) -> PhotoObject | None:
+            shown: _Object = convert(each, _Object)
+            if taken not in (None, shown.category):
                 return None
-            return _object(number, category, each, camera, self.root)
+            return _object(number, shown, camera, self.root)
 
-        objects, problems = read_each(found.structs("objects"), read_object, where=str(path))
+        objects, problems = read_each(structs_of(found.objects), read_object, where=str(path))
         return Photo(name, image, camera, objects, problems=problems)
+
+
+class _Photos(ForeignDocument):
+    imgname: list[PathText]
+    category: list[Id] = field(name="class")
+    cad_index: list[Finite]
+
+    def __post_init__(self) -> None:
+        if len({len(each) for each in (self.imgname, self.category, self.cad_index)}) != 1:
+            raise InputError("its lists have different lengths")
 
 
 class _Keypoint(ForeignDocument):
@@ -153,14 +209,10 @@ class Pascal3DDetections(PhotoDataset):
         self._records: list[tuple[str, int]] = []  # category and number of the CAD model
         names: list[str] = []
         for path in listed(folder / DETECTED, "*.mat"):
-            found = read_structs(path, "annot")[0]
             with in_file(path):
-                images, categories = found.texts("imgname"), found.texts("class")
-                indices = found.array("cad_index").ravel()
-                if len({len(each) for each in (images, categories, indices)}) != 1:
-                    raise InputError("its lists have different lengths")
-            names += images
-            self._records += zip(categories, map(int, indices), strict=True)
+                found: _Photos = convert(read_structs(path, "annot")[0], _Photos)
+            names += found.imgname
+            self._records += zip(found.category, map(int, found.cad_index), strict=True)
         if not names:
             raise DataError(f"there are no {DETECTED}/*.mat", where=str(folder))
         super().__init__(folder, names)
@@ -197,7 +249,6 @@ class Pascal3DDetections(PhotoDataset):
         return PhotoKeypoints(
             points_2d=np.array([each.uv for each in found], dtype=float).reshape(-1, 2),
             names=tuple(each.name for each in found),
-            visible=np.ones(len(found), dtype=bool),
             scores=np.array(scores) if scores else None,
         )
 
@@ -220,74 +271,50 @@ def cad_model(root: Path, category: str, index: int) -> CadModel | None:
     return CadModel(name, partial(_load_mesh, *which), partial(_load_keypoints, *which))
 
 
-def _size(record: MatStruct, image: Path | None) -> tuple[int, int]:
-    if image is not None:
-        return photo_size(image)
-    size = record.struct("size")
-    if size is not None:
-        return int(size.number("width")), int(size.number("height"))
-    try:
-        width, height = record.array("imgsize").ravel()[:2]
-    except (InputError, ValueError):
-        what = "the image is missing, and its size is unknown"
-        raise DataError(what, where=record.where) from None
-    return int(width), int(height)
-
-
-def _object(
-    number: int, category: str, found: MatStruct, camera: Camera, root: Path
-) -> PhotoObject:
-    index = int(found.number("cad_index", default=0.0))
-    corners = found.array("bbox").ravel() - _FIRST_PIXEL
-    if len(corners) != 4:
-        raise InputError(f"{len(corners)} numbers are not a rectangle", where="bbox")
-    viewpoint = found.struct("viewpoint")
+def _object(number: int, found: _Object, camera: Camera, root: Path) -> PhotoObject:
+    index = int(found.cad_index or 0)
     return PhotoObject(
         object_id=str(number),
-        category=category,
-        truth=Truth() if viewpoint is None else _truth(viewpoint, camera),
-        keypoints=_anchors(found.struct("anchors")),
-        model=cad_model(root, category, index) if index >= 1 else None,
-        bbox=corners,
+        category=found.category,
+        truth=_truth(found.viewpoint or {}, camera),
+        keypoints=_anchors(found.anchors or {}),
+        model=cad_model(root, found.category, index) if index >= 1 else None,
+        bbox=np.array(found.bbox) - _FIRST_PIXEL,
     )
 
 
-def _anchors(anchors: MatStruct | None) -> PhotoKeypoints | None:
-    marked: dict[str, FloatArray] = {}
-    for name in anchors.names if anchors else ():
-        each = anchors.struct(name) if anchors else None
-        if each is not None and each.number("status", default=0.0) == _VISIBLE:
-            location = each.array("location", 2)
-            if len(location) == 1:
-                marked[name] = location[0] - _FIRST_PIXEL
+def _anchors(anchors: dict[str, _Anchor | None]) -> PhotoKeypoints | None:
+    marked = {
+        name: each.location
+        for name, each in anchors.items()
+        if each is not None and each.status == _VISIBLE and each.location is not None
+    }
     if not marked:
         return None
-    points = np.array(list(marked.values()))
-    return PhotoKeypoints(points, tuple(marked), np.ones(len(points), dtype=bool))
+    points = np.array(list(marked.values())) - _FIRST_PIXEL
+    return PhotoKeypoints(points, tuple(marked))
 
 
-def _truth(viewpoint: MatStruct, camera: Camera) -> Truth:
+def _truth(viewpoint: dict[str, Any], camera: Camera) -> Truth:
     """The pose, as PASCAL3D+'s ``project_3d.m`` projects the model.
 
     The camera stands at azimuth, elevation and distance around the model, looks at its origin along
     -z with y up, and is then turned by theta about its axis.
     """
-    distance = viewpoint.number("distance", default=0.0)
-    if distance == 0:
+    if not viewpoint.get("distance"):
         return Truth()
-    azimuth, elevation, theta = (
-        np.radians(np.fmod(viewpoint.number(name), 360.0))
-        for name in ("azimuth", "elevation", "theta")
-    )
-    focal = viewpoint.number("focal", default=1.0) * viewpoint.number("viewport", _VIEWPORT)
+    found: _Viewpoint = convert(viewpoint, _Viewpoint, "viewpoint")
+    angles = np.array([found.azimuth, found.elevation, found.theta])
+    azimuth, elevation, theta = np.radians(np.fmod(angles, 360.0)).tolist()
+    focal = (found.focal or 1.0) * (found.viewport or _VIEWPORT)
     across = np.cos(elevation)
     direction = [across * np.sin(azimuth), -across * np.cos(azimuth), np.sin(elevation)]
-    center = distance * np.array(direction)
+    center = found.distance * np.array(direction)
     about_x, about_z = np.eye(3)[[0, 2]]
     lean, turn = rotation_from_vector((elevation - np.pi / 2) * about_x), -azimuth * about_z
     upright = lean @ rotation_from_vector(turn)
     rotation = OPENGL_AXES[:, None] * (rotation_from_vector(theta * about_z) @ upright)
-    cx, cy = (viewpoint.number(name) - _FIRST_PIXEL for name in ("px", "py"))
+    cx, cy = found.px - _FIRST_PIXEL, found.py - _FIRST_PIXEL
     annotated = Camera(camera.width, camera.height, focal, focal, cx, cy)
     pose = Alignment(rotation, -rotation @ center, np.ones(3))
     return Truth(cam_from_model=pose, camera=annotated)
@@ -305,22 +332,29 @@ def _load_mesh(path: Path, category: str, index: int) -> Mesh:
     found = _find_cad(path, category, index)
     where = f"{path}: model {index}"
     with in_file(where):
-        vertices, faces = found.array("vertices", 3), found.array("faces", 3)
+        vertices, faces = _rows(found, "vertices"), _rows(found, "faces")
         if not (np.abs(faces) < _MOST_VERTICES).all():
-            raise DataError("`faces` has entries that are no numbers of vertices", where=where)
+            raise InputError("has entries that are no numbers of vertices", where="faces")
         return Mesh(vertices, faces.astype(np.int64) - 1, source=where)
 
 
 def _load_keypoints(path: Path, category: str, index: int) -> NamedPoints | None:
     found = _find_cad(path, category, index)
     with in_file(f"{path}: model {index}"):
-        names = [name for name in found.texts("pnames") if name in found.names]
-        anchors = {name: found.array(name, 3) for name in names}
+        given = found.get("pnames") or []
+        names = convert([given] if isinstance(given, str) else given, list[Text], "pnames")
+        anchors = {name: _rows(found, name) for name in names if found.get(name) is not None}
     present = {name: xyz[0] for name, xyz in anchors.items() if len(xyz) == 1}
     return NamedPoints(tuple(present), np.array(list(present.values()))) if present else None
 
 
-def _find_cad(path: Path, category: str, index: int) -> MatStruct:
+def _rows(found: dict[str, Any], name: str) -> FloatArray:
+    """A field of points or triangles (k, 3); MATLAB's only row has one dimension."""
+    rows = np.array(found.get(name), dtype=object)
+    return as_floats(rows.reshape(1, -1) if rows.ndim < 2 else rows, name=name, shape=(None, 3))
+
+
+def _find_cad(path: Path, category: str, index: int) -> dict[str, Any]:
     models = _models(path, category)
     if not 1 <= index <= len(models):
         raise DataError(f"there is no model {index}, only {len(models)}", where=str(path))
@@ -328,6 +362,4 @@ def _find_cad(path: Path, category: str, index: int) -> MatStruct:
 
 
 # A category's file takes a second to read, and all of a category's objects need it.
-@lru_cache(maxsize=4)
-def _models(path: Path, category: str) -> tuple[MatStruct, ...]:
-    return read_structs(path, category)
+_models = lru_cache(maxsize=4)(read_structs)

@@ -31,23 +31,18 @@ class PhotoKeypoints:
     """(k, 2), pixels; integers are pixel centres."""
     names: tuple[str, ...]
     """(k,), what each one is called: the model's keypoint of the same name is the same point."""
-    visible: BoolArray
-    """(k,), false for a keypoint that is marked though something hides it."""
     scores: FloatArray | None = None
     """(k,), how sure a detector is of each."""
 
     def __post_init__(self) -> None:
         points = as_points(self.points_2d, name="keypoints", dimension=2)
-        visible = np.asarray(self.visible, dtype=bool)
         count = len(points)
-        if len(self.names) != count or visible.shape != (count,):
-            what = f"{count} keypoints, {len(self.names)} names, {len(visible)} visibilities"
-            raise DataError(what, where="keypoints")
+        if len(self.names) != count:
+            raise DataError(f"{count} keypoints, {len(self.names)} names", where="keypoints")
         if self.scores is not None:
             scores = as_floats(self.scores, name="scores", shape=(count,))
             object.__setattr__(self, "scores", scores)
         object.__setattr__(self, "points_2d", points)
-        object.__setattr__(self, "visible", visible)
 
     def __len__(self) -> int:
         return len(self.points_2d)

@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 from msgspec import field
 
-from cadalign.datasets.photos.dataset import PhotoDataset, read_list
+from cadalign.datasets.photos.dataset import PhotoDataset, read_list, read_matrix
 from cadalign.datasets.photos.photo import (
     CadModel,
     NamedPoints,
@@ -24,7 +24,6 @@ from cadalign.datasets.photos.photo import (
     Truth,
     existing,
 )
-from cadalign.datasets.photos.scannet import read_matrix
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -154,5 +153,4 @@ def _keypoints(entry: _Entry) -> PhotoKeypoints | None:
         return None
     marked = np.where(is_marked[:, :, None], given, 0.0)[:, rows]
     mean = marked.sum(axis=0) / is_marked[:, rows].sum(axis=0)[:, None] - PIXEL_CENTRE
-    names = tuple(str(row) for row in rows)
-    return PhotoKeypoints(mean, names, np.ones(len(rows), dtype=bool))
+    return PhotoKeypoints(mean, tuple(str(row) for row in rows))

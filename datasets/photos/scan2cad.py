@@ -6,20 +6,22 @@ Avetisyan et al., "Scan2CAD: Learning CAD Model Alignment in RGB-D Scans", CVPR 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta
 
-from cadalign.arrays import FloatArray, is_whole
+from cadalign.arrays import FloatArray
 from cadalign.datasets.models.shapenet import MESH_FILES, name_of_synset
 from cadalign.datasets.photos.dataset import (
     PhotoDataset,
     leaving_out,
     read_each,
     read_list,
+    read_matrix,
 )
 from cadalign.datasets.photos.photo import (
     CadModel,
@@ -31,14 +33,14 @@ from cadalign.datasets.photos.photo import (
     existing,
     first_existing,
 )
-from cadalign.datasets.photos.scannet import ScanNetFrame, list_frames
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.rotations import rotation_from_quat_wxyz
+from cadalign.geometry.rotations import nearest_rotation, rotation_from_quat_wxyz
 from cadalign.geometry.symmetry import SCAN2CAD_FOLDS, Symmetry
 from cadalign.io.documents import Finite, ForeignDocument, Id, Point3, Positive, convert, in_file
-from cadalign.io.files import as_path
+from cadalign.io.files import as_path, listed
+from cadalign.io.images import photo_size
 
 FULL = "full_annotations.json"
 # One scan's annotations, as in the repository and its derivatives.
@@ -81,11 +83,8 @@ class _Model(ForeignDocument):
     keypoints_scan: _Points | None = None
 
 
-class _Head(ForeignDocument):
+class _Scan(ForeignDocument):
     id_scan: Annotated[str, Meta(pattern=r"\Ascene[^/\\\0]+\Z")]
-
-
-class _Scan(_Head):
     trs: _Trs
     aligned_models: list[Any]
 
@@ -93,10 +92,14 @@ class _Scan(_Head):
 class Scan2CAD(PhotoDataset):
     """Frames of ScanNet scenes with the CAD models that annotators aligned.
 
-    Read are the official ``full_annotations.json``, or one scan's annotations in the same form
-    (``annot.json``, ``samples/annot.json``, ``example_annotation.json``); ScanNet's frames as
-    `cadalign.datasets.photos.scannet.list_frames` describes; models as
-    ``<synset>/<id>/models/model_normalized.obj`` or without the synset's folder.
+    Read are, below one folder, into which the parts may be linked::
+
+        full_annotations.json, or one scan's: [samples/]annot.json, example_annotation.json
+        scans/<scene>/color/<frame>.jpg, pose/<frame>.txt, intrinsic/intrinsic_color.txt
+        samples/scannet_<scene's number>_<frame>.jpg, ..._<frame>_pose.txt, scannet_..._intr.txt
+        ShapeNetCore.v2/<synset>/<id>/models/model_normalized.obj, with or without the synset
+
+    The folders may have other usual names, such as ``ScanNet`` and ``Meshes``.
 
     The truth is complete: pose and stretch along each axis, in metres. Keypoints are the pairs
     of the annotators: on the CAD model, and on the scan, projected into the photo. Whether
@@ -106,21 +109,12 @@ class Scan2CAD(PhotoDataset):
     Parameters
     ----------
     root : str or path-like
-        The folder of the annotations, or the annotation file itself.
-    scannet : str or path-like, optional
-        The folder of ScanNet's scenes; by default ``scans``, ``scannet`` and the like below
-        ``root``.
-    shapenet : str or path-like, optional
-        ShapeNetCore.v2; by default ``ShapeNetCore.v2``, ``shapenet``, ``Meshes`` and the like.
-    every : int
-        Take each scene's frames 0, every, 2 every and so on: a scene has thousands.
+        The folder of the annotations.
 
     Raises
     ------
     DataError
         If there are no annotations, they cannot be read, or there is no frame of any scan.
-    InputError
-        If ``every`` is no positive whole number.
     """
 
     kind = "Scan2CAD"
@@ -133,43 +127,32 @@ class Scan2CAD(PhotoDataset):
         *(f"{folder}/scannet_*.txt" for folder in _FRAME_FOLDERS),
     )
 
-    def __init__(
-        self,
-        root: str | os.PathLike[str],
-        *,
-        scannet: str | os.PathLike[str] | None = None,
-        shapenet: str | os.PathLike[str] | None = None,
-        every: int = 1,
-    ) -> None:
-        if not (is_whole(every) and every > 0):
-            fix = "give 1, 2, 3 ..."
-            raise InputError(f"{every!r} is not a number of frames", where="every", fix=fix)
-        folder, self.annotations = _annotation_file(as_path(root, "root"))
-        self._entries = read_list(self.annotations)
-        frames = [folder / name for name in _FRAME_FOLDERS]
-        if scannet is not None:
-            frames = [as_path(scannet, "scannet")]
-        below = [folder / name for name in _MODEL_FOLDERS]
-        self._models = below if shapenet is None else [as_path(shapenet, "shapenet")]
-        self._records: list[tuple[int, ScanNetFrame]] = []  # with the row of the scan
+    def __init__(self, root: str | os.PathLike[str]) -> None:
+        folder = as_path(root, "root")
+        annotations = first_existing(folder / name for name in self.marks)
+        if annotations is None:
+            what = f"neither {' nor '.join(self.marks)} is here"
+            raise DataError(what, where=str(folder), fix="give the folder of the annotations")
+        self._file = annotations
+        self._models = [folder / name for name in _MODEL_FOLDERS]
+        self._records: list[tuple[_Scan, _Frame]] = []
         names: list[str] = []
         bad: dict[str, DataError] = {}
-        for number in range(len(self._entries)):
-            with leaving_out(f"[{number}]", bad):
-                scene = self._parse(number, _Head).id_scan
-                for frame in list_frames(frames, scene)[::every]:
-                    self._records.append((number, frame))
-                    names.append(f"{scene}/{frame.frame_id}")
+        for number, entry in enumerate(entries := read_list(annotations)):
+            with leaving_out(f"[{number}]", bad), in_file(annotations):
+                scan: _Scan = convert(entry, _Scan, f"[{number}]")
+                for frame in _frames_of(scan.id_scan, [folder / name for name in _FRAME_FOLDERS]):
+                    self._records.append((scan, frame))
+                    names.append(f"{scan.id_scan}/{frame.frame_id}")
         if not names:
-            what = f"no frame of the {len(self._entries) - len(bad)} annotated scans is here"
-            fix = "give the folder of ScanNet's scenes: Scan2CAD(root, scannet=...)"
-            raise DataError(what, where=str(self.annotations), fix=fix)
+            what = f"no frame of the {len(entries) - len(bad)} annotated scans is here"
+            fix = "link the folder of ScanNet's scenes to scans, beside this file"
+            raise DataError(what, where=str(annotations), fix=fix)
         super().__init__(folder, names, bad)
 
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
-        row, frame = self._records[index]
-        scan = self._parse(row, _Scan)
+        scan, frame = self._records[index]
         camera, cam_from_scan = frame.camera(), frame.cam_from_scan()
         cam_from_world = cam_from_scan @ _inverse(scan.trs.alignment())
 
@@ -178,14 +161,10 @@ class Scan2CAD(PhotoDataset):
             return _object(str(number), found, cam_from_world, camera, self._models)
 
         name = self.names[index]
-        where = f"{self.annotations}, {name}"
+        where = f"{self._file}, {name}"
         objects, problems = read_each(scan.aligned_models, read_object, where=where)
         up = cam_from_scan.rotation[:, 2]  # scans are upright: z points up
         return Photo(name, frame.image_path, camera, objects, up=up, problems=problems)
-
-    def _parse(self, number: int, kind: Any) -> Any:
-        with in_file(self.annotations):
-            return convert(self._entries[number], kind, f"[{number}]")
 
 
 def _object(
@@ -248,8 +227,7 @@ def _keypoints(
     pixels = camera.project_where_ahead(cam_from_world.apply(on_scan))
     inside = np.isfinite(pixels).all(axis=1) & camera.contains(pixels)
     seen = tuple(name for name, is_seen in zip(names, inside, strict=True) if is_seen)
-    marked = PhotoKeypoints(pixels[inside], seen, np.ones(len(seen), dtype=bool))
-    return (marked if seen else None), points
+    return (PhotoKeypoints(pixels[inside], seen) if seen else None), points
 
 
 def _rectangle(box: Box, camera: Camera) -> FloatArray | None:
@@ -272,11 +250,67 @@ def _inverse(alignment: Alignment) -> Alignment:
     return Alignment(rotation, shift, 1 / scale)
 
 
-def _annotation_file(path: Path) -> tuple[Path, Path]:
-    if existing(path):
-        return path.parent, path
-    found = first_existing(path / name for name in (FULL, *_SAMPLES))
-    if found is not None:
-        return path, found
-    what = f"neither {FULL} nor {' nor '.join(_SAMPLES)} is here"
-    raise DataError(what, where=str(path), fix="give the folder of Scan2CAD's annotations")
+# Frames of ScanNet -----------------------------------------------------------------------------
+
+# The intrinsics of the colour images, as SensReader and as scannet_frames_25k name them.
+_INTRINSICS = (Path("intrinsic", "intrinsic_color.txt"), Path("intrinsics_color.txt"))
+_IMAGES = (".jpg", ".jpeg", ".png")
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """One frame of a ScanNet scene."""
+
+    frame_id: str  # its number, as its file writes it
+    image_path: Path
+    pose_path: Path  # (4, 4), the scan's coordinates from the camera's
+    intrinsics_path: Path  # (4, 4), of photos of this size
+
+    def camera(self) -> Camera:
+        """Read the intrinsics; integer pixels are taken for pixel centres."""
+        matrix = read_matrix(self.intrinsics_path, (4, 4))
+        width, height = photo_size(self.image_path)
+        (fx, _, cx), (_, fy, cy) = matrix[:2, :3].tolist()
+        with in_file(self.intrinsics_path):
+            return Camera(width, height, fx, fy, cx, cy)
+
+    def cam_from_scan(self) -> Alignment:
+        """Read the pose: the camera's coordinates from the scan's [m].
+
+        Raises DataError if it is no pose, such as ScanNet's -inf of a frame whose tracking was
+        lost.
+        """
+        pose = read_matrix(self.pose_path, (4, 4))
+        with in_file(self.pose_path):
+            rotation = nearest_rotation(pose[:3, :3]).T
+        return Alignment(rotation, -rotation @ pose[:3, 3], np.ones(3))
+
+
+def _frames_of(scene: str, folders: Iterable[Path]) -> tuple[_Frame, ...]:
+    """A scene's frames, in the first folder that has any, in order of their numbers."""
+    for folder in folders:
+        found = (*_in_scene_folder(folder / scene), *_beside_each_other(folder, scene))
+        if found:
+            return tuple(sorted(found, key=lambda frame: (len(frame.frame_id), frame.frame_id)))
+    return ()
+
+
+def _in_scene_folder(folder: Path) -> Iterator[_Frame]:
+    intrinsics = first_existing(folder / name for name in _INTRINSICS)
+    if intrinsics is None:
+        return
+    for image in listed(folder / "color", "*"):
+        if image.suffix.lower() in _IMAGES:
+            yield _Frame(image.stem, image, folder / "pose" / f"{image.stem}.txt", intrinsics)
+
+
+def _beside_each_other(folder: Path, scene: str) -> Iterator[_Frame]:
+    prefix = f"scannet_{scene.removeprefix('scene')}_"
+    intrinsics = folder / f"{prefix}intr.txt"
+    if not existing(intrinsics):
+        return
+    for pose in folder.glob(f"{prefix}*_pose.txt"):
+        stem = pose.name.removesuffix("_pose.txt")
+        images = (folder / f"{stem}{suffix}" for suffix in _IMAGES)
+        image = first_existing(images) or folder / f"{stem}.jpg"
+        yield _Frame(stem.removeprefix(prefix), image, pose, intrinsics)

@@ -25,9 +25,8 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.io.files import as_path
 
-DEFAULT_FOCAL = 800.0
-"""The virtual camera's focal length [px] where the files don't say one."""
-
+# The virtual camera's focal length [px] where the files don't say one.
+_DEFAULT_FOCAL = 800.0
 _LARGEST_IMAGE = 2**30
 # Pairs whose median distance under the true pose [normalised] is larger don't belong together.
 _PAIRED = 0.05
@@ -47,7 +46,8 @@ class BlindPnP(CorrespondenceSet):
     the image point).
 
     Image points are stored with the calibration taken out. They are given in the pixels of a
-    virtual camera of the sample's focal length, whose image is just large enough for them.
+    virtual camera of the sample's focal length, by default 800 px, whose image is just large
+    enough for them.
 
     No pickle can run code; see `cadalign.datasets.sfm.unpickling`.
 
@@ -55,8 +55,6 @@ class BlindPnP(CorrespondenceSet):
     ----------
     path : str or path-like
         The split's folder.
-    focal : float, optional
-        Focal length [px] of the virtual camera; by default that of ``focal.pkl``, or 800.
 
     Raises
     ------
@@ -64,8 +62,6 @@ class BlindPnP(CorrespondenceSet):
         If files are missing, no pickles, ask for code, or differ in their number of samples.
         Asking for a sample raises it if its arrays are malformed, or if its points don't belong
         together under the true pose.
-    InputError
-        If ``focal`` is not positive.
 
     Examples
     --------
@@ -77,10 +73,7 @@ class BlindPnP(CorrespondenceSet):
     marks = tuple(f"{name}.pkl" for name in _REQUIRED)
     signature = "matches.pkl, R.pkl and t.pkl"
 
-    def __init__(self, path: str | os.PathLike[str], *, focal: float | None = None) -> None:
-        if focal is not None and not (np.isfinite(focal) and focal > 0):
-            raise InputError(f"{focal!r} is not a focal length", where="focal")
-        self._focal = focal
+    def __init__(self, path: str | os.PathLike[str]) -> None:
         folder = as_path(path)
         fix = "give a split's folder, which holds matches.pkl, R.pkl and t.pkl"
         nothing = "there are no correspondences"
@@ -131,39 +124,30 @@ class BlindPnP(CorrespondenceSet):
 
     def _focal_lengths(self, position: int) -> FloatArray:
         """One focal length [px], or those along x and y."""
-        if self._focal is not None:
-            return np.array([self._focal])
         if "focal" not in self._data:
-            return np.array([DEFAULT_FOCAL])
+            return np.array([_DEFAULT_FOCAL])
         focal = self._flat("focal", position)
         if len(focal) > 2 or (focal <= 0).any():
             raise InputError(f"{focal.tolist()} are no focal lengths", where="focal")
         return focal
 
     def _array(self, name: str, position: int, *, shape: tuple[int | None, ...]) -> FloatArray:
-        return as_floats(self._entry(name, position), name=name, shape=shape)
+        return as_floats(self._data[name][position], name=name, shape=shape)
 
     def _flat(self, name: str, position: int) -> FloatArray:
         """A sample's few numbers, whatever shape they were stored in; (k,) float, k >= 1."""
         try:
-            values = np.reshape(self._entry(name, position), -1)
+            values = np.ravel(self._data[name][position])
         except ValueError:
             raise InputError("not an array of numbers", where=name) from None
         if not len(values):
             raise InputError("is empty", where=name)
         return as_floats(values, name=name, shape=(None,))
 
-    def _entry(self, name: str, position: int) -> Any:
-        try:
-            return self._data[name][position]
-        except KeyError:
-            raise InputError("there is no such sample", where=name) from None
-
 
 def _load_samples(file: Path) -> Any:
     value = load_pickle(file)
-    is_array = isinstance(value, np.ndarray) and value.ndim > 0
-    if not is_array and not isinstance(value, list | tuple | dict):
+    if not isinstance(value, list | tuple) and not np.ndim(value):
         raise DataError(f"holds {type(value).__name__}, not a list of samples", where=str(file))
     return value
 

@@ -226,8 +226,7 @@ class _Cursor:
         return int(self.unpack(_COUNT, f"the number of {what}")[0])
 
     def unpack(self, layout: struct.Struct, what: str) -> tuple[Any, ...]:
-        start = self.skip(layout.size, what)
-        return layout.unpack_from(self._data, start)
+        return layout.unpack_from(self._data, self.skip(layout.size, what))
 
     def array(self, dtype: np.dtype[Any], count: int, what: str) -> npt.NDArray[Any]:
         """The next values, not copied."""
@@ -246,8 +245,7 @@ class _Cursor:
         start, left = self.offset, len(self._data) - self.offset
         if size > left:
             what = f"{what} at offset {start} needs {size} bytes, {left} are left"
-            where, fix = str(self._path), "get the whole file"
-            raise DataError(f"the file is cut short: {what}", where=where, fix=fix)
+            raise damaged(what, self._path)
         self.offset += size
         return start
 
@@ -314,8 +312,7 @@ def _text_view(pose: list[str], observations: str | None, where: str) -> _View:
     except ValueError as error:
         raise DataError(f"the pose is malformed ({brief(error)})", where=where) from None
     if observations is None:
-        what = "the file ends before its observations"
-        raise DataError(what, where=where, fix="get the whole file")
+        raise damaged("the file ends before its observations", where)
     words = observations.split()
     if len(words) % 3:
         raise damaged(f"the observations are {len(words)} values, not X Y POINT3D_ID each", where)

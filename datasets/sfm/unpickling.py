@@ -1,228 +1,239 @@
-"""Pickles of NumPy arrays and plain containers, loaded without running code.
+"""Pickles of NumPy arrays and plain containers, read without running code.
 
-A pickle is a program: it may import and call anything. Here it gets nothing but what rebuilds
-arrays, NumPy scalars, sets and ordered dictionaries; asking for anything else is refused before it
-is imported. NumPy's own ``dtype`` and ``ndarray`` are not handed out either: their ``__setstate__``
-trusts flags and lengths in the pickle, and can be made to read bytes as addresses of objects.
-
-Memory and time are bounded by the file's size: the program is read once without being run, which
-finds places in its memory beyond its length and nesting deep enough to exhaust the stack, and
-what it built must not hold more values than the file has bytes.
+A pickle is a program for a stack machine, which may import and call anything. The machine here
+builds values alone: what a program may name is a word that it knows, the arrays are made from their
+shapes, types and bytes, and whatever else is asked for is refused. Memory and time are bounded by
+the file's size.
 """
 
 from __future__ import annotations
 
-import collections
+import codecs
 import io
 import math
 import os
-import pickle
 import pickletools
 import re
-from collections.abc import Collection
-from typing import Any
+from collections.abc import Iterator, ValuesView
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from cadalign.errors import DataError, quote
+from cadalign.io.documents import in_file
 from cadalign.io.files import as_path, damaged, read_bytes
 
-# Numbers, text and objects; no records, whose fields can hide objects.
-_PLAIN_DTYPE = re.compile(r"b1|[iufc]\d{1,2}|[SU]\d{1,6}|O\d?")
+# Numbers and text; no records, whose fields can hide objects.
+_PLAIN_DTYPE = re.compile(r"b1|[iufc]\d{1,2}|[SU][1-9]\d{0,5}|O\d?")
 _MAX_DEPTH = 100
-_FILLING = frozenset(("APPEND", "APPENDS", "SETITEM", "SETITEMS", "ADDITEMS", "BUILD"))
+_MOST_TIMES = 10  # as many values as the file has bytes
+_PARTS = (list, tuple, ValuesView)
 _FIX = (
     "only NumPy arrays and plain containers are loaded, a pickle can run code; get a trusted file"
 )
+_ARRAY, _DTYPE, _NDARRAY = "numpy._core.multiarray._reconstruct", "numpy.dtype", "numpy.ndarray"
+_SCALAR, _BUFFER = "numpy._core.multiarray.scalar", "numpy._core.numeric._frombuffer"
+_BYTES, _ENCODE = "builtins.bytes", "_codecs.encode"
+_KNOWN = {_ARRAY, _DTYPE, _NDARRAY, _SCALAR, _BUFFER, _BYTES, _ENCODE}
+_CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
+# Steps of containers, and how many values each takes; None for those from the last mark on.
+_COUNTS: dict[str, int | None] = {
+    **dict.fromkeys(("EMPTY_LIST", "EMPTY_TUPLE", "EMPTY_DICT"), 0),
+    "TUPLE1": 1,
+    "TUPLE2": 2,
+    "TUPLE3": 3,
+    "APPEND": 1,
+    "SETITEM": 2,
+    **dict.fromkeys(("LIST", "TUPLE", "DICT", "APPENDS", "SETITEMS")),
+}
+_STEPS = {step.code.encode("latin-1"): step for step in pickletools.opcodes}
+_LITERALS = {
+    step.name
+    for step in pickletools.opcodes
+    if step.arg and not step.stack_before and step.stack_after
+    and step.stack_after[0] is not pickletools.anyobject
+}  # fmt: skip
+"""Steps that push their argument, a number or a text."""
+
+
+@dataclass
+class _Named:
+    """What a pickle calls by its name; an array or a type of arrays is made first, then filled."""
+
+    name: str
+    value: Any = None
 
 
 def load_pickle(path: str | os.PathLike[str]) -> Any:
-    """Load a pickle of NumPy arrays (as a subclass), numbers, text, and containers of these.
+    """Load a pickle of NumPy arrays, numbers, texts, and lists, tuples and dictionaries of these.
 
     Pickles of Python 2 and of old and new NumPy are understood. Text of Python 2 is taken as
-    Latin-1, the encoding that keeps its bytes.
+    Latin-1, the encoding that keeps its bytes. An array of objects becomes a list.
+
+    Raises DataError if the file cannot be read, is no whole pickle, or asks for anything else.
     """
     data = read_bytes(as_path(path))
     try:
-        _check_program(data)
-        value = _PlainUnpickler(io.BytesIO(data), str(path)).load()
-        _check_size(value, limit=10 * len(data))
+        with in_file(str(path)):
+            value = _run(data)
+        _check_size(value, most=_MOST_TIMES * len(data))
         return value
     except DataError:
         raise
-    except Exception as error:  # damaged pickles make the unpickler raise what it likes
+    except Exception as error:  # any step of a damaged pickle may fail
         reason = f"{type(error).__name__}: {str(error)[:200]}"
         raise damaged(f"not a whole pickle of arrays ({reason})", path) from None
 
 
-def _check_program(data: bytes) -> None:
-    """Follow the pickle's stack with the nesting depths of its values in the place of values.
-
-    Refused are values that are nested too deeply (hashing them would exhaust the stack), and places
-    in the pickle's memory numbered beyond its length (the unpickler would allocate them all).
-    """
-    stack: list[int] = []
+def _run(data: bytes) -> Any:
+    """Build the value that a pickle's program describes."""
+    stack: list[Any] = []
     marks: list[int] = []
-    memory: dict[int, int] = {}
-    argument: Any
-    for count, (opcode, argument, _) in enumerate(pickletools.genops(data)):
-        name = opcode.name
-        if name == "MARK":
+    memory: dict[int, Any] = {}
+    copied = 0
+
+    def popped(count: int | None = None) -> list[Any]:
+        """Take the last values, by default those from the last mark on."""
+        start = marks.pop() if count is None else len(stack) - count
+        values = [_value_of(each) for each in stack[start:]]
+        del stack[start:]
+        return values
+
+    for name, argument in _steps(data):
+        if name in _LITERALS:
+            stack.append(argument)
+        elif name in _CONSTANTS:
+            stack.append(_CONSTANTS[name])
+        elif name == "MARK":
             marks.append(len(stack))
-        elif name == "MEMOIZE":
-            memory[len(memory)] = stack[-1]
-        elif name in ("PUT", "BINPUT", "LONG_BINPUT"):
-            if int(argument) > count:
-                raise pickle.UnpicklingError("a place in memory beyond the pickle's length")
-            memory[int(argument)] = stack[-1]
+        elif name in _COUNTS:
+            values = popped(_COUNTS[name])
+            if "TUPLE" in name:
+                stack.append(tuple(values))
+            elif "LIST" in name:
+                stack.append(values)
+            elif "APPEND" in name:
+                _of(list, stack[-1]).extend(values)
+            else:
+                if "DICT" in name:
+                    stack.append({})
+                keys = [_of(str | bytes | int | float, key) for key in values[::2]]
+                _of(dict, stack[-1]).update(zip(keys, values[1::2], strict=True))
+        elif name in ("MEMOIZE", "PUT", "BINPUT", "LONG_BINPUT"):
+            memory[len(memory) if name == "MEMOIZE" else int(argument)] = stack[-1]
         elif name in ("GET", "BINGET", "LONG_BINGET"):
             stack.append(memory[int(argument)])
-        else:
-            if pickletools.markobject in opcode.stack_before:
-                start = marks.pop()
-                # What stands before the mark: the container that is filled.
-                start -= opcode.stack_before.index(pickletools.markobject)
+        elif name in ("GLOBAL", "STACK_GLOBAL"):
+            stack.append(_named(*(argument.split(" ") if argument else popped(2))))
+        elif name in ("REDUCE", "BUILD"):
+            (arguments,) = popped(1)
+            copied += sum(len(each) for each in _of(tuple, arguments) if isinstance(each, str))
+            if copied > _MOST_TIMES * len(data):
+                raise ValueError("it copies a text again and again")
+            called = _of(_Named, stack[-1])
+            if name == "BUILD":
+                _fill(called, *arguments)
             else:
-                start = len(stack) - len(opcode.stack_before)
-            used = stack[start:]
-            del stack[start:]
-            if name in _FILLING and used:
-                depth = max(used[0], 1 + max(used[1:], default=0))
-            else:
-                depth = 1 + max(used, default=0)
-            if depth > _MAX_DEPTH:
-                raise pickle.UnpicklingError(f"values are nested more than {_MAX_DEPTH} deep")
-            stack.extend([depth] * len(opcode.stack_after))
+                stack[-1] = _made(called.name, *arguments)
+        elif name not in ("PROTO", "FRAME"):
+            raise ValueError(f"{name} is no step of arrays and plain containers")
+    (value,) = popped(len(stack))
+    return value
 
 
-def _check_size(value: Any, *, limit: int) -> None:
-    """Refuse a container in itself, and shared ones that written out exceed the limit."""
-    sizes: dict[int, int] = {}
-    unfinished: set[int] = set()
-    waiting: list[tuple[Any, bool]] = [(value, False)]
-    while waiting:
-        item, is_done = waiting.pop()
-        items = _items(item)
-        if is_done:
-            unfinished.remove(id(item))
-            sizes[id(item)] = 1 + sum(sizes.get(id(each), 1) for each in items)
-            if sizes[id(item)] > limit:
-                raise pickle.UnpicklingError("it holds more values than the file has bytes")
-        elif id(item) in unfinished:
-            raise pickle.UnpicklingError("a container holds itself")
-        elif id(item) not in sizes and items:
-            unfinished.add(id(item))
-            waiting.append((item, True))
-            waiting.extend((each, False) for each in items)
-
-
-def _items(value: Any) -> Collection[Any]:
-    if isinstance(value, dict):
-        return value.values()
-    if isinstance(value, list | tuple | set | frozenset):
-        return value
-    if isinstance(value, np.ndarray) and value.dtype.hasobject:
-        return list(value.flat)
-    return ()
-
-
-class _PlainUnpickler(pickle.Unpickler):
-    def __init__(self, file: Any, where: str) -> None:
-        super().__init__(file, encoding="latin1")
-        self._where = where
-        self._allowed = _make_allowed()
-
-    def find_class(self, module: str, name: str) -> Any:
-        # Python 2 and NumPy 1 call the same modules otherwise.
-        current = module.replace("__builtin__", "builtins").replace("numpy.core.", "numpy._core.")
-        if (current, name) not in self._allowed:
-            what = f"the pickle asks for {quote(f'{module}.{name}')[1:-1]}, which is refused"
-            raise DataError(what, where=self._where, fix=_FIX)
-        return self._allowed[current, name]
-
-
-class _Dtype:
-    """Stands for ``numpy.dtype`` while a pickle is read."""
-
-    def __init__(self, code: str, align: Any = False, copy: Any = False) -> None:
-        if not isinstance(code, str) or not _PLAIN_DTYPE.fullmatch(code):
-            raise pickle.UnpicklingError(f"the dtype {quote(code)} is not one of plain values")
-        self.value: np.dtype[Any] = np.dtype(code)
-
-    def __setstate__(self, state: tuple[Any, ...]) -> None:
-        # (version, byte order, subdtype, names, fields, ...); the rest follows from the code.
-        self.value = self.value.newbyteorder(state[1])
-
-
-class _Array(np.ndarray[Any, Any]):
-    """An array that checks what it is rebuilt from."""
-
-    def __setstate__(self, state: tuple[Any, ...]) -> None:
-        _, shape, dtype, fortran_order, data = state
-        count = math.prod(_as_shape(shape))
-        values: np.dtype[Any] = dtype.value
-        if values.hasobject:
-            fits = isinstance(data, list) and len(data) == count
+def _steps(data: bytes) -> Iterator[tuple[str, Any]]:
+    """A program's steps to its end, each with its argument."""
+    stream = io.BytesIO(data)
+    while (code := stream.read(1)) != b".":
+        step = _STEPS[code]
+        if step.name == "STRING":  # Python 2's, which need not be ASCII
+            text = pickletools.read_stringnl(stream, decode=False)
+            yield step.name, codecs.escape_decode(text)[0].decode("latin-1")
         else:
-            fits = isinstance(data, bytes | str) and len(data) == count * values.itemsize
-        # Refilling an array would pull its memory away from whatever looks at it already.
-        if not fits or self.size:
-            what = f"an array of shape {quote(shape)} has other data than that"
-            raise pickle.UnpicklingError(what)
-        # NumPy's stubs ask for a numpy.bool, which it doesn't take.
-        rebuilt: Any = (1, shape, values, bool(fortran_order), data)
-        super().__setstate__(rebuilt)
-
-    def __reduce_ex__(self, protocol: Any) -> Any:
-        # Pickled again, for a worker process, it is an array like any other.
-        return self.view(np.ndarray).__reduce_ex__(protocol)
+            yield step.name, step.arg.reader(stream) if step.arg else None
 
 
-def _make_allowed() -> dict[tuple[str, str], Any]:
-    """All that a pickle may name.
+def _of(kind: Any, value: Any) -> Any:
+    """The value, which must be of a kind."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{quote(value)} stands in the place of another kind of value")
+    return value
 
-    Made anew for each file: a pickle can set attributes of the functions that it is given.
+
+def _value_of(item: Any) -> Any:
+    """The value of an item of the stack: what was made by a name, where that is whole."""
+    return item.value if isinstance(item, _Named) and item.value is not None else item
+
+
+def _named(module: str, attribute: str) -> _Named:
+    # Python 2 and NumPy 1 call the same modules otherwise.
+    current = module.replace("__builtin__", "builtins").replace("numpy.core.", "numpy._core.")
+    if f"{current}.{attribute}" not in _KNOWN:
+        asked = quote(f"{module}.{attribute}")[1:-1]
+        raise DataError(f"the pickle asks for {asked}, which is refused", fix=_FIX)
+    return _Named(f"{current}.{attribute}")
+
+
+def _made(name: str, *arguments: Any) -> Any:
+    """What calling a name makes: an array or its type is filled later."""
+    if name == _DTYPE:
+        code = arguments[0]
+        if not _PLAIN_DTYPE.fullmatch(code):
+            raise ValueError(f"the dtype {quote(code)} is not one of plain values")
+        return _Named(name, np.dtype(code))
+    if name == _ARRAY and arguments[0] == _Named(_NDARRAY):
+        return _Named(name)
+    if name == _SCALAR:
+        return _array((), *arguments)[()]
+    if name == _BUFFER:
+        buffer, dtype, shape, order, *axes = arguments
+        array = _array(shape, dtype, buffer, order="F" if order == "F" else "C")
+        return array.transpose(axes[0]) if order == "K" and axes else array
+    if name == _BYTES and not arguments:
+        return b""
+    if name == _ENCODE and arguments[1] == "latin1":  # bytes, as Python 3 writes them for Python 2
+        return arguments[0].encode("latin1")
+    raise ValueError(f"{name} of {quote(arguments)} is no plain value")
+
+
+def _fill(made: _Named, *state: Any) -> None:
+    if made.name == _DTYPE:  # (version, byte order, ...); the rest follows from the code
+        made.value = made.value.newbyteorder(state[1])
+        return
+    if made.name != _ARRAY:
+        raise ValueError(f"{made.name} cannot be changed")
+    _, shape, dtype, is_fortran, data = state
+    if dtype.hasobject:
+        made.value = _of(list, data)
+        if shape != (len(data),):
+            raise ValueError(f"an array of shape {quote(shape)} has {len(data)} objects")
+    else:
+        made.value = _array(shape, dtype, data, order="F" if is_fortran else "C")
+
+
+def _array(
+    shape: Any, dtype: np.dtype[Any], data: bytes | str, *, order: Literal["C", "F"] = "C"
+) -> npt.NDArray[Any]:
+    """An array that looks at its bytes: one and the same may belong to many."""
+    content = data.encode("latin1") if isinstance(data, str) else data
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(content):
+        raise ValueError(f"an array of shape {quote(shape)} has other data than that")
+    return np.ndarray(shape, dtype, content, order=order)
+
+
+def _check_size(value: Any, *, most: int) -> None:
+    """Refuse deep nesting, containers in themselves, and more values than a file can have.
+
+    Shared containers count as often as they are found: who walks through them finds all.
     """
-    array_type = object()  # for ``numpy.ndarray``, which pickles name but need not call
-
-    def reconstruct(kind: Any, shape: Any, code: Any) -> _Array:
-        if kind is not array_type:
-            raise pickle.UnpicklingError("only plain arrays can be loaded")
-        return np.empty(0).view(_Array)
-
-    def scalar(dtype: _Dtype, data: bytes | str) -> Any:
-        content = data.encode("latin1") if isinstance(data, str) else bytes(data)
-        return np.frombuffer(content, dtype=dtype.value, count=1)[0]
-
-    def from_buffer(
-        buffer: bytes | bytearray, dtype: _Dtype, shape: Any, order: str, axes: Any = None
-    ) -> Any:
-        flat = np.frombuffer(bytes(buffer), dtype=dtype.value)
-        if order == "K" and axes is not None:
-            return flat.reshape(_as_shape(shape)).transpose(axes)
-        return flat.reshape(_as_shape(shape), order="F" if order == "F" else "C")
-
-    def encode(text: str, encoding: str) -> bytes:
-        # How Python 3 writes bytes so that Python 2 can read them.
-        if encoding != "latin1":
-            raise pickle.UnpicklingError(f"the encoding {quote(encoding)} is not expected")
-        return text.encode("latin1")
-
-    return {
-        ("numpy", "ndarray"): array_type,
-        ("numpy", "dtype"): _Dtype,
-        ("numpy._core.multiarray", "_reconstruct"): reconstruct,
-        ("numpy._core.multiarray", "scalar"): scalar,
-        ("numpy._core.numeric", "_frombuffer"): from_buffer,
-        ("_codecs", "encode"): encode,
-        ("builtins", "bytes"): lambda: b"",
-        ("builtins", "set"): set,
-        ("builtins", "frozenset"): frozenset,
-        ("collections", "OrderedDict"): collections.OrderedDict,
-    }
-
-
-def _as_shape(shape: Any) -> tuple[int, ...]:
-    if not isinstance(shape, tuple) or not all(isinstance(n, int) and n >= 0 for n in shape):
-        raise pickle.UnpicklingError(f"{quote(shape)} is not a shape")
-    return shape
+    level, count = [value], 0
+    for _ in range(_MAX_DEPTH):
+        count += len(level)
+        if not level or count > most:
+            break
+        parts = [each.values() if isinstance(each, dict) else each for each in level]
+        level = [each for part in parts if isinstance(part, _PARTS) for each in part]
+    if level:
+        raise ValueError("its values are nested too deeply, or more than the file has bytes")

@@ -11,11 +11,11 @@ from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from trimesh.triangles import points_to_barycentric
 
 from cadalign.arrays import FloatArray
 from cadalign.geometry.alignment import Alignment, model_rays
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import barycentric_of
 from cadalign.geometry.pixels import perspective
 from cadalign.geometry.raycaster import FaceArray, RayCaster
 from cadalign.render.drawing.canvas import LinearArray
@@ -183,7 +183,7 @@ class PosedScene:
         points = self._origin + self._directions(rays) * depth[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):  # triangles without area
             triangles = self.scene.triangles[face]
-            weights = points_to_barycentric(triangles, points)  # type: ignore[no-untyped-call]
+            weights = barycentric_of(triangles, points)
         # The float32 caster may hit a triangle a hair outside of it.
         return np.asarray(np.clip(np.nan_to_num(weights), 0, 1), dtype=np.float32)
 

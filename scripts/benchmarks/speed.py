@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks import section
 from benchmarks.section import COMMAND, BenchmarkData, Row, Tables
 from cadalign import Observation
-from cadalign.datasets import sample_models
+from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.evaluation.simulation import simulate_problem
 from cadalign.io.images import write_image
 
@@ -89,13 +89,14 @@ def _commands(folder: Path, runs: int) -> Iterator[Row]:
 
 
 def _observation(folder: Path) -> Path:
-    (model,) = sample_models(categories=["chair"], per_category=1)
+    root = write_sample_dataset(folder / "sample", categories=["chair"], per_category=1)
+    mesh = KeypointNet(root)["chair"][0].load_mesh()
     problem = simulate_problem(np.random.default_rng(0), points=10, noise_px=0.5)
     camera = problem.camera
     photo, path = folder / "photo.jpg", folder / "chair.obj"
     write_image(photo, np.full((camera.height, camera.width, 3), 180, dtype=np.uint8))
-    lines = [f"v {x} {y} {z}" for x, y, z in model.mesh.vertices]
-    lines += [f"f {a} {b} {c}" for a, b, c in (model.mesh.faces + 1).tolist()]
+    lines = [f"v {x} {y} {z}" for x, y, z in mesh.vertices]
+    lines += [f"f {a} {b} {c}" for a, b, c in (mesh.faces + 1).tolist()]
     path.write_text("\n".join(lines) + "\n")
     seen = Observation(problem.points_3d, problem.points_2d, camera, image=photo, model=path)
     seen.save(folder / "seen.json")

@@ -70,25 +70,14 @@ def test_the_stretch_shows(model, tmp_path):
 
 
 @pytest.mark.long
-def test_keypoints_from_their_file_and_from_annotations(model, tmp_path):
-    corner = [0.2, 0.4, -0.3]
-    mesh_info = {"face_index": 0, "face_uv": [1, 0, 0]}
-    keypoint = {"xyz": corner, "semantic_id": 0, "mesh_info": mesh_info}
-    entry = {"class_id": "03001627", "model_id": "parts", "keypoints": [keypoint]}
-    (tmp_path / "chair.json").write_text(json.dumps([{"model_id": "other"}, entry]))
-    named = {"name": "corner", "xyz": corner}
+def test_keypoints_are_drawn_from_their_file(model, tmp_path):
+    named = {"name": "corner", "xyz": [0.2, 0.4, -0.3]}
     own = {"format": "cadalign model keypoints", "version": 1, "keypoints": [named]}
     (tmp_path / "parts.keypoints.json").write_text(json.dumps(own))
-    drawn = []
-    for name in ("parts.keypoints.json", "chair.json"):
-        out = tmp_path / "k.png"
-        _run(model, "--out", out, "--keypoints", tmp_path / name, "--resolution", "160x120")
-        drawn.append(_pixels(out).astype(int))
-    np.testing.assert_array_equal(*drawn)
-    assert ((drawn[0][:, :, 0] - drawn[0][:, :, 2]) > 100).sum() > 10
-    (tmp_path / "chair.json").write_text(json.dumps([{"model_id": "other"}]))
-    with pytest.raises(DataError, match="no annotations of a model whose id"):
-        _run(model, "--out", out, "--keypoints", tmp_path / "chair.json")
+    out, keypoints = tmp_path / "k.png", tmp_path / "parts.keypoints.json"
+    _run(model, "--out", out, "--keypoints", keypoints, "--resolution", "160x120")
+    drawn = _pixels(out).astype(int)
+    assert ((drawn[:, :, 0] - drawn[:, :, 2]) > 100).sum() > 10
 
 
 @pytest.mark.parametrize(

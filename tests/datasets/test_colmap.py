@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from support.files import exact
 from support.problems import assert_drawn_stretches_are_recovered
-from support.timing import reference_seconds, timed
 
 from cadalign.datasets import Colmap, Correspondences
 from cadalign.errors import DataError, InputError
@@ -198,18 +197,6 @@ def test_names_with_spaces_and_crlf_lines_are_read(tmp_path):
 # --- the sequence
 
 
-def test_images_are_found_by_position_and_name(tmp_path):
-    images = Colmap(Model(["PINHOLE"] * 3).write_text(tmp_path))
-    assert len(images) == 3
-    assert [image.id for image in images] == list(images.names)
-    assert images[0].id == images["0.jpg"].id == images[-3].id == "0.jpg"
-    for key in (3, -4):
-        with pytest.raises(IndexError, match=f"3 images, asked for number {key}"):
-            images[key]
-    with pytest.raises(DataError, match=r"no image 'nothing\.jpg'"):
-        images["nothing.jpg"]
-
-
 @either
 def test_models_can_be_sent_to_worker_processes(tmp_path, write):
     images = Colmap(write(Model(["PINHOLE", "RADIAL"]), tmp_path))
@@ -273,19 +260,10 @@ def test_a_binary_file_cut_anywhere_names_itself_and_the_offset(tmp_path, name):
     data = (folder / name).read_bytes()
     for length in range(len(data)):
         (folder / name).write_bytes(data[:length])
-        with pytest.raises(DataError, match=rf"{name}: the file is cut short: .* at offset \d+"):
+        with pytest.raises(DataError, match=rf"{name}: .* at offset \d+ needs .* cut short"):
             Colmap(folder)
     (folder / name).write_bytes(data + b"\0")
     with pytest.raises(DataError, match=f"1 bytes too many from offset {len(data)}"):
-        Colmap(folder)
-
-
-def test_absurd_counts_in_a_binary_file_are_refused(tmp_path):
-    folder = Model(["PINHOLE"]).write_binary(tmp_path)
-    data = bytearray((folder / "images.bin").read_bytes())
-    struct.pack_into("<Q", data, 8 + 64 + len("0.jpg") + 1, 2**63)
-    (folder / "images.bin").write_bytes(data)
-    with pytest.raises(DataError, match="cut short"):
         Colmap(folder)
 
 
@@ -309,6 +287,7 @@ def test_a_text_file_cut_short_names_the_image(tmp_path):
         ("cameras.txt", "10 PINHOLE 6 4 1 1 1 1", "line 3: camera 10 occurs twice"),
         ("points3D.txt", "1 0 zero 0 1 2 3 0.5", "line 32: '1 0 zero 0 1 2 3 0.5' is malformed"),
         ("points3D.txt", "7 0 0 0 1 2 3 0.5", "point 7 occurs twice"),
+        ("points3D.txt", f"{2**63} 0 0 0 1 2 3 0.5", "line 32: '9223372036854775808 0 0 0 1 2 3 0"),
         ("images.txt", "1 1 0 0 0", "line 4: '1 1 0 0 0' is malformed; expected IMAGE_ID"),
         ("images.txt", "1 1 0 0 0 1 2 3 10 0.jpg\n", "the image '0.jpg' occurs twice"),
     ],
@@ -392,10 +371,3 @@ def test_real_model_reprojects():
 @needs_data
 def test_stretches_drawn_for_the_real_model_are_recovered():
     assert_drawn_stretches_are_recovered(Colmap(Path(DATA) / "sfm/maupertuis_colmap"))
-
-
-@needs_data
-@pytest.mark.timing
-def test_real_model_loads_quickly():
-    loading = timed(lambda: list(Colmap(Path(DATA) / "sfm/maupertuis_colmap")))
-    assert reference_seconds(loading, below=0.12) < 0.12

@@ -75,16 +75,6 @@ def test_coco_annotations_have_names_flags_and_images(tmp_path: Path) -> None:
     assert (second.image, second.size) == ("cats/b.jpg", (320, 240))
 
 
-@pytest.mark.parametrize("name", ["images", "categories"])
-def test_an_id_of_two_images_or_categories_is_refused(tmp_path: Path, name: str) -> None:
-    same = ANNOTATIONS[name][0]
-    assert len(read(tmp_path, {**ANNOTATIONS, name: [*ANNOTATIONS[name], same]})) == 2
-    other = {**same, "file_name": "dogs/a.jpg", "keypoints": ["tail"]}
-    row = len(ANNOTATIONS[name])
-    with pytest.raises(DataError, match=rf"{name}\[{row}\].id: .* is the id of another entry, too"):
-        read(tmp_path, {**ANNOTATIONS, name: [*ANNOTATIONS[name], other]})
-
-
 def flat(scores: list[float]) -> list[float]:
     return [n for point, score in zip(POINTS, scores, strict=True) for n in (*point, score)]
 
@@ -156,9 +146,6 @@ def test_mmpose_predictions_name_their_keypoints(tmp_path: Path) -> None:
     meta = {"keypoint_id2name": {str(n): name for n, name in enumerate(NAMES)}}
     (image,) = read(tmp_path, {"meta_info": meta, "instance_info": [instance]})
     assert image.names == tuple(NAMES)
-    frames = [{"frame_id": n, "instances": [instance] * n} for n in (1, 2)]
-    video = read(tmp_path, {"meta_info": meta, "instance_info": frames})
-    assert [found.image for found in video] == ["1", "2", "2"]
 
 
 @pytest.mark.parametrize(
@@ -189,16 +176,10 @@ def test_flags_are_told_from_scores(
         ),
         ([], "{path}: there are no keypoints"),
         ({"annotations": []}, "{path}: there are no keypoints"),
-        ([7], "{path}: [0]: 7 is not an object"),
         (
             [{"bbox": [1, 2, 3, 4]}],
             "{path}: [0].keypoints: missing; is it COCO's keypoint JSON, or a detector's? "
             "see cadalign's page on keypoints of detectors",
-        ),
-        (
-            changed("annotations.0.keypoints", ...),
-            "{path}: annotations[0].keypoints: missing; is it COCO's keypoint JSON, or a "
-            "detector's? see cadalign's page on keypoints of detectors",
         ),
         (
             changed("annotations.0.keypoints", []),
@@ -217,33 +198,21 @@ def test_flags_are_told_from_scores(
             "{path}: annotations[0].keypoints[2]: 'two' is not a finite number",
         ),
         (
-            changed("annotations.0.keypoints", [1, "1", 2] * 3),
-            "{path}: annotations[0].keypoints[1]: '1' is not a finite number",
-        ),
-        (
             changed("annotations.0.image_id", 12),
             "{path}: annotations[0].image_id: there is no image 12",
         ),
         (changed("annotations.0.image_id", ...), "{path}: annotations[0].image_id: missing"),
-        (changed("images.0.id", ...), "{path}: images[0].id: missing"),
-        (changed("images.0.file_name", 5), "{path}: images[0].file_name: 5 is not a text"),
-        (changed("images", 5), "{path}: images: 5 is not a list"),
         (
             changed("categories.0.id", [1]),
             "{path}: categories[0].id: [1] is not a whole number or a text",
         ),
         (
-            changed("categories.0.keypoints", "nose"),
-            "{path}: categories[0].keypoints: 'nose' is not a list",
-        ),
-        (
             changed("categories.0.keypoints.2", "nose"),
             "{path}: categories[0].keypoints[2]: 'nose' occurs twice",
         ),
-        (changed("annotations", 5), "{path}: annotations: 5 is not a list"),
         (
-            [{"keypoints": {"x": [1, 2]}}],
-            "{path}: [0].keypoints.y: missing",
+            {**ANNOTATIONS, "images": [*ANNOTATIONS["images"], {"id": 3, "file_name": "c"}]},
+            "{path}: images[2].id: 3 is the id of another entry, too; ",
         ),
         (
             [{"keypoints": {"x": [1, 2], "y": [1]}}],
@@ -260,10 +229,6 @@ def test_flags_are_told_from_scores(
         (
             [{"keypoints": [[1, 2, -0.5]]}],
             "[0]: scores: keypoint 0 has the value -0.5, which is negative",
-        ),
-        (
-            {"instance_info": [{"keypoints": [[1, 2]]}], "meta_info": {"keypoint_id2name": [1]}},
-            "{path}: meta_info.keypoint_id2name: [1] is not an object",
         ),
         (
             {"instance_info": [{"keypoints": [[1, 2]]}], "meta_info": {"keypoint_id2name": {}}},
@@ -293,7 +258,7 @@ def test_csv_columns_arrive(tmp_path: Path) -> None:
 
 
 def test_csv_needs_pixels_only(tmp_path: Path) -> None:
-    text = "\ufeffX, Y ,visibility,semantic_id,sigma\r\n1,2,2,4,0.5\r\n,,0,5,\r\n\r\n3,4,1,0,2\r\n"
+    text = "\ufeffX, Y ,score,semantic_id,sigma\r\n1,2,1,4,0.5\r\n,,0,5,\r\n\r\n3,4,0.5,0,2\r\n"
     (found,) = read(tmp_path, text, "keypoints.csv")
     assert found.points_2d[[0, 2]].tolist() == [[1, 2], [3, 4]]
     assert found.is_found.tolist() == [True, False, True]
@@ -320,7 +285,6 @@ def test_csv_of_several_images_gives_an_object_each(tmp_path: Path) -> None:
         ("1,2\n3,4\n", "{path}, line 1: unknown column '1'; known are u, v, image, name, "),
         ("name,u\na,1\n", "{path}, line 1: the column 'v' is missing; "),
         ("u,x,v\n", "{path}, line 1: the column 'u' occurs twice"),
-        ("u,v,score,visibility\n", "{path}, line 1: give score or visibility, not both"),
         ("u,v\n", "{path}: there are no keypoints"),
         ("u,v\n1,2,3\n", "{path}, line 2: 3 values for 2 columns"),
         ("u,v\n1,2\n3,four\n", "{path}, line 3: v: 'four' is not a finite number"),
@@ -328,7 +292,6 @@ def test_csv_of_several_images_gives_an_object_each(tmp_path: Path) -> None:
         ("u,v\n1,\n", "{path}, line 2: v: '' is not a finite number"),
         ("u,v,name\n1,2,\n", "{path}, line 2: name: '' is not a text"),
         ("u,v,semantic_id\n1,2,3.5\n", "{path}, line 2: semantic_id: 3.5 is not a whole number"),
-        ("u,v,visibility\n1,2,3\n", "{path}, line 2: visibility: 3 is not 0, 1 or 2"),
         ("u,v,score\n1,2,1\n1,2,null\n", "{path}, line 3: score: 'null' is not a finite number"),
         ("u,v,sigma\n1,2,0\n", "{path}: sigma: keypoint 0 has the value 0, which is not positive"),
         ("u,v,score\n1,2,-1\n", "{path}: scores: keypoint 0 has the value -1, which is negative"),
@@ -401,6 +364,7 @@ def test_photos_of_one_name_in_several_folders_are_told_apart(tmp_path: Path) ->
             "x/a.jpg, y/a.jpg",
         ),
         ([seen("a"), seen("b")], {}, "image: 2 images; choose one of a, b"),
+        ([seen(name) for name in "abcde"], {}, "image: 5 images; choose one of a, b, c, d, e"),
         (
             [seen(name) for name in "abcdefg"],
             {"image": "z"},
@@ -509,13 +473,15 @@ def test_model_keypoints_without_ids_give_none() -> None:
             "give names, or as many keypoints as the model has, in its order",
         ),
         ({}, {"sigma_from_scores": 1.0}, "photo.json: there are no scores to weigh by"),
+        ({}, {"sigma_from_scores": 0.0}, "sigma_from_scores: 0.0 is not positive"),
+        ({}, {"sigma_from_scores": np.nan}, "sigma_from_scores: nan is not positive"),
     ],
 )
 def test_keypoints_that_cannot_be_paired_are_refused(
     fields: dict[str, Any], options: dict[str, Any], text: str
 ) -> None:
     found = ImageKeypoints(**({"points_2d": np.array(POINTS), "source": "photo.json"} | fields))
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(CadalignError) as caught:
         join_keypoints(found, MODEL, CAMERA, **options)
     assert str(caught.value) == text
 
@@ -542,29 +508,6 @@ def test_photo_without_keypoints_does_not_get_those_of_another(tmp_path: Path) -
     data = changed("annotations.2", ...)
     with pytest.raises(InputError, match=r"2 images, and no keypoints in 'b\.jpg'.*cats/a\.jpg"):
         choose_object(read(tmp_path, data), image="b.jpg")
-
-
-def test_empty_frames_of_a_video_are_passed_over(tmp_path: Path) -> None:
-    instance = {"keypoints": POINTS, "keypoint_scores": [0.9, 0.8, 0.7]}
-    frames = [
-        {"frame_id": 1, "instances": [instance]},
-        {"frame_id": 2, "instances": []},
-    ]
-    (found,) = read(tmp_path, {"meta_info": {}, "instance_info": frames})
-    assert found.image == "1"
-
-
-@pytest.mark.parametrize("value", [[1], {"a": 1}])
-def test_category_that_is_no_id_is_refused(tmp_path: Path, value: Any) -> None:
-    with pytest.raises(DataError, match=r"annotations\[0\]\.category_id: .* is not a whole number"):
-        read(tmp_path, changed("annotations.0.category_id", value))
-
-
-@pytest.mark.parametrize("sigma", [0.0, -1.0, float("nan")])
-def test_weights_need_a_positive_deviation(tmp_path: Path, sigma: float) -> None:
-    found = read(tmp_path, ANNOTATIONS)[0]
-    with pytest.raises(InputError, match=r"sigma_from_scores: .* is not positive"):
-        join_keypoints(found, MODEL, CAMERA, sigma_from_scores=sigma)
 
 
 def test_whole_numbers_beyond_all_floats_are_refused(tmp_path: Path) -> None:

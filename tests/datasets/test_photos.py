@@ -75,7 +75,7 @@ def test_what_is_missing_is_told(tmp_path):
     with pytest.raises(DataError, match=r"gone\.obj"):
         CadModel("x", tmp_path / "gone.obj").load_mesh()
     with pytest.raises(DataError, match="2 keypoints, 1 names"):
-        PhotoKeypoints(np.zeros((2, 2)), ("a",), np.ones(2, dtype=bool))
+        PhotoKeypoints(np.zeros((2, 2)), ("a",))
 
 
 def test_folders_are_recognised_or_what_is_known_is_told(tmp_path):
@@ -105,7 +105,3 @@ def test_what_can_be_read_is_given_and_the_rest_is_told(tmp_path):
     photos = list(dataset)
     assert (dataset.kind, len(dataset), len(photos), len(dataset.problems)) == ("Scan2CAD", 4, 3, 1)
     assert [each.category for photo in photos for each in photo.objects] == ["chair"] * 3
-
-
-def test_open_is_a_public_name():
-    assert cadalign.datasets.open is cadalign.datasets.open_photos

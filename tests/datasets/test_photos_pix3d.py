@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import time
-import tracemalloc
-
 import numpy as np
 import pytest
 from support.files import TETRAHEDRON, write_json
@@ -111,26 +108,6 @@ def test_damaged_files_are_told(root):
 
 def test_any_damage_is_told(root):
     assert_damage_is_told(root)
-
-
-@pytest.mark.long
-def test_thousands_of_records_take_little_memory_and_time(root):
-    """Were it the square of their number that time grows with, ten thousand would take 60 s."""
-    count = 2000
-    entries = [entry(focal_length=-1 if number % 100 == 7 else 35.0) for number in range(count)]
-    size = write_json(root / "pix3d.json", entries).stat().st_size
-    begin = time.process_time()
-    dataset = Pix3D(root)
-    photos = list(dataset)
-    assert time.process_time() - begin < 60 * 0.2**2
-    assert (len(dataset), len(photos), len(dataset.problems)) == (count, 1980, 20)
-    tracemalloc.start()
-    dataset = Pix3D(root)
-    for number in range(0, count, 100):
-        dataset[number]
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak < 3 * size + 20e6
 
 
 def test_a_keypoint_at_the_border_is_marked(root):

@@ -53,14 +53,6 @@ def test_meshes_are_read_only_when_asked_for(root):
         models[0].load_mesh()
 
 
-def test_listing_one_category_leaves_the_others_alone(root):
-    shapenet = ShapeNet(root)
-    assert shapenet.categories
-    (root / "03797390/m/model.obj").unlink()
-    assert len(shapenet["chair"]) == 2
-    assert shapenet["mug"] == ()
-
-
 def test_what_is_not_there_is_told(root):
     shapenet = ShapeNet(root)
     with pytest.raises(InputError, match=r"unknown category 'chiar', did you mean 'chair'.*mug"):

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from cadalign.cli import main
 from cadalign.datasets import BlindPnP, Correspondences, open_correspondences
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError
 from cadalign.estimation.fit import fit
 from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.result import Result
@@ -122,28 +122,17 @@ class TestFormats:
         write_pickles(tmp_path, ("matches", "R", "t"))
         assert isinstance(open_correspondences(tmp_path), BlindPnP)
 
-    @pytest.mark.parametrize("format", ["auto", "colmap"])
-    def test_a_format_can_be_named(self, colmap, format):
-        assert open_correspondences(colmap, format=format).names == ("0.jpg", "1.jpg")
-
     def test_an_empty_folder_is_refused_and_says_what_was_sought(self, tmp_path):
-        with pytest.raises(DataError, match=r"known format.*points3D.*matches\.pkl"):
+        with pytest.raises(
+            DataError, match=r"no data set of correspondences .*points3D.*matches\.pkl"
+        ):
             open_correspondences(tmp_path)
 
-    def test_two_formats_in_one_folder_are_refused_unless_one_is_named(self, tmp_path):
-        write_colmap(tmp_path)
-        write_pickles(tmp_path, ("matches", "R", "t"))
-        with pytest.raises(DataError, match="files of colmap and blind-pnp"):
-            open_correspondences(tmp_path)
-        assert isinstance(open_correspondences(tmp_path, format="blind-pnp"), BlindPnP)
-
-    def test_a_missing_folder_a_file_and_an_unknown_format_are_refused(self, tmp_path, colmap):
+    def test_a_missing_folder_and_a_file_are_refused(self, tmp_path, colmap):
         with pytest.raises(DataError, match="no such folder"):
             open_correspondences(colmap / "images.txt")
         with pytest.raises(DataError, match="no such folder"):
             open_correspondences(tmp_path / "nowhere")
-        with pytest.raises(InputError, match="known are auto, colmap, blind-pnp"):
-            open_correspondences(tmp_path, format="nerf")
 
 
 class TestInputs:
@@ -447,11 +436,6 @@ class TestCommand:
         assert main(arguments) == 1
         assert message in capsys.readouterr().err
         assert not out.exists()
-
-    def test_an_unknown_format_is_a_wrong_command_line(self, colmap, tmp_path):
-        with pytest.raises(SystemExit) as error:
-            main(["evaluate", "correspondences", str(colmap), "--format", "nerf"])
-        assert error.value.code == 2
 
 
 @needs_data

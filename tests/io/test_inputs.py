@@ -26,9 +26,8 @@ from cadalign.datasets import (
     open_photos,
     read_image_keypoints,
 )
-from cadalign.datasets.photos.dataset import read_list
+from cadalign.datasets.photos.dataset import read_list, read_matrix
 from cadalign.datasets.photos.mat_files import read_structs
-from cadalign.datasets.photos.scannet import read_matrix
 from cadalign.datasets.sfm.unpickling import load_pickle
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.evaluation.runs.folder import RunFolder

@@ -9,12 +9,11 @@ from typing import cast
 
 import numpy as np
 from scipy.spatial import ConvexHull
-from trimesh.triangles import points_to_barycentric
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.estimation.model import Model
-from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.mesh import Mesh, barycentric_of
 from cadalign.geometry.raycaster import RayCaster
 from cadalign.io.meshes.files import load_mesh
 from cadalign.shapes.model import ShapeModel
@@ -98,7 +97,7 @@ Surface = RigidSurface | WarpedSurface
 
 def _barycentric(triangles: FloatArray, points: FloatArray) -> FloatArray:
     """Barycentric coordinates (n, 3) of points (n, 3) on triangles (n, 3, 3)."""
-    shares = points_to_barycentric(triangles, points)  # type: ignore[no-untyped-call]
+    shares = barycentric_of(triangles, points)
     shares = np.clip(np.where(np.isfinite(shares), shares, 1 / 3), 0.0, 1.0)
     return np.asarray(shares / shares.sum(axis=1, keepdims=True))
 

@@ -63,7 +63,7 @@ def plan(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
         folder.make()
         least = max(options.per_category, _LEAST_SAMPLE)
         place = folder.path / "sample_dataset"
-        root = write_sample_dataset(place, per_category=least, keep=True)
+        root = write_sample_dataset(place, per_category=least)
     dataset = KeypointNet(root).subset(categories=options.categories, with_mesh=True)
     if not dataset.ids():
         raise DataError(

@@ -79,7 +79,7 @@ def sight(target: PhotoTarget, protocol: Protocol, options: PhotosOptions) -> Si
 
 def _marked(marks: PhotoKeypoints, model: NamedPoints) -> tuple[tuple[str, ...], FloatArray]:
     """The visible keypoints that the model has, and their pixels."""
-    good = marks.visible & np.isin(marks.names, model.names)
+    good = np.isin(marks.names, model.names)
     if marks.scores is not None:
         good &= marks.scores > _LEAST_SCORE
     return tuple(np.array(marks.names)[good].tolist()), marks.points_2d[good]

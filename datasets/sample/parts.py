@@ -1,4 +1,4 @@
-"""Sample models: parts, closed surfaces of one colour, joined to one mesh with keypoints.
+"""Parts of sample models: closed surfaces of one colour.
 
 All but sharp boxes are lofts, surfaces through a row of closed outlines, because a part around the
 plane x = 0 must be exactly mirror symmetric, also in its tessellation.
@@ -16,7 +16,7 @@ import numpy.typing as npt
 import trimesh
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.geometry.mesh import Mesh, join
+from cadalign.geometry.mesh import Mesh
 
 Color = npt.ArrayLike
 """Red, green and blue, 0 to 255."""
@@ -26,6 +26,13 @@ Place = Sequence[float] | FloatArray
 def palette(text: str) -> npt.NDArray[np.int64]:
     """Colours (n, 3) by their hexadecimal digits, such as ``"b02428 202228"``."""
     return np.array([list(bytes.fromhex(digits)) for digits in text.split()])
+
+
+def table(text: str) -> list[SimpleNamespace]:
+    """Kinds of objects by the rows of a table, at whose head stand the names of their measures."""
+    names, *rows = (line.split() for line in text.strip().splitlines())
+    cells = ((float(cell) if cell[-1].isdigit() else cell for cell in row) for row in rows)
+    return [SimpleNamespace(**dict(zip(names, row, strict=True))) for row in cells]
 
 
 def part(vertices: npt.ArrayLike, faces: npt.ArrayLike, color: Color) -> Mesh:
@@ -89,42 +96,37 @@ def stack(levels: Iterable[Sequence[Any]], color: Color, *, radius: float) -> Me
     return loft(rings, color)
 
 
-def box(center: Place, size: Place, color: Color, *, radius: float = 0.0, steps: int = 2) -> Mesh:
-    """A box; ``steps`` flat pieces make a quarter circle of its rounded edges."""
+def box(center: Place, size: Place, color: Color, *, radius: float = 0.0) -> Mesh:
+    """A box, its edges rounded by a radius."""
     width, height, depth = size
-    if radius == 0:
-        block = trimesh.creation.box(extents=size)
-        return part(block.vertices + center, block.faces, color)
     radius = min(radius, 0.49 * height, 0.45 * width, 0.45 * depth)
-    angle = np.linspace(0, np.pi / 2, steps + 1)
-    lower = np.stack([1 - np.sin(angle), 1 - np.cos(angle)], axis=1) * radius - (0, height / 2)
-    rings = [
-        np.insert(rectangle(width - 2 * i, depth - 2 * i, radius=radius - i, steps=steps), 1, y, 1)
-        for i, y in np.concatenate([lower, lower[::-1] * (1, -1)])
-    ]
-    return loft(np.array(rings) + center, color)
+    angle = np.linspace(0, np.pi / 2, 4 if radius else 1)
+    inset, rise = radius - radius * np.stack([np.sin(angle), np.cos(angle)])
+    levels = np.concatenate([rise - height / 2, height / 2 - rise[::-1]])
+    scales = 1 - 2 * np.concatenate([inset, inset[::-1]])[:, None] / (width, depth)
+    path = center + np.outer(levels, (0, 1, 0))
+    return beam(path, (width, depth), color, scales=scales, radius=radius)
 
 
 def beam(
-    path: Sequence[Place],
+    path: npt.ArrayLike,
     size: tuple[float, float],
     color: Color,
     *,
-    scales: Sequence[float | tuple[float, float]] = (1.0,),
-    side: Place | None = None,
+    scales: npt.ArrayLike = (1.0,),
     radius: float | None = None,
 ) -> Mesh:
     """Extrude a rectangle along a path (k, 3), ``scales`` (k,) or (k, 2) times as large.
 
-    ``size`` is along ``side``, made perpendicular to the path, and across it; by default ``side``
-    is x, or z where the path runs along x.
+    Its first side is along x, or along z where the path runs along x.
     """
     points = np.asarray(path, dtype=float)
     tangent = trimesh.unitize(np.gradient(points, axis=0))
-    along = side or ((1, 0, 0) if np.abs(tangent[:, 0]).max() < 0.9 else (0, 0, 1))
+    along = np.eye(3)[0 if np.abs(tangent[:, 0]).max() < 0.9 else 2]
     first = trimesh.unitize(along - (tangent @ along)[:, None] * tangent)
-    section = rectangle(*size, radius=radius or 0.18 * min(size), steps=2 if radius else 1)
-    x, y = np.split(section * np.reshape(scales, (len(scales), 1, -1)), 2, axis=2)
+    steps, radius = (1, 0.18 * min(size)) if radius is None else (3, radius)
+    section = rectangle(*size, radius=radius, steps=steps)
+    x, y = np.split(section * np.reshape(scales, (np.shape(scales)[0], 1, -1)), 2, axis=2)
     rings = points[:, None] + (x * first[:, None] + y * np.cross(tangent, first)[:, None])
     return loft(rings, color)
 
@@ -139,33 +141,14 @@ def lathe(
 ) -> Mesh:
     """Turn a profile (k, 2) of radius and height around a vertical axis, in ``count`` = 4 i points.
 
-    Two more columns, depth and exponent, make superellipses ``|x|^e + |z/depth|^e = radius^e`` of
-    the circles. The axis of a ``sideways`` part is along x, its heights are distances outward.
+    The axis of a ``sideways`` part is along x, its heights are distances outward.
     """
-    circles = np.tile((1.0, 2.0), (len(np.asarray(profile)), 1))
-    radius, y, depth, exponent = np.column_stack([profile, circles])[:, :4].T[..., None]
+    radius, height = np.asarray(profile, dtype=float).T[..., None]
     angle = 2 * np.pi * np.arange(count) / count
-    unit = np.round([np.sin(angle), np.cos(angle)], 12)[:, None]
-    across, along = radius * np.sign(unit) * np.abs(unit) ** (2 / exponent)
-    axis, along = np.broadcast_to(y, across.shape), along * depth
+    across, along = radius * np.round([np.sin(angle), np.cos(angle)], 12)[:, None]
+    axis = np.broadcast_to(height, across.shape)
     rings = np.stack([axis, across, along] if sideways else [across, axis, along], axis=2)
     return loft(rings + center, color)
-
-
-class Kind(SimpleNamespace):
-    """Measures of a kind of object, by their names."""
-
-    def varied(self, rng: np.random.Generator, **factors: tuple[float, float]) -> Kind:
-        """A copy, some of its measures multiplied by factors drawn between two."""
-        drawn = {name: getattr(self, name) * rng.uniform(*two) for name, two in factors.items()}
-        return Kind(**vars(self) | drawn)
-
-
-def table(text: str) -> list[Kind]:
-    """Kinds by the rows of a table, at whose head stand the names of numbers and words."""
-    names, *rows = (line.split() for line in text.strip().splitlines())
-    cells = ((float(cell) if cell[-1].isdigit() else cell for cell in row) for row in rows)
-    return [Kind(**dict(zip(names, row, strict=True))) for row in cells]
 
 
 @dataclass
@@ -195,43 +178,3 @@ class Draft:
         x, y, z = place
         self.places |= {right: (x, y, z), left: (-x, y, z)}
         self.mirrored.append((right, left))
-
-
-@dataclass(frozen=True, eq=False)
-class SampleKeypoint:
-    """A keypoint on the surface."""
-
-    semantic_id: int
-    xyz: FloatArray  # (3,) [model units]
-    face_index: int
-    barycentric: FloatArray  # (3,) weights of the face's corners, of sum 1
-
-
-@dataclass(frozen=True, eq=False)
-class SampleModel:
-    """A finished model: the diagonal of its bounding box is 1, the front is at -z."""
-
-    category: str
-    model_id: str
-    mesh: Mesh  # with vertex colours; coordinates are exact in single precision
-    keypoints: tuple[SampleKeypoint, ...]  # ordered by semantic id
-    mirrored: tuple[tuple[int, int], ...]  # as of its `Draft`
-    turned: tuple[tuple[int, ...], ...]
-    round: bool
-
-
-def finish(draft: Draft, category: str, model_id: str, offset: FloatArray) -> SampleModel:
-    """Join the parts, scale them to a box of diagonal 1 about ``offset`` (3,), set keypoints."""
-    whole = join(draft.parts, f"{category} {model_id}")
-    center, diagonal = whole.bounds.mean(axis=0), np.linalg.norm(np.ptp(whole.bounds, axis=0))
-    # The file holds single precision: the mesh and what is computed from it agree with that.
-    scaled = ((whole.vertices - center) / diagonal + offset).astype(np.float32).astype(np.float64)
-    faces = whole.faces[has_area(scaled[whole.faces])]  # rounding flattens some
-    mesh = Mesh(scaled, faces, vertex_colors=whole.vertex_colors, source=whole.source)
-    ids = sorted(draft.places)
-    places = (np.array([draft.places[number] for number in ids]) - center) / diagonal + offset
-    face_index, weights = mesh.closest(places)
-    xyz = mesh.surface_points(face_index, weights)
-    keypoints = tuple(map(SampleKeypoint, ids, xyz, face_index.tolist(), weights))
-    symmetries = tuple(draft.mirrored), tuple(draft.turned), draft.round
-    return SampleModel(category, model_id, mesh, keypoints, *symmetries)

@@ -18,11 +18,9 @@ from cadalign.datasets.models.model_keypoints import ModelKeypoints
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.runs.work import Columns
 from cadalign.evaluation.summary import median
-from cadalign.io.documents import in_file
 from cadalign.io.files import dense_json
 from cadalign.io.observation import Observation
-from cadalign.io.observation_file import fill_xyz
-from cadalign.retrieval.query import ObservationRetrieval
+from cadalign.retrieval.options import ObservationRetrieval
 
 SCORE = Metric("match_score", "score", "%", 0, better="high", factor=100.0, log=False)
 NONE = Metric("none_probability", "none of these", "%", 0, factor=100.0, log=False)
@@ -59,9 +57,7 @@ class RetrieveRunOptions(ManyOptions):
         return self.estimate.opened()[0].keypoints
 
     def read(self, data: Any, where: str, *, folder: Path) -> Observation:
-        with in_file(where):
-            seen = Observation.from_dict(fill_xyz(data), folder=folder)
-        return self.changes.applied_to(seen, where)
+        return self.estimate.read(data, where, folder=folder, changes=self.changes)
 
     def estimate_of(self, seen: Observation, where: str) -> Estimated:
         seen = self.estimate.with_ids(seen, where)

@@ -34,8 +34,7 @@ from cadalign.errors import InputError
 from cadalign.estimation.problems import whitening_of
 from cadalign.retrieval.models import LibraryModel, ModelTable
 from cadalign.retrieval.options import RetrievalOptions
-from cadalign.retrieval.precision import bent
-from cadalign.retrieval.ranking import CandidateSet, Observed, Ranking, shared_keypoints
+from cadalign.retrieval.ranking import CandidateSet, Observed, Ranking, bent, shared_keypoints
 from cadalign.solvers.constants import UNKNOWNS
 from cadalign.solvers.projection import ray_derivatives
 

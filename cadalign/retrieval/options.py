@@ -28,19 +28,43 @@ show costs 0.7.
 
 from __future__ import annotations
 
+import logging
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from cadalign.errors import InputError
-from cadalign.estimation.options import AlignmentOptions, FitOptions
+from cadalign.errors import DataError, InputError
+from cadalign.estimation.options import FitOptions, Sigma
+from cadalign.io.documents import in_file
+from cadalign.io.files import once_per_file, time_of
+from cadalign.io.observation import Observation, ObservationChanges
+from cadalign.io.observation_file import fill_xyz
 
-METHODS = ("optimal", "epnp")
+if TYPE_CHECKING:
+    from cadalign.retrieval.library import Library
+    from cadalign.retrieval.match import Match
+    from cadalign.shapes.model import ShapeModel
+
+logger = logging.getLogger("cadalign")
 
 
 @dataclass(frozen=True)
-class RetrievalOptions(AlignmentOptions):
+class RetrievalOptions:
     """Options of a retrieval."""
 
+    sigma: Sigma | None = 1.0
+    """Standard deviation of the keypoints [px], one per keypoint, or a 2 x 2 covariance per
+    keypoint."""
+    loss: str = "linear"
+    """Loss on the length of a whitened residual: linear (squared), huber or cauchy; the robust ones
+    tolerate outliers."""
+    loss_scale: float = 2.0
+    """Length at which a robust loss begins to bend [sigma]."""
+    stretch: str | None = None
+    """Axes whose scale is estimated: by default both unknown ones; one of them, such as "y"; or
+    "none"."""
     top: int = 10
     """Largest number of matches to return."""
     category: str | None = None
@@ -59,13 +83,8 @@ class RetrievalOptions(AlignmentOptions):
     """Average number of keypoints in an image that the object does not have."""
     none_prior: float = 0.5
     """Probability, before an image is seen, that the object is none of the library's models."""
-    exhaustive: bool = False
-    """Search all models, also those that the bound on their likelihood excludes."""
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            fix = f"known are {', '.join(METHODS)}"
-            raise InputError(f"unknown method {self.method!r}", where="method", fix=fix)
         if not isinstance(self.top, int) or self.top < 1:
             raise InputError(f"must be a whole number >= 1, not {self.top!r}", where="top")
         if self.sigma is None:
@@ -81,10 +100,6 @@ class RetrievalOptions(AlignmentOptions):
         ):
             if not is_valid:
                 raise InputError(f"must be {rule}, not {getattr(self, name)}", where=name)
-        if self.method == "epnp" and (self.loss != "linear" or self.stretch not in (None, "none")):
-            what = "the method 'epnp' supports neither loss nor stretch"
-            fix = "use the method 'optimal', or leave these options at their defaults"
-            raise InputError(what, where="method", fix=fix)
         _ = self.fitting  # checks the options that it shares with a fit
 
     @property
@@ -93,7 +108,7 @@ class RetrievalOptions(AlignmentOptions):
         return FitOptions(
             loss=self.loss,
             loss_scale=self.loss_scale,
-            stretch="none" if self.method == "epnp" else self.stretch,
+            stretch=self.stretch,
             stretch_sigma=self.stretch_sigma,
         )
 
@@ -105,3 +120,97 @@ class RetrievalOptions(AlignmentOptions):
             return 0.0
         axes = len(self.fitting.stretched_axes)
         return -axes * (0.5 * math.log(2 * math.pi) + math.log(sigma))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationRetrieval:
+    """Settings of the retrieval of an observation's model."""
+
+    library: Path
+    """File that `cadalign library build` wrote."""
+    shape: tuple[Path, ...] = ()
+    """Files that `cadalign shape learn` wrote, one for each category: ranks their models by the
+    shape estimated from the keypoints, for objects that are not in the library."""
+    sigma: float | None = None
+    """Standard deviation of the keypoints [px]; by default the file's, or 1."""
+    ranking: RetrievalOptions = field(default_factory=RetrievalOptions)
+
+    def opened(self) -> tuple[Library, ShapeModel | dict[str, ShapeModel] | None]:
+        """The library and the shapes, which runs use again and again.
+
+        Raises
+        ------
+        DataError
+            If a file cannot be read.
+        InputError
+            If two shapes are of the same category.
+        """
+        shapes = tuple((path, time_of(path)) for path in self.shape)
+        return _opened_library(self.library), _opened_shapes(shapes)
+
+    def read(
+        self, data: Any, where: str, *, folder: Path, changes: ObservationChanges
+    ) -> Observation:
+        """Read the parsed form of an observation, with changes, whose keypoints need no xyz."""
+        with in_file(where):
+            seen = Observation.from_dict(fill_xyz(data), folder=folder)
+        return changes.applied_to(seen, where)
+
+    def with_ids(self, seen: Observation, where: str) -> Observation:
+        """The observation with the library's semantic ids, by names where it has none itself.
+
+        Raises
+        ------
+        DataError
+            If the keypoints have neither, or there are none.
+        InputError
+            If the library has no such names.
+        """
+        if seen.ids is not None and len(seen.points_2d):
+            return seen
+        with in_file(where):
+            if not len(seen.points_2d):
+                raise DataError("there are no keypoints")
+            if seen.names is None:
+                fix = "give each the id, or the name, of the library's models for it"
+                raise DataError("the keypoints have no semantic_id and no name", fix=fix)
+            return replace(seen, ids=self.opened()[0].ids_of(seen.names))
+
+    def retrieve(self, seen: Observation, where: str, *, workers: int = -1) -> list[Match]:
+        """Rank the library's models by an observation `with_ids`; see `Library.retrieve`."""
+        if seen.others:
+            said = "%s: models are ranked by the first of its %d photos alone"
+            logger.warning(said, where, len(seen.views))
+        library, shape = self.opened()
+        assert seen.ids is not None
+        stated = 1.0 if seen.sigma is None else seen.sigma
+        sigma = stated if self.sigma is None else self.sigma
+        return library.retrieve(
+            seen.points_2d,
+            seen.ids,
+            seen.camera,
+            **vars(replace(self.ranking, sigma=sigma)),
+            shape=shape,
+            workers=workers,
+        )
+
+
+@once_per_file(4)
+def _opened_library(path: Path) -> Library:
+    from cadalign.retrieval.library import Library  # only here: help of a command needs none
+
+    return Library.open(path)
+
+
+@lru_cache(maxsize=4)
+def _opened_shapes(
+    files: tuple[tuple[Path, int], ...],
+) -> ShapeModel | dict[str, ShapeModel] | None:
+    """The shape models of files: one, or several by category; None of no file."""
+    from cadalign.shapes.model import ShapeModel  # not for help of a command
+
+    found: dict[str, ShapeModel] = {}
+    for model in (ShapeModel.open(path) for path, _ in files):
+        if found.setdefault(model.category, model) is not model:
+            raise InputError(f"two files of the category {model.category!r}", where="shape")
+    return found if len(found) > 1 else next(iter(found.values()), None)

@@ -9,12 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from cadalign.datasets.models.model_keypoints import SUFFIX, ModelKeypoints
-from cadalign.errors import CadalignError, DataError
-from cadalign.geometry.alignment import extent
+from cadalign.errors import DataError
 from cadalign.io.files import listed
 from cadalign.io.kinds import MESH_ENDINGS
-from cadalign.io.meshes.files import load_mesh
-from cadalign.retrieval.models import LibraryModel, ModelTable
+from cadalign.retrieval.models import LibraryModel
 
 logger = logging.getLogger("cadalign")
 _FIX = f"`cadalign annotate PHOTO MODEL` marks keypoints, and writes MODEL{SUFFIX}"
@@ -28,10 +26,10 @@ def keypoint_files(folder: Path) -> list[Path]:
 def read_own_models(
     folder: Path,
     *,
-    categories: Iterable[str] | None = None,
-    on_model: Callable[[], object] = lambda: None,
-) -> ModelTable:
-    """The table of a folder's models; see `cadalign.Library.from_folder`.
+    categories: Iterable[str] | None,
+    on_model: Callable[[], object],
+) -> tuple[list[LibraryModel], dict[str, int]]:
+    """A folder's models, and semantic ids by name; see `cadalign.Library.from_folder`.
 
     Raises
     ------
@@ -56,7 +54,7 @@ def read_own_models(
     if unused and chosen is None:
         said = "%d meshes have no keypoints and are left out, the first is %s; %s"
         logger.warning(said, len(unused), unused[0], _FIX)
-    return ModelTable.of(models, names)
+    return models, names
 
 
 def _category(path: Path) -> str:
@@ -83,12 +81,5 @@ def _model(path: Path, found: ModelKeypoints, names: dict[str, int]) -> LibraryM
     if mesh is None:
         beside = (path.with_name(stem + suffix) for suffix in MESH_ENDINGS)
         mesh = next((each for each in beside if each.is_file()), None)
-    bounds = extent(found.xyz) if len(found) else np.zeros((2, 3))
-    try:
-        bounds = bounds if mesh is None else load_mesh(mesh).bounds
-    except CadalignError as error:
-        logger.warning("bounds are the keypoints': %s", error)
-        mesh = None
     ids = np.array([names[name] for name in found.names], dtype=np.int64)
-    own = _category(path), stem, found.xyz, ids, bounds
-    return LibraryModel(*own, None if mesh is None else mesh.absolute())
+    return LibraryModel.measured(_category(path), stem, found.xyz, ids, mesh)

@@ -94,13 +94,14 @@ def overlay_name(rank: int) -> str:
 
 def draw_match(image: ByteImage, camera: Camera, match: Match) -> ByteImage:
     """Draw a match over its photo: box, keypoints and, where there is a mesh, the model."""
+    (seen,) = match.result.views
     return draw_overlay(
         image,
         camera,
         est_box=match.box,
         est_frame=_cast(match, camera),  # without a mesh, keypoints and box are drawn
-        observed=match.points_2d,
-        reprojected=match.points_2d + match.residuals,
+        observed=seen.points_2d,
+        reprojected=seen.points_2d + seen.residuals,
     )
 
 

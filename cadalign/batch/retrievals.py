@@ -50,7 +50,7 @@ class RetrieveRunOptions(ManyOptions):
 
     @property
     def learned(self) -> Path | None:
-        return self.estimate.shape[0] if len(self.estimate.shape) == 1 else None
+        return self.estimate.shape
 
     @property
     def keypoints(self) -> ModelKeypoints:

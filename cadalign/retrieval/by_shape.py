@@ -11,16 +11,14 @@ object that it stands for:
 - each keypoint of the image that the model lacks, by the probability ``spurious``, and each of the
   model's that the image lacks, by ``missing_prob``.
 
-Keypoints that a model lacks are filled in with those that the category leads to expect. With
-several categories, each has the probability that its shape model gives to the image's keypoints.
-All models are ranked, but those that would reach behind the camera; none is searched for a pose.
+Keypoints that a model lacks are filled in with those that the category leads to expect. All models
+are ranked, but those that would reach behind the camera; none is searched for a pose.
 Matches have the pose of the estimated shape and the stretch that brings the model's keypoints and
-box closest to the estimated ones. The option ``stretch_sigma`` has no effect.
+box closest to the estimated ones.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -29,7 +27,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets.models.shapenet import require_category
-from cadalign.errors import DegenerateError, InputError, require_kind
+from cadalign.errors import DegenerateError, InputError, refuse_unused, require_kind
 from cadalign.estimation.align import align
 from cadalign.estimation.estimates import linearised
 from cadalign.estimation.options import FitOptions
@@ -39,6 +37,7 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import faced, turned_alignment
+from cadalign.retrieval.kernels import MOST_STRETCH
 from cadalign.retrieval.models import ModelTable
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import CandidateSet, Observed, Ranking
@@ -55,7 +54,6 @@ _NEGLIGIBLE = 1e-9  # probability of a Gaussian that is left out
 _FLOOR = 1e-4  # least standard deviation of a coordinate, in extents of the shape
 _FLAT = 1e-9  # share of a model's variance along an axis without extent
 _MOST_NEIGHBOURS = 2000  # models among which the nearest ones are looked for
-_INAPPLICABLE = ("stretch_sigma", "none_prior")
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,43 +68,22 @@ class _Shapes:
     deviation: float  # distance from their nearest ones per coordinate
 
 
-def shapes_by_category(
-    shape: object, options: RetrievalOptions, table: ModelTable
-) -> dict[str, ShapeModel]:
-    """The shape model of each category to rank.
-
-    A single one is that of the options' category, if there is one.
+def category_to_rank(shape: ShapeModel, options: RetrievalOptions, table: ModelTable) -> str:
+    """The category whose models a shape model ranks: that of the options, else its own.
 
     Raises
     ------
     InputError
-        If there is none, a category is not in the library, or an option does not apply.
+        If it is not in the library, the shape model has no semantic ids, or an option has no
+        effect.
     """
-    for name in _INAPPLICABLE:
-        default = getattr(RetrievalOptions, name)
-        if getattr(options, name) != default:
-            fix = f"leave it at {default!r}, or rank without shape"
-            what = f"{getattr(options, name)!r} does not apply to a ranking by shape"
-            raise InputError(what, where=name, fix=fix)
-    if isinstance(shape, ShapeModel):
-        shape = {options.category or shape.category: shape}
-    if not isinstance(shape, Mapping) or not shape:
-        what = f"expected a cadalign.ShapeModel, or some by category, got {type(shape).__name__}"
-        raise InputError(what, where="shape")
-    found = {}
-    for category, model in shape.items():
-        require_kind(model, ShapeModel, f"shape[{category!r}]")
-        if any(isinstance(label, str) for label in model.ids):
-            what, fix = "its keypoints have names", "learn it from models with semantic ids"
-            raise InputError(what, where=f"shape[{category!r}]", fix=fix)
-        found[require_category(category, table.categories, where="shape")] = model
-    if options.category is None:
-        return found
-    category = require_category(options.category, table.categories, where="category")
-    if category not in found:
-        fix = f"known are {', '.join(sorted(found))}"
-        raise InputError(f"no shape model of {category!r}", where="shape", fix=fix)
-    return {category: found[category]}
+    refuse_unused(options, ("stretch_sigma", "none_prior"), "in a ranking by shape")
+    require_kind(shape, ShapeModel, "shape")
+    if any(isinstance(label, str) for label in shape.ids):
+        what, fix = "its keypoints have names", "learn it from models with semantic ids"
+        raise InputError(what, where="shape", fix=fix)
+    where = "shape" if options.category is None else "category"
+    return require_category(options.category or shape.category, table.categories, where=where)
 
 
 def rank_by_shape(
@@ -114,44 +91,38 @@ def rank_by_shape(
     candidates: CandidateSet,
     observed: Observed,
     options: RetrievalOptions,
-    shapes: Mapping[str, ShapeModel],
+    shape: ShapeModel,
 ) -> Ranking:
-    """Rank a candidate set by the estimated shape; candidates of other categories are left out.
+    """Rank a candidate set of one category by the estimated shape.
 
     Raises
     ------
     InputError
-        If no shape model has 3 of the image's keypoints.
+        If the shape model has less than 3 of the image's keypoints.
     DegenerateError
-        If a shape model cannot be aligned with the keypoints, or no model lies in front of the
+        If the shape model cannot be aligned with the keypoints, or no model lies in front of the
         camera.
     """
-    parts, estimated, query = [], dict[str, Result](), observed.query
-    for category, shape in sorted(shapes.items()):
-        has, own = np.isin(query.ids, shape.ids), table.rows_of(category)
-        rows = np.flatnonzero((candidates.models >= own.start) & (candidates.models < own.stop))
-        if has.sum() < _LEAST_KEYPOINTS or not len(rows):
-            continue
-        sigma = np.asarray(options.sigma)
-        view = View(
-            observed.camera,
-            observed.points_2d[has],
-            ids=query.ids[has].tolist(),
-            sigma=sigma[observed.order][has] if sigma.ndim else options.sigma,
-        )
-        result = align(shape, view, loss=options.loss, loss_scale=options.loss_scale)
-        posterior = shape_posterior(result, view, loss=options.loss, loss_scale=options.loss_scale)
-        known, models = _shapes_of(table, category, shape), candidates.models[rows] - own.start
-        turn = observed.facing.lens_from_camera.T
-        logs, poses, kept = _rank_category(models, known, result, posterior, options, turn)
-        # Models share the probability of their category.
-        logs += posterior.log_evidence + float(query.gains[has].sum()) - np.logaddexp.reduce(logs)
-        parts.append((rows[kept], logs[kept], poses[kept]))
-        estimated[category] = result
-    if not parts:
-        what = f"no shape model has {_LEAST_KEYPOINTS} of the keypoints"
+    query, sigma = observed.query, np.asarray(options.sigma)
+    has = np.isin(query.ids, shape.ids)
+    if has.sum() < _LEAST_KEYPOINTS:
+        what = f"the shape model has less than {_LEAST_KEYPOINTS} of the keypoints"
         raise InputError(what, where="ids", fix="check them, or rank without shape")
-    ranked, logs, poses = map(np.concatenate, zip(*parts, strict=True))
+    view = View(
+        observed.camera,
+        observed.points_2d[has],
+        ids=query.ids[has].tolist(),
+        sigma=sigma[observed.order][has] if sigma.ndim else options.sigma,
+    )
+    result = align(shape, view, loss=options.loss, loss_scale=options.loss_scale)
+    likely = shape_posterior(result, view, loss=options.loss, loss_scale=options.loss_scale)
+    category, _ = table.keys[int(candidates.models[0])]
+    known = _shapes_of(table, category, shape)
+    models = candidates.models - table.rows_of(category).start
+    turn = observed.facing.lens_from_camera.T
+    logs, poses, kept = _rank_models(models, known, result, likely.shapes, options, turn)
+    logs += likely.log_evidence + float(query.gains[has].sum()) - np.logaddexp.reduce(logs)
+    ranked, logs, poses = np.flatnonzero(kept), logs[kept], poses[kept]
     if not len(logs):
         fix = "check the keypoints, their semantic ids and the camera"
         what = "no model has all keypoints in front of the camera"
@@ -159,14 +130,14 @@ def rank_by_shape(
     order = np.argsort(-logs, kind="stable")
     weights = np.exp(logs[order] - logs.max())
     scores = weights / weights.sum()
-    return Ranking(ranked[order], poses[order], logs[order], scores, 0, estimated)
+    return Ranking(ranked[order], poses[order], logs[order], scores, 0, result)
 
 
-def _rank_category(
+def _rank_models(
     models: IntArray,
     known: _Shapes,
     result: Result,
-    posterior: ShapePosterior,
+    likely: Gaussians,
     options: RetrievalOptions,
     turn: FloatArray,
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -184,7 +155,7 @@ def _rank_category(
     if options.shape_sigma > 0:
         deviation = options.shape_sigma * known.extent
     vectors = Vectors(placed.reshape(len(models), -1), np.ones(len(models)))
-    logs = log_likelihoods(vectors, _widened(posterior, estimate, deviation))
+    logs = log_likelihoods(vectors, _widened(likely, estimate, deviation))
     seen = np.array([label in result.views[0].ids for label in result.ids])
     has = known.has[models]
     logs = logs + (~has[:, seen]).sum(axis=1) * np.log(options.spurious)
@@ -193,21 +164,20 @@ def _rank_category(
     axes, centres = options.fitting.stretched_axes, known.centres[models]
     scales = _scales(squares, products, axes)
     pose = turned_alignment(result.alignment, turn)
-    poses = _poses(pose, scales, aim - scales * centres, axes, options.max_stretch)
+    poses = _poses(pose, scales, aim - scales * centres, axes)
     across = poses[:, 6:9] * poses[:, 12:]  # the last row of the linear part
     depths = np.einsum("nka,na->nk", centred[:, :-BOX_ROWS], across).min(axis=1)
     ahead = np.asarray(depths + (centres * across).sum(axis=1) + poses[:, 11] > 0)
     return logs, poses, ahead
 
 
-def _widened(posterior: ShapePosterior, estimate: FloatArray, deviation: float) -> Gaussians:
+def _widened(shapes: Gaussians, estimate: FloatArray, deviation: float) -> Gaussians:
     """The distribution of what similar models have in place of the object's shape."""
     centred = estimate - estimate.mean(axis=0)
     extent = float(np.linalg.norm(np.ptp(estimate, axis=0)))
     size = _FREE_SIZE * centred.ravel()
     place = _FREE_PLACE * extent * np.tile(np.eye(3), len(estimate))
     widening = np.outer(size, size) + place.T @ place + deviation**2 * np.eye(len(size))
-    shapes = posterior.shapes
     kept = shapes.weights > _NEGLIGIBLE
     return Gaussians(shapes.weights[kept], shapes.means[kept], shapes.covariances[kept] + widening)
 
@@ -237,13 +207,11 @@ def _scales(squares: FloatArray, products: FloatArray, free: str) -> FloatArray:
     return scales
 
 
-def _poses(
-    pose: Alignment, scales: FloatArray, shifts: FloatArray, free: str, max_stretch: float
-) -> FloatArray:
+def _poses(pose: Alignment, scales: FloatArray, shifts: FloatArray, free: str) -> FloatArray:
     """Packed poses (n, 15) of scaled and shifted models, the scale of an axis not free being 1."""
     held = next(axis for axis, name in enumerate("xyz") if name not in free)
     size = scales[:, [held]]
-    stretch = np.clip(scales / size, 1 / max_stretch, max_stretch)
+    stretch = np.clip(scales / size, 1 / MOST_STRETCH, MOST_STRETCH)
     # The image stays the same if everything is scaled about the camera centre.
     translation = (pose.translation + (shifts * pose.scale) @ pose.rotation.T) / size
     turned = np.broadcast_to(pose.rotation.ravel(), (len(stretch), 9))

@@ -29,6 +29,8 @@ from cadalign.solvers.unknowns import uncenter
 
 LEAST_SHARED = 4
 """Least number of shared keypoints that determine an alignment."""
+MOST_STRETCH = 4.0
+"""Largest stretch of a model; its inverse is the least."""
 _BOUNDED_FROM = 6  # a general linear camera passes through fewer points exactly
 _PROBE_ITERATIONS = 4
 _GRID_ROTATIONS = 48
@@ -55,7 +57,6 @@ class Query(NamedTuple):
     loss_scale: float
     prior_weight: float
     free: FloatArray  # (8,)
-    max_stretch: float  # its inverse is the smallest scale
     gains: FloatArray  # (n,), in log-likelihood, of a candidate that shares it without error
 
 
@@ -123,7 +124,7 @@ def search_all(
             shared.points[i] -= mean
         objective = Objective(query.free, shared, ScalePrior(query.prior_weight, 0.0))
         effort = subsets, refined, iterations
-        costs[m] = _search(objective, query.max_stretch, ceilings[m], effort, poses[m])
+        costs[m] = _search(objective, ceilings[m], effort, poses[m])
         uncenter(poses[m], mean, 1.0)
     return poses, costs
 
@@ -155,7 +156,6 @@ def _gather(
 @kernel
 def _search(
     objective: Objective,
-    max_stretch: float,
     ceiling: float,
     effort: tuple[int, int, int],
     pose: FloatArray,
@@ -187,7 +187,7 @@ def _search(
         if least < np.inf and square < _SAME_CHORD * _SAME_CHORD:
             continue
         cost, _, _ = refine(objective, iterations, probed[best])
-        cost = _within_limits(objective, max_stretch, iterations, probed[best], cost)
+        cost = _within_limits(objective, iterations, probed[best], cost)
         if cost < least:
             least = cost
             pose[:] = probed[best]
@@ -207,15 +207,13 @@ def _linearised_cost(objective: Objective, pose: FloatArray, cost: float) -> flo
 
 
 @kernel
-def _within_limits(
-    objective: Objective, max_stretch: float, iterations: int, pose: FloatArray, cost: float
-) -> float:
+def _within_limits(objective: Objective, iterations: int, pose: FloatArray, cost: float) -> float:
     """Clamp scales to the limits and refine the other unknowns; returns the cost."""
     free = objective.free.copy()
     for _ in range(2):
         beyond = False
         for j in range(2):
-            held = min(max(pose[13 + j], 1.0 / max_stretch), max_stretch)
+            held = min(max(pose[13 + j], 1.0 / MOST_STRETCH), MOST_STRETCH)
             if held != pose[13 + j]:
                 pose[13 + j] = held
                 free[6 + j] = 0.0

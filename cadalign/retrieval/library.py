@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from bisect import bisect_left
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +19,7 @@ from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.files import as_path, checksum
 from cadalign.retrieval.absence import none_probability
-from cadalign.retrieval.by_shape import rank_by_shape, shapes_by_category
+from cadalign.retrieval.by_shape import category_to_rank, rank_by_shape
 from cadalign.retrieval.match import Match
 from cadalign.retrieval.models import (
     SEAL,
@@ -227,7 +227,7 @@ class Library(ModelTable):
         ids: npt.ArrayLike,
         camera: Camera,
         *,
-        shape: ShapeModel | Mapping[str, ShapeModel] | None = None,
+        shape: ShapeModel | None = None,
         exclude: Collection[ModelKey] = (),
         workers: int = -1,
         **options: Any,
@@ -250,19 +250,18 @@ class Library(ModelTable):
             sense.
         camera : Camera
             The calibrated camera. Lens distortion is honoured.
-        shape : ShapeModel or mapping of str to ShapeModel, optional
-            Rank by the shape, or each category's, that these estimate from the image, for objects
-            that no model of the library is, not even stretched: only models of these categories, a
-            single shape model being that of ``category``, if given. See
-            `cadalign.retrieval.by_shape`.
+        shape : ShapeModel, optional
+            Rank by the shape that this estimates from the image, for objects that no model of the
+            library is, not even stretched: only models of ``category``, by default that of the
+            shape model. See `cadalign.retrieval.by_shape`.
         exclude : collection of (str, str)
             Category and id of models to leave out; those that the library lacks make no difference.
         workers : int
             Number of threads; -1 for one per core.
         **options
             Fields of `cadalign.retrieval.options.RetrievalOptions`, which describes them: top,
-            category, method, sigma, shape_sigma, loss, loss_scale, stretch, stretch_sigma,
-            max_stretch, missing_prob, spurious, none_prior, exhaustive.
+            category, sigma, shape_sigma, loss, loss_scale, stretch, stretch_sigma, missing_prob,
+            spurious, none_prior.
 
         Returns
         -------
@@ -294,11 +293,10 @@ class Library(ModelTable):
             ranking = rank(candidates, observed, chosen, workers)
             absent = none_probability(self, candidates, observed, ranking, chosen)
         else:
-            shapes = shapes_by_category(shape, chosen, self)
-            category = next(iter(shapes)) if len(shapes) == 1 else None
+            category = category_to_rank(shape, chosen, self)
             # The deviation of shapes is no noise of the keypoints here.
             plain = replace(chosen, shape_sigma=0.0, category=category)
             observed = observe(points_2d, ids, camera, plain)
             candidates = gather_candidates(self, observed, plain, exclude, workers)
-            ranking = rank_by_shape(self, candidates, observed, chosen, shapes)
+            ranking = rank_by_shape(self, candidates, observed, chosen, shape)
         return make_matches(self, candidates, observed, ranking, chosen, absent)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
-import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.assemble import KeypointPosterior
@@ -18,11 +16,9 @@ from cadalign.estimation.result_parts import FittedKeypoints, Posterior, point_s
 from cadalign.estimation.uncertainty.residuals import loss_slopes
 from cadalign.geometry.alignment import Alignment, Box, Uncertainty, deviation_text
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Mesh
 from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 METHOD = "retrieve"
 """Method of a match's result."""
@@ -116,28 +112,14 @@ class Match:
             **own,
         )
 
-    def plot(
-        self,
-        image: npt.ArrayLike | str | os.PathLike[str] | None = None,
-        *,
-        axes: Axes | None = None,
-    ) -> Axes:
-        """Draw photo, model, box and keypoints; see `cadalign.Result.plot`."""
-        return self.result.plot(image, self._mesh(), axes=axes)
-
-    def export(
-        self, path: str | os.PathLike[str], *, format: str | None = None, **of_the_object: Any
-    ) -> Path:
-        """Write the posed and stretched model for another tool; see `cadalign.Result.export`.
+    def mesh(self) -> Mesh | None:
+        """Read the model's mesh; None if it has none.
 
         Examples
         --------
-        >>> library.retrieve(points_2d, ids, camera)[0].export("chair.glb")  # doctest: +SKIP
+        >>> best = library.retrieve(points_2d, ids, camera)[0]  # doctest: +SKIP
+        >>> best.result.export("chair.glb", mesh=best.mesh())  # doctest: +SKIP
         """
-        known = {"mesh": self._mesh(), "name": self.model_id} | of_the_object
-        return self.result.export(path, format=format, **known)
-
-    def _mesh(self) -> Any:
         return None if self.mesh_path is None else load_mesh(self.mesh_path)
 
     def to_dict(self) -> dict[str, Any]:

@@ -11,7 +11,7 @@ assumptions:
 - An image shows ``spurious`` keypoints, on average, that the object does not have, anywhere in the
   image with equal density: each costs ``log(spurious / area)``.
 - The logarithms of the stretches along y and z are Gaussian about zero, with the standard deviation
-  ``stretch_sigma``, and within ``max_stretch``.
+  ``stretch_sigma``, within 1/4 and 4.
 
 So with N the number of shared keypoints, their errors r_i whitened by their covariances C_i, m the
 number of the model's keypoints that the image lacks and e of the image's that the model lacks::
@@ -31,14 +31,13 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.options import FitOptions, Sigma
 from cadalign.io.documents import in_file
-from cadalign.io.files import once_per_file, time_of
+from cadalign.io.files import once_per_file
 from cadalign.io.observation import Observation, ObservationChanges
 from cadalign.io.observation_file import fill_xyz
 
@@ -72,11 +71,8 @@ class RetrievalOptions:
     shape_sigma: float = 0.0
     """Distance of a model's keypoints from the object's, as a share of the extent of the keypoints
     in the image: above 0, say 0.03, for libraries with only similar models."""
-    stretch_sigma: float | None = 0.4
-    """Standard deviation of a Gaussian prior on the logarithm of each stretch; in Python, None is
-    no prior."""
-    max_stretch: float = 4.0
-    """Largest stretch of a model; its inverse is the smallest."""
+    stretch_sigma: float = 0.4
+    """Standard deviation of a Gaussian prior on the logarithm of each stretch."""
     missing_prob: float = 0.5
     """Probability that a keypoint of the object is not marked in the image."""
     spurious: float = 0.01
@@ -96,7 +92,6 @@ class RetrievalOptions:
             ("missing_prob", is_share, "between 0 and 1, both excluded"),
             ("spurious", 1e-9 <= self.spurious < math.inf, "> 0"),
             ("none_prior", 0 <= self.none_prior < 1, "between 0 and 1, the latter excluded"),
-            ("max_stretch", 1 <= self.max_stretch <= 1000, "between 1 and 1000"),
         ):
             if not is_valid:
                 raise InputError(f"must be {rule}, not {getattr(self, name)}", where=name)
@@ -114,12 +109,9 @@ class RetrievalOptions:
 
     @property
     def log_scale_constant(self) -> float:
-        """The log density of the prior at no stretch; 0 without a prior."""
-        sigma = self.stretch_sigma
-        if sigma is None:
-            return 0.0
+        """The log density of the prior at no stretch."""
         axes = len(self.fitting.stretched_axes)
-        return -axes * (0.5 * math.log(2 * math.pi) + math.log(sigma))
+        return -axes * (0.5 * math.log(2 * math.pi) + math.log(self.stretch_sigma))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,25 +120,16 @@ class ObservationRetrieval:
 
     library: Path
     """File that `cadalign library build` wrote."""
-    shape: tuple[Path, ...] = ()
-    """Files that `cadalign shape learn` wrote, one for each category: ranks their models by the
-    shape estimated from the keypoints, for objects that are not in the library."""
+    shape: Path | None = None
+    """File that `cadalign shape learn` wrote: ranks its category's models by the shape estimated
+    from the keypoints, for objects that are not in the library."""
     sigma: float | None = None
     """Standard deviation of the keypoints [px]; by default the file's, or 1."""
     ranking: RetrievalOptions = field(default_factory=RetrievalOptions)
 
-    def opened(self) -> tuple[Library, ShapeModel | dict[str, ShapeModel] | None]:
-        """The library and the shapes, which runs use again and again.
-
-        Raises
-        ------
-        DataError
-            If a file cannot be read.
-        InputError
-            If two shapes are of the same category.
-        """
-        shapes = tuple((path, time_of(path)) for path in self.shape)
-        return _opened_library(self.library), _opened_shapes(shapes)
+    def opened(self) -> tuple[Library, ShapeModel | None]:
+        """The library and the shape, which runs use again and again; DataError if unreadable."""
+        return _library(self.library), None if self.shape is None else _shape(self.shape)
 
     def read(
         self, data: Any, where: str, *, folder: Path, changes: ObservationChanges
@@ -196,21 +179,14 @@ class ObservationRetrieval:
 
 
 @once_per_file(4)
-def _opened_library(path: Path) -> Library:
+def _library(path: Path) -> Library:
     from cadalign.retrieval.library import Library  # only here: help of a command needs none
 
     return Library.open(path)
 
 
-@lru_cache(maxsize=4)
-def _opened_shapes(
-    files: tuple[tuple[Path, int], ...],
-) -> ShapeModel | dict[str, ShapeModel] | None:
-    """The shape models of files: one, or several by category; None of no file."""
+@once_per_file(4)
+def _shape(path: Path) -> ShapeModel:
     from cadalign.shapes.model import ShapeModel  # not for help of a command
 
-    found: dict[str, ShapeModel] = {}
-    for model in (ShapeModel.open(path) for path, _ in files):
-        if found.setdefault(model.category, model) is not model:
-            raise InputError(f"two files of the category {model.category!r}", where="shape")
-    return found if len(found) > 1 else next(iter(found.values()), None)
+    return ShapeModel.open(path)

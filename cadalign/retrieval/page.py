@@ -16,7 +16,6 @@ from cadalign.geometry.camera import Camera
 from cadalign.io.documents import read_json
 from cadalign.io.files import made_folder, remove_earlier, write_json, write_text
 from cadalign.io.images import write_image
-from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
 from cadalign.render import Geometry, Scene, cast_geometry, draw_overlay
 from cadalign.render.drawing.canvas import ByteImage
@@ -139,10 +138,9 @@ def score_text(score: float) -> str:
 
 def _cast(match: Match, camera: Camera) -> Geometry | None:
     """Cast rays at a match's mesh; None if there is none or, with a warning, it is unreadable."""
-    if match.mesh_path is None:
-        return None
     try:
-        return cast_geometry(Scene(load_mesh(match.mesh_path)), camera, match.alignment)
+        mesh = match.mesh()
+        return None if mesh is None else cast_geometry(Scene(mesh), camera, match.alignment)
     except CadalignError as error:
         logger.warning("no silhouette: %s", error)
         return None

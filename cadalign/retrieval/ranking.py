@@ -14,9 +14,9 @@ the number of threads.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -89,7 +89,7 @@ class Ranking:
     log_likelihoods: FloatArray  # (m,)
     scores: FloatArray  # (m,), probabilities of the models
     searched: int  # number of candidates that were searched for a pose
-    shapes: Mapping[str, Result] = field(default_factory=dict)  # estimated ones, by category
+    shape: Result | None = None  # the estimated one, by which the models are ranked
 
 
 def observe(
@@ -115,7 +115,6 @@ def observe(
         loss_scale=float(fitting.loss_scale),
         prior_weight=fitting.prior_weight,
         free=fitting.free,
-        max_stretch=float(options.max_stretch),
         gains=density - 0.5 * np.log(np.linalg.det(covariances)) - off,
     )
     return Observed(order, pixels, covariances, camera, facing, query, float(off) * len(ids))
@@ -333,9 +332,8 @@ def make_matches(
         alignment = turned_alignment(found, observed.facing.lens_from_camera)
         pixels, camera = observed.points_2d[rows], observed.camera
         residuals = camera.project(alignment.apply(points_3d)) - pixels
-        if model.category in ranking.shapes:
-            shape = ranking.shapes[model.category]
-            posterior = posterior_by_shape(shape, alignment, options.fitting)
+        if ranking.shape is not None:
+            posterior = posterior_by_shape(ranking.shape, alignment, options.fitting)
         else:
             fitting = replace(options.fitting, sigma=observed.covariances[rows])
             posterior = posterior_of_keypoints(points_3d, residuals, alignment, camera, fitting)

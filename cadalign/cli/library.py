@@ -40,8 +40,7 @@ class LibraryBuild:
         """Build the library; returns the exit code."""
         from cadalign.cli.runs import progress_bar
         from cadalign.datasets import KeypointNet
-        from cadalign.retrieval import Library
-        from cadalign.retrieval.own_models import keypoint_files
+        from cadalign.retrieval.library import Library, keypoint_files
 
         for folder in (self.root, self.shapenet):
             if folder is not None:

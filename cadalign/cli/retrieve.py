@@ -134,7 +134,7 @@ def _print_table(matches: Sequence[Match]) -> None:
             score_text(match.score),
             f"{match.log_likelihood:.1f}",
             f"{match.rms:.2f}",
-            f"{match.shared}/{match.observed}",
+            match.shared_text,
             *match.stretch_texts,
             ", ".join(match.result.uncertain),
         )

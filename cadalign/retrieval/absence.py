@@ -35,7 +35,6 @@ from cadalign.estimation.problems import whitening_of
 from cadalign.retrieval.models import LibraryModel, ModelTable
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import CandidateSet, Observed, Ranking, bent, shared_keypoints
-from cadalign.solvers.constants import UNKNOWNS
 from cadalign.solvers.projection import ray_derivatives
 
 SAME_SHAPE = 0.01
@@ -109,11 +108,8 @@ def _log_likelihoods(
     u, v = derivatives[:, :, 0], derivatives[:, :, 1]
     jacobian = np.concatenate([a[..., None] * u + b[..., None] * v, c[..., None] * v], axis=2)
     across, down = a * errors[..., 0] + b * errors[..., 1], c * errors[..., 1]
-    stretches = np.zeros((len(rows), UNKNOWNS))
-    stretches[:, 6:] = np.log(poses[:, 13:])
-    prior = np.zeros(UNKNOWNS)
-    prior[6:] = query.prior_weight
-    prior, stretches = prior[free], stretches[:, free]
+    stretches = np.pad(np.log(poses[:, 13:]), ((0, 0), (6, 0)))[:, free]
+    prior = np.repeat([0.0, query.prior_weight], [6, 2])[free]
     transposed = jacobian.swapaxes(2, 3)
     hessian = transposed @ jacobian + np.diag(prior)
     hessian += _RIDGE * np.trace(hessian, axis1=2, axis2=3)[..., None, None] * np.eye(len(free))

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -114,14 +114,15 @@ def rank_by_shape(
         ids=query.ids[has].tolist(),
         sigma=sigma[observed.order][has] if sigma.ndim else options.sigma,
     )
-    result = align(shape, view, loss=options.loss, loss_scale=options.loss_scale)
-    likely = shape_posterior(result, view, loss=options.loss, loss_scale=options.loss_scale)
+    loss: dict[str, Any] = {"loss": options.loss, "loss_scale": options.loss_scale}
+    result = align(shape, view, **loss)
+    likely, log_evidence = shape_posterior(result, view, **loss)
     category, _ = table.keys[int(candidates.models[0])]
     known = _shapes_of(table, category, shape)
     models = candidates.models - table.rows_of(category).start
     turn = observed.facing.lens_from_camera.T
-    logs, poses, kept = _rank_models(models, known, result, likely.shapes, options, turn)
-    logs += likely.log_evidence + float(query.gains[has].sum()) - np.logaddexp.reduce(logs)
+    logs, poses, kept = _rank_models(models, known, result, likely, options, turn)
+    logs += log_evidence + float(query.gains[has].sum()) - np.logaddexp.reduce(logs)
     ranked, logs, poses = np.flatnonzero(kept), logs[kept], poses[kept]
     if not len(logs):
         fix = "check the keypoints, their semantic ids and the camera"
@@ -130,7 +131,7 @@ def rank_by_shape(
     order = np.argsort(-logs, kind="stable")
     weights = np.exp(logs[order] - logs.max())
     scores = weights / weights.sum()
-    return Ranking(ranked[order], poses[order], logs[order], scores, 0, result)
+    return Ranking(ranked[order], poses[order], logs[order], scores, result)
 
 
 def _rank_models(
@@ -265,23 +266,14 @@ def _deviation(values: FloatArray, prior: Gaussians) -> float:
     return max(float(np.sqrt(np.median(nearest) / values.shape[1])), floor)
 
 
-class ShapePosterior(NamedTuple):
-    """Knowledge of an object's shape from one image and a shape model.
-
-    ``shapes`` is a mixture over stacked rows: x, y, z of each keypoint, then of the box's corners.
-    ``log_evidence``, up to a constant, compares shape models that have all keypoints of the image.
-    """
-
-    shapes: Gaussians
-    log_evidence: float
-
-
 def shape_posterior(
     result: Result, view: View, *, loss: str = "linear", loss_scale: float = 2.0
-) -> ShapePosterior:
+) -> tuple[Gaussians, float]:
     """Posterior of the shape whose alignment with the inliers of one view is ``result``.
 
-    Depths and directions are not used; the ``loss`` weights keypoints by their residuals.
+    It is a mixture over stacked rows: x, y, z of each keypoint, then of the box's corners. The
+    logarithm of the evidence is up to a constant. Depths and directions are not used; the ``loss``
+    weights keypoints by their residuals.
 
     The reprojection errors are linear in shape and pose about the estimate. Whitened and projected
     to what no change of the pose explains, they read ``A x = b + noise`` of unit covariance, with
@@ -322,7 +314,7 @@ def shape_posterior(
     shifts = shapes.covariances[:, :, :keypoints] @ slope
     moved = Gaussians(shapes.weights, shapes.means + shifts, shapes.covariances)
     pose_volume = float(np.log(np.abs(triangle.diagonal())).sum())
-    return ShapePosterior(moved, total - pose_volume)
+    return moved, total - pose_volume
 
 
 def gaussians_of(model: ShapeModel) -> Gaussians:

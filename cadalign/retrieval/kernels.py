@@ -20,7 +20,7 @@ from cadalign.solvers.alignment import (
 )
 from cadalign.solvers.constants import OK, POSE_SIZE, UNKNOWNS, ScalePrior
 from cadalign.solvers.evidence import KeypointEvidence, take_keypoints
-from cadalign.solvers.linalg import cholesky
+from cadalign.solvers.linalg import cholesky, mirror_upper
 from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS
 from cadalign.solvers.search import refine
@@ -40,9 +40,8 @@ _HOPELESS = 2.0
 _HOPELESS_EXCESS = 20.0
 _SAME_CHORD = 1e-3
 # A start is also given up if its linearised cost, from which the quadratic model's decrease is
-# subtracted so many times, exceeds the ceiling by this factor. Among 39,000 candidates of four
-# queries 5 below the ceiling lost likelihood by that, 2e-7 of the best one's at most; with the
-# factor 1 it was 26, and 2e-3.
+# subtracted so many times, exceeds the ceiling by this factor. What candidates below the ceiling
+# lose by that is 2e-7 of the best likelihood at most.
 _OPTIMISM = 2.0
 _OUT_OF_REACH = 5.0
 
@@ -322,55 +321,40 @@ def _depth_variances(
     points: FloatArray, seen: IntArray, rays: FloatArray, multipliers: FloatArray
 ) -> FloatArray:
     """Compute q_i of `error_bound`, (n,); the first is 0 if S is singular to rounding."""
-    n = seen.shape[0]
-    mean = np.zeros(5)
-    total = 0.0
-    for i in range(n):
-        w = multipliers[i]
-        total += w
-        for j in range(3):
-            mean[j] += w * points[seen[i], j]
-        for j in range(2):
-            mean[3 + j] += w * rays[seen[i], j]
+    n, total = seen.shape[0], multipliers.sum()
+    rows = np.ones((n, 6))  # 1, x, y, z, u, v, the latter five about their means
     for j in range(5):
-        mean[j] /= total
+        mean = 0.0
+        for i in range(n):
+            rows[i, 1 + j] = points[seen[i], j] if j < 3 else rays[seen[i], j - 3]
+            mean += multipliers[i] * rows[i, 1 + j]
+        rows[:, 1 + j] -= mean / total
     p = np.zeros((4, 4))
-    white = np.empty((n, 4))
-    spread = np.zeros(n)
     for i in range(n):
-        white[i, 0] = 1.0
-        for j in range(3):
-            white[i, 1 + j] = points[seen[i], j] - mean[j]
         for j in range(4):
-            scaled = multipliers[i] * white[i, j]
+            scaled = multipliers[i] * rows[i, j]
             for k in range(j + 1):
-                p[j, k] += scaled * white[i, k]
+                p[j, k] += scaled * rows[i, k]
+    spread = np.zeros(n)
     if not cholesky(p, 4, _CANCELLATION):
         return spread
     system = np.zeros((4, 4))
     u_matrix = np.zeros((4, 4))
     v_matrix = np.zeros((4, 4))
-    for i in range(n):  # in the basis that whitens a, P is the identity
+    for i in range(n):
+        _whiten(p, rows[i])  # in this basis P is the identity
+        u, v = rows[i, 4], rows[i, 5]
         for j in range(4):
-            value = white[i, j]
-            for k in range(j):
-                value -= p[j, k] * white[i, k]
-            white[i, j] = value / p[j, j]
-        w = multipliers[i]
-        u = rays[seen[i], 0] - mean[3]
-        v = rays[seen[i], 1] - mean[4]
-        for j in range(4):
-            for k in range(j + 1):
-                product = w * white[i, j] * white[i, k]
+            for k in range(j, 4):
+                product = multipliers[i] * rows[i, j] * rows[i, k]
                 u_matrix[j, k] += u * product
                 v_matrix[j, k] += v * product
-                system[j, k] += (u * u + v * v) * product
+                system[k, j] += (u * u + v * v) * product
+    mirror_upper(u_matrix)
+    mirror_upper(v_matrix)
     largest = 0.0
     for j in range(4):
         largest = max(largest, system[j, j])
-        for k in range(j):
-            u_matrix[k, j] = u_matrix[j, k]
-            v_matrix[k, j] = v_matrix[j, k]
     for j in range(4):
         for k in range(j + 1):
             for m in range(4):
@@ -379,12 +363,17 @@ def _depth_variances(
     if not cholesky(system, 4, 0.0):
         return spread
     for i in range(n):
-        square = 0.0
-        for j in range(4):
-            value = white[i, j]
-            for k in range(j):
-                value -= system[j, k] * white[i, k]
-            white[i, j] = value / system[j, j]
-            square += white[i, j] * white[i, j]
-        spread[i] = square
+        spread[i] = _whiten(system, rows[i])
     return spread
+
+
+@kernel
+def _whiten(factor: FloatArray, row: FloatArray) -> float:
+    """Divide the first 4 of a row by a lower triangle, in place; returns their squared length."""
+    square = 0.0
+    for j in range(4):
+        for k in range(j):
+            row[j] -= factor[j, k] * row[k]
+        row[j] /= factor[j, j]
+        square += row[j] * row[j]
+    return square

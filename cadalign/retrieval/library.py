@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,10 +16,11 @@ import numpy.typing as npt
 from cadalign.arrays import IntArray
 from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.datasets.detections.image_keypoints import plain_name, some_of
-from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
+from cadalign.datasets.models.model_keypoints import SUFFIX, ModelKeypoint, ModelKeypoints
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
-from cadalign.io.files import as_path, checksum
+from cadalign.io.files import as_path, checksum, listed
+from cadalign.io.kinds import MESH_ENDINGS
 from cadalign.retrieval.absence import none_probability
 from cadalign.retrieval.by_shape import category_to_rank, rank_by_shape
 from cadalign.retrieval.match import Match
@@ -31,14 +34,11 @@ from cadalign.retrieval.models import (
     table_of,
 )
 from cadalign.retrieval.options import RetrievalOptions
-from cadalign.retrieval.own_models import read_own_models
 from cadalign.retrieval.ranking import gather_candidates, make_matches, observe, rank
 from cadalign.shapes.model import ShapeModel
 
-_KNOWN_FOCAL = (
-    "estimate it, as `cadalign fit` does by a learned shape and align(shape, view, "
-    'focal="estimate"), or give it: camera.with_focal(...)'
-)
+logger = logging.getLogger("cadalign")
+_FIX = f"`cadalign annotate PHOTO MODEL` marks keypoints, and writes MODEL{SUFFIX}"
 
 
 class Library(ModelTable):
@@ -151,7 +151,7 @@ class Library(ModelTable):
         >>> library = Library.from_folder("chairs")  # doctest: +SKIP
         >>> library.retrieve(points_2d, ["seat", "back"], camera)  # doctest: +SKIP
         """
-        own = read_own_models(as_path(folder), categories=categories, on_model=on_model)
+        own = _read_own_models(as_path(folder), categories, on_model)
         return cls(table_of(*own))
 
     @classmethod
@@ -284,8 +284,8 @@ class Library(ModelTable):
         if (labels := np.asarray(ids)).dtype.kind == "U":
             ids = self.ids_of(labels.ravel().tolist())
         if isinstance(camera, Camera) and not camera.focal_known:
-            what = "the focal length is unknown, without which no model's pose is searched"
-            raise InputError(what, where="camera", fix=_KNOWN_FOCAL)
+            fix = "estimate it first, as `cadalign fit` does with a learned shape, or give it"
+            raise InputError("the focal length is unknown", where="camera", fix=fix)
         absent = None
         if shape is None:
             observed = observe(points_2d, ids, camera, chosen)
@@ -300,3 +300,63 @@ class Library(ModelTable):
             candidates = gather_candidates(self, observed, plain, exclude, workers)
             ranking = rank_by_shape(self, candidates, observed, chosen, shape)
         return make_matches(self, candidates, observed, ranking, chosen, absent)
+
+
+def keypoint_files(folder: Path) -> list[Path]:
+    """The files of keypoints in a folder and in those below it."""
+    return listed(folder, f"**/*{SUFFIX}")
+
+
+def _read_own_models(
+    folder: Path,
+    categories: Iterable[str] | None,
+    on_model: Callable[[], object],
+) -> tuple[list[LibraryModel], dict[str, int]]:
+    """A folder's models, and semantic ids by name; raises as `Library.from_folder`."""
+    chosen = None if categories is None else set(categories)
+    files = keypoint_files(folder)
+    files = [path for path in files if chosen is None or _category(path) in chosen]
+    if not files:
+        what = "no model with keypoints" + ("" if chosen is None else " of these categories")
+        raise DataError(what, where=str(folder), fix=_FIX)
+    read = [(path, ModelKeypoints.load(path)) for path in files]
+    names = _numbers(read)
+    models = []
+    for path, found in read:
+        models.append(_model(path, found, names))
+        on_model()
+    meshes = [path for path in listed(folder, "**/*") if path.suffix.lower() in MESH_ENDINGS]
+    used = {model.mesh_path for model in models}
+    unused = [path for path in meshes if path.absolute() not in used]
+    if unused and chosen is None:
+        said = "%d meshes have no keypoints and are left out, the first is %s; %s"
+        logger.warning(said, len(unused), unused[0], _FIX)
+    return models, names
+
+
+def _category(path: Path) -> str:
+    return path.absolute().parent.name
+
+
+def _numbers(read: Sequence[tuple[Path, ModelKeypoints]]) -> dict[str, int]:
+    """Semantic ids by name: those of the files where all keypoints have one, else by the names."""
+    entries = [(path, each) for path, found in read for each in found.keypoints]
+    if any(each.semantic_id is None for _, each in entries):
+        return {name: k for k, name in enumerate(sorted({each.name for _, each in entries}))}
+    names: dict[str, int] = {}
+    first: dict[str, Path] = {}
+    for path, each in entries:
+        number, before = each.semantic_id or 0, first.setdefault(each.name, path)
+        if names.setdefault(each.name, number) != number:
+            what = f"{each.name!r} has semantic_id {number}, and {names[each.name]} in {before}"
+            raise DataError(what, where=str(path), fix="give a name one id, or leave ids out")
+    return names
+
+
+def _model(path: Path, found: ModelKeypoints, names: dict[str, int]) -> LibraryModel:
+    stem, mesh = path.name.removesuffix(SUFFIX), found.model
+    if mesh is None:
+        beside = (path.with_name(stem + suffix) for suffix in MESH_ENDINGS)
+        mesh = next((each for each in beside if each.is_file()), None)
+    ids = np.array([names[name] for name in found.names], dtype=np.int64)
+    return LibraryModel.measured(_category(path), stem, found.xyz, ids, mesh)

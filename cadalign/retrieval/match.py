@@ -74,17 +74,17 @@ class Match:
         """Number of keypoints that model and image share."""
         return len(self.result.ids)
 
-    @property
-    def observed(self) -> int:
-        """Number of keypoints in the image."""
-        return self.shared + len(self.missing_ids)
-
     def __repr__(self) -> str:
         stretch = ", ".join(f"{value:.3g}" for value in self.alignment.scale)
         return (
             f"Match({self.category!r}, {self.model_id!r}, score={self.score:.3g}, "
             f"rms={self.rms:.3g} px, shared={self.shared}, scale=({stretch}))"
         )
+
+    @property
+    def shared_text(self) -> str:
+        """The number of shared keypoints of those in the image, as tables show it."""
+        return f"{self.shared}/{self.shared + len(self.missing_ids)}"
 
     @property
     def stretch_texts(self) -> tuple[str, str]:

@@ -81,14 +81,10 @@ def _remove_earlier(folder: Path) -> None:
 
 
 def _files(folder: Path, rank: int) -> tuple[Path, Path, Path]:
-    """A match's overlay, observation and fit."""
-    name = f"match_{rank:02d}"
-    return folder / overlay_name(rank), folder / f"{name}.json", folder / f"{name}_fit" / "fit.json"
-
-
-def overlay_name(rank: int) -> str:
-    """File name of a match's overlay; ranks count from 1."""
-    return f"overlay_{rank:02d}.png"
+    """A match's overlay, observation and fit; ranks count from 1."""
+    names = (f"overlay_{rank:02d}.png", f"match_{rank:02d}.json", f"match_{rank:02d}_fit/fit.json")
+    overlay, observation, fit = (folder / name for name in names)
+    return overlay, observation, fit
 
 
 def draw_match(image: ByteImage, camera: Camera, match: Match) -> ByteImage:
@@ -115,7 +111,7 @@ def _card(rank: int, match: Match) -> str:
     values = {
         "stretch": f"y {y}, z {z}",
         "residuals": f"{match.rms:.2f} px",
-        "shared keypoints": f"{match.shared} of {match.observed}",
+        "shared keypoints": match.shared_text,
         "log-likelihood": f"{match.log_likelihood:.1f}",
     }
     rows = [fill("retrieval_value.html", label=key, value=value) for key, value in values.items()]
@@ -124,7 +120,7 @@ def _card(rank: int, match: Match) -> str:
         rank=rank,
         category=escape(match.category),
         model_id=escape(match.model_id),
-        picture=overlay_name(rank),
+        picture=_files(Path(), rank)[0].name,
         score=escape(score_text(match.score)),
         percent=f"{100 * match.score:.1f}",
         values="".join(rows),

@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, worker_count
+from cadalign.datasets.detections.image_keypoints import some_of
 from cadalign.datasets.models.shapenet import require_category
 from cadalign.errors import DegenerateError, InputError, require_kind
 from cadalign.estimation.options import LOSSES
@@ -88,7 +89,6 @@ class Ranking:
     poses: FloatArray  # (m, 15), in the frame of the facing camera
     log_likelihoods: FloatArray  # (m,)
     scores: FloatArray  # (m,), probabilities of the models
-    searched: int  # number of candidates that were searched for a pose
     shape: Result | None = None  # the estimated one, by which the models are ranked
 
 
@@ -146,24 +146,6 @@ def bent(squares: FloatArray, loss: int, bend: float) -> FloatArray:
     return squares
 
 
-def _chosen_models(
-    table: ModelTable, category: str | None, exclude: Collection[ModelKey]
-) -> IntArray:
-    """Select the rows of the models to compare, in the table's order.
-
-    Raises InputError if there are none.
-    """
-    rows = np.arange(len(table))
-    if category is not None:
-        rows = rows[table.rows_of(category)]
-    unwanted = {checked_key(key, "exclude") for key in exclude}
-    if unwanted:
-        rows = rows[[table.keys[row] not in unwanted for row in rows.tolist()]]
-        if not len(rows):
-            raise InputError("all models are excluded", where="exclude")
-    return rows
-
-
 def gather_candidates(
     table: ModelTable,
     observed: Observed,
@@ -177,13 +159,19 @@ def gather_candidates(
         raise InputError("the library is empty", where="library")
     if category is not None:
         category = require_category(category, table.categories, where="category")
-    chosen = _chosen_models(table, category, exclude)
+    chosen = np.arange(len(table))
+    if category is not None:
+        chosen = chosen[table.rows_of(category)]
+    if unwanted := {checked_key(key, "exclude") for key in exclude}:
+        chosen = chosen[[table.keys[row] not in unwanted for row in chosen.tolist()]]
+        if not len(chosen):
+            raise InputError("all models are excluded", where="exclude")
     known = table.known_ids(category)
     unknown = np.setdiff1d(query.ids, known)
     if len(unknown):
         where = "the library" if category is None else f"the category {category!r}"
         what = f"no model of {where} has a keypoint with the semantic id {unknown[0]}"
-        raise InputError(what, where="ids", fix=f"known are {_ranges(known)}")
+        raise InputError(what, where="ids", fix=f"it has {some_of([str(each) for each in known])}")
     spans = np.stack([table.offsets[chosen], table.offsets[chosen + 1]], axis=1)
     candidates = Candidates(table.xyz, table.ids, spans)
 
@@ -206,14 +194,6 @@ def gather_candidates(
     base = base + options.log_scale_constant
     kept_keypoints = candidates._replace(spans=spans[kept])
     return CandidateSet(kept_keypoints, chosen[kept], base[kept], bounds[kept])
-
-
-def _ranges(ids: IntArray) -> str:
-    """Format ascending numbers as ranges: 0-2, 5."""
-    runs = np.split(ids, np.flatnonzero(np.diff(ids) > 1) + 1)
-    return ", ".join(
-        str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs if len(run)
-    )
 
 
 def rank(
@@ -239,7 +219,6 @@ class _SearchState:
         self._best = -np.inf
         self._poses = np.empty((len(candidates.base), POSE_SIZE))
         self._reached = np.full(len(candidates.base), -np.inf)
-        self._searched = np.zeros(len(candidates.base), dtype=bool)
 
     def search(self, chosen: IntArray, effort: tuple[int, int, int], *, floor: float) -> None:
         """Search candidates for poses above a log-likelihood; a known better pose is kept."""
@@ -258,7 +237,6 @@ class _SearchState:
         better = reached > self._reached[chosen]
         self._poses[chosen[better]] = poses[better]
         self._reached[chosen[better]] = reached[better]
-        self._searched[chosen] = True
         self._best = max(self._best, float(reached.max()))
 
     def search_in_order(self, effort: tuple[int, int, int], top: int) -> None:
@@ -297,8 +275,7 @@ class _SearchState:
             raise DegenerateError(what, where="points_2d", fix=fix)
         reached = self._reached[order]
         weights = np.exp(reached - reached[0])
-        searched = int(self._searched.sum())
-        return Ranking(order, self._poses[order], reached, weights / weights.sum(), searched)
+        return Ranking(order, self._poses[order], reached, weights / weights.sum())
 
 
 def shared_keypoints(

@@ -103,13 +103,13 @@ class LibraryModel:
 
         Without a mesh, or with a warning where it cannot be read, they are those of the keypoints.
         """
-        bounds = extent(xyz) if len(xyz) else np.zeros((2, 3))
+        own = category, model_id, xyz, ids
         try:
-            bounds = bounds if mesh is None else load_mesh(mesh).bounds
+            if mesh is not None:
+                return cls(*own, load_mesh(mesh).bounds, mesh.absolute())
         except CadalignError as error:
             logger.warning("bounds are the keypoints': %s", error)
-            mesh = None
-        return cls(category, model_id, xyz, ids, bounds, mesh and mesh.absolute())
+        return cls(*own, extent(xyz) if len(xyz) else np.zeros((2, 3)))
 
     @property
     def key(self) -> ModelKey:

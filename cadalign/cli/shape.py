@@ -9,9 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
-from cadalign.cli.common import JsonOption, answer, group_of, make_folder_of, print_json, say
+from cadalign.cli.common import (
+    JsonOption,
+    answer,
+    group_of,
+    make_folder_of,
+    print_json,
+    say,
+    waiting,
+)
 from cadalign.cli.options import named_as_flags
-from cadalign.cli.runs import progress_bar
 from cadalign.datasets import KeypointNet
 from cadalign.io.files import keeping, refuse_input
 
@@ -50,13 +57,9 @@ class ShapeLearn:
     def _learn(self, dataset: KeypointNet) -> int:
         from cadalign.shapes.model import ShapeModel  # not for help of a command
 
-        with progress_bar(f"learning {self.category}") as on_progress:
+        with waiting(f"learning {self.category}"):
             model = ShapeModel.from_dataset(
-                dataset,
-                self.category,
-                split=self.split,
-                components=self.components,
-                on_progress=on_progress,
+                dataset, self.category, split=self.split, components=self.components
             )
         out = Path(f"{model.category}.shape") if self.out is None else self.out
         model.save(out)

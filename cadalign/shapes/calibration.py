@@ -220,13 +220,6 @@ def _squares(view: _View, mixture: Gaussians, sigma: float) -> tuple[FloatArray,
     return turned.sum(axis=(1, 2)), (gaps * solved).sum(axis=(2, 3))
 
 
-def margins_of(rows: FloatArray) -> FloatArray:
-    """Distances of the faces beyond the outermost keypoints of models (N, m + 2, 3); (N, 2, 3)."""
-    points, boxes = rows[:, :-BOX_ROWS], rows[:, -BOX_ROWS:]
-    reached = np.stack([np.nanmin(points, axis=1), np.nanmax(points, axis=1)], axis=1)
-    return np.asarray(OUTWARD * (boxes - reached))
-
-
 def excesses_of(rows: FloatArray, mixture: Gaussians) -> FloatArray:
     """Distances of linear boxes beyond the true faces of models that were held out, (N, 2, 3)."""
     found = np.full((len(rows), BOX_ROWS, 3), np.nan)
@@ -252,7 +245,9 @@ def learn_margins(rows: FloatArray, excesses: FloatArray) -> BoxMargins | None:
     has_box = np.isfinite(rows[:, -BOX_ROWS:]).all(axis=(1, 2))
     if not has_box.any():
         return None
+    points, boxes = rows[has_box, :-BOX_ROWS], rows[has_box, -BOX_ROWS:]
+    reached = np.stack([np.nanmin(points, axis=1), np.nanmax(points, axis=1)], axis=1)
     return BoxMargins(
-        np.median(margins_of(rows[has_box]), axis=0),
+        np.median(OUTWARD * (boxes - reached), axis=0),
         np.maximum(np.percentile(excesses[has_box], _EXCEEDED, axis=0), 0.0),
     )

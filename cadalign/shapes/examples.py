@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import permutations, product
 from pathlib import Path
@@ -104,9 +104,7 @@ class Dataset(Protocol):
     def __getitem__(self, key: str, /) -> Any: ...
 
 
-def examples_of(
-    models: Sequence[Any], *, meshes: bool, on_progress: Callable[[int, int], object]
-) -> list[Example]:
+def examples_of(models: Sequence[Any], *, meshes: bool) -> list[Example]:
     """Convert `cadalign.datasets.AnnotatedModel`s; their boxes are those of the meshes.
 
     If less than half have a mesh, boxes are left out.
@@ -124,7 +122,6 @@ def examples_of(
         path = None if model.mesh_path is None else model.mesh_path.absolute()
         ids = [int(label) for label in model.keypoints.ids]
         examples.append(Example(model.model_id, ids, model.keypoints.xyz, bounds, path))
-        on_progress(len(examples), len(models))
     return examples
 
 
@@ -204,15 +201,8 @@ def _warn_of_units(examples: Sequence[Example]) -> None:
     is_large, is_small = sizes > _LARGEST_RATIO * typical, sizes < typical / _LARGEST_RATIO
     rows = np.flatnonzero((sizes > 0) & (is_large | is_small))
     if typical and len(rows):
-        logger.warning(
-            "models of another size than the others: %d of %d, such as %s, whose keypoints reach "
-            "over %.3g instead of %.3g; give all in one unit",
-            len(rows),
-            len(examples),
-            quote(whole[rows[0]].model_id),
-            sizes[rows[0]],
-            typical,
-        )
+        why = f"reach over {sizes[rows[0]]:.3g} instead of {typical:.3g}; give all in one unit"
+        _warn("of another size", len(rows), examples, whole[rows[0]], why)
 
 
 def _warn_of_axes(examples: Sequence[Example], rows: FloatArray) -> None:
@@ -236,15 +226,16 @@ def _warn_of_axes(examples: Sequence[Example], rows: FloatArray) -> None:
             turned[int(row)] = _AXES[best].T
     if turned:
         odd, turn = next(iter(turned.items()))
-        logger.warning(
-            "models with other axes than the others: %d of %d, such as %s, whose keypoints fit "
-            "with %s as (x, y, z)%s; give all the same axes",
-            len(turned),
-            len(examples),
-            quote(examples[odd].model_id),
-            _axes_text(turn),
-            ", mirrored" if np.linalg.det(turn) < 0 else "",
-        )
+        axes = [f"{'-' * int(row.sum() < 0)}{'xyz'[int(np.abs(row).argmax())]}" for row in turn]
+        why = f"fit with ({', '.join(axes)}) as (x, y, z)"
+        why += ", mirrored" if np.linalg.det(turn) < 0 else ""
+        why += "; give all the same axes"
+        _warn("with other axes", len(turned), examples, examples[odd], why)
+
+
+def _warn(what: str, count: int, examples: Sequence[Example], odd: Example, why: str) -> None:
+    said = "models %s than the others: %d of %d, such as %s, whose keypoints %s"
+    logger.warning(said, what, count, len(examples), quote(odd.model_id), why)
 
 
 def _unit(points: FloatArray) -> FloatArray:
@@ -252,9 +243,3 @@ def _unit(points: FloatArray) -> FloatArray:
     centred = points - points.mean(axis=0)
     radius = np.sqrt((centred**2).sum(axis=1).mean())
     return np.asarray(centred / radius if radius > 0 else centred)
-
-
-def _axes_text(turn: FloatArray) -> str:
-    """Axes after a turn, such as "(x, z, -y)"."""
-    names = [f"{'-' * int(row.sum() < 0)}{'xyz'[int(np.abs(row).argmax())]}" for row in turn]
-    return f"({', '.join(names)})"

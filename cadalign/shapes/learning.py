@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, require_counts
 from cadalign.errors import InputError
-from cadalign.shapes.basis import component_of_covariance, find_reflection, mirrored_rows
+from cadalign.shapes.basis import component_of_covariance, find_reflection, mirrored
 from cadalign.shapes.calibration import ShapeCalibration, calibrate, excesses_of, learn_margins
 from cadalign.shapes.examples import Example, tabulated
 from cadalign.shapes.gaussians import (
@@ -45,7 +45,6 @@ _MIXTURE_STRENGTH = 10.0
 _MOST_COMPONENTS = 4  # each costs a search of its own when an image is aligned
 _CLUSTER_MODES = 10
 _CLUSTERINGS = 5
-_STEPS = _FOLDS * (len(_STRENGTHS) + 3 + _MOST_COMPONENTS) + 1
 _MODES = (5, 10, 15, 20, 30, 40, 50, 60, 80, 100)
 
 
@@ -132,29 +131,19 @@ class _Trial:
     scores: FloatArray  # (N,), log-likelihood of each model under what was learned without its fold
 
 
-class Choice(NamedTuple):
-    """Choices made by held-out models, and figures learned from them."""
-
-    recipe: _Recipe
-    modes: int | None
-    calibration: ShapeCalibration
-    margins: BoxMargins | None
-
-
 class _CrossValidation:
     """Recipes compared by the likelihood of models that were held out."""
 
-    def __init__(self, models: _Models, on_progress: Callable[[int, int], object]) -> None:
+    def __init__(self, models: _Models) -> None:
         self._models = models
         count = len(models.rows)
         folds = _FOLDS if count >= _LEAST_TO_CHOOSE else count
         self._folds = np.random.default_rng(0).permutation(count) % folds
         self._kept = [models.some(self._folds != fold) for fold in range(folds)]
         self._held_out = [models.some(self._folds == fold) for fold in range(folds)]
-        self._on_progress, self._done = on_progress, 0
 
-    def choose(self, components: int | None) -> Choice:
-        """Choose a recipe and the number of modes, and calibrate what they give.
+    def choose(self, components: int | None) -> tuple[_Recipe, int | None, dict[str, Any]]:
+        """Choose a recipe and the number of modes; the fields that calibrate what they give.
 
         Few models tell nothing but how strongly covariances are to be drawn to equal entries, and
         how far from the truth estimates are.
@@ -171,7 +160,8 @@ class _CrossValidation:
         else:
             best = self._with_components(self._with_reflection(best), components)
             recipe, modes = best.recipe, self._modes(best)
-        return Choice(recipe, modes, self._calibration(best, modes), self._margins(best))
+        margins = {"box_margins": self._margins(best)}
+        return recipe, modes, margins | self._calibration(best, modes)._asdict()
 
     def _with_reflection(self, best: _Trial) -> _Trial:
         completed = self._models.completed()
@@ -211,12 +201,8 @@ class _CrossValidation:
         return learn_margins(rows, excesses)
 
     def _try(self, recipe: _Recipe) -> _Trial:
-        learned = []
-        for kept in self._kept:
-            learned.append(kept.mixture(recipe))
-            self._done += 1
-            self._on_progress(min(self._done, _STEPS - 1), _STEPS)
-        return _Trial(recipe, tuple(learned), self._scores(learned))
+        learned = tuple(kept.mixture(recipe) for kept in self._kept)
+        return _Trial(recipe, learned, self._scores(learned))
 
     def _scores(self, learned: Sequence[Gaussians]) -> FloatArray:
         found = np.empty(len(self._folds))
@@ -225,12 +211,7 @@ class _CrossValidation:
         return found
 
 
-def learn_parts(
-    examples: Sequence[Example],
-    on_progress: Callable[[int, int], object],
-    *,
-    components: int | None,
-) -> dict[str, Any]:
+def learn_parts(examples: Sequence[Example], components: int | None) -> dict[str, Any]:
     """Learn the fields of a `cadalign.ShapeModel`, but for its names; see `ShapeModel.learn`."""
     if components is not None:
         require_counts(components=components)
@@ -240,26 +221,21 @@ def learn_parts(
         raise InputError(what, where="components")
     extents = np.nanmax(rows, axis=1) - np.nanmin(rows, axis=1)
     models = _Models(ids, rows, float(np.median(np.linalg.norm(extents, axis=1))))
-    choice = _CrossValidation(models, on_progress).choose(components)
-    mixture = models.mixture(choice.recipe)
-    on_progress(_STEPS, _STEPS)
-    weights = mixture.weights / mixture.weights.sum()
-    parts = sorted(
-        zip(weights, mixture.means, mixture.covariances, strict=True), key=lambda part: -part[0]
-    )
+    recipe, modes, calibration = _CrossValidation(models).choose(components)
+    parts = sorted(zip(*models.mixture(recipe), strict=True), key=lambda part: -part[0])
+    total = sum(weight for weight, _, _ in parts)
     learned = (
         component_of_covariance(
-            mean.reshape(-1, 3), covariance, weight=float(weight), modes=choice.modes
+            mean.reshape(-1, 3), covariance, weight=float(weight / total), modes=modes
         )
         for weight, mean, covariance in parts
     )
     return {
         "ids": ids,
         "components": tuple(learned),
-        "reflection": choice.recipe.reflection,
+        "reflection": recipe.reflection,
         "training": training,
-        "box_margins": choice.margins,
-        **choice.calibration._asdict(),
+        **calibration,
     }
 
 
@@ -267,7 +243,8 @@ def _vectors(rows: FloatArray, reflection: Reflection | None, ids: Sequence[Keyp
     """Models as vectors, beside each its mirror image of the same weight."""
     weight = 1.0
     if reflection is not None:
-        rows = np.concatenate([rows, mirrored_rows(rows, ids, reflection)])
+        images = mirrored(rows, ids, reflection, offset=reflection.offset)
+        rows = np.concatenate([rows, images])
         weight = 0.5
     return Vectors(rows.reshape(len(rows), -1), np.full(len(rows), weight))
 

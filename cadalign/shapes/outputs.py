@@ -26,8 +26,6 @@ from cadalign.io.sealed import Seal
 from cadalign.shapes.parts import BOX_ROWS, ShapeComponent
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
     from cadalign.shapes.model import ShapeModel
 
 
@@ -43,7 +41,7 @@ _MODES = 4  # of a picture
 _DEVIATIONS = 2.0
 _COMMON = 0.25  # share of the training models whose keypoints are joined by lines
 _CELL = 2.9  # inches
-_AZIMUTH, _ELEVATION = np.radians(32.0), np.radians(18.0)
+_AZIMUTH, _ELEVATION = 32.0, 18.0  # degrees
 _GREY, _DARK, _LESS, _MORE, _BOX = "#8a8f98", "#30343b", "#2a6fbb", "#d9622b", "#c3c7cd"
 
 
@@ -124,11 +122,9 @@ def draw_shape(path: Path, model: ShapeModel) -> None:
         f"standard deviations along its first modes",
         fontsize=10,
     )
-    axes = figure.subplots(rows, columns, squeeze=False)
+    space = {"projection": "3d", "proj_type": "ortho"}
+    axes = figure.subplots(rows, columns, squeeze=False, subplot_kw=space)
     for row, component in zip(axes, model.components, strict=True):
-        for each in row:
-            each.set_aspect("equal")
-            each.set_axis_off()
         _draw_component(row, model, component)
     write_whole(path, lambda unfinished: figure.savefig(unfinished, dpi=110))
 
@@ -149,33 +145,36 @@ def neighbour_pairs(points: FloatArray) -> IntArray:
     return np.argwhere(np.triu(~blocked, 1))
 
 
-def _draw_component(row: Sequence[Axes], model: ShapeModel, component: ShapeComponent) -> None:
-    view, mean, common = _view(model.up_axis), component.mean, _common(model)
+def _draw_component(row: Sequence[Any], model: ShapeModel, component: ShapeComponent) -> None:
+    mean, common = component.mean, _common(model)
     chosen = np.flatnonzero(common)
-    lines = chosen[neighbour_pairs(mean[chosen])].T
+    pairs = chosen[neighbour_pairs(mean[chosen])]
     sizes = np.where(common, 14, 5)
 
-    def draw(axes: Axes, shape: FloatArray, color: str) -> None:
-        flat = (shape @ view)[:-BOX_ROWS]
-        axes.plot(*flat[lines].transpose(2, 0, 1), color=color, lw=1.3, zorder=2)
-        axes.scatter(flat[:, 0], flat[:, 1], s=sizes, color=color, zorder=3, linewidths=0)
+    def draw(axes: Any, shape: FloatArray, color: str) -> None:
+        for pair in pairs:
+            axes.plot(*shape[pair].T, color=color, lw=1.3)
+        axes.scatter(*shape[:-BOX_ROWS].T, s=sizes, color=color, linewidths=0)
 
-    corners = bounds_corners(*mean[-BOX_ROWS:]) @ view
-    row[0].plot(*corners[np.transpose(BOX_EDGES)].transpose(2, 0, 1), color=_BOX, lw=0.7, zorder=0)
-    draw(row[0], mean, _DARK)
-    share = 100 * component.weight
-    row[0].set_title(
-        "mean" if len(model.components) == 1 else f"{share:.0f} % of the models", size=8
-    )
-    for label, place in zip(model.ids, (mean @ view)[:-BOX_ROWS], strict=True):
-        offset: Any = {"xytext": (3, 3), "textcoords": "offset points"}
-        row[0].annotate(str(label), place, **offset, fontsize=6, color=_DARK)
+    first, *others = row
+    corners = bounds_corners(*mean[-BOX_ROWS:])
+    for edge in BOX_EDGES:
+        first.plot(*corners[list(edge)].T, color=_BOX, lw=0.7)
+    draw(first, mean, _DARK)
+    share = f"{100 * component.weight:.0f} % of the models"
+    first.set_title("mean" if len(model.components) == 1 else share, size=8)
+    for label, place in zip(model.ids, mean[:-BOX_ROWS], strict=True):
+        first.text(*place, f" {label}", fontsize=6, color=_DARK)
     total = float(np.trace(component.covariance)) or 1.0
-    modes = zip(row[1:], component.modes, component.variance, strict=False)
+    modes = zip(others, component.modes, component.variance, strict=False)
     for number, (axes, mode, variance) in enumerate(modes, start=1):
         axes.set_title(f"mode {number}: {100 * variance / total:.0f} % of the variance", size=8)
         for deviations, color in ((0.0, _GREY), (-_DEVIATIONS, _LESS), (_DEVIATIONS, _MORE)):
             draw(axes, mean + deviations * mode, color)
+    for axes in row:
+        axes.view_init(_ELEVATION, _AZIMUTH, vertical_axis=model.up_axis or "y")
+        axes.set_aspect("equal")
+        axes.set_axis_off()
 
 
 def _common(model: ShapeModel) -> BoolArray:
@@ -185,19 +184,3 @@ def _common(model: ShapeModel) -> BoolArray:
         return every
     common = np.isfinite(model.training.points_3d[..., 0]).mean(axis=0) >= _COMMON
     return np.asarray(common) if common.sum() > 1 else every
-
-
-def _view(up_axis: str | None) -> FloatArray:
-    """Projection to the picture's plane, (3, 2) float: slightly from the right and from above."""
-    right, up, towards = {
-        "x": ([0, 1, 0], [1, 0, 0], [0, 0, -1]),
-        "z": ([1, 0, 0], [0, 0, 1], [0, -1, 0]),
-    }.get(up_axis or "y", ([1, 0, 0], [0, 1, 0], [0, 0, 1]))
-    frame = np.array([right, up, towards], dtype=float).T
-    horizontal = [np.cos(_AZIMUTH), 0, -np.sin(_AZIMUTH)]
-    vertical = [
-        -np.sin(_ELEVATION) * np.sin(_AZIMUTH),
-        np.cos(_ELEVATION),
-        -np.sin(_ELEVATION) * np.cos(_AZIMUTH),
-    ]
-    return np.asarray(frame @ np.array([horizontal, vertical]).T)

@@ -184,18 +184,6 @@ class TrainingShapes:
         """Rows of the models that have a mesh."""
         return [row for row, path in enumerate(self.mesh_paths) if path is not None]
 
-    def nearest(self, points: FloatArray, rows: npt.NDArray[np.int64]) -> NearestShape:
-        """The model whose keypoints of some rows (n,) are nearest to points (n, 3)."""
-        known = self.points_3d[:, rows]
-        squares = ((known.astype(np.float64) - points) ** 2).sum(axis=2)
-        # Two objects of the category are this far apart in a keypoint on average.
-        expected = 2 * np.nanvar(known, axis=0).sum(axis=1)
-        distances = np.where(np.isnan(squares), expected, squares).mean(axis=1)
-        best = int(np.argmin(distances))
-        own = self.points_3d[best].astype(np.float64)
-        distance = float(np.sqrt(distances[best]))
-        return NearestShape(self.model_ids[best], own, self.mesh_paths[best], distance)
-
 
 @dataclass(frozen=True, eq=False)
 class BoxMargins:
@@ -324,8 +312,8 @@ def check_text(text: object, where: str) -> str:
 
 def check_axis(axis: object, where: str) -> None:
     """Refuse what is not the name of an axis."""
-    if axis not in AXES:
-        raise InputError(f"{axis!r} is not one of 'x', 'y', 'z'", where=where)
+    if not isinstance(axis, str) or axis not in AXES:
+        raise InputError(f"{quote(axis)} is no axis", where=where, fix="give x, y or z")
 
 
 def checked_box(box: npt.ArrayLike, where: str) -> FloatArray:

@@ -25,12 +25,10 @@ from cadalign.shapes.parts import checked_box
 _ROUNDING = 0.02  # of the kernel's tip, at most
 _MARGIN = 0.25  # from the mesh to the corners around it, which follow the stretch alone
 _COINCIDENT = 1e-6
-_PRIOR_SPREAD = 0.1  # keypoints that spread less along an axis barely determine its stretch
-_LEAST_STRETCH = 0.1  # relative to that of all axes together
 
 
 def warp_mesh(
-    mesh: Mesh, source: npt.ArrayLike, target: npt.ArrayLike, *, bounds: npt.ArrayLike | None = None
+    mesh: Mesh, source: npt.ArrayLike, target: npt.ArrayLike, *, bounds: npt.ArrayLike
 ) -> Mesh:
     """Warp a mesh such that its keypoints come to given places.
 
@@ -44,9 +42,8 @@ def warp_mesh(
         Keypoints of the mesh [model units].
     target : (n, 3) float
         The places that they come to [model units].
-    bounds : (2, 3) float, optional
-        Least and greatest corner of the box that the mesh shall about fill; by default the stretch
-        is the one that fits the keypoints best.
+    bounds : (2, 3) float
+        Least and greatest corner of the box that the mesh shall about fill.
 
     Returns
     -------
@@ -62,7 +59,7 @@ def warp_mesh(
     --------
     >>> corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     >>> square = Mesh(corners, [[0, 1, 2], [0, 2, 3]])
-    >>> taller = warp_mesh(square, corners, corners * [1, 2, 1])
+    >>> taller = warp_mesh(square, corners, corners * [1, 2, 1], bounds=[[0, 0, 0], [1, 2, 0]])
     >>> bool(np.allclose(taller.vertices, corners * [1, 2, 1]))
     True
     """
@@ -70,10 +67,7 @@ def warp_mesh(
     targets = as_floats(target, name="target", shape=(len(places), 3))
     if not len(places):
         raise InputError("no keypoints", where="source")
-    if bounds is None:
-        corners = _stretched_box(mesh.bounds, places, targets)
-    else:
-        corners = checked_box(bounds, "bounds")
+    corners = checked_box(bounds, "bounds")
     warp = linear_warp(mesh.vertices, mesh.bounds, places)
     return replace(mesh, vertices=warp.apply(targets, corners))
 
@@ -162,22 +156,3 @@ def _merging(places: FloatArray, tolerance: float) -> FloatArray:
     first = (gaps <= tolerance).argmax(axis=1)
     same = np.unique(first)[:, None] == first
     return np.asarray(same / same.sum(axis=1, keepdims=True))
-
-
-def _stretched_box(box: FloatArray, source: FloatArray, target: FloatArray) -> FloatArray:
-    """A box (2, 3) after the shift and the stretch along each axis that fit the keypoints best.
-
-    The stretch is drawn to an equal one along all axes.
-    """
-    merging = _merging(source, _COINCIDENT * _diagonal(box, source))
-    places, targets = merging @ source, merging @ target
-    centre, to = places.mean(axis=0), targets.mean(axis=0)
-    offsets, moved = places - centre, targets - to
-    total = float((offsets**2).sum())
-    if not total:
-        return np.asarray(box - centre + to)
-    equal = float(np.sqrt((moved**2).sum() / total)) or 1.0
-    weight = _PRIOR_SPREAD**2 * total
-    stretch = ((offsets * moved).sum(axis=0) + weight * equal) / ((offsets**2).sum(axis=0) + weight)
-    stretch = np.maximum(stretch, _LEAST_STRETCH * equal)
-    return np.asarray((box - centre) * stretch + to)

@@ -69,7 +69,7 @@ class ShapeLearn:
 
 @dataclass(frozen=True)
 class ShapeShow(JsonOption):
-    """Describe a shape model; with --out, draw its mean and its first modes."""
+    """Describe a shape model; with --out, draw its mean with the keypoints' ids."""
 
     shape: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SHAPE")]
     """File that `cadalign shape learn` wrote."""

@@ -102,26 +102,19 @@ def calibrate(
 
 
 def _departures(squares: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
-    """Squared departures of coverage by degrees of freedom and factor; see `_squares`."""
+    """Squared departures of coverage from its nominal values, in tolerances; see `_squares`.
+
+    By degrees of freedom and factor, the sum of those of rotations and of keypoints.
+    """
     turned = np.array([each for each, _ in squares])
     moved = np.concatenate([each for _, each in squares], axis=1).T
-    return np.array(
-        [
-            _departure(turned, freedom) + _departure(moved, freedom)
-            for freedom in _DEGREES_OF_FREEDOM
-        ]
-    )
-
-
-def _departure(squares: FloatArray, degrees_of_freedom: float | None) -> FloatArray:
-    """Squared departures of coverage from its nominal values, in tolerances, by factor (F,).
-
-    ``squares`` (N, F) are those of errors along three coordinates, in stated standard deviations.
-    """
-    levels = probability_within(squares, 3, degrees_of_freedom)
-    shares = np.array([(levels <= nominal).mean(axis=0) for nominal in _NOMINAL])
-    gaps = (shares - _NOMINAL[:, None]) / _TOLERANCE[:, None]
-    return np.asarray((gaps**2).sum(axis=0))
+    found = np.zeros((len(_DEGREES_OF_FREEDOM), len(_FACTORS)))
+    for row, freedom in enumerate(_DEGREES_OF_FREEDOM):
+        for errors in (turned, moved):
+            levels = probability_within(errors, 3, freedom)
+            shares = np.array([(levels <= nominal).mean(axis=0) for nominal in _NOMINAL])
+            found[row] += (((shares.T - _NOMINAL) / _TOLERANCE) ** 2).sum(axis=1)
+    return found
 
 
 def _view(

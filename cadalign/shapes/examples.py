@@ -80,21 +80,18 @@ class Example:
         object.__setattr__(self, "points_3d", read_only(points))
         if self.bounds is not None:
             bounds = checked_box(self.bounds, f"{where}, bounds")
-            _check_reach(points, bounds, f"{where}, bounds")
+            least, greatest = extent(points)
+            gap = np.maximum(least - bounds[1], bounds[0] - greatest).max()
+            if gap > _FARTHEST * np.linalg.norm(bounds[1] - bounds[0]):
+                what = f"no keypoint lies in the box from {bounds[0].tolist()} to "
+                what += str(bounds[1].tolist())
+                fix = "give the box in the keypoints' axes and unit"
+                raise InputError(what, where=f"{where}, bounds", fix=fix)
             object.__setattr__(self, "bounds", read_only(bounds))
         if self.mesh_path is not None:
             path = as_path(self.mesh_path, f"{where}, mesh_path").absolute()
             require_utf8(path)
             object.__setattr__(self, "mesh_path", path)
-
-
-def _check_reach(points: FloatArray, bounds: FloatArray, where: str) -> None:
-    """Refuse a box that is elsewhere than the keypoints, or of another unit."""
-    least, greatest = extent(points)
-    gap = np.maximum(least - bounds[1], bounds[0] - greatest).max()
-    if gap > _FARTHEST * np.linalg.norm(bounds[1] - bounds[0]):
-        what = f"no keypoint lies in the box from {bounds[0].tolist()} to {bounds[1].tolist()}"
-        raise InputError(what, where=where, fix="give the box in the keypoints' axes and unit")
 
 
 class Dataset(Protocol):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -151,7 +151,7 @@ class _CrossValidation:
         count = len(self._models.rows)
         is_few, modes = count < _LEAST_TO_CHOOSE, None
         strengths = _STRENGTHS_OF_FEW if is_few else _STRENGTHS
-        best = max((self._try(_Recipe(each)) for each in strengths), key=_total)
+        best = self._best(_Recipe(each) for each in strengths)
         if is_few:
             recipe = replace(best.recipe, components=components or 1)
             if recipe.components > 1:  # but for one model each
@@ -166,8 +166,7 @@ class _CrossValidation:
     def _with_reflection(self, best: _Trial) -> _Trial:
         completed = self._models.completed()
         mirrors = [find_reflection(completed, self._models.ids, axis) for axis in range(3)]
-        tried = [self._try(replace(best.recipe, reflection=each)) for each in mirrors]
-        mirrored = max(tried, key=_total)
+        mirrored = self._best(replace(best.recipe, reflection=each) for each in mirrors)
         # Twice as many models to learn from are worth a little.
         return mirrored if _is_enough(mirrored.scores, best.scores, _TOLERANCE) else best
 
@@ -199,6 +198,9 @@ class _CrossValidation:
             held_out = self._folds == fold
             excesses[held_out] = excesses_of(rows[held_out], mixture)
         return learn_margins(rows, excesses)
+
+    def _best(self, recipes: Iterable[_Recipe]) -> _Trial:
+        return max(map(self._try, recipes), key=lambda trial: float(trial.scores.sum()))
 
     def _try(self, recipe: _Recipe) -> _Trial:
         learned = tuple(kept.mixture(recipe) for kept in self._kept)
@@ -277,15 +279,10 @@ def _truncated(mixture: Gaussians, modes: int | None) -> Gaussians:
     return Gaussians(mixture.weights, mixture.means, np.array(parts))
 
 
-def _total(trial: _Trial) -> float:
-    return float(trial.scores.sum())
-
-
 def _least_enough(scores: Sequence[FloatArray], tolerance: float) -> int:
     """The first that makes the models about as likely as any other."""
     best = max(scores, key=np.sum)
-    enough = [row for row, each in enumerate(scores) if _is_enough(each, best, tolerance)]
-    return enough[0]
+    return next(row for row, each in enumerate(scores) if _is_enough(each, best, tolerance))
 
 
 def _is_enough(scores: FloatArray, best: FloatArray, tolerance: float) -> bool:

@@ -27,7 +27,6 @@ from cadalign.shapes.parts import (
     TrainingShapes,
     check_axis,
     check_ids,
-    check_mixture,
     check_text,
 )
 
@@ -95,7 +94,16 @@ class ShapeModel:
 
     def __post_init__(self) -> None:
         ids = check_ids(self.ids, "ids")
-        check_mixture(self.components, len(ids))
+        if not self.components:
+            raise InputError("there are none", where="components")
+        for row, each in enumerate(self.components):
+            if len(each.mean) != len(ids) + BOX_ROWS:
+                what = f"{len(each.mean)} rows, expected {len(ids) + BOX_ROWS}: "
+                what += f"{len(ids)} keypoints and {BOX_ROWS} box corners"
+                raise InputError(what, where=f"components[{row}]")
+        total = sum(each.weight for each in self.components)
+        if abs(total - 1) > 1e-6:
+            raise InputError(f"weights sum to {total:.6g}, not to 1", where="components")
         if self.up_axis is not None:
             check_axis(self.up_axis, "up_axis")
             object.__setattr__(self, "up_axis", str(self.up_axis))

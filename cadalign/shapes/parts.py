@@ -75,22 +75,6 @@ class ShapeComponent:
         return np.asarray((self.modes**2).sum(axis=(1, 2)))
 
 
-def check_mixture(components: Sequence[ShapeComponent], keypoints: int) -> None:
-    """Check that components are of so many keypoints, and that their weights sum to 1."""
-    if not components:
-        raise InputError("there are none", where="components")
-    for row, component in enumerate(components):
-        if len(component.mean) != keypoints + BOX_ROWS:
-            what = (
-                f"{len(component.mean)} rows, expected {keypoints + BOX_ROWS}: "
-                f"{keypoints} keypoints and {BOX_ROWS} box corners"
-            )
-            raise InputError(what, where=f"components[{row}]")
-    total = sum(component.weight for component in components)
-    if abs(total - 1) > 1e-6:
-        raise InputError(f"weights sum to {total:.6g}, not to 1", where="components")
-
-
 @dataclass(frozen=True)
 class Reflection:
     """A category's mirror symmetry: mirrored objects are as likely as the objects themselves."""

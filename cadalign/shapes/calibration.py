@@ -219,10 +219,8 @@ def excesses_of(rows: FloatArray, mixture: Gaussians) -> FloatArray:
     first = rows[0].size - 3 * BOX_ROWS
     for place, row in enumerate(rows):
         entries = np.flatnonzero(np.isfinite(row.ravel()[:first]))
-        best, linear = -np.inf, np.full(3 * BOX_ROWS, np.nan)
-        for weight, mean, covariance in zip(
-            mixture.weights, mixture.means, mixture.covariances, strict=True
-        ):
+        best = -np.inf
+        for weight, mean, covariance in zip(*mixture, strict=True):
             gap = row.ravel()[entries] - mean[entries]
             own = covariance[entries[:, None], entries]
             solved = np.linalg.solve(own, gap)

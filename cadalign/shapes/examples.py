@@ -208,9 +208,7 @@ def _warn_of_axes(examples: Sequence[Example], rows: FloatArray) -> None:
     some = np.flatnonzero(count >= _LEAST_TO_TURN)
     if not len(some):
         return
-    middle = np.nanmean(rows[some], axis=1, keepdims=True)
-    radius = np.sqrt(np.nanmean(((rows[some] - middle) ** 2).sum(axis=2), axis=1))
-    normal = (rows[some] - middle) / np.where(radius > 0, radius, 1.0)[:, None, None]
+    normal = np.array([_unit(each) for each in rows[some]])
     is_seen = np.isfinite(normal[..., 0])
     place = np.full(rows.shape[1:], np.nan)
     place[is_seen.any(axis=0)] = np.nanmedian(normal[:, is_seen.any(axis=0)], axis=0)
@@ -236,7 +234,7 @@ def _warn(what: str, count: int, examples: Sequence[Example], odd: Example, why:
 
 
 def _unit(points: FloatArray) -> FloatArray:
-    """Points (n, 3) about their mean, with a mean square distance of 1 from it."""
-    centred = points - points.mean(axis=0)
-    radius = np.sqrt((centred**2).sum(axis=1).mean())
+    """Points (n, 3), or NaN, about their mean, with a mean square distance of 1 from it."""
+    centred = points - np.nanmean(points, axis=0)
+    radius = np.sqrt(np.nanmean((centred**2).sum(axis=1)))
     return np.asarray(centred / radius if radius > 0 else centred)

@@ -40,18 +40,11 @@ Prior = tuple[FloatArray, float, float]
 standard deviation that no direction falls below."""
 
 
-class Gap(NamedTuple):
-    """Vectors, by their ``rows`` (r, 1), that lack the entries ``missing`` (l,), and no others."""
-
-    rows: IntArray
-    missing: IntArray
-
-
 class Conditional(NamedTuple):
     """A Gaussian of vectors, given the entries that these have.
 
     The lower ``root`` (d, d) of its covariance, and ``offsets`` (N, d) from its mean, 0 for what is
-    missing. Of each of the vectors' `Gap`, the root of the inverse covariance of its l missing
+    missing. Of each of `Vectors.gaps`, the root of the inverse covariance of its l missing
     entries, given the others, and how far below the mean these are expected, (l, r).
     """
 
@@ -73,13 +66,13 @@ class Vectors:
         return ~np.isnan(self.values)
 
     @cached_property
-    def gaps(self) -> tuple[Gap, ...]:
-        """The vectors that lack entries, grouped by which these are."""
+    def gaps(self) -> tuple[tuple[IntArray, IntArray], ...]:
+        """Rows (r, 1) of the vectors that lack the same entries, and these entries (l,)."""
         lacking = np.flatnonzero(~self.has.all(axis=1))
         bits = np.packbits(self.has[lacking], axis=1)  # sorted faster than the entries themselves
         _, first, kind_of = np.unique(bits, axis=0, return_index=True, return_inverse=True)
         return tuple(
-            Gap(lacking[kind_of.ravel() == kind][:, None], np.flatnonzero(~self.has[row]))
+            (lacking[kind_of.ravel() == kind][:, None], np.flatnonzero(~self.has[row]))
             for kind, row in enumerate(lacking[first].tolist())
         )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from bisect import bisect_left
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -86,7 +86,6 @@ class Library(ModelTable):
         dataset: KeypointNet,
         *,
         categories: Iterable[str] | None = None,
-        on_model: Callable[[], object] = lambda: None,
     ) -> Library:
         """Make a library of a data set's annotated models.
 
@@ -99,8 +98,6 @@ class Library(ModelTable):
         dataset : KeypointNet
         categories : iterable of str, optional
             Names or synset ids; by default all.
-        on_model : callable
-            Called after every model, for progress.
 
         Raises
         ------
@@ -109,10 +106,7 @@ class Library(ModelTable):
         DataError
             If there are no models.
         """
-        models = []
-        for model in dataset.subset(categories=categories):
-            models.append(LibraryModel.of_annotated(model))
-            on_model()
+        models = list(map(LibraryModel.of_annotated, dataset.subset(categories=categories)))
         if not models:
             raise DataError("the data set has no such models", where=str(dataset.root))
         return cls.from_models(models)
@@ -123,7 +117,6 @@ class Library(ModelTable):
         folder: str | os.PathLike[str],
         *,
         categories: Iterable[str] | None = None,
-        on_model: Callable[[], object] = lambda: None,
     ) -> Library:
         """Make a library of own models: a folder of files ``NAME.keypoints.json`` and meshes.
 
@@ -137,8 +130,6 @@ class Library(ModelTable):
             It, and those below it, are looked through.
         categories : iterable of str, optional
             By default all.
-        on_model : callable
-            Called after every model, for progress.
 
         Raises
         ------
@@ -151,7 +142,7 @@ class Library(ModelTable):
         >>> library = Library.from_folder("chairs")  # doctest: +SKIP
         >>> library.retrieve(points_2d, ["seat", "back"], camera)  # doctest: +SKIP
         """
-        own = _read_own_models(as_path(folder), categories, on_model)
+        own = _read_own_models(as_path(folder), categories)
         return cls(table_of(*own))
 
     @classmethod
@@ -310,7 +301,6 @@ def keypoint_files(folder: Path) -> list[Path]:
 def _read_own_models(
     folder: Path,
     categories: Iterable[str] | None,
-    on_model: Callable[[], object],
 ) -> tuple[list[LibraryModel], dict[str, int]]:
     """A folder's models, and semantic ids by name; raises as `Library.from_folder`."""
     chosen = None if categories is None else set(categories)
@@ -321,10 +311,7 @@ def _read_own_models(
         raise DataError(what, where=str(folder), fix=_FIX)
     read = [(path, ModelKeypoints.load(path)) for path in files]
     names = _numbers(read)
-    models = []
-    for path, found in read:
-        models.append(_model(path, found, names))
-        on_model()
+    models = [_model(path, found, names) for path, found in read]
     meshes = [path for path in listed(folder, "**/*") if path.suffix.lower() in MESH_ENDINGS]
     used = {model.mesh_path for model in models}
     unused = [path for path in meshes if path.absolute() not in used]

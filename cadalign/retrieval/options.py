@@ -107,12 +107,6 @@ class RetrievalOptions:
             stretch_sigma=self.stretch_sigma,
         )
 
-    @property
-    def log_scale_constant(self) -> float:
-        """The log density of the prior at no stretch."""
-        axes = len(self.fitting.stretched_axes)
-        return -axes * (0.5 * math.log(2 * math.pi) + math.log(self.stretch_sigma))
-
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationRetrieval:

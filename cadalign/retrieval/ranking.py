@@ -191,7 +191,8 @@ def gather_candidates(
     bounds = bent(bounds, query.loss, query.loss_scale)
     counts = spans[:, 1] - spans[:, 0]
     base = gains + observed.spurious + (counts - shared) * np.log(options.missing_prob)
-    base = base + options.log_scale_constant
+    axes = len(options.fitting.stretched_axes)  # the prior's log density at no stretch:
+    base = base - axes * (0.5 * np.log(2 * np.pi) + np.log(options.stretch_sigma))
     kept_keypoints = candidates._replace(spans=spans[kept])
     return CandidateSet(kept_keypoints, chosen[kept], base[kept], bounds[kept])
 

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -194,15 +194,13 @@ class ShapeModel:
         InputError
             If category or split is unknown, or the category has too few models.
         """
-        from cadalign.shapes.examples import LEAST_MODELS, examples_of
+        from cadalign.shapes.examples import examples_of
 
         models = dataset.subset(categories=[category], split=split)[category]
-        if len(models) < LEAST_MODELS:
-            where = f"{category}, split {split}" if split else category
-            what = f"{len(models)} models are too few to learn a shape from"
-            raise InputError(what, where=where, fix=f"at least {LEAST_MODELS} are needed")
-        of_category = {"category": models[0].category, "up_axis": "y", "unit": "diagonal"}
-        return cls.learn(examples_of(models, meshes=meshes), components=components, **of_category)
+        examples = examples_of(models, meshes=meshes)
+        name = models[0].category if models else category
+        how: dict[str, Any] = {"up_axis": "y", "unit": "diagonal", "components": components}
+        return cls.learn(examples, category=name, **how)
 
     @classmethod
     def from_basis(

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import BOX_EDGES, bounds_corners
 from cadalign.io.documents import Count, Document, PathText, in_file
@@ -121,7 +121,9 @@ def draw_shape(path: Path, model: ShapeModel) -> None:
 
 
 def _draw_mean(axes: Any, model: ShapeModel, mean: FloatArray) -> None:
-    common, points = _common(model), mean[:-BOX_ROWS]
+    points, common = mean[:-BOX_ROWS], np.ones(len(model.ids), dtype=bool)
+    if model.training is not None:
+        common = np.isfinite(model.training.points_3d[..., 0]).mean(axis=0) >= _COMMON
     chosen, corners = np.flatnonzero(common), bounds_corners(*mean[-BOX_ROWS:])
     for edge in BOX_EDGES:
         axes.plot(*corners[list(edge)].T, color=_GREY, lw=0.7)
@@ -144,12 +146,3 @@ def neighbour_pairs(points: FloatArray) -> IntArray:
     gaps = np.linalg.norm(points[:, None] - points, axis=2)
     blocked = (np.maximum(gaps[:, None, :], gaps[None, :, :]) < gaps[..., None]).any(axis=2)
     return np.argwhere(np.triu(~blocked, 1))
-
-
-def _common(model: ShapeModel) -> BoolArray:
-    """The keypoints that a good part of the training models have; all if there are none."""
-    every = np.ones(len(model.ids), dtype=bool)
-    if model.training is None:
-        return every
-    common = np.isfinite(model.training.points_3d[..., 0]).mean(axis=0) >= _COMMON
-    return np.asarray(common) if common.sum() > 1 else every

@@ -268,12 +268,12 @@ class FewKeypoints:
     share: float  # its share with `FEW` keypoints or less, in (0, 1]
 
     def __post_init__(self) -> None:
-        if not is_number(self.typical) or self.typical <= FEW:
-            raise InputError(f"{self.typical!r} is not a number above {FEW}", where="typical")
-        if not is_number(self.share) or not 0 < self.share <= 1:
-            raise InputError(f"{self.share!r} is not a number in (0, 1]", where="share")
-        object.__setattr__(self, "typical", float(self.typical))
-        object.__setattr__(self, "share", float(self.share))
+        for name, least, most in (("typical", FEW, math.inf), ("share", 0, 1)):
+            value = getattr(self, name)
+            if not is_number(value) or not least < value <= most:
+                what = f"{value!r} is not a number above {least}, up to {most}"
+                raise InputError(what, where=name)
+            object.__setattr__(self, name, float(value))
 
     def share_of(self, count: float) -> float:
         """Share of the inflation with a number of keypoints."""

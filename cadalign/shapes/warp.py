@@ -123,7 +123,10 @@ def _weights(
 ) -> FloatArray:
     """Shares (p, n) of the keypoints' displacements in those of points."""
     from scipy.interpolate import RBFInterpolator
+    from scipy.spatial.distance import pdist
 
+    # The kernel's tip is rounded less where keypoints are near each other.
+    rounding = min(_ROUNDING * diagonal, float(pdist(places).min(initial=diagonal)))
     everything = np.vstack([box, places])
     margin = _MARGIN * diagonal
     around = bounds_corners(everything.min(axis=0) - margin, everything.max(axis=0) + margin)
@@ -131,7 +134,7 @@ def _weights(
         np.vstack([places, around]),
         np.eye(len(places) + len(around), len(places)),
         kernel="multiquadric",
-        epsilon=1 / _rounding(places, diagonal),
+        epsilon=1 / rounding,
         degree=0,
     )
     return np.asarray(shares(points))
@@ -140,14 +143,6 @@ def _weights(
 def _diagonal(box: FloatArray, places: FloatArray) -> float:
     """Diagonal of mesh and keypoints together; 1 where they are one point."""
     return float(np.linalg.norm(np.ptp(np.vstack([box, places]), axis=0))) or 1.0
-
-
-def _rounding(places: FloatArray, diagonal: float) -> float:
-    """Radius within which the kernel's tip is rounded: less where keypoints are near each other."""
-    from scipy.spatial.distance import pdist
-
-    least = float(pdist(places).min()) if len(places) > 1 else diagonal
-    return min(_ROUNDING * diagonal, least)
 
 
 def _merging(places: FloatArray, tolerance: float) -> FloatArray:

@@ -66,7 +66,8 @@ def none_probability(
     for place, row in enumerate(candidates.models[chosen].tolist()):
         alike.setdefault((table.keys[row][0], len(shared[place][1])), []).append(place)
     extent = float(np.linalg.norm(np.ptp(observed.points_2d, axis=0)))
-    weights = np.exp(-0.5 * _STEPS**2)
+    shares = np.exp(-0.5 * _STEPS**2)
+    shares = np.log(shares / shares.sum())[:, None]
     factors = np.empty(len(chosen))
     for (name, _), places in alike.items():
         center, spread = deviation_of(table, name)
@@ -75,8 +76,7 @@ def none_probability(
         points, rows = (np.array([shared[place][k] for place in places]) for k in range(2))
         poses = ranking.poses[places]
         logs = _log_likelihoods(poses, points, rows, observed, covariances)
-        means = np.logaddexp.reduce(logs[1:] + np.log(weights / weights.sum())[:, None], axis=0)
-        factors[places] = means - logs[0]
+        factors[places] = np.logaddexp.reduce(logs[1:] + shares, axis=0) - logs[0]
     relative = ranking.log_likelihoods[:_MOST_LIKELY] - ranking.log_likelihoods[0]
     odds = np.log(options.none_prior) - np.log1p(-options.none_prior)
     odds += np.logaddexp.reduce(relative + factors) - np.logaddexp.reduce(relative)

@@ -180,9 +180,7 @@ def _search(
         costs[best] = np.inf
         if out_of_reach:
             continue
-        square = 0.0
-        for i in range(9):
-            square += (pose[i] - probed[best, i]) ** 2
+        square = ((pose[:9] - probed[best, :9]) ** 2).sum()
         if least < np.inf and square < _SAME_CHORD * _SAME_CHORD:
             continue
         cost, _, _ = refine(objective, iterations, probed[best])
@@ -235,10 +233,9 @@ def _propose(objective: Objective, subsets: int, starts: FloatArray) -> int:
     # Other starts are for coplanar points, and for fixed scales.
     if count == 0 or free[6] == 0.0 or free[7] == 0.0:
         count += rotation_starts(points, rays, starts[count : count + _GRID_ROTATIONS])
-    for k in range(count):
-        for j in range(2):
-            if free[6 + j] == 0.0:
-                starts[k, 13 + j] = 1.0
+    for j in range(2):
+        if free[6 + j] == 0.0:
+            starts[:count, 13 + j] = 1.0
     return count
 
 

@@ -305,7 +305,7 @@ def _read_own_models(
     """A folder's models, and semantic ids by name; raises as `Library.from_folder`."""
     chosen = None if categories is None else set(categories)
     files = keypoint_files(folder)
-    files = [path for path in files if chosen is None or _category(path) in chosen]
+    files = [path for path in files if chosen is None or path.absolute().parent.name in chosen]
     if not files:
         what = "no model with keypoints" + ("" if chosen is None else " of these categories")
         raise DataError(what, where=str(folder), fix=_FIX)
@@ -319,10 +319,6 @@ def _read_own_models(
         said = "%d meshes have no keypoints and are left out, the first is %s; %s"
         logger.warning(said, len(unused), unused[0], _FIX)
     return models, names
-
-
-def _category(path: Path) -> str:
-    return path.absolute().parent.name
 
 
 def _numbers(read: Sequence[tuple[Path, ModelKeypoints]]) -> dict[str, int]:
@@ -346,4 +342,4 @@ def _model(path: Path, found: ModelKeypoints, names: dict[str, int]) -> LibraryM
         beside = (path.with_name(stem + suffix) for suffix in MESH_ENDINGS)
         mesh = next((each for each in beside if each.is_file()), None)
     ids = np.array([names[name] for name in found.names], dtype=np.int64)
-    return LibraryModel.measured(_category(path), stem, found.xyz, ids, mesh)
+    return LibraryModel.measured(path.absolute().parent.name, stem, found.xyz, ids, mesh)

@@ -160,8 +160,8 @@ class _CrossValidation:
         else:
             best = self._with_components(self._with_reflection(best), components)
             recipe, modes = best.recipe, self._modes(best)
-        margins = {"box_margins": self._margins(best)}
-        return recipe, modes, margins | self._calibration(best, modes)._asdict()
+        figures = self._calibration(best, modes)._asdict()
+        return recipe, modes, figures | {"box_margins": self._margins(best)}
 
     def _with_reflection(self, best: _Trial) -> _Trial:
         completed = self._models.completed()

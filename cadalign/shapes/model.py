@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -198,9 +198,13 @@ class ShapeModel:
 
         models = dataset.subset(categories=[category], split=split)[category]
         examples = examples_of(models, meshes=meshes)
-        name = models[0].category if models else category
-        how: dict[str, Any] = {"up_axis": "y", "unit": "diagonal", "components": components}
-        return cls.learn(examples, category=name, **how)
+        return cls.learn(
+            examples,
+            category=models[0].category if models else category,
+            up_axis="y",
+            unit="diagonal",
+            components=components,
+        )
 
     @classmethod
     def from_basis(

@@ -65,7 +65,7 @@ def read_shape(path: str | os.PathLike[str], kind: type[Kind]) -> Kind:
     payload = SEAL.unwrap(read_bytes(file, most=_MAX_BYTES), str(file))
     try:
         document = msgspec.msgpack.decode(payload)
-        model = msgspec.convert(document, kind, dec_hook=_read)
+        return msgspec.convert(document, kind, dec_hook=_read)
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         cause = error.__cause__
         if isinstance(cause, InputError) and str(cause) == str(error):  # of the model as a whole
@@ -75,7 +75,6 @@ def read_shape(path: str | os.PathLike[str], kind: type[Kind]) -> Kind:
         join = "." if isinstance(cause, InputError) and cause.where else ": "
         what = f"{place.rstrip('`')}{join}{what}" if place else what
         raise SEAL.error(f"is invalid: {what[:200]}", str(file)) from None
-    return model
 
 
 def _written(value: Any) -> Any:
@@ -138,10 +137,9 @@ def _draw_mean(axes: Any, model: ShapeModel, mean: FloatArray) -> None:
 
 
 def neighbour_pairs(points: FloatArray) -> IntArray:
-    """Pairs (n, 2) of points that have no third point nearer to both: a skeleton of the shape.
+    """Pairs (n, 2) of points that have no third one nearer to both, a skeleton of the shape.
 
-    The relative neighbourhood graph, which holds the minimum spanning tree: Toussaint, "The
-    relative neighbourhood graph of a finite planar set", 1980.
+    The relative neighbourhood graph (Toussaint, 1980), which holds the minimum spanning tree.
     """
     gaps = np.linalg.norm(points[:, None] - points, axis=2)
     blocked = (np.maximum(gaps[:, None, :], gaps[None, :, :]) < gaps[..., None]).any(axis=2)

@@ -96,24 +96,24 @@ class LinearWarp(NamedTuple):
 
 def linear_warp(points: FloatArray, box: FloatArray, source: FloatArray) -> LinearWarp:
     """The warp of points (p, 3) of a mesh, with its ``box`` (2, 3) and keypoints (n, 3)."""
-    diagonal = _diagonal(box, source)
-    merging = _merging(source, _COINCIDENT * diagonal)
+    diagonal = float(np.linalg.norm(np.ptp(np.vstack([box, source]), axis=0))) or 1.0
+    # Of coincident keypoints there is one place, which takes the mean of their targets.
+    gaps = np.linalg.norm(source[:, None] - source, axis=2)
+    first = (gaps <= _COINCIDENT * diagonal).argmax(axis=1)
+    same = np.unique(first)[:, None] == first
+    merging = np.asarray(same / same.sum(axis=1, keepdims=True))
     places = merging @ source
     weights = _weights(points, box, places, diagonal)
     extents = box[1] - box[0]
     flat = extents <= _COINCIDENT * extents.max()
     safe = np.where(flat, np.inf, extents)
 
-    def corners(of: FloatArray) -> tuple[FloatArray, FloatArray]:
-        share = (of - box.mean(axis=0)) / safe
-        return 0.5 - share, 0.5 + share
-
-    (least, greatest), (least_there, greatest_there) = corners(points), corners(places)
     middle = box.mean(axis=0)
+    share, share_there = (points - middle) / safe, (places - middle) / safe
     return LinearWarp(
         weights @ merging,
-        least - weights @ least_there,
-        greatest - weights @ greatest_there,
+        0.5 - share - weights @ (0.5 - share_there),
+        0.5 + share - weights @ (0.5 + share_there),
         flat * (points - middle - weights @ (places - middle)),
     )
 
@@ -138,16 +138,3 @@ def _weights(
         degree=0,
     )
     return np.asarray(shares(points))
-
-
-def _diagonal(box: FloatArray, places: FloatArray) -> float:
-    """Diagonal of mesh and keypoints together; 1 where they are one point."""
-    return float(np.linalg.norm(np.ptp(np.vstack([box, places]), axis=0))) or 1.0
-
-
-def _merging(places: FloatArray, tolerance: float) -> FloatArray:
-    """Matrix (k, n) that replaces coincident keypoints by one, which takes their mean."""
-    gaps = np.linalg.norm(places[:, None] - places, axis=2)
-    first = (gaps <= tolerance).argmax(axis=1)
-    same = np.unique(first)[:, None] == first
-    return np.asarray(same / same.sum(axis=1, keepdims=True))

@@ -20,7 +20,7 @@ from cadalign.evaluation.runs.work import Columns
 from cadalign.evaluation.summary import median
 from cadalign.io.files import dense_json
 from cadalign.io.observation import Observation
-from cadalign.retrieval.options import ObservationRetrieval
+from cadalign.retrieval.query import ObservationRetrieval
 
 SCORE = Metric("match_score", "score", "%", 0, better="high", factor=100.0, log=False)
 NONE = Metric("none_probability", "none of these", "%", 0, factor=100.0, log=False)

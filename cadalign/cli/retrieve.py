@@ -18,7 +18,8 @@ from cadalign.io.files import keeping
 from cadalign.io.images import read_image
 from cadalign.io.kinds import OBSERVATION, is_of_many
 from cadalign.io.observation import Observation
-from cadalign.retrieval.options import ObservationRetrieval, RetrievalOptions
+from cadalign.retrieval.options import RetrievalOptions
+from cadalign.retrieval.query import ObservationRetrieval
 
 if TYPE_CHECKING:
     from cadalign.retrieval.match import Match

@@ -262,7 +262,7 @@ class ShapeModel:
         >>> cars = ShapeModel.from_basis(mean, [longer], [0.5], ids=["a", "b", "c", "d"],
         ...                              size_sigma=[0.1, 0.1, 0.1], unit="m")
         >>> cars.components[0].modes.shape
-        (4, 6, 3)
+        (3, 6, 3)
         """
         component = component_of_basis(
             mean, modes, deviations, box=box, residual_sigma=residual_sigma, size_sigma=size_sigma

@@ -299,8 +299,7 @@ def keypoint_files(folder: Path) -> list[Path]:
 
 
 def _read_own_models(
-    folder: Path,
-    categories: Iterable[str] | None,
+    folder: Path, categories: Iterable[str] | None
 ) -> tuple[list[LibraryModel], dict[str, int]]:
     """A folder's models, and semantic ids by name; raises as `Library.from_folder`."""
     chosen = None if categories is None else set(categories)

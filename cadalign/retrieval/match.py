@@ -20,9 +20,6 @@ from cadalign.geometry.mesh import Mesh
 from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
 
-METHOD = "retrieve"
-"""Method of a match's result."""
-
 
 @dataclass(frozen=True, eq=False)
 class Match:

@@ -33,7 +33,7 @@ from cadalign.estimation.result_parts import ViewResult
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, faced, turned_alignment
 from cadalign.retrieval.kernels import LEAST_SHARED, Candidates, Query, bound_all, search_all
-from cadalign.retrieval.match import METHOD, Match, posterior_by_shape, posterior_of_keypoints
+from cadalign.retrieval.match import Match, posterior_by_shape, posterior_of_keypoints
 from cadalign.retrieval.models import ModelKey, ModelTable, check_semantic_ids, checked_key
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.solvers.constants import CAUCHY, HUBER, POSE_SIZE
@@ -320,7 +320,7 @@ def make_matches(
         match = Match(
             model.category,
             model.model_id,
-            Result((view,), ids, points_3d, METHOD, posterior, own_bounds=model.bounds),
+            Result((view,), ids, points_3d, "retrieve", posterior, own_bounds=model.bounds),
             log_likelihood=float(ranking.log_likelihoods[place]),
             score=float(ranking.scores[place]),
             missing_ids=tuple(np.delete(observed.query.ids, rows).tolist()),

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import kernel
+from cadalign.compile import inlined, kernel
 from cadalign.solvers.alignment import (
     Objective,
     evaluate_alignment,
@@ -313,6 +313,18 @@ def error_bound(points: FloatArray, seen: IntArray, rays: FloatArray, weights: F
     return best
 
 
+@inlined
+def _whiten(factor: FloatArray, row: FloatArray) -> float:
+    """Divide the first 4 of a row by a lower triangle, in place; returns their squared length."""
+    square = 0.0
+    for j in range(4):
+        for k in range(j):
+            row[j] -= factor[j, k] * row[k]
+        row[j] /= factor[j, j]
+        square += row[j] * row[j]
+    return square
+
+
 @kernel
 def _depth_variances(
     points: FloatArray, seen: IntArray, rays: FloatArray, multipliers: FloatArray
@@ -320,12 +332,15 @@ def _depth_variances(
     """Compute q_i of `error_bound`, (n,); the first is 0 if S is singular to rounding."""
     n, total = seen.shape[0], multipliers.sum()
     rows = np.ones((n, 6))  # 1, x, y, z, u, v, the latter five about their means
-    for j in range(5):
-        mean = 0.0
-        for i in range(n):
-            rows[i, 1 + j] = points[seen[i], j] if j < 3 else rays[seen[i], j - 3]
-            mean += multipliers[i] * rows[i, 1 + j]
-        rows[:, 1 + j] -= mean / total
+    mean = np.zeros(6)
+    for i in range(n):
+        for j in range(3):
+            rows[i, 1 + j] = points[seen[i], j]
+        for j in range(2):
+            rows[i, 4 + j] = rays[seen[i], j]
+        for j in range(1, 6):
+            mean[j] += multipliers[i] * rows[i, j] / total
+    rows -= mean
     p = np.zeros((4, 4))
     for i in range(n):
         for j in range(4):
@@ -362,15 +377,3 @@ def _depth_variances(
     for i in range(n):
         spread[i] = _whiten(system, rows[i])
     return spread
-
-
-@kernel
-def _whiten(factor: FloatArray, row: FloatArray) -> float:
-    """Divide the first 4 of a row by a lower triangle, in place; returns their squared length."""
-    square = 0.0
-    for j in range(4):
-        for k in range(j):
-            row[j] -= factor[j, k] * row[k]
-        row[j] /= factor[j, j]
-        square += row[j] * row[j]
-    return square

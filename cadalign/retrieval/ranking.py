@@ -159,9 +159,7 @@ def gather_candidates(
         raise InputError("the library is empty", where="library")
     if category is not None:
         category = require_category(category, table.categories, where="category")
-    chosen = np.arange(len(table))
-    if category is not None:
-        chosen = chosen[table.rows_of(category)]
+    chosen = np.arange(len(table))[slice(None) if category is None else table.rows_of(category)]
     if unwanted := {checked_key(key, "exclude") for key in exclude}:
         chosen = chosen[[table.keys[row] not in unwanted for row in chosen.tolist()]]
         if not len(chosen):

@@ -17,7 +17,6 @@ from cadalign.datasets.models.model_keypoints import ModelKeypoints
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.runs.work import Columns
 from cadalign.evaluation.summary import median
-from cadalign.io.documents import in_file
 from cadalign.io.observation import Observation
 from cadalign.retrieval.query import ObservationRetrieval
 
@@ -48,15 +47,13 @@ class RetrieveRunOptions(ManyOptions):
 
     @property
     def learned(self) -> Path | None:
-        return self.estimate.shape[0] if len(self.estimate.shape) == 1 else None
+        return self.estimate.shape
 
     def own_keypoints(self) -> ModelKeypoints:
         return self.estimate.opened()[0].keypoints
 
     def read(self, data: Any, where: str, *, folder: Path) -> Observation:
-        with in_file(where):
-            seen = Observation.from_dict(data, folder=folder, needs_xyz=False)
-        return self.changes.applied_to(seen, where)
+        return self.estimate.read(data, where, folder=folder, changes=self.changes)
 
     def estimate_of(self, seen: Observation, where: str) -> Estimated:
         seen = self.estimate.with_ids(seen, where)

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from cadalign.cli.common import answer, group_of, make_folder_of, say
+from cadalign.cli.common import answer, group_of, make_folder_of, say, waiting
 from cadalign.cli.options import named_as_flags
 from cadalign.errors import refuse_unused
 from cadalign.io.files import keeping, refuse_input, require_utf8
@@ -38,17 +37,15 @@ class LibraryBuild:
 
     def run(self) -> int:
         """Build the library; returns the exit code."""
-        from cadalign.cli.runs import progress_bar
         from cadalign.datasets import KeypointNet
-        from cadalign.retrieval import Library
-        from cadalign.retrieval.own_models import keypoint_files
+        from cadalign.retrieval.library import Library, keypoint_files
 
         for folder in (self.root, self.shapenet):
             if folder is not None:
                 require_utf8(folder)
         own = keypoint_files(self.root) if self.root.is_dir() else []
         files: Iterable[Path] = own
-        dataset, total, done = None, len(own), count(1)
+        dataset, total = None, len(own)
         if own:
             with named_as_flags(self):
                 refuse_unused(self, {"split", "shapenet"}, "on a folder of own models")
@@ -56,18 +53,13 @@ class LibraryBuild:
             dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
             dataset = dataset.subset(categories=self.categories, split=self.split)
             files, total = dataset.files, len(dataset.ids())
-        with keeping(files), progress_bar("reading models") as show:
+        with keeping(files), waiting(f"reading {total:,} models"):
             refuse_input(self.out)
             make_folder_of(self.out)
-
-            def on_model() -> None:
-                show(next(done), total)
-
             if dataset is None:
-                chosen = self.categories
-                library = Library.from_folder(self.root, categories=chosen, on_model=on_model)
+                library = Library.from_folder(self.root, categories=self.categories)
             else:
-                library = Library.from_dataset(dataset, on_model=on_model)
+                library = Library.from_dataset(dataset)
             library.save(self.out)
         megabytes = self.out.stat().st_size / 1e6
         say(f"{_describe(library)}\nWritten: {self.out} ({megabytes:.1f} MB)")

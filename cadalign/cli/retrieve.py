@@ -16,7 +16,7 @@ from cadalign.estimation.options import Sigma
 from cadalign.io.documents import read_json
 from cadalign.io.files import keeping
 from cadalign.io.images import read_image
-from cadalign.io.kinds import is_of_many
+from cadalign.io.kinds import OBSERVATION, is_of_many
 from cadalign.io.observation import Observation
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.query import ObservationRetrieval
@@ -30,9 +30,6 @@ class _RetrievalOptions(RetrievalOptions):
     """Ranking of the models; the observation file supplies the standard deviation."""
 
     sigma: tyro.conf.Suppress[Sigma | None] = RetrievalOptions.sigma
-    method: str = RetrievalOptions.method
-    """Solver: optimal (maximum likelihood, searched globally) or epnp (OpenCV's, without
-    stretch)."""
 
     def __post_init__(self) -> None:
         """Check nothing: options are checked once the command runs, and refused in one line."""
@@ -66,7 +63,7 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
         """Run the retrieval, or the retrievals; returns the exit code."""
         path = self.first()
         is_file = path.suffix.lower() == ".json" and os.path.isfile(path)
-        is_many = is_of_many(path, read_json(path) if is_file else None)
+        data = read_json(path) if is_file else None
         with named_as_flags(self, self.ranking):
             how = ObservationRetrieval(
                 library=self.library,
@@ -74,10 +71,12 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
                 sigma=self.sigma,
                 ranking=RetrievalOptions(**vars(self.ranking)),
             )
-            if len(self.observations) > 1 or is_many:
+            if len(self.observations) > 1 or is_of_many(path, data):
                 return self._retrieve_many(how)
             self.refuse_of_many("workers")
-            return self._retrieve(path, how)
+            data = read_json(path, OBSERVATION) if data is None else data
+            query = how.read(data, str(path), folder=path.parent, changes=self.changes)
+            return self._retrieve(how.with_ids(query, str(path)), path, how)
 
     def _retrieve_many(self, how: ObservationRetrieval) -> int:
         """Retrieve the models of all observations; returns the exit code."""
@@ -87,24 +86,18 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
         options = RetrieveRunOptions(estimate=how, **inputs_of(self))
         return run_command(self, options, done="retrieved")
 
-    def _retrieve(self, path: Path, how: ObservationRetrieval) -> int:
-        """Retrieve the models of one observation; returns the exit code."""
+    def _retrieve(self, query: Observation, path: Path, how: ObservationRetrieval) -> int:
+        """Retrieve the models of one observation, read of a path; returns the exit code."""
         from cadalign.retrieval.page import none_text, write_retrieval
 
-        query = how.with_ids(Observation.load(path, needs_xyz=False), str(path))
-        query = self.changes.applied_to(query, str(path))
         library, _ = how.opened()
-        camera = query.camera
         # The table needs no photo, which may have been moved.
         photo = None
         if self.out is not None and query.image is not None:
-            photo = read_image(query.image, camera)
+            photo = read_image(query.image, query.camera)
         with waiting("retrieving (the first time after an installation takes a minute)"):
             workers = -1 if self.workers is None else self.workers
             matches = how.retrieve(query, str(path), workers=workers)
-        found = matches[0].camera if matches else None
-        if not camera.focal_known and found is not None:
-            say(f"Focal length: estimated as {found.fx:.4g} px")
         if self.json:
             print_json([match.to_dict() for match in matches])
         else:
@@ -118,7 +111,7 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
                 page = write_retrieval(
                     self.out,
                     matches,
-                    found or camera,
+                    query.camera,
                     query=query,
                     title=f"Models for {path.name}",
                     library=f"{self.library.name} ({len(library):,} models)",
@@ -142,7 +135,7 @@ def _print_table(matches: Sequence[Match]) -> None:
             score_text(match.score),
             f"{match.log_likelihood:.1f}",
             f"{match.rms:.2f}",
-            f"{match.shared}/{match.observed}",
+            match.shared_text,
             *match.stretch_texts,
             ", ".join(match.result.uncertain),
         )

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
-from cadalign.cli.common import answer, group_of, make_folder_of, say
+from cadalign.cli.common import answer, group_of, make_folder_of, say, waiting
 from cadalign.cli.options import named_as_flags
-from cadalign.cli.runs import progress_bar
 from cadalign.datasets import KeypointNet
 from cadalign.io.files import keeping, refuse_input
 
@@ -50,13 +49,9 @@ class ShapeLearn:
     def _learn(self, dataset: KeypointNet) -> int:
         from cadalign.shapes.model import ShapeModel  # not for help of a command
 
-        with progress_bar(f"learning {self.category}") as on_progress:
+        with waiting(f"learning {self.category}"):
             model = ShapeModel.from_dataset(
-                dataset,
-                self.category,
-                split=self.split,
-                components=self.components,
-                on_progress=on_progress,
+                dataset, self.category, split=self.split, components=self.components
             )
         out = Path(f"{model.category}.shape") if self.out is None else self.out
         model.save(out)
@@ -66,7 +61,7 @@ class ShapeLearn:
 
 @dataclass(frozen=True)
 class ShapeShow:
-    """Describe a shape model; with --out, draw its mean and its first modes."""
+    """Describe a shape model; with --out, draw its mean with the keypoints' ids."""
 
     shape: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SHAPE")]
     """File that `cadalign shape learn` wrote."""

@@ -16,6 +16,7 @@ from cadalign.estimation.symmetry import check_symmetry
 from cadalign.geometry.alignment import extent
 from cadalign.geometry.mesh import Mesh, check_near
 from cadalign.geometry.symmetry import Symmetry
+from cadalign.shapes.parts import check_axis
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -100,7 +101,8 @@ class Model:
         object.__setattr__(self, "bounds", read_only(bounds))
         if self.symmetry is not None:
             check_symmetry(self.symmetry)
-        check_axis(self.up_axis)
+        if self.up_axis is not None:
+            check_axis(self.up_axis, "up_axis")
         self.fit_options()
 
     def fit_options(self) -> FitOptions:
@@ -114,13 +116,6 @@ class Model:
 def is_exact_model(model: object) -> bool:
     """True for a CAD model whose object has its shape, but for the stretch."""
     return isinstance(model, Model) and model.shape_sigma is None
-
-
-def check_axis(axis: object) -> None:
-    """Refuse what is neither an axis nor None."""
-    if axis is not None and axis not in ("x", "y", "z"):
-        fix = "give x, y, z, or None"
-        raise InputError(f"{quote(axis)} is no axis", where="up_axis", fix=fix)
 
 
 def checked_ids(ids: Iterable[Any] | None, count: int) -> tuple[Hashable, ...]:

@@ -34,9 +34,7 @@ from cadalign.errors import InputError
 from cadalign.estimation.problems import whitening_of
 from cadalign.retrieval.models import LibraryModel, ModelTable
 from cadalign.retrieval.options import RetrievalOptions
-from cadalign.retrieval.precision import bent
-from cadalign.retrieval.ranking import CandidateSet, Observed, Ranking, shared_keypoints
-from cadalign.solvers.constants import UNKNOWNS
+from cadalign.retrieval.ranking import CandidateSet, Observed, Ranking, bent, shared_keypoints
 from cadalign.solvers.projection import ray_derivatives
 
 SAME_SHAPE = 0.01
@@ -68,7 +66,8 @@ def none_probability(
     for place, row in enumerate(candidates.models[chosen].tolist()):
         alike.setdefault((table.keys[row][0], len(shared[place][1])), []).append(place)
     extent = float(np.linalg.norm(np.ptp(observed.points_2d, axis=0)))
-    weights = np.exp(-0.5 * _STEPS**2)
+    shares = np.exp(-0.5 * _STEPS**2)
+    shares = np.log(shares / shares.sum())[:, None]
     factors = np.empty(len(chosen))
     for (name, _), places in alike.items():
         center, spread = deviation_of(table, name)
@@ -77,8 +76,7 @@ def none_probability(
         points, rows = (np.array([shared[place][k] for place in places]) for k in range(2))
         poses = ranking.poses[places]
         logs = _log_likelihoods(poses, points, rows, observed, covariances)
-        means = np.logaddexp.reduce(logs[1:] + np.log(weights / weights.sum())[:, None], axis=0)
-        factors[places] = means - logs[0]
+        factors[places] = np.logaddexp.reduce(logs[1:] + shares, axis=0) - logs[0]
     relative = ranking.log_likelihoods[:_MOST_LIKELY] - ranking.log_likelihoods[0]
     odds = np.log(options.none_prior) - np.log1p(-options.none_prior)
     odds += np.logaddexp.reduce(relative + factors) - np.logaddexp.reduce(relative)
@@ -110,11 +108,8 @@ def _log_likelihoods(
     u, v = derivatives[:, :, 0], derivatives[:, :, 1]
     jacobian = np.concatenate([a[..., None] * u + b[..., None] * v, c[..., None] * v], axis=2)
     across, down = a * errors[..., 0] + b * errors[..., 1], c * errors[..., 1]
-    stretches = np.zeros((len(rows), UNKNOWNS))
-    stretches[:, 6:] = np.log(poses[:, 13:])
-    prior = np.zeros(UNKNOWNS)
-    prior[6:] = query.prior_weight
-    prior, stretches = prior[free], stretches[:, free]
+    stretches = np.pad(np.log(poses[:, 13:]), ((0, 0), (6, 0)))[:, free]
+    prior = np.repeat([0.0, query.prior_weight], [6, 2])[free]
     transposed = jacobian.swapaxes(2, 3)
     hessian = transposed @ jacobian + np.diag(prior)
     hessian += _RIDGE * np.trace(hessian, axis1=2, axis2=3)[..., None, None] * np.eye(len(free))

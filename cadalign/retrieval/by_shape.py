@@ -11,18 +11,14 @@ object that it stands for:
 - each keypoint of the image that the model lacks, by the probability ``spurious``, and each of the
   model's that the image lacks, by ``missing_prob``.
 
-Keypoints that a model lacks are filled in with those that the category leads to expect. With
-several categories, each has the probability that its shape model gives to the image's keypoints.
-All models are ranked, but those that would reach behind the camera; none is searched for a pose.
+Keypoints that a model lacks are filled in with those that the category leads to expect. All models
+are ranked, but those that would reach behind the camera; none is searched for a pose.
 Matches have the pose of the estimated shape and the stretch that brings the model's keypoints and
-box closest to the estimated ones. An unknown focal length is estimated with the shape of the most
-probable category. The options ``stretch_sigma`` and ``exhaustive`` have no
-effect.
+box closest to the estimated ones.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -31,20 +27,25 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets.models.shapenet import require_category
-from cadalign.errors import DegenerateError, InputError, require_kind
+from cadalign.errors import DegenerateError, InputError, refuse_unused, require_kind
 from cadalign.estimation.align import align
+from cadalign.estimation.estimates import linearised
+from cadalign.estimation.options import FitOptions
+from cadalign.estimation.pack import seen_keypoints
+from cadalign.estimation.prior import prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera, turned_alignment
-from cadalign.io.focal import FocalPrior
+from cadalign.geometry.camera import faced, turned_alignment
+from cadalign.retrieval.kernels import MOST_STRETCH
 from cadalign.retrieval.models import ModelTable
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import CandidateSet, Observed, Ranking
-from cadalign.retrieval.shape_posterior import ShapePosterior, gaussians_of, shape_posterior
 from cadalign.shapes.gaussians import Gaussians, Vectors, log_likelihoods
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import BOX_ROWS
+from cadalign.solvers.marginal.equations import POSE_UNKNOWNS
+from cadalign.solvers.marginal.problem import Seen, coordinates_of
 
 _LEAST_KEYPOINTS = 3
 _FREE_SIZE = 1.0  # standard deviations of what the image leaves open: of the log size,
@@ -53,10 +54,6 @@ _NEGLIGIBLE = 1e-9  # probability of a Gaussian that is left out
 _FLOOR = 1e-4  # least standard deviation of a coordinate, in extents of the shape
 _FLAT = 1e-9  # share of a model's variance along an axis without extent
 _MOST_NEIGHBOURS = 2000  # models among which the nearest ones are looked for
-_INAPPLICABLE = {
-    "method": "optimal",
-    **{name: getattr(RetrievalOptions, name) for name in ("stretch_sigma", "none_prior")},
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,45 +64,26 @@ class _Shapes:
     centres: FloatArray  # (n, 3)
     squares: FloatArray  # (n, 3), variances
     has: BoolArray  # (n, m), which keypoints they have
+    extent: float  # of the mean shape
     deviation: float  # distance from their nearest ones per coordinate
 
 
-def shapes_by_category(
-    shape: object, options: RetrievalOptions, table: ModelTable
-) -> dict[str, ShapeModel]:
-    """The shape model of each category to rank.
-
-    A single one is that of the options' category, if there is one.
+def category_to_rank(shape: ShapeModel, options: RetrievalOptions, table: ModelTable) -> str:
+    """The category whose models a shape model ranks: that of the options, else its own.
 
     Raises
     ------
     InputError
-        If there is none, a category is not in the library, or an option does not apply.
+        If it is not in the library, the shape model has no semantic ids, or an option has no
+        effect.
     """
-    for name, default in _INAPPLICABLE.items():
-        if getattr(options, name) != default:
-            fix = f"leave it at {default!r}, or rank without shape"
-            what = f"{getattr(options, name)!r} does not apply to a ranking by shape"
-            raise InputError(what, where=name, fix=fix)
-    if isinstance(shape, ShapeModel):
-        shape = {options.category or shape.category: shape}
-    if not isinstance(shape, Mapping) or not shape:
-        what = f"expected a cadalign.ShapeModel, or some by category, got {type(shape).__name__}"
-        raise InputError(what, where="shape")
-    found = {}
-    for category, model in shape.items():
-        require_kind(model, ShapeModel, f"shape[{category!r}]")
-        if any(isinstance(label, str) for label in model.ids):
-            what, fix = "its keypoints have names", "learn it from models with semantic ids"
-            raise InputError(what, where=f"shape[{category!r}]", fix=fix)
-        found[require_category(category, table.categories, where="shape")] = model
-    if options.category is None:
-        return found
-    category = require_category(options.category, table.categories, where="category")
-    if category not in found:
-        fix = f"known are {', '.join(sorted(found))}"
-        raise InputError(f"no shape model of {category!r}", where="shape", fix=fix)
-    return {category: found[category]}
+    refuse_unused(options, ("stretch_sigma", "none_prior"), "in a ranking by shape")
+    require_kind(shape, ShapeModel, "shape")
+    if any(isinstance(label, str) for label in shape.ids):
+        what, fix = "its keypoints have names", "learn it from models with semantic ids"
+        raise InputError(what, where="shape", fix=fix)
+    where = "shape" if options.category is None else "category"
+    return require_category(options.category or shape.category, table.categories, where=where)
 
 
 def rank_by_shape(
@@ -113,32 +91,39 @@ def rank_by_shape(
     candidates: CandidateSet,
     observed: Observed,
     options: RetrievalOptions,
-    shapes: Mapping[str, ShapeModel],
+    shape: ShapeModel,
 ) -> Ranking:
-    """Rank a candidate set by the estimated shape; candidates of other categories are left out.
+    """Rank a candidate set of one category by the estimated shape.
 
     Raises
     ------
     InputError
-        If no shape model has 3 of the image's keypoints.
+        If the shape model has less than 3 of the image's keypoints.
     DegenerateError
-        If a shape model cannot be aligned with the keypoints, or no model lies in front of the
+        If the shape model cannot be aligned with the keypoints, or no model lies in front of the
         camera.
     """
-    parts, estimated = [], dict[str, Result]()
-    for category, shape, view, gains in _shown(observed, options, shapes):
-        own = table.rows_of(category)
-        chosen = (candidates.models >= own.start) & (candidates.models < own.stop)
-        if chosen.any():
-            rows, known = np.flatnonzero(chosen), _shapes_of(table, category, shape)
-            models = candidates.models[rows] - own.start
-            turn = observed.facing.lens_from_camera.T
-            given = models, known, view, gains, options, shape, turn
-            logs, poses, kept, estimated[category] = _rank_category(*given)
-            parts.append((rows[kept], logs[kept], poses[kept]))
-    if not parts:
-        raise _no_shape()
-    ranked, logs, poses = map(np.concatenate, zip(*parts, strict=True))
+    query, sigma = observed.query, np.asarray(options.sigma)
+    has = np.isin(query.ids, shape.ids)
+    if has.sum() < _LEAST_KEYPOINTS:
+        what = f"the shape model has less than {_LEAST_KEYPOINTS} of the keypoints"
+        raise InputError(what, where="ids", fix="check them, or rank without shape")
+    view = View(
+        observed.camera,
+        observed.points_2d[has],
+        ids=query.ids[has].tolist(),
+        sigma=sigma[observed.order][has] if sigma.ndim else options.sigma,
+    )
+    loss: dict[str, Any] = {"loss": options.loss, "loss_scale": options.loss_scale}
+    result = align(shape, view, **loss)
+    likely, log_evidence = shape_posterior(result, view, **loss)
+    category, _ = table.keys[int(candidates.models[0])]
+    known = _shapes_of(table, category, shape)
+    models = candidates.models - table.rows_of(category).start
+    turn = observed.facing.lens_from_camera.T
+    logs, poses, kept = _rank_models(models, known, result, likely, options, turn)
+    logs += log_evidence + float(query.gains[has].sum()) - np.logaddexp.reduce(logs)
+    ranked, logs, poses = np.flatnonzero(kept), logs[kept], poses[kept]
     if not len(logs):
         fix = "check the keypoints, their semantic ids and the camera"
         what = "no model has all keypoints in front of the camera"
@@ -146,73 +131,21 @@ def rank_by_shape(
     order = np.argsort(-logs, kind="stable")
     weights = np.exp(logs[order] - logs.max())
     scores = weights / weights.sum()
-    return Ranking(ranked[order], poses[order], logs[order], scores, 0, estimated)
+    return Ranking(ranked[order], poses[order], logs[order], scores, result)
 
 
-def camera_by_shape(
-    observed: Observed,
-    options: RetrievalOptions,
-    shapes: Mapping[str, ShapeModel],
-    prior: FocalPrior | None,
-) -> Camera:
-    """The image's camera at the focal length that the most probable category's shape gives.
-
-    Raises
-    ------
-    InputError
-        If no shape model has 3 of the image's keypoints.
-    DegenerateError
-        If the keypoints do not determine the focal length.
-    """
-    found: list[tuple[float, Camera]] = []
-    unknown = replace(observed.camera, focal_known=False)
-    loss: dict[str, Any] = {"loss": options.loss, "loss_scale": options.loss_scale}
-    for _, shape, view, gains in _shown(observed, options, shapes):
-        view = replace(view, camera=unknown)
-        free = align(shape, view, focal="estimate", focal_prior=prior, **loss)
-        view = replace(view, camera=free.camera)
-        posterior = shape_posterior(align(shape, view, **loss), view, **loss)
-        found.append((posterior.log_evidence + gains, free.camera))
-    if not found:
-        raise _no_shape()
-    return max(found, key=lambda each: each[0])[1]
-
-
-def _no_shape() -> InputError:
-    what = f"no shape model has {_LEAST_KEYPOINTS} of the keypoints"
-    return InputError(what, where="ids", fix="check them, or rank without shape")
-
-
-def _shown(
-    observed: Observed, options: RetrievalOptions, shapes: Mapping[str, ShapeModel]
-) -> Iterator[tuple[str, ShapeModel, View, float]]:
-    """Categories and shape models with 3 of the image's keypoints, these, and their gains."""
-    sigma, query = options.sigma, observed.query
-    assert sigma is not None
-    for category, shape in sorted(shapes.items()):
-        has = np.isin(query.ids, shape.ids)
-        if has.sum() >= _LEAST_KEYPOINTS:
-            own = np.asarray(sigma)[observed.order][has] if np.ndim(sigma) else sigma
-            ids, points_2d = query.ids[has].tolist(), observed.points_2d[has]
-            view = View(observed.camera, points_2d, ids=ids, sigma=own)
-            yield category, shape, view, float(query.gains[has].sum())
-
-
-def _rank_category(
+def _rank_models(
     models: IntArray,
     known: _Shapes,
-    view: View,
-    gains: float,
+    result: Result,
+    likely: Gaussians,
     options: RetrievalOptions,
-    shape: ShapeModel,
     turn: FloatArray,
-) -> tuple[FloatArray, FloatArray, BoolArray, Result]:
-    """Log probabilities (c,) of models, their poses (c, 15), which are ahead, and the estimate.
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Log probabilities (c,) of a category's models, their poses (c, 15), and which are ahead.
 
     The ``turn`` (3, 3) leads from the camera's frame to that of the poses.
     """
-    result = align(shape, view, loss=options.loss, loss_scale=options.loss_scale)
-    posterior = shape_posterior(result, view, loss=options.loss, loss_scale=options.loss_scale)
     estimate = np.concatenate([result.points_3d, result.bounds])
     weights = _weights(len(estimate))
     aim = weights @ estimate
@@ -221,11 +154,10 @@ def _rank_category(
     placed = centred * _scales(squares, products, "")[:, None] + aim
     deviation = known.deviation
     if options.shape_sigma > 0:
-        deviation = options.shape_sigma * _extent(shape)
+        deviation = options.shape_sigma * known.extent
     vectors = Vectors(placed.reshape(len(models), -1), np.ones(len(models)))
-    logs = log_likelihoods(vectors, _widened(posterior, estimate, deviation))
-    shown = set(view.keypoint_ids)
-    seen = np.array([label in shown for label in shape.ids])
+    logs = log_likelihoods(vectors, _widened(likely, estimate, deviation))
+    seen = np.array([label in result.views[0].ids for label in result.ids])
     has = known.has[models]
     logs = logs + (~has[:, seen]).sum(axis=1) * np.log(options.spurious)
     logs += has[:, ~seen].sum(axis=1) * np.log(options.missing_prob)
@@ -233,23 +165,20 @@ def _rank_category(
     axes, centres = options.fitting.stretched_axes, known.centres[models]
     scales = _scales(squares, products, axes)
     pose = turned_alignment(result.alignment, turn)
-    poses = _poses(pose, scales, aim - scales * centres, axes, options.max_stretch)
-    # Models share the probability of their category.
-    logs += posterior.log_evidence + gains - np.logaddexp.reduce(logs)
+    poses = _poses(pose, scales, aim - scales * centres, axes)
     across = poses[:, 6:9] * poses[:, 12:]  # the last row of the linear part
     depths = np.einsum("nka,na->nk", centred[:, :-BOX_ROWS], across).min(axis=1)
     ahead = np.asarray(depths + (centres * across).sum(axis=1) + poses[:, 11] > 0)
-    return logs, poses, ahead, result
+    return logs, poses, ahead
 
 
-def _widened(posterior: ShapePosterior, estimate: FloatArray, deviation: float) -> Gaussians:
+def _widened(shapes: Gaussians, estimate: FloatArray, deviation: float) -> Gaussians:
     """The distribution of what similar models have in place of the object's shape."""
     centred = estimate - estimate.mean(axis=0)
     extent = float(np.linalg.norm(np.ptp(estimate, axis=0)))
     size = _FREE_SIZE * centred.ravel()
     place = _FREE_PLACE * extent * np.tile(np.eye(3), len(estimate))
     widening = np.outer(size, size) + place.T @ place + deviation**2 * np.eye(len(size))
-    shapes = posterior.shapes
     kept = shapes.weights > _NEGLIGIBLE
     return Gaussians(shapes.weights[kept], shapes.means[kept], shapes.covariances[kept] + widening)
 
@@ -279,13 +208,11 @@ def _scales(squares: FloatArray, products: FloatArray, free: str) -> FloatArray:
     return scales
 
 
-def _poses(
-    pose: Alignment, scales: FloatArray, shifts: FloatArray, free: str, max_stretch: float
-) -> FloatArray:
+def _poses(pose: Alignment, scales: FloatArray, shifts: FloatArray, free: str) -> FloatArray:
     """Packed poses (n, 15) of scaled and shifted models, the scale of an axis not free being 1."""
     held = next(axis for axis, name in enumerate("xyz") if name not in free)
     size = scales[:, [held]]
-    stretch = np.clip(scales / size, 1 / max_stretch, max_stretch)
+    stretch = np.clip(scales / size, 1 / MOST_STRETCH, MOST_STRETCH)
     # The image stays the same if everything is scaled about the camera centre.
     translation = (pose.translation + (shifts * pose.scale) @ pose.rotation.T) / size
     turned = np.broadcast_to(pose.rotation.ravel(), (len(stretch), 9))
@@ -300,12 +227,14 @@ def _shapes_of(table: ModelTable, category: str, shape: ShapeModel) -> _Shapes:
     stacked[:, rows] = points[:, own]
     stacked[:, -BOX_ROWS:] = table.bounds[table.rows_of(category)]
     has = ~np.isnan(stacked[:, :-BOX_ROWS, 0])
-    prior = gaussians_of(shape).widened(_FLOOR * _extent(shape))
+    extent = float(np.linalg.norm(np.ptp(shape.mean, axis=0)))
+    prior = gaussians_of(shape).widened(_FLOOR * extent)
     flat = _completed(stacked.reshape(len(stacked), -1), prior)
     weights, full = _weights(stacked.shape[1]), flat.reshape(stacked.shape)
     centres = weights @ full
     centred = full - centres[:, None]
-    return _Shapes(centred, centres, weights @ centred**2, has, _deviation(flat, prior))
+    squares = weights @ centred**2
+    return _Shapes(centred, centres, squares, has, extent, _deviation(flat, prior))
 
 
 def _completed(values: FloatArray, prior: Gaussians) -> FloatArray:
@@ -337,5 +266,57 @@ def _deviation(values: FloatArray, prior: Gaussians) -> float:
     return max(float(np.sqrt(np.median(nearest) / values.shape[1])), floor)
 
 
-def _extent(shape: ShapeModel) -> float:
-    return float(np.linalg.norm(np.ptp(shape.mean, axis=0)))
+def shape_posterior(
+    result: Result, view: View, *, loss: str = "linear", loss_scale: float = 2.0
+) -> tuple[Gaussians, float]:
+    """Posterior of the shape whose alignment with the inliers of one view is ``result``.
+
+    It is a mixture over stacked rows: x, y, z of each keypoint, then of the box's corners. The
+    logarithm of the evidence is up to a constant. Depths and directions are not used; the ``loss``
+    weights keypoints by their residuals.
+
+    The reprojection errors are linear in shape and pose about the estimate. Whitened and projected
+    to what no change of the pose explains, they read ``A x = b + noise`` of unit covariance, with
+    the stacked rows x of the shape: each Gaussian of the category is conditioned on that in closed
+    form, and its weight grows with the probability that it gave to b.
+    """
+    assert isinstance(result.model, ShapeModel)
+    camera, rows_of = faced(view.camera, view.pixels), prior_of(result.model).rows_of
+    options = FitOptions(loss=loss, loss_scale=loss_scale)
+    names = rows_of(view.keypoint_ids, "view.ids")
+    seen = seen_keypoints(replace(view, camera=camera), view.pixels, names, options)
+    kept = result.inliers
+    seen = Seen(seen.points[kept], seen.rays[kept], seen.whitening[kept], *seen[3:])
+    pose = turned_alignment(result.alignment, camera.lens_from_camera.T)
+    estimate, columns = np.concatenate([result.points_3d, result.bounds]), coordinates_of(seen)
+    errors, rows, by_pose = linearised(estimate[seen.points], pose, seen)
+    full, triangle = np.linalg.qr(by_pose, mode="complete")
+    rest = full[:, POSE_UNKNOWNS:].T
+    rows, right = rest @ rows, rest @ (rows @ estimate[seen.points].ravel() - errors)
+    logs, means, covariances = [], [], []
+    for weight, mean, covariance in zip(*gaussians_of(result.model), strict=True):
+        across = rows @ covariance[columns]
+        spread = across[:, columns] @ rows.T + np.eye(len(right))
+        gap = right - rows @ mean[columns]
+        gain = np.linalg.solve(spread, across).T
+        square = float(gap @ np.linalg.solve(spread, gap))
+        logs.append(np.log(weight) - 0.5 * (square + np.linalg.slogdet(spread)[1]))
+        means.append(mean + gain @ gap)
+        covariances.append(covariance - gain @ across)
+    total = float(np.logaddexp.reduce(logs))
+    shapes = Gaussians(np.exp(np.array(logs) - total), np.array(means), np.array(covariances))
+    # The estimate's objective has the log determinant of the shape, linear here: a slope by the
+    # keypoints, which moves the means. The box of an estimate is widened to hold what is seen.
+    keypoints = result.points_3d.size
+    gap = (estimate.ravel() - shapes.means[result.component])[:keypoints]
+    own = shapes.covariances[result.component][:keypoints, :keypoints]
+    slope = np.linalg.pinv(own, hermitian=True) @ gap
+    shifts = shapes.covariances[:, :, :keypoints] @ slope
+    moved = Gaussians(shapes.weights, shapes.means + shifts, shapes.covariances)
+    pose_volume = float(np.log(np.abs(triangle.diagonal())).sum())
+    return moved, total - pose_volume
+
+
+def gaussians_of(model: ShapeModel) -> Gaussians:
+    weights, means, covariances = model.gaussians
+    return Gaussians(weights, means.reshape(len(means), -1), covariances)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import kernel
+from cadalign.compile import inlined, kernel
 from cadalign.solvers.alignment import (
     Objective,
     evaluate_alignment,
@@ -20,7 +20,7 @@ from cadalign.solvers.alignment import (
 )
 from cadalign.solvers.constants import OK, POSE_SIZE, UNKNOWNS, ScalePrior
 from cadalign.solvers.evidence import KeypointEvidence, take_keypoints
-from cadalign.solvers.linalg import cholesky
+from cadalign.solvers.linalg import cholesky, mirror_upper
 from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS
 from cadalign.solvers.search import refine
@@ -29,6 +29,8 @@ from cadalign.solvers.unknowns import uncenter
 
 LEAST_SHARED = 4
 """Least number of shared keypoints that determine an alignment."""
+MOST_STRETCH = 4.0
+"""Largest stretch of a model; its inverse is the least."""
 _BOUNDED_FROM = 6  # a general linear camera passes through fewer points exactly
 _PROBE_ITERATIONS = 4
 _GRID_ROTATIONS = 48
@@ -38,9 +40,8 @@ _HOPELESS = 2.0
 _HOPELESS_EXCESS = 20.0
 _SAME_CHORD = 1e-3
 # A start is also given up if its linearised cost, from which the quadratic model's decrease is
-# subtracted so many times, exceeds the ceiling by this factor. Among 39,000 candidates of four
-# queries 5 below the ceiling lost likelihood by that, 2e-7 of the best one's at most; with the
-# factor 1 it was 26, and 2e-3.
+# subtracted so many times, exceeds the ceiling by this factor. What candidates below the ceiling
+# lose by that is 2e-7 of the best likelihood at most.
 _OPTIMISM = 2.0
 _OUT_OF_REACH = 5.0
 
@@ -55,7 +56,6 @@ class Query(NamedTuple):
     loss_scale: float
     prior_weight: float
     free: FloatArray  # (8,)
-    max_stretch: float  # its inverse is the smallest scale
     gains: FloatArray  # (n,), in log-likelihood, of a candidate that shares it without error
 
 
@@ -123,7 +123,7 @@ def search_all(
             shared.points[i] -= mean
         objective = Objective(query.free, shared, ScalePrior(query.prior_weight, 0.0))
         effort = subsets, refined, iterations
-        costs[m] = _search(objective, query.max_stretch, ceilings[m], effort, poses[m])
+        costs[m] = _search(objective, ceilings[m], effort, poses[m])
         uncenter(poses[m], mean, 1.0)
     return poses, costs
 
@@ -155,7 +155,6 @@ def _gather(
 @kernel
 def _search(
     objective: Objective,
-    max_stretch: float,
     ceiling: float,
     effort: tuple[int, int, int],
     pose: FloatArray,
@@ -181,13 +180,11 @@ def _search(
         costs[best] = np.inf
         if out_of_reach:
             continue
-        square = 0.0
-        for i in range(9):
-            square += (pose[i] - probed[best, i]) ** 2
+        square = ((pose[:9] - probed[best, :9]) ** 2).sum()
         if least < np.inf and square < _SAME_CHORD * _SAME_CHORD:
             continue
         cost, _, _ = refine(objective, iterations, probed[best])
-        cost = _within_limits(objective, max_stretch, iterations, probed[best], cost)
+        cost = _within_limits(objective, iterations, probed[best], cost)
         if cost < least:
             least = cost
             pose[:] = probed[best]
@@ -207,15 +204,13 @@ def _linearised_cost(objective: Objective, pose: FloatArray, cost: float) -> flo
 
 
 @kernel
-def _within_limits(
-    objective: Objective, max_stretch: float, iterations: int, pose: FloatArray, cost: float
-) -> float:
+def _within_limits(objective: Objective, iterations: int, pose: FloatArray, cost: float) -> float:
     """Clamp scales to the limits and refine the other unknowns; returns the cost."""
     free = objective.free.copy()
     for _ in range(2):
         beyond = False
         for j in range(2):
-            held = min(max(pose[13 + j], 1.0 / max_stretch), max_stretch)
+            held = min(max(pose[13 + j], 1.0 / MOST_STRETCH), MOST_STRETCH)
             if held != pose[13 + j]:
                 pose[13 + j] = held
                 free[6 + j] = 0.0
@@ -238,10 +233,9 @@ def _propose(objective: Objective, subsets: int, starts: FloatArray) -> int:
     # Other starts are for coplanar points, and for fixed scales.
     if count == 0 or free[6] == 0.0 or free[7] == 0.0:
         count += rotation_starts(points, rays, starts[count : count + _GRID_ROTATIONS])
-    for k in range(count):
-        for j in range(2):
-            if free[6 + j] == 0.0:
-                starts[k, 13 + j] = 1.0
+    for j in range(2):
+        if free[6 + j] == 0.0:
+            starts[:count, 13 + j] = 1.0
     return count
 
 
@@ -319,60 +313,60 @@ def error_bound(points: FloatArray, seen: IntArray, rays: FloatArray, weights: F
     return best
 
 
+@inlined
+def _whiten(factor: FloatArray, row: FloatArray) -> float:
+    """Divide the first 4 of a row by a lower triangle, in place; returns their squared length."""
+    square = 0.0
+    for j in range(4):
+        for k in range(j):
+            row[j] -= factor[j, k] * row[k]
+        row[j] /= factor[j, j]
+        square += row[j] * row[j]
+    return square
+
+
 @kernel
 def _depth_variances(
     points: FloatArray, seen: IntArray, rays: FloatArray, multipliers: FloatArray
 ) -> FloatArray:
     """Compute q_i of `error_bound`, (n,); the first is 0 if S is singular to rounding."""
-    n = seen.shape[0]
-    mean = np.zeros(5)
-    total = 0.0
+    n, total = seen.shape[0], multipliers.sum()
+    rows = np.ones((n, 6))  # 1, x, y, z, u, v, the latter five about their means
+    mean = np.zeros(6)
     for i in range(n):
-        w = multipliers[i]
-        total += w
         for j in range(3):
-            mean[j] += w * points[seen[i], j]
+            rows[i, 1 + j] = points[seen[i], j]
         for j in range(2):
-            mean[3 + j] += w * rays[seen[i], j]
-    for j in range(5):
-        mean[j] /= total
+            rows[i, 4 + j] = rays[seen[i], j]
+        for j in range(1, 6):
+            mean[j] += multipliers[i] * rows[i, j] / total
+    rows -= mean
     p = np.zeros((4, 4))
-    white = np.empty((n, 4))
-    spread = np.zeros(n)
     for i in range(n):
-        white[i, 0] = 1.0
-        for j in range(3):
-            white[i, 1 + j] = points[seen[i], j] - mean[j]
         for j in range(4):
-            scaled = multipliers[i] * white[i, j]
+            scaled = multipliers[i] * rows[i, j]
             for k in range(j + 1):
-                p[j, k] += scaled * white[i, k]
+                p[j, k] += scaled * rows[i, k]
+    spread = np.zeros(n)
     if not cholesky(p, 4, _CANCELLATION):
         return spread
     system = np.zeros((4, 4))
     u_matrix = np.zeros((4, 4))
     v_matrix = np.zeros((4, 4))
-    for i in range(n):  # in the basis that whitens a, P is the identity
+    for i in range(n):
+        _whiten(p, rows[i])  # in this basis P is the identity
+        u, v = rows[i, 4], rows[i, 5]
         for j in range(4):
-            value = white[i, j]
-            for k in range(j):
-                value -= p[j, k] * white[i, k]
-            white[i, j] = value / p[j, j]
-        w = multipliers[i]
-        u = rays[seen[i], 0] - mean[3]
-        v = rays[seen[i], 1] - mean[4]
-        for j in range(4):
-            for k in range(j + 1):
-                product = w * white[i, j] * white[i, k]
+            for k in range(j, 4):
+                product = multipliers[i] * rows[i, j] * rows[i, k]
                 u_matrix[j, k] += u * product
                 v_matrix[j, k] += v * product
-                system[j, k] += (u * u + v * v) * product
+                system[k, j] += (u * u + v * v) * product
+    mirror_upper(u_matrix)
+    mirror_upper(v_matrix)
     largest = 0.0
     for j in range(4):
         largest = max(largest, system[j, j])
-        for k in range(j):
-            u_matrix[k, j] = u_matrix[j, k]
-            v_matrix[k, j] = v_matrix[j, k]
     for j in range(4):
         for k in range(j + 1):
             for m in range(4):
@@ -381,12 +375,5 @@ def _depth_variances(
     if not cholesky(system, 4, 0.0):
         return spread
     for i in range(n):
-        square = 0.0
-        for j in range(4):
-            value = white[i, j]
-            for k in range(j):
-                value -= system[j, k] * white[i, k]
-            white[i, j] = value / system[j, j]
-            square += white[i, j] * white[i, j]
-        spread[i] = square
+        spread[i] = _whiten(system, rows[i])
     return spread

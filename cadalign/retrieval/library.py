@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import os
 from bisect import bisect_left
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,30 +16,32 @@ import numpy.typing as npt
 from cadalign.arrays import IntArray
 from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.datasets.detections.image_keypoints import plain_name, some_of
-from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
-from cadalign.errors import DataError, InputError, quote
+from cadalign.datasets.models.model_keypoints import SUFFIX, ModelKeypoint, ModelKeypoints
+from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
-from cadalign.io.files import as_path, checksum
-from cadalign.io.focal import FocalPrior
+from cadalign.io.files import as_path, checksum, listed
+from cadalign.io.kinds import MESH_ENDINGS
 from cadalign.retrieval.absence import none_probability
-from cadalign.retrieval.by_shape import camera_by_shape, rank_by_shape, shapes_by_category
+from cadalign.retrieval.by_shape import category_to_rank, rank_by_shape
 from cadalign.retrieval.match import Match
 from cadalign.retrieval.models import (
     SEAL,
     LibraryModel,
     ModelKey,
     ModelTable,
-    read_annotated,
+    checked_key,
     read_library,
+    table_of,
 )
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import gather_candidates, make_matches, observe, rank
 from cadalign.shapes.model import ShapeModel
 
 logger = logging.getLogger("cadalign")
+_FIX = f"`cadalign annotate PHOTO MODEL` marks keypoints, and writes MODEL{SUFFIX}"
 
 
-class Library:
+class Library(ModelTable):
     """Annotated CAD models to retrieve from: keypoints, bounds and mesh paths.
 
     The models are sorted by category and id, so that results do not depend on their order.
@@ -47,7 +50,7 @@ class Library:
 
     Parameters
     ----------
-    table : ModelTable
+    table : pyarrow.Table
         The models.
 
     Examples
@@ -69,16 +72,13 @@ class Library:
     ('7', [1.0, 1.5, 0.7])
     """
 
-    def __init__(self, table: ModelTable) -> None:
-        self._table = table
-
     @classmethod
     def from_models(cls, models: Iterable[LibraryModel | AnnotatedModel]) -> Library:
         """Make a library; raises InputError if two models have the same category and id.
 
         Models of a data set are read, with the bounds of their meshes.
         """
-        return cls(ModelTable.of(models))
+        return cls(table_of(models))
 
     @classmethod
     def from_dataset(
@@ -86,7 +86,6 @@ class Library:
         dataset: KeypointNet,
         *,
         categories: Iterable[str] | None = None,
-        on_model: Callable[[], object] = lambda: None,
     ) -> Library:
         """Make a library of a data set's annotated models.
 
@@ -99,8 +98,6 @@ class Library:
         dataset : KeypointNet
         categories : iterable of str, optional
             Names or synset ids; by default all.
-        on_model : callable
-            Called after every model, for progress.
 
         Raises
         ------
@@ -109,13 +106,7 @@ class Library:
         DataError
             If there are no models.
         """
-        models = []
-        for model in dataset.subset(categories=categories):
-            found, warning = read_annotated(model)
-            if warning:
-                logger.warning("bounds are the keypoints': %s", warning)
-            models.append(found)
-            on_model()
+        models = list(map(LibraryModel.of_annotated, dataset.subset(categories=categories)))
         if not models:
             raise DataError("the data set has no such models", where=str(dataset.root))
         return cls.from_models(models)
@@ -126,7 +117,6 @@ class Library:
         folder: str | os.PathLike[str],
         *,
         categories: Iterable[str] | None = None,
-        on_model: Callable[[], object] = lambda: None,
     ) -> Library:
         """Make a library of own models: a folder of files ``NAME.keypoints.json`` and meshes.
 
@@ -140,8 +130,6 @@ class Library:
             It, and those below it, are looked through.
         categories : iterable of str, optional
             By default all.
-        on_model : callable
-            Called after every model, for progress.
 
         Raises
         ------
@@ -154,9 +142,8 @@ class Library:
         >>> library = Library.from_folder("chairs")  # doctest: +SKIP
         >>> library.retrieve(points_2d, ["seat", "back"], camera)  # doctest: +SKIP
         """
-        from cadalign.retrieval.own_models import read_own_models
-
-        return cls(read_own_models(as_path(folder), categories=categories, on_model=on_model))
+        own = _read_own_models(as_path(folder), categories)
+        return cls(table_of(*own))
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Library:
@@ -171,42 +158,21 @@ class Library:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the library to a file atomically; raises DataError on failure."""
-        SEAL.write(as_path(path), self._table.payload())
-
-    def __len__(self) -> int:
-        return len(self._table)
+        SEAL.write(as_path(path), self.payload())
 
     def __iter__(self) -> Iterator[LibraryModel]:
-        return (self._table.model(row) for row in range(len(self)))
+        return map(self.model, range(len(self)))
 
     def __getitem__(self, key: ModelKey) -> LibraryModel:
         """Find a model, as ``library["chair", model_id]``; raises InputError if there is none."""
-        if not (isinstance(key, tuple) and len(key) == 2 and all(isinstance(k, str) for k in key)):
-            fix = "give category and id, as library['chair', model_id]; library.keys lists them"
-            raise InputError(f"{quote(key)} names no model", where="library", fix=fix)
-        keys = self._table.keys
-        row = bisect_left(keys, key)
-        if keys[row : row + 1] != [key]:
-            raise InputError(f"no model {key[1]!r} of {key[0]!r}", where="library")
-        return self._table.model(row)
+        category, model_id = checked_key(key, "library")
+        row = bisect_left(self.keys, (category, model_id))
+        if self.keys[row : row + 1] != ((category, model_id),):
+            raise InputError(f"no model {model_id!r} of {category!r}", where="library")
+        return self.model(row)
 
     def __repr__(self) -> str:
         return f"Library({len(self)} models, categories={list(self.categories)})"
-
-    @property
-    def categories(self) -> tuple[str, ...]:
-        """Names of the categories, sorted."""
-        return self._table.categories
-
-    @property
-    def keys(self) -> tuple[ModelKey, ...]:
-        """Category and model id of every model, sorted."""
-        return tuple(self._table.keys)
-
-    @property
-    def names(self) -> Mapping[str, int]:
-        """Semantic ids by the keypoints' names; empty where a data set has no names."""
-        return self._table.names
 
     @property
     def keypoints(self) -> ModelKeypoints:
@@ -219,7 +185,7 @@ class Library:
         return ModelKeypoints(
             tuple(
                 ModelKeypoint(names.get(number, f"keypoint {number}"), (0.0, 0.0, 0.0), number)
-                for number in self._table.all_ids.tolist()
+                for number in self.known_ids().tolist()
             )
         )
 
@@ -239,17 +205,12 @@ class Library:
     @property
     def with_mesh(self) -> int:
         """Number of models that have a mesh."""
-        return len(self) - int(self._table.table["mesh"].null_count)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the models in bytes; an opened library shares it among processes."""
-        return int(self._table.table.nbytes)
+        return len(self) - int(self.table["mesh"].null_count)
 
     @property
     def fingerprint(self) -> str:
         """Hash of the library's content, as text."""
-        return checksum(self._table.payload()).hex()
+        return checksum(self.payload()).hex()
 
     def retrieve(
         self,
@@ -257,8 +218,7 @@ class Library:
         ids: npt.ArrayLike,
         camera: Camera,
         *,
-        shape: ShapeModel | Mapping[str, ShapeModel] | None = None,
-        focal_prior: FocalPrior | None = None,
+        shape: ShapeModel | None = None,
         exclude: Collection[ModelKey] = (),
         workers: int = -1,
         **options: Any,
@@ -280,23 +240,19 @@ class Library:
             differ by category: without ``category`` each model reads them in its own category's
             sense.
         camera : Camera
-            The calibrated camera. Lens distortion is honoured. With ``shape`` it may lack a focal
-            length, which is then estimated: ``match.camera`` has it.
-        shape : ShapeModel or mapping of str to ShapeModel, optional
-            Rank by the shape, or each category's, that these estimate from the image, for objects
-            that no model of the library is, not even stretched: only models of these categories, a
-            single shape model being that of ``category``, if given. See
-            `cadalign.retrieval.by_shape`.
-        focal_prior : FocalPrior, optional
-            Prior on an unknown focal length, with ``shape``.
+            The calibrated camera. Lens distortion is honoured.
+        shape : ShapeModel, optional
+            Rank by the shape that this estimates from the image, for objects that no model of the
+            library is, not even stretched: only models of ``category``, by default that of the
+            shape model. See `cadalign.retrieval.by_shape`.
         exclude : collection of (str, str)
             Category and id of models to leave out; those that the library lacks make no difference.
         workers : int
             Number of threads; -1 for one per core.
         **options
             Fields of `cadalign.retrieval.options.RetrievalOptions`, which describes them: top,
-            category, method, sigma, shape_sigma, loss, loss_scale, stretch, stretch_sigma,
-            max_stretch, missing_prob, spurious, none_prior, exhaustive.
+            category, sigma, shape_sigma, loss, loss_scale, stretch, stretch_sigma, missing_prob,
+            spurious, none_prior.
 
         Returns
         -------
@@ -308,8 +264,7 @@ class Library:
         ------
         InputError
             If the library is empty, shapes don't match, a value is NaN or infinite, a semantic id
-            is unknown or occurs twice, an option is invalid, or the focal length is unknown without
-            ``shape``.
+            is unknown or occurs twice, an option is invalid, or the focal length is unknown.
         DegenerateError
             If no model shares at least 4 keypoints with the image.
         """
@@ -319,27 +274,71 @@ class Library:
             raise InputError(f"unknown option ({error})", where="options") from None
         if (labels := np.asarray(ids)).dtype.kind == "U":
             ids = self.ids_of(labels.ravel().tolist())
-        is_calibrated = not isinstance(camera, Camera) or camera.focal_known
+        if isinstance(camera, Camera) and not camera.focal_known:
+            fix = "estimate it first, as `cadalign fit` does with a learned shape, or give it"
+            raise InputError("the focal length is unknown", where="camera", fix=fix)
         absent = None
         if shape is None:
-            if not is_calibrated:
-                what = "the focal length is unknown, without which no model's pose is searched"
-                fix = "rank by shape=, which estimates it, or give it: camera.with_focal(...)"
-                raise InputError(what, where="camera", fix=fix)
             observed = observe(points_2d, ids, camera, chosen)
-            candidates = gather_candidates(self._table, observed, chosen, exclude, workers)
+            candidates = gather_candidates(self, observed, chosen, exclude, workers)
             ranking = rank(candidates, observed, chosen, workers)
-            absent = none_probability(self._table, candidates, observed, ranking, chosen)
+            absent = none_probability(self, candidates, observed, ranking, chosen)
         else:
-            shapes = shapes_by_category(shape, chosen, self._table)
-            category = next(iter(shapes)) if len(shapes) == 1 else None
+            category = category_to_rank(shape, chosen, self)
             # The deviation of shapes is no noise of the keypoints here.
             plain = replace(chosen, shape_sigma=0.0, category=category)
-            if not is_calibrated:
-                some = camera.with_focal(max(camera.width, camera.height))  # which rays need
-                observed = observe(points_2d, ids, some, plain)
-                camera = camera_by_shape(observed, chosen, shapes, focal_prior)
             observed = observe(points_2d, ids, camera, plain)
-            candidates = gather_candidates(self._table, observed, plain, exclude, workers)
-            ranking = rank_by_shape(self._table, candidates, observed, chosen, shapes)
-        return make_matches(self._table, candidates, observed, ranking, chosen, absent)
+            candidates = gather_candidates(self, observed, plain, exclude, workers)
+            ranking = rank_by_shape(self, candidates, observed, chosen, shape)
+        return make_matches(self, candidates, observed, ranking, chosen, absent)
+
+
+def keypoint_files(folder: Path) -> list[Path]:
+    """The files of keypoints in a folder and in those below it."""
+    return listed(folder, f"**/*{SUFFIX}")
+
+
+def _read_own_models(
+    folder: Path, categories: Iterable[str] | None
+) -> tuple[list[LibraryModel], dict[str, int]]:
+    """A folder's models, and semantic ids by name; raises as `Library.from_folder`."""
+    chosen = None if categories is None else set(categories)
+    files = keypoint_files(folder)
+    files = [path for path in files if chosen is None or path.absolute().parent.name in chosen]
+    if not files:
+        what = "no model with keypoints" + ("" if chosen is None else " of these categories")
+        raise DataError(what, where=str(folder), fix=_FIX)
+    read = [(path, ModelKeypoints.load(path)) for path in files]
+    names = _numbers(read)
+    models = [_model(path, found, names) for path, found in read]
+    meshes = [path for path in listed(folder, "**/*") if path.suffix.lower() in MESH_ENDINGS]
+    used = {model.mesh_path for model in models}
+    unused = [path for path in meshes if path.absolute() not in used]
+    if unused and chosen is None:
+        said = "%d meshes have no keypoints and are left out, the first is %s; %s"
+        logger.warning(said, len(unused), unused[0], _FIX)
+    return models, names
+
+
+def _numbers(read: Sequence[tuple[Path, ModelKeypoints]]) -> dict[str, int]:
+    """Semantic ids by name: those of the files where all keypoints have one, else by the names."""
+    entries = [(path, each) for path, found in read for each in found.keypoints]
+    if any(each.semantic_id is None for _, each in entries):
+        return {name: k for k, name in enumerate(sorted({each.name for _, each in entries}))}
+    names: dict[str, int] = {}
+    first: dict[str, Path] = {}
+    for path, each in entries:
+        number, before = each.semantic_id or 0, first.setdefault(each.name, path)
+        if names.setdefault(each.name, number) != number:
+            what = f"{each.name!r} has semantic_id {number}, and {names[each.name]} in {before}"
+            raise DataError(what, where=str(path), fix="give a name one id, or leave ids out")
+    return names
+
+
+def _model(path: Path, found: ModelKeypoints, names: dict[str, int]) -> LibraryModel:
+    stem, mesh = path.name.removesuffix(SUFFIX), found.model
+    if mesh is None:
+        beside = (path.with_name(stem + suffix) for suffix in MESH_ENDINGS)
+        mesh = next((each for each in beside if each.is_file()), None)
+    ids = np.array([names[name] for name in found.names], dtype=np.int64)
+    return LibraryModel.measured(path.absolute().parent.name, stem, found.xyz, ids, mesh)

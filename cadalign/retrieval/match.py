@@ -1,32 +1,24 @@
-"""Result of a retrieval."""
+"""Result of a retrieval: a match, and the uncertainty of its pose and stretch."""
 
 from __future__ import annotations
 
-import os
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
-import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.errors import InputError
+from cadalign.estimation.assemble import KeypointPosterior
+from cadalign.estimation.options import LOSSES, FitOptions, pixel_information
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import Posterior, ViewResult
-from cadalign.geometry.alignment import Alignment, Box, Uncertainty, deviation_text, uncertainty_of
+from cadalign.estimation.result_parts import FittedKeypoints, Posterior, point_slopes, quickly
+from cadalign.estimation.uncertainty.residuals import loss_slopes
+from cadalign.geometry.alignment import Alignment, Box, Uncertainty, deviation_text
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Mesh
 from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from cadalign.retrieval.models import LibraryModel
-
-
-METHOD = "retrieve"
-"""Method of a match's result."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +27,10 @@ class Match:
 
     category: str
     model_id: str
-    alignment: Alignment
-    rms: float
-    """Root mean square length of the shared keypoints' residuals [px]."""
+    result: Result
+    """The match in the form of every estimate: camera, pose, stretch, the keypoints that model and
+    image share with their residuals, box, and JSON form. Its ``std`` is that of `cadalign.fit` of
+    the keypoints or, in a ranking by shape, that of the estimated shape, in the model's unit."""
     log_likelihood: float
     """Log-likelihood of all keypoints, marked and missing; see `cadalign.retrieval.options`."""
     score: float
@@ -45,18 +38,6 @@ class Match:
     was named) and that all are equally likely a priori: the likelihood over the sum of all models'.
     It is calibrated as far as the assumptions hold: nine in ten matches with the score 0.9 are
     correct."""
-    box: Box
-    """Box of the model in the camera frame."""
-    bounds: FloatArray
-    """Lowest and highest coordinates in the model's frame (2, 3)."""
-    ids: IntArray
-    """Ids of the shared keypoints (n,)."""
-    points_3d: FloatArray
-    """Shared keypoints on the model (n, 3)."""
-    points_2d: FloatArray
-    """Shared keypoints in the image (n, 2) [px]."""
-    residuals: FloatArray
-    """Projected minus observed (n, 2) [px]."""
     missing_ids: tuple[int, ...]
     """Ids of the image's keypoints that the model lacks."""
     mesh_path: Path | None
@@ -64,33 +45,31 @@ class Match:
     """Probability that the object is none of the library's models, not even stretched: the same in
     all matches of an image. See `cadalign.retrieval.absence`. None in a ranking by shape, which
     takes the object for none of them."""
-    camera: Camera | None = field(default=None, repr=False)
-    """The camera of the image."""
-    posterior: Posterior = field(default_factory=Posterior, repr=False)
-    """The uncertainty of the pose and stretch, if this is the model; see `result`."""
 
-    @classmethod
-    def of(cls, model: LibraryModel, alignment: Alignment, **fit: Any) -> Match:
-        """A match of a library's model, with the other fields but box and bounds."""
-        return cls(
-            category=model.category,
-            model_id=model.model_id,
-            alignment=alignment,
-            box=Box.from_model(model.bounds, alignment),
-            bounds=model.bounds,
-            mesh_path=model.mesh_path,
-            **fit,
-        )
+    @property
+    def alignment(self) -> Alignment:
+        """Pose and stretch of the model."""
+        return self.result.alignment
+
+    @property
+    def box(self) -> Box:
+        """Box of the model in the camera frame."""
+        return self.result.box
+
+    @property
+    def rms(self) -> float:
+        """Root mean square length of the shared keypoints' residuals [px]."""
+        return self.result.rms
+
+    @property
+    def std(self) -> Uncertainty | None:
+        """Standard deviations of pose and stretch, if this is the model."""
+        return self.result.std
 
     @property
     def shared(self) -> int:
         """Number of keypoints that model and image share."""
-        return len(self.ids)
-
-    @property
-    def observed(self) -> int:
-        """Number of keypoints in the image."""
-        return self.shared + len(self.missing_ids)
+        return len(self.result.ids)
 
     def __repr__(self) -> str:
         stretch = ", ".join(f"{value:.3g}" for value in self.alignment.scale)
@@ -100,10 +79,9 @@ class Match:
         )
 
     @property
-    def std(self) -> Uncertainty | None:
-        """Standard deviations of pose and stretch; see `result`."""
-        found = self.posterior.covariance
-        return None if found is None else uncertainty_of(found)
+    def shared_text(self) -> str:
+        """The number of shared keypoints of those in the image, as tables show it."""
+        return f"{self.shared}/{self.shared + len(self.missing_ids)}"
 
     @property
     def stretch_texts(self) -> tuple[str, str]:
@@ -112,68 +90,33 @@ class Match:
         _, y, z = map("{:.3f}{}".format, self.alignment.scale, map(deviation_text, std))
         return y, z
 
-    @property
-    def result(self) -> Result:
-        """The match in the form of every estimate: its pose, residuals, box, and JSON form.
-
-        Its ``std`` is that of `cadalign.fit` of the keypoints or, in a ranking by shape, that of
-        the estimated shape, in the model's unit. A match by OpenCV's EPnP has none.
-
-        Raises
-        ------
-        InputError
-            If the match has no camera.
-        """
-        if self.camera is None:
-            raise InputError("the match has no camera", where="camera", fix="retrieve it again")
-        ids, own = tuple(self.ids.tolist()), self.posterior
-        inliers = np.ones(self.shared, dtype=bool)
-        seen = (self.camera, self.alignment, ids, self.points_2d, self.residuals, inliers, own)
-        return Result(
-            (ViewResult(*seen),), ids, self.points_3d, METHOD, own, own_bounds=self.bounds
-        )
-
     def observation(self, seen: Observation) -> Observation:
         """The keypoints of an observation that the model has, paired with the model's."""
         given = cast(IntArray, seen.ids)
-        kept = np.flatnonzero(np.isin(given, self.ids))
+        shared = np.array(self.result.ids)
+        kept = np.flatnonzero(np.isin(given, shared))
         ids = given[kept]
         own: dict[str, Any] = {name: getattr(seen, name) for name in ("sigma", "scores", "depths")}
         own = {name: None if each is None else each[kept] for name, each in own.items()}
         return replace(
             seen,
-            points_3d=self.points_3d[np.searchsorted(self.ids, ids)],
+            points_3d=self.result.points_3d[np.searchsorted(shared, ids)],
             points_2d=seen.points_2d[kept],
             ids=ids,
             names=seen.names and tuple(seen.names[row] for row in kept.tolist()),
-            camera=self.camera or seen.camera,
             model=self.mesh_path,
             others=(),
             **own,
         )
 
-    def plot(
-        self,
-        image: npt.ArrayLike | str | os.PathLike[str] | None = None,
-        *,
-        axes: Axes | None = None,
-    ) -> Axes:
-        """Draw photo, model, box and keypoints; see `cadalign.Result.plot`."""
-        return self.result.plot(image, self._mesh(), axes=axes)
-
-    def export(
-        self, path: str | os.PathLike[str], *, format: str | None = None, **of_the_object: Any
-    ) -> Path:
-        """Write the posed and stretched model for another tool; see `cadalign.Result.export`.
+    def mesh(self) -> Mesh | None:
+        """Read the model's mesh; None if it has none.
 
         Examples
         --------
-        >>> library.retrieve(points_2d, ids, camera)[0].export("chair.glb")  # doctest: +SKIP
+        >>> best = library.retrieve(points_2d, ids, camera)[0]  # doctest: +SKIP
+        >>> best.result.export("chair.glb", mesh=best.mesh())  # doctest: +SKIP
         """
-        known = {"mesh": self._mesh(), "name": self.model_id} | of_the_object
-        return self.result.export(path, format=format, **known)
-
-    def _mesh(self) -> Any:
         return None if self.mesh_path is None else load_mesh(self.mesh_path)
 
     def to_dict(self) -> dict[str, Any]:
@@ -184,12 +127,55 @@ class Match:
             **{name: getattr(self, name) for name in names},
             "alignment": self.alignment.to_dict(),
             "box": box,
-            "semantic_ids": self.ids.tolist(),
-            "residuals": self.residuals.tolist(),
+            "semantic_ids": list(self.result.ids),
+            "residuals": self.result.residuals.tolist(),
             "missing_ids": list(self.missing_ids),
             "mesh": None if self.mesh_path is None else str(self.mesh_path),
-            "camera": None if self.camera is None else self.camera.to_dict(),
+            "camera": self.result.camera.to_dict(),
             "none_probability": self.none_probability,
             "std": self.std
             and {name: np.asarray(each).tolist() for name, each in vars(self.std).items()},
         }
+
+
+def posterior_of_keypoints(
+    points_3d: FloatArray,
+    residuals: FloatArray,
+    alignment: Alignment,
+    camera: Camera,
+    options: FitOptions,
+) -> Posterior:
+    """The posterior at the optimum of keypoints (n, 3), with residuals (n, 2) [px].
+
+    As of `cadalign.fit`; without a covariance where a pose is not determined at all.
+    """
+    information = pixel_information(options.sigma, len(points_3d))
+    squares = np.einsum("ni,nij,nj->n", residuals, information, residuals)
+    weights = loss_slopes(squares, LOSSES[options.loss], options.loss_scale)[0]
+    slopes = camera.projection_slopes(alignment.apply(points_3d))
+    slopes = slopes @ point_slopes(points_3d, alignment)
+    total = np.einsum("nki,n,nkl,nlj->ij", slopes, weights, information, slopes)
+    total[range(6, 9), range(6, 9)] += options.prior_weight
+    free, covariance = options.estimated_unknowns, np.zeros((9, 9))
+    try:
+        covariance[np.ix_(free, free)] = np.linalg.inv(total[np.ix_(free, free)])
+    except np.linalg.LinAlgError:
+        return Posterior()
+    inliers = np.ones(len(points_3d), dtype=bool)
+    given = points_3d, residuals, inliers, alignment, camera, options
+    keypoints = FittedKeypoints(*given, fisher_covariance=covariance)
+    known = {"keypoints": keypoints, "diagnosis": None, "fisher_covariance": covariance}
+    return quickly(KeypointPosterior, known)
+
+
+def posterior_by_shape(shape: Result, alignment: Alignment, options: FitOptions) -> Posterior:
+    """The posterior of an estimated shape in the unit of a match, whose held length sets it."""
+    free = options.stretched_axes
+    held = next(axis for axis, name in enumerate("xyz") if name not in free)
+    change, size = np.eye(9), np.linalg.norm(shape.alignment.translation)
+    change[3:6] *= np.linalg.norm(alignment.translation) / size
+    change[3:6, 6 + held] = -alignment.translation
+    change[6:, 6 + held] -= 1.0
+    change[6:] *= np.array([[name in free] for name in "xyz"])
+    covariance = cast(FloatArray, shape.covariance)
+    return Posterior(change @ covariance @ change.T, degrees_of_freedom=shape.degrees_of_freedom)

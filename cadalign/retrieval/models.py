@@ -1,4 +1,4 @@
-"""Models of a library: `LibraryModel`, `ModelTable` of all as an Arrow table, and its file.
+"""Models of a library: `LibraryModel`, the `ModelTable` of all, and its file.
 
 The file is sealed (see `cadalign.io.files`) about an Arrow IPC file of the columns of `SCHEMA`.
 Opening maps it into memory and compares the checksum, which reads the file once: 50,000 models of
@@ -7,9 +7,10 @@ Opening maps it into memory and compares the checksum, which reads the file once
 
 from __future__ import annotations
 
+import logging
 import os
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -25,19 +26,24 @@ import pyarrow.compute as pc
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_only
 from cadalign.datasets import AnnotatedModel, load_mesh
-from cadalign.errors import CadalignError, DataError, InputError
+from cadalign.errors import CadalignError, InputError, quote
 from cadalign.geometry.alignment import extent
-from cadalign.geometry.mesh import Mesh
-from cadalign.io.files import as_path
+from cadalign.io.files import as_path, open_input
 from cadalign.io.sealed import Seal
 
+logger = logging.getLogger("cadalign")
 ModelKey = tuple[str, str]
 """Category name and model id."""
 
 _LARGEST = 1e50  # coordinate
 _NAMES = b"names"  # of the schema's metadata
-_AGAIN = "build it with: cadalign library build"
-SEAL = Seal(magic=b"cadalign library", version=1, noun="library file", fix=_AGAIN)
+_MOST_BYTES = 1 << 40  # mapped, not read; a million models are 0.8 GB
+SEAL = Seal(
+    magic=b"cadalign library",
+    version=1,
+    noun="library file",
+    fix="build it with: cadalign library build",
+)
 SCHEMA = pa.schema(
     [
         ("category", pa.string()),
@@ -83,29 +89,32 @@ class LibraryModel:
 
     @classmethod
     def of_annotated(cls, model: AnnotatedModel, *, with_mesh: bool = True) -> LibraryModel:
-        """Make a library model of a data set's model; the bounds are those of its mesh.
+        """Make a library model of a data set's model, with the bounds of its mesh."""
+        mesh = model.mesh_path if with_mesh else None
+        return cls.measured(
+            model.category, model.model_id, model.keypoints.xyz, model.keypoints.ids, mesh
+        )
 
-        Raises DataError if the mesh cannot be read; see ``with_mesh``.
+    @classmethod
+    def measured(
+        cls, category: str, model_id: str, xyz: FloatArray, ids: IntArray, mesh: Path | None
+    ) -> LibraryModel:
+        """Make a model with the bounds of its mesh.
+
+        Without a mesh, or with a warning where it cannot be read, they are those of the keypoints.
         """
-        xyz, path = model.keypoints.xyz, model.mesh_path if with_mesh else None
-        if path is None:
-            bounds = extent(xyz)
-        else:
-            bounds, path = load_mesh(path).bounds, path.absolute()
-        own = model.category, model.model_id, xyz, model.keypoints.ids, bounds
-        return cls(*own, path)
+        own = category, model_id, xyz, ids
+        try:
+            if mesh is not None:
+                return cls(*own, load_mesh(mesh).bounds, mesh.absolute())
+        except CadalignError as error:
+            logger.warning("bounds are the keypoints': %s", error)
+        return cls(*own, extent(xyz) if len(xyz) else np.zeros((2, 3)))
 
     @property
     def key(self) -> ModelKey:
         """Category and model id."""
         return self.category, self.model_id
-
-    def load_mesh(self) -> Mesh:
-        """Read the mesh; raises DataError if there is none or it cannot be read."""
-        if self.mesh_path is None:
-            where = f"{self.category}, model {self.model_id}"
-            raise DataError("the model has no mesh", where=where)
-        return load_mesh(self.mesh_path)
 
 
 def check_semantic_ids(value: Any, count: int, *, where: str) -> IntArray:
@@ -120,52 +129,66 @@ def check_semantic_ids(value: Any, count: int, *, where: str) -> IntArray:
     return ids.astype(np.int64)
 
 
+def checked_key(key: object, where: str) -> ModelKey:
+    """A model's category and id; InputError for anything else, which would name no model."""
+    match key:
+        case (str(category), str(model_id)) | [str(category), str(model_id)]:
+            return category, model_id
+    what = f"{quote(key)} is not a model's category and id"
+    raise InputError(what, where=where, fix='give pairs, as ("chair", model_id)')
+
+
+def table_of(
+    models: Iterable[LibraryModel | AnnotatedModel], names: Mapping[str, int] | None = None
+) -> pa.Table:
+    """Make the table of models, sorted; ``names`` are semantic ids by the keypoints' names.
+
+    Raises InputError if two models have the same category and id.
+    """
+    key_of = itemgetter("category", "model_id")
+    rows = sorted(map(_row_of, models), key=key_of)
+    for first, second in pairwise(rows):
+        if key_of(first) == key_of(second):
+            what = f"the model {first['model_id']!r} of {first['category']!r} occurs twice"
+            fix = "give every model of a category its own id"
+            raise InputError(what, where="library", fix=fix)
+    table = pa.Table.from_pylist(rows, schema=SCHEMA)
+    stored = msgspec.json.encode(names, order="deterministic")
+    return table if names is None else table.replace_schema_metadata({_NAMES: stored})
+
+
+def _row_of(model: object) -> dict[str, Any]:
+    """Convert a model to a row of the table, its keypoints in the order of their ids."""
+    if isinstance(model, AnnotatedModel):
+        model = LibraryModel.of_annotated(model)
+    if not isinstance(model, LibraryModel):
+        what = f"expected a LibraryModel or a data set's model, got {type(model).__name__}"
+        raise InputError(what, where="models", fix="give the models of `cadalign.datasets`")
+    order = np.argsort(model.ids)
+    return {
+        "category": model.category,
+        "model_id": model.model_id,
+        "mesh": None if model.mesh_path is None else str(model.mesh_path),
+        "bounds": model.bounds.ravel().tolist(),
+        "keypoints": model.xyz[order].tolist(),
+        "semantic_ids": model.ids[order].tolist(),
+    }
+
+
 class ModelTable:
     """All models of a library, sorted by category and id: arrays on an Arrow table of `SCHEMA`."""
 
     def __init__(self, table: pa.Table) -> None:
         self.table = table.combine_chunks()
 
-    @classmethod
-    def of(
-        cls, models: Iterable[LibraryModel | AnnotatedModel], names: Mapping[str, int] | None = None
-    ) -> ModelTable:
-        """Make a table; raises InputError if two models have the same category and id.
-
-        Models of a data set are read. The ``names`` are semantic ids by the keypoints' names.
-        """
-
-        def checked(model: object) -> LibraryModel:
-            if isinstance(model, LibraryModel):
-                return model
-            if isinstance(model, AnnotatedModel):
-                return LibraryModel.of_annotated(model)
-            what = f"expected a LibraryModel or a data set's model, got {type(model).__name__}"
-            raise InputError(what, where="models", fix="give the models of `cadalign.datasets`")
-
-        made = cls.of_rows(row_of(checked(model)) for model in models)
-        return made if names is None else cls(made.table.replace_schema_metadata(_stored(names)))
-
-    @classmethod
-    def of_rows(cls, rows: Iterable[dict[str, Any]]) -> ModelTable:
-        """Make a table of what `row_of` makes of each model; raises as `of`."""
-        key_of = itemgetter("category", "model_id")
-        in_order = sorted(rows, key=key_of)
-        for first, second in pairwise(in_order):
-            if key_of(first) == key_of(second):
-                what = f"the model {first['model_id']!r} of {first['category']!r} occurs twice"
-                fix = "give every model of a category its own id"
-                raise InputError(what, where="library", fix=fix)
-        return cls(pa.Table.from_pylist(in_order, schema=SCHEMA))
-
     def __len__(self) -> int:
         return len(self.table)
 
     @cached_property
-    def keys(self) -> Sequence[ModelKey]:
-        """Category and model id of every model."""
-        names = self.table["category"].to_pylist()
-        return list(zip(names, self.table["model_id"].to_pylist(), strict=True))
+    def keys(self) -> tuple[ModelKey, ...]:
+        """Category and model id of every model, sorted."""
+        columns = (self.table[name].to_pylist() for name in ("category", "model_id"))
+        return tuple(zip(*columns, strict=True))
 
     @cached_property
     def categories(self) -> tuple[str, ...]:
@@ -198,14 +221,9 @@ class ModelTable:
         stored = (self.table.schema.metadata or {}).get(_NAMES, b"{}")
         return msgspec.json.decode(stored, type=dict[str, int])
 
-    @cached_property
-    def all_ids(self) -> IntArray:
-        """Semantic ids of all models, ascending."""
-        return np.unique(self.ids)
-
-    def known_ids(self, category: str) -> IntArray:
-        """Semantic ids of a category's models, ascending."""
-        rows = self.rows_of(category)
+    def known_ids(self, category: str | None = None) -> IntArray:
+        """Semantic ids of a category's models, or of all, ascending."""
+        rows = slice(0, len(self)) if category is None else self.rows_of(category)
         return np.unique(self.ids[self.offsets[rows.start] : self.offsets[rows.stop]])
 
     def rows_of(self, category: str) -> slice:
@@ -246,31 +264,6 @@ class ModelTable:
         return column.chunk(0) if column.num_chunks else pa.array([], type=column.type)
 
 
-def read_annotated(model: AnnotatedModel) -> tuple[LibraryModel, str]:
-    """A data set's model, and why its bounds are the keypoints' where the mesh cannot be used."""
-    try:
-        return LibraryModel.of_annotated(model), ""
-    except CadalignError as error:
-        return LibraryModel.of_annotated(model, with_mesh=False), str(error)
-
-
-def row_of(model: LibraryModel) -> dict[str, Any]:
-    """Convert a model to a row of the table, its keypoints in the order of their ids."""
-    order = np.argsort(model.ids)
-    return {
-        "category": model.category,
-        "model_id": model.model_id,
-        "mesh": None if model.mesh_path is None else str(model.mesh_path),
-        "bounds": model.bounds.ravel().tolist(),
-        "keypoints": model.xyz[order].tolist(),
-        "semantic_ids": model.ids[order].tolist(),
-    }
-
-
-def _stored(names: Mapping[str, int]) -> dict[bytes, bytes]:
-    return {_NAMES: msgspec.json.encode(names, order="deterministic")}
-
-
 def _numbers(array: Any) -> npt.NDArray[Any]:
     """View an Arrow array as a read-only NumPy array, without a copy."""
     numbers = array.to_numpy(zero_copy_only=True)
@@ -285,21 +278,11 @@ def _offsets(array: Any) -> IntArray:
     return np.asarray(offsets)
 
 
-def read_library(path: str | os.PathLike[str]) -> ModelTable:
+def read_library(path: str | os.PathLike[str]) -> pa.Table:
     """Map a library's file into memory and check it."""
-    where = str(path)
-    if as_path(path).is_dir():
-        raise DataError("is a folder, not a library's file", where=where, fix=_AGAIN)
-    try:
-        # Opening a pipe would wait for its other end.
-        if as_path(path).exists() and not Path(path).is_file():
-            raise OSError("not a regular file")
-        with pa.memory_map(where) as source:
-            content = source.read_buffer()
-    except FileNotFoundError:
-        raise DataError("no such library file", where=where, fix=_AGAIN) from None
-    except (OSError, pa.ArrowException) as error:
-        raise DataError(f"cannot be read ({error})", where=where) from None
+    file, where = as_path(path), str(path)
+    with open_input(file, most=_MOST_BYTES), pa.memory_map(where) as source:
+        content = source.read_buffer()
     payload = SEAL.unwrap(content, where)
     try:
         with pa.ipc.open_file(pa.BufferReader(pa.py_buffer(payload))) as reader:
@@ -308,7 +291,7 @@ def read_library(path: str | os.PathLike[str]) -> ModelTable:
         _ = ModelTable(table).names
     except (pa.ArrowException, OSError, ValueError, msgspec.MsgspecError) as error:
         raise SEAL.error(f"is invalid: {str(error)[:200]}", where) from None
-    return ModelTable(table)
+    return table
 
 
 def _check_table(table: pa.Table) -> None:
@@ -316,20 +299,13 @@ def _check_table(table: pa.Table) -> None:
     if not table.schema.equals(SCHEMA):
         raise ValueError("it has other columns")
     table.validate(full=True)
-    for name in table.column_names:
-        column = table[name]
-        while column is not None:
-            if column.null_count and name != "mesh":
-                raise ValueError(f"{name} is missing for a model")
-            is_nested = pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type)
-            column = pc.list_flatten(column) if is_nested else None
-    counts = pc.list_value_length(table["semantic_ids"]).to_numpy()
-    if (pc.list_value_length(table["keypoints"]).to_numpy() != counts).any():
+    if any(table[name].null_count for name in table.column_names if name != "mesh"):
+        raise ValueError("a value is missing")
+    found = ModelTable(table)  # of which a missing number cannot be viewed
+    points, ids = (pc.list_value_length(table[name]) for name in ("keypoints", "semantic_ids"))
+    if len(found.xyz) != len(found.ids) or not points.equals(ids):
         raise ValueError("keypoints and semantic_ids differ in length")
-    for numbers in (pc.list_flatten(pc.list_flatten(table["keypoints"])), table["bounds"]):
-        values = numbers if pa.types.is_floating(numbers.type) else pc.list_flatten(numbers)
-        if not (np.abs(values.to_numpy()) < _LARGEST).all():
-            raise ValueError("a coordinate is NaN, infinite or so large that its powers are")
-    keys = list(zip(table["category"].to_pylist(), table["model_id"].to_pylist(), strict=True))
-    if keys != sorted(set(keys)):
+    if not all((np.abs(each) < _LARGEST).all() for each in (found.xyz, found.bounds)):
+        raise ValueError("a coordinate is NaN, infinite or so large that its powers are")
+    if list(found.keys) != sorted(set(found.keys)):
         raise ValueError("models are not sorted by category and id")

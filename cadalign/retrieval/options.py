@@ -11,7 +11,7 @@ assumptions:
 - An image shows ``spurious`` keypoints, on average, that the object does not have, anywhere in the
   image with equal density: each costs ``log(spurious / area)``.
 - The logarithms of the stretches along y and z are Gaussian about zero, with the standard deviation
-  ``stretch_sigma``, and within ``max_stretch``.
+  ``stretch_sigma``, within 1/4 and 4.
 
 So with N the number of shared keypoints, their errors r_i whitened by their covariances C_i, m the
 number of the model's keypoints that the image lacks and e of the image's that the model lacks::
@@ -32,15 +32,24 @@ import math
 from dataclasses import dataclass
 
 from cadalign.errors import InputError
-from cadalign.estimation.options import AlignmentOptions, FitOptions
-
-METHODS = ("optimal", "epnp")
+from cadalign.estimation.options import FitOptions, Sigma
 
 
 @dataclass(frozen=True)
-class RetrievalOptions(AlignmentOptions):
+class RetrievalOptions:
     """Options of a retrieval."""
 
+    sigma: Sigma | None = 1.0
+    """Standard deviation of the keypoints [px], one per keypoint, or a 2 x 2 covariance per
+    keypoint."""
+    loss: str = "linear"
+    """Loss on the length of a whitened residual: linear (squared), huber or cauchy; the robust ones
+    tolerate outliers."""
+    loss_scale: float = 2.0
+    """Length at which a robust loss begins to bend [sigma]."""
+    stretch: str | None = None
+    """Axes whose scale is estimated: by default both unknown ones; one of them, such as "y"; or
+    "none"."""
     top: int = 10
     """Largest number of matches to return."""
     category: str | None = None
@@ -48,24 +57,16 @@ class RetrievalOptions(AlignmentOptions):
     shape_sigma: float = 0.0
     """Distance of a model's keypoints from the object's, as a share of the extent of the keypoints
     in the image: above 0, say 0.03, for libraries with only similar models."""
-    stretch_sigma: float | None = 0.4
-    """Standard deviation of a Gaussian prior on the logarithm of each stretch; in Python, None is
-    no prior."""
-    max_stretch: float = 4.0
-    """Largest stretch of a model; its inverse is the smallest."""
+    stretch_sigma: float = 0.4
+    """Standard deviation of a Gaussian prior on the logarithm of each stretch."""
     missing_prob: float = 0.5
     """Probability that a keypoint of the object is not marked in the image."""
     spurious: float = 0.01
     """Average number of keypoints in an image that the object does not have."""
     none_prior: float = 0.5
     """Probability, before an image is seen, that the object is none of the library's models."""
-    exhaustive: bool = False
-    """Search all models, also those that the bound on their likelihood excludes."""
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            fix = f"known are {', '.join(METHODS)}"
-            raise InputError(f"unknown method {self.method!r}", where="method", fix=fix)
         if not isinstance(self.top, int) or self.top < 1:
             raise InputError(f"must be a whole number >= 1, not {self.top!r}", where="top")
         if self.sigma is None:
@@ -77,14 +78,9 @@ class RetrievalOptions(AlignmentOptions):
             ("missing_prob", is_share, "between 0 and 1, both excluded"),
             ("spurious", 1e-9 <= self.spurious < math.inf, "> 0"),
             ("none_prior", 0 <= self.none_prior < 1, "between 0 and 1, the latter excluded"),
-            ("max_stretch", 1 <= self.max_stretch <= 1000, "between 1 and 1000"),
         ):
             if not is_valid:
                 raise InputError(f"must be {rule}, not {getattr(self, name)}", where=name)
-        if self.method == "epnp" and (self.loss != "linear" or self.stretch not in (None, "none")):
-            what = "the method 'epnp' supports neither loss nor stretch"
-            fix = "use the method 'optimal', or leave these options at their defaults"
-            raise InputError(what, where="method", fix=fix)
         _ = self.fitting  # checks the options that it shares with a fit
 
     @property
@@ -93,15 +89,6 @@ class RetrievalOptions(AlignmentOptions):
         return FitOptions(
             loss=self.loss,
             loss_scale=self.loss_scale,
-            stretch="none" if self.method == "epnp" else self.stretch,
+            stretch=self.stretch,
             stretch_sigma=self.stretch_sigma,
         )
-
-    @property
-    def log_scale_constant(self) -> float:
-        """The log density of the prior at no stretch; 0 without a prior."""
-        sigma = self.stretch_sigma
-        if sigma is None:
-            return 0.0
-        axes = len(self.fitting.stretched_axes)
-        return -axes * (0.5 * math.log(2 * math.pi) + math.log(sigma))

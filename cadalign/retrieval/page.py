@@ -16,7 +16,6 @@ from cadalign.geometry.camera import Camera
 from cadalign.io.documents import read_json
 from cadalign.io.files import made_folder, remove_earlier, write_json, write_text
 from cadalign.io.images import write_image
-from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
 from cadalign.render import Geometry, Scene, cast_geometry, draw_overlay
 from cadalign.render.drawing.canvas import ByteImage
@@ -83,25 +82,22 @@ def _remove_earlier(folder: Path) -> None:
 
 
 def _files(folder: Path, rank: int) -> tuple[Path, Path, Path]:
-    """A match's overlay, observation and fit."""
-    name = f"match_{rank:02d}"
-    return folder / overlay_name(rank), folder / f"{name}.json", folder / f"{name}_fit" / "fit.json"
-
-
-def overlay_name(rank: int) -> str:
-    """File name of a match's overlay; ranks count from 1."""
-    return f"overlay_{rank:02d}.png"
+    """A match's overlay, observation and fit; ranks count from 1."""
+    names = (f"overlay_{rank:02d}.png", f"match_{rank:02d}.json", f"match_{rank:02d}_fit/fit.json")
+    overlay, observation, fit = (folder / name for name in names)
+    return overlay, observation, fit
 
 
 def draw_match(image: ByteImage, camera: Camera, match: Match) -> ByteImage:
     """Draw a match over its photo: box, keypoints and, where there is a mesh, the model."""
+    (seen,) = match.result.views
     return draw_overlay(
         image,
         camera,
         est_box=match.box,
         est_frame=_cast(match, camera),  # without a mesh, keypoints and box are drawn
-        observed=match.points_2d,
-        reprojected=match.points_2d + match.residuals,
+        observed=seen.points_2d,
+        reprojected=seen.points_2d + seen.residuals,
     )
 
 
@@ -116,7 +112,7 @@ def _card(rank: int, match: Match) -> str:
     values = {
         "stretch": f"y {y}, z {z}",
         "residuals": f"{match.rms:.2f} px",
-        "shared keypoints": f"{match.shared} of {match.observed}",
+        "shared keypoints": match.shared_text,
         "log-likelihood": f"{match.log_likelihood:.1f}",
     }
     rows = [fill("retrieval_value.html", label=key, value=value) for key, value in values.items()]
@@ -125,7 +121,7 @@ def _card(rank: int, match: Match) -> str:
         rank=rank,
         category=escape(match.category),
         model_id=escape(match.model_id),
-        picture=overlay_name(rank),
+        picture=_files(Path(), rank)[0].name,
         score=escape(score_text(match.score)),
         percent=f"{100 * match.score:.1f}",
         values="".join(rows),
@@ -139,10 +135,9 @@ def score_text(score: float) -> str:
 
 def _cast(match: Match, camera: Camera) -> Geometry | None:
     """Cast rays at a match's mesh; None if there is none or, with a warning, it is unreadable."""
-    if match.mesh_path is None:
-        return None
     try:
-        return cast_geometry(Scene(load_mesh(match.mesh_path)), camera, match.alignment)
+        mesh = match.mesh()
+        return None if mesh is None else cast_geometry(Scene(mesh), camera, match.alignment)
     except CadalignError as error:
         logger.warning("no silhouette: %s", error)
         return None

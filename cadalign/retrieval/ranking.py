@@ -14,32 +14,29 @@ the number of threads.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import cast
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, worker_count
+from cadalign.datasets.detections.image_keypoints import some_of
 from cadalign.datasets.models.shapenet import require_category
-from cadalign.errors import DegenerateError, InputError, quote, require_kind
-from cadalign.estimation.fit import fit_batch
-from cadalign.estimation.options import LOSSES, Sigma
+from cadalign.errors import DegenerateError, InputError, require_kind
+from cadalign.estimation.options import LOSSES
 from cadalign.estimation.problems import rays_of, whitening_of
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import Posterior
+from cadalign.estimation.result_parts import ViewResult
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, faced, turned_alignment
-from cadalign.geometry.pixels import perspective
 from cadalign.retrieval.kernels import LEAST_SHARED, Candidates, Query, bound_all, search_all
-from cadalign.retrieval.match import Match
-from cadalign.retrieval.models import ModelKey, ModelTable, check_semantic_ids
+from cadalign.retrieval.match import Match, posterior_by_shape, posterior_of_keypoints
+from cadalign.retrieval.models import ModelKey, ModelTable, check_semantic_ids, checked_key
 from cadalign.retrieval.options import RetrievalOptions
-from cadalign.retrieval.precision import bent, posterior_by_shape, posterior_of_keypoints
-from cadalign.solvers.constants import POSE_SIZE
+from cadalign.solvers.constants import CAUCHY, HUBER, POSE_SIZE
 
 _BOUNDED_AT_ONCE = 1024  # candidates that a thread bounds at a time
 _SEARCHED_AT_ONCE = 32  # and searches
@@ -59,10 +56,6 @@ _EFFORT = (5, 4, 20)
 _ROBUST_EFFORT = (30, 10, 50)
 # For the top list and as many behind it, searched again so that the result is the optimum.
 _FINAL_EFFORT = (35, 12, 200)
-
-Search = Callable[[IntArray, FloatArray], tuple[FloatArray, FloatArray]]
-"""Function from candidates (m,) and the costs (m,) above which poses are of no interest, to their
-packed poses (m, 15) and costs (m,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +89,7 @@ class Ranking:
     poses: FloatArray  # (m, 15), in the frame of the facing camera
     log_likelihoods: FloatArray  # (m,)
     scores: FloatArray  # (m,), probabilities of the models
-    searched: int  # number of candidates that were searched for a pose
-    shapes: Mapping[str, Result] = field(default_factory=dict)  # estimated ones, by category
+    shape: Result | None = None  # the estimated one, by which the models are ranked
 
 
 def observe(
@@ -123,7 +115,6 @@ def observe(
         loss_scale=float(fitting.loss_scale),
         prior_weight=fitting.prior_weight,
         free=fitting.free,
-        max_stretch=float(options.max_stretch),
         gains=density - 0.5 * np.log(np.linalg.det(covariances)) - off,
     )
     return Observed(order, pixels, covariances, camera, facing, query, float(off) * len(ids))
@@ -132,7 +123,7 @@ def observe(
 def _covariances(options: RetrievalOptions, pixels: FloatArray, order: IntArray) -> FloatArray:
     """Sum of the covariances of noise and shape, (n, 2, 2) float [px^2], in the given order."""
     count = len(pixels)
-    sigma = cast("Sigma", options.sigma)  # the options refuse None
+    sigma: Any = options.sigma  # the options refuse None
     if np.ndim(sigma) == 3:
         covariances = as_floats(sigma, name="sigma", shape=(count, 2, 2))[order]
     else:
@@ -145,33 +136,14 @@ def _covariances(options: RetrievalOptions, pixels: FloatArray, order: IntArray)
     return np.asarray(covariances + (options.shape_sigma * extent) ** 2 * np.eye(2))
 
 
-def _chosen_models(
-    table: ModelTable, category: str | None, exclude: Collection[ModelKey]
-) -> IntArray:
-    """Select the rows of the models to compare, in the table's order.
-
-    Raises InputError if there are none, or the category is unknown.
-    """
-    if not len(table):
-        raise InputError("the library is empty", where="library")
-    rows = np.arange(len(table))
-    if category is not None:
-        rows = rows[table.rows_of(require_category(category, table.categories, where="category"))]
-    if exclude:
-        unwanted = {_checked_key(key) for key in exclude}
-        rows = rows[[table.keys[row] not in unwanted for row in rows.tolist()]]
-        if not len(rows):
-            raise InputError("all models are excluded", where="exclude")
-    return rows
-
-
-def _checked_key(key: object) -> ModelKey:
-    """A model's category and id; other things would exclude nothing."""
-    match key:
-        case (str(category), str(model_id)) | [str(category), str(model_id)]:
-            return category, model_id
-    what = f"{quote(key)} is not a model's category and id"
-    raise InputError(what, where="exclude", fix='give pairs, as [("chair", model_id)]')
+def bent(squares: FloatArray, loss: int, bend: float) -> FloatArray:
+    """Loss on squared whitened lengths of any shape, one of `cadalign.solvers.constants`."""
+    if loss == HUBER:
+        linear = 2 * bend * np.sqrt(squares) - bend**2
+        return np.asarray(np.where(squares <= bend**2, squares, linear))
+    if loss == CAUCHY:
+        return np.asarray(bend**2 * np.log1p(squares / bend**2))
+    return squares
 
 
 def gather_candidates(
@@ -182,16 +154,22 @@ def gather_candidates(
     workers: int = -1,
 ) -> CandidateSet:
     """Gather the candidates of a query, without the models to ``exclude``."""
-    threads, query = worker_count(workers), observed.query
-    chosen = _chosen_models(table, options.category, exclude)
-    known = table.all_ids
-    if options.category is not None:
-        known = table.known_ids(table.keys[int(chosen[0])][0])
+    threads, query, category = worker_count(workers), observed.query, options.category
+    if not len(table):
+        raise InputError("the library is empty", where="library")
+    if category is not None:
+        category = require_category(category, table.categories, where="category")
+    chosen = np.arange(len(table))[slice(None) if category is None else table.rows_of(category)]
+    if unwanted := {checked_key(key, "exclude") for key in exclude}:
+        chosen = chosen[[table.keys[row] not in unwanted for row in chosen.tolist()]]
+        if not len(chosen):
+            raise InputError("all models are excluded", where="exclude")
+    known = table.known_ids(category)
     unknown = np.setdiff1d(query.ids, known)
     if len(unknown):
-        where = "the library" if options.category is None else f"the category {options.category!r}"
+        where = "the library" if category is None else f"the category {category!r}"
         what = f"no model of {where} has a keypoint with the semantic id {unknown[0]}"
-        raise InputError(what, where="ids", fix=f"known are {_ranges(known)}")
+        raise InputError(what, where="ids", fix=f"it has {some_of([str(each) for each in known])}")
     spans = np.stack([table.offsets[chosen], table.offsets[chosen + 1]], axis=1)
     candidates = Candidates(table.xyz, table.ids, spans)
 
@@ -211,73 +189,77 @@ def gather_candidates(
     bounds = bent(bounds, query.loss, query.loss_scale)
     counts = spans[:, 1] - spans[:, 0]
     base = gains + observed.spurious + (counts - shared) * np.log(options.missing_prob)
-    base = base + options.log_scale_constant
+    axes = len(options.fitting.stretched_axes)  # the prior's log density at no stretch:
+    base = base - axes * (0.5 * np.log(2 * np.pi) + np.log(options.stretch_sigma))
     kept_keypoints = candidates._replace(spans=spans[kept])
     return CandidateSet(kept_keypoints, chosen[kept], base[kept], bounds[kept])
-
-
-def _ranges(ids: IntArray) -> str:
-    """Format ascending numbers as ranges: 0-2, 5."""
-    runs = np.split(ids, np.flatnonzero(np.diff(ids) > 1) + 1)
-    return ", ".join(
-        str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs if len(run)
-    )
 
 
 def rank(
     candidates: CandidateSet, observed: Observed, options: RetrievalOptions, workers: int
 ) -> Ranking:
     """Rank the models of a candidate set."""
-    found = _SearchState(candidates)
-    if options.method == "epnp":
-        _search_in_order(found, options, partial(_search_unstretched, candidates, observed))
-        return found.ranking()
+    effort = _EFFORT if options.loss == "linear" else _ROBUST_EFFORT
     with ThreadPoolExecutor(worker_count(workers)) as pool:
-
-        def search(
-            effort: tuple[int, int, int], chosen: IntArray, ceilings: FloatArray
-        ) -> tuple[FloatArray, FloatArray]:
-            def piece(start: int) -> tuple[FloatArray, FloatArray]:
-                own = slice(start, start + _SEARCHED_AT_ONCE)
-                known = observed.query, candidates.keypoints
-                return search_all(*known, chosen[own], ceilings[own], *effort)
-
-            parts = list(pool.map(piece, range(0, len(chosen), _SEARCHED_AT_ONCE)))
-            poses, costs = map(np.concatenate, zip(*parts, strict=True))
-            return poses, costs
-
-        effort = _EFFORT if options.loss == "linear" else _ROBUST_EFFORT
-        _search_in_order(found, options, partial(search, effort))
+        found = _SearchState(candidates, observed, pool)
+        found.search_in_order(effort, options.top)
         last = found.ranking().candidates[: 2 * options.top]
-        found.search(last, partial(search, _FINAL_EFFORT), floor=-np.inf)
+        found.search(last, _FINAL_EFFORT, floor=-np.inf)
     return found.ranking()
 
 
 class _SearchState:
     """Best pose of every candidate searched so far."""
 
-    def __init__(self, candidates: CandidateSet) -> None:
-        self.limits = candidates.base - 0.5 * candidates.bounds
-        self.guesses = candidates.base - _GUESS * candidates.bounds
-        self.best = -np.inf
-        self._candidates = candidates
-        self._poses = np.empty((len(self.limits), POSE_SIZE))
-        self._reached = np.full(len(self.limits), -np.inf)
-        self._searched = np.zeros(len(self.limits), dtype=bool)
+    def __init__(
+        self, candidates: CandidateSet, observed: Observed, pool: ThreadPoolExecutor
+    ) -> None:
+        self._candidates, self._query, self._pool = candidates, observed.query, pool
+        self._best = -np.inf
+        self._poses = np.empty((len(candidates.base), POSE_SIZE))
+        self._reached = np.full(len(candidates.base), -np.inf)
 
-    def search(self, chosen: IntArray, search: Search, *, floor: float) -> None:
+    def search(self, chosen: IntArray, effort: tuple[int, int, int], *, floor: float) -> None:
         """Search candidates for poses above a log-likelihood; a known better pose is kept."""
         if not len(chosen):
             return
-        poses, costs = search(chosen, 2.0 * (self._candidates.base[chosen] - floor))
+        ceilings = 2.0 * (self._candidates.base[chosen] - floor)
+
+        def piece(start: int) -> tuple[FloatArray, FloatArray]:
+            own = slice(start, start + _SEARCHED_AT_ONCE)
+            known = self._query, self._candidates.keypoints
+            return search_all(*known, chosen[own], ceilings[own], *effort)
+
+        parts = list(self._pool.map(piece, range(0, len(chosen), _SEARCHED_AT_ONCE)))
+        poses, costs = map(np.concatenate, zip(*parts, strict=True))
         reached = self._candidates.base[chosen] - 0.5 * costs
         better = reached > self._reached[chosen]
         self._poses[chosen[better]] = poses[better]
         self._reached[chosen[better]] = reached[better]
-        self._searched[chosen] = True
-        self.best = max(self.best, float(reached.max()))
+        self._best = max(self._best, float(reached.max()))
 
-    def last_of(self, top: int) -> float:
+    def search_in_order(self, effort: tuple[int, int, int], top: int) -> None:
+        """Search the candidates in the order of their bounds; see the module."""
+        base, bounds = self._candidates.base, self._candidates.bounds
+        limits, guesses = base - 0.5 * bounds, base - _GUESS * bounds
+        order = np.argsort(-limits, kind="stable")
+        done, size = 0, _FIRST_BATCH
+        while done < len(order):
+            batch = order[done : done + size]
+            batch = batch[limits[batch] >= self._best - _NEGLIGIBLE]
+            if not len(batch):
+                break
+            self.search(batch, effort, floor=min(self._best - _NEGLIGIBLE, self._last_of(top)))
+            done += len(batch)
+            size = min(2 * size, _LARGEST_BATCH)
+        rest = order[done:]
+        rest = rest[np.argsort(-guesses[rest], kind="stable")]
+        for start in range(0, min(_TO_FILL, len(rest)), _FILL_BATCH):
+            batch = rest[start : start + _FILL_BATCH]
+            last = self._last_of(top)
+            self.search(batch[limits[batch] >= last], effort, floor=last)
+
+    def _last_of(self, top: int) -> float:
         """Log-likelihood of the last model of the top list; minus infinity if it is not full."""
         best = self._reached[np.isfinite(self._reached)]
         return float(np.partition(best, -top)[-top]) if len(best) >= top else -np.inf
@@ -292,51 +274,7 @@ class _SearchState:
             raise DegenerateError(what, where="points_2d", fix=fix)
         reached = self._reached[order]
         weights = np.exp(reached - reached[0])
-        searched = int(self._searched.sum())
-        return Ranking(order, self._poses[order], reached, weights / weights.sum(), searched)
-
-
-def _search_in_order(found: _SearchState, options: RetrievalOptions, search: Search) -> None:
-    """Search the candidates in the order of their bounds; see the module."""
-    order = np.argsort(-found.limits, kind="stable")
-    done, size = 0, _FIRST_BATCH
-    while done < len(order):
-        batch = order[done : done + size]
-        if not options.exhaustive:
-            batch = batch[found.limits[batch] >= found.best - _NEGLIGIBLE]
-        if not len(batch):
-            break
-        wanted = min(found.best - _NEGLIGIBLE, found.last_of(options.top))
-        found.search(batch, search, floor=-np.inf if options.exhaustive else wanted)
-        done += len(batch)
-        size = min(2 * size, _LARGEST_BATCH)
-    rest = order[done:]
-    rest = rest[np.argsort(-found.guesses[rest], kind="stable")]
-    for start in range(0, min(_TO_FILL, len(rest)), _FILL_BATCH):
-        batch = rest[start : start + _FILL_BATCH]
-        last = found.last_of(options.top)
-        found.search(batch[found.limits[batch] >= last], search, floor=last)
-
-
-def _search_unstretched(
-    candidates: CandidateSet, observed: Observed, chosen: IntArray, _ceilings: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Compute poses and costs by OpenCV's EPnP."""
-    shared = [shared_keypoints(candidates, observed, each) for each in chosen.tolist()]
-    seen = [observed.points_2d[rows] for _, rows in shared]
-    batch = fit_batch([points for points, _ in shared], seen, observed.camera, method="epnp")
-    facing_from_camera = observed.facing.lens_from_camera.T
-    poses, costs = np.zeros((len(chosen), POSE_SIZE)), np.full(len(chosen), np.inf)
-    each = len(observed.query.whitening) > 1
-    for m in np.flatnonzero(batch.solved).tolist():
-        points, rows = shared[m]
-        found = turned_alignment(batch.alignment(m), facing_from_camera)
-        poses[m] = found.packed
-        inside = found.apply(points)
-        across, down = (perspective(inside) - observed.query.rays[rows]).T
-        a, b, c = observed.query.whitening[rows if each else [0]].T
-        costs[m] = ((a * across + b * down) ** 2 + (c * down) ** 2).sum()
-    return poses, costs
+        return Ranking(order, self._poses[order], reached, weights / weights.sum())
 
 
 def shared_keypoints(
@@ -368,30 +306,24 @@ def make_matches(
         model = table.model(int(candidates.models[candidate]))
         found = Alignment.from_packed(ranking.poses[place])
         alignment = turned_alignment(found, observed.facing.lens_from_camera)
-        residuals = observed.camera.project(alignment.apply(points_3d)) - observed.points_2d[rows]
-        if model.category in ranking.shapes:
-            shape = ranking.shapes[model.category]
-            posterior = posterior_by_shape(shape, alignment, options.fitting)
-        elif options.method == "optimal":
-            fitting = replace(options.fitting, sigma=observed.covariances[rows])
-            given = points_3d, residuals, alignment, observed.camera
-            posterior = posterior_of_keypoints(*given, fitting)
+        pixels, camera = observed.points_2d[rows], observed.camera
+        residuals = camera.project(alignment.apply(points_3d)) - pixels
+        if ranking.shape is not None:
+            posterior = posterior_by_shape(ranking.shape, alignment, options.fitting)
         else:
-            posterior = Posterior()
-        match = Match.of(
-            model,
-            alignment,
-            rms=float(np.sqrt((residuals**2).sum(axis=1).mean())),
+            fitting = replace(options.fitting, sigma=observed.covariances[rows])
+            posterior = posterior_of_keypoints(points_3d, residuals, alignment, camera, fitting)
+        ids, inliers = tuple(observed.query.ids[rows].tolist()), np.ones(len(rows), dtype=bool)
+        view = ViewResult(camera, alignment, ids, pixels, residuals, inliers, posterior)
+        match = Match(
+            model.category,
+            model.model_id,
+            Result((view,), ids, points_3d, "retrieve", posterior, own_bounds=model.bounds),
             log_likelihood=float(ranking.log_likelihoods[place]),
             score=float(ranking.scores[place]),
-            ids=observed.query.ids[rows],
-            points_3d=points_3d,
-            points_2d=observed.points_2d[rows],
-            residuals=residuals,
             missing_ids=tuple(np.delete(observed.query.ids, rows).tolist()),
+            mesh_path=model.mesh_path,
             none_probability=none_probability,
-            camera=observed.camera,
-            posterior=posterior,
         )
         matches.append(match)
     return matches

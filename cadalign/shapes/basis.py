@@ -20,6 +20,7 @@ from cadalign.shapes.parts import (
     checked_box,
 )
 
+_ROUNDS = 10  # of pairing keypoints and moving the mirror; 3 suffice as a rule
 _LARGEST_GAP = 0.2  # of a keypoint from its mirror image, over the mean's diagonal
 
 
@@ -36,16 +37,21 @@ def component_of_basis(
     points = as_floats(mean, name="mean", shape=(None, 3))
     if not len(points):
         raise InputError("there are no keypoints", where="mean")
-    directions = _directions(modes, len(points))
-    sigmas = as_floats(deviations, name="deviations", shape=(len(directions),))
-    if (sigmas < 0).any():
-        row = int(np.flatnonzero(sigmas < 0)[0])
-        raise InputError(f"deviations[{row}] is negative ({sigmas[row]:g})", where="deviations")
+    directions = as_floats(modes, name="modes", shape=(None, len(points), 3))
+    sigmas = _not_negative(deviations, "deviations", len(directions))
     rows = np.vstack([points, extent(points) if box is None else checked_box(box, "box")])
     scaled = sigmas[:, None, None] * directions
     extended = [np.vstack([mode, _corners(points, mode, rows[-BOX_ROWS:])]) for mode in scaled]
-    extended += _size_modes(rows, size_sigma)
+    if size_sigma is not None:
+        extended += list(rows * np.diag(_not_negative(size_sigma, "size_sigma", 3))[:, None])
     return ShapeComponent(1.0, rows, orthogonal(np.array(extended), len(rows)), residual_sigma)
+
+
+def _not_negative(given: npt.ArrayLike, where: str, count: int) -> FloatArray:
+    sigmas = as_floats(given, name=where, shape=(count,))
+    if (sigmas < 0).any():
+        raise InputError(f"{sigmas.min():g} is negative", where=where)
+    return sigmas
 
 
 def component_of_covariance(
@@ -69,14 +75,6 @@ def component_of_covariance(
     return ShapeComponent(weight, mean, directions, sigma)
 
 
-def _directions(modes: npt.ArrayLike, count: int) -> FloatArray:
-    """Modes as (K, m, 3), also from (K, 3 m): x, y, z of the first keypoint, and so on."""
-    if np.ndim(modes) == 2:
-        flat = as_floats(modes, name="modes", shape=(None, 3 * count))
-        return flat.reshape(len(flat), count, 3)
-    return as_floats(modes, name="modes", shape=(None, count, 3))
-
-
 def _corners(points: FloatArray, mode: FloatArray, corners: FloatArray) -> FloatArray:
     """Motion of the box's corners: the shift and stretch along each axis that fit the mode best."""
     centre = points.mean(axis=0)
@@ -86,19 +84,6 @@ def _corners(points: FloatArray, mode: FloatArray, corners: FloatArray) -> Float
     return np.asarray(mode.mean(axis=0) + stretch * (corners - centre))
 
 
-def _size_modes(rows: FloatArray, size_sigma: npt.ArrayLike | None) -> list[FloatArray]:
-    if size_sigma is None:
-        return []
-    wide = as_floats(size_sigma, name="size_sigma", shape=(None,) * np.ndim(size_sigma))
-    if wide.shape not in ((), (3,)):
-        raise InputError(f"shape {wide.shape}, expected () or (3,)", where="size_sigma")
-    if (wide < 0).any():
-        raise InputError(f"{wide.tolist()} is negative", where="size_sigma")
-    if wide.ndim == 0:
-        return [rows * wide]
-    return [rows * (wide * np.eye(3)[axis]) for axis in range(3)]
-
-
 def orthogonal(modes: FloatArray, count: int) -> FloatArray:
     """Modes (K, count, 3) of the same covariance that are orthogonal, the longest first."""
     if not len(modes):
@@ -106,9 +91,6 @@ def orthogonal(modes: FloatArray, count: int) -> FloatArray:
     _, lengths, directions = np.linalg.svd(modes.reshape(len(modes), -1), full_matrices=False)
     keep = lengths > 1e-12 * max(float(lengths[0]), 1e-300)
     return np.asarray((lengths[keep, None] * directions[keep]).reshape(-1, count, 3))
-
-
-_ROUNDS = 10  # of pairing keypoints and moving the mirror; 3 suffice as a rule
 
 
 def find_reflection(completed: FloatArray, ids: Sequence[KeypointId], axis: int) -> Reflection:
@@ -141,23 +123,18 @@ def find_reflection(completed: FloatArray, ids: Sequence[KeypointId], axis: int)
     return Reflection(AXES[axis], offset, pairs)
 
 
-def mirrored_rows(
-    rows: FloatArray, ids: Sequence[KeypointId], reflection: Reflection
+def mirrored(
+    rows: FloatArray, ids: Sequence[KeypointId], reflection: Reflection, *, offset: float
 ) -> FloatArray:
-    """Mirror models' keypoints and box corners, (N, m + 2, 3) float, NaN where missing."""
-    mirrored = mirrored_motions(rows, ids, reflection)
-    mirrored[..., AXES.index(reflection.axis)] += 2 * reflection.offset
-    return mirrored
+    """Mirror models' keypoints and box corners, (N, m + 2, 3) float, NaN where missing.
 
-
-def mirrored_motions(
-    motions: FloatArray, ids: Sequence[KeypointId], reflection: Reflection
-) -> FloatArray:
-    """Mirror displacements of models' keypoints and box corners, (N, m + 2, 3) float."""
+    The ``offset`` is the reflection's or, for displacements of keypoints and corners, 0.
+    """
     axis = AXES.index(reflection.axis)
-    exchanged = motions[:, [*reflection.partners(ids), -BOX_ROWS, -1]]
+    exchanged = rows[:, [*reflection.partners(ids), -BOX_ROWS, -1]]
     exchanged[..., axis] = -exchanged[..., axis]
     exchanged[:, [-BOX_ROWS, -1], axis] = exchanged[:, [-1, -BOX_ROWS], axis]
+    exchanged[..., axis] += 2 * offset
     return exchanged
 
 
@@ -169,8 +146,8 @@ def symmetric_component(
     Mean and covariance are the average of the component's own and of the mirrored ones.
     """
     mean, modes = component.mean, component.modes
-    mirrored = mirrored_motions(modes, ids, reflection)
-    of_mean = mirrored_rows(mean[None], ids, reflection)[0]
+    of_modes = mirrored(modes, ids, reflection, offset=0.0)
+    (of_mean,) = mirrored(mean[None], ids, reflection, offset=reflection.offset)
     gaps = np.linalg.norm(of_mean - mean, axis=1)[:-BOX_ROWS]
     worst = int(np.argmax(gaps))
     if gaps[worst] > _LARGEST_GAP * np.linalg.norm(np.ptp(mean[:-BOX_ROWS], axis=0)):
@@ -179,5 +156,5 @@ def symmetric_component(
     return replace(
         component,
         mean=(mean + of_mean) / 2,
-        modes=orthogonal(np.concatenate([modes, mirrored]) / np.sqrt(2), len(mean)),
+        modes=orthogonal(np.concatenate([modes, of_modes]) / np.sqrt(2), len(mean)),
     )

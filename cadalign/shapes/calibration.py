@@ -102,26 +102,19 @@ def calibrate(
 
 
 def _departures(squares: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
-    """Squared departures of coverage by degrees of freedom and factor; see `_squares`."""
+    """Squared departures of coverage from its nominal values, in tolerances; see `_squares`.
+
+    By degrees of freedom and factor, the sum of those of rotations and of keypoints.
+    """
     turned = np.array([each for each, _ in squares])
     moved = np.concatenate([each for _, each in squares], axis=1).T
-    return np.array(
-        [
-            _departure(turned, freedom) + _departure(moved, freedom)
-            for freedom in _DEGREES_OF_FREEDOM
-        ]
-    )
-
-
-def _departure(squares: FloatArray, degrees_of_freedom: float | None) -> FloatArray:
-    """Squared departures of coverage from its nominal values, in tolerances, by factor (F,).
-
-    ``squares`` (N, F) are those of errors along three coordinates, in stated standard deviations.
-    """
-    levels = probability_within(squares, 3, degrees_of_freedom)
-    shares = np.array([(levels <= nominal).mean(axis=0) for nominal in _NOMINAL])
-    gaps = (shares - _NOMINAL[:, None]) / _TOLERANCE[:, None]
-    return np.asarray((gaps**2).sum(axis=0))
+    found = np.zeros((len(_DEGREES_OF_FREEDOM), len(_FACTORS)))
+    for row, freedom in enumerate(_DEGREES_OF_FREEDOM):
+        for errors in (turned, moved):
+            levels = probability_within(errors, 3, freedom)
+            shares = np.array([(levels <= nominal).mean(axis=0) for nominal in _NOMINAL])
+            found[row] += (((shares.T - _NOMINAL) / _TOLERANCE) ** 2).sum(axis=1)
+    return found
 
 
 def _view(
@@ -220,23 +213,14 @@ def _squares(view: _View, mixture: Gaussians, sigma: float) -> tuple[FloatArray,
     return turned.sum(axis=(1, 2)), (gaps * solved).sum(axis=(2, 3))
 
 
-def margins_of(rows: FloatArray) -> FloatArray:
-    """Distances of the faces beyond the outermost keypoints of models (N, m + 2, 3); (N, 2, 3)."""
-    points, boxes = rows[:, :-BOX_ROWS], rows[:, -BOX_ROWS:]
-    reached = np.stack([np.nanmin(points, axis=1), np.nanmax(points, axis=1)], axis=1)
-    return np.asarray(OUTWARD * (boxes - reached))
-
-
 def excesses_of(rows: FloatArray, mixture: Gaussians) -> FloatArray:
     """Distances of linear boxes beyond the true faces of models that were held out, (N, 2, 3)."""
     found = np.full((len(rows), BOX_ROWS, 3), np.nan)
     first = rows[0].size - 3 * BOX_ROWS
     for place, row in enumerate(rows):
         entries = np.flatnonzero(np.isfinite(row.ravel()[:first]))
-        best, linear = -np.inf, np.full(3 * BOX_ROWS, np.nan)
-        for weight, mean, covariance in zip(
-            mixture.weights, mixture.means, mixture.covariances, strict=True
-        ):
+        best = -np.inf
+        for weight, mean, covariance in zip(*mixture, strict=True):
             gap = row.ravel()[entries] - mean[entries]
             own = covariance[entries[:, None], entries]
             solved = np.linalg.solve(own, gap)
@@ -252,7 +236,9 @@ def learn_margins(rows: FloatArray, excesses: FloatArray) -> BoxMargins | None:
     has_box = np.isfinite(rows[:, -BOX_ROWS:]).all(axis=(1, 2))
     if not has_box.any():
         return None
+    points, boxes = rows[has_box, :-BOX_ROWS], rows[has_box, -BOX_ROWS:]
+    reached = np.stack([np.nanmin(points, axis=1), np.nanmax(points, axis=1)], axis=1)
     return BoxMargins(
-        np.median(margins_of(rows[has_box]), axis=0),
+        np.median(OUTWARD * (boxes - reached), axis=0),
         np.maximum(np.percentile(excesses[has_box], _EXCEEDED, axis=0), 0.0),
     )

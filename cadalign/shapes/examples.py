@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import permutations, product
 from pathlib import Path
@@ -26,7 +26,7 @@ from cadalign.shapes.parts import (
 
 logger = logging.getLogger("cadalign")
 
-LEAST_MODELS = 4
+_LEAST_MODELS = 4
 _LEAST_TO_MEASURE = 4  # keypoints; fewer may be near each other
 _LARGEST_RATIO = 20.0  # of models' sizes in one unit; an inch is 25 mm
 _LEAST_TO_TURN = 5  # keypoints; the turn of fewer may be their own
@@ -80,21 +80,18 @@ class Example:
         object.__setattr__(self, "points_3d", read_only(points))
         if self.bounds is not None:
             bounds = checked_box(self.bounds, f"{where}, bounds")
-            _check_reach(points, bounds, f"{where}, bounds")
+            least, greatest = extent(points)
+            gap = np.maximum(least - bounds[1], bounds[0] - greatest).max()
+            if gap > _FARTHEST * np.linalg.norm(bounds[1] - bounds[0]):
+                what = f"no keypoint lies in the box from {bounds[0].tolist()} to "
+                what += str(bounds[1].tolist())
+                fix = "give the box in the keypoints' axes and unit"
+                raise InputError(what, where=f"{where}, bounds", fix=fix)
             object.__setattr__(self, "bounds", read_only(bounds))
         if self.mesh_path is not None:
             path = as_path(self.mesh_path, f"{where}, mesh_path").absolute()
             require_utf8(path)
             object.__setattr__(self, "mesh_path", path)
-
-
-def _check_reach(points: FloatArray, bounds: FloatArray, where: str) -> None:
-    """Refuse a box that is elsewhere than the keypoints, or of another unit."""
-    least, greatest = extent(points)
-    gap = np.maximum(least - bounds[1], bounds[0] - greatest).max()
-    if gap > _FARTHEST * np.linalg.norm(bounds[1] - bounds[0]):
-        what = f"no keypoint lies in the box from {bounds[0].tolist()} to {bounds[1].tolist()}"
-        raise InputError(what, where=where, fix="give the box in the keypoints' axes and unit")
 
 
 class Dataset(Protocol):
@@ -104,9 +101,7 @@ class Dataset(Protocol):
     def __getitem__(self, key: str, /) -> Any: ...
 
 
-def examples_of(
-    models: Sequence[Any], *, meshes: bool, on_progress: Callable[[int, int], object]
-) -> list[Example]:
+def examples_of(models: Sequence[Any], *, meshes: bool) -> list[Example]:
     """Convert `cadalign.datasets.AnnotatedModel`s; their boxes are those of the meshes.
 
     If less than half have a mesh, boxes are left out.
@@ -124,7 +119,6 @@ def examples_of(
         path = None if model.mesh_path is None else model.mesh_path.absolute()
         ids = [int(label) for label in model.keypoints.ids]
         examples.append(Example(model.model_id, ids, model.keypoints.xyz, bounds, path))
-        on_progress(len(examples), len(models))
     return examples
 
 
@@ -140,9 +134,9 @@ def tabulated(
     for number, each in enumerate(examples):
         fix = "`cadalign shape learn` takes the folder of a data set"
         require_kind(each, Example, f"models[{number}]", fix=fix)
-    if len(examples) < LEAST_MODELS:
+    if len(examples) < _LEAST_MODELS:
         what = f"{len(examples)} models are too few to learn a shape from"
-        raise InputError(what, where="models", fix=f"give at least {LEAST_MODELS}")
+        raise InputError(what, where="models", fix=f"give at least {_LEAST_MODELS}")
     _check_names(examples)
     _check_shared(examples)
     _warn_of_units(examples)
@@ -204,15 +198,8 @@ def _warn_of_units(examples: Sequence[Example]) -> None:
     is_large, is_small = sizes > _LARGEST_RATIO * typical, sizes < typical / _LARGEST_RATIO
     rows = np.flatnonzero((sizes > 0) & (is_large | is_small))
     if typical and len(rows):
-        logger.warning(
-            "models of another size than the others: %d of %d, such as %s, whose keypoints reach "
-            "over %.3g instead of %.3g; give all in one unit",
-            len(rows),
-            len(examples),
-            quote(whole[rows[0]].model_id),
-            sizes[rows[0]],
-            typical,
-        )
+        why = f"reach over {sizes[rows[0]]:.3g} instead of {typical:.3g}; give all in one unit"
+        _warn("of another size", len(rows), examples, whole[rows[0]], why)
 
 
 def _warn_of_axes(examples: Sequence[Example], rows: FloatArray) -> None:
@@ -221,9 +208,7 @@ def _warn_of_axes(examples: Sequence[Example], rows: FloatArray) -> None:
     some = np.flatnonzero(count >= _LEAST_TO_TURN)
     if not len(some):
         return
-    middle = np.nanmean(rows[some], axis=1, keepdims=True)
-    radius = np.sqrt(np.nanmean(((rows[some] - middle) ** 2).sum(axis=2), axis=1))
-    normal = (rows[some] - middle) / np.where(radius > 0, radius, 1.0)[:, None, None]
+    normal = np.array([_unit(each) for each in rows[some]])
     is_seen = np.isfinite(normal[..., 0])
     place = np.full(rows.shape[1:], np.nan)
     place[is_seen.any(axis=0)] = np.nanmedian(normal[:, is_seen.any(axis=0)], axis=0)
@@ -236,25 +221,20 @@ def _warn_of_axes(examples: Sequence[Example], rows: FloatArray) -> None:
             turned[int(row)] = _AXES[best].T
     if turned:
         odd, turn = next(iter(turned.items()))
-        logger.warning(
-            "models with other axes than the others: %d of %d, such as %s, whose keypoints fit "
-            "with %s as (x, y, z)%s; give all the same axes",
-            len(turned),
-            len(examples),
-            quote(examples[odd].model_id),
-            _axes_text(turn),
-            ", mirrored" if np.linalg.det(turn) < 0 else "",
-        )
+        axes = [f"{'-' * int(row.sum() < 0)}{'xyz'[int(np.abs(row).argmax())]}" for row in turn]
+        why = f"fit with ({', '.join(axes)}) as (x, y, z)"
+        why += ", mirrored" if np.linalg.det(turn) < 0 else ""
+        why += "; give all the same axes"
+        _warn("with other axes", len(turned), examples, examples[odd], why)
+
+
+def _warn(what: str, count: int, examples: Sequence[Example], odd: Example, why: str) -> None:
+    said = "models %s than the others: %d of %d, such as %s, whose keypoints %s"
+    logger.warning(said, what, count, len(examples), quote(odd.model_id), why)
 
 
 def _unit(points: FloatArray) -> FloatArray:
-    """Points (n, 3) about their mean, with a mean square distance of 1 from it."""
-    centred = points - points.mean(axis=0)
-    radius = np.sqrt((centred**2).sum(axis=1).mean())
+    """Points (n, 3), or NaN, about their mean, with a mean square distance of 1 from it."""
+    centred = points - np.nanmean(points, axis=0)
+    radius = np.sqrt(np.nanmean((centred**2).sum(axis=1)))
     return np.asarray(centred / radius if radius > 0 else centred)
-
-
-def _axes_text(turn: FloatArray) -> str:
-    """Axes after a turn, such as "(x, z, -y)"."""
-    names = [f"{'-' * int(row.sum() < 0)}{'xyz'[int(np.abs(row).argmax())]}" for row in turn]
-    return f"({', '.join(names)})"

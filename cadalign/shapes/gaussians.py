@@ -35,23 +35,11 @@ class Gaussians(NamedTuple):
         return Gaussians(self.weights, self.means, self.covariances + noise)
 
 
-Prior = tuple[FloatArray, float, float]
-"""What covariances are drawn towards (d, d), the number of vectors that it counts as, and the
-standard deviation that no direction falls below."""
-
-
-class Gap(NamedTuple):
-    """Vectors, by their ``rows`` (r, 1), that lack the entries ``missing`` (l,), and no others."""
-
-    rows: IntArray
-    missing: IntArray
-
-
 class Conditional(NamedTuple):
     """A Gaussian of vectors, given the entries that these have.
 
     The lower ``root`` (d, d) of its covariance, and ``offsets`` (N, d) from its mean, 0 for what is
-    missing. Of each of the vectors' `Gap`, the root of the inverse covariance of its l missing
+    missing. Of each of `Vectors.gaps`, the root of the inverse covariance of its l missing
     entries, given the others, and how far below the mean these are expected, (l, r).
     """
 
@@ -73,13 +61,13 @@ class Vectors:
         return ~np.isnan(self.values)
 
     @cached_property
-    def gaps(self) -> tuple[Gap, ...]:
-        """The vectors that lack entries, grouped by which these are."""
+    def gaps(self) -> tuple[tuple[IntArray, IntArray], ...]:
+        """Rows (r, 1) of the vectors that lack the same entries, and these entries (l,)."""
         lacking = np.flatnonzero(~self.has.all(axis=1))
         bits = np.packbits(self.has[lacking], axis=1)  # sorted faster than the entries themselves
         _, first, kind_of = np.unique(bits, axis=0, return_index=True, return_inverse=True)
         return tuple(
-            Gap(lacking[kind_of.ravel() == kind][:, None], np.flatnonzero(~self.has[row]))
+            (lacking[kind_of.ravel() == kind][:, None], np.flatnonzero(~self.has[row]))
             for kind, row in enumerate(lacking[first].tolist())
         )
 
@@ -136,7 +124,7 @@ def learn_mixture(
 
     ``labels`` (N,) are the components that the vectors start in, ``common`` is the Gaussian of all,
     from which the components start. Covariances are drawn towards their mean over the components;
-    for ``strength`` and ``floor`` see `Prior`.
+    for ``strength`` and ``floor`` see `_maximise`.
     """
     count = int(labels.max()) + 1
     model = Gaussians(
@@ -167,7 +155,9 @@ def _conditionals(vectors: Vectors, model: Gaussians) -> list[Conditional]:
             pulled = multiplied(offsets, precision)
             for rows, missing in vectors.gaps:
                 of_gap = _root(precision[missing[:, None], missing])
-                gaps.append((of_gap, _solve(of_gap, pulled[rows, missing].T)))
+                below = np.array(pulled[rows, missing].T, order="C")
+                solve_factor_rows(of_gap, below)
+                gaps.append((of_gap, below))
         found.append(Conditional(root, offsets, tuple(gaps)))
     return found
 
@@ -206,9 +196,13 @@ def _maximise(
     shares: FloatArray,
     model: Gaussians,
     given: Sequence[Conditional],
-    prior: Prior,
+    prior: tuple[FloatArray, float, float],
 ) -> Gaussians:
-    """One round: the mixture that makes the completed vectors most likely."""
+    """One round: the mixture that makes the completed vectors most likely.
+
+    The prior is what covariances are drawn towards (d, d), the number of vectors that it counts
+    as, and the standard deviation that no direction falls below.
+    """
     means, covariances = [], []
     towards, strength, floor = prior
     for number, share in enumerate(shares.T):
@@ -234,13 +228,6 @@ def _root(covariance: FloatArray) -> FloatArray:
     if not factorize(root):
         raise np.linalg.LinAlgError("a covariance is not positive definite")
     return root
-
-
-def _solve(root: FloatArray, right: FloatArray) -> FloatArray:
-    """The quotient by the matrix that has the root."""
-    solution = np.array(right, order="C")
-    solve_factor_rows(root, solution)
-    return solution
 
 
 def _inverse(root: FloatArray) -> FloatArray:

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, require_counts
 from cadalign.errors import InputError
-from cadalign.shapes.basis import component_of_covariance, find_reflection, mirrored_rows
+from cadalign.shapes.basis import component_of_covariance, find_reflection, mirrored
 from cadalign.shapes.calibration import ShapeCalibration, calibrate, excesses_of, learn_margins
 from cadalign.shapes.examples import Example, tabulated
 from cadalign.shapes.gaussians import (
@@ -45,7 +45,6 @@ _MIXTURE_STRENGTH = 10.0
 _MOST_COMPONENTS = 4  # each costs a search of its own when an image is aligned
 _CLUSTER_MODES = 10
 _CLUSTERINGS = 5
-_STEPS = _FOLDS * (len(_STRENGTHS) + 3 + _MOST_COMPONENTS) + 1
 _MODES = (5, 10, 15, 20, 30, 40, 50, 60, 80, 100)
 
 
@@ -132,29 +131,19 @@ class _Trial:
     scores: FloatArray  # (N,), log-likelihood of each model under what was learned without its fold
 
 
-class Choice(NamedTuple):
-    """Choices made by held-out models, and figures learned from them."""
-
-    recipe: _Recipe
-    modes: int | None
-    calibration: ShapeCalibration
-    margins: BoxMargins | None
-
-
 class _CrossValidation:
     """Recipes compared by the likelihood of models that were held out."""
 
-    def __init__(self, models: _Models, on_progress: Callable[[int, int], object]) -> None:
+    def __init__(self, models: _Models) -> None:
         self._models = models
         count = len(models.rows)
         folds = _FOLDS if count >= _LEAST_TO_CHOOSE else count
         self._folds = np.random.default_rng(0).permutation(count) % folds
         self._kept = [models.some(self._folds != fold) for fold in range(folds)]
         self._held_out = [models.some(self._folds == fold) for fold in range(folds)]
-        self._on_progress, self._done = on_progress, 0
 
-    def choose(self, components: int | None) -> Choice:
-        """Choose a recipe and the number of modes, and calibrate what they give.
+    def choose(self, components: int | None) -> tuple[_Recipe, int | None, dict[str, Any]]:
+        """Choose a recipe and the number of modes; the fields that calibrate what they give.
 
         Few models tell nothing but how strongly covariances are to be drawn to equal entries, and
         how far from the truth estimates are.
@@ -162,7 +151,7 @@ class _CrossValidation:
         count = len(self._models.rows)
         is_few, modes = count < _LEAST_TO_CHOOSE, None
         strengths = _STRENGTHS_OF_FEW if is_few else _STRENGTHS
-        best = max((self._try(_Recipe(each)) for each in strengths), key=_total)
+        best = self._best(_Recipe(each) for each in strengths)
         if is_few:
             recipe = replace(best.recipe, components=components or 1)
             if recipe.components > 1:  # but for one model each
@@ -171,13 +160,13 @@ class _CrossValidation:
         else:
             best = self._with_components(self._with_reflection(best), components)
             recipe, modes = best.recipe, self._modes(best)
-        return Choice(recipe, modes, self._calibration(best, modes), self._margins(best))
+        figures = self._calibration(best, modes)._asdict()
+        return recipe, modes, figures | {"box_margins": self._margins(best)}
 
     def _with_reflection(self, best: _Trial) -> _Trial:
         completed = self._models.completed()
         mirrors = [find_reflection(completed, self._models.ids, axis) for axis in range(3)]
-        tried = [self._try(replace(best.recipe, reflection=each)) for each in mirrors]
-        mirrored = max(tried, key=_total)
+        mirrored = self._best(replace(best.recipe, reflection=each) for each in mirrors)
         # Twice as many models to learn from are worth a little.
         return mirrored if _is_enough(mirrored.scores, best.scores, _TOLERANCE) else best
 
@@ -210,13 +199,12 @@ class _CrossValidation:
             excesses[held_out] = excesses_of(rows[held_out], mixture)
         return learn_margins(rows, excesses)
 
+    def _best(self, recipes: Iterable[_Recipe]) -> _Trial:
+        return max(map(self._try, recipes), key=lambda trial: float(trial.scores.sum()))
+
     def _try(self, recipe: _Recipe) -> _Trial:
-        learned = []
-        for kept in self._kept:
-            learned.append(kept.mixture(recipe))
-            self._done += 1
-            self._on_progress(min(self._done, _STEPS - 1), _STEPS)
-        return _Trial(recipe, tuple(learned), self._scores(learned))
+        learned = tuple(kept.mixture(recipe) for kept in self._kept)
+        return _Trial(recipe, learned, self._scores(learned))
 
     def _scores(self, learned: Sequence[Gaussians]) -> FloatArray:
         found = np.empty(len(self._folds))
@@ -225,12 +213,7 @@ class _CrossValidation:
         return found
 
 
-def learn_parts(
-    examples: Sequence[Example],
-    on_progress: Callable[[int, int], object],
-    *,
-    components: int | None,
-) -> dict[str, Any]:
+def learn_parts(examples: Sequence[Example], components: int | None) -> dict[str, Any]:
     """Learn the fields of a `cadalign.ShapeModel`, but for its names; see `ShapeModel.learn`."""
     if components is not None:
         require_counts(components=components)
@@ -240,26 +223,21 @@ def learn_parts(
         raise InputError(what, where="components")
     extents = np.nanmax(rows, axis=1) - np.nanmin(rows, axis=1)
     models = _Models(ids, rows, float(np.median(np.linalg.norm(extents, axis=1))))
-    choice = _CrossValidation(models, on_progress).choose(components)
-    mixture = models.mixture(choice.recipe)
-    on_progress(_STEPS, _STEPS)
-    weights = mixture.weights / mixture.weights.sum()
-    parts = sorted(
-        zip(weights, mixture.means, mixture.covariances, strict=True), key=lambda part: -part[0]
-    )
+    recipe, modes, calibration = _CrossValidation(models).choose(components)
+    parts = sorted(zip(*models.mixture(recipe), strict=True), key=lambda part: -part[0])
+    total = sum(weight for weight, _, _ in parts)
     learned = (
         component_of_covariance(
-            mean.reshape(-1, 3), covariance, weight=float(weight), modes=choice.modes
+            mean.reshape(-1, 3), covariance, weight=float(weight / total), modes=modes
         )
         for weight, mean, covariance in parts
     )
     return {
         "ids": ids,
         "components": tuple(learned),
-        "reflection": choice.recipe.reflection,
+        "reflection": recipe.reflection,
         "training": training,
-        "box_margins": choice.margins,
-        **choice.calibration._asdict(),
+        **calibration,
     }
 
 
@@ -267,7 +245,8 @@ def _vectors(rows: FloatArray, reflection: Reflection | None, ids: Sequence[Keyp
     """Models as vectors, beside each its mirror image of the same weight."""
     weight = 1.0
     if reflection is not None:
-        rows = np.concatenate([rows, mirrored_rows(rows, ids, reflection)])
+        images = mirrored(rows, ids, reflection, offset=reflection.offset)
+        rows = np.concatenate([rows, images])
         weight = 0.5
     return Vectors(rows.reshape(len(rows), -1), np.full(len(rows), weight))
 
@@ -300,15 +279,10 @@ def _truncated(mixture: Gaussians, modes: int | None) -> Gaussians:
     return Gaussians(mixture.weights, mixture.means, np.array(parts))
 
 
-def _total(trial: _Trial) -> float:
-    return float(trial.scores.sum())
-
-
 def _least_enough(scores: Sequence[FloatArray], tolerance: float) -> int:
     """The first that makes the models about as likely as any other."""
     best = max(scores, key=np.sum)
-    enough = [row for row, each in enumerate(scores) if _is_enough(each, best, tolerance)]
-    return enough[0]
+    return next(row for row, each in enumerate(scores) if _is_enough(each, best, tolerance))
 
 
 def _is_enough(scores: FloatArray, best: FloatArray, tolerance: float) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal
@@ -27,15 +27,11 @@ from cadalign.shapes.parts import (
     TrainingShapes,
     check_axis,
     check_ids,
-    check_mixture,
     check_text,
 )
 
 if TYPE_CHECKING:
     from cadalign.shapes.examples import Dataset, Example
-
-OnProgress = Callable[[int, int], object]
-"""Called with the number of steps that are done and that of all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +94,16 @@ class ShapeModel:
 
     def __post_init__(self) -> None:
         ids = check_ids(self.ids, "ids")
-        check_mixture(self.components, len(ids))
+        if not self.components:
+            raise InputError("there are none", where="components")
+        for row, each in enumerate(self.components):
+            if len(each.mean) != len(ids) + BOX_ROWS:
+                what = f"{len(each.mean)} rows, expected {len(ids) + BOX_ROWS}: "
+                what += f"{len(ids)} keypoints and {BOX_ROWS} box corners"
+                raise InputError(what, where=f"components[{row}]")
+        total = sum(each.weight for each in self.components)
+        if abs(total - 1) > 1e-6:
+            raise InputError(f"weights sum to {total:.6g}, not to 1", where="components")
         if self.up_axis is not None:
             check_axis(self.up_axis, "up_axis")
             object.__setattr__(self, "up_axis", str(self.up_axis))
@@ -131,7 +136,6 @@ class ShapeModel:
         up_axis: Literal["x", "y", "z"] | None = None,
         unit: str = "model units",
         components: int | None = None,
-        on_progress: OnProgress = lambda done, total: None,
     ) -> ShapeModel:
         """Learn the shapes of a category from models of it.
 
@@ -148,8 +152,6 @@ class ShapeModel:
             See `ShapeModel`.
         components : int, optional
             Number of Gaussians; each costs a search of its own when an image is aligned.
-        on_progress : callable
-            Called with the number of steps done and of all.
 
         Raises
         ------
@@ -159,7 +161,7 @@ class ShapeModel:
         """
         from cadalign.shapes.learning import learn_parts  # an estimate learns nothing
 
-        learned = learn_parts(list(models), on_progress, components=components)
+        learned = learn_parts(list(models), components)
         return cls(category=category, up_axis=up_axis, unit=unit, **learned)
 
     @classmethod
@@ -171,7 +173,6 @@ class ShapeModel:
         split: str | None = None,
         meshes: bool = True,
         components: int | None = None,
-        on_progress: OnProgress = lambda done, total: None,
     ) -> ShapeModel:
         """Learn the shapes of a category of `cadalign.datasets.KeypointNet`.
 
@@ -185,29 +186,24 @@ class ShapeModel:
         meshes : bool
             Whether to read the meshes for the bounding boxes, where at least half of the models
             have one; otherwise the boxes are those of the keypoints.
-        components, on_progress
-            See `ShapeModel.learn`; the first steps are those of reading.
+        components
+            See `ShapeModel.learn`.
 
         Raises
         ------
         InputError
             If category or split is unknown, or the category has too few models.
         """
-        from cadalign.shapes.examples import LEAST_MODELS, examples_of
+        from cadalign.shapes.examples import examples_of
 
         models = dataset.subset(categories=[category], split=split)[category]
-        if len(models) < LEAST_MODELS:
-            where = f"{category}, split {split}" if split else category
-            what = f"{len(models)} models are too few to learn a shape from"
-            raise InputError(what, where=where, fix=f"at least {LEAST_MODELS} are needed")
-        examples = examples_of(models, meshes=meshes, on_progress=on_progress)
+        examples = examples_of(models, meshes=meshes)
         return cls.learn(
             examples,
-            category=models[0].category,
+            category=models[0].category if models else category,
             up_axis="y",
             unit="diagonal",
             components=components,
-            on_progress=on_progress,
         )
 
     @classmethod
@@ -232,9 +228,8 @@ class ShapeModel:
         ----------
         mean : (m, 3) float
             The keypoints of the mean shape.
-        modes : (K, m, 3) or (K, 3 m) float
-            Directions of deformation; as rows of 3 m they are x, y, z of the first keypoint, and so
-            on.
+        modes : (K, m, 3) float
+            Directions of deformation.
         deviations : (K,) float
             Standard deviations of their coefficients, 0 or more.
         ids : (m,) int or str, optional
@@ -245,10 +240,9 @@ class ShapeModel:
             default the box of an estimate is the extent of all its keypoints.
         residual_sigma : float
             Standard deviation per coordinate of what the modes leave [model units].
-        size_sigma : float or (3,) float, optional
-            Standard deviation of the logarithm of the size, overall or along x, y and z, where the
-            modes are of objects of one size: further modes, which scale mean and box about the
-            origin.
+        size_sigma : (3,) float, optional
+            Standard deviations of the logarithms of the sizes along x, y and z, where the modes are
+            of objects of one size: further modes, which scale mean and box about the origin.
         reflection : Reflection, optional
             The category's mirror symmetry. Mean and covariance are averaged with their mirror
             images, since a mean whose left and right differ a little turns the estimates.
@@ -266,9 +260,9 @@ class ShapeModel:
         >>> mean = [[0, 0, 0], [4, 0, 0], [4, 2, 0], [0, 2, 1]]
         >>> longer = [[0, 0, 0], [1, 0, 0], [1, 0, 0], [0, 0, 0]]
         >>> cars = ShapeModel.from_basis(mean, [longer], [0.5], ids=["a", "b", "c", "d"],
-        ...                              size_sigma=0.1, unit="m")
+        ...                              size_sigma=[0.1, 0.1, 0.1], unit="m")
         >>> cars.components[0].modes.shape
-        (2, 6, 3)
+        (3, 6, 3)
         """
         component = component_of_basis(
             mean, modes, deviations, box=box, residual_sigma=residual_sigma, size_sigma=size_sigma
@@ -365,4 +359,12 @@ class ShapeModel:
         points = as_floats(points_3d, name="points_3d", shape=(len(rows), 3))
         if not len(rows):
             raise InputError("no keypoints", where="points_3d")
-        return self.training.nearest(points, rows)
+        known = self.training.points_3d[:, rows]
+        squares = ((known.astype(np.float64) - points) ** 2).sum(axis=2)
+        # Two objects of the category are this far apart in a keypoint on average.
+        expected = 2 * np.nanvar(known, axis=0).sum(axis=1)
+        distances = np.where(np.isnan(squares), expected, squares).mean(axis=1)
+        best = int(np.argmin(distances))
+        own = self.training.points_3d[best].astype(np.float64)
+        name, path = self.training.model_ids[best], self.training.mesh_paths[best]
+        return NearestShape(name, own, path, float(np.sqrt(distances[best])))

@@ -1,4 +1,4 @@
-"""Outputs of shape models: their file, and a picture of mean and modes.
+"""Outputs of shape models: their file, and a picture of the mean.
 
 The file is a sealed MessagePack document; see `cadalign.io.files` for the header. It holds the
 fields of `cadalign.ShapeModel` and of its parts, arrays as little-endian numbers with their shape.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
@@ -17,17 +16,15 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import BOX_EDGES, bounds_corners
 from cadalign.io.documents import Count, Document, PathText, in_file
 from cadalign.io.files import as_path, printable, read_bytes, refuse_input, write_whole
 from cadalign.io.sealed import Seal
-from cadalign.shapes.parts import BOX_ROWS, ShapeComponent
+from cadalign.shapes.parts import BOX_ROWS
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
     from cadalign.shapes.model import ShapeModel
 
 
@@ -39,12 +36,10 @@ SEAL = Seal(
     fix="learn it with: cadalign shape learn",
 )
 _MAX_BYTES = 1 << 30  # of thousands of models with hundreds of keypoints each
-_MODES = 4  # of a picture
-_DEVIATIONS = 2.0
 _COMMON = 0.25  # share of the training models whose keypoints are joined by lines
-_CELL = 2.9  # inches
-_AZIMUTH, _ELEVATION = np.radians(32.0), np.radians(18.0)
-_GREY, _DARK, _LESS, _MORE, _BOX = "#8a8f98", "#30343b", "#2a6fbb", "#d9622b", "#c3c7cd"
+_CELL = 4.0  # inches
+_AZIMUTH, _ELEVATION = 32.0, 18.0  # degrees
+_GREY, _DARK = "#c3c7cd", "#30343b"
 
 
 class _Array(Document):
@@ -70,7 +65,7 @@ def read_shape(path: str | os.PathLike[str], kind: type[Kind]) -> Kind:
     payload = SEAL.unwrap(read_bytes(file, most=_MAX_BYTES), str(file))
     try:
         document = msgspec.msgpack.decode(payload)
-        model = msgspec.convert(document, kind, dec_hook=_read)
+        return msgspec.convert(document, kind, dec_hook=_read)
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         cause = error.__cause__
         if isinstance(cause, InputError) and str(cause) == str(error):  # of the model as a whole
@@ -80,7 +75,6 @@ def read_shape(path: str | os.PathLike[str], kind: type[Kind]) -> Kind:
         join = "." if isinstance(cause, InputError) and cause.where else ": "
         what = f"{place.rstrip('`')}{join}{what}" if place else what
         raise SEAL.error(f"is invalid: {what[:200]}", str(file)) from None
-    return model
 
 
 def _written(value: Any) -> Any:
@@ -105,99 +99,48 @@ def _read(kind: Any, value: Any) -> Any:
 
 
 def draw_shape(path: Path, model: ShapeModel) -> None:
-    """Draw a row for each component: the mean with its box and ids, then the first modes.
+    """Draw the mean of each component, with its box and the keypoints' ids.
 
-    A mode is drawn at -2 (blue) and +2 (orange) standard deviations from the mean (grey). Raises
-    DataError if no picture has the path's ending, or the file cannot be written.
+    Raises DataError if no picture has the path's ending, or the file cannot be written.
     """
     from matplotlib.figure import Figure
 
-    modes = max(1, min(_MODES, max(len(each.modes) for each in model.components)))
-    rows, columns = len(model.components), modes + 1
-    figure = Figure(figsize=(columns * _CELL, rows * _CELL + 0.45), layout="constrained")
+    columns = len(model.components)
+    figure = Figure(figsize=(columns * _CELL, _CELL), layout="constrained")
     refuse_input(path)
     if path.suffix[1:].lower() not in figure.canvas.get_supported_filetypes():
         what, fix = "is no picture's name", "end it in .png, .jpg, .svg or .pdf"
         raise DataError(what, where=printable(path), fix=fix)
-    figure.suptitle(
-        f"{model.category}: mean, and -{_DEVIATIONS:g} (blue) to +{_DEVIATIONS:g} (orange) "
-        f"standard deviations along its first modes",
-        fontsize=10,
-    )
-    axes = figure.subplots(rows, columns, squeeze=False)
-    for row, component in zip(axes, model.components, strict=True):
-        for each in row:
-            each.set_aspect("equal")
-            each.set_axis_off()
-        _draw_component(row, model, component)
+    space = {"projection": "3d", "proj_type": "ortho"}
+    axes = figure.subplots(1, columns, squeeze=False, subplot_kw=space)
+    for each, component in zip(axes[0], model.components, strict=True):
+        each.set_title(f"{model.category}, {100 * component.weight:.0f} % of the models", size=9)
+        _draw_mean(each, model, component.mean)
     write_whole(path, lambda unfinished: figure.savefig(unfinished, dpi=110))
 
 
+def _draw_mean(axes: Any, model: ShapeModel, mean: FloatArray) -> None:
+    points, common = mean[:-BOX_ROWS], np.ones(len(model.ids), dtype=bool)
+    if model.training is not None:
+        common = np.isfinite(model.training.points_3d[..., 0]).mean(axis=0) >= _COMMON
+    chosen, corners = np.flatnonzero(common), bounds_corners(*mean[-BOX_ROWS:])
+    for edge in BOX_EDGES:
+        axes.plot(*corners[list(edge)].T, color=_GREY, lw=0.7)
+    for pair in chosen[neighbour_pairs(points[chosen])]:
+        axes.plot(*points[pair].T, color=_DARK, lw=1.3)
+    axes.scatter(*points.T, s=np.where(common, 14, 5), color=_DARK, linewidths=0)
+    for label, place in zip(model.ids, points, strict=True):
+        axes.text(*place, f" {label}", fontsize=7, color=_DARK)
+    axes.view_init(_ELEVATION, _AZIMUTH, vertical_axis=model.up_axis or "y")
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+
+
 def neighbour_pairs(points: FloatArray) -> IntArray:
-    """Pairs (n, 2) of points that have no third point nearer to both: a skeleton of the shape.
+    """Pairs (n, 2) of points that have no third one nearer to both, a skeleton of the shape.
 
-    The relative neighbourhood graph, which holds the minimum spanning tree: Toussaint, "The
-    relative neighbourhood graph of a finite planar set", 1980.
-
-    Examples
-    --------
-    >>> neighbour_pairs(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])).tolist()
-    [[0, 1], [1, 2]]
+    The relative neighbourhood graph (Toussaint, 1980), which holds the minimum spanning tree.
     """
     gaps = np.linalg.norm(points[:, None] - points, axis=2)
     blocked = (np.maximum(gaps[:, None, :], gaps[None, :, :]) < gaps[..., None]).any(axis=2)
     return np.argwhere(np.triu(~blocked, 1))
-
-
-def _draw_component(row: Sequence[Axes], model: ShapeModel, component: ShapeComponent) -> None:
-    view, mean, common = _view(model.up_axis), component.mean, _common(model)
-    chosen = np.flatnonzero(common)
-    lines = chosen[neighbour_pairs(mean[chosen])].T
-    sizes = np.where(common, 14, 5)
-
-    def draw(axes: Axes, shape: FloatArray, color: str) -> None:
-        flat = (shape @ view)[:-BOX_ROWS]
-        axes.plot(*flat[lines].transpose(2, 0, 1), color=color, lw=1.3, zorder=2)
-        axes.scatter(flat[:, 0], flat[:, 1], s=sizes, color=color, zorder=3, linewidths=0)
-
-    corners = bounds_corners(*mean[-BOX_ROWS:]) @ view
-    row[0].plot(*corners[np.transpose(BOX_EDGES)].transpose(2, 0, 1), color=_BOX, lw=0.7, zorder=0)
-    draw(row[0], mean, _DARK)
-    share = 100 * component.weight
-    row[0].set_title(
-        "mean" if len(model.components) == 1 else f"{share:.0f} % of the models", size=8
-    )
-    for label, place in zip(model.ids, (mean @ view)[:-BOX_ROWS], strict=True):
-        offset: Any = {"xytext": (3, 3), "textcoords": "offset points"}
-        row[0].annotate(str(label), place, **offset, fontsize=6, color=_DARK)
-    total = float(np.trace(component.covariance)) or 1.0
-    modes = zip(row[1:], component.modes, component.variance, strict=False)
-    for number, (axes, mode, variance) in enumerate(modes, start=1):
-        axes.set_title(f"mode {number}: {100 * variance / total:.0f} % of the variance", size=8)
-        for deviations, color in ((0.0, _GREY), (-_DEVIATIONS, _LESS), (_DEVIATIONS, _MORE)):
-            draw(axes, mean + deviations * mode, color)
-
-
-def _common(model: ShapeModel) -> BoolArray:
-    """The keypoints that a good part of the training models have; all if there are none."""
-    every = np.ones(len(model.ids), dtype=bool)
-    if model.training is None:
-        return every
-    common = np.isfinite(model.training.points_3d[..., 0]).mean(axis=0) >= _COMMON
-    return np.asarray(common) if common.sum() > 1 else every
-
-
-def _view(up_axis: str | None) -> FloatArray:
-    """Projection to the picture's plane, (3, 2) float: slightly from the right and from above."""
-    right, up, towards = {
-        "x": ([0, 1, 0], [1, 0, 0], [0, 0, -1]),
-        "z": ([1, 0, 0], [0, 0, 1], [0, -1, 0]),
-    }.get(up_axis or "y", ([1, 0, 0], [0, 1, 0], [0, 0, 1]))
-    frame = np.array([right, up, towards], dtype=float).T
-    horizontal = [np.cos(_AZIMUTH), 0, -np.sin(_AZIMUTH)]
-    vertical = [
-        -np.sin(_ELEVATION) * np.sin(_AZIMUTH),
-        np.cos(_ELEVATION),
-        -np.sin(_ELEVATION) * np.cos(_AZIMUTH),
-    ]
-    return np.asarray(frame @ np.array([horizontal, vertical]).T)

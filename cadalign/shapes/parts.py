@@ -75,22 +75,6 @@ class ShapeComponent:
         return np.asarray((self.modes**2).sum(axis=(1, 2)))
 
 
-def check_mixture(components: Sequence[ShapeComponent], keypoints: int) -> None:
-    """Check that components are of so many keypoints, and that their weights sum to 1."""
-    if not components:
-        raise InputError("there are none", where="components")
-    for row, component in enumerate(components):
-        if len(component.mean) != keypoints + BOX_ROWS:
-            what = (
-                f"{len(component.mean)} rows, expected {keypoints + BOX_ROWS}: "
-                f"{keypoints} keypoints and {BOX_ROWS} box corners"
-            )
-            raise InputError(what, where=f"components[{row}]")
-    total = sum(component.weight for component in components)
-    if abs(total - 1) > 1e-6:
-        raise InputError(f"weights sum to {total:.6g}, not to 1", where="components")
-
-
 @dataclass(frozen=True)
 class Reflection:
     """A category's mirror symmetry: mirrored objects are as likely as the objects themselves."""
@@ -183,18 +167,6 @@ class TrainingShapes:
     def rows_with_mesh(self) -> list[int]:
         """Rows of the models that have a mesh."""
         return [row for row, path in enumerate(self.mesh_paths) if path is not None]
-
-    def nearest(self, points: FloatArray, rows: npt.NDArray[np.int64]) -> NearestShape:
-        """The model whose keypoints of some rows (n,) are nearest to points (n, 3)."""
-        known = self.points_3d[:, rows]
-        squares = ((known.astype(np.float64) - points) ** 2).sum(axis=2)
-        # Two objects of the category are this far apart in a keypoint on average.
-        expected = 2 * np.nanvar(known, axis=0).sum(axis=1)
-        distances = np.where(np.isnan(squares), expected, squares).mean(axis=1)
-        best = int(np.argmin(distances))
-        own = self.points_3d[best].astype(np.float64)
-        distance = float(np.sqrt(distances[best]))
-        return NearestShape(self.model_ids[best], own, self.mesh_paths[best], distance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,12 +268,12 @@ class FewKeypoints:
     share: float  # its share with `FEW` keypoints or less, in (0, 1]
 
     def __post_init__(self) -> None:
-        if not is_number(self.typical) or self.typical <= FEW:
-            raise InputError(f"{self.typical!r} is not a number above {FEW}", where="typical")
-        if not is_number(self.share) or not 0 < self.share <= 1:
-            raise InputError(f"{self.share!r} is not a number in (0, 1]", where="share")
-        object.__setattr__(self, "typical", float(self.typical))
-        object.__setattr__(self, "share", float(self.share))
+        for name, least, most in (("typical", FEW, math.inf), ("share", 0, 1)):
+            value = getattr(self, name)
+            if not is_number(value) or not least < value <= most:
+                what = f"{value!r} is not a number above {least}, up to {most}"
+                raise InputError(what, where=name)
+            object.__setattr__(self, name, float(value))
 
     def share_of(self, count: float) -> float:
         """Share of the inflation with a number of keypoints."""
@@ -324,8 +296,8 @@ def check_text(text: object, where: str) -> str:
 
 def check_axis(axis: object, where: str) -> None:
     """Refuse what is not the name of an axis."""
-    if axis not in AXES:
-        raise InputError(f"{axis!r} is not one of 'x', 'y', 'z'", where=where)
+    if not isinstance(axis, str) or axis not in AXES:
+        raise InputError(f"{quote(axis)} is no axis", where=where, fix="give x, y or z")
 
 
 def checked_box(box: npt.ArrayLike, where: str) -> FloatArray:

@@ -25,12 +25,10 @@ from cadalign.shapes.parts import checked_box
 _ROUNDING = 0.02  # of the kernel's tip, at most
 _MARGIN = 0.25  # from the mesh to the corners around it, which follow the stretch alone
 _COINCIDENT = 1e-6
-_PRIOR_SPREAD = 0.1  # keypoints that spread less along an axis barely determine its stretch
-_LEAST_STRETCH = 0.1  # relative to that of all axes together
 
 
 def warp_mesh(
-    mesh: Mesh, source: npt.ArrayLike, target: npt.ArrayLike, *, bounds: npt.ArrayLike | None = None
+    mesh: Mesh, source: npt.ArrayLike, target: npt.ArrayLike, *, bounds: npt.ArrayLike
 ) -> Mesh:
     """Warp a mesh such that its keypoints come to given places.
 
@@ -44,9 +42,8 @@ def warp_mesh(
         Keypoints of the mesh [model units].
     target : (n, 3) float
         The places that they come to [model units].
-    bounds : (2, 3) float, optional
-        Least and greatest corner of the box that the mesh shall about fill; by default the stretch
-        is the one that fits the keypoints best.
+    bounds : (2, 3) float
+        Least and greatest corner of the box that the mesh shall about fill.
 
     Returns
     -------
@@ -62,7 +59,7 @@ def warp_mesh(
     --------
     >>> corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     >>> square = Mesh(corners, [[0, 1, 2], [0, 2, 3]])
-    >>> taller = warp_mesh(square, corners, corners * [1, 2, 1])
+    >>> taller = warp_mesh(square, corners, corners * [1, 2, 1], bounds=[[0, 0, 0], [1, 2, 0]])
     >>> bool(np.allclose(taller.vertices, corners * [1, 2, 1]))
     True
     """
@@ -70,10 +67,7 @@ def warp_mesh(
     targets = as_floats(target, name="target", shape=(len(places), 3))
     if not len(places):
         raise InputError("no keypoints", where="source")
-    if bounds is None:
-        corners = _stretched_box(mesh.bounds, places, targets)
-    else:
-        corners = checked_box(bounds, "bounds")
+    corners = checked_box(bounds, "bounds")
     warp = linear_warp(mesh.vertices, mesh.bounds, places)
     return replace(mesh, vertices=warp.apply(targets, corners))
 
@@ -102,24 +96,24 @@ class LinearWarp(NamedTuple):
 
 def linear_warp(points: FloatArray, box: FloatArray, source: FloatArray) -> LinearWarp:
     """The warp of points (p, 3) of a mesh, with its ``box`` (2, 3) and keypoints (n, 3)."""
-    diagonal = _diagonal(box, source)
-    merging = _merging(source, _COINCIDENT * diagonal)
+    diagonal = float(np.linalg.norm(np.ptp(np.vstack([box, source]), axis=0))) or 1.0
+    # Of coincident keypoints there is one place, which takes the mean of their targets.
+    gaps = np.linalg.norm(source[:, None] - source, axis=2)
+    first = (gaps <= _COINCIDENT * diagonal).argmax(axis=1)
+    same = np.unique(first)[:, None] == first
+    merging = np.asarray(same / same.sum(axis=1, keepdims=True))
     places = merging @ source
     weights = _weights(points, box, places, diagonal)
     extents = box[1] - box[0]
     flat = extents <= _COINCIDENT * extents.max()
     safe = np.where(flat, np.inf, extents)
 
-    def corners(of: FloatArray) -> tuple[FloatArray, FloatArray]:
-        share = (of - box.mean(axis=0)) / safe
-        return 0.5 - share, 0.5 + share
-
-    (least, greatest), (least_there, greatest_there) = corners(points), corners(places)
     middle = box.mean(axis=0)
+    share, share_there = (points - middle) / safe, (places - middle) / safe
     return LinearWarp(
         weights @ merging,
-        least - weights @ least_there,
-        greatest - weights @ greatest_there,
+        0.5 - share - weights @ (0.5 - share_there),
+        0.5 + share - weights @ (0.5 + share_there),
         flat * (points - middle - weights @ (places - middle)),
     )
 
@@ -129,7 +123,10 @@ def _weights(
 ) -> FloatArray:
     """Shares (p, n) of the keypoints' displacements in those of points."""
     from scipy.interpolate import RBFInterpolator
+    from scipy.spatial.distance import pdist
 
+    # The kernel's tip is rounded less where keypoints are near each other.
+    rounding = min(_ROUNDING * diagonal, float(pdist(places).min(initial=diagonal)))
     everything = np.vstack([box, places])
     margin = _MARGIN * diagonal
     around = bounds_corners(everything.min(axis=0) - margin, everything.max(axis=0) + margin)
@@ -137,47 +134,7 @@ def _weights(
         np.vstack([places, around]),
         np.eye(len(places) + len(around), len(places)),
         kernel="multiquadric",
-        epsilon=1 / _rounding(places, diagonal),
+        epsilon=1 / rounding,
         degree=0,
     )
     return np.asarray(shares(points))
-
-
-def _diagonal(box: FloatArray, places: FloatArray) -> float:
-    """Diagonal of mesh and keypoints together; 1 where they are one point."""
-    return float(np.linalg.norm(np.ptp(np.vstack([box, places]), axis=0))) or 1.0
-
-
-def _rounding(places: FloatArray, diagonal: float) -> float:
-    """Radius within which the kernel's tip is rounded: less where keypoints are near each other."""
-    from scipy.spatial.distance import pdist
-
-    least = float(pdist(places).min()) if len(places) > 1 else diagonal
-    return min(_ROUNDING * diagonal, least)
-
-
-def _merging(places: FloatArray, tolerance: float) -> FloatArray:
-    """Matrix (k, n) that replaces coincident keypoints by one, which takes their mean."""
-    gaps = np.linalg.norm(places[:, None] - places, axis=2)
-    first = (gaps <= tolerance).argmax(axis=1)
-    same = np.unique(first)[:, None] == first
-    return np.asarray(same / same.sum(axis=1, keepdims=True))
-
-
-def _stretched_box(box: FloatArray, source: FloatArray, target: FloatArray) -> FloatArray:
-    """A box (2, 3) after the shift and the stretch along each axis that fit the keypoints best.
-
-    The stretch is drawn to an equal one along all axes.
-    """
-    merging = _merging(source, _COINCIDENT * _diagonal(box, source))
-    places, targets = merging @ source, merging @ target
-    centre, to = places.mean(axis=0), targets.mean(axis=0)
-    offsets, moved = places - centre, targets - to
-    total = float((offsets**2).sum())
-    if not total:
-        return np.asarray(box - centre + to)
-    equal = float(np.sqrt((moved**2).sum() / total)) or 1.0
-    weight = _PRIOR_SPREAD**2 * total
-    stretch = ((offsets * moved).sum(axis=0) + weight * equal) / ((offsets**2).sum(axis=0) + weight)
-    stretch = np.maximum(stretch, _LEAST_STRETCH * equal)
-    return np.asarray((box - centre) * stretch + to)

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import map_coordinates
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.geometry.mesh import Mesh
@@ -76,6 +75,8 @@ def linear_colors(color: npt.NDArray[Any]) -> LinearArray:
 
 def sample_texture(texture: LinearArray, uv: LinearArray) -> LinearArray:
     """Read a texture (h, w, 4) bilinearly at (n, 2) texture coordinates; (n, 4) float32."""
+    from scipy.ndimage import map_coordinates  # takes time to import
+
     height, width = texture.shape[:2]
     u, v = np.where(np.isfinite(uv), uv % 1.0, 0.0).T
     at = [(1 - v) * height - 0.5, u * width - 0.5]

@@ -153,9 +153,9 @@ def test_a_match_is_a_result(case: Case, tmp_path: Path) -> None:
     assert paired.names == seen.names
     fitted = cadalign.fit(paired.points_3d, paired.points_2d, CAMERA)
     np.testing.assert_allclose(fitted.alignment.scale, pose.scale, atol=1e-3)
-    written = match.export(tmp_path / "chair.glb")
+    written = result.export(tmp_path / "chair.glb", mesh=match.mesh())
     assert written.stat().st_size > 1000
-    assert match.plot().get_ylim() == (479.5, -0.5)
+    assert result.plot(mesh=match.mesh()).get_ylim() == (479.5, -0.5)
 
 
 def test_the_columns_are_documented() -> None:

@@ -222,7 +222,9 @@ def _keypointnet(root: Path, out: Path) -> None:
 
 
 def _retrieval(root: Path, out: Path) -> None:
-    options = RetrievalRunOptions(root, methods=("epnp",), keypoints=(6,), noises_px=(1.0,))
+    options = RetrievalRunOptions(
+        root, methods=("optimal-unstretched",), keypoints=(6,), noises_px=(1.0,)
+    )
     do_run(options, RunFolder(out), workers=0, dask=None)
 
 

@@ -125,18 +125,18 @@ class TestRows:
         assert keys[:4] == [
             ("000", 6, protocol, method)
             for protocol in ("leave-in", "leave-out")
-            for method in ("optimal", "epnp")
+            for method in ("optimal", "optimal-unstretched")
         ]
 
     def test_the_true_model_comes_first_with_stretch_and_less_often_without(self, finished) -> None:
         with_stretch = rows_of(finished, protocol="leave-in", method="optimal", keypoints=8)
-        without = rows_of(finished, protocol="leave-in", method="epnp", keypoints=8)
+        without = rows_of(finished, protocol="leave-in", method="optimal-unstretched", keypoints=8)
         assert np.mean([row["rank"] == 1 for row in with_stretch]) > 0.95
         assert np.mean([row["rank"] == 1 for row in without]) < 0.85
         assert np.median([row["box_iou"] for row in with_stretch]) > 0.7
         stretched, rigid = (
             [row["box_iou"] for row in rows_of(finished, protocol="leave-out", method=each)]
-            for each in ("optimal", "epnp")
+            for each in ("optimal", "optimal-unstretched")
         )
         assert np.mean(stretched) > np.mean(rigid) + 0.05
 
@@ -228,7 +228,7 @@ class TestRuns:
             patch.setattr(RunFolder, "claim", die)
             with pytest.raises(KeyboardInterrupt):
                 run(replace(QUICK, root=other), folder, workers=0, dask=None)
-        options = replace(QUICK, max_models=2, methods=("epnp",), keypoints=(8,))
+        options = replace(QUICK, max_models=2, methods=("optimal-unstretched",), keypoints=(8,))
         run(replace(options, root=library), folder, workers=0, dask=None)
         evaluated = Library.open(folder.path / "library.cadalign")
         assert evaluated.fingerprint == Library.open(library).fingerprint

@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cadalign import Alignment, Camera, Library, Match
-from cadalign.errors import InputError
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.absence import _distances, shape_distance
 
@@ -84,7 +83,7 @@ def test_distances_of_a_category_are_those_of_its_pairs_of_models() -> None:
         for keep in [np.random.default_rng(seed).permutation(10)[: 3 + seed % 8]]
     ]
     library = Library.from_models(models)
-    _, points = library._table.keypoints_of("box")
+    _, points = library.keypoints_of("box")
     rows = np.array([0, 4, 17])
     found = _distances(points, rows)
     every = list(library)
@@ -102,8 +101,3 @@ def test_distances_of_a_category_are_those_of_its_pairs_of_models() -> None:
             ]
             expected = shape_distance(model, every[row]) * extents[0] / extents[1]
             assert distance == pytest.approx(expected, abs=1e-7)
-
-
-def test_impossible_prior_is_refused() -> None:
-    with pytest.raises(InputError, match="none_prior"):
-        retrieve(1, none_prior=1.0)

@@ -6,6 +6,7 @@ import os
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -16,7 +17,7 @@ from support.refusals import refusal_text
 import cadalign
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
-from cadalign.errors import DataError, InputError
+from cadalign.errors import InputError
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.io.sealed import Seal
 from cadalign.shapes.basis import find_reflection
@@ -107,14 +108,6 @@ def test_two_kinds_of_objects_get_two_components() -> None:
 
 
 @pytest.mark.long
-def test_the_order_of_models_hardly_matters() -> None:
-    models = tables(40)
-    first = ShapeModel.learn(models, components=1)
-    second = ShapeModel.learn(models[::-1], components=1)
-    assert first.mean == pytest.approx(second.mean, abs=0.02)
-
-
-@pytest.mark.long
 def test_learning_does_not_depend_on_the_unit() -> None:
     models, factor = tables(30), 730.0
     scaled = [
@@ -134,15 +127,6 @@ def test_without_bounds_the_boxes_are_those_of_the_keypoints() -> None:
     extents = np.array([[e.points_3d.min(axis=0), e.points_3d.max(axis=0)] for e in bare])
     offset = model.mean[-2:] - extents.mean(axis=0)
     assert np.abs(offset).max() < 0.1
-
-
-@pytest.mark.long
-def test_progress_ends_at_all_steps() -> None:
-    steps: list[tuple[int, int]] = []
-    ShapeModel.learn(tables(20), on_progress=lambda done, total: steps.append((done, total)))
-    done = [each[0] for each in steps]
-    assert done == sorted(done)
-    assert steps[-1][0] == steps[-1][1]
 
 
 @pytest.mark.parametrize("count", [4, 5, 11])
@@ -222,10 +206,10 @@ def test_models_that_are_all_the_same_are_learned_without_a_warning() -> None:
 
 
 def test_from_basis_scales_with_the_size() -> None:
-    model = ShapeModel.from_basis(TABLE, np.zeros((1, 7, 3)), [0.0], size_sigma=0.1, ids=IDS)
+    model = ShapeModel.from_basis(TABLE, np.zeros((1, 7, 3)), [0.0], size_sigma=[0.1] * 3, ids=IDS)
     component = model.components[0]
-    assert component.modes.shape == (1, 9, 3)
-    along = np.abs(component.modes[0] / 0.1)
+    assert component.modes.shape == (3, 9, 3)
+    along = np.abs(component.modes / 0.1).sum(axis=0)
     assert along == pytest.approx(np.abs(component.mean), abs=1e-12)
     assert not model.has_box
 
@@ -272,7 +256,7 @@ def test_from_basis_with_a_reflection_is_symmetric(tmp_path: Path) -> None:
     mirror = Reflection("x", 0.5, ((0, 1), (2, 3), (4, 5)))
     made, free = (
         ShapeModel.from_basis(
-            skew, modes, [0.3, 0.1], residual_sigma=0.05, size_sigma=0.1, reflection=each
+            skew, modes, [0.3, 0.1], residual_sigma=0.05, size_sigma=[0.1] * 3, reflection=each
         )
         for each in (mirror, None)
     )
@@ -301,7 +285,7 @@ def test_a_reflection_changes_nothing_of_a_symmetric_basis() -> None:
 def test_from_basis_keeps_the_covariance_of_its_modes() -> None:
     rng = np.random.default_rng(0)
     modes, sigmas = rng.normal(size=(3, 7, 3)), np.array([0.3, 0.0, 0.1])
-    model = ShapeModel.from_basis(TABLE, modes.reshape(3, -1), sigmas, residual_sigma=0.05)
+    model = ShapeModel.from_basis(TABLE, modes, sigmas, residual_sigma=0.05)
     flat = sigmas[:, None] * modes.reshape(3, -1)
     expected = flat.T @ flat + 0.05**2 * np.eye(21)
     assert model.components[0].covariance[:21, :21] == pytest.approx(expected, abs=1e-12)
@@ -363,14 +347,6 @@ def test_a_mesh_is_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.Mon
     assert text.endswith("the path is not UTF-8; rename it, or the folder that it is in")
 
 
-def test_numbers_of_numpy_are_saved(tmp_path: Path) -> None:
-    mean = np.array([[0, 0, 0], [4, 0, 0], [4, 2, 0], [0, 2, 1]], float)
-    made = ShapeModel.from_basis(mean, [np.ones((4, 3))], [0.5], residual_sigma=np.float64(0.1))
-    made.save(tmp_path / "made.shape")
-    opened = ShapeModel.open(tmp_path / "made.shape")
-    assert opened.components[0].residual_sigma == 0.1
-
-
 def test_a_saved_model_is_the_same(learned: ShapeModel, tmp_path: Path) -> None:
     few = FewKeypoints(typical=9.5, share=0.8)
     learned = replace(learned, inflation=1.25, degrees_of_freedom=5.0, few_keypoints=few)
@@ -395,18 +371,13 @@ def test_a_saved_model_is_the_same(learned: ShapeModel, tmp_path: Path) -> None:
     assert opened.training.points_3d.tobytes() == learned.training.points_3d.tobytes()
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
-def test_an_inflation_that_is_no_factor_is_refused(learned: ShapeModel, value: float) -> None:
-    with pytest.raises(InputError, match="inflation"):
-        replace(learned, inflation=value)
-
-
-@pytest.mark.parametrize("value", [2.0, 0.0, float("nan")])
-def test_degrees_of_freedom_without_a_covariance_are_refused(
-    learned: ShapeModel, value: float
-) -> None:
-    with pytest.raises(InputError, match="degrees_of_freedom"):
-        replace(learned, degrees_of_freedom=value)
+@pytest.mark.parametrize(
+    "change",
+    [{"inflation": 0.0}, {"inflation": np.nan}, {"degrees_of_freedom": 2.0}],
+)
+def test_figures_out_of_range_are_refused(learned: ShapeModel, change: dict[str, float]) -> None:
+    with pytest.raises(InputError, match=next(iter(change))):
+        replace(learned, **change)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -430,13 +401,22 @@ def test_files_that_are_none_are_refused(content: bytes, tmp_path: Path) -> None
     assert "is truncated" in refusal_text(lambda: ShapeModel.open(path))
 
 
-def test_parts_that_disagree_in_a_file_are_refused(content: bytes, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("place", "value", "what"),
+    [
+        ("ids", [1, 2], "components[0]: 9 rows, expected 4"),
+        ("weight", -1.0, "the shape file is invalid: components[0].weight: -1.0 is not in (0, 1];"),
+        ("mean", 3, "the shape file is invalid: components[0].mean: Expected `object`, got `int`;"),
+    ],
+)
+def test_damaged_parts_of_a_file_are_named(
+    content: bytes, tmp_path: Path, place: str, value: Any, what: str
+) -> None:
     path = tmp_path / "a.shape"
-    fields = msgspec.msgpack.decode(content[64:])
-    SEAL.write(path, msgspec.msgpack.encode(fields | {"ids": [1, 2]}))
-    assert refusal_text(lambda: ShapeModel.open(path)).startswith(
-        f"{path}: components[0]: 9 rows, expected 4"
-    )
+    document = msgspec.msgpack.decode(content[64:])
+    (document if place == "ids" else document["components"][0])[place] = value
+    SEAL.write(path, msgspec.msgpack.encode(document))
+    assert refusal_text(lambda: ShapeModel.open(path)).startswith(f"{path}: {what}")
 
 
 def test_more_components_than_models_are_refused() -> None:
@@ -482,14 +462,14 @@ def test_refusals(learned: ShapeModel) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"deviations": [-1.0]}, "deviations: deviations[0] is negative (-1)"),
+        ({"deviations": [-1.0]}, "deviations: -1 is negative"),
         ({"deviations": [np.nan]}, "deviations: NaN or infinite values in row 0"),
         ({"modes": np.zeros((1, 6, 3))}, "modes: shape (1, 6, 3), expected (n, 7, 3)"),
         ({"ids": ["a"]}, "ids: 1 for 7 keypoints"),
         ({"ids": ["a"] * 7}, "ids: 'a' occurs twice"),
-        ({"size_sigma": -0.1}, "size_sigma: -0.1 is negative"),
+        ({"size_sigma": [0.1, -0.1, 0]}, "size_sigma: -0.1 is negative"),
         ({"box": [[1, 0, 0], [0, 1, 1]]}, "box: the least corner [1.0, 0.0, 0.0] exceeds"),
-        ({"up_axis": "w"}, "up_axis: 'w' is not one of 'x', 'y', 'z'"),
+        ({"up_axis": "w"}, "up_axis: 'w' is no axis; give x, y or z"),
         ({"reflection": Reflection("x", 0, ((0, 9),))}, "reflection: unknown keypoint 9"),
         ({"reflection": "x"}, "reflection: expected a cadalign.Reflection, got str"),
         (
@@ -505,11 +485,6 @@ def test_a_wrong_basis_is_refused(change: dict[str, object], message: str) -> No
     assert text.startswith(message)
 
 
-def test_a_mean_without_keypoints_is_refused() -> None:
-    text = refusal_text(lambda: ShapeModel.from_basis(TABLE[:0], np.zeros((1, 0, 3)), [1.0]))
-    assert text == "mean: there are no keypoints"
-
-
 def test_components_must_agree() -> None:
     component = ShapeComponent(1.0, np.vstack([TABLE, TABLE[:2]]), np.zeros((0, 9, 3)), 0.1)
     half = replace(component, weight=0.5)
@@ -517,14 +492,6 @@ def test_components_must_agree() -> None:
         ShapeModel("table", tuple(IDS), (half,))
     with pytest.raises(InputError, match="9 rows, expected 5"):
         ShapeModel("table", (1, 2, 3), (component,))
-
-
-def test_real_linear_models_are_read(real_data: Path) -> None:
-    folder = real_data / "real" / "kitti_cars"
-    mean, modes = np.loadtxt(folder / "meanShape_2.txt"), np.loadtxt(folder / "vectors2.txt")
-    model = ShapeModel.from_basis(mean, modes, np.full(5, 0.5), size_sigma=0.07, up_axis="z")
-    assert len(model.ids) == 14
-    assert model.components[0].covariance.shape == (48, 48)
 
 
 @pytest.mark.long
@@ -553,22 +520,3 @@ def test_real_models_that_were_held_out_are_likely(real_data: Path, category: st
     assert np.median(np.abs(errors)) < 0.6 * np.median(np.abs(spreads))
     assert 0.6 < (np.abs(whitened) < 1).mean() < 0.95
     assert (np.abs(whitened) < 2).mean() > 0.88
-
-
-@pytest.mark.parametrize(
-    ("place", "value", "what"),
-    [
-        ("weight", -1.0, "components[0].weight: -1.0 is not in (0, 1]"),
-        ("mean", 3, "components[0].mean: Expected `object`, got `int`"),
-    ],
-)
-def test_damaged_parts_of_a_file_are_named(tmp_path, place, value, what):
-    path = tmp_path / "table.shape"
-    examples = [Example(f"t{k}", "abcdefg", TABLE * (1 + 0.01 * k)) for k in range(6)]
-    ShapeModel.learn(examples, category="table").save(path)
-    document = msgspec.msgpack.decode(SEAL.unwrap(path.read_bytes(), "table"))
-    document["components"][0][place] = value
-    SEAL.write(path, msgspec.msgpack.encode(document))
-    with pytest.raises(DataError) as caught:
-        ShapeModel.open(path)
-    assert str(caught.value).startswith(f"{path}: the shape file is invalid: {what};")

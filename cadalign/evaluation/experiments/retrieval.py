@@ -67,7 +67,6 @@ PROTOCOLS = (LEAVE_IN, LEAVE_OUT)
 _METHODS: dict[str, dict[str, Any]] = {
     "optimal": {},
     "optimal-unstretched": {"stretch": "none"},
-    "epnp": {"method": "epnp"},
 }
 """Options of `cadalign.Library.retrieve` by method."""
 
@@ -92,8 +91,8 @@ class RetrievalRunOptions(ModelOptions):
     """Standard deviations of the keypoints' noise, in pixels."""
     keypoints: tuple[int, ...] = (6, 7, 8, 9, 10)
     """Numbers of visible keypoints that are given."""
-    methods: tuple[str, ...] = ("optimal", "epnp")
-    """optimal, optimal-unstretched, epnp."""
+    methods: tuple[str, ...] = ("optimal", "optimal-unstretched")
+    """optimal, optimal-unstretched."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -198,7 +198,7 @@ def _nearest(seen: UnseenObject) -> ShapeEstimate:
         workers=1,
     )[0]
     model = library[first.category, first.model_id]
-    return ShapeEstimate(first.alignment, first.bounds, model.ids, model.xyz)
+    return ShapeEstimate(first.alignment, model.bounds, model.ids, model.xyz)
 
 
 def _bound(seen: UnseenObject) -> ShapeEstimate:

@@ -30,7 +30,7 @@ def bottles(tmp_path_factory: pytest.TempPathFactory) -> tuple[AnnotatedModel, .
 @pytest.fixture(scope="module")
 def shape(bottles: tuple[AnnotatedModel, ...]) -> ShapeModel:
     """The shape of all bottles but the first four."""
-    examples = examples_of(bottles[4:], meshes=True, on_progress=lambda done, total: None)
+    examples = examples_of(bottles[4:], meshes=True)
     return ShapeModel.learn(examples, category="bottle", components=1)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cadalign.estimation.uncertainty.residuals import loss_slopes
-from cadalign.retrieval.precision import bent
+from cadalign.retrieval.ranking import bent
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR
 
 

@@ -31,8 +31,7 @@ from cadalign.io.files import write_json
 
 SECTIONS: dict[str, Section] = {
     each.__name__: each
-    for each in (accuracy, coverage, shapes, retrieval, runs, speed, cold)
-    + (evidence, photo, cars)
+    for each in (accuracy, coverage, shapes, retrieval, runs, speed, cold) + (evidence, photo, cars)
 }
 ON_REQUEST = {"evidence", "photo", "cars"}
 TOLERANCE = 0.2

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,7 +51,7 @@ class _Case(NamedTuple):
     points_2d: FloatArray
     gt: Alignment
     camera: Camera = KEYPOINT_CAMERA
-    options: dict[str, Any] = {}
+    options: Mapping[str, Any] = MappingProxyType({})
 
 
 def _rows(dataset: KeypointNet, count: int) -> Iterator[Row]:

@@ -17,10 +17,10 @@ from support.solving import broken, depth_error
 import cadalign
 from cadalign.cli import main
 from cadalign.errors import DataError, InputError
+from cadalign.evaluation.experiments.photos import SETS
 from cadalign.evaluation.functions import FunctionMetric
 from cadalign.evaluation.metrics import BOX_IOU, ROTATION, Metric
 from cadalign.evaluation.metrics.photos import score_columns
-from cadalign.evaluation.photos.options import SETS
 from cadalign.evaluation.plots import cumulative
 from cadalign.report import headline_text
 

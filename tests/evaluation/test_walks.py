@@ -26,8 +26,7 @@ from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics import photos as metrics
 from cadalign.evaluation.metrics.photos import score_alignment, score_columns, statistics_of
 from cadalign.evaluation.photos.objects import PhotoObjects
-from cadalign.evaluation.photos.sighting import Sighting
-from cadalign.evaluation.photos.target import PhotoTask, PhotoTasks, opened
+from cadalign.evaluation.photos.target import PhotoTask, PhotoTasks, Sighting, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.summary import Group

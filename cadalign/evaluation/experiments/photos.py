@@ -1,26 +1,38 @@
-"""The experiment on data sets of photos."""
+"""The experiment on data sets of photos: options, names of methods, protocols, summary and page.
+
+A method's name is a base, and the evidence beside the keypoints, as in ``rigid+mask``.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+import tyro
 
+from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
+from cadalign.datasets.photos.pix3d import Pix3D
+from cadalign.datasets.photos.scan2cad import Scan2CAD
+from cadalign.errors import InputError, quote
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import VIEW_NAMES
+from cadalign.evaluation.methods import SHAPE
 from cadalign.evaluation.metrics import BOX_IOU
 from cadalign.evaluation.metrics.photos import (
     BOX,
     ROTATION,
     SCAN2CAD,
     VIEWPOINT,
+    MetricSet,
     score_columns,
     statistics_of,
 )
-from cadalign.evaluation.photos.options import SETS, PhotosOptions
+from cadalign.evaluation.options import FunctionOptions, is_function
 from cadalign.evaluation.plots import cumulative_curves
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import LEFT_OUT, UNREADABLE, Columns, Plan, fingerprint
@@ -40,6 +52,119 @@ if TYPE_CHECKING:
     from cadalign.evaluation.photos.target import PhotoTask
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.tables import Run
+
+EPNP, RIGID, STRETCHED, PRIOR, SIMILAR = "epnp", "rigid", "stretched", "prior", "similar"
+TRUTH = "truth"
+BASES = (EPNP, RIGID, STRETCHED, PRIOR, SIMILAR, SHAPE)
+MASK, GRAVITY, IMAGE = "mask", "gravity", "image"
+EVIDENCE = (MASK, GRAVITY, IMAGE)
+
+
+@dataclass(frozen=True)
+class PhotosOptions(FunctionOptions):
+    """Evaluate methods on photos of real objects, by the metrics of their data set.
+
+    The folder may hold Scan2CAD, PASCAL3D+, ObjectNet3D or Pix3D. Keypoints
+    are the annotated or detected ones. The model's width (x) is given,
+    as one image leaves size open; with a shape model in metres it is estimated. The
+    run's folder gets results.parquet with a row per object and method, summary.csv, figures and
+    report.html. A killed run continues when the same command is started again.
+    """
+
+    experiment = "photos"
+
+    root: Annotated[Path, tyro.conf.Positional]
+    """Folder of the data set, in any of the known formats."""
+    _: KW_ONLY
+    categories: tuple[str, ...] | None = None
+    """Categories to take; all by default."""
+    methods: tuple[str, ...] = ()
+    """epnp, rigid; stretched, prior (stretched, with a prior on the scales), similar (prior, and
+    keypoints that differ from the model's), shape (a shape model); each also with evidence, as in
+    rigid+mask, rigid+image (the photo itself) or similar+mask+gravity; and truth. By default the
+    first five, and shape where there is one."""
+    shape: tuple[Path, ...] = ()
+    """Files of `cadalign shape learn`, each for its category."""
+    similar_sigma: float = 0.04
+    """Standard deviation of the object's keypoints from the model's, for the method similar, in
+    diagonals of the model."""
+    max_photos: int | None = None
+    """Number of photos to take, the first ones; all by default."""
+    pictures: int = 100
+    """Number of photos whose pictures the report shows, the first ones."""
+    sigma: float | None = None
+    """Standard deviation of annotated keypoints that methods are given, in pixels; by
+    default that of the data set."""
+    min_keypoints: int = 6
+    """Objects with fewer keypoints are left out."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_least(max_photos=1, pictures=0, min_keypoints=1)
+        for name in ("sigma", "similar_sigma"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise InputError(f"{value} is not positive", where=name)
+        own = [each for each in self.methods if not is_function(each)]
+        for name in own:
+            _check_method(name)
+        bases = BASES if self.shape else BASES[:-1]
+        self.replace_values(methods=self.methods or bases)
+        self.check_methods((*BASES, TRUTH, *own))
+
+
+def parts_of(method: str) -> tuple[str, frozenset[str]]:
+    """The base of a method, and its evidence."""
+    base, *evidence = method.split("+")
+    return base, frozenset(evidence)
+
+
+def _check_method(method: str) -> None:
+    """Check that there is a method of a name, and that EPnP and the truth are given no evidence."""
+    base, evidence = parts_of(method)
+    is_known = base in (*BASES, TRUTH) and evidence <= set(EVIDENCE)
+    if not is_known or method.count("+") != len(evidence):
+        fix = f"known are {', '.join((*BASES, TRUTH))}, with {', '.join(f'+{e}' for e in EVIDENCE)}"
+        raise InputError(f"unknown method {quote(method)}", where="methods", fix=fix)
+    if evidence and base in (EPNP, TRUTH):
+        fix = "give rigid, stretched, prior, similar or shape the evidence"
+        raise InputError(f"{base} takes keypoints alone", where="methods", fix=fix)
+
+
+SETS = (VIEWPOINT, BOX, SCAN2CAD)
+"""All sets of metrics, in the order of the result table's columns."""
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """Evaluation of a data set: its metrics, and what it is given."""
+
+    metrics: tuple[MetricSet, ...]
+    best: str
+    """The method whose estimates are drawn."""
+    up_axis: str = "y"  # the upward axis of its models
+    sigma_of_side: float = 1 / 64
+    """Standard deviation of its keypoints as a share of the longer side of the object's rectangle:
+    networks' heatmaps have 64 cells."""
+    sigma_of_width: float | None = None  # the same as a share of the image's width
+
+
+_PROTOCOLS = {
+    # Annotators' points on scan and model are about 5 cm apart, 8 px in an image of 480.
+    Scan2CAD.kind: Protocol((VIEWPOINT, SCAN2CAD, BOX), SIMILAR, sigma_of_width=1 / 60),
+    Pix3D.kind: Protocol((VIEWPOINT, BOX), RIGID),
+    Pascal3D.kind: Protocol((VIEWPOINT,), SIMILAR, up_axis="z"),
+    Pascal3DDetections.kind: Protocol((VIEWPOINT,), SIMILAR, up_axis="z"),
+}
+_OTHER = Protocol((VIEWPOINT, BOX), PRIOR)
+
+
+def protocol_of(kind: str) -> Protocol:
+    """The protocol of a data set's kind; of another one, viewpoint and box."""
+    return _PROTOCOLS.get(kind, _OTHER)
+
+
+# Summary ------------------------------------------------------------------------------------------
 
 COLUMNS: Columns = (
     *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int), ("source", str)),

@@ -1,7 +1,7 @@
 """Metrics of photos: sets of them, those of PASCAL3D+, of boxes, and of Scan2CAD.
 
 A set is what a data set's protocol measures of each object, and shows of many. A new metric of
-photos is a line of one set; a new set has its place in `cadalign.evaluation.photos.options`.
+photos is a line of one set; a new set has its place in `cadalign.evaluation.experiments.photos`.
 
 Tulsiani, Malik, "Viewpoints and Keypoints", CVPR 2015, section 4.1: accuracy at pi/6, median error.
 Wang et al., "Normalized Object Coordinate Space for Category-Level 6D Object Pose and Size

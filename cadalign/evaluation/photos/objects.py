@@ -23,20 +23,8 @@ from cadalign.evaluation.benchmark import (
     attempt,
     write_picture,
 )
-from cadalign.evaluation.experiments.photos import COLUMNS
-from cadalign.evaluation.instances.pictures import NO_PHOTO, write_pictures, write_preview
-from cadalign.evaluation.instances.record import (
-    RECORD_COLUMNS,
-    Estimate,
-    aligned_shape,
-    box_alignment,
-    record_of,
-    record_stem,
-)
-from cadalign.evaluation.methods import SHAPE, Method, MethodInput
-from cadalign.evaluation.metrics.photos import score_alignment
-from cadalign.evaluation.options import is_function
-from cadalign.evaluation.photos.options import (
+from cadalign.evaluation.experiments.photos import (
+    COLUMNS,
     EPNP,
     GRAVITY,
     IMAGE,
@@ -49,11 +37,24 @@ from cadalign.evaluation.photos.options import (
     parts_of,
     protocol_of,
 )
-from cadalign.evaluation.photos.sighting import Sighting, sight
+from cadalign.evaluation.instances.pictures import NO_PHOTO, write_pictures, write_preview
+from cadalign.evaluation.instances.record import (
+    RECORD_COLUMNS,
+    Estimate,
+    aligned_shape,
+    box_alignment,
+    record_of,
+    record_stem,
+)
+from cadalign.evaluation.methods import SHAPE, Method, MethodInput
+from cadalign.evaluation.metrics.photos import score_alignment
+from cadalign.evaluation.options import is_function
 from cadalign.evaluation.photos.target import (
     PhotoTarget,
     PhotoTask,
+    Sighting,
     opened,
+    sight,
     targets_of,
 )
 from cadalign.evaluation.runs.folder import RunFolder

@@ -12,7 +12,7 @@ from support.photo_sets import write_pascal3d
 
 import cadalign.datasets
 from cadalign import Model
-from cadalign.evaluation.photos import options
+from cadalign.evaluation.experiments import photos as options
 from cadalign.evaluation.photos.objects import _model
 from cadalign.evaluation.photos.target import PhotoTarget
 

@@ -33,8 +33,7 @@ from cadalign.evaluation.experiments.photos import COLUMNS, SPEC, PhotosOptions,
 from cadalign.evaluation.instances.pictures import cut_out
 from cadalign.evaluation.methods import Method
 from cadalign.evaluation.photos.objects import PhotoEstimate, PhotoObjects
-from cadalign.evaluation.photos.sighting import Sighting
-from cadalign.evaluation.photos.target import PhotoTasks, opened
+from cadalign.evaluation.photos.target import PhotoTasks, Sighting, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.summary import Summary

@@ -13,12 +13,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, TypeVar
 
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.functions import (
+from cadalign.evaluation.methods import (
     FunctionMetric,
+    Method,
+    MethodInput,
     choose_methods,
     choose_metrics,
 )
-from cadalign.evaluation.methods import Method, MethodInput
 from cadalign.evaluation.options import ExperimentOptions, text_of
 from cadalign.evaluation.runs.work import (
     FAILED,
@@ -136,7 +137,7 @@ class Benchmark:
         metrics: Iterable[str] = (),
         **how: Any,
     ) -> Benchmark:
-        """The benchmark of methods and of functions; see `cadalign.evaluation.functions`."""
+        """The benchmark of methods and of functions; see `cadalign.evaluation.methods`."""
         further = choose_metrics(metrics, setting.columns)
         return cls(setting, choose_methods(methods, own), metrics=further, **how)
 

@@ -138,7 +138,7 @@ def plain_value(value: Any) -> Any:
 class FunctionOptions(ExperimentOptions):
     """Options of experiments that take functions of one's own, as methods and as metrics.
 
-    Each is a callable or a text ``module:function``; see `cadalign.evaluation.functions`.
+    Each is a callable or a text ``module:function``; see `cadalign.evaluation.methods`.
     """
 
     metrics: tuple[str, ...] = ()
@@ -146,7 +146,7 @@ class FunctionOptions(ExperimentOptions):
 
     def check_methods(self, own: tuple[str, ...] | None = None) -> None:
         """Check methods, each once; ``own`` are the names of the experiment's, if it has any."""
-        from cadalign.evaluation.functions import checked_methods
+        from cadalign.evaluation.methods import checked_methods
 
         self.replace_values(methods=checked_methods(getattr(self, "methods", ()), own))
 

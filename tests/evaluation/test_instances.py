@@ -8,7 +8,6 @@ import pytest
 from cadalign import Alignment, fit
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError, InputError, TooFewVisibleError
-from cadalign.evaluation.functions import checked_methods
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view, sample_hull_views
 from cadalign.evaluation.instances.instance import (
     KEYPOINT_CAMERA,
@@ -16,7 +15,7 @@ from cadalign.evaluation.instances.instance import (
     KeypointTask,
     make_hull_instances,
 )
-from cadalign.evaluation.methods import LIMIT, fit_methods, fit_options
+from cadalign.evaluation.methods import LIMIT, checked_methods, fit_methods, fit_options
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, limit_estimate
 from cadalign.evaluation.simulation import simulate_problem
 from cadalign.geometry.alignment import Box

@@ -18,7 +18,7 @@ import cadalign
 from cadalign.cli import main
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.experiments.photos import SETS
-from cadalign.evaluation.functions import FunctionMetric
+from cadalign.evaluation.methods import FunctionMetric
 from cadalign.evaluation.metrics import BOX_IOU, ROTATION, Metric
 from cadalign.evaluation.metrics.photos import score_columns
 from cadalign.evaluation.plots import cumulative

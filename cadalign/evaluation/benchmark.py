@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, TypeVar
 
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError
 from cadalign.evaluation.methods import (
     FunctionMetric,
     Method,
@@ -60,8 +60,6 @@ class Case:
     facts: Row = field(default_factory=dict)  # cells that do not depend on the estimate
     instance: Any = None
     error: Exception | None = None  # why there is no instance
-    status: str = ""
-    """The rows' status where there is no instance; by default the error's, see `status_of`."""
 
 
 class Setting:
@@ -97,8 +95,9 @@ class Setting:
         return [Case(task.names)]
 
     def given(self, instance: Any) -> MethodInput:
-        """The instance as general methods are given it; an error of settings without them."""
-        raise InputError("there are no general methods", where="methods")
+        """The instance as general methods are given it; by default it is that."""
+        found: MethodInput = instance
+        return found
 
     def answered(self, method: Method, instance: Any, answer: Any) -> Any:
         """The estimate that is measured, of a general method's alignment or result."""
@@ -205,8 +204,7 @@ class Benchmark:
             row = estimate if isinstance(estimate, Exception) else next(rows)
             names = {**case.names, "method": method.name}
             if isinstance(row, Exception):
-                status = case.status or status_of(row)
-                outcome = Outcome(names, case.facts, status, reason_of(row), seconds)
+                outcome = Outcome(names, case.facts, status_of(row), reason_of(row), seconds)
                 answers.append((outcome, row))
             else:
                 answers.append((Outcome(names, case.facts | row, seconds=seconds), estimate))

@@ -32,6 +32,7 @@ from cadalign.geometry.camera import Camera
 
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
+    from cadalign.evaluation.simulation import SimulatedProblem
 
 LIMIT = "limit"
 """The pseudo-method of the Cramer-Rao bound; see `cadalign.evaluation.metrics.cramer_rao`."""
@@ -54,6 +55,21 @@ class MethodInput:
     gt: Alignment | None = None
     """The truth, for metrics and for the Cramer-Rao bound; no method is given it."""
     inliers: BoolArray | None = None  # (n,), the true inliers, for the bound
+
+    @classmethod
+    def of_problem(
+        cls, problem: SimulatedProblem, sigma: float, *, ransac: RansacOptions | None = None
+    ) -> MethodInput:
+        """A simulated problem with the noise [px] that methods are told."""
+        inliers = None if problem.outliers is None else ~problem.outliers
+        seen = problem.points_3d, problem.points_2d, problem.camera
+        return cls(*seen, sigma, ransac=ransac, gt=problem.alignment, inliers=inliers)
+
+
+def pose_of(estimate: Any) -> Alignment:
+    """The alignment of an estimate."""
+    found: Alignment = estimate if isinstance(estimate, Alignment) else estimate.alignment
+    return found
 
 
 @dataclass(frozen=True)
@@ -302,7 +318,7 @@ class FunctionMetric:
             return None
         where = f"metric {self.metric.key}"
         found = {
-            "est": estimate if isinstance(estimate, Alignment) else estimate.alignment,
+            "est": pose_of(estimate),
             "result": estimate
             if isinstance(estimate, Result)
             else getattr(estimate, "result", None),

@@ -33,7 +33,7 @@ from cadalign.evaluation.experiments.correspondences import (
     spoil,
     summarize_shares,
 )
-from cadalign.evaluation.methods import fit_options
+from cadalign.evaluation.methods import MethodInput, fit_options
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run, read_table
 from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
@@ -244,13 +244,14 @@ class TestRows:
     def test_errors_are_counted_as_they_are_described(self):
         # All points 10 from the camera; the last of 4 was moved.
         points = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], dtype=float)
-        truth = SimulatedProblem(
+        problem = SimulatedProblem(
             points,
             np.zeros((4, 2)),
             CAMERA,
             Alignment(np.eye(3), [0, 0, 10], [1, 1.0, 2.0]),
             np.array([False, False, False, True]),
         )
+        truth = MethodInput.of_problem(problem, 1.0)
         angle = np.radians(0.4)
         turn = [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
 

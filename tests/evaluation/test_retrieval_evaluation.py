@@ -99,7 +99,9 @@ class TestQueries:
         models = [make_model(1), make_model(2, keypoints=7), make_model(3, category="can")]
         library = Library.from_models(models)
         options = RetrievalRunOptions(Path(), noises_px=(5, 1), keypoints=(9, 6))
-        found = [(t.model_id, t.noise_px, t.keypoints) for t in retrieval_tasks(library, options)]
+        tasks = retrieval_tasks(library, options)
+        assert [task.protocol for task in tasks[:2]] == ["leave-in", "leave-out"]
+        found = [(task.model_id, task.noise_px, task.keypoints) for task in tasks[::2]]
         cases = [(1, 6), (1, 9), (5, 6), (5, 9)]
         expected = [("001", *case) for case in cases] + [("002", 1, 6), ("002", 5, 6)]
         assert found == expected + [("003", *case) for case in cases]
@@ -191,7 +193,7 @@ class TestRows:
         options = replace(QUICK, keypoints=(14,), methods=("optimal",))
         experiment = retrieval_benchmark(str(path), options)
         rows = experiment.evaluate([RetrievalTask("box", "001", 1.0, 14)])
-        assert [row["status"] for row in rows] == ["no view", "no view"]
+        assert [row["status"] for row in rows] == ["skipped"]
         assert "14 keypoints should be visible" in rows[0]["reason"]
 
     def test_flat_models_have_no_box_overlap(self, tmp_path: Path) -> None:
@@ -200,7 +202,7 @@ class TestRows:
         path = tmp_path / "lib"
         Library.from_models(flat).save(path)
         experiment = retrieval_benchmark(str(path), replace(QUICK, methods=("optimal",)))
-        (row, _) = experiment.evaluate([RetrievalTask("box", "001", 1.0, 8)])
+        (row,) = experiment.evaluate([RetrievalTask("box", "001", 1.0, 8)])
         assert row["status"] == "ok"
         assert row["box_iou"] is None
 

@@ -21,7 +21,7 @@ from cadalign.errors import DataError, InputError
 from cadalign.estimation.options import RansacOptions
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting, Tasks
-from cadalign.evaluation.methods import LIMIT, Method, MethodInput
+from cadalign.evaluation.methods import LIMIT, Method, MethodInput, pose_of
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.options import FunctionOptions
 from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, plot_against
@@ -199,10 +199,6 @@ _STRETCH = (0.5, 2.0)
 _REDRAWS = 100
 
 
-SpoiledImage = tuple[SimulatedProblem, RansacOptions]
-"""An image with a stretched scene and moved points, and the options of searches for inliers."""
-
-
 @dataclass(frozen=True)
 class SpoiledImages(Setting):
     """Stretched scenes with outliers: the setting of the experiment on real correspondences."""
@@ -223,33 +219,26 @@ class SpoiledImages(Setting):
         rng = instance_rng(self.options.seed, *names)
         truth = spoil(task.seen, task.outliers, rng=rng)
         ransac = self.options.ransac(int(rng.integers(2**31)))
-        return replace(case, instance=(truth, ransac))
+        return replace(case, instance=MethodInput.of_problem(truth, 1.0, ransac=ransac))
 
-    def given(self, image: SpoiledImage) -> MethodInput:
-        truth, ransac = image
-        given = (truth.points_3d, truth.points_2d, truth.camera)
-        return MethodInput(*given, 1.0, ransac=ransac, gt=truth.alignment)
-
-    def row(self, method: Method, image: SpoiledImage, estimate: Alignment | Result) -> Row:
-        return errors_of(estimate, image[0], is_robust=method.is_robust)
+    def row(self, method: Method, given: MethodInput, estimate: Alignment | Result) -> Row:
+        return errors_of(estimate, given, is_robust=method.is_robust)
 
 
-def errors_of(
-    found: Alignment | Result, truth: SimulatedProblem, *, is_robust: bool = False
-) -> Row:
+def errors_of(found: Alignment | Result, given: MethodInput, *, is_robust: bool = False) -> Row:
     """Errors of an estimate by column; of its inliers where they were searched for."""
-    est = found if isinstance(found, Alignment) else found.alignment
-    distance = np.linalg.norm(truth.alignment.apply(truth.points_3d).mean(axis=0))
-    errors = alignment_errors(est=est, gt=truth.alignment, length=float(distance))
+    assert given.gt is not None
+    distance = np.linalg.norm(given.gt.apply(given.points_3d).mean(axis=0))
+    errors = alignment_errors(est=pose_of(found), gt=given.gt, length=float(distance))
     scales = max(errors["scale_y_error"], errors["scale_z_error"])
     row: Row = {
-        "points": len(truth.points_3d),
+        "points": len(given.points_3d),
         **errors,
         "success": errors["rotation_error_deg"] < SUCCESS_DEG and scales <= SUCCESS_SCALE,
     }
     if not is_robust or isinstance(found, Alignment):
         return row
-    inliers = np.ones(len(truth.points_3d), bool) if truth.outliers is None else ~truth.outliers
+    inliers = np.ones(len(given.points_3d), bool) if given.inliers is None else given.inliers
     kept, kept_inliers = int(found.inliers.sum()), int((found.inliers & inliers).sum())
     return {
         **row,

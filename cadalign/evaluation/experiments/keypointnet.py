@@ -31,8 +31,8 @@ from cadalign.evaluation.instances.instance import (
     make_instance,
     scene_of,
 )
-from cadalign.evaluation.instances.record import RECORD_COLUMNS, pose_of, record_of
-from cadalign.evaluation.methods import LIMIT, Method, MethodInput
+from cadalign.evaluation.instances.record import RECORD_COLUMNS, record_of
+from cadalign.evaluation.methods import LIMIT, Method, MethodInput, pose_of
 from cadalign.evaluation.metrics import INSTANCE_METRICS
 from cadalign.evaluation.metrics.errors import estimate_errors
 from cadalign.evaluation.options import ViewOptions

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import tyro
@@ -22,7 +22,7 @@ import tyro
 from cadalign.arrays import FloatArray, IntArray, instance_rng
 from cadalign.datasets import KeypointNet
 from cadalign.datasets.models.shapenet import require_category
-from cadalign.errors import DegenerateError, InputError, unknown
+from cadalign.errors import InputError, unknown
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
@@ -57,19 +57,12 @@ if TYPE_CHECKING:
     from cadalign.retrieval.match import Match
     from cadalign.retrieval.models import LibraryModel, ModelKey
 
-NO_VIEW = "no view"
-"""Status of a model of which no view shows as many keypoints as are to be handed over."""
 LEAVE_IN = "leave-in"
 """The library holds the true model."""
 LEAVE_OUT = "leave-out"
 """It doesn't."""
-PROTOCOLS = (LEAVE_IN, LEAVE_OUT)
-_METHODS: dict[str, dict[str, Any]] = {
-    "optimal": {},
-    "optimal-unstretched": {"stretch": "none"},
-    "epnp": {"method": "epnp"},
-}
-"""Options of `cadalign.Library.retrieve` by method."""
+_METHODS = ("optimal", "epnp")
+"""Methods of `cadalign.Library.retrieve`."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +85,8 @@ class RetrievalRunOptions(ModelOptions):
     """Standard deviations of the keypoints' noise, in pixels."""
     keypoints: tuple[int, ...] = (6, 7, 8, 9, 10)
     """Numbers of visible keypoints that are given."""
-    methods: tuple[str, ...] = ("optimal", "epnp")
-    """optimal, optimal-unstretched, epnp."""
+    methods: tuple[str, ...] = _METHODS
+    """optimal, epnp."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -131,16 +124,18 @@ _NO_MATCH: Row = {"matched_category": "", "matched_id": ""}
 
 @dataclass(frozen=True)
 class RetrievalTask:
-    """One view of one model, with a level of noise and a number of keypoints."""
+    """One view of one model, with a level of noise, a number of keypoints, and a protocol."""
 
     category: str
     model_id: str
     noise_px: float
     keypoints: int
+    protocol: str = LEAVE_IN
 
-    def names(self, protocol: str) -> Row:
-        """The cells that name the rows of a protocol, but for the method."""
-        return {**asdict(self), "protocol": protocol}
+    @property
+    def names(self) -> Row:
+        """The cells that name its rows, but for the method."""
+        return asdict(self)
 
 
 def retrieval_tasks(library: Library, options: RetrievalRunOptions) -> list[RetrievalTask]:
@@ -156,10 +151,11 @@ def retrieval_tasks(library: Library, options: RetrievalRunOptions) -> list[Retr
         for key in (own[i * len(own) // count] for i in range(count)):
             most = len(library[key].xyz)
             tasks += [
-                RetrievalTask(*key, noise, keypoints)
+                RetrievalTask(*key, noise, keypoints, protocol)
                 for noise in options.noises_px
                 for keypoints in options.keypoints
                 if keypoints <= most
+                for protocol in (LEAVE_IN, LEAVE_OUT)
             ]
     if not tasks:
         raise InputError(f"no model has {options.keypoints[0]} keypoints", where="keypoints")
@@ -194,15 +190,13 @@ def observe_model(model: LibraryModel, task: RetrievalTask, *, seed: int) -> Ret
     )
 
 
-@dataclass(frozen=True, eq=False)
-class RetrievalInstance:
+class RetrievalInstance(NamedTuple):
     """A query of a library's file, with the models that count as the true one."""
 
     task: RetrievalTask
     query: RetrievalQuery
     gt: LibraryModel
     alike: frozenset[ModelKey]
-    protocol: str
 
 
 @dataclass(frozen=True)
@@ -215,20 +209,14 @@ class RetrievalQueries(Setting):
     options: RetrievalRunOptions
 
     def failed(self, task: RetrievalTask) -> list[Case]:
-        return [Case(task.names(protocol), _NO_MATCH) for protocol in PROTOCOLS]
+        return [Case(task.names, _NO_MATCH)]
 
-    def _cases(self, task: RetrievalTask) -> list[Case]:
-        library, cases = _opened(self.library), self.failed(task)
+    def case(self, task: RetrievalTask) -> Case:
+        library = _opened(self.library)
         gt = library[task.category, task.model_id]
-        try:
-            query = observe_model(gt, task, seed=self.options.seed)
-        except DegenerateError as error:
-            return [replace(case, error=error, status=NO_VIEW) for case in cases]
-        seen = task, query, gt, same_shapes(library, gt.key)
-        return [
-            replace(case, instance=RetrievalInstance(*seen, protocol))
-            for case, protocol in zip(cases, PROTOCOLS, strict=True)
-        ]
+        query = observe_model(gt, task, seed=self.options.seed)
+        instance = RetrievalInstance(task, query, gt, same_shapes(library, gt.key))
+        return Case(task.names, _NO_MATCH, instance)
 
     def row(self, method: Method, instance: RetrievalInstance, matches: Sequence[Match]) -> Row:
         """Compare matches with the true model; errors are those of the first match."""
@@ -266,7 +254,7 @@ def _retrieve(
     instance: RetrievalInstance, *, method: str, library: str, options: RetrievalRunOptions
 ) -> list[Match]:
     task = instance.task
-    is_exact = instance.protocol == LEAVE_IN and method == "optimal"
+    is_exact = task.protocol == LEAVE_IN and method == "optimal"
     return _opened(library).retrieve(
         instance.query.points_2d,
         instance.query.ids,
@@ -275,9 +263,9 @@ def _retrieve(
         category=task.category,
         sigma=max(task.noise_px, _LEAST_SIGMA),
         shape_sigma=0.0 if is_exact else _SHAPE_SIGMA,
-        exclude=instance.alike if instance.protocol == LEAVE_OUT else (),
+        exclude=instance.alike if task.protocol == LEAVE_OUT else (),
         workers=1,
-        **_METHODS[method],
+        method=method,
     )
 
 
@@ -356,7 +344,6 @@ def summarize_queries(run: Run) -> list[Summary]:
         _STATISTICS,
         by=("category", "protocol", "noise_px", "keypoints"),
         name="{}, {}, {:g} px, {} keypoints".format,
-        apart=NO_VIEW,
     )
 
 
@@ -421,7 +408,6 @@ SPEC = Spec(
     results=COLUMNS,
     summarize=summarize_queries,
     console=HEADLINE[2:],
-    apart=NO_VIEW,
     group=lambda run: QUERIES,
     plots=plots,
     topic="retrieval",

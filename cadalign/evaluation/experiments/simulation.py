@@ -19,7 +19,7 @@ from cadalign.arrays import instance_rng
 from cadalign.errors import DataError, InputError, quote, refuse_unused, unknown
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
-from cadalign.evaluation.methods import Method, MethodInput
+from cadalign.evaluation.methods import Method, MethodInput, pose_of
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.options import FunctionOptions, plain_value
@@ -27,7 +27,7 @@ from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, plot_against
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Columns, Plan, Row
 from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
-from cadalign.evaluation.summary import Group, Quartiles, Summary, group_name, summarize
+from cadalign.evaluation.summary import Summary, group_name, quartiles, summarize
 from cadalign.geometry.alignment import Alignment
 
 if TYPE_CHECKING:
@@ -176,33 +176,15 @@ class SweepProblems(Setting):
     seed: int
 
     def case(self, task: SweepTask) -> Case:
-        instance = self.problem(task), self._setting(task)["noise_px"] or 1.0
-        return Case(self._names(task), instance=instance)
+        sigma = self._setting(task)["noise_px"] or 1.0
+        return Case(self._names(task), instance=MethodInput.of_problem(self.problem(task), sigma))
 
     def failed(self, task: SweepTask) -> list[Case]:
         return [Case(self._names(task))]
 
-    def given(self, instance: tuple[SimulatedProblem, float]) -> MethodInput:
-        problem, sigma = instance
-        inliers = None if problem.outliers is None else ~problem.outliers
-        return MethodInput(
-            problem.points_3d,
-            problem.points_2d,
-            problem.camera,
-            sigma,
-            gt=problem.alignment,
-            inliers=inliers,
-        )
-
-    def answered(
-        self, method: Method, instance: tuple[SimulatedProblem, float], answer: Alignment | Result
-    ) -> Alignment:
-        return answer if isinstance(answer, Alignment) else answer.alignment
-
-    def row(
-        self, method: Method, instance: tuple[SimulatedProblem, float], estimate: Alignment
-    ) -> Row:
-        return {**alignment_errors(est=estimate, gt=instance[0].alignment)}
+    def row(self, method: Method, given: MethodInput, estimate: Alignment | Result) -> Row:
+        assert given.gt is not None
+        return {**alignment_errors(est=pose_of(estimate), gt=given.gt)}
 
     def problem(self, task: SweepTask) -> SimulatedProblem:
         """The problem of a task."""
@@ -245,13 +227,9 @@ def varied(run: Run) -> Metric:
 
 def summarize_sweep(run: Run) -> list[Summary]:
     """Quartiles of every metric for every value and method, over the problems that are solved."""
-    statistics = {metric.key: _quartiles(metric.key) for metric in (*ERRORS, *run.metrics)}
+    statistics = {metric.key: quartiles(metric.key) for metric in (*ERRORS, *run.metrics)}
     name = partial(group_name, varied(run))
     return summarize(run, statistics, by=(kind_of(run).column,), name=name)
-
-
-def _quartiles(key: str) -> Callable[[Group], Quartiles]:
-    return lambda group: Quartiles.of_solved(group.solved[key].astype(float))
 
 
 def plots(runs: Sequence[Run]) -> list[Plot]:

@@ -8,12 +8,14 @@ import pytest
 from cadalign import Alignment, fit
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError, InputError, TooFewVisibleError
-from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view, sample_hull_views
 from cadalign.evaluation.instances.instance import (
     KEYPOINT_CAMERA,
     Instance,
+    KeypointHull,
     KeypointTask,
     make_hull_instances,
+    sample_hull_view,
+    sample_hull_views,
 )
 from cadalign.evaluation.methods import LIMIT, checked_methods, fit_methods, fit_options
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, limit_estimate

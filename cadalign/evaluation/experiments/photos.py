@@ -80,14 +80,11 @@ class PhotosOptions(FunctionOptions):
     """Categories to take; all by default."""
     methods: tuple[str, ...] = ()
     """epnp, rigid; stretched, prior (stretched, with a prior on the scales), similar (prior, and
-    keypoints that differ from the model's), shape (a shape model); each also with evidence, as in
-    rigid+mask, rigid+image (the photo itself) or similar+mask+gravity; and truth. By default the
-    first five, and shape where there is one."""
+    keypoints that differ from the model's by 4 % of its diagonal), shape (a shape model); each also
+    with evidence, as in rigid+mask, rigid+image (the photo itself) or similar+mask+gravity; and
+    truth. By default the first five, and shape where there is one."""
     shape: tuple[Path, ...] = ()
     """Files of `cadalign shape learn`, each for its category."""
-    similar_sigma: float = 0.04
-    """Standard deviation of the object's keypoints from the model's, for the method similar, in
-    diagonals of the model."""
     max_photos: int | None = None
     """Number of photos to take, the first ones; all by default."""
     pictures: int = 100
@@ -95,16 +92,12 @@ class PhotosOptions(FunctionOptions):
     sigma: float | None = None
     """Standard deviation of annotated keypoints that methods are given, in pixels; by
     default that of the data set."""
-    min_keypoints: int = 6
-    """Objects with fewer keypoints are left out."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_least(max_photos=1, pictures=0, min_keypoints=1)
-        for name in ("sigma", "similar_sigma"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise InputError(f"{value} is not positive", where=name)
+        self.check_least(max_photos=1, pictures=0)
+        if self.sigma is not None and not 0 < self.sigma < math.inf:
+            raise InputError(f"{self.sigma} is not positive", where="sigma")
         own = [each for each in self.methods if not is_function(each)]
         for name in own:
             _check_method(name)

@@ -25,8 +25,12 @@ from cadalign.datasets.models.shapenet import require_category
 from cadalign.errors import InputError, unknown
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
-from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
-from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
+from cadalign.evaluation.instances.instance import (
+    KEYPOINT_CAMERA,
+    STRETCH_RANGE,
+    KeypointHull,
+    sample_hull_view,
+)
 from cadalign.evaluation.methods import Method
 from cadalign.evaluation.metrics import QUERIES
 from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
@@ -175,7 +179,7 @@ def observe_model(model: LibraryModel, task: RetrievalTask, *, seed: int) -> Ret
     """Stretch a model, draw a view of it, and hand over some of its visible keypoints.
 
     Everything random follows from the seed and the task. Visibility follows from the
-    keypoints alone; see `cadalign.evaluation.instances.hull`.
+    keypoints alone; see `cadalign.evaluation.instances.instance`.
     """
     rng = instance_rng(seed, task.category, task.model_id, repr(task.noise_px), str(task.keypoints))
     stretch = np.array([1.0, *rng.uniform(*STRETCH_RANGE, 2)])

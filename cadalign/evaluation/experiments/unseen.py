@@ -87,8 +87,7 @@ COLUMNS: Columns = (
     *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int)),
     *(("rotation_error_deg", float), ("best_rotation_error_deg", float)),
     *(("translation_error", float), ("translation_error_up_to_scale", float), ("box_iou", float)),
-    *(("box_iou_up_to_scale", float), ("stated_box_iou_up_to_scale", float)),
-    ("keypoint_error", float),
+    *(("box_iou_up_to_scale", float), ("keypoint_error", float)),
     *(("rotation_level", float), ("stretch_level", float)),
     *(("keypoints_within_68", float), ("keypoints_within_95", float)),
 )
@@ -96,8 +95,7 @@ COLUMNS: Columns = (
 _MEDIANS = (
     *(metrics.ROTATION, metrics.BEST_ROTATION),
     *(metrics.TRANSLATION, metrics.TRANSLATION_UP_TO_SCALE),
-    *(metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE, metrics.STATED_BOX_IOU_UP_TO_SCALE),
-    metrics.KEYPOINT_ERROR,
+    *(metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE, metrics.KEYPOINT_ERROR),
 )
 _COVERAGE = (
     *(metrics.ROTATION_IN_68, metrics.ROTATION_IN_95),

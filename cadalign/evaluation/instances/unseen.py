@@ -20,8 +20,11 @@ from cadalign.estimation.view import View
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
 from cadalign.evaluation.experiments.keypointnet import KeypointTasks
 from cadalign.evaluation.experiments.unseen import COLUMNS, METHODS, UnseenOptions
-from cadalign.evaluation.instances.hull import sample_hull_view
-from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, KeypointTask
+from cadalign.evaluation.instances.instance import (
+    KEYPOINT_CAMERA,
+    KeypointTask,
+    sample_hull_view,
+)
 from cadalign.evaluation.instances.record import (
     RECORD_COLUMNS,
     AlignedShape,
@@ -293,7 +296,7 @@ def _errors(found: ShapeEstimate, seen: UnseenObject) -> Row:
     known, rows = _shared(found, seen)
     own = found.points_3d[rows]
     box = Box.from_model([own.min(axis=0), own.max(axis=0)], est)
-    stated, gt_box = Box.from_model(found.bounds, est), Box.from_model(seen.task.hull.bounds, gt)
+    gt_box = Box.from_model(seen.task.hull.bounds, gt)
     centre = Alignment(est.rotation, box.center, np.ones(3))
     gt_centre = Alignment(gt.rotation, gt_box.center, np.ones(3))
     values: Row = {
@@ -303,7 +306,6 @@ def _errors(found: ShapeEstimate, seen: UnseenObject) -> Row:
         "translation_error_up_to_scale": translation_error_up_to_scale(est=centre, gt=gt_centre),
         "box_iou": overlap(est=box, gt=gt_box),
         "box_iou_up_to_scale": overlap_up_to_scale(est=box, gt=gt_box),
-        "stated_box_iou_up_to_scale": overlap_up_to_scale(est=stated, gt=gt_box),
         "keypoint_error": _distance_up_to_scale(est.apply(own), gt.apply(seen.xyz[known])),
     }
     if found.result is not None:

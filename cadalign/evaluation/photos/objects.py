@@ -70,6 +70,7 @@ _OUTLINED = frozenset({MASK, IMAGE})
 
 
 _UP_SIGMA_DEG = 3.0  # of rigs and phones, and of objects that stand upright
+_SIMILAR_SIGMA = 0.04  # of an object's keypoints from its model's [diagonals]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,14 +84,12 @@ class PhotoEstimate:
 
 
 def estimate_object(
-    sighting: Sighting, *, method: str, shapes: Collection[ShapeModel], similar_sigma: float
+    sighting: Sighting, *, method: str, shapes: Collection[ShapeModel]
 ) -> PhotoEstimate:
     """The estimate of a method by name; see `PhotosOptions.methods`.
 
-    ``shapes`` are models of the categories that they name, ``similar_sigma`` is the standard
-    deviation of the object's keypoints from the model's [diagonals of the model]. Raises
-    LeftOutError if the object lacks what the method needs; and CadalignError if there is no
-    estimate.
+    ``shapes`` are models of the categories that they name. Raises LeftOutError if the object lacks
+    what the method needs; and CadalignError if there is no estimate.
     """
     base, evidence = parts_of(method)
     if base == TRUTH:
@@ -104,12 +103,12 @@ def estimate_object(
         return estimate_of_model(found.alignment, sighting)
     if base == SHAPE:
         return _of_shape(sighting, shapes, evidence)
-    model = _model(base, sighting, similar_sigma, with_mesh=bool(_OUTLINED & evidence))
+    model = _model(base, sighting, with_mesh=bool(_OUTLINED & evidence))
     result = align(model, _view(sighting, evidence))
     return estimate_of_model(result.alignment, sighting, result)
 
 
-def _model(base: str, sighting: Sighting, similar_sigma: float, *, with_mesh: bool) -> Model:
+def _model(base: str, sighting: Sighting, *, with_mesh: bool) -> Model:
     width, bounds = sighting.width, sighting.bounds * sighting.width
     kind: dict[str, Any] = {}
     if base == RIGID:
@@ -118,7 +117,7 @@ def _model(base: str, sighting: Sighting, similar_sigma: float, *, with_mesh: bo
         kind = {"stretch_sigma": SIMILAR_SCALE_SIGMA}
     elif base == SIMILAR:
         diagonal = float(np.linalg.norm(np.ptp(bounds, axis=0)))
-        kind = {"shape_sigma": similar_sigma * diagonal}
+        kind = {"shape_sigma": _SIMILAR_SIGMA * diagonal}
     if with_mesh:
         cad = sighting.target.cad
         if cad is None or not cad.has_mesh:
@@ -277,9 +276,8 @@ def photos_benchmark(
     options: PhotosOptions, shapes: tuple[ShapeModel, ...], drawn_in: RunFolder
 ) -> Benchmark:
     """The methods of the options on objects in photos."""
-    how: dict[str, Any] = {"shapes": shapes, "similar_sigma": options.similar_sigma}
     own = {
-        name: Method(name, partial(estimate_object, method=name, **how))
+        name: Method(name, partial(estimate_object, method=name, shapes=shapes))
         for name in options.methods
         if not is_function(name)
     }

@@ -35,6 +35,7 @@ from cadalign.render.scene import Scene
 
 _KEPT = 16
 ANNOTATED, DETECTED = "annotated", "detected"
+_LEAST_KEYPOINTS = 6
 _LEAST_SCORE = 0.4  # of a detected keypoint that methods are given
 _LEAST_PX = 0.5  # a standard deviation that keypoints are given at least
 _FOCAL_PRIOR = 0.2  # of the logs of scales, while the focal length is estimated
@@ -252,8 +253,8 @@ def sight(target: PhotoTarget, protocol: Protocol, options: PhotosOptions) -> Si
     if marks is None or model is None:
         raise LeftOutError("there are no keypoints")
     names, pixels = _marked(marks, model)
-    if len(names) < options.min_keypoints:
-        raise LeftOutError(f"{len(names)} keypoints are fewer than {options.min_keypoints}")
+    if len(names) < _LEAST_KEYPOINTS:
+        raise LeftOutError(f"{len(names)} keypoints are fewer than {_LEAST_KEYPOINTS}")
     bounds, gt = target.bounds, target.gt
     assert bounds is not None  # of the keypoints at least
     sighting = Sighting(

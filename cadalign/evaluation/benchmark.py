@@ -165,11 +165,12 @@ class Benchmark:
     def evaluate(self, tasks: Sequence[Any]) -> list[Row]:
         """A row for every instance and method; the first of an instance has its record."""
         cases = self.setting.cases(tasks)
+        blank = self._blank
         answers = zip(*(self._answers(method, cases) for method in self.methods), strict=True)
         rows: list[Row] = []
         for case, each in zip(cases, answers, strict=True):
             outcomes = [outcome for outcome, _ in each]
-            own = [outcome.row() for outcome in outcomes]
+            own = [blank | outcome.row() for outcome in outcomes]
             if case.instance is not None:
                 record = self.setting.finish(case, outcomes, [estimate for _, estimate in each])
                 if record is not None:
@@ -180,10 +181,16 @@ class Benchmark:
     def failure(self, task: Any, reason: str) -> list[Row]:
         """A failed row for every method."""
         return [
-            Outcome({**case.names, "method": method.name}, case.facts, FAILED, reason).row()
+            self._blank
+            | Outcome({**case.names, "method": method.name}, case.facts, FAILED, reason).row()
             for case in self.setting.failed(task)
             for method in self.methods
         ]
+
+    @property
+    def _blank(self) -> Row:
+        """Texts of a row that says nothing: no text of a result table is missing."""
+        return {name: "" for name, kind in self.columns if kind is str}
 
     def _answers(self, method: Method, cases: Sequence[Case]) -> list[tuple[Outcome, Any]]:
         """Outcome and estimate of a method for every case; an error where there is no estimate."""

@@ -127,18 +127,9 @@ class Spec:
 
 
 # In the order in which they are named to users, with their modules.
-_EXPERIMENTS = {
-    name: f"cadalign.evaluation.experiments.{module}"
-    for name, module in {
-        "keypointnet": "keypointnet",
-        "demo": "demo",
-        "simulate": "simulation",
-        "correspondences": "correspondences",
-        "retrieval": "retrieval",
-        "unseen": "unseen",
-        "photos": "photos",
-    }.items()
-}
+_NAMES = ("keypointnet", "demo", "simulate", "correspondences", "retrieval", "unseen", "photos")
+_EXPERIMENTS = {name: f"cadalign.evaluation.experiments.{name}" for name in _NAMES}
+_EXPERIMENTS["simulate"] = "cadalign.evaluation.experiments.simulation"
 BATCHES: dict[str, str] = {}
 """Modules of runs over many observations, which `cadalign.report` shows as experiments are."""
 

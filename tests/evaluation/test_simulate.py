@@ -70,8 +70,7 @@ def test_a_problem_does_not_depend_on_its_neighbours() -> None:
 
 def test_another_seed_gives_other_problems() -> None:
     kind = SweepOptions("points", values=(8,)).kind
-    first = SweepProblems(kind, 0).problem((8.0, 0))
-    other = SweepProblems(kind, 1).problem((8.0, 0))
+    first, other = (SweepProblems("points", seed).problem(sweep_tasks(kind)[0]) for seed in (0, 1))
     assert not np.array_equal(first.points_2d, other.points_2d)
 
 

@@ -166,8 +166,7 @@ class KeypointViews(Setting):
         return Case(task.names, facts, (task, instance))
 
     def failed(self, task: KeypointTask) -> list[Case]:
-        facts = {"visibility": "", "symmetry": "" if task.problem else str(task.symmetry)}
-        return [Case(task.names, facts)]
+        return [Case(task.names, {} if task.problem else {"symmetry": str(task.symmetry)})]
 
     def _instances(self, tasks: Sequence[KeypointTask]) -> list[Instance | Exception]:
         names = ("noise_px", "min_visible", "seed")

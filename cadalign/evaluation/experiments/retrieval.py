@@ -123,7 +123,6 @@ TOP = 50
 """Ranks beyond this are one."""
 _SHAPE_SIGMA = 0.02  # of the keypoints of the best model where the right one lacks, of their extent
 _LEAST_SIGMA = 0.5  # keypoints without noise would leave no other model any chance
-_NO_MATCH: Row = {"matched_category": "", "matched_id": ""}
 
 
 @dataclass(frozen=True)
@@ -212,15 +211,12 @@ class RetrievalQueries(Setting):
     library: str
     options: RetrievalRunOptions
 
-    def failed(self, task: RetrievalTask) -> list[Case]:
-        return [Case(task.names, _NO_MATCH)]
-
     def case(self, task: RetrievalTask) -> Case:
         library = _opened(self.library)
         gt = library[task.category, task.model_id]
         query = observe_model(gt, task, seed=self.options.seed)
-        instance = RetrievalInstance(task, query, gt, same_shapes(library, gt.key))
-        return Case(task.names, _NO_MATCH, instance)
+        alike = same_shapes(library, gt.key)
+        return Case(task.names, instance=RetrievalInstance(task, query, gt, alike))
 
     def row(self, method: Method, instance: RetrievalInstance, matches: Sequence[Match]) -> Row:
         """Compare matches with the true model; errors are those of the first match."""

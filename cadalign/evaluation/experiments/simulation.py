@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import tyro
 
@@ -157,13 +157,30 @@ COLUMNS: Columns = (
 )
 
 
-SweepTask = tuple[float, int]
-"""One random problem: the value of the quantity that is varied, and the problem's number."""
+class SweepTask(NamedTuple):
+    """One random problem by its setting and its number; ``value`` is what the sweep varies."""
+
+    value: float
+    points: int
+    noise_px: float
+    outlier_share: float
+    run: int
+
+    @property
+    def names(self) -> Row:
+        """The cells that name its rows, but for the method."""
+        return {name: value for name, value in self._asdict().items() if name != "value"}
 
 
 def sweep_tasks(kind: SweepKind) -> list[SweepTask]:
     """All problems of a sweep, value by value."""
-    return [(value, run) for value in kind.values for run in range(kind.runs)]
+    held = {name: getattr(kind, name) for name in ("points", "noise_px", "outlier_share")}
+    settings = ({**held, kind.column: value, "value": value} for value in kind.values)
+    return [
+        SweepTask(**{**setting, "points": int(setting["points"])}, run=run)
+        for setting in settings
+        for run in range(kind.runs)
+    ]
 
 
 @dataclass(frozen=True)
@@ -172,15 +189,12 @@ class SweepProblems(Setting):
 
     columns = COLUMNS
 
-    kind: SweepKind
+    sweep: str
     seed: int
 
     def case(self, task: SweepTask) -> Case:
-        sigma = self._setting(task)["noise_px"] or 1.0
-        return Case(self._names(task), instance=MethodInput.of_problem(self.problem(task), sigma))
-
-    def failed(self, task: SweepTask) -> list[Case]:
-        return [Case(self._names(task))]
+        problem = self.problem(task)
+        return Case(task.names, instance=MethodInput.of_problem(problem, task.noise_px or 1.0))
 
     def row(self, method: Method, given: MethodInput, estimate: Alignment | Result) -> Row:
         assert given.gt is not None
@@ -188,22 +202,16 @@ class SweepProblems(Setting):
 
     def problem(self, task: SweepTask) -> SimulatedProblem:
         """The problem of a task."""
-        value, run = task
-        rng = instance_rng(self.seed, self.kind.name, repr(float(value)), str(run))
-        return simulate_problem(rng, **self._setting(task))
-
-    def _setting(self, task: SweepTask) -> Row:
-        held = {name: getattr(self.kind, name) for name in ("points", "noise_px", "outlier_share")}
-        setting = {**held, self.kind.column: task[0]}
-        return {**setting, "points": int(setting["points"])}
-
-    def _names(self, task: SweepTask) -> Row:
-        return {**self._setting(task), "run": task[1]}
+        rng = instance_rng(self.seed, self.sweep, repr(float(task.value)), str(task.run))
+        noise_px, outlier_share = task.noise_px, task.outlier_share
+        return simulate_problem(
+            rng, points=task.points, noise_px=noise_px, outlier_share=outlier_share
+        )
 
 
 def sweep_benchmark(kind: SweepKind, seed: int, metrics: Sequence[str] = ()) -> Benchmark:
     """The methods of a sweep on its problems, in batches."""
-    setting, batched = SweepProblems(kind, seed), frozenset(kind.methods)
+    setting, batched = SweepProblems(kind.name, seed), frozenset(kind.methods)
     return Benchmark.chosen(setting, kind.methods, metrics=metrics, batched=batched)
 
 

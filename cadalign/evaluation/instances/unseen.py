@@ -360,19 +360,12 @@ def _coverage(result: Result, seen: UnseenObject, known: IntArray, rows: IntArra
 
 def _described(found: ShapeEstimate, seen: UnseenObject) -> AlignedShape:
     known, rows = _shared(found, seen)
-    shape = aligned_shape(
+    return aligned_shape(
         found if found.result is None else found.result,
         rows,
         seen.xyz[known],
         model_bounds=seen.task.hull.bounds,
         spans_points=True,
+        rms=np.nan if found.result is None else found.result.rms,
         sigma=seen.options.sigma,
     )
-    # The residuals are those of the given keypoints that the method has, before the camera.
-    given = np.isin(seen.rows, known)
-    in_camera = shape.alignment.apply(shape.target[np.searchsorted(known, seen.rows[given])])
-    ahead = in_camera[:, 2] > 0
-    if not ahead.any():
-        return shape
-    residuals = KEYPOINT_CAMERA.project(in_camera[ahead]) - seen.points_2d[given][ahead]
-    return replace(shape, rms=float(np.sqrt((residuals**2).sum(axis=1).mean())))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -192,8 +192,6 @@ def _of_shape(
 
 # Setting ------------------------------------------------------------------------------------------
 
-_NO_SOURCE: Row = {"source": ""}
-
 
 @dataclass(frozen=True)
 class PhotoObjects(Setting):
@@ -205,15 +203,12 @@ class PhotoObjects(Setting):
     options: PhotosOptions
     drawn_in: RunFolder  # the folder that pictures go to
 
-    def failed(self, task: PhotoTask) -> list[Case]:
-        return [Case(task.names, _NO_SOURCE)]
-
     def _cases(self, task: PhotoTask) -> list[Case]:
         wanted = self.options.categories
         found = []
         for each in targets_of(task, self.options.root, pictures=self.options.pictures):
             if isinstance(each, Case):
-                found.append(replace(each, facts=_NO_SOURCE))
+                found.append(each)
             elif wanted is None or each.found.category in wanted:
                 found.append(self._case(each))
         return found
@@ -222,7 +217,7 @@ class PhotoObjects(Setting):
         protocol = protocol_of(opened(self.options.root).kind)
         sighting = attempt(sight, target, protocol, self.options)
         if isinstance(sighting, Exception):
-            return Case(target.names, _NO_SOURCE, error=sighting)
+            return Case(target.names, error=sighting)
         facts = {"keypoints": len(sighting.names), "source": sighting.source}
         return Case(target.names, facts, sighting)
 

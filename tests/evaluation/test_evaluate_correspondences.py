@@ -22,13 +22,10 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Posterior, ViewResult
 from cadalign.evaluation import plots
 from cadalign.evaluation.api import run as do_run
-from cadalign.evaluation.benchmark import Benchmark
 from cadalign.evaluation.experiments.correspondences import (
     SPEC,
     CorrespondenceOptions,
-    CorrespondenceTask,
-    CorrespondenceTasks,
-    SpoiledImages,
+    correspondence_tasks,
     errors_of,
     spoil,
     summarize_shares,
@@ -291,21 +288,6 @@ class TestRows:
         few = fit_with("ransac-aepnp", RansacOptions(minimal="ap4p", seed=1))
         assert few.method == "ransac-aepnp"
 
-    def test_too_few_points_become_a_failed_row_with_the_reason(self):
-        seen = seen_image("a", 1)
-        few = replace(seen, points_3d=seen.points_3d[:5], points_2d=seen.points_2d[:5])
-        task = CorrespondenceTask("a", 0.0, 0, few)
-        options = CorrespondenceOptions(ANY, methods=("aepnp-paper", "epnp"))
-        benchmark = Benchmark.chosen(SpoiledImages(options), options.methods)
-        paper, epnp = benchmark.evaluate([task])
-        assert (paper["status"], epnp["status"]) == ("failed", "ok")
-        assert "5" in paper["reason"]
-        assert (paper["points"], paper["success"], paper.get("rotation_error_deg")) == (
-            5,
-            False,
-            None,
-        )
-
 
 class TestBrokenImages:
     @pytest.mark.long
@@ -329,7 +311,7 @@ class TestBrokenImages:
     def test_nothing_but_broken_ones_is_refused(self, tmp_path):
         root = write_colmap(tmp_path, images=2, broken=(0, 1))
         with pytest.raises(DataError, match=r"none of 2 images can be read.*do not exist"):
-            CorrespondenceTasks(open_correspondences(root), QUICK)
+            correspondence_tasks(open_correspondences(root), QUICK)
 
 
 class TestRuns:

@@ -103,7 +103,7 @@ class TestRecords:
                 assert box_iou(**dict(zip(("est", "gt"), boxes, strict=True))) == pytest.approx(
                     expected[1], abs=1e-4
                 )
-                assert estimate["rms_px"] >= 0
+                assert estimate["method"] not in ("shape", "exact") or estimate["rms_px"] >= 0
 
     @pytest.mark.slow
     def test_are_on_the_page(self, finished: RunFolder, tmp_path: Path) -> None:
@@ -232,7 +232,7 @@ class TestRun:
         with pytest.raises(Killed):
             run(options, broken, workers=0, dask=None, on_progress=kill)
         assert broken.parts.is_dir()
-        learned = {path: path.stat().st_mtime_ns for path in broken.path.glob("learned/*")}
+        learned = {path: path.stat().st_mtime_ns for path in broken.path.glob("learned/*/*")}
         assert len(learned) == 2
         run(options, broken, workers=0, dask=None)
         assert {path: path.stat().st_mtime_ns for path in learned} == learned

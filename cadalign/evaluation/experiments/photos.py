@@ -6,6 +6,7 @@ A method's name is a base, and the evidence beside the keypoints, as in ``rigid+
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
     from cadalign.evaluation.photos.target import PhotoTask
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.tables import Run
+    from cadalign.shapes.model import ShapeModel
 
 EPNP, RIGID, STRETCHED, PRIOR, SIMILAR = "epnp", "rigid", "stretched", "prior", "similar"
 TRUTH = "truth"
@@ -221,6 +223,22 @@ plots = partial(cumulative_curves, curves=_CURVES, of="on photos")
 """Shares of objects within an error, as `Spec.plots`."""
 
 
+def shapes_of(files: Sequence[Path]) -> tuple[ShapeModel, ...]:
+    """The shape models of some files.
+
+    Raises InputError if two files are of the same category; and DataError if one cannot be read.
+    """
+    from cadalign.shapes.model import ShapeModel
+
+    given = [ShapeModel.open(path) for path in files]
+    counts = Counter(each.category for each in given)
+    twice = next((name for name, count in counts.items() if count > 1), None)
+    if twice is not None:
+        what, fix = f"two files are of the category {quote(twice)}", "give one for each category"
+        raise InputError(what, where="shape", fix=fix)
+    return tuple(given)
+
+
 _CHUNK, _LARGE_CHUNK = 4, 32
 _LARGE = 500  # photos
 
@@ -229,7 +247,6 @@ def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
     """Plan a run over the photos of a data set."""
     from cadalign.evaluation.photos.objects import photos_benchmark
     from cadalign.evaluation.photos.target import PhotoTasks, reopened
-    from cadalign.evaluation.shape_files import shapes_of
 
     dataset = reopened(options.root)
     shapes = shapes_of(options.shape)

@@ -19,7 +19,7 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
 from cadalign.evaluation.experiments.keypointnet import KeypointTasks
-from cadalign.evaluation.experiments.unseen import COLUMNS, METHODS, UnseenOptions
+from cadalign.evaluation.experiments.unseen import COLUMNS, METHODS, LearnedFiles, UnseenOptions
 from cadalign.evaluation.instances.instance import (
     KEYPOINT_CAMERA,
     KeypointTask,
@@ -35,7 +35,6 @@ from cadalign.evaluation.methods import LIMIT, SHAPE, Method, MethodInput
 from cadalign.evaluation.metrics.cramer_rao import limit_estimate, probability_level
 from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
 from cadalign.evaluation.runs.work import Outcome, Row
-from cadalign.evaluation.shape_files import LearnedFiles
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.metrics import (
     rotation_error,

@@ -40,18 +40,6 @@ VIEW_NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("me
 """The columns that name a row of a method on a view of a model."""
 
 
-class Tasks(Sequence[T]):
-    """Tasks of a run that are made when they are asked for; a subclass has ``__len__``."""
-
-    def task(self, index: int) -> T:
-        """The task of a number from 0."""
-        raise NotImplementedError
-
-    def __getitem__(self, index: Any) -> Any:
-        places = range(len(self))[index]
-        return list(map(self.task, places)) if isinstance(places, range) else self.task(places)
-
-
 @dataclass(frozen=True)
 class Case:
     """An instance with the cells that name its rows, or why there is none."""

@@ -20,7 +20,6 @@ from cadalign.evaluation.benchmark import (
     Case,
     Pair,
     Setting,
-    Tasks,
     attempt,
     write_picture,
 )
@@ -98,8 +97,8 @@ KeypointView = tuple[KeypointTask, Instance]
 """A view of a model as an instance of the benchmark: its task, and what it shows."""
 
 
-class KeypointTasks(Tasks[KeypointTask]):
-    """All views of all models of a dataset in the order of their names.
+class KeypointTasks(Sequence[KeypointTask]):
+    """All views of all models of a dataset in the order of their names, each made when asked for.
 
     ``options`` are an experiment's, with ``visibility``, ``views_per_model`` and ``max_models``.
     """
@@ -121,8 +120,11 @@ class KeypointTasks(Tasks[KeypointTask]):
     def __len__(self) -> int:
         return len(self.keys) * self._views
 
-    def task(self, index: int) -> KeypointTask:
-        """A view of a model."""
+    def __getitem__(self, index: Any) -> Any:
+        places = range(len(self))[index]
+        return list(map(self._task, places)) if isinstance(places, range) else self._task(places)
+
+    def _task(self, index: int) -> KeypointTask:
         place, view = divmod(index, self._views)
         first = self._first(self.keys[place])
         return first if view == 0 else replace(first, view=view)

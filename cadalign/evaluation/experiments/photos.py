@@ -246,11 +246,11 @@ _LARGE = 500  # photos
 def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
     """Plan a run over the photos of a data set."""
     from cadalign.evaluation.photos.objects import photos_benchmark
-    from cadalign.evaluation.photos.target import PhotoTasks, reopened
+    from cadalign.evaluation.photos.target import annotations_of, photo_tasks, reopened
 
     dataset = reopened(options.root)
     shapes = shapes_of(options.shape)
-    tasks = PhotoTasks(dataset, options.max_photos)
+    tasks = photo_tasks(dataset, options.max_photos)
     pictures = folder.made_for_pictures()
     chunk = _CHUNK if len(tasks) < _LARGE else _LARGE_CHUNK
     return photos_benchmark(options, shapes, pictures).plan(
@@ -259,7 +259,7 @@ def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
         chunk=chunk,
         kind=dataset.kind,
         shapes=fingerprint(*map(read_bytes, options.shape)),
-        annotations=tasks.fingerprint(),
+        annotations=annotations_of(dataset, tasks),
     )
 
 

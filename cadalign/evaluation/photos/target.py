@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -20,7 +21,7 @@ from cadalign.datasets.photos.photo import (
 )
 from cadalign.errors import DataError
 from cadalign.estimation.fit import fit
-from cadalign.evaluation.benchmark import Case, Tasks
+from cadalign.evaluation.benchmark import Case
 from cadalign.evaluation.experiments.photos import PhotosOptions, Protocol
 from cadalign.evaluation.runs.work import (
     UNREADABLE,
@@ -55,29 +56,19 @@ class PhotoTask:
         return {"category": UNREADABLE, "model_id": self.name, "view": 0}
 
 
-class PhotoTasks(Tasks[PhotoTask]):
+def photo_tasks(dataset: PhotoDataset, max_photos: int | None) -> list[PhotoTask]:
     """The photos of a data set, then the records that its listing could not read."""
+    tasks = [PhotoTask(index, name) for index, name in enumerate(dataset.names[:max_photos])]
+    bad = dataset.problems.items() if max_photos is None else ()
+    tasks += [PhotoTask(-1, name, str(error)) for name, error in bad]
+    if not tasks:
+        raise DataError("there are no photos", where=str(dataset.root))
+    return tasks
 
-    def __init__(self, dataset: PhotoDataset, max_photos: int | None) -> None:
-        self._names = dataset.names[:max_photos]
-        bad = dataset.problems.items() if max_photos is None else ()
-        self._bad = tuple((name, str(error)) for name, error in bad)
-        self._annotations = fingerprint_of_files(dataset.annotation_files())
-        if not len(self):
-            raise DataError("there are no photos", where=str(dataset.root))
 
-    def __len__(self) -> int:
-        return len(self._names) + len(self._bad)
-
-    def task(self, index: int) -> PhotoTask:
-        """A photo, or a record that could not be read."""
-        if index < len(self._names):
-            return PhotoTask(index, self._names[index])
-        return PhotoTask(-1, *self._bad[index - len(self._names)])
-
-    def fingerprint(self) -> str:
-        """Hash of the photos' names and annotations: a run must not go on with others."""
-        return fingerprint("\0".join(self._names), repr(self._bad), self._annotations)
+def annotations_of(dataset: PhotoDataset, tasks: Sequence[PhotoTask]) -> str:
+    """Hash of the photos' names and annotations: a run must not go on with others."""
+    return fingerprint(repr(tasks), fingerprint_of_files(dataset.annotation_files()))
 
 
 opened = lru_cache(maxsize=1)(open_photos)

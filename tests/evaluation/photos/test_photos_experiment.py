@@ -33,7 +33,7 @@ from cadalign.evaluation.experiments.photos import COLUMNS, SPEC, PhotosOptions,
 from cadalign.evaluation.instances.pictures import cut_out
 from cadalign.evaluation.methods import Method
 from cadalign.evaluation.photos.objects import PhotoEstimate, PhotoObjects
-from cadalign.evaluation.photos.target import PhotoTasks, Sighting, opened
+from cadalign.evaluation.photos.target import Sighting, annotations_of, opened, photo_tasks
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.summary import Summary
@@ -110,7 +110,7 @@ def score_poses(dataset: PhotoDataset, poses: dict[tuple[str, str], Alignment]) 
         return PhotoEstimate(pose, Box.from_model(sighting.bounds, pose))
 
     setting = PhotoObjects(PhotosOptions(dataset.root, pictures=0), RunFolder(Path("unused")))
-    found = Benchmark(setting, (Method("given", given),)).evaluate(PhotoTasks(dataset, None))
+    found = Benchmark(setting, (Method("given", given),)).evaluate(photo_tasks(dataset, None))
     return [row | {"source": ""} for row in found]
 
 
@@ -302,12 +302,12 @@ class TestRuns:
     def test_every_file_of_annotations_counts(self, tmp_path: Path, kind: str) -> None:
         WRITERS[kind](tmp_path / "data")
         dataset = opened(tmp_path / "data")
-        seen = {PhotoTasks(dataset, None).fingerprint()}
+        seen = {annotations_of(dataset, photo_tasks(dataset, None))}
         ends = (".json", ".txt", ".mat")
         files = [path for path in dataset.root.rglob("*") if path.suffix in ends]
         for path in files:
             path.write_bytes(path.read_bytes() + b"\n")
-            seen.add(PhotoTasks(dataset, None).fingerprint())
+            seen.add(annotations_of(dataset, photo_tasks(dataset, None)))
         assert len(seen) == len(files) + 1
 
     def test_as_one_call(self, tmp_path: Path) -> None:

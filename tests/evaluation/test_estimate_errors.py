@@ -84,7 +84,3 @@ def test_flat_models_have_no_overlap_and_estimates_that_are_not_finite_no_errors
     assert isinstance(second, InputError)
     assert "NaN" in str(second)
     assert third["box_iou"] == pytest.approx(1)
-
-
-def test_no_estimates_have_no_errors() -> None:
-    assert estimate_errors([], [], []) == []

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.pages import embedded_payload
 
 from cadalign import Alignment, Box
 from cadalign.cli import main
@@ -25,7 +24,7 @@ from cadalign.evaluation.runs.engine import Progress
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run, read_table
 from cadalign.geometry.metrics import box_iou
-from cadalign.report import headline_text, write_report
+from cadalign.report import headline_text
 
 SYNSET = "03001627"
 BASE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -104,13 +103,6 @@ class TestRecords:
                     expected[1], abs=1e-4
                 )
                 assert estimate["method"] not in ("shape", "exact") or estimate["rms_px"] >= 0
-
-    @pytest.mark.slow
-    def test_are_on_the_page(self, finished: RunFolder, tmp_path: Path) -> None:
-        written = write_report([finished.path], tmp_path / "report.html")
-        page = embedded_payload(written)
-        assert len(page["exhibits"]) == OBJECTS
-        assert "keypoint_error" in [metric["key"] for metric in page["metrics"]]
 
 
 def pose(record: dict[str, Any]) -> Alignment:
@@ -240,24 +232,6 @@ class TestRun:
         assert broken.config_file.read_bytes() == whole.config_file.read_bytes()
 
     @pytest.mark.long
-    def test_results_do_not_depend_on_the_other_methods(
-        self, root: Path, finished: RunFolder, tmp_path: Path
-    ) -> None:
-        folder = RunFolder(tmp_path / "run")
-        run(UnseenOptions(root, methods=("mean-rigid",)), folder, workers=0, dask=None)
-        table = read_table(finished.results).to_pandas()
-        kept = table[table["method"] == "mean-rigid"].reset_index(drop=True)
-        assert kept.equals(read_table(folder.results).to_pandas())
-
-    @pytest.mark.long
-    def test_outliers_are_found(self, root: Path, tmp_path: Path) -> None:
-        folder = RunFolder(tmp_path / "run")
-        options = UnseenOptions(root, outliers=0.3, methods=("shape", "exact", "limit"))
-        run(options, folder, workers=0, dask=None)
-        assert np.median(column(folder, "rotation_error_deg", "shape")) < 15
-        assert np.median(column(folder, "rotation_error_deg", "limit")) < 5
-
-    @pytest.mark.long
     def test_bad_objects_do_not_stop_the_others(self, root: Path, tmp_path: Path) -> None:
         spoiled = tmp_path / "frames"
         (spoiled / "annotations").mkdir(parents=True)
@@ -337,39 +311,3 @@ class TestCommand:
             *("calibration_rotation", "calibration_stretch"),
         ]
         assert "| limit |" in headline_text([finished.path], format="md")
-
-
-@pytest.mark.long
-def test_of_real_bottles_the_shape_model_is_best(real_data: Path, tmp_path: Path) -> None:
-    folder = RunFolder(tmp_path / "run")
-    options = UnseenOptions(real_data / "keypointnet", categories=("bottle",), max_models=8)
-    run(options, folder, workers=0, dask=None)
-    rotation, iou = (
-        # One of the bottles has no volume.
-        {name: np.nanmedian(column(folder, key, name)) for name in METHODS}
-        for key in ("rotation_error_deg", "box_iou_up_to_scale")
-    )
-    assert rotation["shape"] <= 2.0
-    assert iou["shape"] >= 0.87
-    for name in ("random-rigid", "random-stretched", "mean-rigid", "mean-stretched", "nearest"):
-        assert rotation["shape"] < rotation[name]
-        assert iou["shape"] > iou[name]
-
-
-@pytest.mark.long
-def test_of_real_knives_the_shape_is_nearer_than_the_mean(real_data: Path, tmp_path: Path) -> None:
-    """Their keypoints lie near a line, and the turn about it is nearly open."""
-    options = UnseenOptions(
-        real_data / "keypointnet",
-        categories=("knife",),
-        methods=("shape", "mean-rigid"),
-        views_per_model=3,
-    )
-    folder = RunFolder(tmp_path / "knives")
-    run(options, folder, workers=0, dask=None)
-    ratios = [
-        np.median(column(folder, key, "shape")) / np.median(column(folder, key, "mean-rigid"))
-        for key in ("translation_error_up_to_scale", "rotation_error_deg")
-    ]
-    assert ratios[0] <= 0.6
-    assert ratios[1] < 0.9

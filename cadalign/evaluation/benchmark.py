@@ -20,7 +20,7 @@ from cadalign.evaluation.methods import (
     choose_methods,
     choose_metrics,
 )
-from cadalign.evaluation.options import ExperimentOptions, text_of
+from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.runs.work import (
     FAILED,
     AbortError,
@@ -141,14 +141,8 @@ class Benchmark:
     def plan(
         self, options: ExperimentOptions, tasks: Sequence[T], *, chunk: int, **more: Any
     ) -> Plan[T]:
-        """The plan of a run, with more of its configuration than the options and the metrics."""
-        return Plan(self, tasks, options.as_config() | more | self.further, chunk)
-
-    @property
-    def further(self) -> dict[str, Any]:
-        """Metrics of users in a run's configuration; empty without any."""
-        functions = [text_of(each.function) for each in self.metrics]
-        return {"metrics": functions} if functions else {}
+        """The plan of a run, with more of its configuration than the options."""
+        return Plan(self, tasks, options.as_config() | more, chunk)
 
     def evaluate(self, tasks: Sequence[Any]) -> list[Row]:
         """A row for every instance and method; the first of an instance has its record."""
@@ -206,17 +200,11 @@ class Benchmark:
         return answers
 
     def _measured(self, method: Method, pairs: Sequence[Pair]) -> Sequence[Row | Exception]:
-        """The cells of each estimate; one that cannot be measured does not stop the others."""
-        if not pairs:
-            return []
-        found = attempt(self.setting.measure, method, pairs)
-        if not isinstance(found, Exception):
-            if not self.metrics:
-                return found
-            return [self._further(*each) for each in zip(pairs, found, strict=True)]
-        if len(pairs) == 1:
-            return [found]
-        return [row for pair in pairs for row in self._measured(method, [pair])]
+        """The cells of each estimate, or why there are none."""
+        rows = self.setting.measure(method, pairs) if pairs else []
+        if not self.metrics:
+            return rows
+        return [self._further(*each) for each in zip(pairs, rows, strict=True)]
 
     def _further(self, pair: Pair, row: Row | Exception) -> Row | Exception:
         """The cells of an estimate with those of further metrics."""

@@ -47,7 +47,7 @@ def test_every_experiment_has_a_specification_with_its_name() -> None:
 @pytest.mark.parametrize(
     ("experiment", "options"),
     [
-        ("keypointnet", {"methods": ("optimal",), "visibility": "rays"}),
+        ("keypointnet", {"methods": ("optimal",)}),
         ("unseen", {"methods": ("shape",)}),
         ("photos", {"methods": ("rigid",)}),
     ],

@@ -101,12 +101,6 @@ def test_models_that_cannot_be_used_become_failed_or_skipped_rows(annotated: Pat
         assert failed[metric].isna().all()
 
 
-def test_rays_without_a_mesh_are_a_failed_row(annotated: Path) -> None:
-    table = evaluate(annotated, methods=["optimal"], visibility="rays")
-    reason = table[table.model_id == "good"].reason.item()
-    assert "there is no mesh" in reason
-
-
 @pytest.mark.long
 def test_an_instance_does_not_depend_on_its_neighbours(sample_root: Path) -> None:
     methods = ("optimal", "aepnp-paper", "limit")
@@ -139,7 +133,7 @@ def test_a_run_does_not_go_on_with_other_annotations(annotated: Path, tmp_path: 
         ({"noise_px": -1.0}, "not a noise level"),
         ({"min_visible": 0}, "min_visible"),
         ({"views_per_model": 0}, "views_per_model"),
-        ({"visibility": "guess"}, "known are auto, rays, hull"),
+        ({"visibility": "guess"}, "known are auto, hull"),
     ],
 )
 def test_bad_options_are_named(sample_root: Path, options: dict[str, Any], message: str) -> None:

@@ -65,9 +65,9 @@ class KeypointNetOptions(ViewOptions):
     methods: tuple[str, ...] = ("optimal", "aepnp", "aepnp-paper", "epnp", "limit")
     """Methods of `cadalign fit`, optimal-huber, optimal-cauchy, ransac-optimal, ransac-ap4p,
     ransac-aepnp, and limit: the Cramer-Rao bound."""
-    visibility: Literal["auto", "rays", "hull"] = "auto"
-    """Keypoints are seen that rays cast at the mesh reach, or by a rule on the hull of the
-    keypoints; auto takes rays where there is a mesh."""
+    visibility: Literal["auto", "hull"] = "auto"
+    """Keypoints are seen that rays cast at the mesh reach, where there is one, or, everywhere by
+    hull, by a rule on the hull of the keypoints."""
     render: Literal["none", "overlay"] = "none"
     """Draw the first method's result for every model with a mesh, or nothing."""
 
@@ -75,7 +75,7 @@ class KeypointNetOptions(ViewOptions):
         super().__post_init__()
         self.check_methods()
         self.check_least(min_visible=1)
-        self.check_known(visibility=("auto", "rays", "hull"), render=("none", "overlay"))
+        self.check_known(visibility=("auto", "hull"), render=("none", "overlay"))
 
 
 POSE_ERRORS = ("rotation_error_deg", "translation_error", "box_iou")
@@ -114,7 +114,7 @@ class KeypointTasks(Sequence[KeypointTask]):
         if not self.keys:
             raise DataError("there are no models to evaluate", where=str(dataset.root))
         self._first = lru_cache(maxsize=4)(
-            lambda key: KeypointTask.of_model(dataset, *key, visibility=options.visibility)
+            lambda key: KeypointTask.of_model(dataset, *key, hull=options.visibility == "hull")
         )
 
     def __len__(self) -> int:

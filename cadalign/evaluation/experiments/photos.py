@@ -17,7 +17,6 @@ import numpy as np
 import tyro
 
 from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
-from cadalign.datasets.photos.pix3d import Pix3D
 from cadalign.datasets.photos.scan2cad import Scan2CAD
 from cadalign.errors import InputError, quote
 from cadalign.evaluation import metrics
@@ -135,8 +134,6 @@ class Protocol:
     """Evaluation of a data set: its metrics, and what it is given."""
 
     metrics: tuple[MetricSet, ...]
-    best: str
-    """The method whose estimates are drawn."""
     up_axis: str = "y"  # the upward axis of its models
     sigma_of_side: float = 1 / 64
     """Standard deviation of its keypoints as a share of the longer side of the object's rectangle:
@@ -146,12 +143,11 @@ class Protocol:
 
 _PROTOCOLS = {
     # Annotators' points on scan and model are about 5 cm apart, 8 px in an image of 480.
-    Scan2CAD.kind: Protocol((VIEWPOINT, SCAN2CAD, BOX), SIMILAR, sigma_of_width=1 / 60),
-    Pix3D.kind: Protocol((VIEWPOINT, BOX), RIGID),
-    Pascal3D.kind: Protocol((VIEWPOINT,), SIMILAR, up_axis="z"),
-    Pascal3DDetections.kind: Protocol((VIEWPOINT,), SIMILAR, up_axis="z"),
+    Scan2CAD.kind: Protocol((VIEWPOINT, SCAN2CAD, BOX), sigma_of_width=1 / 60),
+    Pascal3D.kind: Protocol((VIEWPOINT,), up_axis="z"),
+    Pascal3DDetections.kind: Protocol((VIEWPOINT,), up_axis="z"),
 }
-_OTHER = Protocol((VIEWPOINT, BOX), PRIOR)
+_OTHER = Protocol((VIEWPOINT, BOX))
 
 
 def protocol_of(kind: str) -> Protocol:

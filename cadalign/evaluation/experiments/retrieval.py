@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
@@ -193,13 +193,7 @@ def observe_model(model: LibraryModel, task: RetrievalTask, *, seed: int) -> Ret
     )
 
 
-class RetrievalInstance(NamedTuple):
-    """A query of a library's file, with the models that count as the true one."""
-
-    task: RetrievalTask
-    query: RetrievalQuery
-    gt: LibraryModel
-    alike: frozenset[ModelKey]
+RetrievalInstance = tuple[RetrievalTask, RetrievalQuery]
 
 
 @dataclass(frozen=True)
@@ -213,22 +207,24 @@ class RetrievalQueries(Setting):
 
     def case(self, task: RetrievalTask) -> Case:
         library = _opened(self.library)
-        gt = library[task.category, task.model_id]
-        query = observe_model(gt, task, seed=self.options.seed)
-        alike = same_shapes(library, gt.key)
-        return Case(task.names, instance=RetrievalInstance(task, query, gt, alike))
+        model = library[task.category, task.model_id]
+        same_shapes(library, model.key)  # kept at hand: no query's time holds it
+        query = observe_model(model, task, seed=self.options.seed)
+        return Case(task.names, instance=(task, query))
 
     def row(self, method: Method, instance: RetrievalInstance, matches: Sequence[Match]) -> Row:
         """Compare matches with the true model; errors are those of the first match."""
         from cadalign.retrieval.absence import shape_distance
 
-        first, gt, placed = matches[0], instance.gt, instance.query.gt
-        best = _opened(self.library)[first.category, first.model_id]
-        boxes = {"est": first.box, "gt": Box.from_model(gt.bounds, placed)}
+        (task, query), library, first = instance, _opened(self.library), matches[0]
+        gt = library[task.category, task.model_id]
+        alike = same_shapes(library, gt.key)
+        best = library[first.category, first.model_id]
+        boxes = {"est": first.box, "gt": Box.from_model(gt.bounds, query.gt)}
         keys = [(match.category, match.model_id) for match in matches]
-        ranks = (rank for rank, key in enumerate(keys, start=1) if key in instance.alike)
+        ranks = (rank for rank, key in enumerate(keys, start=1) if key in alike)
         return {
-            "alike": len(instance.alike),
+            "alike": len(alike),
             "rank": next(ranks, None),
             "matched_category": first.category,
             "matched_id": first.model_id,
@@ -239,7 +235,7 @@ class RetrievalQueries(Setting):
             "shape_distance": shape_distance(best, gt) if best.category == gt.category else None,
             "box_iou": overlap(**boxes),
             "box_iou_up_to_scale": overlap_up_to_scale(**boxes),
-            "rotation_error_deg": rotation_error(est=first.alignment, gt=placed),
+            "rotation_error_deg": rotation_error(est=first.alignment, gt=query.gt),
         }
 
 
@@ -253,17 +249,18 @@ def retrieval_benchmark(library: str, options: RetrievalRunOptions) -> Benchmark
 def _retrieve(
     instance: RetrievalInstance, *, method: str, library: str, options: RetrievalRunOptions
 ) -> list[Match]:
-    task = instance.task
+    (task, query), opened = instance, _opened(library)
+    alike = same_shapes(opened, (task.category, task.model_id))
     is_exact = task.protocol == LEAVE_IN and method == "optimal"
-    return _opened(library).retrieve(
-        instance.query.points_2d,
-        instance.query.ids,
+    return opened.retrieve(
+        query.points_2d,
+        query.ids,
         KEYPOINT_CAMERA,
         top=TOP,
         category=task.category,
         sigma=max(task.noise_px, _LEAST_SIGMA),
         shape_sigma=0.0 if is_exact else _SHAPE_SIGMA,
-        exclude=instance.alike if task.protocol == LEAVE_OUT else (),
+        exclude=alike if task.protocol == LEAVE_OUT else (),
         workers=1,
         method=method,
     )

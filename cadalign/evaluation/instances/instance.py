@@ -37,12 +37,6 @@ if TYPE_CHECKING:
 KEYPOINT_CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)
 """The camera of the sparse-keypoint experiment."""
 STRETCH_RANGE = (0.5, 2.0)
-RAYS = "rays"
-"""Visibility found by casting rays at the mesh."""
-AUTO = "auto"
-"""Rays where there is a mesh, the hull's rule elsewhere."""
-HULL = "hull"
-"""Visibility by the rule of the hull, without a mesh."""
 
 # The ranges of `cadalign.render.sample_view`: azimuth, the elevation's sine, share of the image.
 _LOWEST = np.array([-np.pi, 0.0, 0.7])
@@ -219,9 +213,12 @@ class KeypointTask:
 
     @classmethod
     def of_model(
-        cls, dataset: KeypointNet, category: str, model_id: str, *, visibility: str
+        cls, dataset: KeypointNet, category: str, model_id: str, *, hull: bool
     ) -> KeypointTask:
-        """The first view of a dataset's model; a malformed one gives a task with a problem."""
+        """The first view of a dataset's model, by its ``hull`` alone or with its mesh.
+
+        A malformed model gives a task with a problem.
+        """
         try:
             model = dataset[category, model_id]
         except CadalignError as error:
@@ -232,14 +229,8 @@ class KeypointTask:
             hull=KeypointHull(model.keypoints.xyz),
             ids=model.keypoints.ids,
             symmetry=symmetry_group(model.keypoints.xyz, model.symmetries),
-            model=mesh_of(model, visibility),
+            model=None if hull or model.mesh_path is None else model,
         )
-
-
-def mesh_of(model: AnnotatedModel, visibility: str) -> AnnotatedModel | None:
-    """The model if its mesh is to be used, which `load_scene` looks for."""
-    use_mesh = visibility == RAYS or (visibility == AUTO and model.mesh_path is not None)
-    return model if use_mesh else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -368,7 +359,7 @@ def _stretched(views: Sequence[_Seen], *, noise_px: float, scene: Scene | None) 
             gt=Alignment(
                 view.cam_from_model.rotation, view.cam_from_model.translation, scale, is_valid=True
             ),
-            visibility=HULL if scene is None else RAYS,
+            visibility="hull" if scene is None else "rays",
             scene=scene,
             diagonal=diagonal,
         )

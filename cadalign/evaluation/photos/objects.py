@@ -120,10 +120,9 @@ def _model(base: str, sighting: Sighting, *, with_mesh: bool) -> Model:
         kind = {"shape_sigma": _SIMILAR_SIGMA * diagonal}
     if with_mesh:
         cad = sighting.target.cad
-        if cad is None or not cad.has_mesh:
+        if cad is None or cad.scene is None:
             raise LeftOutError("the model has no mesh for the mask")
-        mesh = cad.scene.mesh
-        kind["mesh"] = Mesh(mesh.vertices * width, mesh.faces)
+        kind["mesh"] = Mesh(cad.scene.mesh.vertices * width, cad.scene.mesh.faces)
     return Model(
         points_3d=sighting.model.xyz * width,
         ids=sighting.model.names,
@@ -249,11 +248,8 @@ class PhotoObjects(Setting):
             return None
         sighting: Sighting = case.instance
         if sighting.target.is_shown:
-            methods = [outcome.names["method"] for outcome in outcomes]
-            pairs = dict(zip(methods, estimates, strict=True))
-            found = (pairs.get(name) for name in (sighting.protocol.best, *methods, TRUTH))
-            best = next((each for each in found if isinstance(each, PhotoEstimate)), None)
-            write_picture(draw_sighting, self.drawn_in, sighting, best)
+            *_, last = (each for each in estimates if isinstance(each, PhotoEstimate))
+            write_picture(draw_sighting, self.drawn_in, sighting, last)
         return record_of(
             outcomes,
             [_described(each, sighting) for each in estimates],
@@ -310,7 +306,7 @@ def _described(estimate: PhotoEstimate | Any, sighting: Sighting) -> Estimate | 
     )
 
 
-def draw_sighting(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate | None) -> None:
+def draw_sighting(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate) -> None:
     """Write the pictures of an object in a photo, and the preview of its model, to a run's folder.
 
     The photo is grey where there is none.
@@ -321,10 +317,7 @@ def draw_sighting(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate
         photo = sighting.target.photo.read_image()
     except DataError:
         photo = np.full((camera.height, camera.width, 3), NO_PHOTO, dtype=np.uint8)
-    boxes = {
-        "gt_box": sighting.target.gt_box,
-        "est_box": None if estimate is None else estimate.box,
-    }
+    boxes = {"gt_box": sighting.target.gt_box, "est_box": estimate.box}
     write_pictures(folder, stem, photo, camera, observed=sighting.points_2d, **boxes)
-    if cad is not None and cad.has_mesh:
+    if cad is not None and cad.scene is not None:
         write_preview(folder.previews / f"{stem}.json", cad.scene.mesh)

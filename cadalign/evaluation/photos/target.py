@@ -90,24 +90,16 @@ class Cad:
     model: CadModel = field(compare=False, repr=False)  # where it is read from
 
     @property
-    def scene(self) -> Scene:
-        """The mesh; raises DataError if there is none, or it cannot be read."""
+    def scene(self) -> Scene | None:
+        """The mesh; None if there is none that can be read."""
         return _scene(self)
-
-    @property
-    def has_mesh(self) -> bool:
-        """True if there is a mesh that can be read."""
-        try:
-            return bool(self.scene.mesh.faces.size)
-        except DataError:
-            return False
 
     @property
     def bounds(self) -> FloatArray | None:
         """The bounding box (2, 3): the annotation's, the mesh's or that of the keypoints."""
         if self.model.bounds is not None:
             return np.asarray(self.model.bounds)
-        if self.has_mesh:
+        if self.scene is not None:
             return np.asarray(self.scene.bounds)
         points = self.model.load_keypoints()
         return (
@@ -116,8 +108,12 @@ class Cad:
 
 
 @lru_cache(maxsize=_KEPT)
-def _scene(cad: Cad) -> Scene:
-    return Scene(cad.model.load_mesh())
+def _scene(cad: Cad) -> Scene | None:
+    try:
+        scene = Scene(cad.model.load_mesh())
+    except DataError:
+        return None
+    return scene if scene.mesh.faces.size else None
 
 
 @dataclass(frozen=True, eq=False)

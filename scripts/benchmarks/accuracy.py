@@ -19,10 +19,8 @@ from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.simulation import (
     SIMULATION_CAMERA,
     SimulatedProblem,
-    random_rotation,
     simulate_problem,
 )
-from cadalign.geometry.camera import turned_alignment
 from cadalign.metrics import rotation_error
 from cadalign.solvers.linear import aepnp
 
@@ -32,16 +30,11 @@ _METHODS = ("optimal", "aepnp", "aepnp-paper")
 _TITLE = "Rotation, median (90th percentile): the bound, and errors over it"
 _UNKNOWN = Camera.without_focal(SIMULATION_CAMERA.width, SIMULATION_CAMERA.height)
 _ROBUST_POINTS = 100
-_FIELDS = (120, 180, 200)  # of view [degrees]
-_WIDE_SIDE = 1000  # of their images [px]
-
-Draw = Callable[[np.random.Generator], SimulatedProblem]
 
 
 def accuracy(given: BenchmarkData) -> Tables:
-    """Accuracy against the Cramer-Rao bound: usual and wide lenses, unknown focal lengths."""
+    """Accuracy against the Cramer-Rao bound, with known and unknown focal lengths."""
     yield from _solvers(given)
-    yield from _wide_lenses(given)
     yield from _unknown_focal(given)
 
 
@@ -55,39 +48,19 @@ def _solvers(given: BenchmarkData) -> Tables:
     """
     rows = []
     for points, noise in _ROWS:
-        draw = partial(simulate_problem, points=points, noise_px=noise)
-        name = f"{points} points, {noise:g} px"
-        rows.append(_over_bound(name, draw, noise, given.count or 2000, given.seed))
+        rows.append(_over_bound(points, noise, given.count or 2000, given.seed))
     yield _TITLE, rows
     rng = np.random.default_rng(given.seed)
     problems = [simulate_problem(rng, points=n, noise_px=1.0) for n in (10, 100, 1024, 4096)]
     yield "Time over OpenCV's, which does not stretch", [r for p in problems for r in _speed(p)]
 
 
-def _wide_lenses(given: BenchmarkData) -> Tables:
-    """Accuracy of fits of 20 points with wide lenses against the Cramer-Rao bound.
-
-    Objects lie anywhere in the field of view, which fills an image of 1000 x 1000 px.
-    """
-    half, omega = (_WIDE_SIDE - 1) / 2, 0.9
-    rows = []
-    for field in _FIELDS:
-        reach = np.radians(field / 2)
-        bend = np.arctan2(2 * np.tan(omega / 2) * np.sin(reach), np.cos(reach)) / omega
-        for lens, slope, coefficients in (("fisheye", reach, ()), ("fov", bend, (omega,))):
-            size, focal = (_WIDE_SIDE, _WIDE_SIDE), half / slope
-            camera = Camera(*size, focal, focal, half, half, coefficients, lens=lens)
-            draw, name = partial(_wide_problem, camera, reach), f"{lens}, {field} degrees"
-            rows.append(_over_bound(name, draw, 1.0, given.count or 1000, given.seed))
-    yield f"Wide lenses. {_TITLE}", rows
-
-
-def _over_bound(name: str, draw: Draw, noise: float, count: int, seed: int) -> Row:
+def _over_bound(points: int, noise: float, count: int, seed: int) -> Row:
     """Rotation errors of an ideal estimator, and those of every method relative to them."""
     rng = np.random.default_rng(seed)
-    problems = [draw(rng) for _ in range(count)]
+    problems = [simulate_problem(rng, points=points, noise_px=noise) for _ in range(count)]
     ideal = _ideal_errors(problems, rng, sigma=noise, focal="known")["rotation_error_deg"]
-    row: Row = {"problems": name, "bound, deg": section.spread(ideal)}
+    row: Row = {"problems": f"{points} points, {noise:g} px", "bound, deg": section.spread(ideal)}
     for method in _METHODS:
         sigma = noise if method == "optimal" else 1.0
         results = [section.fitted(each, method=method, sigma=sigma) for each in problems]
@@ -111,16 +84,6 @@ def _ideal_errors(
         if bound is not None:
             draws.append(sample_limit(bound, rng=rng, draws=section.LIMIT_DRAWS))
     return {error: np.concatenate([draw[error] for draw in draws]) for error in draws[0]}
-
-
-def _wide_problem(camera: Camera, reach: float, rng: np.random.Generator) -> SimulatedProblem:
-    """A problem as `simulate_problem` draws them, turned to anywhere in a field of view."""
-    while True:
-        drawn = simulate_problem(rng, points=20, noise_px=0.0, depth=(3.0, 6.0))
-        pose = turned_alignment(drawn.alignment, random_rotation(rng))
-        x, y, z = pose.apply(drawn.points_3d).T
-        if (np.arctan2(np.hypot(x, y), z) < reach).all():
-            return section.seen_in(camera, pose, drawn.points_3d, 1.0, rng)
 
 
 def _speed(problem: SimulatedProblem) -> Iterator[Row]:

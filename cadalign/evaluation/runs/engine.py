@@ -228,9 +228,7 @@ def _submitted(
     future: Future[Any] = Future()
     try:
         return executor.submit(call, tasks)
-    except workers.deaths as error:
-        future.set_exception(error)
-    except (OSError, ValueError, RuntimeError) as error:
+    except Exception as error:
         # The pool is closing its pipes, since a process has died, or the scheduler is gone.
         if not workers.deaths:
             raise
@@ -371,11 +369,8 @@ def _cluster(address: str, *, timeout: float = 15.0) -> Iterator[tuple[Executor,
                 raise DataError("the Dask cluster has no workers", where=address, fix=fix) from None
             # Named by chance: to name a chunk by its content takes longer than to evaluate it.
             executor = client.get_executor(pure=False)
-            try:
-                # Clusters grow, and a round trip may cost more than a chunk.
-                yield executor, 2 * sum(client.nthreads().values()) + 2
-            finally:
-                executor.shutdown(wait=False)
+            # Clusters grow, and a round trip may cost more than a chunk.
+            yield executor, 2 * sum(client.nthreads().values()) + 2
 
 
 @contextmanager

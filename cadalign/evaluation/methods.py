@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from cadalign.evaluation.simulation import SimulatedProblem
 
 LIMIT = "limit"
-"""The pseudo-method of the Cramer-Rao bound; see `cadalign.evaluation.metrics.cramer_rao`."""
+"""The pseudo-method of the Cramer-Rao bound; see `cadalign.evaluation.metrics.errors`."""
 SHAPE = "shape"
 """The alignment of a category's learned shape, in runs that have one."""
 _ARGUMENTS = ("est", "gt", "result", "points_3d", "points_2d", "camera", "sigma", "bounds")
@@ -161,7 +161,7 @@ def _fit_many(inputs: Sequence[MethodInput], *, name: str) -> list[Alignment | C
 
 
 def _bound(given: MethodInput) -> Alignment:
-    from cadalign.evaluation.metrics.cramer_rao import limit_estimate
+    from cadalign.evaluation.metrics.errors import limit_estimate
 
     if given.gt is None:
         raise InputError("the Cramer-Rao bound needs the true alignment", where="methods")

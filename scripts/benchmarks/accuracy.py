@@ -14,8 +14,7 @@ from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Camera, RansacOptions
 from cadalign.arrays import FloatArray
-from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, sample_limit
-from cadalign.evaluation.metrics.errors import alignment_errors
+from cadalign.evaluation.metrics.errors import alignment_errors, cramer_rao_bound, sample_limit
 from cadalign.evaluation.simulation import (
     SIMULATION_CAMERA,
     SimulatedProblem,

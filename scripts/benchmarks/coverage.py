@@ -17,7 +17,7 @@ from benchmarks.warned import warned
 from cadalign import Alignment, Camera, Model, RansacOptions, Result, View
 from cadalign.arrays import FloatArray
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.metrics.cramer_rao import probability_level
+from cadalign.evaluation.metrics.errors import probability_level
 from cadalign.metrics import rotation_error
 
 _KINDS = ("fit", "sigma=None", "20 % outliers", "focal", "shape_sigma=.05", "two views")

@@ -15,7 +15,7 @@ from cadalign.arrays import FloatArray, instance_rng
 from cadalign.datasets import KeypointNet
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.unseen import UnseenObject
-from cadalign.evaluation.metrics.cramer_rao import probability_level
+from cadalign.evaluation.metrics.errors import probability_level
 from cadalign.geometry.pixels import PIXEL_CENTRE
 from cadalign.metrics import rotation_error
 

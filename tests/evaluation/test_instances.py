@@ -18,7 +18,7 @@ from cadalign.evaluation.instances.instance import (
     sample_hull_views,
 )
 from cadalign.evaluation.methods import LIMIT, fit_methods, fit_options
-from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, limit_estimate
+from cadalign.evaluation.metrics.errors import cramer_rao_bound, limit_estimate
 from cadalign.evaluation.simulation import simulate_problem
 from cadalign.geometry.alignment import Box
 from cadalign.geometry.camera import Camera

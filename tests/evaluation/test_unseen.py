@@ -18,8 +18,8 @@ from cadalign.errors import InputError
 from cadalign.evaluation.api import run
 from cadalign.evaluation.experiments.unseen import METHODS, SPEC, UnseenOptions
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.instances.unseen import UnseenTasks, observe_object
-from cadalign.evaluation.metrics.cramer_rao import probability_level
+from cadalign.evaluation.instances.unseen import observe_object, unseen_tasks
+from cadalign.evaluation.metrics.errors import probability_level
 from cadalign.evaluation.runs.engine import Progress
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run, read_table
@@ -112,7 +112,7 @@ def pose(record: dict[str, Any]) -> Alignment:
 class TestViews:
     def test_depend_on_names_alone(self, root: Path) -> None:
         options = UnseenOptions(root)
-        tasks = UnseenTasks(KeypointNet(root), options)
+        tasks = unseen_tasks(KeypointNet(root), options)
         all_points = observe_object(tasks[1], options)
         few = observe_object(tasks[1], replace(options, keypoints=5))
         assert len(few.points_2d) == 5
@@ -124,7 +124,7 @@ class TestViews:
 
     def test_noise_scales_and_outliers_are_marked(self, root: Path) -> None:
         options = UnseenOptions(root, noise_px=1.0)
-        task = UnseenTasks(KeypointNet(root), options)[0]
+        task = unseen_tasks(KeypointNet(root), options)[0]
         clean = observe_object(task, replace(options, noise_px=0.0))
         np.testing.assert_allclose(
             clean.points_2d, KEYPOINT_CAMERA.project(clean.gt.apply(clean.xyz))

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 import tyro
@@ -63,8 +63,6 @@ class CorrespondenceOptions(FunctionOptions):
     path: Annotated[Path, tyro.conf.Positional]
     """Folder of a COLMAP model, or of a blind-PnP data set's split."""
     _: KW_ONLY
-    format: Literal["auto", "colmap", "blind-pnp"] = "auto"
-    """Format of the folder; auto goes by the names of the files."""
     outliers: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
     """Shares of the image points that are moved, from 0 to less than 1."""
     draws: int = 20
@@ -193,7 +191,7 @@ class SpoiledImages(Setting):
         return [Case(task.names, {"success": False})]
 
     def case(self, task: CorrespondenceTask) -> Case:
-        seen = _opened(self.options.path, format=self.options.format)[task.image]
+        seen = _opened(self.options.path)[task.image]
         names = (task.image, str(task.draw), repr(task.outliers))
         rng = instance_rng(self.options.seed, *names)
         truth = spoil(seen, task.outliers, rng=rng)
@@ -320,7 +318,7 @@ _CHUNK = 8
 def plan(options: CorrespondenceOptions, folder: RunFolder) -> Plan[CorrespondenceTask]:
     """Plan a run over the images of a model or data set."""
     _opened.cache_clear()  # a session may have changed its files
-    images = _opened(options.path, format=options.format)
+    images = _opened(options.path)
     tasks = correspondence_tasks(images, options)
     more = {"loader": type(images).__name__, "correspondences": _fingerprint(Path(images.root))}
     benchmark = Benchmark.chosen(SpoiledImages(options), options.methods, metrics=options.metrics)

@@ -242,11 +242,12 @@ _CHUNK = 8
 
 def plan(options: UnseenOptions, folder: RunFolder) -> Plan[KeypointTask]:
     """Plan a run over a split's objects; the folder gets what is learned from the other split."""
-    from cadalign.evaluation.instances.unseen import UnseenTasks, unseen_benchmark
+    from cadalign.evaluation.instances.unseen import unseen_benchmark, unseen_tasks
 
     dataset = KeypointNet(options.root, shapenet_root=options.shapenet)
-    tasks = UnseenTasks(dataset, options)
-    learned = learn(dataset, tasks.categories, split=options.train, folder=folder)
+    tasks = unseen_tasks(dataset, options)
+    categories = sorted({category for category, _ in tasks.keys})
+    learned = learn(dataset, categories, split=options.train, folder=folder)
     hashes = {"annotations": tasks.fingerprint(), "learned": learned.folder.name}
     benchmark = unseen_benchmark(learned, options)
     return benchmark.plan(options, tasks, chunk=_CHUNK, **hashes)

@@ -32,8 +32,12 @@ from cadalign.evaluation.instances.record import (
     record_of,
 )
 from cadalign.evaluation.methods import LIMIT, SHAPE, Method, MethodInput
-from cadalign.evaluation.metrics.cramer_rao import limit_estimate, probability_level
-from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
+from cadalign.evaluation.metrics.errors import (
+    limit_estimate,
+    overlap,
+    overlap_up_to_scale,
+    probability_level,
+)
 from cadalign.evaluation.runs.work import Outcome, Row
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.metrics import (
@@ -53,19 +57,10 @@ _LEAST_SHARED = 6
 _RATIOS = np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
 
 
-class UnseenTasks(KeypointTasks):
+def unseen_tasks(dataset: KeypointNet, options: UnseenOptions) -> KeypointTasks:
     """All views of all objects of a split in the order of their names."""
-
-    def __init__(self, dataset: KeypointNet, options: UnseenOptions) -> None:
-        objects = dataset.subset(categories=options.categories, split=options.split)
-        if not objects.ids():
-            raise DataError(f"no objects in the split {options.split}", where=str(dataset.root))
-        super().__init__(objects, options)
-
-    @property
-    def categories(self) -> tuple[str, ...]:
-        """The categories that have objects, sorted."""
-        return tuple(sorted({category for category, _ in self.keys}))
+    objects = dataset.subset(categories=options.categories, split=options.split)
+    return KeypointTasks(objects, options)
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ from cadalign import (
 )
 from cadalign.annotate.photos import PhotoFile, camera_of
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound
+from cadalign.evaluation.metrics.errors import cramer_rao_bound
 from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
 from cadalign.render import Scene, cast_geometry
 

@@ -29,7 +29,7 @@ from cadalign import (
 )
 from cadalign.datasets import Colmap
 from cadalign.errors import DegenerateError, InputError, NoConsensusError
-from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, sample_limit
+from cadalign.evaluation.metrics.errors import cramer_rao_bound, sample_limit
 from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem, simulate_problem
 from cadalign.geometry.metrics import rotation_error
 

@@ -28,7 +28,7 @@ from cadalign.evaluation.metrics.photos import (
     ROTATION,
     SCAN2CAD,
     VIEWPOINT,
-    MetricSet,
+    Protocol,
     score_columns,
     statistics_of,
 )
@@ -127,18 +127,6 @@ def _check_method(method: str) -> None:
 
 SETS = (VIEWPOINT, BOX, SCAN2CAD)
 """All sets of metrics, in the order of the result table's columns."""
-
-
-@dataclass(frozen=True)
-class Protocol:
-    """Evaluation of a data set: its metrics, and what it is given."""
-
-    metrics: tuple[MetricSet, ...]
-    up_axis: str = "y"  # the upward axis of its models
-    sigma_of_side: float = 1 / 64
-    """Standard deviation of its keypoints as a share of the longer side of the object's rectangle:
-    networks' heatmaps have 64 cells."""
-    sigma_of_width: float | None = None  # the same as a share of the image's width
 
 
 _PROTOCOLS = {

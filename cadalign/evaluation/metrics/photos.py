@@ -66,6 +66,18 @@ class MetricSet:
         return (*(rate.metric for rate in self.rates), *self.medians)
 
 
+@dataclass(frozen=True)
+class Protocol:
+    """Evaluation of a data set: its metrics, and what it is given."""
+
+    metrics: tuple[MetricSet, ...]
+    up_axis: str = "y"  # the upward axis of its models
+    sigma_of_side: float = 1 / 64
+    """Standard deviation of its keypoints as a share of the longer side of the object's rectangle:
+    networks' heatmaps have 64 cells."""
+    sigma_of_width: float | None = None  # the same as a share of the image's width
+
+
 def score_columns(sets: Iterable[MetricSet]) -> Columns:
     """The columns of some sets in the result table."""
     found = (m for each in sets for m in (*each.medians, *(rate.column for rate in each.rates)))

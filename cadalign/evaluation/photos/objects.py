@@ -214,7 +214,7 @@ class PhotoObjects(Setting):
 
     def _case(self, target: PhotoTarget) -> Case:
         protocol = protocol_of(opened(self.options.root).kind)
-        sighting = attempt(sight, target, protocol, self.options)
+        sighting = attempt(partial(sight, target, protocol, sigma=self.options.sigma))
         if isinstance(sighting, Exception):
             return Case(target.names, error=sighting)
         facts = {"keypoints": len(sighting.names), "source": sighting.source}

@@ -22,7 +22,7 @@ from cadalign.datasets.photos.photo import (
 from cadalign.errors import DataError
 from cadalign.estimation.fit import fit
 from cadalign.evaluation.benchmark import Case
-from cadalign.evaluation.experiments.photos import PhotosOptions, Protocol
+from cadalign.evaluation.metrics.photos import Protocol
 from cadalign.evaluation.runs.work import (
     UNREADABLE,
     LeftOutError,
@@ -224,8 +224,8 @@ class Sighting:
         return self.model.xyz[[row_of[name] for name in self.names]]
 
 
-def sight(target: PhotoTarget, protocol: Protocol, options: PhotosOptions) -> Sighting:
-    """Collect what methods are given of an object.
+def sight(target: PhotoTarget, protocol: Protocol, *, sigma: float | None) -> Sighting:
+    """Collect what methods are given of an object, ``sigma`` [px] in place of the protocol's.
 
     Raises LeftOutError if it has no camera, no model, or too few keypoints; and DataError if its
     model cannot be read.
@@ -250,7 +250,7 @@ def sight(target: PhotoTarget, protocol: Protocol, options: PhotosOptions) -> Si
         source=ANNOTATED if marks.scores is None else DETECTED,
         names=names,
         points_2d=pixels,
-        sigma=_sigma(target, protocol, options),
+        sigma=_sigma(target, protocol) if sigma is None else sigma,
         model=model,
         bounds=bounds,
         width=1.0 if gt is None else float(gt.scale[0]),
@@ -267,10 +267,8 @@ def _marked(marks: PhotoKeypoints, model: NamedPoints) -> tuple[tuple[str, ...],
     return tuple(np.array(marks.names)[good].tolist()), marks.points_2d[good]
 
 
-def _sigma(target: PhotoTarget, protocol: Protocol, options: PhotosOptions) -> float:
+def _sigma(target: PhotoTarget, protocol: Protocol) -> float:
     """The standard deviation of keypoints [px] that methods are given."""
-    if options.sigma is not None:
-        return options.sigma
     if protocol.sigma_of_width is not None and target.photo.camera is not None:
         return protocol.sigma_of_width * target.photo.camera.width
     left, top, right, bottom = rectangle_of(target.found)

@@ -1,10 +1,8 @@
 """The experiment on retrieval: views of a library's models, to be found again in it.
 
-Every model of the library is stretched by factors from 0.5 to 2 along y and z, seen from a random
-view, and some of its visible keypoints are handed over with noise. Models whose keypoints are the
-same after a stretch, to within 1 % of their extent and with the same set of keypoints, count as the
-true model. Two protocols: ``leave-in``, where the library holds the model, and ``leave-out``, where
-it and all that count as it are taken out. All methods get the same keypoints.
+Models whose keypoints are the same after a stretch, to within 1 % of their extent and with the same
+set of keypoints, count as the true model. Two protocols: ``leave-in``, where the library holds the
+model, and ``leave-out``, where it and all that count as it are taken out.
 """
 
 from __future__ import annotations

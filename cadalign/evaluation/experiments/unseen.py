@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
 from cadalign.evaluation import metrics
@@ -117,11 +116,7 @@ HEADLINE = (
 
 def _within(level: str, nominal: float) -> Callable[[Group], float]:
     """Share of the known levels that are at most the nominal one; NaN of none."""
-    return lambda group: mean_of(_flags(group.solved[level], nominal))
-
-
-def _flags(levels: FloatArray, nominal: float) -> FloatArray:
-    return (known(levels) <= nominal).astype(float)
+    return lambda group: mean_of((known(group.solved[level]) <= nominal).astype(float))
 
 
 _STATISTICS = {

@@ -187,27 +187,6 @@ def _scaled(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     return scaled, norms
 
 
-def sample_limit(
-    bound: FloatArray, *, rng: np.random.Generator, draws: int
-) -> dict[str, FloatArray]:
-    """Errors of an ideal estimator: draws from a Gaussian with the bound as its covariance.
-
-    By name, each (draws,) float in the units of `cadalign.metrics`; ``focal_error``, relative, only
-    if the focal length is unknown.
-    """
-    errors = np.zeros((draws, len(bound)))
-    free = np.flatnonzero(bound.diagonal())
-    own, mean = bound[np.ix_(free, free)], np.zeros(len(free))
-    errors[:, free] = rng.multivariate_normal(mean, own, size=draws, method="eigh")
-    focal = {"focal_error": np.abs(np.expm1(errors[:, _FOCAL]))} if len(bound) > _FOCAL else {}
-    return focal | {
-        "rotation_error_deg": np.degrees(np.linalg.norm(errors[:, :3], axis=1)),
-        "translation_error": np.linalg.norm(errors[:, 3:6], axis=1),
-        "scale_y_error": np.abs(np.expm1(errors[:, 7])),
-        "scale_z_error": np.abs(np.expm1(errors[:, 8])),
-    }
-
-
 def limit_estimate(
     points_3d: FloatArray, points_2d: FloatArray, camera: Camera, gt: Alignment
 ) -> Alignment:

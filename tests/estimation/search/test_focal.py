@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks.accuracy import sample_limit
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
@@ -29,7 +30,7 @@ from cadalign import (
 )
 from cadalign.datasets import Colmap
 from cadalign.errors import DegenerateError, InputError, NoConsensusError
-from cadalign.evaluation.metrics.errors import cramer_rao_bound, sample_limit
+from cadalign.evaluation.metrics.errors import cramer_rao_bound
 from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem, simulate_problem
 from cadalign.geometry.metrics import rotation_error
 

@@ -271,12 +271,11 @@ def checked_methods(chosen: Iterable[Any], own: Collection[str] | None = None) -
     if not found:
         fix = f"known are {', '.join(known)}"
         raise InputError("none is given", where="methods", fix=fix)
-    functions = [each for each in found if is_function(each)]
     for each in found:
         if not is_function(each) and each not in known:
             raise unknown("method", each, known, where="methods")
-    check_names(functions, known, "methods")
-    for function in functions:
+    check_names(filter(is_function, found), known, "methods")
+    for function in filter(is_function, found):
         _loaded(function, "methods")
     return found
 

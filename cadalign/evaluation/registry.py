@@ -19,7 +19,7 @@ from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.plots import Plot, draw_plot
 from cadalign.evaluation.runs.work import COLUMNS, SKIPPED, Columns, Plan
 from cadalign.evaluation.summary import ConsoleTable, Summary, summary_csv
-from cadalign.io.files import write_text
+from cadalign.io.files import made_folder, write_text
 
 if TYPE_CHECKING:
     from cadalign.evaluation.runs.folder import RunFolder
@@ -122,7 +122,7 @@ class Spec:
         names = {"value": self.group(run).key}
         write_text(run.folder.summary, summary_csv(summaries, rename=names))
         for plot in self.plots([run]):
-            draw_plot(run.folder.made_figures() / plot.id, plot)
+            draw_plot(made_folder(run.folder.figures) / plot.id, plot)
         return summaries
 
 

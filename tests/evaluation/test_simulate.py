@@ -75,7 +75,7 @@ def test_failures_are_rows_with_reasons() -> None:
         ("points", {"values": [3]}, "not a number of points"),
         ("points", {"values": [8.5]}, "not a number of points"),
         ("outliers", {"values": [1.0]}, "not a share"),
-        ("points", {"runs": 0}, "not positive"),
+        ("points", {"runs": 0}, "runs: 0 is less than 1"),
         ("noise", {"points": 3}, "not a number of points"),
         ("points", {"noise_px": float("nan")}, "not a noise level"),
         ("noise", {"noise_px": 5.0}, "noise_px: has no effect where it is varied; leave it out"),

@@ -171,10 +171,7 @@ def _fingerprint(root: Path) -> str:
     return fingerprint_of_files(sorted(path for path in folder.iterdir() if path.is_file()))
 
 
-SUCCESS_DEG = 0.5
-"""A success has less than this rotation error [degrees] ..."""
-SUCCESS_SCALE = 0.01
-"""... and at most this relative error of either scale."""
+_SUCCESS_DEG, _SUCCESS_SCALE = 0.5, 0.01  # rotation error below, relative error of scales at most
 _STRETCH = (0.5, 2.0)
 _REDRAWS = 100
 
@@ -212,7 +209,7 @@ def errors_of(found: Alignment | Result, given: MethodInput, *, is_robust: bool 
     row: Row = {
         "points": len(given.points_3d),
         **errors,
-        "success": errors["rotation_error_deg"] < SUCCESS_DEG and scales <= SUCCESS_SCALE,
+        "success": errors["rotation_error_deg"] < _SUCCESS_DEG and scales <= _SUCCESS_SCALE,
     }
     if not is_robust or isinstance(found, Alignment):
         return row

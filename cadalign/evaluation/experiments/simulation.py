@@ -105,6 +105,7 @@ class SweepOptions(FunctionOptions):
             self.check_methods()
         if self.values is not None:
             self.replace_values(values=tuple(float(value) for value in self.values))
+        self.check_least(runs=1)
         _check_values(self.kind)
         refuse_unused(self, [self.kind.column], "where it is varied")
 
@@ -145,8 +146,6 @@ def _check_values(kind: SweepKind) -> None:
             if not valid(value):
                 where = "values" if column == kind.column else column
                 raise InputError(f"{value:g} is not {what}", where=where, fix=fix)
-    if kind.runs < 1:
-        raise InputError(f"{kind.runs} is not positive", where="runs")
 
 
 ERRORS = (metrics.ROTATION, metrics.TRANSLATION_IN_UNITS, metrics.SCALE_Y, metrics.SCALE_Z)

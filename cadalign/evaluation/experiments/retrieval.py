@@ -59,10 +59,8 @@ if TYPE_CHECKING:
     from cadalign.retrieval.match import Match
     from cadalign.retrieval.models import LibraryModel, ModelKey
 
-LEAVE_IN = "leave-in"
-"""The library holds the true model."""
-LEAVE_OUT = "leave-out"
-"""It doesn't."""
+LEAVE_IN, LEAVE_OUT = "leave-in", "leave-out"
+"""Protocols: the library holds the true model, or it doesn't."""
 _METHODS = ("optimal", "epnp")
 """Methods of `cadalign.Library.retrieve`."""
 

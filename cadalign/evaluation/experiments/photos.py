@@ -198,9 +198,6 @@ _CURVES = (
     (replace(BOX_IOU, log=False), np.arange(0, 1.01, 0.05)),
 )
 
-plots = partial(cumulative_curves, curves=_CURVES, of="on photos")
-"""Shares of objects within an error, as `Spec.plots`."""
-
 
 def shapes_of(files: Sequence[Path]) -> tuple[ShapeModel, ...]:
     """The shape models of some files.
@@ -250,7 +247,7 @@ SPEC = Spec(
     summarize=summarize_objects,
     console=_CONSOLE,
     console_note="shares count failures",
-    plots=plots,
+    plots=partial(cumulative_curves, curves=_CURVES, of="on photos"),
     apart=LEFT_OUT,
     topic="alignment to photos",
     subject="photos",

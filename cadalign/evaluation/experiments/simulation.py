@@ -214,10 +214,6 @@ def sweep_benchmark(kind: SweepKind, seed: int, metrics: Sequence[str] = ()) -> 
     return Benchmark.chosen(setting, kind.methods, metrics=metrics, batched=batched)
 
 
-VARIED = {metric.key: metric for metric in (metrics.NOISE, metrics.POINTS, metrics.OUTLIER_SHARE)}
-"""Quantities that a sweep may vary."""
-
-
 def kind_of(run: Run) -> SweepKind:
     """The sweep that a run makes, with its own settings."""
     name = str(run.config.get("sweep"))
@@ -229,7 +225,8 @@ def kind_of(run: Run) -> SweepKind:
 
 def varied(run: Run) -> Metric:
     """The quantity that a run varies."""
-    return VARIED[kind_of(run).column]
+    known = {each.key: each for each in (metrics.NOISE, metrics.POINTS, metrics.OUTLIER_SHARE)}
+    return known[kind_of(run).column]
 
 
 def summarize_sweep(run: Run) -> list[Summary]:

@@ -20,7 +20,6 @@ from benchmarks.accuracy import accuracy
 from benchmarks.cars import cars
 from benchmarks.coverage import coverage
 from benchmarks.evidence import evidence
-from benchmarks.mistakes import mistakes
 from benchmarks.photo import photo
 from benchmarks.retrieval import retrieval
 from benchmarks.runs import runs
@@ -32,10 +31,9 @@ from cadalign.io.files import write_json
 
 SECTIONS: dict[str, Section] = {
     each.__name__: each
-    for each in (accuracy, coverage, shapes, retrieval, runs, speed, cold)
-    + (evidence, photo, cars, mistakes)
+    for each in (accuracy, coverage, shapes, retrieval, runs, speed, cold) + (evidence, photo, cars)
 }
-ON_REQUEST = {"evidence", "photo", "cars", "mistakes"}
+ON_REQUEST = {"evidence", "photo", "cars"}
 TOLERANCE = 0.2
 
 

@@ -10,7 +10,7 @@ from dataclasses import MISSING, fields
 from typing import TYPE_CHECKING, Any
 
 from cadalign.errors import InputError, unknown
-from cadalign.evaluation.functions import check_metric_names
+from cadalign.evaluation.methods import check_names
 from cadalign.evaluation.options import ExperimentOptions, absolute_paths, tuples
 from cadalign.evaluation.registry import spec_named
 from cadalign.evaluation.runs.engine import OnProgress, Workers, execute, workers_of
@@ -167,5 +167,6 @@ def prepared(
     count = options.default_workers if workers is None else workers
     pool = workers_of(count, dask)
     spec = spec_named(options.experiment)
-    check_metric_names(getattr(options, "metrics", ()), [column.key for column in spec.columns])
+    taken = [column.key for column in spec.columns]
+    check_names(getattr(options, "metrics", ()), taken, "metrics")
     return spec.plan(options, folder), pool

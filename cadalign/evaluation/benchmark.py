@@ -12,14 +12,15 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, TypeVar
 
-from cadalign.errors import DataError, InputError
-from cadalign.evaluation.functions import (
+from cadalign.errors import DataError
+from cadalign.evaluation.methods import (
     FunctionMetric,
+    Method,
+    MethodInput,
     choose_methods,
     choose_metrics,
 )
-from cadalign.evaluation.methods import Method, MethodInput
-from cadalign.evaluation.options import ExperimentOptions, text_of
+from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.runs.work import (
     FAILED,
     AbortError,
@@ -39,18 +40,6 @@ VIEW_NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("me
 """The columns that name a row of a method on a view of a model."""
 
 
-class Tasks(Sequence[T]):
-    """Tasks of a run that are made when they are asked for; a subclass has ``__len__``."""
-
-    def task(self, index: int) -> T:
-        """The task of a number from 0."""
-        raise NotImplementedError
-
-    def __getitem__(self, index: Any) -> Any:
-        places = range(len(self))[index]
-        return list(map(self.task, places)) if isinstance(places, range) else self.task(places)
-
-
 @dataclass(frozen=True)
 class Case:
     """An instance with the cells that name its rows, or why there is none."""
@@ -59,8 +48,6 @@ class Case:
     facts: Row = field(default_factory=dict)  # cells that do not depend on the estimate
     instance: Any = None
     error: Exception | None = None  # why there is no instance
-    status: str = ""
-    """The rows' status where there is no instance; by default the error's, see `status_of`."""
 
 
 class Setting:
@@ -96,8 +83,9 @@ class Setting:
         return [Case(task.names)]
 
     def given(self, instance: Any) -> MethodInput:
-        """The instance as general methods are given it; an error of settings without them."""
-        raise InputError("there are no general methods", where="methods")
+        """The instance as general methods are given it; by default it is that."""
+        found: MethodInput = instance
+        return found
 
     def answered(self, method: Method, instance: Any, answer: Any) -> Any:
         """The estimate that is measured, of a general method's alignment or result."""
@@ -136,7 +124,7 @@ class Benchmark:
         metrics: Iterable[str] = (),
         **how: Any,
     ) -> Benchmark:
-        """The benchmark of methods and of functions; see `cadalign.evaluation.functions`."""
+        """The benchmark of methods and of functions; see `cadalign.evaluation.methods`."""
         further = choose_metrics(metrics, setting.columns)
         return cls(setting, choose_methods(methods, own), metrics=further, **how)
 
@@ -153,23 +141,18 @@ class Benchmark:
     def plan(
         self, options: ExperimentOptions, tasks: Sequence[T], *, chunk: int, **more: Any
     ) -> Plan[T]:
-        """The plan of a run, with more of its configuration than the options and the metrics."""
-        return Plan(self, tasks, options.as_config() | more | self.further, chunk)
-
-    @property
-    def further(self) -> dict[str, Any]:
-        """Metrics of users in a run's configuration; empty without any."""
-        functions = [text_of(each.function) for each in self.metrics]
-        return {"metrics": functions} if functions else {}
+        """The plan of a run, with more of its configuration than the options."""
+        return Plan(self, tasks, options.as_config() | more, chunk)
 
     def evaluate(self, tasks: Sequence[Any]) -> list[Row]:
         """A row for every instance and method; the first of an instance has its record."""
         cases = self.setting.cases(tasks)
+        blank = self._blank
         answers = zip(*(self._answers(method, cases) for method in self.methods), strict=True)
         rows: list[Row] = []
         for case, each in zip(cases, answers, strict=True):
             outcomes = [outcome for outcome, _ in each]
-            own = [outcome.row() for outcome in outcomes]
+            own = [blank | outcome.row() for outcome in outcomes]
             if case.instance is not None:
                 record = self.setting.finish(case, outcomes, [estimate for _, estimate in each])
                 if record is not None:
@@ -180,10 +163,16 @@ class Benchmark:
     def failure(self, task: Any, reason: str) -> list[Row]:
         """A failed row for every method."""
         return [
-            Outcome({**case.names, "method": method.name}, case.facts, FAILED, reason).row()
+            self._blank
+            | Outcome({**case.names, "method": method.name}, case.facts, FAILED, reason).row()
             for case in self.setting.failed(task)
             for method in self.methods
         ]
+
+    @property
+    def _blank(self) -> Row:
+        """Texts of a row that says nothing: no text of a result table is missing."""
+        return {name: "" for name, kind in self.columns if kind is str}
 
     def _answers(self, method: Method, cases: Sequence[Case]) -> list[tuple[Outcome, Any]]:
         """Outcome and estimate of a method for every case; an error where there is no estimate."""
@@ -204,25 +193,18 @@ class Benchmark:
             row = estimate if isinstance(estimate, Exception) else next(rows)
             names = {**case.names, "method": method.name}
             if isinstance(row, Exception):
-                status = case.status or status_of(row)
-                outcome = Outcome(names, case.facts, status, reason_of(row), seconds)
+                outcome = Outcome(names, case.facts, status_of(row), reason_of(row), seconds)
                 answers.append((outcome, row))
             else:
                 answers.append((Outcome(names, case.facts | row, seconds=seconds), estimate))
         return answers
 
     def _measured(self, method: Method, pairs: Sequence[Pair]) -> Sequence[Row | Exception]:
-        """The cells of each estimate; one that cannot be measured does not stop the others."""
-        if not pairs:
-            return []
-        found = attempt(self.setting.measure, method, pairs)
-        if not isinstance(found, Exception):
-            if not self.metrics:
-                return found
-            return [self._further(*each) for each in zip(pairs, found, strict=True)]
-        if len(pairs) == 1:
-            return [found]
-        return [row for pair in pairs for row in self._measured(method, [pair])]
+        """The cells of each estimate, or why there are none."""
+        rows = self.setting.measure(method, pairs) if pairs else []
+        if not self.metrics:
+            return rows
+        return [self._further(*each) for each in zip(pairs, rows, strict=True)]
 
     def _further(self, pair: Pair, row: Row | Exception) -> Row | Exception:
         """The cells of an estimate with those of further metrics."""

@@ -32,10 +32,6 @@ class ExperimentOptions:
     """Name of the experiment, as in the run's configuration."""
     command: ClassVar[str] = "evaluate"
     """Command that runs it."""
-    not_stored: ClassVar[tuple[str, ...]] = ("metrics", "format")
-    """Options that the run's configuration describes otherwise."""
-    if_given: ClassVar[tuple[str, ...]] = ("shapenet",)
-    """Options that the run's configuration has only if they are not None."""
 
     seed: int = 0
     """Seed of everything random."""
@@ -56,12 +52,10 @@ class ExperimentOptions:
     def as_config(self) -> dict[str, Any]:
         """The options and the experiment's name in a run's configuration, paths made absolute.
 
-        Some stand there only if they are given; others are left to the rest of it.
+        Options of several values have none there if they are empty.
         """
-        options = plain_value(self).items()
-        stored = {name: each for name, each in options if name not in self.not_stored}
-        config = {k: v for k, v in stored.items() if v is not None or k not in self.if_given}
-        return {**config, "experiment": self.experiment}
+        options = {name: each for name, each in plain_value(self).items() if each != []}
+        return {**options, "experiment": self.experiment}
 
     def check_least(self, **bounds: float) -> None:
         """Check that options, if they are given, are not less than their bounds."""
@@ -138,7 +132,7 @@ def plain_value(value: Any) -> Any:
 class FunctionOptions(ExperimentOptions):
     """Options of experiments that take functions of one's own, as methods and as metrics.
 
-    Each is a callable or a text ``module:function``; see `cadalign.evaluation.functions`.
+    Each is a callable or a text ``module:function``; see `cadalign.evaluation.methods`.
     """
 
     metrics: tuple[str, ...] = ()
@@ -146,7 +140,7 @@ class FunctionOptions(ExperimentOptions):
 
     def check_methods(self, own: tuple[str, ...] | None = None) -> None:
         """Check methods, each once; ``own`` are the names of the experiment's, if it has any."""
-        from cadalign.evaluation.functions import checked_methods
+        from cadalign.evaluation.methods import checked_methods
 
         self.replace_values(methods=checked_methods(getattr(self, "methods", ()), own))
 

@@ -30,18 +30,8 @@ if TYPE_CHECKING:
 # Colours that colour-blind people tell apart, too: Okabe and Ito's (jfly.uni-koeln.de/color), then
 # dark ones of Paul Tol's "muted" (personal.sron.nl/~pault).
 COLORS = (
-    "#0072B2",
-    "#E69F00",
-    "#D55E00",
-    "#CC79A7",
-    "#009E73",
-    "#56B4E9",
-    "#332288",
-    "#999933",
-    "#882255",
-    "#44AA99",
-    "#AA4499",
-    "#117733",
+    *("#0072B2", "#E69F00", "#D55E00", "#CC79A7", "#009E73", "#56B4E9"),
+    *("#332288", "#999933", "#882255", "#44AA99", "#AA4499", "#117733"),
 )
 """Colours of lines, in their order."""
 _MARKERS = "os^DvP<X>phd"

@@ -19,7 +19,7 @@ from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.plots import Plot, draw_plot
 from cadalign.evaluation.runs.work import COLUMNS, SKIPPED, Columns, Plan
 from cadalign.evaluation.summary import ConsoleTable, Summary, summary_csv
-from cadalign.io.files import write_text
+from cadalign.io.files import made_folder, write_text
 
 if TYPE_CHECKING:
     from cadalign.evaluation.runs.folder import RunFolder
@@ -122,23 +122,14 @@ class Spec:
         names = {"value": self.group(run).key}
         write_text(run.folder.summary, summary_csv(summaries, rename=names))
         for plot in self.plots([run]):
-            draw_plot(run.folder.made_figures() / plot.id, plot)
+            draw_plot(made_folder(run.folder.figures) / plot.id, plot)
         return summaries
 
 
 # In the order in which they are named to users, with their modules.
-_EXPERIMENTS = {
-    name: f"cadalign.evaluation.experiments.{module}"
-    for name, module in {
-        "keypointnet": "keypointnet",
-        "demo": "demo",
-        "simulate": "simulation",
-        "correspondences": "correspondences",
-        "retrieval": "retrieval",
-        "unseen": "unseen",
-        "photos": "photos",
-    }.items()
-}
+_NAMES = ("keypointnet", "demo", "simulate", "correspondences", "retrieval", "unseen", "photos")
+_EXPERIMENTS = {name: f"cadalign.evaluation.experiments.{name}" for name in _NAMES}
+_EXPERIMENTS["simulate"] = "cadalign.evaluation.experiments.simulation"
 BATCHES: dict[str, str] = {}
 """Modules of runs over many observations, which `cadalign.report` shows as experiments are."""
 

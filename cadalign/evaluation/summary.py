@@ -191,6 +191,11 @@ def mean(key: str) -> Callable[[Group], float]:
     return lambda group: mean_of(group.solved[key])
 
 
+def quartiles(key: str) -> Callable[[Group], Quartiles]:
+    """The quartiles of a column over the rows that are ok."""
+    return lambda group: Quartiles.of_solved(group.solved[key].astype(float))
+
+
 def percentile(key: str, percent: float) -> Callable[[Group], float]:
     """A percentile of a column, NaN where all cells are missing."""
 

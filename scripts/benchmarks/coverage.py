@@ -1,4 +1,4 @@
-"""Coverage of stated uncertainties."""
+"""Coverage of stated uncertainties, and warnings."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from scipy.spatial.transform import Rotation
 import cadalign
 from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, T, Tables
+from benchmarks.warned import warned
 from cadalign import Alignment, Camera, Model, RansacOptions, Result, View
 from cadalign.arrays import FloatArray
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.metrics.cramer_rao import probability_level
+from cadalign.evaluation.metrics.errors import probability_level
 from cadalign.metrics import rotation_error
 
 _KINDS = ("fit", "sigma=None", "20 % outliers", "focal", "shape_sigma=.05", "two views")
@@ -29,10 +30,11 @@ _NOISE_PX = 1.0
 
 
 def coverage(given: BenchmarkData) -> Tables:
-    """Coverage of stated uncertainties, of random objects in a unit cube with 1 px of noise."""
+    """Coverage of stated uncertainties, of random objects in a unit cube with 1 px; warnings."""
     count = given.count or 150
     yield "Truths within nominal 68, 95 %", _regions(given.seed, count)
     yield "Similar models, more and more keypoints", _similar(given.seed, count)
+    yield from warned(given)
 
 
 def _regions(seed: int, count: int) -> Iterator[Row]:

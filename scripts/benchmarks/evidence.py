@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -10,10 +9,9 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from scipy.stats import chi2
 
 from benchmarks import section
-from benchmarks.section import BenchmarkData, Row, Table, Tables
+from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Alignment, Model, Result, View, align
 from cadalign.arrays import BoolArray, FloatArray, IntArray, instance_rng
 from cadalign.datasets import AnnotatedModel, KeypointNet
@@ -28,7 +26,7 @@ from cadalign.geometry.alignment import Box
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.evidence import Size
-from cadalign.render import Scene, cast_geometry, sample_view, visible_keypoints
+from cadalign.render import cast_geometry, visible_keypoints
 
 _DEPTH_SIGMA = 0.005  # relative
 _UP_SIGMA_DEG = 1.0
@@ -41,10 +39,6 @@ _DRAWS = 1000  # of an ideal estimator's errors
 _WANDER = 2.0  # [px], standard deviation of a smoothed contour
 _WANDER_LENGTH = 5.0  # [px], over which it wanders
 _HIDDEN = 0.25  # share of the area
-_STRETCH = 2.0
-_FAR_OFF = 0.1  # of the logarithms of stretch and distance
-_FILLS = ((0.75, 0.95), (0.5, 0.75), (0.25, 0.5), (0.12, 0.25))  # of the image, by the object
-_FREE = [0, 1, 2, 3, 4, 5, 7, 8]  # of a covariance, where x is known
 _ALL = ("mask", "depth", "gravity", "length", "views-2")
 _KINDS = (
     *("keypoints", "gravity", "length", "depth", "views-2-free", "views-5-free"),
@@ -53,12 +47,6 @@ _KINDS = (
 
 
 def evidence(given: BenchmarkData) -> Tables:
-    """Evidence beside keypoints, and exact masks of models seen from anywhere."""
-    yield _beside_keypoints(given)
-    yield _exact_masks(given)
-
-
-def _beside_keypoints(given: BenchmarkData) -> Table:
     """Medians with keypoints alone, and with further evidence.
 
     Each view shows a model with a mesh as it is; the alignment gets its visible keypoints with
@@ -87,7 +75,7 @@ def _beside_keypoints(given: BenchmarkData) -> Table:
         bottles = [row["box IoU"] for each, row in found if row and each.category == "bottle"]
         medians = section.summary(solved)
         rows.append({"evidence": kind, **medians, "of bottles": float(np.median(bottles))})
-    return f"evidence beside keypoints, {len(seen)} views: medians", rows
+    yield f"evidence beside keypoints, {len(seen)} views: medians", rows
 
 
 class Shot(NamedTuple):
@@ -225,77 +213,6 @@ def _measured(kind: str, noisy: SeenObject, ideal: SeenObject) -> Row:
     drawn = noisy.rng_of("bound").multivariate_normal(np.zeros(9), bound, _DRAWS, method="eigh")
     turn = float(np.median(np.degrees(np.linalg.norm(drawn[:, :3], axis=1))))
     return row | {"R over bound": errors["rotation_error_deg"] / turn}
-
-
-# Exact masks --------------------------------------------------------------------------------------
-
-_Meshed = tuple[AnnotatedModel, Scene]
-
-
-def _exact_masks(given: BenchmarkData) -> Table:
-    """Estimates by exact masks of models seen from anywhere, and whether they are as stated.
-
-    Stretched by 0.5 to 2, with 1 px of noise of the keypoints, at four distances. The models are
-    those of the sample dataset, and KeypointNet's with ShapeNet's meshes.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        sample, real = section.meshed_models(given, folder, per_category=1)
-        models = [(model, Scene(model.load_mesh())) for model in (*sample, *real)]
-    rows = [_optima(models, fill, given.count or 130, given.seed) for fill in _FILLS]
-    return "exact masks, seen from anywhere", rows
-
-
-def _optima(models: list[_Meshed], fill: tuple[float, float], count: int, seed: int) -> Row:
-    """Errors of objects at one distance, and whether these are stated."""
-    drawn = (
-        _mask_errors(models[number % len(models)], fill, [seed, 3, round(100 * fill[0]), number])
-        for number in range(count)
-    )
-    found = [errors for errors in drawn if errors is not None]
-    stretch, distance, squares = np.transpose(found)
-    return {
-        "image filled": f"{fill[0]:g} to {fill[1]:g}",
-        "count": len(found),
-        "beyond 10 %": int((np.maximum(stretch, distance) > _FAR_OFF).sum()),
-        "beyond the 99.9 % region, %": section.percent(squares > chi2.ppf(0.999, len(_FREE))),
-        "95 % regions hold": float((squares < chi2.ppf(0.95, len(_FREE))).mean()),
-        "stretch, %": 100 * float(np.median(stretch)),
-        "distance, %": 100 * float(np.median(distance)),
-    }
-
-
-def _mask_errors(
-    meshed: _Meshed, fill: tuple[float, float], seed: list[int]
-) -> tuple[float, float, float] | None:
-    """Errors of stretch and distance, squared error in the stated covariance; None if unseen."""
-    (model, scene), rng = meshed, np.random.default_rng(seed)
-    xyz = model.keypoints.xyz
-    how: dict[str, Any] = {"fill": fill, "roll": 180.0, "elevation": (-89.0, 89.0), "rng": rng}
-    how["scale"] = np.array([1.0, *np.exp(rng.uniform(-1, 1, 2) * np.log(_STRETCH))])
-    shown = scene, xyz, KEYPOINT_CAMERA
-    view = section.attempt(sample_view, *shown, min_visible=7, **how)
-    view = view or section.attempt(sample_view, *shown, min_visible=4, **how)
-    if view is None:
-        return None
-    truth, ids = view.cam_from_model, np.flatnonzero(view.visible)
-    seen = section.seen_in(KEYPOINT_CAMERA, truth, xyz[ids], 1.0, rng)
-    mask = cast_geometry(scene, KEYPOINT_CAMERA, truth).mask
-    sighting = View(KEYPOINT_CAMERA, seen.points_2d, ids=ids.tolist(), sigma=1.0, mask=mask)
-    result = align(Model(points_3d=xyz, mesh=scene.mesh), sighting)
-    est = result.alignment
-    # With the logarithm of the distance: it rises with the stretches where the size is open.
-    error = section.deviation(est=truth, gt=est)[_FREE]
-    error[3:6] = _shift_to(est.translation, truth.translation)
-    square = error @ np.linalg.solve(result.covariance[np.ix_(_FREE, _FREE)], error)
-    lengths = np.linalg.norm([truth.translation, est.translation], axis=1)
-    return np.abs(error[6:]).max(), abs(np.log(lengths[1] / lengths[0])), square
-
-
-def _shift_to(place: FloatArray, other: FloatArray) -> FloatArray:
-    """The step to another place, of which the part along the direction is that of a logarithm."""
-    square, along = float(place @ place), float(place @ other)
-    ratio = np.log(np.linalg.norm(other) / np.sqrt(square))
-    return np.asarray(ratio * place + square / along * other - place)
 
 
 def damaged_mask(mask: BoolArray, kind: str, rng: np.random.Generator) -> BoolArray:

@@ -18,7 +18,7 @@ from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Alignment, Camera, Mesh, Model, Result, Symmetry, View, align
 from cadalign.arrays import FloatArray
-from cadalign.evaluation.metrics.cramer_rao import probability_level
+from cadalign.evaluation.metrics.errors import probability_level
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.io.images import read_photo
 from cadalign.io.meshes.files import load_mesh

@@ -18,6 +18,7 @@ from benchmarks.section import COMMAND, BenchmarkData, Row, Table, Tables
 from cadalign import Camera, RansacOptions
 from cadalign.datasets import Colmap, Correspondences, KeypointNet, write_sample_dataset
 from cadalign.evaluation.experiments.correspondences import errors_of, spoil
+from cadalign.evaluation.methods import MethodInput
 
 _POINTS = 8
 _CAMERA = Camera(640, 480, 700.0, 700.0, 319.5, 239.5)
@@ -151,8 +152,8 @@ def _row(images: list[Correspondences], share: float, draws: int) -> Row:
             truth = spoil(image, share, rng=rng)
             wall, _, result = section.clocked(partial(section.fitted, truth, ransac=options))
             ours.append(wall)
-            is_found = result is not None and errors_of(result.alignment, truth)["success"]
-            succeeded.append(is_found)
+            given = MethodInput.of_problem(truth, 1.0)
+            succeeded.append(result is not None and errors_of(result, given)["success"])
             poselibs.append(section.seconds(_poselib(image, truth.points_2d, iterations)))
             if draw < _OPENCV_DRAWS:
                 opencvs.append(section.seconds(_opencv(image, truth.points_2d)))

@@ -20,7 +20,7 @@ from cadalign import CadalignError
 from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.evaluation.experiments.unseen import UnseenOptions
-from cadalign.evaluation.instances.unseen import UnseenObject, UnseenTasks, observe_object
+from cadalign.evaluation.instances.unseen import UnseenObject, observe_object, unseen_tasks
 from cadalign.evaluation.simulation import SimulatedProblem
 from cadalign.geometry.rotations import vector_from_rotation
 
@@ -183,7 +183,7 @@ def unseen_objects(
     ``options`` are those of `cadalign evaluate unseen`.
     """
     chosen = UnseenOptions(root=dataset.root, categories=(category,), **options)
-    tasks = UnseenTasks(dataset, chosen)
+    tasks = unseen_tasks(dataset, chosen)
     for place in range(0, len(tasks), -(-len(tasks) // count)):
         seen = attempt(observe_object, tasks[place], chosen)
         if seen is not None:

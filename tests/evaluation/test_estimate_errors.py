@@ -8,7 +8,7 @@ import pytest
 from cadalign import metrics
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
-from cadalign.evaluation.instances.instance import HULL, KEYPOINT_CAMERA, Instance
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, Instance
 from cadalign.evaluation.metrics.errors import estimate_errors
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.rotations import rotation_from_vector
@@ -33,7 +33,7 @@ def instance(rng: np.random.Generator, gt: Alignment, extents: FloatArray) -> In
         ids=np.arange(len(points)),
         bounds=np.array([-0.5, 0.5])[:, None] * extents,
         gt=gt,
-        visibility=HULL,
+        visibility="hull",
         scene=None,
         diagonal=float(rng.uniform(1, 2)),
     )
@@ -84,7 +84,3 @@ def test_flat_models_have_no_overlap_and_estimates_that_are_not_finite_no_errors
     assert isinstance(second, InputError)
     assert "NaN" in str(second)
     assert third["box_iou"] == pytest.approx(1)
-
-
-def test_no_estimates_have_no_errors() -> None:
-    assert estimate_errors([], [], []) == []

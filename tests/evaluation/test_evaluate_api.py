@@ -16,6 +16,7 @@ from cadalign.errors import DataError, InputError
 from cadalign.evaluation.api import prepared
 from cadalign.evaluation.instances.instance import make_instance
 from cadalign.evaluation.metrics.errors import alignment_errors
+from cadalign.evaluation.options import tuples
 from cadalign.evaluation.registry import known_options, spec_named
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.render import Scene
@@ -46,7 +47,7 @@ def test_every_experiment_has_a_specification_with_its_name() -> None:
 @pytest.mark.parametrize(
     ("experiment", "options"),
     [
-        ("keypointnet", {"methods": ("optimal",), "visibility": "rays"}),
+        ("keypointnet", {"methods": ("optimal",)}),
         ("unseen", {"methods": ("shape",)}),
         ("photos", {"methods": ("rigid",)}),
     ],
@@ -80,6 +81,12 @@ def test_what_is_wrong_is_named(tmp_path: Path) -> None:
         evaluate(None)
     with pytest.raises(InputError, match="sweep: is not given"):
         evaluate(experiment="simulate")
+
+
+def test_lists_of_options_become_tuples() -> None:
+    given = {"a": [1, 2], "b": range(2), "c": "ab", "d": Path("x"), "e": None, "f": 1.5, "g": len}
+    kept = {name: given[name] for name in "cdefg"}
+    assert tuples(given) == {"a": (1, 2), "b": (0, 1), **kept}
 
 
 def test_translation_errors_are_in_diagonals_of_the_model(sample_root: Path) -> None:

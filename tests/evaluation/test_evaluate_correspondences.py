@@ -16,24 +16,19 @@ from scipy.spatial.transform import Rotation
 from cadalign.cli import main
 from cadalign.datasets import BlindPnP, Correspondences, open_correspondences
 from cadalign.errors import DataError
-from cadalign.estimation.fit import fit
-from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Posterior, ViewResult
 from cadalign.evaluation import plots
 from cadalign.evaluation.api import run as do_run
-from cadalign.evaluation.benchmark import Benchmark
 from cadalign.evaluation.experiments.correspondences import (
     SPEC,
     CorrespondenceOptions,
-    CorrespondenceTask,
-    CorrespondenceTasks,
-    SpoiledImages,
+    correspondence_tasks,
     errors_of,
     spoil,
     summarize_shares,
 )
-from cadalign.evaluation.methods import fit_options
+from cadalign.evaluation.methods import MethodInput
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run, read_table
 from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
@@ -233,13 +228,14 @@ class TestRows:
     def test_errors_are_counted_as_they_are_described(self):
         # All points 10 from the camera; the last of 4 was moved.
         points = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], dtype=float)
-        truth = SimulatedProblem(
+        problem = SimulatedProblem(
             points,
             np.zeros((4, 2)),
             CAMERA,
             Alignment(np.eye(3), [0, 0, 10], [1, 1.0, 2.0]),
             np.array([False, False, False, True]),
         )
+        truth = MethodInput.of_problem(problem, 1.0)
         angle = np.radians(0.4)
         turn = [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
 
@@ -265,35 +261,6 @@ class TestRows:
             off = made(Alignment(turn, [0, 0, 10], scale), np.ones(4, dtype=bool))
             assert not errors_of(off, truth)["success"]
 
-    def test_options_of_the_search_reach_it(self):
-        problem = spoil(seen_image("a", 3), 0.3, rng=np.random.default_rng(0))
-        given = (problem.points_3d, problem.points_2d, problem.camera)
-
-        def fit_with(method, ransac):
-            return fit(*given, **fit_options(method, sigma=1.0, ransac=ransac))
-
-        wide = fit_with("ransac-optimal", RansacOptions(max_reproj_error=4.0))
-        narrow = fit_with("ransac-optimal", RansacOptions(max_reproj_error=0.1))
-        assert narrow.inliers.sum() < wide.inliers.sum() <= 44
-        # The method's own minimal solver is taken, whatever the options say.
-        few = fit_with("ransac-aepnp", RansacOptions(minimal="ap4p", seed=1))
-        assert few.method == "ransac-aepnp"
-
-    def test_too_few_points_become_a_failed_row_with_the_reason(self):
-        seen = seen_image("a", 1)
-        few = replace(seen, points_3d=seen.points_3d[:5], points_2d=seen.points_2d[:5])
-        task = CorrespondenceTask("a", 0.0, 0, few)
-        options = CorrespondenceOptions(ANY, methods=("aepnp-paper", "epnp"))
-        benchmark = Benchmark.chosen(SpoiledImages(options), options.methods)
-        paper, epnp = benchmark.evaluate([task])
-        assert (paper["status"], epnp["status"]) == ("failed", "ok")
-        assert "5" in paper["reason"]
-        assert (paper["points"], paper["success"], paper.get("rotation_error_deg")) == (
-            5,
-            False,
-            None,
-        )
-
 
 class TestBrokenImages:
     @pytest.mark.long
@@ -317,14 +284,10 @@ class TestBrokenImages:
     def test_nothing_but_broken_ones_is_refused(self, tmp_path):
         root = write_colmap(tmp_path, images=2, broken=(0, 1))
         with pytest.raises(DataError, match=r"none of 2 images can be read.*do not exist"):
-            CorrespondenceTasks(open_correspondences(root), QUICK)
+            correspondence_tasks(open_correspondences(root), QUICK)
 
 
 class TestRuns:
-    def test_only_the_first_images_are_taken_if_asked_for(self, colmap, tmp_path):
-        rows = run(colmap, tmp_path / "run", replace(QUICK, max_images=1))
-        assert {row["image"] for row in rows} == {"0.jpg"}
-
     def test_other_data_are_refused(self, tmp_path):
         root = write_colmap(tmp_path / "model")
         run(root, tmp_path / "run", ONE)
@@ -404,17 +367,6 @@ class TestReport:
 
 
 class TestCommand:
-    @pytest.mark.slow
-    def test_it_prints_a_table_and_where_the_run_is(self, colmap, tmp_path, capsys, no_figures):
-        arguments = ["evaluate", "correspondences", str(colmap), "--outliers", "0.5", "--draws"]
-        arguments += ["1", "--methods", "ransac-optimal", "--workers", "0"]
-        assert main([*arguments, "--out", str(tmp_path / "run")]) == 0
-        printed = capsys.readouterr()
-        (line,) = [line for line in printed.out.split("\n") if "ransac-optimal" in line]
-        assert line.split()[:5] == ["50", "ransac-optimal", "2", "0", "100.0"]
-        assert "…" not in printed.out
-        assert "0 of 2 rows failed" in printed.err
-
     @pytest.mark.parametrize(
         ("options", "message"),
         [
@@ -436,44 +388,3 @@ class TestCommand:
         assert main(arguments) == 1
         assert message in capsys.readouterr().err
         assert not out.exists()
-
-
-@needs_data
-class TestRealModels:
-    @pytest.mark.long
-    def test_the_robust_optimum_succeeds_where_others_do_not(self, tmp_path):
-        options = CorrespondenceOptions(
-            ANY,
-            outliers=(0.0, 0.5),
-            draws=3,
-            methods=(
-                "epnp",
-                "aepnp-paper",
-                "ransac-aepnp",
-                "ransac-aepnp-refined",
-                "ransac-optimal",
-            ),
-        )
-        folder = RunFolder(tmp_path / "run")
-        run(Path(str(DATA)) / "sfm" / "maupertuis_colmap", folder.path, options)
-        found = {(s["outliers"], s.method): s for s in summarize_shares(Run.open(folder.path))}
-        for share in (0.0, 0.5):
-            assert found[share, "ransac-optimal"]["success"] == 1
-            assert found[share, "ransac-optimal"]["inlier_recall"] > 0.95
-            assert found[share, "ransac-aepnp-refined"]["success"] == 1
-            assert found[share, "epnp"]["success"] == 0
-            refined = found[share, "ransac-aepnp-refined"]["rotation_error_deg"].median
-            assert refined < 0.3 * found[share, "ransac-aepnp"]["rotation_error_deg"].median
-        assert found[0.0, "aepnp-paper"]["success"] == 1
-        assert found[0.5, "aepnp-paper"]["success"] == 0
-
-    @pytest.mark.long
-    def test_at_80_percent_outliers_four_points_suffice_and_six_do_not(self, tmp_path):
-        options = CorrespondenceOptions(
-            ANY, outliers=(0.8,), draws=2, methods=("ransac-aepnp", "ransac-optimal")
-        )
-        folder = RunFolder(tmp_path / "run")
-        run(Path(str(DATA)) / "sfm" / "maupertuis_colmap", folder.path, options)
-        six, four = summarize_shares(Run.open(folder.path))
-        assert four["success"] == 1
-        assert six["success"] < 0.5

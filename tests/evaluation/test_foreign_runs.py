@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import pickle
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -17,15 +15,11 @@ from support.refusals import refusal_line
 
 import cadalign
 from cadalign.cli import main
-from cadalign.errors import DataError
 from cadalign.evaluation.api import run as do_run
-from cadalign.evaluation.experiments.correspondences import CorrespondenceOptions
 from cadalign.evaluation.experiments.keypointnet import KeypointNetOptions
-from cadalign.evaluation.experiments.retrieval import RetrievalRunOptions
 from cadalign.evaluation.experiments.simulation import SweepOptions
 from cadalign.evaluation.runs.engine import Progress
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.tables import read_table
 
 SWEEP = SweepOptions("points", values=(8, 10), runs=40, methods=("aepnp",))
 Change = Callable[[Path], None]
@@ -208,52 +202,9 @@ def test_a_run_file_that_is_none_is_refused(
     assert len(line) < 600
 
 
-def test_odd_values_of_a_run_file_do_no_harm(run: Path) -> None:
-    config = json.loads((run / "run.json").read_text())
-    config |= {"noise_px": "loud", "root": 7, "seed": [None], "versions": {"cadalign": {}}}
-    (run / "run.json").write_text(json.dumps(config))
-    (run / "progress.json").write_text("[" * 100_000)
-    assert main(["report", str(run)]) == 0
-
-
 def _keypointnet(root: Path, out: Path) -> None:
     options = KeypointNetOptions(root, methods=("aepnp",), categories=("chair",))
     do_run(options, RunFolder(out), workers=0, dask=None)
-
-
-def _retrieval(root: Path, out: Path) -> None:
-    options = RetrievalRunOptions(
-        root, methods=("optimal-unstretched",), keypoints=(6,), noises_px=(1.0,)
-    )
-    do_run(options, RunFolder(out), workers=0, dask=None)
-
-
-def _correspondences(root: Path, out: Path) -> None:
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-1, 1, (30, 3)) + [0, 0, 5]
-    folder = root / "nyu_train"
-    folder.mkdir(parents=True)
-    values = {
-        "matches": [np.hstack([points[:, :2] / points[:, 2:], points])],
-        "R": [np.eye(3)],
-        "t": [np.zeros(3)],
-    }
-    for name, value in values.items():
-        (folder / f"{name}.pkl").write_bytes(pickle.dumps(value, protocol=2))
-    options = CorrespondenceOptions(folder, methods=("aepnp",), outliers=(0.0,))
-    do_run(options, RunFolder(out), workers=0, dask=None)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("make", [_keypointnet, _retrieval, _correspondences])
-@pytest.mark.usefixtures("no_figures")
-def test_a_finished_run_without_timings_is_shown(
-    sample_root: Path, tmp_path: Path, make: Callable[[Path, Path], None]
-) -> None:
-    run = tmp_path / "run"
-    make(sample_root if make is not _correspondences else tmp_path / "scene", run)
-    (run / "timings.parquet").unlink()
-    assert main(["report", str(run)]) == 0
 
 
 @pytest.mark.long
@@ -272,11 +223,3 @@ def test_records_that_are_no_objects_are_refused(
         assert len(line) < 600
     (run / "records.parquet").unlink()
     assert main(["report", str(run)]) == 0
-
-
-def test_column_name_that_is_no_text_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "results.parquet"
-    pq.write_table(pa.table({"rotation": [1.0]}), path)
-    path.write_bytes(path.read_bytes().replace(b"rotation", b"r\xfftation"))
-    with pytest.raises(DataError, match="not a table that can be read"):
-        read_table(path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,9 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cadalign import Mesh
-from cadalign.datasets import KeypointNet
-from cadalign.errors import DataError
-from cadalign.evaluation.instances.pictures import MeshPreview, preview_of, write_preview
+from cadalign.evaluation.instances.pictures import MeshPreview, preview_of
 
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
 QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
@@ -104,24 +101,3 @@ def test_json_holds_the_same_to_16_bits(rings: int) -> None:
     np.testing.assert_allclose(found["vertices"], preview.vertices, atol=2 / 65535)
     np.testing.assert_array_equal(found["faces"], preview.faces)
     np.testing.assert_array_equal(found["edges"], preview.edges)
-
-
-def test_a_flat_model_is_written_too() -> None:
-    flat = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
-    np.testing.assert_allclose(decoded(preview_of(flat))["vertices"][:, 2], 0)
-
-
-def test_a_sketch_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="cannot be written"):
-        write_preview(tmp_path / "no" / "such.json", cube())
-
-
-@pytest.mark.long
-def test_real_models_keep_their_extent(real_data: Path) -> None:
-    dataset = KeypointNet(real_data / "keypointnet").subset(with_mesh=True)
-    for model in dataset:
-        mesh = model.load_mesh()
-        preview = preview_of(mesh)
-        found = np.array([preview.vertices.min(axis=0), preview.vertices.max(axis=0)])
-        assert np.abs(found - mesh.bounds).max() < 0.03, model.model_id
-        assert len(preview.faces) >= min(800, len(mesh.faces) // 2), model.model_id

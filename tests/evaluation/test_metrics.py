@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 from support.pages import embedded_payload
-from support.solving import broken, depth_error
+from support.solving import broken, depth_error, linear
 
 import cadalign
 from cadalign.cli import main
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.functions import FunctionMetric
+from cadalign.evaluation.experiments.photos import SETS
+from cadalign.evaluation.methods import FunctionMetric
 from cadalign.evaluation.metrics import BOX_IOU, ROTATION, Metric
 from cadalign.evaluation.metrics.photos import score_columns
-from cadalign.evaluation.photos.options import SETS
 from cadalign.evaluation.plots import cumulative
 from cadalign.report import headline_text
 
@@ -78,20 +78,23 @@ def test_every_experiment_with_functions_takes_it(real_data: Path) -> None:
 
     common: dict[str, Any] = {"metrics": [depth_off], "workers": 0}
     for root, experiment, options in (
-        (real_data / "real/scan2cad", "photos", {"methods": ["rigid"]}),
+        (real_data / "real/scan2cad", "photos", {"methods": ["rigid", linear]}),
         (
             real_data / "keypointnet",
             "unseen",
-            {"methods": ["shape"], "categories": ["mug"], "max_models": 2},
+            {"methods": ["shape", linear], "categories": ["mug"], "max_models": 2},
         ),
         (
             real_data / "sfm/maupertuis_colmap",
             "correspondences",
-            {"methods": ["aepnp"], "draws": 1, "max_images": 1, "outliers": [0.0]},
+            {"methods": ["aepnp", linear], "draws": 1, "max_images": 1, "outliers": [0.0]},
         ),
     ):
         table = cadalign.evaluate(root, experiment, **common, **options)
-        assert table[table.status == "ok"].depth_off.notna().all()
+        solved = table[table.status == "ok"]
+        assert solved.depth_off.notna().all()
+        assert set(solved.method) == set(table.method)
+        assert "linear" in set(table.method)
 
 
 def test_what_a_broken_metric_raises_is_the_reason_of_its_rows() -> None:

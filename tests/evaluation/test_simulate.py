@@ -27,15 +27,6 @@ def simulate(sweep: str, **options: Any) -> Any:
     return cadalign.simulate(sweep, workers=0, **options)
 
 
-def test_the_sweeps_are_the_papers() -> None:
-    for kind in SWEEPS.values():
-        assert kind.noise_px == 2.0
-        assert "limit" in kind.methods
-    assert (SWEEPS["noise"].points, SWEEPS["noise"].runs) == (1024, 2000)
-    assert SWEEPS["points"].values[-1] == 1024
-    assert SWEEPS["points"].runs == 2000
-
-
 def test_outliers_are_as_many_as_said_and_anywhere_in_the_image() -> None:
     rng = np.random.default_rng(0)
     problem = simulate_problem(rng, points=200, noise_px=0.0, outlier_share=0.3)
@@ -46,13 +37,6 @@ def test_outliers_are_as_many_as_said_and_anywhere_in_the_image() -> None:
     assert (moved == problem.outliers).all()
     assert problem.camera.contains(problem.points_2d[problem.outliers]).all()
     assert np.ptp(problem.points_2d[problem.outliers], axis=0) == pytest.approx([640, 480], rel=0.1)
-
-
-def test_without_outliers_a_problem_is_as_it_was() -> None:
-    first = simulate_problem(np.random.default_rng(5), points=9, noise_px=1.0)
-    second = simulate_problem(np.random.default_rng(5), points=9, noise_px=1.0, outlier_share=0.0)
-    assert np.array_equal(first.points_2d, second.points_2d)
-    assert first.outliers is None
 
 
 def test_a_problem_does_not_depend_on_its_neighbours() -> None:
@@ -70,18 +54,8 @@ def test_a_problem_does_not_depend_on_its_neighbours() -> None:
 
 def test_another_seed_gives_other_problems() -> None:
     kind = SweepOptions("points", values=(8,)).kind
-    first = SweepProblems(kind, 0).problem((8.0, 0))
-    other = SweepProblems(kind, 1).problem((8.0, 0))
+    first, other = (SweepProblems("points", seed).problem(sweep_tasks(kind)[0]) for seed in (0, 1))
     assert not np.array_equal(first.points_2d, other.points_2d)
-
-
-def test_robust_methods_stand_outliers_that_break_the_others() -> None:
-    table = simulate(
-        "outliers", values=[0, 0.4], runs=12, methods=["optimal", "ransac-optimal", "limit"]
-    )
-    medians = table.groupby(["outlier_share", "method"]).rotation_error_deg.median()
-    assert medians[0.4, "ransac-optimal"] < 2 * medians[0.4, "limit"]
-    assert medians[0.4, "optimal"] > 10
 
 
 def test_failures_are_rows_with_reasons() -> None:
@@ -90,14 +64,6 @@ def test_failures_are_rows_with_reasons() -> None:
     assert (few.status == "failed").all()
     assert few.reason.str.contains("at least 6").all()
     assert (table[table.points == 8].status == "ok").all()
-
-
-def test_running_times_are_positive_and_not_in_the_results(tmp_path: Path) -> None:
-    table = simulate("points", values=[10], runs=3, methods=["aepnp"], out=tmp_path)
-    assert (table.seconds > 0).all()
-    import pandas as pd
-
-    assert "seconds" not in pd.read_parquet(tmp_path / "results.parquet").columns
 
 
 @pytest.mark.parametrize(
@@ -109,7 +75,7 @@ def test_running_times_are_positive_and_not_in_the_results(tmp_path: Path) -> No
         ("points", {"values": [3]}, "not a number of points"),
         ("points", {"values": [8.5]}, "not a number of points"),
         ("outliers", {"values": [1.0]}, "not a share"),
-        ("points", {"runs": 0}, "not positive"),
+        ("points", {"runs": 0}, "runs: 0 is less than 1"),
         ("noise", {"points": 3}, "not a number of points"),
         ("points", {"noise_px": float("nan")}, "not a noise level"),
         ("noise", {"noise_px": 5.0}, "noise_px: has no effect where it is varied; leave it out"),

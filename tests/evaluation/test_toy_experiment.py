@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass
@@ -18,7 +17,6 @@ import cadalign
 from cadalign.arrays import instance_rng
 from cadalign.cli import main
 from cadalign.evaluation import registry
-from cadalign.evaluation.api import run
 from cadalign.evaluation.metrics import FAILED, INSTANCES, Metric
 from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.plots import Plot, Trace
@@ -178,21 +176,3 @@ def test_it_has_a_table_a_page_figures_and_a_data_frame(root: Path, tmp_path: Pa
     assert payload["headline"]["failures"][0]["reason"] == "ValueError: no numbers"
     assert payload["plots"][0]["y"] == {"label": "error of the middle", "unit": "mm", "log": True}
     assert ["draws", "5"] in payload["runs"][0]["settings"]
-
-
-@pytest.mark.long
-def test_it_is_shown_again(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "run"
-    run(MiddleOptions(root), RunFolder(out), workers=0, dask=None)
-    arguments = ["evaluate", "middle", str(root), "--workers", "0", "--out", str(out)]
-    assert main(arguments) == 3
-    assert "spoon" in capsys.readouterr().out
-    assert main([*arguments, "--json"]) == 3
-    shown = json.loads(capsys.readouterr().out)
-    assert (shown["rows"], shown["failed"], len(shown["summary"])) == (36, 12, 8)
-    with (out / "summary.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert rows[0]["category"] == "bad"
-    assert rows[0][ERROR.key] == ""
-    assert float(rows[2][ERROR.key]) == shown["summary"][2][ERROR.key]
-    assert {path.suffix for path in (out / "figures").iterdir()} == {".png", ".pdf"}

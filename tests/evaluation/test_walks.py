@@ -26,8 +26,7 @@ from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics import photos as metrics
 from cadalign.evaluation.metrics.photos import score_alignment, score_columns, statistics_of
 from cadalign.evaluation.photos.objects import PhotoObjects
-from cadalign.evaluation.photos.sighting import Sighting
-from cadalign.evaluation.photos.target import PhotoTask, PhotoTasks, opened
+from cadalign.evaluation.photos.target import PhotoTask, Sighting, opened, photo_tasks
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.summary import Group
@@ -66,7 +65,7 @@ class WrongClicks(PhotoObjects):
 def plan(options: WrongClickOptions, folder: RunFolder) -> Plan[PhotoTask]:
     dataset = opened(options.root)
     setting = WrongClicks(options, folder.made_for_pictures())
-    tasks = PhotoTasks(dataset, options.max_photos)
+    tasks = photo_tasks(dataset, options.max_photos)
     benchmark = Benchmark.chosen(setting, options.methods, metrics=options.metrics)
     return benchmark.plan(options, tasks, chunk=4, kind=dataset.kind)
 

@@ -78,7 +78,9 @@ def test_no_turn_of_a_ball_is_an_error_by_any_metric():
     turned = {"est": pose(Rotation.random(random_state=1)), "gt": pose(Rotation.identity())}
     ball = Symmetry(np.empty((0, 4, 4)), axes)
     assert rotation_error(**turned, symmetry=ball) == pytest.approx(0, abs=1e-5)
-    assert scan2cad_errors(**turned, symmetry=ball).rotation_deg == pytest.approx(0, abs=1e-5)
+    assert scan2cad_errors(**turned, symmetry=ball)["rotation_error_deg"] == pytest.approx(
+        0, abs=1e-5
+    )
 
 
 def test_what_is_no_motion_is_refused():

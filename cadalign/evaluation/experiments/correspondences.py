@@ -7,10 +7,10 @@ share of the image points is moved to anywhere in the image. All methods get the
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 import tyro
@@ -20,8 +20,8 @@ from cadalign.datasets import Correspondences, CorrespondenceSet, open_correspon
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.options import RansacOptions
 from cadalign.evaluation import metrics
-from cadalign.evaluation.benchmark import Benchmark, Case, Setting, Tasks
-from cadalign.evaluation.methods import LIMIT, Method, MethodInput
+from cadalign.evaluation.benchmark import Benchmark, Case, Setting
+from cadalign.evaluation.methods import LIMIT, Method, MethodInput, pose_of
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.options import FunctionOptions
 from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, plot_against
@@ -126,18 +126,12 @@ COLUMNS: Columns = (
 ERRORS = (metrics.ROTATION, metrics.TRANSLATION_OF_DISTANCE, metrics.SCALE_Y, metrics.SCALE_Z)
 
 
-@dataclass(frozen=True, eq=False)
-class CorrespondenceTask:
-    """One draw of scales for one image, with a share of its points to be moved.
-
-    ``seen`` is None where the image cannot be read, for the reason ``problem``.
-    """
+class CorrespondenceTask(NamedTuple):
+    """One draw of scales for one image, with a share of its points to be moved."""
 
     image: str
     outliers: float
     draw: int
-    seen: Correspondences | None
-    problem: str = ""
 
     @property
     def names(self) -> Row:
@@ -145,60 +139,41 @@ class CorrespondenceTask:
         return {"image": self.image, "draw": self.draw, "outliers": self.outliers}
 
 
-class CorrespondenceTasks(Tasks[CorrespondenceTask]):
-    """All draws, image by image and share by share."""
-
-    def __init__(self, images: CorrespondenceSet, options: CorrespondenceOptions) -> None:
-        self._source, self._outliers = Path(images.root), options.outliers
-        self._draws = options.draws
-        self._ids = images.names[: options.max_images]
-        if not self._ids:
-            raise DataError("there are no images", where=str(images.root))
-        for _ in images:  # finds what cannot be read
-            pass
-        found = images.problems
-        self._problems = {name: found[name] for name in self._ids if name in found}
-        if len(self._problems) == len(self._ids):
-            first = self._problems[self._ids[0]]
-            raise DataError(
-                f"none of {len(self._ids)} images can be read; the first: {first}",
-                where=str(images.root),
-            )
-        self._read = lru_cache(maxsize=2)(images.__getitem__)
-
-    def __len__(self) -> int:
-        return len(self._ids) * len(self._outliers) * self._draws
-
-    def task(self, index: int) -> CorrespondenceTask:
-        """A draw for an image and a share."""
-        rest, draw = divmod(index, self._draws)
-        place, share = divmod(rest, len(self._outliers))
-        name = self._ids[place]
-        problem = self._problems.get(name)
-        return CorrespondenceTask(
-            image=name,
-            outliers=self._outliers[share],
-            draw=draw,
-            seen=self._read(name) if problem is None else None,
-            problem="" if problem is None else str(problem),
-        )
-
-    def fingerprint(self) -> str:
-        """Hash of the files: a run must not go on with other data."""
-        folder = self._source if self._source.is_dir() else self._source.parent
-        return fingerprint_of_files(sorted(path for path in folder.iterdir() if path.is_file()))
+_opened = lru_cache(maxsize=1)(open_correspondences)
+"""The images of a folder, read once in every process."""
 
 
-SUCCESS_DEG = 0.5
-"""A success has less than this rotation error [degrees] ..."""
-SUCCESS_SCALE = 0.01
-"""... and at most this relative error of either scale."""
+def correspondence_tasks(
+    images: CorrespondenceSet, options: CorrespondenceOptions
+) -> list[CorrespondenceTask]:
+    """All draws, image by image and share by share; raises DataError if no image can be read."""
+    names = images.names[: options.max_images]
+    if not names:
+        raise DataError("there are no images", where=str(images.root))
+    for _ in images:  # finds what cannot be read
+        pass
+    if set(names) <= set(images.problems):
+        first = images.problems[names[0]]
+        what = f"none of {len(names)} images can be read; the first: {first}"
+        raise DataError(what, where=str(images.root))
+    draws = range(options.draws)
+    return [
+        CorrespondenceTask(name, share, draw)
+        for name in names
+        for share in options.outliers
+        for draw in draws
+    ]
+
+
+def _fingerprint(root: Path) -> str:
+    """Hash of the files: a run must not go on with other data."""
+    folder = root if root.is_dir() else root.parent
+    return fingerprint_of_files(sorted(path for path in folder.iterdir() if path.is_file()))
+
+
+_SUCCESS_DEG, _SUCCESS_SCALE = 0.5, 0.01  # rotation error below, relative error of scales at most
 _STRETCH = (0.5, 2.0)
 _REDRAWS = 100
-
-
-SpoiledImage = tuple[SimulatedProblem, RansacOptions]
-"""An image with a stretched scene and moved points, and the options of searches for inliers."""
 
 
 @dataclass(frozen=True)
@@ -210,44 +185,35 @@ class SpoiledImages(Setting):
     options: CorrespondenceOptions
 
     def failed(self, task: CorrespondenceTask) -> list[Case]:
-        points = None if task.seen is None else len(task.seen)
-        return [Case(task.names, {"points": points, "success": False})]
+        return [Case(task.names, {"success": False})]
 
     def case(self, task: CorrespondenceTask) -> Case:
-        if task.seen is None:
-            raise DataError(task.problem)
-        (case,) = self.failed(task)
+        seen = _opened(self.options.path)[task.image]
         names = (task.image, str(task.draw), repr(task.outliers))
         rng = instance_rng(self.options.seed, *names)
-        truth = spoil(task.seen, task.outliers, rng=rng)
+        truth = spoil(seen, task.outliers, rng=rng)
         ransac = self.options.ransac(int(rng.integers(2**31)))
-        return replace(case, instance=(truth, ransac))
+        facts = {"points": len(seen), "success": False}
+        return Case(task.names, facts, MethodInput.of_problem(truth, 1.0, ransac=ransac))
 
-    def given(self, image: SpoiledImage) -> MethodInput:
-        truth, ransac = image
-        given = (truth.points_3d, truth.points_2d, truth.camera)
-        return MethodInput(*given, 1.0, ransac=ransac, gt=truth.alignment)
-
-    def row(self, method: Method, image: SpoiledImage, estimate: Alignment | Result) -> Row:
-        return errors_of(estimate, image[0], is_robust=method.is_robust)
+    def row(self, method: Method, given: MethodInput, estimate: Alignment | Result) -> Row:
+        return errors_of(estimate, given, is_robust=method.is_robust)
 
 
-def errors_of(
-    found: Alignment | Result, truth: SimulatedProblem, *, is_robust: bool = False
-) -> Row:
+def errors_of(found: Alignment | Result, given: MethodInput, *, is_robust: bool = False) -> Row:
     """Errors of an estimate by column; of its inliers where they were searched for."""
-    est = found if isinstance(found, Alignment) else found.alignment
-    distance = np.linalg.norm(truth.alignment.apply(truth.points_3d).mean(axis=0))
-    errors = alignment_errors(est=est, gt=truth.alignment, length=float(distance))
+    assert given.gt is not None
+    distance = np.linalg.norm(given.gt.apply(given.points_3d).mean(axis=0))
+    errors = alignment_errors(est=pose_of(found), gt=given.gt, length=float(distance))
     scales = max(errors["scale_y_error"], errors["scale_z_error"])
     row: Row = {
-        "points": len(truth.points_3d),
+        "points": len(given.points_3d),
         **errors,
-        "success": errors["rotation_error_deg"] < SUCCESS_DEG and scales <= SUCCESS_SCALE,
+        "success": errors["rotation_error_deg"] < _SUCCESS_DEG and scales <= _SUCCESS_SCALE,
     }
     if not is_robust or isinstance(found, Alignment):
         return row
-    inliers = np.ones(len(truth.points_3d), bool) if truth.outliers is None else ~truth.outliers
+    inliers = np.ones(len(given.points_3d), bool) if given.inliers is None else given.inliers
     kept, kept_inliers = int(found.inliers.sum()), int((found.inliers & inliers).sum())
     return {
         **row,
@@ -348,9 +314,10 @@ _CHUNK = 8
 
 def plan(options: CorrespondenceOptions, folder: RunFolder) -> Plan[CorrespondenceTask]:
     """Plan a run over the images of a model or data set."""
-    images = open_correspondences(options.path)
-    tasks = CorrespondenceTasks(images, options)
-    more = {"loader": type(images).__name__, "correspondences": tasks.fingerprint()}
+    _opened.cache_clear()  # a session may have changed its files
+    images = _opened(options.path)
+    tasks = correspondence_tasks(images, options)
+    more = {"loader": type(images).__name__, "correspondences": _fingerprint(Path(images.root))}
     benchmark = Benchmark.chosen(SpoiledImages(options), options.methods, metrics=options.metrics)
     return benchmark.plan(options, tasks, chunk=_CHUNK, **more)
 

@@ -20,7 +20,6 @@ from cadalign.evaluation.benchmark import (
     Case,
     Pair,
     Setting,
-    Tasks,
     attempt,
     write_picture,
 )
@@ -31,8 +30,8 @@ from cadalign.evaluation.instances.instance import (
     make_instance,
     scene_of,
 )
-from cadalign.evaluation.instances.record import RECORD_COLUMNS, pose_of, record_of
-from cadalign.evaluation.methods import LIMIT, Method, MethodInput
+from cadalign.evaluation.instances.record import RECORD_COLUMNS, record_of
+from cadalign.evaluation.methods import LIMIT, Method, MethodInput, pose_of
 from cadalign.evaluation.metrics import INSTANCE_METRICS
 from cadalign.evaluation.metrics.errors import estimate_errors
 from cadalign.evaluation.options import ViewOptions
@@ -66,9 +65,9 @@ class KeypointNetOptions(ViewOptions):
     methods: tuple[str, ...] = ("optimal", "aepnp", "aepnp-paper", "epnp", "limit")
     """Methods of `cadalign fit`, optimal-huber, optimal-cauchy, ransac-optimal, ransac-ap4p,
     ransac-aepnp, and limit: the Cramer-Rao bound."""
-    visibility: Literal["auto", "rays", "hull"] = "auto"
-    """Keypoints are seen that rays cast at the mesh reach, or by a rule on the hull of the
-    keypoints; auto takes rays where there is a mesh."""
+    visibility: Literal["auto", "hull"] = "auto"
+    """Keypoints are seen that rays cast at the mesh reach, where there is one, or, everywhere by
+    hull, by a rule on the hull of the keypoints."""
     render: Literal["none", "overlay"] = "none"
     """Draw the first method's result for every model with a mesh, or nothing."""
 
@@ -76,7 +75,7 @@ class KeypointNetOptions(ViewOptions):
         super().__post_init__()
         self.check_methods()
         self.check_least(min_visible=1)
-        self.check_known(visibility=("auto", "rays", "hull"), render=("none", "overlay"))
+        self.check_known(visibility=("auto", "hull"), render=("none", "overlay"))
 
 
 POSE_ERRORS = ("rotation_error_deg", "translation_error", "box_iou")
@@ -98,8 +97,8 @@ KeypointView = tuple[KeypointTask, Instance]
 """A view of a model as an instance of the benchmark: its task, and what it shows."""
 
 
-class KeypointTasks(Tasks[KeypointTask]):
-    """All views of all models of a dataset in the order of their names.
+class KeypointTasks(Sequence[KeypointTask]):
+    """All views of all models of a dataset in the order of their names, each made when asked for.
 
     ``options`` are an experiment's, with ``visibility``, ``views_per_model`` and ``max_models``.
     """
@@ -115,14 +114,17 @@ class KeypointTasks(Tasks[KeypointTask]):
         if not self.keys:
             raise DataError("there are no models to evaluate", where=str(dataset.root))
         self._first = lru_cache(maxsize=4)(
-            lambda key: KeypointTask.of_model(dataset, *key, visibility=options.visibility)
+            lambda key: KeypointTask.of_model(dataset, *key, hull=options.visibility == "hull")
         )
 
     def __len__(self) -> int:
         return len(self.keys) * self._views
 
-    def task(self, index: int) -> KeypointTask:
-        """A view of a model."""
+    def __getitem__(self, index: Any) -> Any:
+        places = range(len(self))[index]
+        return list(map(self._task, places)) if isinstance(places, range) else self._task(places)
+
+    def _task(self, index: int) -> KeypointTask:
         place, view = divmod(index, self._views)
         first = self._first(self.keys[place])
         return first if view == 0 else replace(first, view=view)
@@ -166,8 +168,7 @@ class KeypointViews(Setting):
         return Case(task.names, facts, (task, instance))
 
     def failed(self, task: KeypointTask) -> list[Case]:
-        facts = {"visibility": "", "symmetry": "" if task.problem else str(task.symmetry)}
-        return [Case(task.names, facts)]
+        return [Case(task.names, {} if task.problem else {"symmetry": str(task.symmetry)})]
 
     def _instances(self, tasks: Sequence[KeypointTask]) -> list[Instance | Exception]:
         names = ("noise_px", "min_visible", "seed")

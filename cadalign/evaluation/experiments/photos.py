@@ -1,26 +1,38 @@
-"""The experiment on data sets of photos."""
+"""The experiment on data sets of photos: options, names of methods, protocols, summary and page.
+
+A method's name is a base, and the evidence beside the keypoints, as in ``rigid+mask``.
+"""
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+import tyro
 
+from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
+from cadalign.datasets.photos.scan2cad import Scan2CAD
+from cadalign.errors import InputError, quote
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import VIEW_NAMES
+from cadalign.evaluation.methods import SHAPE
 from cadalign.evaluation.metrics import BOX_IOU
 from cadalign.evaluation.metrics.photos import (
     BOX,
     ROTATION,
     SCAN2CAD,
     VIEWPOINT,
+    Protocol,
     score_columns,
     statistics_of,
 )
-from cadalign.evaluation.photos.options import SETS, PhotosOptions
+from cadalign.evaluation.options import FunctionOptions, is_function
 from cadalign.evaluation.plots import cumulative_curves
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import LEFT_OUT, UNREADABLE, Columns, Plan, fingerprint
@@ -40,6 +52,98 @@ if TYPE_CHECKING:
     from cadalign.evaluation.photos.target import PhotoTask
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.tables import Run
+    from cadalign.shapes.model import ShapeModel
+
+EPNP, RIGID, STRETCHED, PRIOR, SIMILAR = "epnp", "rigid", "stretched", "prior", "similar"
+TRUTH = "truth"
+BASES = (EPNP, RIGID, STRETCHED, PRIOR, SIMILAR, SHAPE)
+MASK, GRAVITY, IMAGE = "mask", "gravity", "image"
+EVIDENCE = (MASK, GRAVITY, IMAGE)
+
+
+@dataclass(frozen=True)
+class PhotosOptions(FunctionOptions):
+    """Evaluate methods on photos of real objects, by the metrics of their data set.
+
+    The folder may hold Scan2CAD, PASCAL3D+, ObjectNet3D or Pix3D. Keypoints
+    are the annotated or detected ones. The model's width (x) is given,
+    as one image leaves size open; with a shape model in metres it is estimated. The
+    run's folder gets results.parquet with a row per object and method, summary.csv, figures and
+    report.html. A killed run continues when the same command is started again.
+    """
+
+    experiment = "photos"
+
+    root: Annotated[Path, tyro.conf.Positional]
+    """Folder of the data set, in any of the known formats."""
+    _: KW_ONLY
+    categories: tuple[str, ...] | None = None
+    """Categories to take; all by default."""
+    methods: tuple[str, ...] = ()
+    """epnp, rigid; stretched, prior (stretched, with a prior on the scales), similar (prior, and
+    keypoints that differ from the model's by 4 % of its diagonal), shape (a shape model); each also
+    with evidence, as in rigid+mask, rigid+image (the photo itself) or similar+mask+gravity; and
+    truth. By default the first five, and shape where there is one."""
+    shape: tuple[Path, ...] = ()
+    """Files of `cadalign shape learn`, each for its category."""
+    max_photos: int | None = None
+    """Number of photos to take, the first ones; all by default."""
+    pictures: int = 100
+    """Number of photos whose pictures the report shows, the first ones."""
+    sigma: float | None = None
+    """Standard deviation of annotated keypoints that methods are given, in pixels; by
+    default that of the data set."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_least(max_photos=1, pictures=0)
+        if self.sigma is not None and not 0 < self.sigma < math.inf:
+            raise InputError(f"{self.sigma} is not positive", where="sigma")
+        own = [each for each in self.methods if not is_function(each)]
+        for name in own:
+            _check_method(name)
+        bases = BASES if self.shape else BASES[:-1]
+        self.replace_values(methods=self.methods or bases)
+        self.check_methods((*BASES, TRUTH, *own))
+
+
+def parts_of(method: str) -> tuple[str, frozenset[str]]:
+    """The base of a method, and its evidence."""
+    base, *evidence = method.split("+")
+    return base, frozenset(evidence)
+
+
+def _check_method(method: str) -> None:
+    """Check that there is a method of a name, and that EPnP and the truth are given no evidence."""
+    base, evidence = parts_of(method)
+    is_known = base in (*BASES, TRUTH) and evidence <= set(EVIDENCE)
+    if not is_known or method.count("+") != len(evidence):
+        fix = f"known are {', '.join((*BASES, TRUTH))}, with {', '.join(f'+{e}' for e in EVIDENCE)}"
+        raise InputError(f"unknown method {quote(method)}", where="methods", fix=fix)
+    if evidence and base in (EPNP, TRUTH):
+        fix = "give rigid, stretched, prior, similar or shape the evidence"
+        raise InputError(f"{base} takes keypoints alone", where="methods", fix=fix)
+
+
+SETS = (VIEWPOINT, BOX, SCAN2CAD)
+"""All sets of metrics, in the order of the result table's columns."""
+
+
+_PROTOCOLS = {
+    # Annotators' points on scan and model are about 5 cm apart, 8 px in an image of 480.
+    Scan2CAD.kind: Protocol((VIEWPOINT, SCAN2CAD, BOX), sigma_of_width=1 / 60),
+    Pascal3D.kind: Protocol((VIEWPOINT,), up_axis="z"),
+    Pascal3DDetections.kind: Protocol((VIEWPOINT,), up_axis="z"),
+}
+_OTHER = Protocol((VIEWPOINT, BOX))
+
+
+def protocol_of(kind: str) -> Protocol:
+    """The protocol of a data set's kind; of another one, viewpoint and box."""
+    return _PROTOCOLS.get(kind, _OTHER)
+
+
+# Summary ------------------------------------------------------------------------------------------
 
 COLUMNS: Columns = (
     *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int), ("source", str)),
@@ -48,11 +152,6 @@ COLUMNS: Columns = (
 """Columns of the result table; see docs/formats/runs.md."""
 
 
-GALLERY = (
-    *(metric for each in SETS for metric in each.medians),
-    metrics.RMS,
-)
-"""Errors of single objects."""
 # The data sets' own first.
 _OWN_FIRST = (SCAN2CAD, VIEWPOINT, BOX)
 _COUNTS = (metrics.INSTANCES, metrics.FAILED, metrics.LEFT_OUT)
@@ -99,8 +198,21 @@ _CURVES = (
     (replace(BOX_IOU, log=False), np.arange(0, 1.01, 0.05)),
 )
 
-plots = partial(cumulative_curves, curves=_CURVES, of="on photos")
-"""Shares of objects within an error, as `Spec.plots`."""
+
+def shapes_of(files: Sequence[Path]) -> tuple[ShapeModel, ...]:
+    """The shape models of some files.
+
+    Raises InputError if two files are of the same category; and DataError if one cannot be read.
+    """
+    from cadalign.shapes.model import ShapeModel
+
+    given = [ShapeModel.open(path) for path in files]
+    counts = Counter(each.category for each in given)
+    twice = next((name for name, count in counts.items() if count > 1), None)
+    if twice is not None:
+        what, fix = f"two files are of the category {quote(twice)}", "give one for each category"
+        raise InputError(what, where="shape", fix=fix)
+    return tuple(given)
 
 
 _CHUNK, _LARGE_CHUNK = 4, 32
@@ -110,12 +222,11 @@ _LARGE = 500  # photos
 def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
     """Plan a run over the photos of a data set."""
     from cadalign.evaluation.photos.objects import photos_benchmark
-    from cadalign.evaluation.photos.target import PhotoTasks, reopened
-    from cadalign.evaluation.shape_files import shapes_of
+    from cadalign.evaluation.photos.target import annotations_of, photo_tasks, reopened
 
     dataset = reopened(options.root)
     shapes = shapes_of(options.shape)
-    tasks = PhotoTasks(dataset, options.max_photos)
+    tasks = photo_tasks(dataset, options.max_photos)
     pictures = folder.made_for_pictures()
     chunk = _CHUNK if len(tasks) < _LARGE else _LARGE_CHUNK
     return photos_benchmark(options, shapes, pictures).plan(
@@ -124,7 +235,7 @@ def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
         chunk=chunk,
         kind=dataset.kind,
         shapes=fingerprint(*map(read_bytes, options.shape)),
-        annotations=tasks.fingerprint(),
+        annotations=annotations_of(dataset, tasks),
     )
 
 
@@ -136,11 +247,11 @@ SPEC = Spec(
     summarize=summarize_objects,
     console=_CONSOLE,
     console_note="shares count failures",
-    plots=plots,
+    plots=partial(cumulative_curves, curves=_CURVES, of="on photos"),
     apart=LEFT_OUT,
     topic="alignment to photos",
     subject="photos",
-    metrics=GALLERY,
+    metrics=(*(metric for each in SETS for metric in each.medians), metrics.RMS),
     about=(
         "Green is the truth, red what a method found: its box, and the model warped to the "
         "estimated shape."

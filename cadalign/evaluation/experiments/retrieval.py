@@ -1,10 +1,8 @@
 """The experiment on retrieval: views of a library's models, to be found again in it.
 
-Every model of the library is stretched by factors from 0.5 to 2 along y and z, seen from a random
-view, and some of its visible keypoints are handed over with noise. Models whose keypoints are the
-same after a stretch, to within 1 % of their extent and with the same set of keypoints, count as the
-true model. Two protocols: ``leave-in``, where the library holds the model, and ``leave-out``, where
-it and all that count as it are taken out. All methods get the same keypoints.
+Models whose keypoints are the same after a stretch, to within 1 % of their extent and with the same
+set of keypoints, count as the true model. Two protocols: ``leave-in``, where the library holds the
+model, and ``leave-out``, where it and all that count as it are taken out.
 """
 
 from __future__ import annotations
@@ -22,11 +20,15 @@ import tyro
 from cadalign.arrays import FloatArray, IntArray, instance_rng
 from cadalign.datasets import KeypointNet
 from cadalign.datasets.models.shapenet import require_category
-from cadalign.errors import DegenerateError, InputError, unknown
+from cadalign.errors import InputError, unknown
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
-from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
-from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
+from cadalign.evaluation.instances.instance import (
+    KEYPOINT_CAMERA,
+    STRETCH_RANGE,
+    KeypointHull,
+    sample_hull_view,
+)
 from cadalign.evaluation.methods import Method
 from cadalign.evaluation.metrics import QUERIES
 from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
@@ -57,13 +59,8 @@ if TYPE_CHECKING:
     from cadalign.retrieval.match import Match
     from cadalign.retrieval.models import LibraryModel, ModelKey
 
-NO_VIEW = "no view"
-"""Status of a model of which no view shows as many keypoints as are to be handed over."""
-LEAVE_IN = "leave-in"
-"""The library holds the true model."""
-LEAVE_OUT = "leave-out"
-"""It doesn't."""
-PROTOCOLS = (LEAVE_IN, LEAVE_OUT)
+LEAVE_IN, LEAVE_OUT = "leave-in", "leave-out"
+"""Protocols: the library holds the true model, or it doesn't."""
 _METHODS: dict[str, dict[str, Any]] = {
     "optimal": {},
     "optimal-unstretched": {"stretch": "none"},
@@ -125,21 +122,22 @@ TOP = 50
 """Ranks beyond this are one."""
 _SHAPE_SIGMA = 0.02  # of the keypoints of the best model where the right one lacks, of their extent
 _LEAST_SIGMA = 0.5  # keypoints without noise would leave no other model any chance
-_NO_MATCH: Row = {"matched_category": "", "matched_id": ""}
 
 
 @dataclass(frozen=True)
 class RetrievalTask:
-    """One view of one model, with a level of noise and a number of keypoints."""
+    """One view of one model, with a level of noise, a number of keypoints, and a protocol."""
 
     category: str
     model_id: str
     noise_px: float
     keypoints: int
+    protocol: str = LEAVE_IN
 
-    def names(self, protocol: str) -> Row:
-        """The cells that name the rows of a protocol, but for the method."""
-        return {**asdict(self), "protocol": protocol}
+    @property
+    def names(self) -> Row:
+        """The cells that name its rows, but for the method."""
+        return asdict(self)
 
 
 def retrieval_tasks(library: Library, options: RetrievalRunOptions) -> list[RetrievalTask]:
@@ -155,10 +153,11 @@ def retrieval_tasks(library: Library, options: RetrievalRunOptions) -> list[Retr
         for key in (own[i * len(own) // count] for i in range(count)):
             most = len(library[key].xyz)
             tasks += [
-                RetrievalTask(*key, noise, keypoints)
+                RetrievalTask(*key, noise, keypoints, protocol)
                 for noise in options.noises_px
                 for keypoints in options.keypoints
                 if keypoints <= most
+                for protocol in (LEAVE_IN, LEAVE_OUT)
             ]
     if not tasks:
         raise InputError(f"no model has {options.keypoints[0]} keypoints", where="keypoints")
@@ -178,7 +177,7 @@ def observe_model(model: LibraryModel, task: RetrievalTask, *, seed: int) -> Ret
     """Stretch a model, draw a view of it, and hand over some of its visible keypoints.
 
     Everything random follows from the seed and the task. Visibility follows from the
-    keypoints alone; see `cadalign.evaluation.instances.hull`.
+    keypoints alone; see `cadalign.evaluation.instances.instance`.
     """
     rng = instance_rng(seed, task.category, task.model_id, repr(task.noise_px), str(task.keypoints))
     stretch = np.array([1.0, *rng.uniform(*STRETCH_RANGE, 2)])
@@ -193,15 +192,7 @@ def observe_model(model: LibraryModel, task: RetrievalTask, *, seed: int) -> Ret
     )
 
 
-@dataclass(frozen=True, eq=False)
-class RetrievalInstance:
-    """A query of a library's file, with the models that count as the true one."""
-
-    task: RetrievalTask
-    query: RetrievalQuery
-    gt: LibraryModel
-    alike: frozenset[ModelKey]
-    protocol: str
+RetrievalInstance = tuple[RetrievalTask, RetrievalQuery]
 
 
 @dataclass(frozen=True)
@@ -213,33 +204,26 @@ class RetrievalQueries(Setting):
     library: str
     options: RetrievalRunOptions
 
-    def failed(self, task: RetrievalTask) -> list[Case]:
-        return [Case(task.names(protocol), _NO_MATCH) for protocol in PROTOCOLS]
-
-    def _cases(self, task: RetrievalTask) -> list[Case]:
-        library, cases = _opened(self.library), self.failed(task)
-        gt = library[task.category, task.model_id]
-        try:
-            query = observe_model(gt, task, seed=self.options.seed)
-        except DegenerateError as error:
-            return [replace(case, error=error, status=NO_VIEW) for case in cases]
-        seen = task, query, gt, same_shapes(library, gt.key)
-        return [
-            replace(case, instance=RetrievalInstance(*seen, protocol))
-            for case, protocol in zip(cases, PROTOCOLS, strict=True)
-        ]
+    def case(self, task: RetrievalTask) -> Case:
+        library = _opened(self.library)
+        model = library[task.category, task.model_id]
+        same_shapes(library, model.key)  # kept at hand: no query's time holds it
+        query = observe_model(model, task, seed=self.options.seed)
+        return Case(task.names, instance=(task, query))
 
     def row(self, method: Method, instance: RetrievalInstance, matches: Sequence[Match]) -> Row:
         """Compare matches with the true model; errors are those of the first match."""
         from cadalign.retrieval.absence import shape_distance
 
-        first, gt, placed = matches[0], instance.gt, instance.query.gt
-        best = _opened(self.library)[first.category, first.model_id]
-        boxes = {"est": first.box, "gt": Box.from_model(gt.bounds, placed)}
+        (task, query), library, first = instance, _opened(self.library), matches[0]
+        gt = library[task.category, task.model_id]
+        alike = same_shapes(library, gt.key)
+        best = library[first.category, first.model_id]
+        boxes = {"est": first.box, "gt": Box.from_model(gt.bounds, query.gt)}
         keys = [(match.category, match.model_id) for match in matches]
-        ranks = (rank for rank, key in enumerate(keys, start=1) if key in instance.alike)
+        ranks = (rank for rank, key in enumerate(keys, start=1) if key in alike)
         return {
-            "alike": len(instance.alike),
+            "alike": len(alike),
             "rank": next(ranks, None),
             "matched_category": first.category,
             "matched_id": first.model_id,
@@ -250,7 +234,7 @@ class RetrievalQueries(Setting):
             "shape_distance": shape_distance(best, gt) if best.category == gt.category else None,
             "box_iou": overlap(**boxes),
             "box_iou_up_to_scale": overlap_up_to_scale(**boxes),
-            "rotation_error_deg": rotation_error(est=first.alignment, gt=placed),
+            "rotation_error_deg": rotation_error(est=first.alignment, gt=query.gt),
         }
 
 
@@ -264,17 +248,18 @@ def retrieval_benchmark(library: str, options: RetrievalRunOptions) -> Benchmark
 def _retrieve(
     instance: RetrievalInstance, *, method: str, library: str, options: RetrievalRunOptions
 ) -> list[Match]:
-    task = instance.task
-    is_exact = instance.protocol == LEAVE_IN and method == "optimal"
-    return _opened(library).retrieve(
-        instance.query.points_2d,
-        instance.query.ids,
+    (task, query), opened = instance, _opened(library)
+    alike = same_shapes(opened, (task.category, task.model_id))
+    is_exact = task.protocol == LEAVE_IN and method == "optimal"
+    return opened.retrieve(
+        query.points_2d,
+        query.ids,
         KEYPOINT_CAMERA,
         top=TOP,
         category=task.category,
         sigma=max(task.noise_px, _LEAST_SIGMA),
         shape_sigma=0.0 if is_exact else _SHAPE_SIGMA,
-        exclude=instance.alike if instance.protocol == LEAVE_OUT else (),
+        exclude=alike if task.protocol == LEAVE_OUT else (),
         workers=1,
         **_METHODS[method],
     )
@@ -355,7 +340,6 @@ def summarize_queries(run: Run) -> list[Summary]:
         _STATISTICS,
         by=("category", "protocol", "noise_px", "keypoints"),
         name="{}, {}, {:g} px, {} keypoints".format,
-        apart=NO_VIEW,
     )
 
 
@@ -420,7 +404,6 @@ SPEC = Spec(
     results=COLUMNS,
     summarize=summarize_queries,
     console=HEADLINE[2:],
-    apart=NO_VIEW,
     group=lambda run: QUERIES,
     plots=plots,
     topic="retrieval",

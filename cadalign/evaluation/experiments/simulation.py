@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import tyro
 
@@ -19,7 +19,7 @@ from cadalign.arrays import instance_rng
 from cadalign.errors import DataError, InputError, quote, refuse_unused, unknown
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
-from cadalign.evaluation.methods import Method, MethodInput
+from cadalign.evaluation.methods import Method, MethodInput, pose_of
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.options import FunctionOptions, plain_value
@@ -27,7 +27,7 @@ from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, plot_against
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Columns, Plan, Row
 from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
-from cadalign.evaluation.summary import Group, Quartiles, Summary, group_name, summarize
+from cadalign.evaluation.summary import Summary, group_name, quartiles, summarize
 from cadalign.geometry.alignment import Alignment
 
 if TYPE_CHECKING:
@@ -106,6 +106,7 @@ class SweepOptions(FunctionOptions):
             self.check_methods()
         if self.values is not None:
             self.replace_values(values=tuple(float(value) for value in self.values))
+        self.check_least(runs=1)
         _check_values(self.kind)
         refuse_unused(self, [self.kind.column], "where it is varied")
 
@@ -146,8 +147,6 @@ def _check_values(kind: SweepKind) -> None:
             if not valid(value):
                 where = "values" if column == kind.column else column
                 raise InputError(f"{value:g} is not {what}", where=where, fix=fix)
-    if kind.runs < 1:
-        raise InputError(f"{kind.runs} is not positive", where="runs")
 
 
 ERRORS = (metrics.ROTATION, metrics.TRANSLATION_IN_UNITS, metrics.SCALE_Y, metrics.SCALE_Z)
@@ -158,13 +157,30 @@ COLUMNS: Columns = (
 )
 
 
-SweepTask = tuple[float, int]
-"""One random problem: the value of the quantity that is varied, and the problem's number."""
+class SweepTask(NamedTuple):
+    """One random problem by its setting and its number; ``value`` is what the sweep varies."""
+
+    value: float
+    points: int
+    noise_px: float
+    outlier_share: float
+    run: int
+
+    @property
+    def names(self) -> Row:
+        """The cells that name its rows, but for the method."""
+        return {name: value for name, value in self._asdict().items() if name != "value"}
 
 
 def sweep_tasks(kind: SweepKind) -> list[SweepTask]:
     """All problems of a sweep, value by value."""
-    return [(value, run) for value in kind.values for run in range(kind.runs)]
+    held = {name: getattr(kind, name) for name in ("points", "noise_px", "outlier_share")}
+    settings = ({**held, kind.column: value, "value": value} for value in kind.values)
+    return [
+        SweepTask(**{**setting, "points": int(setting["points"])}, run=run)
+        for setting in settings
+        for run in range(kind.runs)
+    ]
 
 
 @dataclass(frozen=True)
@@ -173,61 +189,30 @@ class SweepProblems(Setting):
 
     columns = COLUMNS
 
-    kind: SweepKind
+    sweep: str
     seed: int
 
     def case(self, task: SweepTask) -> Case:
-        instance = self.problem(task), self._setting(task)["noise_px"] or 1.0
-        return Case(self._names(task), instance=instance)
+        problem = self.problem(task)
+        return Case(task.names, instance=MethodInput.of_problem(problem, task.noise_px or 1.0))
 
-    def failed(self, task: SweepTask) -> list[Case]:
-        return [Case(self._names(task))]
-
-    def given(self, instance: tuple[SimulatedProblem, float]) -> MethodInput:
-        problem, sigma = instance
-        inliers = None if problem.outliers is None else ~problem.outliers
-        return MethodInput(
-            problem.points_3d,
-            problem.points_2d,
-            problem.camera,
-            sigma,
-            gt=problem.alignment,
-            inliers=inliers,
-        )
-
-    def answered(
-        self, method: Method, instance: tuple[SimulatedProblem, float], answer: Alignment | Result
-    ) -> Alignment:
-        return answer if isinstance(answer, Alignment) else answer.alignment
-
-    def row(
-        self, method: Method, instance: tuple[SimulatedProblem, float], estimate: Alignment
-    ) -> Row:
-        return {**alignment_errors(est=estimate, gt=instance[0].alignment)}
+    def row(self, method: Method, given: MethodInput, estimate: Alignment | Result) -> Row:
+        assert given.gt is not None
+        return {**alignment_errors(est=pose_of(estimate), gt=given.gt)}
 
     def problem(self, task: SweepTask) -> SimulatedProblem:
         """The problem of a task."""
-        value, run = task
-        rng = instance_rng(self.seed, self.kind.name, repr(float(value)), str(run))
-        return simulate_problem(rng, **self._setting(task))
-
-    def _setting(self, task: SweepTask) -> Row:
-        held = {name: getattr(self.kind, name) for name in ("points", "noise_px", "outlier_share")}
-        setting = {**held, self.kind.column: task[0]}
-        return {**setting, "points": int(setting["points"])}
-
-    def _names(self, task: SweepTask) -> Row:
-        return {**self._setting(task), "run": task[1]}
+        rng = instance_rng(self.seed, self.sweep, repr(float(task.value)), str(task.run))
+        noise_px, outlier_share = task.noise_px, task.outlier_share
+        return simulate_problem(
+            rng, points=task.points, noise_px=noise_px, outlier_share=outlier_share
+        )
 
 
 def sweep_benchmark(kind: SweepKind, seed: int, metrics: Sequence[str] = ()) -> Benchmark:
     """The methods of a sweep on its problems, in batches."""
-    setting, batched = SweepProblems(kind, seed), frozenset(kind.methods)
+    setting, batched = SweepProblems(kind.name, seed), frozenset(kind.methods)
     return Benchmark.chosen(setting, kind.methods, metrics=metrics, batched=batched)
-
-
-VARIED = {metric.key: metric for metric in (metrics.NOISE, metrics.POINTS, metrics.OUTLIER_SHARE)}
-"""Quantities that a sweep may vary."""
 
 
 def kind_of(run: Run) -> SweepKind:
@@ -241,18 +226,15 @@ def kind_of(run: Run) -> SweepKind:
 
 def varied(run: Run) -> Metric:
     """The quantity that a run varies."""
-    return VARIED[kind_of(run).column]
+    known = {each.key: each for each in (metrics.NOISE, metrics.POINTS, metrics.OUTLIER_SHARE)}
+    return known[kind_of(run).column]
 
 
 def summarize_sweep(run: Run) -> list[Summary]:
     """Quartiles of every metric for every value and method, over the problems that are solved."""
-    statistics = {metric.key: _quartiles(metric.key) for metric in (*ERRORS, *run.metrics)}
+    statistics = {metric.key: quartiles(metric.key) for metric in (*ERRORS, *run.metrics)}
     name = partial(group_name, varied(run))
     return summarize(run, statistics, by=(kind_of(run).column,), name=name)
-
-
-def _quartiles(key: str) -> Callable[[Group], Quartiles]:
-    return lambda group: Quartiles.of_solved(group.solved[key].astype(float))
 
 
 def plots(runs: Sequence[Run]) -> list[Plot]:

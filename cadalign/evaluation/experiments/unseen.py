@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
 from cadalign.evaluation import metrics
@@ -29,11 +30,16 @@ from cadalign.evaluation.summary import (
     percentile,
     summarize,
 )
+from cadalign.io.files import made_folder
 
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.instance import KeypointTask
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.tables import Run
+    from cadalign.retrieval.library import Library
+    from cadalign.shapes.model import ShapeModel
+
+logger = logging.getLogger("cadalign")
 
 METHODS = (
     *("random-rigid", "random-stretched", "nearest", "mean-rigid", "mean-stretched"),
@@ -87,8 +93,7 @@ COLUMNS: Columns = (
     *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int)),
     *(("rotation_error_deg", float), ("best_rotation_error_deg", float)),
     *(("translation_error", float), ("translation_error_up_to_scale", float), ("box_iou", float)),
-    *(("box_iou_up_to_scale", float), ("stated_box_iou_up_to_scale", float)),
-    ("keypoint_error", float),
+    *(("box_iou_up_to_scale", float), ("keypoint_error", float)),
     *(("rotation_level", float), ("stretch_level", float)),
     *(("keypoints_within_68", float), ("keypoints_within_95", float)),
 )
@@ -96,8 +101,7 @@ COLUMNS: Columns = (
 _MEDIANS = (
     *(metrics.ROTATION, metrics.BEST_ROTATION),
     *(metrics.TRANSLATION, metrics.TRANSLATION_UP_TO_SCALE),
-    *(metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE, metrics.STATED_BOX_IOU_UP_TO_SCALE),
-    metrics.KEYPOINT_ERROR,
+    *(metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE, metrics.KEYPOINT_ERROR),
 )
 _COVERAGE = (
     *(metrics.ROTATION_IN_68, metrics.ROTATION_IN_95),
@@ -112,11 +116,7 @@ HEADLINE = (
 
 def _within(level: str, nominal: float) -> Callable[[Group], float]:
     """Share of the known levels that are at most the nominal one; NaN of none."""
-    return lambda group: mean_of(_flags(group.solved[level], nominal))
-
-
-def _flags(levels: FloatArray, nominal: float) -> FloatArray:
-    return (known(levels) <= nominal).astype(float)
+    return lambda group: mean_of((known(group.solved[level]) <= nominal).astype(float))
 
 
 _STATISTICS = {
@@ -170,18 +170,80 @@ def _calibration(runs: Sequence[Run], column: str, name: str) -> Plot:
     )
 
 
+# Learned models ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LearnedFiles:
+    """Folder of shape models by category and of a library; small: workers open what they need."""
+
+    folder: Path
+
+    def shape(self, category: str) -> ShapeModel:
+        """The shape model of a category."""
+        return _open_shape(self.folder / f"{category}.shape")
+
+    def library(self) -> Library:
+        """The library."""
+        return _open_library(self.folder / "library.cadalign")
+
+
+@lru_cache(maxsize=32)
+def _open_shape(path: Path) -> ShapeModel:
+    from cadalign.shapes.model import ShapeModel
+
+    return ShapeModel.open(path)
+
+
+@lru_cache(maxsize=2)
+def _open_library(path: Path) -> Library:
+    from cadalign.retrieval.library import Library
+
+    return Library.open(path)
+
+
+def learn(
+    dataset: KeypointNet, categories: Sequence[str], *, split: str, folder: RunFolder
+) -> LearnedFiles:
+    """Learn from the models of a split, or find in a folder what was learned from them before.
+
+    Boxes are those of the keypoints. The files' folder is named after a hash of the models, so that
+    those of other models are neither used nor overwritten.
+
+    Raises InputError if there is no such split, or a category has too few models in it.
+    """
+    from cadalign.retrieval.library import Library
+    from cadalign.retrieval.models import LibraryModel
+    from cadalign.shapes.model import ShapeModel
+
+    train = dataset.subset(categories=categories, split=split)
+    models = [model for category in categories for model in train[category]]
+    library = Library.from_models(
+        [LibraryModel.of_annotated(model, with_mesh=False) for model in models]
+    )
+    place = made_folder(folder.path / "learned" / library.fingerprint[:16])
+    for category in categories:
+        file = place / f"{category}.shape"
+        if not file.is_file():
+            logger.info("learning the shape of %s from %d models", category, len(train[category]))
+            ShapeModel.from_dataset(dataset, category, split=split, meshes=False).save(file)
+    if not (place / "library.cadalign").is_file():
+        library.save(place / "library.cadalign")
+    return LearnedFiles(place.absolute())
+
+
 _CHUNK = 8
 
 
 def plan(options: UnseenOptions, folder: RunFolder) -> Plan[KeypointTask]:
     """Plan a run over a split's objects; the folder gets what is learned from the other split."""
-    from cadalign.evaluation.instances.unseen import UnseenTasks, unseen_benchmark
-    from cadalign.evaluation.shape_files import learn
+    from cadalign.evaluation.instances.unseen import unseen_benchmark, unseen_tasks
 
     dataset = KeypointNet(options.root, shapenet_root=options.shapenet)
-    tasks = UnseenTasks(dataset, options)
-    learned = learn(dataset, tasks.categories, split=options.train, folder=folder)
-    hashes = {"annotations": tasks.fingerprint(), "learned": learned.fingerprint()}
+    tasks = unseen_tasks(dataset, options)
+    categories = sorted({category for category, _ in tasks.keys})
+    learned = learn(dataset, categories, split=options.train, folder=folder)
+    hashes = {"annotations": tasks.fingerprint(), "learned": learned.folder.name}
     benchmark = unseen_benchmark(learned, options)
     return benchmark.plan(options, tasks, chunk=_CHUNK, **hashes)
 

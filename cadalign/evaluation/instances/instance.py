@@ -1,5 +1,11 @@
 """Test instances of an annotated model: a view, a stretch, noisy visible keypoints, symmetry.
 
+Which keypoints a view shows is found by rays, or without a mesh by a rule: a keypoint counts as
+visible if a face of the keypoints' convex hull next to it faces the camera. Next to it are the
+faces that it lies on, for one inside the hull those nearest to it, with a slack of 1 % of the
+keypoints' extent. Keypoints in one plane, or fewer than 4, all count as visible. The hull has no
+holes and no parts that stand before others, so the rule is kinder to things such as chairs.
+
 An estimate that is off by a rotation that maps the object onto itself shows the same object in the
 same place: that is no error. `cadalign.datasets.models.keypoints.annotated_symmetry` finds
 these rotations.
@@ -14,11 +20,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray, instance_rng
+from cadalign.arrays import BoolArray, FloatArray, IntArray, instance_rng
 from cadalign.datasets import AnnotatedModel, KeypointNet, check_solid
 from cadalign.datasets.models.keypoints import symmetry_group
 from cadalign.errors import CadalignError, TooFewVisibleError
-from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_views
 from cadalign.evaluation.runs.work import Row
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
@@ -32,14 +37,156 @@ if TYPE_CHECKING:
 KEYPOINT_CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)
 """The camera of the sparse-keypoint experiment."""
 STRETCH_RANGE = (0.5, 2.0)
-RAYS = "rays"
-"""Visibility found by casting rays at the mesh."""
-AUTO = "auto"
-"""Rays where there is a mesh, the hull's rule elsewhere."""
-HULL = "hull"
-"""Visibility by the rule of `cadalign.evaluation.instances.hull`, without a mesh."""
+
+# The ranges of `cadalign.render.sample_view`: azimuth, the elevation's sine, share of the image.
+_LOWEST = np.array([-np.pi, 0.0, 0.7])
+_HIGHEST = np.array([np.pi, np.sin(np.radians(60.0)), 0.95])
+_ATTEMPTS = 100
+_SLACK = 0.01
+_CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) - 0.5
 
 
+# Views of keypoints without a mesh ----------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointHull:
+    """The convex hull of a model's keypoints (k, 3) [model units]."""
+
+    xyz: FloatArray
+
+    @cached_property
+    def bounds(self) -> FloatArray:
+        """The keypoints' lowest and highest coordinates, (2, 3) float."""
+        return np.array([self.xyz.min(axis=0), self.xyz.max(axis=0)])
+
+    def visible_from(self, position: FloatArray) -> BoolArray:
+        """Mask (k,) of the keypoints that count as visible from a place (3,) of the model."""
+        if self._faces is None:
+            return np.ones(len(self.xyz), dtype=bool)
+        faces, beside = self._faces
+        facing = faces[:, :3] @ position + faces[:, 3] > 0
+        return np.asarray(beside @ facing)  # of truth values: is any of both
+
+    @cached_property
+    def _faces(self) -> tuple[FloatArray, BoolArray] | None:
+        """Planes (f, 4) of the faces, outward, and a mask (k, f) of those next to each keypoint."""
+        from scipy.spatial import ConvexHull, QhullError
+
+        if len(self.xyz) < 4:
+            return None
+        try:
+            planes = ConvexHull(self.xyz).equations
+        except QhullError:  # all in one plane
+            return None
+        depth = -(self.xyz @ planes[:, :3].T + planes[:, 3])
+        low, high = self.bounds
+        slack = _SLACK * float(np.linalg.norm(high - low))
+        return planes, depth <= depth.min(axis=1, keepdims=True) + slack
+
+
+HullView = tuple[Alignment, BoolArray]
+"""A view: the pose, and a mask (k,) of the keypoints that count as visible."""
+
+
+def sample_hull_view(
+    hull: KeypointHull, camera: Camera, *, rng: np.random.Generator, min_visible: int
+) -> HullView:
+    """Draw a view, as `cadalign.render.sample_view` does, in which enough keypoints count as seen.
+
+    The camera has no lens distortion.
+
+    Raises TooFewVisibleError if no view shows enough of the keypoints.
+    """
+    (found,) = sample_hull_views([hull], camera, rngs=[rng], min_visible=min_visible)
+    if isinstance(found, TooFewVisibleError):
+        raise found
+    return found
+
+
+def sample_hull_views(
+    hulls: Sequence[KeypointHull],
+    camera: Camera,
+    *,
+    rngs: Sequence[np.random.Generator],
+    min_visible: int,
+) -> list[HullView | TooFewVisibleError]:
+    """Draw a view of each hull as `sample_hull_view` does, from its own random stream."""
+    counts = [len(hull.xyz) for hull in hulls]
+    found: dict[int, HullView] = {}
+    best = [0] * len(hulls)
+    left = [k for k, count in enumerate(counts) if count >= min_visible]
+    for _ in range(_ATTEMPTS if left else 0):
+        draws = np.array([rngs[k].random(3) for k in left])
+        bounds = np.array([hulls[k].bounds for k in left])
+        poses = _framed_poses(_LOWEST + (_HIGHEST - _LOWEST) * draws, bounds, camera)
+        for k, rotation, translation, position in zip(left, *poses, strict=True):
+            visible = hulls[k].visible_from(position)
+            best[k] = max(best[k], int(np.count_nonzero(visible)))
+            if best[k] >= min_visible:
+                pose = Alignment(rotation, translation, np.ones(3), is_valid=True)
+                found[k] = (pose, visible)
+        left = [k for k in left if k not in found]
+        if not left:
+            break
+    return [found.get(k) or _too_few(count, best[k], min_visible) for k, count in enumerate(counts)]
+
+
+def _too_few(count: int, best: int, min_visible: int) -> TooFewVisibleError:
+    found = f"the best of {_ATTEMPTS} views shows {best}" if best else f"there are only {count}"
+    return TooFewVisibleError(
+        f"{min_visible} keypoints should be visible, but {found}",
+        where="keypoints",
+        fix="lower min_visible, or leave this model out",
+    )
+
+
+def _framed_poses(
+    drawn: FloatArray, bounds: FloatArray, camera: Camera
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rotations (n, 3, 3), translations (n, 3) and camera positions (n, 3) of framed views.
+
+    ``drawn`` (n, 3) are azimuth, sine of the elevation, and share of the image to fill; ``bounds``
+    (n, 2, 3) those of the models.
+    """
+    low, high = bounds[:, 0], bounds[:, 1]
+    rotations = _upright_rotations(drawn[:, 0], np.arcsin(drawn[:, 1]))
+    corners = (high - low)[:, None] * _CORNERS @ rotations.transpose(0, 2, 1)
+    centers = _framed_centers(corners, camera, fill=drawn[:, 2])
+    middles = ((low + high) / 2)[:, :, None]
+    translations = centers - (rotations @ middles)[:, :, 0]
+    positions = -(rotations.transpose(0, 2, 1) @ translations[:, :, None])[:, :, 0]
+    return rotations, translations, positions
+
+
+def _upright_rotations(azimuths: FloatArray, elevations: FloatArray) -> FloatArray:
+    """Model to camera (n, 3, 3), the model's y axis up in the image; angles [rad] of `look_at`."""
+    sin_a, cos_a = np.sin(azimuths), np.cos(azimuths)
+    sin_e, cos_e = np.sin(elevations), np.cos(elevations)
+    rows = [
+        *(cos_a, np.zeros_like(sin_a), -sin_a),
+        *(sin_e * sin_a, -cos_e, sin_e * cos_a),
+        *(-cos_e * sin_a, -sin_e, -cos_e * cos_a),
+    ]
+    return np.stack(rows, axis=-1).reshape(-1, 3, 3)
+
+
+def _framed_centers(corners: FloatArray, camera: Camera, *, fill: FloatArray) -> FloatArray:
+    """Places (n, 3) in the camera frame of boxes' centres, to fill shares (n,) of the image.
+
+    ``corners`` (n, 8, 3) are relative to the centres. The corner X of a box at depth d on the ray a
+    through the image's centre lies f |X - a X_z| / (X_z + d) off it; solved for d, for each corner
+    and direction, the largest d keeps all of them inside.
+    """
+    size = np.array([camera.width, camera.height])
+    focal = np.array([camera.fx, camera.fy])
+    ray = ((size - 1) / 2 - (camera.cx, camera.cy)) / focal
+    across = np.abs(corners[..., :2] - ray * corners[..., 2:])
+    depths = 2 * focal * across / (size * fill[:, None, None]) - corners[..., 2:]
+    return np.asarray(depths.max(axis=(1, 2))[:, None] * np.append(ray, 1.0))
+
+
+# Instances ----------------------------------------------------------------------------------------
 NO_SYMMETRY = SymmetryGroup(np.zeros(3), np.eye(3)[None])
 NO_KEYPOINTS = KeypointHull(np.empty((0, 3)))
 
@@ -66,9 +213,12 @@ class KeypointTask:
 
     @classmethod
     def of_model(
-        cls, dataset: KeypointNet, category: str, model_id: str, *, visibility: str
+        cls, dataset: KeypointNet, category: str, model_id: str, *, hull: bool
     ) -> KeypointTask:
-        """The first view of a dataset's model; a malformed one gives a task with a problem."""
+        """The first view of a dataset's model, by its ``hull`` alone or with its mesh.
+
+        A malformed model gives a task with a problem.
+        """
         try:
             model = dataset[category, model_id]
         except CadalignError as error:
@@ -79,14 +229,8 @@ class KeypointTask:
             hull=KeypointHull(model.keypoints.xyz),
             ids=model.keypoints.ids,
             symmetry=symmetry_group(model.keypoints.xyz, model.symmetries),
-            model=mesh_of(model, visibility),
+            model=None if hull or model.mesh_path is None else model,
         )
-
-
-def mesh_of(model: AnnotatedModel, visibility: str) -> AnnotatedModel | None:
-    """The model if its mesh is to be used, which `load_scene` looks for."""
-    use_mesh = visibility == RAYS or (visibility == AUTO and model.mesh_path is not None)
-    return model if use_mesh else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,9 +305,8 @@ def make_hull_instances(
 ) -> list[Instance | TooFewVisibleError]:
     """Draw views, stretches and keypoint noise, as `make_instance`, for models without a mesh.
 
-    Which keypoints are seen, and a model's box, follow from the keypoints alone; see
-    `cadalign.evaluation.instances.hull`. An error takes the place of an instance that no view shows
-    enough keypoints of.
+    Which keypoints are seen, and a model's box, follow from the keypoints alone. An error takes the
+    place of an instance that no view shows enough keypoints of.
     """
     rngs = [instance_rng(seed, each.category, each.model_id, str(each.view)) for each in views]
     hulls = [each.hull for each in views]
@@ -216,7 +359,7 @@ def _stretched(views: Sequence[_Seen], *, noise_px: float, scene: Scene | None) 
             gt=Alignment(
                 view.cam_from_model.rotation, view.cam_from_model.translation, scale, is_valid=True
             ),
-            visibility=HULL if scene is None else RAYS,
+            visibility="hull" if scene is None else "rays",
             scene=scene,
             diagonal=diagonal,
         )

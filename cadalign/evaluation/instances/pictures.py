@@ -135,8 +135,7 @@ def _renderer() -> RaycastRenderer:
     return RaycastRenderer()
 
 
-MAX_FACES = 1500
-MAX_EDGES = 1500
+_MOST_PARTS = 1500  # triangles and lines of a preview each
 _FINEST = 1 << 15  # cells along the longest side: the steps of 16-bit coordinates
 _CREASE_DEG = 30.0
 
@@ -171,7 +170,7 @@ class MeshPreview:
 
 
 def preview_of(
-    mesh: Mesh, *, max_faces: int = MAX_FACES, max_edges: int = MAX_EDGES
+    mesh: Mesh, *, max_faces: int = _MOST_PARTS, max_edges: int = _MOST_PARTS
 ) -> MeshPreview:
     """Simplify a mesh to at most so many triangles and lines, by merging vertices on a grid."""
     small = cluster(mesh, cells=_FINEST)

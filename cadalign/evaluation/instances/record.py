@@ -17,6 +17,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.result import Result
 from cadalign.estimation.warning import Warnings
+from cadalign.evaluation.methods import pose_of
 from cadalign.evaluation.runs.work import Columns, Outcome
 from cadalign.geometry.alignment import Alignment, Uncertainty
 from cadalign.geometry.camera import Camera
@@ -100,12 +101,6 @@ def box_alignment(
     center = alignment.apply(bounds.mean(axis=0)[None])[0]
     shift = alignment.rotation @ (scale * model_bounds.mean(axis=0))
     return Alignment(alignment.rotation, center - shift, scale)
-
-
-def pose_of(estimate: Any) -> Alignment:
-    """The alignment of an estimate."""
-    found: Alignment = estimate if isinstance(estimate, Alignment) else estimate.alignment
-    return found
 
 
 def record_of(

@@ -19,9 +19,12 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
 from cadalign.evaluation.experiments.keypointnet import KeypointTasks
-from cadalign.evaluation.experiments.unseen import COLUMNS, METHODS, UnseenOptions
-from cadalign.evaluation.instances.hull import sample_hull_view
-from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, KeypointTask
+from cadalign.evaluation.experiments.unseen import COLUMNS, METHODS, LearnedFiles, UnseenOptions
+from cadalign.evaluation.instances.instance import (
+    KEYPOINT_CAMERA,
+    KeypointTask,
+    sample_hull_view,
+)
 from cadalign.evaluation.instances.record import (
     RECORD_COLUMNS,
     AlignedShape,
@@ -29,10 +32,13 @@ from cadalign.evaluation.instances.record import (
     record_of,
 )
 from cadalign.evaluation.methods import LIMIT, SHAPE, Method, MethodInput
-from cadalign.evaluation.metrics.cramer_rao import limit_estimate, probability_level
-from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
+from cadalign.evaluation.metrics.errors import (
+    limit_estimate,
+    overlap,
+    overlap_up_to_scale,
+    probability_level,
+)
 from cadalign.evaluation.runs.work import Outcome, Row
-from cadalign.evaluation.shape_files import LearnedFiles
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.metrics import (
@@ -51,19 +57,10 @@ _LEAST_SHARED = 6
 _RATIOS = np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
 
 
-class UnseenTasks(KeypointTasks):
+def unseen_tasks(dataset: KeypointNet, options: UnseenOptions) -> KeypointTasks:
     """All views of all objects of a split in the order of their names."""
-
-    def __init__(self, dataset: KeypointNet, options: UnseenOptions) -> None:
-        objects = dataset.subset(categories=options.categories, split=options.split)
-        if not objects.ids():
-            raise DataError(f"no objects in the split {options.split}", where=str(dataset.root))
-        super().__init__(objects, options)
-
-    @property
-    def categories(self) -> tuple[str, ...]:
-        """The categories that have objects, sorted."""
-        return tuple(sorted({category for category, _ in self.keys}))
+    objects = dataset.subset(categories=options.categories, split=options.split)
+    return KeypointTasks(objects, options)
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,7 +290,7 @@ def _errors(found: ShapeEstimate, seen: UnseenObject) -> Row:
     known, rows = _shared(found, seen)
     own = found.points_3d[rows]
     box = Box.from_model([own.min(axis=0), own.max(axis=0)], est)
-    stated, gt_box = Box.from_model(found.bounds, est), Box.from_model(seen.task.hull.bounds, gt)
+    gt_box = Box.from_model(seen.task.hull.bounds, gt)
     centre = Alignment(est.rotation, box.center, np.ones(3))
     gt_centre = Alignment(gt.rotation, gt_box.center, np.ones(3))
     values: Row = {
@@ -303,7 +300,6 @@ def _errors(found: ShapeEstimate, seen: UnseenObject) -> Row:
         "translation_error_up_to_scale": translation_error_up_to_scale(est=centre, gt=gt_centre),
         "box_iou": overlap(est=box, gt=gt_box),
         "box_iou_up_to_scale": overlap_up_to_scale(est=box, gt=gt_box),
-        "stated_box_iou_up_to_scale": overlap_up_to_scale(est=stated, gt=gt_box),
         "keypoint_error": _distance_up_to_scale(est.apply(own), gt.apply(seen.xyz[known])),
     }
     if found.result is not None:
@@ -358,19 +354,12 @@ def _coverage(result: Result, seen: UnseenObject, known: IntArray, rows: IntArra
 
 def _described(found: ShapeEstimate, seen: UnseenObject) -> AlignedShape:
     known, rows = _shared(found, seen)
-    shape = aligned_shape(
+    return aligned_shape(
         found if found.result is None else found.result,
         rows,
         seen.xyz[known],
         model_bounds=seen.task.hull.bounds,
         spans_points=True,
+        rms=np.nan if found.result is None else found.result.rms,
         sigma=seen.options.sigma,
     )
-    # The residuals are those of the given keypoints that the method has, before the camera.
-    given = np.isin(seen.rows, known)
-    in_camera = shape.alignment.apply(shape.target[np.searchsorted(known, seen.rows[given])])
-    ahead = in_camera[:, 2] > 0
-    if not ahead.any():
-        return shape
-    residuals = KEYPOINT_CAMERA.project(in_camera[ahead]) - seen.points_2d[given][ahead]
-    return replace(shape, rms=float(np.sqrt((residuals**2).sum(axis=1).mean())))

@@ -126,13 +126,6 @@ TRANSLATION_UP_TO_SCALE = _like(
 BOX_IOU_UP_TO_SCALE = _like(
     BOX_IOU, "box_iou_up_to_scale", "box IoU, up to scale", symbol="IoU scaled"
 )
-STATED_BOX_IOU_UP_TO_SCALE = _like(
-    BOX_IOU,
-    "stated_box_iou_up_to_scale",
-    "IoU of the stated box, up to scale",
-    "stated box IoU, up to scale",
-    "IoU scaled",
-)
 RMS = Metric("rms_px", "reprojection error", "px")
 
 # From the nearest truth that looks the same.

@@ -1,7 +1,7 @@
 """Metrics of photos: sets of them, those of PASCAL3D+, of boxes, and of Scan2CAD.
 
 A set is what a data set's protocol measures of each object, and shows of many. A new metric of
-photos is a line of one set; a new set has its place in `cadalign.evaluation.photos.options`.
+photos is a line of one set; a new set has its place in `cadalign.evaluation.experiments.photos`.
 
 Tulsiani, Malik, "Viewpoints and Keypoints", CVPR 2015, section 4.1: accuracy at pi/6, median error.
 Wang et al., "Normalized Object Coordinate Space for Category-Level 6D Object Pose and Size
@@ -64,6 +64,18 @@ class MetricSet:
     def shown(self) -> tuple[Metric, ...]:
         """The columns of its summary."""
         return (*(rate.metric for rate in self.rates), *self.medians)
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """Evaluation of a data set: its metrics, and what it is given."""
+
+    metrics: tuple[MetricSet, ...]
+    up_axis: str = "y"  # the upward axis of its models
+    sigma_of_side: float = 1 / 64
+    """Standard deviation of its keypoints as a share of the longer side of the object's rectangle:
+    networks' heatmaps have 64 cells."""
+    sigma_of_width: float | None = None  # the same as a share of the image's width
 
 
 def score_columns(sets: Iterable[MetricSet]) -> Columns:
@@ -170,37 +182,11 @@ BOX = MetricSet(_measure_box, (TRANSLATION, metrics.BOX_IOU, metrics.BOX_IOU_UP_
 
 # Scan2CAD -----------------------------------------------------------------------------------------
 
-MAX_TRANSLATION = 0.2
-"""[m]"""
-MAX_ROTATION_DEG = 20.0
-MAX_SCALE = 0.2
-"""Fraction."""
-
-
-@dataclass(frozen=True)
-class Scan2CadErrors:
-    """Errors of one alignment."""
-
-    translation: float  # distance of the positions [m]
-    rotation_deg: float  # angle to the nearest rotation that looks the same [degrees]
-    scale: float
-    """The benchmark's: the mean over the axes of the ratio to the truth, less 1; a fraction. Errors
-    of opposite sign cancel in it."""
-    scale_axes: FloatArray  # (3,), relative error along each axis
-
-    @property
-    def is_aligned(self) -> bool:
-        """True if no error is over its threshold."""
-        return (
-            self.translation <= MAX_TRANSLATION
-            and self.rotation_deg <= MAX_ROTATION_DEG
-            and self.scale <= MAX_SCALE
-        )
-
-    @property
-    def is_aligned_on_each_axis(self) -> bool:
-        """True if neither is the scale along any axis."""
-        return self.is_aligned and bool((self.scale_axes <= MAX_SCALE).all())
+_MAX_TRANSLATION, _MAX_ROTATION_DEG, _MAX_SCALE = 0.2, 20.0, 0.2  # [m], [degrees], fraction
+_TRANSLATION_M = Metric("scan2cad_translation_m", "translation error", "m", 3, symbol="t m")
+_SCALE = Metric("scan2cad_scale", "mean scale error", "%", 1, factor=100.0, symbol="s %")
+_ALIGNED = metrics.rate("scan2cad_aligned", "Scan2CAD accuracy", "acc %")
+_ALIGNED_AXES = metrics.rate("scan2cad_aligned_axes", "Scan2CAD accuracy, each axis", "acc xyz %")
 
 
 def scan2cad_errors(
@@ -209,40 +195,35 @@ def scan2cad_errors(
     gt: Alignment,
     symmetry: Symmetry | None = None,
     center: FloatArray | None = None,
-) -> Scan2CadErrors:
-    """Errors of an estimate of a true alignment, in metres.
+) -> Row:
+    """Errors of an estimate of a true alignment, in metres, by column.
 
     Positions of the point ``center`` (3,) of the model are compared, by default of its origin.
     Rotations about an axis of symmetry are compared exactly; the benchmark's script takes steps of
-    10 degrees there, so that its errors are larger by up to 5 degrees.
+    10 degrees there, so that its errors are larger by up to 5 degrees. The scale's error is the
+    benchmark's: the mean over the axes of the ratio to the truth, less 1. Errors of opposite sign
+    cancel in it; aligned on each axis is what none of them is over the threshold of.
     """
-    symmetry = symmetry or Symmetry.none()
     point = np.zeros(3) if center is None else center
     gap = est.apply([point])[0] - gt.apply([point])[0]
-    return Scan2CadErrors(
-        translation=float(np.linalg.norm(gap)),
-        rotation_deg=model_rotation_error(est=est, gt=gt, symmetry=symmetry),
-        scale=float(np.abs(np.mean(est.scale / gt.scale) - 1)),
-        scale_axes=scale_error(est=est, gt=gt),
-    )
-
-
-_TRANSLATION_M = Metric("scan2cad_translation_m", "translation error", "m", 3, symbol="t m")
-_SCALE = Metric("scan2cad_scale", "mean scale error", "%", 1, factor=100.0, symbol="s %")
-_ALIGNED = metrics.rate("scan2cad_aligned", "Scan2CAD accuracy", "acc %")
-_ALIGNED_AXES = metrics.rate("scan2cad_aligned_axes", "Scan2CAD accuracy, each axis", "acc xyz %")
+    turn = model_rotation_error(est=est, gt=gt, symmetry=symmetry or Symmetry.none())
+    distance = float(np.linalg.norm(gap))
+    scale = float(np.abs(np.mean(est.scale / gt.scale) - 1))
+    is_aligned = distance <= _MAX_TRANSLATION and turn <= _MAX_ROTATION_DEG and scale <= _MAX_SCALE
+    on_each_axis = is_aligned and bool((scale_error(est=est, gt=gt) <= _MAX_SCALE).all())
+    return {
+        ROTATION.key: turn,
+        _TRANSLATION_M.key: distance,
+        _SCALE.key: scale,
+        _ALIGNED.key: float(is_aligned),
+        _ALIGNED_AXES.key: float(on_each_axis),
+    }
 
 
 def _measure_scan2cad(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
     # The benchmark's script takes minus the centre of the model's box.
     center = None if target.bounds is None else -target.bounds.mean(axis=0)
-    errors = scan2cad_errors(est=est, gt=gt, symmetry=target.found.symmetry, center=center)
-    return {
-        _TRANSLATION_M.key: errors.translation,
-        _SCALE.key: errors.scale,
-        _ALIGNED.key: float(errors.is_aligned),
-        _ALIGNED_AXES.key: float(errors.is_aligned_on_each_axis),
-    }
+    return scan2cad_errors(est=est, gt=gt, symmetry=target.found.symmetry, center=center)
 
 
 SCAN2CAD = MetricSet(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -23,20 +23,8 @@ from cadalign.evaluation.benchmark import (
     attempt,
     write_picture,
 )
-from cadalign.evaluation.experiments.photos import COLUMNS
-from cadalign.evaluation.instances.pictures import NO_PHOTO, write_pictures, write_preview
-from cadalign.evaluation.instances.record import (
-    RECORD_COLUMNS,
-    Estimate,
-    aligned_shape,
-    box_alignment,
-    record_of,
-    record_stem,
-)
-from cadalign.evaluation.methods import SHAPE, Method, MethodInput
-from cadalign.evaluation.metrics.photos import score_alignment
-from cadalign.evaluation.options import is_function
-from cadalign.evaluation.photos.options import (
+from cadalign.evaluation.experiments.photos import (
+    COLUMNS,
     EPNP,
     GRAVITY,
     IMAGE,
@@ -49,11 +37,24 @@ from cadalign.evaluation.photos.options import (
     parts_of,
     protocol_of,
 )
-from cadalign.evaluation.photos.sighting import Sighting, sight
+from cadalign.evaluation.instances.pictures import NO_PHOTO, write_pictures, write_preview
+from cadalign.evaluation.instances.record import (
+    RECORD_COLUMNS,
+    Estimate,
+    aligned_shape,
+    box_alignment,
+    record_of,
+    record_stem,
+)
+from cadalign.evaluation.methods import SHAPE, Method, MethodInput
+from cadalign.evaluation.metrics.photos import score_alignment
+from cadalign.evaluation.options import is_function
 from cadalign.evaluation.photos.target import (
     PhotoTarget,
     PhotoTask,
+    Sighting,
     opened,
+    sight,
     targets_of,
 )
 from cadalign.evaluation.runs.folder import RunFolder
@@ -69,6 +70,7 @@ _OUTLINED = frozenset({MASK, IMAGE})
 
 
 _UP_SIGMA_DEG = 3.0  # of rigs and phones, and of objects that stand upright
+_SIMILAR_SIGMA = 0.04  # of an object's keypoints from its model's [diagonals]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,14 +84,12 @@ class PhotoEstimate:
 
 
 def estimate_object(
-    sighting: Sighting, *, method: str, shapes: Collection[ShapeModel], similar_sigma: float
+    sighting: Sighting, *, method: str, shapes: Collection[ShapeModel]
 ) -> PhotoEstimate:
     """The estimate of a method by name; see `PhotosOptions.methods`.
 
-    ``shapes`` are models of the categories that they name, ``similar_sigma`` is the standard
-    deviation of the object's keypoints from the model's [diagonals of the model]. Raises
-    LeftOutError if the object lacks what the method needs; and CadalignError if there is no
-    estimate.
+    ``shapes`` are models of the categories that they name. Raises LeftOutError if the object lacks
+    what the method needs; and CadalignError if there is no estimate.
     """
     base, evidence = parts_of(method)
     if base == TRUTH:
@@ -103,12 +103,12 @@ def estimate_object(
         return estimate_of_model(found.alignment, sighting)
     if base == SHAPE:
         return _of_shape(sighting, shapes, evidence)
-    model = _model(base, sighting, similar_sigma, with_mesh=bool(_OUTLINED & evidence))
+    model = _model(base, sighting, with_mesh=bool(_OUTLINED & evidence))
     result = align(model, _view(sighting, evidence))
     return estimate_of_model(result.alignment, sighting, result)
 
 
-def _model(base: str, sighting: Sighting, similar_sigma: float, *, with_mesh: bool) -> Model:
+def _model(base: str, sighting: Sighting, *, with_mesh: bool) -> Model:
     width, bounds = sighting.width, sighting.bounds * sighting.width
     kind: dict[str, Any] = {}
     if base == RIGID:
@@ -117,13 +117,12 @@ def _model(base: str, sighting: Sighting, similar_sigma: float, *, with_mesh: bo
         kind = {"stretch_sigma": SIMILAR_SCALE_SIGMA}
     elif base == SIMILAR:
         diagonal = float(np.linalg.norm(np.ptp(bounds, axis=0)))
-        kind = {"shape_sigma": similar_sigma * diagonal}
+        kind = {"shape_sigma": _SIMILAR_SIGMA * diagonal}
     if with_mesh:
         cad = sighting.target.cad
-        if cad is None or not cad.has_mesh:
+        if cad is None or cad.scene is None:
             raise LeftOutError("the model has no mesh for the mask")
-        mesh = cad.scene.mesh
-        kind["mesh"] = Mesh(mesh.vertices * width, mesh.faces)
+        kind["mesh"] = Mesh(cad.scene.mesh.vertices * width, cad.scene.mesh.faces)
     return Model(
         points_3d=sighting.model.xyz * width,
         ids=sighting.model.names,
@@ -192,8 +191,6 @@ def _of_shape(
 
 # Setting ------------------------------------------------------------------------------------------
 
-_NO_SOURCE: Row = {"source": ""}
-
 
 @dataclass(frozen=True)
 class PhotoObjects(Setting):
@@ -205,24 +202,21 @@ class PhotoObjects(Setting):
     options: PhotosOptions
     drawn_in: RunFolder  # the folder that pictures go to
 
-    def failed(self, task: PhotoTask) -> list[Case]:
-        return [Case(task.names, _NO_SOURCE)]
-
     def _cases(self, task: PhotoTask) -> list[Case]:
         wanted = self.options.categories
         found = []
         for each in targets_of(task, self.options.root, pictures=self.options.pictures):
             if isinstance(each, Case):
-                found.append(replace(each, facts=_NO_SOURCE))
+                found.append(each)
             elif wanted is None or each.found.category in wanted:
                 found.append(self._case(each))
         return found
 
     def _case(self, target: PhotoTarget) -> Case:
         protocol = protocol_of(opened(self.options.root).kind)
-        sighting = attempt(sight, target, protocol, self.options)
+        sighting = attempt(partial(sight, target, protocol, sigma=self.options.sigma))
         if isinstance(sighting, Exception):
-            return Case(target.names, _NO_SOURCE, error=sighting)
+            return Case(target.names, error=sighting)
         facts = {"keypoints": len(sighting.names), "source": sighting.source}
         return Case(target.names, facts, sighting)
 
@@ -254,11 +248,8 @@ class PhotoObjects(Setting):
             return None
         sighting: Sighting = case.instance
         if sighting.target.is_shown:
-            methods = [outcome.names["method"] for outcome in outcomes]
-            pairs = dict(zip(methods, estimates, strict=True))
-            found = (pairs.get(name) for name in (sighting.protocol.best, *methods, TRUTH))
-            best = next((each for each in found if isinstance(each, PhotoEstimate)), None)
-            write_picture(draw_sighting, self.drawn_in, sighting, best)
+            *_, last = (each for each in estimates if isinstance(each, PhotoEstimate))
+            write_picture(draw_sighting, self.drawn_in, sighting, last)
         return record_of(
             outcomes,
             [_described(each, sighting) for each in estimates],
@@ -276,9 +267,8 @@ def photos_benchmark(
     options: PhotosOptions, shapes: tuple[ShapeModel, ...], drawn_in: RunFolder
 ) -> Benchmark:
     """The methods of the options on objects in photos."""
-    how: dict[str, Any] = {"shapes": shapes, "similar_sigma": options.similar_sigma}
     own = {
-        name: Method(name, partial(estimate_object, method=name, **how))
+        name: Method(name, partial(estimate_object, method=name, shapes=shapes))
         for name in options.methods
         if not is_function(name)
     }
@@ -316,7 +306,7 @@ def _described(estimate: PhotoEstimate | Any, sighting: Sighting) -> Estimate | 
     )
 
 
-def draw_sighting(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate | None) -> None:
+def draw_sighting(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate) -> None:
     """Write the pictures of an object in a photo, and the preview of its model, to a run's folder.
 
     The photo is grey where there is none.
@@ -327,10 +317,7 @@ def draw_sighting(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate
         photo = sighting.target.photo.read_image()
     except DataError:
         photo = np.full((camera.height, camera.width, 3), NO_PHOTO, dtype=np.uint8)
-    boxes = {
-        "gt_box": sighting.target.gt_box,
-        "est_box": None if estimate is None else estimate.box,
-    }
+    boxes = {"gt_box": sighting.target.gt_box, "est_box": estimate.box}
     write_pictures(folder, stem, photo, camera, observed=sighting.points_2d, **boxes)
-    if cad is not None and cad.has_mesh:
+    if cad is not None and cad.scene is not None:
         write_preview(folder.previews / f"{stem}.json", cad.scene.mesh)

@@ -1,8 +1,9 @@
-"""Photos as tasks, and their objects with truth and CAD models, which are read once for many."""
+"""Photos as tasks, their objects with truth and CAD models, and what methods are given of them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -11,9 +12,17 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.datasets.formats import open_photos
 from cadalign.datasets.photos.dataset import PhotoDataset
-from cadalign.datasets.photos.photo import CadModel, Photo, PhotoObject
+from cadalign.datasets.photos.photo import (
+    CadModel,
+    NamedPoints,
+    Photo,
+    PhotoKeypoints,
+    PhotoObject,
+)
 from cadalign.errors import DataError
-from cadalign.evaluation.benchmark import Case, Tasks
+from cadalign.estimation.fit import fit
+from cadalign.evaluation.benchmark import Case
+from cadalign.evaluation.metrics.photos import Protocol
 from cadalign.evaluation.runs.work import (
     UNREADABLE,
     LeftOutError,
@@ -26,6 +35,11 @@ from cadalign.geometry.camera import Camera
 from cadalign.render.scene import Scene
 
 _KEPT = 16
+ANNOTATED, DETECTED = "annotated", "detected"
+_LEAST_KEYPOINTS = 6
+_LEAST_SCORE = 0.4  # of a detected keypoint that methods are given
+_LEAST_PX = 0.5  # a standard deviation that keypoints are given at least
+_FOCAL_PRIOR = 0.2  # of the logs of scales, while the focal length is estimated
 
 
 @dataclass(frozen=True)
@@ -42,29 +56,19 @@ class PhotoTask:
         return {"category": UNREADABLE, "model_id": self.name, "view": 0}
 
 
-class PhotoTasks(Tasks[PhotoTask]):
+def photo_tasks(dataset: PhotoDataset, max_photos: int | None) -> list[PhotoTask]:
     """The photos of a data set, then the records that its listing could not read."""
+    tasks = [PhotoTask(index, name) for index, name in enumerate(dataset.names[:max_photos])]
+    bad = dataset.problems.items() if max_photos is None else ()
+    tasks += [PhotoTask(-1, name, str(error)) for name, error in bad]
+    if not tasks:
+        raise DataError("there are no photos", where=str(dataset.root))
+    return tasks
 
-    def __init__(self, dataset: PhotoDataset, max_photos: int | None) -> None:
-        self._names = dataset.names[:max_photos]
-        bad = dataset.problems.items() if max_photos is None else ()
-        self._bad = tuple((name, str(error)) for name, error in bad)
-        self._annotations = fingerprint_of_files(dataset.annotation_files())
-        if not len(self):
-            raise DataError("there are no photos", where=str(dataset.root))
 
-    def __len__(self) -> int:
-        return len(self._names) + len(self._bad)
-
-    def task(self, index: int) -> PhotoTask:
-        """A photo, or a record that could not be read."""
-        if index < len(self._names):
-            return PhotoTask(index, self._names[index])
-        return PhotoTask(-1, *self._bad[index - len(self._names)])
-
-    def fingerprint(self) -> str:
-        """Hash of the photos' names and annotations: a run must not go on with others."""
-        return fingerprint("\0".join(self._names), repr(self._bad), self._annotations)
+def annotations_of(dataset: PhotoDataset, tasks: Sequence[PhotoTask]) -> str:
+    """Hash of the photos' names and annotations: a run must not go on with others."""
+    return fingerprint(repr(tasks), fingerprint_of_files(dataset.annotation_files()))
 
 
 opened = lru_cache(maxsize=1)(open_photos)
@@ -86,24 +90,16 @@ class Cad:
     model: CadModel = field(compare=False, repr=False)  # where it is read from
 
     @property
-    def scene(self) -> Scene:
-        """The mesh; raises DataError if there is none, or it cannot be read."""
+    def scene(self) -> Scene | None:
+        """The mesh; None if there is none that can be read."""
         return _scene(self)
-
-    @property
-    def has_mesh(self) -> bool:
-        """True if there is a mesh that can be read."""
-        try:
-            return bool(self.scene.mesh.faces.size)
-        except DataError:
-            return False
 
     @property
     def bounds(self) -> FloatArray | None:
         """The bounding box (2, 3): the annotation's, the mesh's or that of the keypoints."""
         if self.model.bounds is not None:
             return np.asarray(self.model.bounds)
-        if self.has_mesh:
+        if self.scene is not None:
             return np.asarray(self.scene.bounds)
         points = self.model.load_keypoints()
         return (
@@ -112,8 +108,12 @@ class Cad:
 
 
 @lru_cache(maxsize=_KEPT)
-def _scene(cad: Cad) -> Scene:
-    return Scene(cad.model.load_mesh())
+def _scene(cad: Cad) -> Scene | None:
+    try:
+        scene = Scene(cad.model.load_mesh())
+    except DataError:
+        return None
+    return scene if scene.mesh.faces.size else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,3 +197,91 @@ def rectangle_of(found: PhotoObject) -> FloatArray:
         raise LeftOutError("the object's place in the photo is not known")
     points = found.keypoints.points_2d
     return np.concatenate([points.min(axis=0), points.max(axis=0)])
+
+
+# What methods are given ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """The keypoints of an object that methods are given."""
+
+    target: PhotoTarget
+    camera: Camera  # with a focal length
+    source: str  # annotated or detected: where the keypoints come from
+    names: tuple[str, ...]  # (n,), the given keypoints
+    points_2d: FloatArray  # (n, 2), [px]
+    sigma: float  # their standard deviation [px]
+    model: NamedPoints  # all keypoints of the model, in its own unit
+    bounds: FloatArray  # (2, 3), the model's box, in its own unit
+    width: float  # factor of the model's size that gives it the object's width
+    protocol: Protocol  # of the data set
+
+    @property
+    def points_3d(self) -> FloatArray:
+        """The given keypoints on the model (n, 3), in its own unit."""
+        row_of = {name: row for row, name in enumerate(self.model.names)}
+        return self.model.xyz[[row_of[name] for name in self.names]]
+
+
+def sight(target: PhotoTarget, protocol: Protocol, *, sigma: float | None) -> Sighting:
+    """Collect what methods are given of an object, ``sigma`` [px] in place of the protocol's.
+
+    Raises LeftOutError if it has no camera, no model, or too few keypoints; and DataError if its
+    model cannot be read.
+    """
+    camera, cad = target.camera, target.cad
+    if camera is None:
+        raise LeftOutError("the photo's camera is not known")
+    if cad is None:
+        raise LeftOutError("no model is annotated for the object")
+    model = cad.model.load_keypoints()
+    marks = target.found.keypoints
+    if marks is None or model is None:
+        raise LeftOutError("there are no keypoints")
+    names, pixels = _marked(marks, model)
+    if len(names) < _LEAST_KEYPOINTS:
+        raise LeftOutError(f"{len(names)} keypoints are fewer than {_LEAST_KEYPOINTS}")
+    bounds, gt = target.bounds, target.gt
+    assert bounds is not None  # of the keypoints at least
+    sighting = Sighting(
+        target=target,
+        camera=camera,
+        source=ANNOTATED if marks.scores is None else DETECTED,
+        names=names,
+        points_2d=pixels,
+        sigma=_sigma(target, protocol) if sigma is None else sigma,
+        model=model,
+        bounds=bounds,
+        width=1.0 if gt is None else float(gt.scale[0]),
+        protocol=protocol,
+    )
+    return sighting if camera.focal_known else _calibrated(sighting)
+
+
+def _marked(marks: PhotoKeypoints, model: NamedPoints) -> tuple[tuple[str, ...], FloatArray]:
+    """The visible keypoints that the model has, and their pixels."""
+    good = np.isin(marks.names, model.names)
+    if marks.scores is not None:
+        good &= marks.scores > _LEAST_SCORE
+    return tuple(np.array(marks.names)[good].tolist()), marks.points_2d[good]
+
+
+def _sigma(target: PhotoTarget, protocol: Protocol) -> float:
+    """The standard deviation of keypoints [px] that methods are given."""
+    if protocol.sigma_of_width is not None and target.photo.camera is not None:
+        return protocol.sigma_of_width * target.photo.camera.width
+    left, top, right, bottom = rectangle_of(target.found)
+    return max(protocol.sigma_of_side * float(max(right - left, bottom - top)), _LEAST_PX)
+
+
+def _calibrated(sighting: Sighting) -> Sighting:
+    found = fit(
+        sighting.points_3d * sighting.width,
+        sighting.points_2d,
+        sighting.camera,
+        sigma=sighting.sigma,
+        stretch_sigma=_FOCAL_PRIOR,
+        focal="estimate",
+    )
+    return replace(sighting, camera=found.camera)

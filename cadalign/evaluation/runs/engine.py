@@ -90,7 +90,8 @@ def workers_of(count: int, dask: str | None, *, threads: int = 1) -> Workers:
         except ImportError:
             fix = "pip install 'cadalign[dask]'"
             raise CadalignError("Dask is not installed", where="--dask", fix=fix) from None
-        return Workers(partial(_cluster, dask), (KilledWorker,))
+        # Of a scheduler that is gone, all calls are cancelled; to connect anew tells of it.
+        return Workers(partial(_cluster, dask), (KilledWorker, CancelledError))
     if not is_integer(count) or count < -1:
         raise InputError(
             f"{quote(count)} is not a number of processes",
@@ -227,16 +228,16 @@ def _submitted(
     future: Future[Any] = Future()
     try:
         return executor.submit(call, tasks)
-    except workers.deaths as error:
-        future.set_exception(error)
-    except (OSError, ValueError) as error:
-        # A process cannot be started: the pool is closing its pipes, since another one has died.
-        future.set_exception(BrokenProcessPool(reason_of(error)))
+    except Exception as error:
+        # The pool is closing its pipes, since a process has died, or the scheduler is gone.
+        if not workers.deaths:
+            raise
+        future.set_exception(workers.deaths[-1](reason_of(error)))
     return future
 
 
 def _rows_of(future: Future[list[Row]], workers: Workers) -> list[Row]:
-    known: tuple[type[BaseException], ...] = (CadalignError, CancelledError, *workers.deaths)
+    known: tuple[type[Exception], ...] = (CadalignError, *workers.deaths)
     try:
         return future.result()
     except known:
@@ -368,17 +369,8 @@ def _cluster(address: str, *, timeout: float = 15.0) -> Iterator[tuple[Executor,
                 raise DataError("the Dask cluster has no workers", where=address, fix=fix) from None
             # Named by chance: to name a chunk by its content takes longer than to evaluate it.
             executor = client.get_executor(pure=False)
-            try:
-                # Clusters grow, and a round trip may cost more than a chunk.
-                yield executor, 2 * sum(client.nthreads().values()) + 2
-            except Exception as error:
-                if client.status == "running" and not isinstance(error, CancelledError):
-                    raise
-                fix = "start the same command again with a cluster: the run goes on"
-                what = "the Dask cluster has gone away"
-                raise CadalignError(what, where=address, fix=fix) from None
-            finally:
-                executor.shutdown(wait=False)
+            # Clusters grow, and a round trip may cost more than a chunk.
+            yield executor, 2 * sum(client.nthreads().values()) + 2
 
 
 @contextmanager

@@ -92,10 +92,6 @@ class RunFolder:
             made_folder(path)
         return RunFolder(self.path.absolute())
 
-    def made_figures(self) -> Path:
-        """Make the folder of figures; returns it."""
-        return made_folder(self.figures)
-
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Keep other processes out; a killed process holds no lock."""

@@ -169,40 +169,26 @@ class Run:
     @classmethod
     def open(cls, path: Path, name: str | None = None, *, columns: Columns = COLUMNS) -> Self:
         """Read a run, whose result table must have these columns; see `checked`."""
-        folder = RunFolder(path)
-        if not path.is_dir():
-            raise DataError("no such folder", where=str(path), fix=_FIX)
-        config = folder.read_config()
+        folder, name = RunFolder(path), path.name if name is None else name
+        config = folder.read_config() if path.is_dir() else None
         if config is None:
-            raise DataError(
-                "not the folder of a run: it has no run.json", where=str(path), fix=_FIX
+            what = (
+                "not the folder of a run: it has no run.json" if path.is_dir() else "no such folder"
             )
-        name = path.name if name is None else name
-        total = int(config.get("tasks", 0))
+            raise DataError(what, where=str(path), fix=_FIX)
+        total, size = int(config.get("tasks", 0)), int(config.get("chunk_size", 1))
         if folder.is_finished:
-            results = checked(
-                read_table(folder.results), columns, path=folder.results, fix=DONE_ANEW
-            )
-            times = np.full(len(results), np.nan)
-            if folder.timings.is_file():
-                timings = read_table(folder.timings, fix=_TIMINGS_FIX)
-                timings = checked(timings, SECONDS, path=folder.timings, fix=_TIMINGS_FIX)
-                if len(timings) == len(results):
-                    times = timings["seconds"].to_numpy(zero_copy_only=False).astype(float)
-            return cls(folder, name, config, results, times, total, total)
-        size = int(config.get("chunk_size", 1))
+            table = read_table(folder.results)
+            results = checked(table, columns, path=folder.results, fix=DONE_ANEW)
+            return cls(folder, name, config, results, _times(folder, len(results)), total, total)
         parts = [index for index in _parts(folder) if index * size < total]
         if not parts:
-            raise DataError(
-                "nothing of the run is finished yet",
-                where=str(path),
-                fix="wait, or start the command that made it again: it goes on",
-            )
+            fix = "wait, or start the command that made it again: it goes on"
+            raise DataError("nothing of the run is finished yet", where=str(path), fix=fix)
         done = sum(min(size, total - index * size) for index in parts)
         table = _joined([folder.part(index) for index in parts], (*columns, *SECONDS))
         own = table.column_names[: table.column_names.index("seconds")]
-        times = table["seconds"].to_numpy(zero_copy_only=False).astype(float)
-        return cls(folder, name, config, table.select(own), times, done, total)
+        return cls(folder, name, config, table.select(own), _seconds(table), done, total)
 
     @property
     def experiment(self) -> str:
@@ -260,6 +246,20 @@ class Run:
         if self.is_finished:
             return [whole] if whole.is_file() else []
         return [self.folder.part(index) for index in _parts(self.folder)]
+
+
+def _times(folder: RunFolder, count: int) -> FloatArray:
+    """The times of a finished run's rows, NaN where they were not kept."""
+    if folder.timings.is_file():
+        timings = read_table(folder.timings, fix=_TIMINGS_FIX)
+        timings = checked(timings, SECONDS, path=folder.timings, fix=_TIMINGS_FIX)
+        if len(timings) == count:
+            return _seconds(timings)
+    return np.full(count, np.nan)
+
+
+def _seconds(table: pa.Table) -> FloatArray:
+    return np.asarray(table["seconds"].to_numpy(zero_copy_only=False), dtype=float)
 
 
 def _parts(folder: RunFolder) -> list[int]:

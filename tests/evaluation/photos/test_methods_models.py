@@ -12,7 +12,7 @@ from support.photo_sets import write_pascal3d
 
 import cadalign.datasets
 from cadalign import Model
-from cadalign.evaluation.photos import options
+from cadalign.evaluation.experiments import photos as options
 from cadalign.evaluation.photos.objects import _model
 from cadalign.evaluation.photos.target import PhotoTarget
 
@@ -26,11 +26,11 @@ def model_of(base: str) -> Model:
         model=SimpleNamespace(xyz=0.5 * BOUNDS, names=("first", "second")),
         protocol=SimpleNamespace(up_axis="y"),
     )
-    return _model(base, sighting, 0.1, with_mesh=False)
+    return _model(base, sighting, with_mesh=False)
 
 
 def test_a_similar_model_alone_deviates_by_a_share_of_its_diagonal() -> None:
-    assert model_of(options.SIMILAR).shape_sigma == pytest.approx(0.1 * 3 * 2)
+    assert model_of(options.SIMILAR).shape_sigma == pytest.approx(0.04 * 3 * 2)
     for base in (options.RIGID, options.STRETCHED, options.PRIOR):
         assert model_of(base).shape_sigma is None
 

@@ -26,7 +26,7 @@ from cadalign.shapes.parts import (
 
 logger = logging.getLogger("cadalign")
 
-_LEAST_MODELS = 4
+LEAST_MODELS = 4
 _LEAST_TO_MEASURE = 4  # keypoints; fewer may be near each other
 _LARGEST_RATIO = 20.0  # of models' sizes in one unit; an inch is 25 mm
 _LEAST_TO_TURN = 5  # keypoints; the turn of fewer may be their own
@@ -134,9 +134,9 @@ def tabulated(
     for number, each in enumerate(examples):
         fix = "`cadalign shape learn` takes the folder of a data set"
         require_kind(each, Example, f"models[{number}]", fix=fix)
-    if len(examples) < _LEAST_MODELS:
+    if len(examples) < LEAST_MODELS:
         what = f"{len(examples)} models are too few to learn a shape from"
-        raise InputError(what, where="models", fix=f"give at least {_LEAST_MODELS}")
+        raise InputError(what, where="models", fix=f"give at least {LEAST_MODELS}")
     _check_names(examples)
     _check_shared(examples)
     _warn_of_units(examples)

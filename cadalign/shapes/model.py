@@ -194,13 +194,17 @@ class ShapeModel:
         InputError
             If category or split is unknown, or the category has too few models.
         """
-        from cadalign.shapes.examples import examples_of
+        from cadalign.shapes.examples import LEAST_MODELS, examples_of
 
         models = dataset.subset(categories=[category], split=split)[category]
+        if len(models) < LEAST_MODELS:
+            where = f"{category}, split {split}" if split else category
+            what = f"{len(models)} models are too few to learn a shape from"
+            raise InputError(what, where=where, fix=f"at least {LEAST_MODELS} are needed")
         examples = examples_of(models, meshes=meshes)
         return cls.learn(
             examples,
-            category=models[0].category if models else category,
+            category=models[0].category,
             up_axis="y",
             unit="diagonal",
             components=components,

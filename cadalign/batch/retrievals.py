@@ -9,22 +9,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-from cadalign.arrays import worker_count
-from cadalign.batch.experiment import Estimated, ManyOptions, plan_run
+from cadalign.batch.runs import Estimated, ManyOptions
 from cadalign.batch.spec import SPEC as FIT_SPEC
-from cadalign.batch.spec import summarize_by
 from cadalign.datasets.models.model_keypoints import ModelKeypoints
-from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.runs.work import Columns
-from cadalign.evaluation.summary import median
 from cadalign.io.documents import in_file
 from cadalign.io.observation import Observation
 from cadalign.io.observation_file import fill_xyz
 from cadalign.retrieval.query import ObservationRetrieval
-
-SCORE = Metric("match_score", "score", "%", 0, better="high", factor=100.0, log=False)
-NONE = Metric("none_probability", "none of these", "%", 0, factor=100.0, log=False)
-_SHOWN = (SCORE, NONE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,19 +31,15 @@ class RetrieveRunOptions(ManyOptions):
         ("missing", int),
         *(("top_categories", list[str]), ("top_ids", list[str]), ("top_scores", list[float])),
     )
+    threads: ClassVar[int] = -1  # the search lets go of the interpreter lock
 
     estimate: ObservationRetrieval
 
     @property
-    def threads(self) -> int:
-        """The search lets go of the interpreter lock: a run without workers takes all cores."""
-        return worker_count(-1)
+    def files(self) -> tuple[Path | None, ...]:
+        return *super().files, self.estimate.library, *self.estimate.shape
 
-    @property
-    def learned(self) -> Path | None:
-        return self.estimate.shape[0] if len(self.estimate.shape) == 1 else None
-
-    def own_keypoints(self) -> ModelKeypoints:
+    def keypoints(self) -> ModelKeypoints:
         return self.estimate.opened()[0].keypoints
 
     def read(self, data: Any, where: str, *, folder: Path) -> Observation:
@@ -76,17 +64,10 @@ class RetrieveRunOptions(ManyOptions):
         }
         return best.observation(seen), best.result, cells
 
-    def check_files(self) -> None:
-        self.estimate.opened()
-
 
 SPEC = replace(
     FIT_SPEC,
     options=RetrieveRunOptions,
-    plan=plan_run,
-    columns=(*FIT_SPEC.columns[:3], *_SHOWN, *FIT_SPEC.columns[3:]),
-    summarize=summarize_by({metric.key: median(metric.key) for metric in _SHOWN}, by=()),
-    metrics=(*_SHOWN, *FIT_SPEC.metrics),
     topic="retrieved models",
     about="Red is the best match: its box and model, posed and stretched.",
 )

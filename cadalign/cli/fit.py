@@ -99,7 +99,7 @@ class Fit(ManyCommand, ObservationFit, CameraOptions):
 
     def _fit_many(self) -> int:
         """Align all observations; returns the exit code."""
-        from cadalign.batch.experiment import FitRunOptions
+        from cadalign.batch.runs import FitRunOptions
         from cadalign.cli.runs import inputs_of, run_command
 
         with named_as_flags(self):

@@ -26,7 +26,7 @@ from cadalign.io.observation import DetectorOptions
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from cadalign.batch.experiment import ManyOptions
+    from cadalign.batch.runs import ManyOptions
     from cadalign.cli.options import ManyCommand
     from cadalign.evaluation.registry import Spec
     from cadalign.evaluation.runs.engine import Progress as RunProgress
@@ -127,8 +127,8 @@ def run_command(command: ManyCommand, options: ManyOptions, *, done: str) -> int
     """
     import pyarrow.parquet as pq
 
-    from cadalign.batch.fits import run_many
     from cadalign.batch.outputs import WARNED, warnings_text, without_lists
+    from cadalign.batch.runs import run_many
 
     folder = run_folder(command, options)
     with run_progress(options.experiment) as on_progress:

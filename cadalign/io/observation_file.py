@@ -5,7 +5,7 @@ The format is described in docs/formats/observation.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, cast
 
@@ -194,17 +194,6 @@ def read_fields(data: Any) -> tuple[OneView | SeveralViews, tuple[ViewFields | O
         fix = "give one for all, or `sigma` of every keypoint"
         raise DataError("a list, but there are several views", where="fit.sigma", fix=fix)
     return several, tuple(several.views)
-
-
-def named_files(data: Any, folder: Path) -> Iterator[Path]:
-    """Photos, masks and meshes that an observation names, in its parsed form, valid or not."""
-    given = data if isinstance(data, Mapping) else {}
-    views = given.get("views")
-    for part in (given, *(views if isinstance(views, list) else ())):
-        for name in ("image", "model", "shape", *_PATHS):
-            path = part.get(name) if isinstance(part, Mapping) else None
-            if isinstance(path, str) and path:
-                yield path_from(path, folder)
 
 
 def read_image_fields(read: ViewFields | OneView, folder: Path | None) -> ObservedImage:

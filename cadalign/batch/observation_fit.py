@@ -1,4 +1,4 @@
-"""Options of one observation's alignment, in the place of those that the observation stores.
+"""Observations as problems of `cadalign.fit` and `cadalign.align`: options, model and views.
 
 `cadalign fit` and runs over many observations align each in this way.
 """
@@ -6,30 +6,34 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import tyro
 
-from cadalign.errors import InputError
-from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions
+from cadalign.errors import DataError, InputError
+from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions, Sigma
 from cadalign.io.documents import in_file, within
+from cadalign.io.evidence import ObservedImage
 from cadalign.io.files import once_per_file
 from cadalign.io.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
+from cadalign.io.images import photo_size
 from cadalign.io.observation import Observation, ObservationChanges
 from cadalign.io.observation_file import fill_xyz
 
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
     from cadalign.estimation.result import Result
+    from cadalign.estimation.view import View
+    from cadalign.geometry.mesh import Mesh
     from cadalign.shapes.model import ShapeModel
+    from cadalign.shapes.parts import KeypointId
 
 _NOT_OF_FIT = ("shape_sigma", "image")  # stored options that are not of `FitOptions`
-_STORED = ("sigma", "method", "loss", "stretch", "shape_sigma", "focal", "focal_prior")
+_STORED = ("sigma", "method", "loss", "stretch", "shape_sigma", "focal")
 Note = Callable[[str], object]
 """What is told about an estimate, such as the source of its focal length."""
 
@@ -57,9 +61,6 @@ class ObservationFit:
     everything else. The model needs a mesh."""
     focal: Literal["known", "estimate"] | None = None
     """Focal length: known (the file's) or estimate; by default known, if every view has one."""
-    focal_prior: Annotated[FocalPrior | Literal["usual", "none"] | None, tyro.conf.Suppress] = None
-    """Prior on an estimated focal length; by default the file's, or that of the photo's EXIF data,
-    or else that of usual lenses."""
     method: str | None = None
     """Solver: optimal (maximum likelihood, searched globally; the default), aepnp (linear),
     aepnp-paper (linear, as published) or epnp (OpenCV's, without stretch)."""
@@ -74,11 +75,8 @@ class ObservationFit:
         """What is given, as the entry ``fit`` of an observation's file has it."""
         values = {name: getattr(self, name) for name in _STORED}
         given = {name: value for name, value in values.items() if value is not None}
-        given |= {name: None for name in ("sigma", "focal_prior") if given.get(name) == "none"}
-        if isinstance(self.focal_prior, FocalPrior):
-            given["focal_prior"] = asdict(self.focal_prior)
-        if self.similar:
-            given.setdefault("sigma", None)
+        if self.sigma == "none" or (self.similar and self.sigma is None):
+            given["sigma"] = None
         return given | ({"image": True} if self.use_photo else {})
 
     def check(self) -> None:
@@ -160,9 +158,6 @@ class ObservationFit:
         if focal == "known" and not are_known:
             fix = "give `focal` estimate, or a calibrated camera"
             raise InputError("the focal length is unknown", where=f"{where}: camera", fix=fix)
-        if focal == "known" and self.focal_prior is not None:
-            what, fix = "given for a known focal length", "give `focal` estimate with it"
-            raise InputError(what, where="focal_prior", fix=fix)
         prior = _prior_for(seen, note) if focal == "estimate" else None
         if prior is not None:
             shown = prior_of_camera(prior, seen.camera)
@@ -173,7 +168,6 @@ class ObservationFit:
 
     def _fit_keypoints(self, seen: Observation, options: FitOptions) -> Result:
         """Fit a stretched model to the keypoints of one image."""
-        from cadalign.batch.observed import has_photo
         from cadalign.estimation.fit import check_search, fit_one  # not for help of a command
         from cadalign.estimation.problems import pack_one
 
@@ -188,7 +182,6 @@ class ObservationFit:
 
     def _align(self, seen: Observation, where: str, options: FitOptions) -> Result:
         """Align all evidence of an observation."""
-        from cadalign.batch.observed import views_of
         from cadalign.estimation.align import align
 
         model, given = self._model(seen, where, options), seen.fit_options
@@ -213,7 +206,6 @@ class ObservationFit:
             )
 
     def _model(self, seen: Observation, where: str, options: FitOptions) -> Model | ShapeModel:
-        from cadalign.batch.observed import model_of
         from cadalign.io.meshes.files import mesh_at
 
         if seen.shape is not None:
@@ -243,6 +235,131 @@ def _is_plain(seen: Observation) -> bool:
     given = seen.fit_options
     is_exact = seen.shape is None and given.get("shape_sigma") is None
     return seen.is_plain and is_exact and not given.get("image")
+
+
+def model_of(
+    observation: Observation,
+    *,
+    options: FitOptions,
+    shape_sigma: float | None = None,
+    mesh: Mesh | None = None,
+) -> Model:
+    """The model of an observation's own keypoints, those of all its views.
+
+    Of the options the stretch and the prior on it count. Raises InputError if views
+    place the same keypoint at different points of the model.
+    """
+    from cadalign.estimation.model import Model  # not for help of a command
+
+    points: dict[Hashable, tuple[float, ...]] = {}
+    labels = own_ids(observation.views)
+    for number, (view, names) in enumerate(zip(observation.views, labels, strict=True)):
+        for row, (name, xyz) in enumerate(zip(names, view.points_3d.tolist(), strict=True)):
+            if points.setdefault(name, tuple(xyz)) != tuple(xyz):
+                raise InputError(
+                    f"differs from that of keypoint {name!r} in a view before",
+                    where=f"views[{number}].keypoints[{row}].xyz",
+                    fix="give the same point of the model",
+                )
+    return Model(
+        points_3d=list(points.values()),
+        ids=list(points),
+        mesh=mesh,
+        shape_sigma=shape_sigma,
+        stretch=options.stretch,
+        stretch_sigma=options.stretch_sigma,
+        symmetry=observation.symmetry,
+        up_axis=observation.up_axis,
+    )
+
+
+def views_of(
+    observation: Observation,
+    model: Model | ShapeModel,
+    *,
+    with_photos: bool = False,
+    **stated: Sigma | None,
+) -> tuple[View, ...]:
+    """Evidence of an observation's images about a model, at a stated ``sigma`` or at its own [px].
+
+    A learned shape's keypoints are found by semantic id or by name, as the shape has them; a sigma
+    is 1 where none is known. Photos themselves are evidence where these are asked for.
+
+    Raises InputError if the shape has no such keypoints, the observation has no ids or names, one
+    occurs twice, or what is said of an image is invalid; DataError if a file cannot be read.
+    """
+    from cadalign.estimation.view import View
+    from cadalign.shapes.model import ShapeModel
+
+    labels = own_ids(observation.views)
+    views = []
+    for number, image in enumerate(observation.views):
+        with within(f"views[{number}]") if observation.others else nullcontext():
+            ids = shape_ids(image, model) if isinstance(model, ShapeModel) else labels[number]
+            evidence = image.evidence.given
+            if image.depths is not None:
+                evidence["depth"] = image.depths
+            own = {"sigma": 1.0 if image.sigma is None else image.sigma}
+            view = View(
+                image.camera,
+                image.points_2d,
+                ids=ids,
+                scores=image.scores,
+                image=image.image if with_photos else None,
+                has_photo=has_photo(image),
+                **evidence | own | stated,
+            )
+            views.append(view)
+    return tuple(views)
+
+
+def has_photo(image: ObservedImage) -> bool:
+    """True if the photo of an image is there, of its camera's size."""
+    size = image.camera.width, image.camera.height
+    with suppress(DataError):
+        return image.image is not None and photo_size(image.image) == size
+    return False
+
+
+def shape_ids(image: ObservedImage, shape: ShapeModel) -> tuple[KeypointId, ...]:
+    """The ids, or names, by which a learned shape knows an image's keypoints; see `views_of`."""
+    if not len(image.points_2d):
+        return ()
+    named = isinstance(shape.ids[0], str)
+    field, kind = ("name", "names") if named else ("semantic_id", "semantic ids")
+    given = image.names if named else image.ids
+    if given is None:
+        raise InputError(
+            f"the keypoints have no {field}",
+            where="keypoints",
+            fix=f"the shape of {shape.category} knows its keypoints by their {kind}",
+        )
+    ids = tuple(each if named else int(each) for each in given)
+    shape.rows(ids, where=f"keypoints.{field}")
+    return ids
+
+
+def own_ids(images: Sequence[ObservedImage]) -> tuple[tuple[Hashable, ...], ...]:
+    """Labels of the images' keypoints by which they are the same in several.
+
+    Ids or names where these distinguish all; otherwise numbers, in several images of equal ``xyz``.
+    """
+    shown = [image for image in images if len(image.points_2d)]
+    for field in ("ids", "names"):
+        columns = [getattr(image, field) for image in shown]
+        if all(column is not None and len(set(column)) == len(column) for column in columns):
+            of_all = [getattr(image, field) if len(image.points_2d) else () for image in images]
+            return tuple(
+                tuple(each if isinstance(each, str) else int(each) for each in column)
+                for column in of_all
+            )
+    if len(shown) < 2:
+        return tuple(tuple(range(len(image.points_2d))) for image in images)
+    numbers: dict[tuple[float, ...], int] = {}
+    return tuple(
+        tuple(numbers.setdefault(tuple(xyz), len(numbers)) for xyz in image.points_3d.tolist())
+        for image in images
+    )
 
 
 @once_per_file(4)

@@ -18,14 +18,14 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
-from cadalign.errors import CadalignError, RenderError
+from cadalign.errors import CadalignError
 from cadalign.estimation.result import Result
 from cadalign.evaluation.benchmark import write_picture
 from cadalign.evaluation.instances.pictures import write_pictures, write_preview
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
-from cadalign.evaluation.runs.work import Columns, Row
+from cadalign.evaluation.runs.work import AbortError, Columns, Row
 from cadalign.export.tables import RESULT_COLUMNS, row_of
 from cadalign.geometry.alignment import Box
 from cadalign.io.files import write_whole
@@ -126,24 +126,25 @@ def draw_fit(
     """
     camera, names = seen.camera if result is None else result.camera, page_names(row)
     stem = record_stem(names["category"], names["model_id"])
-    troubles = []
-    photo = mesh = box = None
-    try:
-        photo = None if seen.image is None else read_image(seen.image, camera)
-    except CadalignError as error:
-        troubles.append(f"the photo is not shown: {error}")
-    try:
-        if result is not None:
-            box = Box.from_model(result.bounds, result.alignment)
-            mesh = mesh_of(seen, result)
-    except CadalignError as error:
-        troubles.append(f"the model is shown as a box: {error}")
-    try:
-        if photo is not None:
+
+    def draw_photo() -> None:
+        if seen.image is not None:
+            box = None if result is None else Box.from_model(result.bounds, result.alignment)
             how = partial(write_pictures, observed=seen.points_2d, est_box=box)
-            write_picture(how, folder, stem, photo, camera)
+            write_picture(how, folder, stem, read_image(seen.image, camera), camera)
+
+    def draw_model() -> None:
+        mesh = None if result is None else mesh_of(seen, result)
         if mesh is not None:
             write_picture(write_preview, folder.previews / f"{stem}.json", mesh)
-    except RenderError as error:
-        troubles.append(f"not drawn: {error}")
+
+    troubles = []
+    drawn = {"the photo is not shown": draw_photo, "the model is shown as a box": draw_model}
+    for trouble, draw in drawn.items():
+        try:
+            draw()
+        except AbortError:
+            raise
+        except CadalignError as error:
+            troubles.append(f"{trouble}: {error}")
     return tuple(troubles)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-from cadalign.batch.runs import Estimated, ManyOptions
+from cadalign.batch.runs import Estimated, FitRunOptions
 from cadalign.batch.spec import SPEC as FIT_SPEC
 from cadalign.datasets.models.model_keypoints import ModelKeypoints
 from cadalign.evaluation.runs.work import Columns
@@ -20,8 +20,8 @@ from cadalign.retrieval.query import ObservationRetrieval
 
 
 @dataclass(frozen=True, kw_only=True)
-class RetrieveRunOptions(ManyOptions):
-    """A run that retrieves the models of many observations; see `ManyOptions`."""
+class RetrieveRunOptions(FitRunOptions):
+    """A run that retrieves the models of many observations; see `FitRunOptions`."""
 
     experiment: ClassVar[str] = "retrieve"
     command: ClassVar[str] = "retrieve"
@@ -33,11 +33,12 @@ class RetrieveRunOptions(ManyOptions):
     )
     threads: ClassVar[int] = -1  # the search lets go of the interpreter lock
 
-    estimate: ObservationRetrieval
+    estimate: ObservationRetrieval  # type: ignore[assignment]
 
     @property
     def files(self) -> tuple[Path | None, ...]:
-        return *super().files, self.estimate.library, *self.estimate.shape
+        named = self.changes.camera, self.detector.model
+        return *named, self.estimate.library, *self.estimate.shape
 
     def keypoints(self) -> ModelKeypoints:
         return self.estimate.opened()[0].keypoints

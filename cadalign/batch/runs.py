@@ -37,7 +37,6 @@ from cadalign.evaluation.runs.work import Columns, Plan, Row, fingerprint
 from cadalign.export.tables import failed_row
 from cadalign.io.documents import Positive, convert, in_file, parse_json
 from cadalign.io.files import as_path, read_bytes
-from cadalign.io.focal import FocalPrior
 from cadalign.io.images import photo_size, require_one_size
 from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
 
@@ -52,9 +51,11 @@ Estimated = tuple[Observation, Result, Row]
 
 
 @dataclass(frozen=True, kw_only=True)
-class ManyOptions(ExperimentOptions):
-    """A run over many observations, whatever is estimated of each."""
+class FitRunOptions(ExperimentOptions):
+    """A run that aligns many observations, as ``estimate`` says."""
 
+    experiment: ClassVar[str] = "fit"
+    command: ClassVar[str] = "fit"
     columns: ClassVar[Columns] = ()
     """Columns of the table beside those of every run."""
     threads: ClassVar[int] = 1
@@ -67,6 +68,7 @@ class ManyOptions(ExperimentOptions):
     detector: DetectorOptions = field(default_factory=DetectorOptions)
     pictures: int = 0
     """Number of observations whose photos the page shows, the first ones."""
+    estimate: ObservationFit = field(default_factory=ObservationFit)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -75,38 +77,13 @@ class ManyOptions(ExperimentOptions):
     @property
     def files(self) -> tuple[Path | None, ...]:
         """The files that the estimates depend on, beside the observations."""
-        return self.changes.camera, self.detector.model
+        return self.changes.camera, self.detector.model, self.estimate.shape
 
     def keypoints(self) -> ModelKeypoints | None:
         """Those that a detector's are paired with, where no model's are given.
 
         Raises CadalignError if an option of the estimate is invalid, or its file cannot be read.
         """
-        raise NotImplementedError
-
-    def read(self, data: Any, where: str, *, folder: Path) -> Observation:
-        """Read the parsed form of an observation, which messages call ``where``."""
-        raise NotImplementedError
-
-    def estimate_of(self, seen: Observation, where: str) -> Estimated:
-        """Estimate the object of an observation; raises CadalignError if it cannot be."""
-        raise NotImplementedError
-
-
-@dataclass(frozen=True, kw_only=True)
-class FitRunOptions(ManyOptions):
-    """A run that aligns many observations, as ``estimate`` says; see `ManyOptions`."""
-
-    experiment: ClassVar[str] = "fit"
-    command: ClassVar[str] = "fit"
-
-    estimate: ObservationFit = field(default_factory=ObservationFit)
-
-    @property
-    def files(self) -> tuple[Path | None, ...]:
-        return *super().files, self.estimate.shape
-
-    def keypoints(self) -> ModelKeypoints | None:
         self.estimate.check()
         if self.estimate.shape is None:
             return None
@@ -118,9 +95,11 @@ class FitRunOptions(ManyOptions):
         )
 
     def read(self, data: Any, where: str, *, folder: Path) -> Observation:
+        """Read the parsed form of an observation, which messages call ``where``."""
         return self.estimate.read(data, where, folder=folder, changes=self.changes)
 
     def estimate_of(self, seen: Observation, where: str) -> Estimated:
+        """Estimate the object of an observation; raises CadalignError if it cannot be."""
         seen = self.estimate.changed(seen)
         return seen, self.estimate.fit(seen, where), {}
 
@@ -129,7 +108,7 @@ class FitRunOptions(ManyOptions):
 class ManyEstimates:
     """Estimates of observations; see `cadalign.evaluation.runs.work.Experiment`."""
 
-    options: ManyOptions
+    options: FitRunOptions
     model: ModelKeypoints | None = None
     """The keypoints that a detector's are paired with."""
     folder: RunFolder | None = field(default=None, repr=False)
@@ -214,7 +193,7 @@ def _doubts(seen: Observation) -> Iterator[tuple[str, str]]:
 
 
 def plan_run(
-    options: ManyOptions, folder: RunFolder, given: Iterable[bytes] = ()
+    options: FitRunOptions, folder: RunFolder, given: Iterable[bytes] = ()
 ) -> Plan[ObservationTask]:
     """Plan the estimates of the observations of all inputs, and of ``given`` lines.
 
@@ -241,7 +220,7 @@ def plan_run(
 
 
 def run_many(
-    options: ManyOptions,
+    options: FitRunOptions,
     folder: RunFolder,
     *,
     given: Iterable[bytes] = (),
@@ -296,8 +275,7 @@ def fit_many(
         ``robust``, ``shape``; of `cadalign.batch.DetectorOptions`, such as ``model``, ``images``;
         and ``camera``, the file of a camera for all. A number as ``focal`` is the focal length [px]
         of all images. What an observation stores holds where an option is None: unlike those of
-        `cadalign.fit`, ``sigma=None`` and ``focal_prior=None`` mean the observation's, or the
-        default; ``sigma="none"`` estimates it, ``focal_prior="none"`` takes no prior.
+        `cadalign.fit`, ``sigma=None`` means the observation's, or 1; ``sigma="none"`` estimates it.
 
     Returns
     -------
@@ -374,8 +352,6 @@ def _parts_of(given: dict[str, Any]) -> dict[str, Any]:
 def _converted(value: Any, kind: Any, name: str) -> Any:
     if Path in get_args(kind):
         return as_path(value, name)
-    if isinstance(value, FocalPrior):  # which checks its values itself
-        return value
     try:
         return convert(value, kind, name)
     except DataError as error:

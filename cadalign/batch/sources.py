@@ -23,6 +23,7 @@ from cadalign.io.documents import read_json
 from cadalign.io.files import listed, open_input, read_bytes, read_text
 from cadalign.io.kinds import DETECTOR, LINES, OBSERVATION, TABLE, kind_of, refuse_other_file
 
+_DAMAGED = "damaged"  # a file whose row says what is wrong with it
 _CELLS = 3  # of a task: the number of its source, its own in it, and the byte where it begins
 
 
@@ -57,8 +58,8 @@ class ObservationTasks(Sequence[ObservationTask]):
             self._digest.update(b"\n".join(line for _, line in lines))
             self._add_objects(Path("observations"), lines)
         for path in inputs:
-            for file, data in _files_of(path):
-                self._add(file, data)
+            for file, kind in _files_of(path):
+                self._add(file, kind)
 
     @property
     def fingerprint(self) -> str:
@@ -95,14 +96,13 @@ class ObservationTasks(Sequence[ObservationTask]):
                 content = error
         return ObservationTask(row, name, content, os.path.dirname(os.path.abspath(path)))
 
-    def _add(self, path: Path, data: Any) -> None:
-        suffix = path.suffix.lower()
-        if suffix in LINES:
+    def _add(self, path: Path, kind: str | None) -> None:
+        if path.suffix.lower() in LINES:
             self._add_lines(path)
             return
         with suppress(DataError):  # which the task's row says
             self._digest.update(read_bytes(path))
-        if suffix == TABLE or kind_of(data) == DETECTOR:
+        if kind == DETECTOR:
             # Which memory holds whole; objects that cannot be read come last.
             bad: dict[str, DataError] = {}
             good = read_image_keypoints(path, problems=bad)
@@ -133,37 +133,31 @@ class ObservationTasks(Sequence[ObservationTask]):
         self._sources.append(path)
 
 
-def _files_of(path: Path) -> Iterator[tuple[Path, Any]]:
-    """The files of an input; with those of JSON their content, None if it is damaged."""
-    suffix = path.suffix.lower()
-    if os.path.isdir(path):  # also of a name that no file can have
-        yield from _files_in(path)
-    elif suffix in (*LINES, TABLE):
-        yield path, None
-    else:
-        data = _content(path)
-        if kind_of(data) not in (DETECTOR, OBSERVATION):
+def _files_of(path: Path) -> Iterator[tuple[Path, str | None]]:
+    """The files of an input with their kinds; of a folder's JSON files those of observations."""
+    if not os.path.isdir(path):  # also of a name that no file can have
+        kind = _kind_of(path)
+        if kind not in (DETECTOR, OBSERVATION):
             refuse_other_file(path, OBSERVATION)
-        yield path, data
-
-
-def _files_in(folder: Path) -> Iterator[tuple[Path, Any]]:
-    """The observations of a folder, whose other JSON files are passed over."""
+        yield path, kind
+        return
     is_empty = True
-    for path in listed(folder):
-        suffix = path.suffix.lower()
-        if not path.is_file() or suffix not in (".json", *LINES):
-            continue
-        data = _content(path) if suffix == ".json" else None
-        if data is None or kind_of(data) == OBSERVATION:
-            is_empty = False
-            yield path, data
+    for each in listed(path):
+        if each.suffix.lower() in (".json", *LINES) and each.is_file():
+            kind = _kind_of(each)
+            if kind in (OBSERVATION, _DAMAGED):
+                is_empty = False
+                yield each, kind
     if is_empty:
         fix = "`cadalign annotate` and `cadalign observe` write them"
-        raise DataError("the folder holds no observation", where=str(folder), fix=fix)
+        raise DataError("the folder holds no observation", where=str(path), fix=fix)
 
 
-def _content(path: Path) -> Any:
-    with suppress(DataError):
-        return read_json(path)
-    return None
+def _kind_of(path: Path) -> str | None:
+    suffix = path.suffix.lower()
+    if suffix in (*LINES, TABLE):
+        return DETECTOR if suffix == TABLE else OBSERVATION
+    try:
+        return kind_of(read_json(path))
+    except DataError:
+        return _DAMAGED

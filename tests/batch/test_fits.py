@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import cadalign
-from cadalign import Alignment, CadalignError, Camera, FocalPrior, Observation, Result, Results
+from cadalign import Alignment, CadalignError, Camera, Observation, Result, Results
 from cadalign.batch.observation_fit import ObservationFit
 from cadalign.batch.outputs import COLUMNS
 from cadalign.batch.runs import FitRunOptions, plan_run
@@ -172,7 +172,6 @@ def test_another_input_or_option_is_refused(tmp_path: Path) -> None:
         ({"robust": "no"}, "robust"),
         ({"focal": "guess"}, "focal"),
         ({"focal": -5.0}, "focal"),
-        ({"focal_prior": "foo"}, "focal_prior"),
         ({"sigma": np.ones(8)}, "sigma"),
         ({"camera": CAMERA}, "camera"),
         ({"shape": 3}, "shape"),
@@ -197,17 +196,6 @@ def test_numbers_as_focal_are_the_focal_length_of_all_cameras() -> None:
     seen = [replace(each, camera=unknown) for each in observations(2)]
     cameras = [each.camera.fx for each in cadalign.fit_many(seen, focal=650)]  # type: ignore[union-attr]
     assert cameras == [650.0, 650.0]
-
-
-def test_priors_of_focal_lengths_are_taken_as_such_and_none_is_the_default() -> None:
-    given, usual = (
-        cadalign.fit_many(observations(1), focal="estimate", focal_prior=prior)[0]
-        for prior in (FocalPrior(900.0, 0.1), None)
-    )
-    assert isinstance(given, Result)
-    assert given.focal_prior == FocalPrior(900.0, 0.1)
-    assert isinstance(usual, Result)
-    assert usual.focal_prior == FocalPrior.of_usual_lenses(640, 480)
 
 
 def test_what_is_no_observation_is_refused() -> None:

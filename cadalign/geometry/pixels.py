@@ -15,6 +15,7 @@ and then adds distortion, for the first two: OpenCV's model with k1, k2, p1, p2,
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from functools import lru_cache
 from typing import Literal, get_args
@@ -76,8 +77,9 @@ def unmeasured(points_2d: FloatArray, *, least: int = _SEVERAL) -> BoolArray:
         bad |= here
     known = points_2d[~bad]
     if len(known) >= _CROWD and np.ptp(known, axis=0).max() >= _CROWDED_SPAN:
-        _, of, counts = np.unique(known, axis=0, return_inverse=True, return_counts=True)
-        bad[~bad] = counts[of.reshape(-1)] >= _CROWD
+        rows = list(map(tuple, known.tolist()))
+        times = Counter(rows)
+        bad[~bad] = [times[row] >= _CROWD for row in rows]
     return np.asarray(bad)
 
 

@@ -20,7 +20,7 @@ from cadalign.io.documents import in_file, within
 from cadalign.io.evidence import ObservedImage
 from cadalign.io.files import once_per_file
 from cadalign.io.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
-from cadalign.io.images import photo_size
+from cadalign.io.images import photo_size, require_one_size
 from cadalign.io.observation import Observation, ObservationChanges
 from cadalign.io.observation_file import fill_xyz
 
@@ -177,7 +177,7 @@ class ObservationFit:
         check_search(ransac, scores, seen.symmetry)
         with np.errstate(all="ignore"):
             search = (ransac, scores, seen.symmetry, start)
-            named = seen.labels, has_photo(seen.views[0])
+            named = seen.labels, photo_doubt(seen.views[0]) == ""
             return fit_one(problem, options, *search, *named)
 
     def _align(self, seen: Observation, where: str, options: FitOptions) -> Result:
@@ -306,19 +306,26 @@ def views_of(
                 ids=ids,
                 scores=image.scores,
                 image=image.image if with_photos else None,
-                has_photo=has_photo(image),
+                has_photo=photo_doubt(image) == "",
                 **evidence | own | stated,
             )
             views.append(view)
     return tuple(views)
 
 
-def has_photo(image: ObservedImage) -> bool:
-    """True if the photo of an image is there, of its camera's size."""
-    size = image.camera.width, image.camera.height
+def photo_doubt(image: ObservedImage) -> str | None:
+    """What is wrong with the size of an image's photo; None where there is none to be read."""
+    if image.image is None:
+        return None
     with suppress(DataError):
-        return image.image is not None and photo_size(image.image) == size
-    return False
+        size = photo_size(image.image)
+        known = {"its camera": (image.camera.width, image.camera.height), image.image.name: size}
+        try:
+            require_one_size(known, image.image)
+        except DataError as error:
+            return f"{error} (`Camera.resized`, `Camera.cropped`)"
+        return ""
+    return None
 
 
 def shape_ids(image: ObservedImage, shape: ShapeModel) -> tuple[KeypointId, ...]:
@@ -344,17 +351,15 @@ def own_ids(images: Sequence[ObservedImage]) -> tuple[tuple[Hashable, ...], ...]
 
     Ids or names where these distinguish all; otherwise numbers, in several images of equal ``xyz``.
     """
-    shown = [image for image in images if len(image.points_2d)]
     for field in ("ids", "names"):
-        columns = [getattr(image, field) for image in shown]
+        columns = [getattr(each, field) if len(each.points_2d) else () for each in images]
         if all(column is not None and len(set(column)) == len(column) for column in columns):
-            of_all = [getattr(image, field) if len(image.points_2d) else () for image in images]
             return tuple(
                 tuple(each if isinstance(each, str) else int(each) for each in column)
-                for column in of_all
+                for column in columns
             )
-    if len(shown) < 2:
-        return tuple(tuple(range(len(image.points_2d))) for image in images)
+    if len(images) < 2:
+        return (tuple(range(len(images[0].points_2d))),)
     numbers: dict[tuple[float, ...], int] = {}
     return tuple(
         tuple(numbers.setdefault(tuple(xyz), len(numbers)) for xyz in image.points_3d.tolist())

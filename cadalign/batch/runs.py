@@ -6,7 +6,7 @@ import os
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import chain, starmap
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, ClassVar, get_args, get_type_hints
 
 from cadalign.arrays import is_number, worker_count
-from cadalign.batch.observation_fit import ObservationFit, opened_shape
+from cadalign.batch.observation_fit import ObservationFit, opened_shape, photo_doubt
 from cadalign.batch.outputs import (
     COLUMNS,
     RECORD_COLUMNS,
@@ -37,7 +37,6 @@ from cadalign.evaluation.runs.work import Columns, Plan, Row, fingerprint
 from cadalign.export.tables import failed_row
 from cadalign.io.documents import Positive, convert, in_file, parse_json
 from cadalign.io.files import as_path, read_bytes
-from cadalign.io.images import photo_size, require_one_size
 from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
 
 LARGEST_CHUNK = 256
@@ -182,14 +181,8 @@ def _doubts(seen: Observation) -> Iterator[tuple[str, str]]:
     for view in seen.views:
         if view.text_of_not_found:
             yield "left-out", view.text_of_not_found
-        if view.image is not None:
-            with suppress(DataError):
-                size, camera = photo_size(view.image), view.camera
-                named = {"its camera": (camera.width, camera.height), view.image.name: size}
-                try:
-                    require_one_size(named, view.image)
-                except DataError as error:
-                    yield "camera", f"{error} (`Camera.resized`, `Camera.cropped`)"
+        if doubt := photo_doubt(view):
+            yield "camera", doubt
 
 
 def plan_run(

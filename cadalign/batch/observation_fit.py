@@ -136,10 +136,8 @@ class ObservationFit:
         ``note`` is called with what is left out, and the source of a focal length. Raises
         CadalignError if options or observation are invalid, or there is no alignment.
         """
-        for view in seen.views:
-            if text := view.text_of_not_found:
-                note(text)
-        options = self._options(seen, where, note)
+        notes = [text for view in seen.views if (text := view.text_of_not_found)]
+        options = self._options(seen, where, notes.append)
         if seen.model is not None and seen.shape is None:
             from cadalign.io.meshes.files import check_keypoints
 
@@ -147,8 +145,12 @@ class ObservationFit:
                 for view in seen.views:
                     check_keypoints(view.points_3d, seen.model, where="keypoints.xyz")
         if _is_plain(seen):
-            return self._fit_keypoints(seen, options)
-        return self._align(seen, where, options)
+            result = self._fit_keypoints(seen, options)
+        else:
+            result = self._align(seen, where, options)
+        for text in notes:
+            note(text)
+        return result
 
     def _options(self, seen: Observation, where: str, note: Note) -> FitOptions:
         """Options of the fit, with the standard deviation and focal length that are known."""

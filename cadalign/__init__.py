@@ -6,7 +6,7 @@ from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
     from cadalign import datasets, errors, geometry, metrics, render, retrieval, shapes, solvers
-    from cadalign.batch.fits import fit_many
+    from cadalign.batch.runs import fit_many
     from cadalign.errors import CadalignError
     from cadalign.estimation.align import align, align_batch
     from cadalign.estimation.fit import fit, fit_batch

@@ -1,13 +1,12 @@
-"""Many observations aligned as a run: what goes in, the table that comes out, its exports."""
+"""Many observations aligned as a run: what goes in, and the table that comes out."""
 
 from typing import TYPE_CHECKING
 
 from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
-    from cadalign.batch.experiment import FitRunOptions
-    from cadalign.batch.fits import fit_many, run_many
     from cadalign.batch.retrievals import RetrieveRunOptions
+    from cadalign.batch.runs import FitRunOptions, fit_many, run_many
     from cadalign.io.observation import DetectorOptions
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""Options of one observation's alignment, and those of the observation that hold.
+"""Observations as problems of `cadalign.fit` and `cadalign.align`: options, model and views.
 
 `cadalign fit` and runs over many observations align each in this way.
 """
@@ -6,29 +6,33 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import tyro
 
-from cadalign.errors import InputError
+from cadalign.errors import DataError, InputError
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions, Sigma
 from cadalign.io.documents import in_file, within
+from cadalign.io.evidence import ObservedImage
 from cadalign.io.files import once_per_file
 from cadalign.io.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
+from cadalign.io.images import photo_size, require_one_size
 from cadalign.io.observation import Observation, ObservationChanges
 
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
     from cadalign.estimation.result import Result
+    from cadalign.estimation.view import View
+    from cadalign.geometry.mesh import Mesh
     from cadalign.shapes.model import ShapeModel
+    from cadalign.shapes.parts import KeypointId
 
-_NOT_OF_FIT = ("shape_sigma", "image", "focal_prior")  # stored options that are read apart
-_OF_THE_MODEL = ("stretch", "stretch_sigma")  # options that a learned shape lacks
+_NOT_OF_FIT = ("shape_sigma", "image")  # stored options that are not of `FitOptions`
+_STORED = ("sigma", "method", "loss", "stretch", "shape_sigma", "focal")
 Note = Callable[[str], object]
 """What is told about an estimate, such as the source of its focal length."""
 
@@ -56,141 +60,112 @@ class ObservationFit:
     everything else. The model needs a mesh."""
     focal: Literal["known", "estimate"] | None = None
     """Focal length: known (the file's) or estimate; by default known, if every view has one."""
-    focal_prior: Annotated[FocalPrior | Literal["usual", "none"] | None, tyro.conf.Suppress] = None
-    """Prior on an estimated focal length; by default the file's, or that of the photo's EXIF data,
-    or else that of usual lenses."""
-    fitting: Annotated[FitOptions, tyro.conf.Suppress] = field(default_factory=FitOptions)
-    """Method and model; of sigma and focal length, the options above hold."""
-    ransac: Annotated[RansacOptions, tyro.conf.Suppress] = field(default_factory=RansacOptions)
-    """The search for outliers, where it is asked for."""
-
-    def shape_of(self, observation: Observation) -> Path | None:
-        """File of the learned shape to fit: the given one, or else the file's."""
-        takes_own = self.shape is None and self.shape_sigma is None
-        return observation.shape if takes_own else self.shape
-
-    def shape_sigma_of(self, observation: Observation) -> float | None:
-        """Deviation of a similar model's shape: the given one, or else the file's."""
-        if self.shape is not None or self.shape_sigma is not None:
-            return self.shape_sigma
-        return observation.fit_options.get("shape_sigma")
-
-    def uses_photos(self, observation: Observation) -> bool:
-        """True if the photos themselves are evidence."""
-        return self.use_photo or bool(observation.fit_options.get("image"))
-
-    def stated_sigma(self, observation: Observation) -> dict[str, Sigma | None]:
-        """Standard deviation in the place of the keypoints' own, empty if there is none.
-
-        None is to be estimated.
-        """
-        if self.sigma is not None or self.similar:
-            return {"sigma": None if isinstance(self.sigma, str) else self.sigma}
-        stored = observation.fit_options
-        return {"sigma": stored["sigma"]} if "sigma" in stored else {}
-
-    def options_for(self, observation: Observation, where: str, note: Note) -> FitOptions:
-        """Options of the fit: those that are given, otherwise those of the file."""
-        given = observation.fit_options
-        with in_file(where), within("fit"):
-            stored = FitOptions(**{name: given[name] for name in given if name not in _NOT_OF_FIT})
-        are_known = all(view.camera.focal_known for view in observation.views)
-        focal = self.focal or given.get("focal", "known" if are_known else "estimate")
-        if focal == "known" and not are_known:
-            fix = "give `focal` estimate, or a calibrated camera"
-            raise InputError("the focal length is unknown", where=f"{where}: camera", fix=fix)
-        if focal == "known" and self.focal_prior is not None:
-            what, fix = "given for a known focal length", "give `focal` estimate with it"
-            raise InputError(what, where="focal_prior", fix=fix)
-        prior = self._prior_for(observation, note) if focal == "estimate" else None
-        shown = prior_of_camera(prior, observation.camera)
-        if shown is not None:
-            note(f"Focal length is estimated, its prior: {shown}")
-        own = 1.0 if observation.sigma is None else observation.sigma
-        sigma = self.stated_sigma(observation).get("sigma", own)
-        changes = {**self._set, "sigma": sigma, "focal": focal, "focal_prior": prior}
-        options = replace(stored, **changes)
-        is_chosen = "stretch_sigma" in given or options.stretch_sigma is not None
-        has_prior = options.method == "optimal" and bool(options.stretched_axes)
-        if self.similar and has_prior and not is_chosen:
-            return replace(options, stretch_sigma=SIMILAR_SCALE_SIGMA)
-        return options
+    method: str | None = None
+    """Solver: optimal (maximum likelihood, searched globally; the default), aepnp (linear),
+    aepnp-paper (linear, as published) or epnp (OpenCV's, without stretch)."""
+    loss: str | None = None
+    """Loss on the length of a residual: linear (squared; the default), huber or cauchy; the robust
+    ones tolerate outliers."""
+    stretch: str | None = None
+    """Axes whose scale is estimated: yz by default; y, z or none."""
 
     @property
-    def _set(self) -> dict[str, Any]:
-        """Options of the fit that are not at their defaults."""
-        values = {each.name: getattr(self.fitting, each.name) for each in fields(self.fitting)}
-        return {name: each for name, each in values.items() if each != getattr(FitOptions, name)}
+    def given(self) -> dict[str, Any]:
+        """What is given, as the entry ``fit`` of an observation's file has it."""
+        values = {name: getattr(self, name) for name in _STORED}
+        given = {name: value for name, value in values.items() if value is not None}
+        if self.sigma == "none" or (self.similar and self.sigma is None):
+            given["sigma"] = None
+        return given | ({"image": True} if self.use_photo else {})
 
-    def _prior_for(self, observation: Observation, note: Note) -> PriorOption:
-        """The prior on an estimated focal length: the given one, the file's, or the photos'."""
-        stored = observation.fit_options
-        if self.focal_prior is not None:
-            return None if self.focal_prior == "none" else self.focal_prior
-        if "focal_prior" in stored:
-            prior = stored["focal_prior"]
-            return FocalPrior(**prior) if isinstance(prior, dict) else prior
-        return _prior_of_photos(observation, note) or USUAL
-
-    def check_for(self, observation: Observation) -> None:
-        """Refuse options that have no effect together with a shape or further evidence."""
-        if self.shape is not None and self.shape_sigma is not None:
-            what = "`shape` has learned how far objects of the category differ"
-            raise InputError(what, where="shape_sigma", fix="give one of the two options")
-        is_learned = self.shape_of(observation) is not None
-        is_similar = self.shape_sigma_of(observation) is not None
-        given, refused = {*self._set}, {"method"}
-        cause = "evidence beyond the keypoints of one image"
-        if is_learned or is_similar:
-            cause = "a learned shape" if is_learned else "a similar shape"
-            refused |= {"similar", *(_OF_THE_MODEL if is_learned else ())}
-            given |= {"similar"} if self.similar else set()
-        for name in sorted(given & refused):
-            what, fix = f"has no effect together with {cause}", "leave out one of the two"
-            raise InputError(what, where=name, fix=fix)
+    def check(self) -> None:
+        """Raise an InputError if an option is invalid by itself."""
+        checked = ("method", "loss", "stretch")
+        FitOptions(**{name: each for name, each in self.given.items() if name in checked})
 
     def read(
         self, data: Any, where: str, *, folder: Path | None, changes: ObservationChanges
     ) -> Observation:
         """Read the parsed form of an observation, with changes; ``where`` is its name in messages.
 
-        Its shape is the learned one that is fitted, without which keypoints need ``xyz``.
+        Where a learned shape is fitted, keypoints need no ``xyz``.
         """
         needs_xyz = None if self.shape_sigma is None else True
         if self.shape is not None:
             needs_xyz = False
         with in_file(where):
             seen = Observation.from_dict(data, folder=folder, needs_xyz=needs_xyz)
-        seen = changes.applied_to(seen, where)  # whose errors name options
-        shape = self.shape_of(seen)
-        return replace(seen, shape=None if shape is None else shape.absolute())
+        return changes.applied_to(seen, where)  # whose errors name options
 
-    def fit(
-        self, observation: Observation, where: str, *, note: Note = lambda text: None
-    ) -> Result:
-        """Align an observation, ``where`` is its name in messages.
+    def changed(self, seen: Observation) -> Observation:
+        """The observation with what is given in the place of what it stores.
 
-        ``note`` is called with the source of a focal length. Raises CadalignError if options or
-        observation are invalid, or there is no alignment.
+        Raises InputError if that has no effect together with a shape or further evidence.
         """
-        notes = [text for view in observation.views if (text := view.text_of_not_found)]
-        options = self.options_for(observation, where, notes.append)
-        shape, shape_sigma = self.shape_of(observation), self.shape_sigma_of(observation)
-        if observation.model is not None and shape is None:
+        given, stored, shape = self.given, dict(seen.fit_options), seen.shape
+        if self.shape is not None or self.shape_sigma is not None:
+            if self.shape is not None and self.shape_sigma is not None:
+                what = "`shape` has learned how far objects of the category differ"
+                raise InputError(what, where="shape_sigma", fix="give one of the two options")
+            shape = self.shape
+            stored.pop("shape_sigma", None)
+        options = stored | given
+        changed = replace(seen, shape=shape and shape.absolute(), fit_options=options)
+        if not _is_plain(changed):
+            self._refuse_without_effect(changed)
+        has_prior = options.get("method", "optimal") == "optimal"
+        if self.similar and has_prior and options.get("stretch") != "none":
+            options.setdefault("stretch_sigma", SIMILAR_SCALE_SIGMA)
+        return changed
+
+    def _refuse_without_effect(self, seen: Observation) -> None:
+        cause, refused = "evidence beyond the keypoints of one image", ["method"]
+        if seen.shape is not None:
+            cause, refused = "a learned shape", ["method", "similar", "stretch"]
+        elif "shape_sigma" in seen.fit_options:
+            cause, refused = "a similar shape", ["method", "similar"]
+        for name in refused:
+            if getattr(self, name):
+                what, fix = f"has no effect together with {cause}", "leave out one of the two"
+                raise InputError(what, where=name, fix=fix)
+
+    def fit(self, seen: Observation, where: str, *, note: Note = lambda text: None) -> Result:
+        """Align an observation that is `changed`; ``where`` is its name in messages.
+
+        ``note`` is called with what is left out, and the source of a focal length. Raises
+        CadalignError if options or observation are invalid, or there is no alignment.
+        """
+        notes = [text for view in seen.views if (text := view.text_of_not_found)]
+        options = self._options(seen, where, notes.append)
+        if seen.model is not None and seen.shape is None:
             from cadalign.io.meshes.files import check_keypoints
 
             with in_file(where):
-                for view in observation.views:
-                    check_keypoints(view.points_3d, observation.model, where="keypoints.xyz")
-        is_exact = shape is None and shape_sigma is None
-        if observation.is_plain and is_exact and not self.uses_photos(observation):
-            result = self._fit_keypoints(observation, options)
+                for view in seen.views:
+                    check_keypoints(view.points_3d, seen.model, where="keypoints.xyz")
+        if _is_plain(seen):
+            result = self._fit_keypoints(seen, options)
         else:
-            self.check_for(observation)
-            result = self._align(observation, where, options)
+            result = self._align(seen, where, options)
         for text in notes:
             note(text)
         return result
+
+    def _options(self, seen: Observation, where: str, note: Note) -> FitOptions:
+        """Options of the fit, with the standard deviation and focal length that are known."""
+        given = {name: each for name, each in seen.fit_options.items() if name not in _NOT_OF_FIT}
+        are_known = all(view.camera.focal_known for view in seen.views)
+        focal = given.setdefault("focal", "known" if are_known else "estimate")
+        if focal == "known" and not are_known:
+            fix = "give `focal` estimate, or a calibrated camera"
+            raise InputError("the focal length is unknown", where=f"{where}: camera", fix=fix)
+        prior = _prior_for(seen, note) if focal == "estimate" else None
+        if prior is not None:
+            shown = prior_of_camera(prior, seen.camera)
+            note(f"Focal length is estimated, its prior: {shown}")
+        given.setdefault("sigma", 1.0 if seen.sigma is None else seen.sigma)
+        with self._located(where, "fit"):
+            return FitOptions(**given | {"focal_prior": prior})
 
     def _fit_keypoints(self, seen: Observation, options: FitOptions) -> Result:
         """Fit a stretched model to the keypoints of one image."""
@@ -199,64 +174,197 @@ class ObservationFit:
 
         start = time.perf_counter()
         problem = pack_one(seen.points_3d, seen.points_2d, seen.camera)
-        ransac, scores = (self.ransac, seen.scores) if self.robust else (None, None)
+        ransac, scores = (RansacOptions(), seen.scores) if self.robust else (None, None)
         check_search(ransac, scores, seen.symmetry)
         with np.errstate(all="ignore"):
             search = (ransac, scores, seen.symmetry, start)
             return fit_one(problem, options, *search, seen.labels, seen.image)
 
-    def _align(self, observation: Observation, where: str, options: FitOptions) -> Result:
+    def _align(self, seen: Observation, where: str, options: FitOptions) -> Result:
         """Align all evidence of an observation."""
-        from cadalign.batch.observed import views_of
         from cadalign.estimation.align import align
 
-        model = self._model(observation, where, options)
-        has_photos = self.uses_photos(observation)
-        if has_photos and all(image.image is None for image in observation.views):
+        model, given = self._model(seen, where, options), seen.fit_options
+        has_photos = bool(given.get("image"))
+        if has_photos and all(image.image is None for image in seen.views):
             fix = "write its path as image into the file, or leave the option away"
             raise InputError("the observation names no photo", where="use_photo", fix=fix)
         with in_file(where):
-            stated = self.stated_sigma(observation)
-            views = views_of(observation, model, with_photos=has_photos, **stated)
+            stated = {"sigma": given["sigma"]} if "sigma" in given else {}
+            views = views_of(seen, model, with_photos=has_photos, **stated)
         with self._located(where):
             return align(
                 model,
                 views,
-                size=observation.size,
-                init=observation.init,
+                size=seen.size,
+                init=seen.init,
                 loss=options.loss,
                 loss_scale=options.loss_scale,
                 focal=options.focal,
                 focal_prior=options.focal_prior,
-                ransac=self.ransac if self.robust else None,
+                ransac=RansacOptions() if self.robust else None,
             )
 
-    def _model(
-        self, observation: Observation, where: str, options: FitOptions
-    ) -> Model | ShapeModel:
-        from cadalign.batch.observed import model_of
+    def _model(self, seen: Observation, where: str, options: FitOptions) -> Model | ShapeModel:
         from cadalign.io.meshes.files import mesh_at
 
-        if (shape := self.shape_of(observation)) is not None:
-            if observation.symmetry is not None:
+        if seen.shape is not None:
+            if seen.symmetry is not None:
                 what, place = "has no effect together with a learned shape", f"{where}: symmetry"
                 raise InputError(what, where=place, fix="leave out one of the two")
-            return opened_shape(shape)
-        mesh = None if observation.model is None else mesh_at(observation.model)
-        sigma = self.shape_sigma_of(observation)
+            return opened_shape(self.shape or seen.shape)  # as it was named
+        mesh = None if seen.model is None else mesh_at(seen.model)
+        sigma = seen.fit_options.get("shape_sigma")
         with self._located(where):
-            return model_of(observation, options=options, shape_sigma=sigma, mesh=mesh)
+            return model_of(seen, options=options, shape_sigma=sigma, mesh=mesh)
 
     @contextmanager
-    def _located(self, where: str) -> Iterator[None]:
-        """Let errors about arguments name the option, or else the observation."""
+    def _located(self, where: str, part: str = "") -> Iterator[None]:
+        """Let errors about arguments name the option, or else the observation, and its part."""
         try:
             yield
         except InputError as error:
-            if error.where in {field.name for field in (*fields(self), *fields(self.ransac))}:
+            if error.where in self.given:
                 raise
-            with in_file(where):
+            with in_file(where), within(part) if part else nullcontext():
                 raise
+
+
+def _is_plain(seen: Observation) -> bool:
+    """True where a stretched model is fitted to the keypoints of one image, and to nothing else."""
+    given = seen.fit_options
+    is_exact = seen.shape is None and given.get("shape_sigma") is None
+    return seen.is_plain and is_exact and not given.get("image")
+
+
+def model_of(
+    observation: Observation,
+    *,
+    options: FitOptions,
+    shape_sigma: float | None = None,
+    mesh: Mesh | None = None,
+) -> Model:
+    """The model of an observation's own keypoints, those of all its views.
+
+    Of the options the stretch and the prior on it count. Raises InputError if views
+    place the same keypoint at different points of the model.
+    """
+    from cadalign.estimation.model import Model  # not for help of a command
+
+    points: dict[Hashable, tuple[float, ...]] = {}
+    labels = own_ids(observation.views)
+    for number, (view, names) in enumerate(zip(observation.views, labels, strict=True)):
+        for row, (name, xyz) in enumerate(zip(names, view.points_3d.tolist(), strict=True)):
+            if points.setdefault(name, tuple(xyz)) != tuple(xyz):
+                raise InputError(
+                    f"differs from that of keypoint {name!r} in a view before",
+                    where=f"views[{number}].keypoints[{row}].xyz",
+                    fix="give the same point of the model",
+                )
+    return Model(
+        points_3d=list(points.values()),
+        ids=list(points),
+        mesh=mesh,
+        shape_sigma=shape_sigma,
+        stretch=options.stretch,
+        stretch_sigma=options.stretch_sigma,
+        symmetry=observation.symmetry,
+        up_axis=observation.up_axis,
+    )
+
+
+def views_of(
+    observation: Observation,
+    model: Model | ShapeModel,
+    *,
+    with_photos: bool = False,
+    **stated: Sigma | None,
+) -> tuple[View, ...]:
+    """Evidence of an observation's images about a model, at a stated ``sigma`` or at its own [px].
+
+    A learned shape's keypoints are found by semantic id or by name, as the shape has them; a sigma
+    is 1 where none is known. Photos themselves are evidence where these are asked for.
+
+    Raises InputError if the shape has no such keypoints, the observation has no ids or names, one
+    occurs twice, or what is said of an image is invalid; DataError if a file cannot be read.
+    """
+    from cadalign.estimation.view import View
+    from cadalign.shapes.model import ShapeModel
+
+    labels = own_ids(observation.views)
+    views = []
+    for number, image in enumerate(observation.views):
+        with within(f"views[{number}]") if observation.others else nullcontext():
+            ids = shape_ids(image, model) if isinstance(model, ShapeModel) else labels[number]
+            evidence = image.evidence.given
+            if image.depths is not None:
+                evidence["depth"] = image.depths
+            own = {"sigma": 1.0 if image.sigma is None else image.sigma}
+            view = View(
+                image.camera,
+                image.points_2d,
+                ids=ids,
+                scores=image.scores,
+                image=image.image if with_photos else None,
+                photo=image.image,
+                **evidence | own | stated,
+            )
+            views.append(view)
+    return tuple(views)
+
+
+def photo_doubt(image: ObservedImage) -> str | None:
+    """What is wrong with the size of an image's photo; None where there is none to be read."""
+    if image.image is None:
+        return None
+    with suppress(DataError):
+        size = photo_size(image.image)
+        known = {"its camera": (image.camera.width, image.camera.height), image.image.name: size}
+        try:
+            require_one_size(known, image.image)
+        except DataError as error:
+            return f"{error} (`Camera.resized`, `Camera.cropped`)"
+        return ""
+    return None
+
+
+def shape_ids(image: ObservedImage, shape: ShapeModel) -> tuple[KeypointId, ...]:
+    """The ids, or names, by which a learned shape knows an image's keypoints; see `views_of`."""
+    if not len(image.points_2d):
+        return ()
+    named = isinstance(shape.ids[0], str)
+    field, kind = ("name", "names") if named else ("semantic_id", "semantic ids")
+    given = image.names if named else image.ids
+    if given is None:
+        raise InputError(
+            f"the keypoints have no {field}",
+            where="keypoints",
+            fix=f"the shape of {shape.category} knows its keypoints by their {kind}",
+        )
+    ids = tuple(each if named else int(each) for each in given)
+    shape.rows(ids, where=f"keypoints.{field}")
+    return ids
+
+
+def own_ids(images: Sequence[ObservedImage]) -> tuple[tuple[Hashable, ...], ...]:
+    """Labels of the images' keypoints by which they are the same in several.
+
+    Ids or names where these distinguish all; otherwise numbers, in several images of equal ``xyz``.
+    """
+    for field in ("ids", "names"):
+        columns = [getattr(each, field) if len(each.points_2d) else () for each in images]
+        if all(column is not None and len(set(column)) == len(column) for column in columns):
+            return tuple(
+                tuple(each if isinstance(each, str) else int(each) for each in column)
+                for column in columns
+            )
+    if len(images) < 2:
+        return (tuple(range(len(images[0].points_2d))),)
+    numbers: dict[tuple[float, ...], int] = {}
+    return tuple(
+        tuple(numbers.setdefault(tuple(xyz), len(numbers)) for xyz in image.points_3d.tolist())
+        for image in images
+    )
 
 
 @once_per_file(4)
@@ -267,13 +375,19 @@ def opened_shape(path: Path) -> ShapeModel:
     return ShapeModel.open(path)
 
 
-def _prior_of_photos(observation: Observation, note: Note) -> FocalPrior | None:
-    """The prior of the first photo's EXIF data, unless those of another photo differ from it."""
-    images = [view.image for view in observation.views if view.image is not None]
+def _prior_for(seen: Observation, note: Note) -> PriorOption:
+    """The prior on a focal length: the stored one, or that of the photos, or of usual lenses.
+
+    Photos whose EXIF data differ tell none.
+    """
+    if "focal_prior" in seen.fit_options:
+        prior = seen.fit_options["focal_prior"]
+        return FocalPrior(**prior) if isinstance(prior, dict) else prior
+    images = [view.image for view in seen.views if view.image is not None]
     found = [prior for prior in map(FocalPrior.from_exif, images) if prior is not None]
     for other in found[1:]:
         if not found[0].is_like(other):
             focals = f"{found[0].focal:.4g} and {other.focal:.4g} px"
             note(f"The photos' EXIF data differ ({focals}): unused")
-            return None
-    return found[0] if found else None
+            return USUAL
+    return found[0] if found else USUAL

@@ -1,4 +1,4 @@
-"""Outputs of runs over many observations: their table, and pictures for the page.
+"""Outputs of runs over many observations: their tables, and pictures for the page.
 
 The table is ``results.parquet``, and ``results.csv`` without the columns that are lists;
 docs/how_to/many_photos.md describes the columns. Rows are in the order of the observations. Pose
@@ -9,23 +9,23 @@ from __future__ import annotations
 
 from collections import Counter
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import msgspec
+import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
-from cadalign.datasets.models.shapenet import name_of_synset
-from cadalign.errors import CadalignError, RenderError
+from cadalign.errors import CadalignError
 from cadalign.estimation.result import Result
 from cadalign.evaluation.benchmark import write_picture
 from cadalign.evaluation.instances.pictures import write_pictures, write_preview
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
-from cadalign.evaluation.runs.work import Columns, Row
+from cadalign.evaluation.runs.work import AbortError, Columns, Row
 from cadalign.export.results import RESULT_COLUMNS, row_of
 from cadalign.geometry.alignment import Box
 from cadalign.io.files import write_whole
@@ -33,16 +33,22 @@ from cadalign.io.images import read_image
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.model_overlay import mesh_of
 
-_LISTS: Columns = (
-    *(("covariance", list[float]), ("residuals", list[float]), ("is_inlier", list[bool])),
-)
 COLUMNS: Columns = (
     *(("row", int), ("source", str), ("image", str), ("object", str), ("model", str)),
     *RESULT_COLUMNS,
-    *_LISTS,
+    *(("covariance", list[float]), ("residuals", list[float]), ("is_inlier", list[bool])),
 )
 RECORD_COLUMNS: Columns = (("row", int), ("observation", str), ("result", str))
-"""Observation and result as JSON: all that pages, exports and `cadalign.Results.open` need."""
+"""As JSON the result, for pages and `cadalign.Results.open`, or the observation that has none."""
+WARNED = {"warning_kinds": "with warnings", "uncertain": "uncertain"}
+"""Columns that list what is said of a row, by name."""
+# Several times as fast as the standard library's; numbers that are not finite become null.
+_ENCODER = msgspec.json.Encoder(enc_hook=np.generic.item)
+
+
+def json_of(data: Any) -> bytes:
+    """Parsed JSON as one line; numbers and texts may be NumPy's."""
+    return _ENCODER.encode(data)
 
 
 def naming_row(row: int, source: str, observation: Observation | None) -> Row:
@@ -57,12 +63,17 @@ def naming_row(row: int, source: str, observation: Observation | None) -> Row:
 
 
 def result_row(result: Result) -> Row:
-    """The cells of a result, those that are lists, too."""
+    """The cells of a result, those that are lists, too, and its record.
+
+    The record is without its time, on which no two runs agree.
+    """
     row = row_of(result)
     row |= {"residuals": result.residuals.ravel().tolist(), "is_inlier": result.inliers.tolist()}
     if result.covariance is not None:
         row["covariance"] = result.covariance.ravel().tolist()
-    return row
+    data = result.to_dict()
+    data["stats"]["seconds"] = 0.0
+    return row | {"observation": "", "result": json_of(data).decode()}
 
 
 def write_csv(folder: RunFolder) -> None:
@@ -75,10 +86,6 @@ def write_csv(folder: RunFolder) -> None:
                 writer.write_table(without_lists(table))
 
     write_whole(folder.path / "results.csv", write)
-
-
-WARNED = {"warning_kinds": "with warnings", "uncertain": "uncertain"}
-"""Columns that list what is said of a row, by name."""
 
 
 def warnings_text(table: pa.Table) -> str:
@@ -103,24 +110,11 @@ NAMING = ("row", "source", "image", "object", "model", "match_category", "match_
 
 
 def page_names(row: Row) -> Row:
-    """Names of an observation on the page, unique by its number in the run, and of its model."""
-    known = row["image"] or row["source"]
-    parts = (Path(known).name, row["object"], f"row {row['row']}")
-    category, model = row.get("match_category"), row.get("match_id")
-    if not category or not model:
-        category, model = _names_of(Path(row["model"]))
-    name = ", ".join(filter(None, parts))
-    return {"category": category, "model_id": name, "view": 0, "model_name": model}
-
-
-def _names_of(model: Path) -> tuple[str, str]:
-    """Category and name of a model's or a shape's file: in ShapeNet's layout the folders'."""
-    for part, below in pairwise(model.parts):
-        category = name_of_synset(part)
-        if category != part:
-            return category, Path(below).stem
-    name = model.stem.removesuffix(".keypoints") or "no model"
-    return name, name
+    """Names of an observation on the page, unique by its number in the run."""
+    parts = Path(row["image"] or row["source"]).name, row["object"], f"row {row['row']}"
+    model = Path(row["model"]).stem.removesuffix(".keypoints") or "no model"
+    category = row.get("match_category") or model
+    return {"category": category, "model_id": ", ".join(filter(None, parts)), "view": 0}
 
 
 def draw_fit(
@@ -130,26 +124,27 @@ def draw_fit(
 
     Raises AbortError if a picture cannot be written, as on a full disk.
     """
-    camera = seen.camera if result is None else result.camera
-    names = page_names(row)
+    camera, names = seen.camera if result is None else result.camera, page_names(row)
     stem = record_stem(names["category"], names["model_id"])
-    troubles = []
-    photo = mesh = None
-    try:
-        photo = None if seen.image is None else read_image(seen.image, camera)
-    except CadalignError as error:
-        troubles.append(f"the photo is not shown: {error}")
-    try:
-        mesh = None if result is None else mesh_of(seen, result)
-    except CadalignError as error:
-        troubles.append(f"the model is shown as a box: {error}")
-    box = None if result is None else Box.from_model(result.bounds, result.alignment)
-    try:
-        if photo is not None:
+
+    def draw_photo() -> None:
+        if seen.image is not None:
+            box = None if result is None else Box.from_model(result.bounds, result.alignment)
             how = partial(write_pictures, observed=seen.points_2d, est_box=box)
-            write_picture(how, folder, stem, photo, camera)
+            write_picture(how, folder, stem, read_image(seen.image, camera), camera)
+
+    def draw_model() -> None:
+        mesh = None if result is None else mesh_of(seen, result)
         if mesh is not None:
             write_picture(write_preview, folder.previews / f"{stem}.json", mesh)
-    except RenderError as error:
-        troubles.append(f"not drawn: {error}")
+
+    troubles = []
+    drawn = {"the photo is not shown": draw_photo, "the model is shown as a box": draw_model}
+    for trouble, draw in drawn.items():
+        try:
+            draw()
+        except AbortError:
+            raise
+        except CadalignError as error:
+            troubles.append(f"{trouble}: {error}")
     return tuple(troubles)

@@ -9,25 +9,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-from cadalign.arrays import worker_count
-from cadalign.batch.experiment import Estimated, ManyOptions, plan_run
+from cadalign.batch.runs import Estimated, FitRunOptions
 from cadalign.batch.spec import SPEC as FIT_SPEC
-from cadalign.batch.spec import summarize_by
 from cadalign.datasets.models.model_keypoints import ModelKeypoints
-from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.runs.work import Columns
-from cadalign.evaluation.summary import median
 from cadalign.io.observation import Observation
 from cadalign.retrieval.query import ObservationRetrieval
 
-SCORE = Metric("match_score", "score", "%", 0, better="high", factor=100.0, log=False)
-NONE = Metric("none_probability", "none of these", "%", 0, factor=100.0, log=False)
-_SHOWN = (SCORE, NONE)
-
 
 @dataclass(frozen=True, kw_only=True)
-class RetrieveRunOptions(ManyOptions):
-    """A run that retrieves the models of many observations; see `ManyOptions`."""
+class RetrieveRunOptions(FitRunOptions):
+    """A run that retrieves the models of many observations; see `FitRunOptions`."""
 
     experiment: ClassVar[str] = "retrieve"
     command: ClassVar[str] = "retrieve"
@@ -37,19 +29,16 @@ class RetrieveRunOptions(ManyOptions):
         ("missing", int),
         *(("top_categories", list[str]), ("top_ids", list[str]), ("top_scores", list[float])),
     )
+    threads: ClassVar[int] = -1  # the search lets go of the interpreter lock
 
-    estimate: ObservationRetrieval
-
-    @property
-    def threads(self) -> int:
-        """The search lets go of the interpreter lock: a run without workers takes all cores."""
-        return worker_count(-1)
+    estimate: ObservationRetrieval  # type: ignore[assignment]
 
     @property
-    def learned(self) -> Path | None:
-        return self.estimate.shape
+    def files(self) -> tuple[Path | None, ...]:
+        named = self.changes.camera, self.detector.model
+        return *named, self.estimate.library, self.estimate.shape
 
-    def own_keypoints(self) -> ModelKeypoints:
+    def keypoints(self) -> ModelKeypoints:
         return self.estimate.opened()[0].keypoints
 
     def read(self, data: Any, where: str, *, folder: Path) -> Observation:
@@ -72,17 +61,10 @@ class RetrieveRunOptions(ManyOptions):
         }
         return best.observation(seen), best.result, cells
 
-    def check_files(self) -> None:
-        self.estimate.opened()
-
 
 SPEC = replace(
     FIT_SPEC,
     options=RetrieveRunOptions,
-    plan=plan_run,
-    columns=(*FIT_SPEC.columns[:3], *_SHOWN, *FIT_SPEC.columns[3:]),
-    summarize=summarize_by({metric.key: median(metric.key) for metric in _SHOWN}, by=()),
-    metrics=(*_SHOWN, *FIT_SPEC.metrics),
     topic="retrieved models",
     about="Red is the best match: its box and model, posed and stretched.",
 )

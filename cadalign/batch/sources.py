@@ -16,19 +16,15 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
-import msgspec
-
 from cadalign.datasets.detections.image_keypoints import ImageKeypoints
 from cadalign.datasets.detections.keypoint_files import read_image_keypoints
 from cadalign.errors import DataError
-from cadalign.evaluation.runs.work import fingerprint, fingerprint_of_files
 from cadalign.io.documents import read_json
 from cadalign.io.files import listed, open_input, read_bytes, read_text
 from cadalign.io.kinds import DETECTOR, LINES, OBSERVATION, TABLE, kind_of, refuse_other_file
-from cadalign.io.observation_file import named_files
 
-_INVALID = (msgspec.MsgspecError, UnicodeError, RecursionError)
-_CELLS = 3  # of a task: the number of its file, its own in it, and the byte where it begins
+_DAMAGED = "damaged"  # a file whose row says what is wrong with it
+_CELLS = 3  # of a task: the number of its source, its own in it, and the byte where it begins
 
 
 class ObservationTask(NamedTuple):
@@ -47,27 +43,28 @@ class ObservationTask(NamedTuple):
 class ObservationTasks(Sequence[ObservationTask]):
     """The observations of all inputs; of a file of lines it keeps where each begins.
 
-    Raises DataError if a file cannot be read, or an input holds no observation.
+    ``given`` are lines of observations that come from no file. Raises DataError if a file cannot be
+    read, or an input holds no observation.
     """
 
-    def __init__(self, inputs: Iterable[Path]) -> None:
-        self._files: list[Path] = []
+    def __init__(self, inputs: Iterable[Path], given: Iterable[bytes] = ()) -> None:
+        self._digest = hashlib.sha256()
+        self._sources: list[Path] = []
         self._cells = array("q")
-        self._objects: dict[int, list[tuple[str, ImageKeypoints | DataError]]] = {}
-        self._marks: list[str] = []
-        self._named: dict[Path, None] = {}
+        self._objects: dict[int, list[tuple[str, bytes | ImageKeypoints | DataError]]] = {}
+        self.has_detections = False
+        lines = [(f"observations[{number}]", line) for number, line in enumerate(given)]
+        if lines:
+            self._digest.update(b"\n".join(line for _, line in lines))
+            self._add_objects(Path("observations"), lines)
         for path in inputs:
-            for file, data in _files_of(path):
-                self._add(file, data)
+            for file, kind in _files_of(path):
+                self._add(file, kind)
 
     @property
-    def has_detections(self) -> bool:
-        """True where an input is a detector's file."""
-        return bool(self._objects)
-
     def fingerprint(self) -> str:
-        """A text that changes with the inputs, and with the photos, masks and meshes they name."""
-        return fingerprint("\n".join((*self._marks, fingerprint_of_files(self._named))))
+        """A text that changes with the inputs' content."""
+        return self._digest.hexdigest()
 
     def __len__(self) -> int:
         return len(self._cells) // _CELLS
@@ -77,97 +74,90 @@ class ObservationTasks(Sequence[ObservationTask]):
         if isinstance(rows, int):
             return self[rows : rows + 1][0]
         with ExitStack() as opened:
-            found: dict[int, BinaryIO] = {}
-            return [self._task(row, found, opened) for row in rows]
+            files: dict[int, BinaryIO] = {}
+            return [self._task(row, files, opened) for row in rows]
 
     def _task(self, row: int, files: dict[int, BinaryIO], opened: ExitStack) -> ObservationTask:
-        number, own, start = self._cells[_CELLS * row : _CELLS * (row + 1)]
-        path = self._files[number]
-        name: str = str(path)
-        content: Any = None
-        if number in self._objects:
-            name, content = self._objects[number][own]
+        source, own, start = self._cells[_CELLS * row : _CELLS * (row + 1)]
+        path = self._sources[source]
+        name = os.fspath(path)
+        content: str | bytes | ImageKeypoints | DataError
+        if source in self._objects:
+            name, content = self._objects[source][own]
         elif path.suffix.lower() in LINES:
-            if number not in files:
-                files[number] = opened.enter_context(open_input(path))
-            files[number].seek(start)
-            name, content = f"{path}, line {own}", files[number].readline()
+            if source not in files:
+                files[source] = opened.enter_context(open_input(path))
+            files[source].seek(start)
+            name, content = f"{name}, line {own}", files[source].readline()
         else:
             try:
                 content = read_text(path)
             except DataError as error:
                 content = error
-        return ObservationTask(row, name, content, str(path.absolute().parent))
+        return ObservationTask(row, name, content, os.path.dirname(os.path.abspath(path)))
 
-    def _add(self, path: Path, data: Any) -> None:
-        number, suffix = len(self._files), path.suffix.lower()
-        self._files.append(path)
-        if suffix in LINES:
-            self._add_lines(number, path)
-        elif suffix == TABLE or kind_of(data) == DETECTOR:
+    def _add(self, path: Path, kind: str | None) -> None:
+        if path.suffix.lower() in LINES:
+            self._add_lines(path)
+            return
+        with suppress(DataError):  # which the task's row says
+            self._digest.update(read_bytes(path))
+        if kind == DETECTOR:
             # Which memory holds whole; objects that cannot be read come last.
             bad: dict[str, DataError] = {}
             good = read_image_keypoints(path, problems=bad)
-            self._objects[number] = [*((each.source, each) for each in good), *bad.items()]
-            self._marks.append(fingerprint(read_bytes(path)))
-            for own in range(len(self._objects[number])):
-                self._cells.extend((number, own, 0))
+            self._add_objects(path, [*((each.source, each) for each in good), *bad.items()])
+            self.has_detections = True
         else:
-            self._marks.append(fingerprint_of_files([path]))
-            self._cells.extend((number, 0, 0))
-            self._named.update(dict.fromkeys(named_files(data, path.parent)))
+            self._cells.extend((len(self._sources), 0, 0))
+            self._sources.append(path)
 
-    def _add_lines(self, number: int, path: Path) -> None:
+    def _add_objects(self, path: Path, objects: list[tuple[str, Any]]) -> None:
+        for own in range(len(objects)):
+            self._cells.extend((len(self._sources), own, 0))
+        self._objects[len(self._sources)] = objects
+        self._sources.append(path)
+
+    def _add_lines(self, path: Path) -> None:
         """Find where the lines of a file begin; empty ones are passed over."""
-        place, digest, before = 0, hashlib.sha256(), len(self._cells)
+        place, before = 0, len(self._cells)
         with open_input(path) as file:
             for own, line in enumerate(file, start=1):
                 mark = len(BOM_UTF8) if own == 1 and line.startswith(BOM_UTF8) else 0
                 if line[mark:].strip():  # behind the mark that programs of Windows write
-                    self._cells.extend((number, own, place + mark))
-                    with suppress(*_INVALID):  # whoever reads it says so
-                        named = named_files(msgspec.json.decode(line[mark:]), path.parent)
-                        self._named.update(dict.fromkeys(named))
+                    self._cells.extend((len(self._sources), own, place + mark))
                 place += len(line)
-                digest.update(line)
+                self._digest.update(line)
         if len(self._cells) == before:
             raise DataError("the file holds no observation", where=str(path))
-        self._marks.append(digest.hexdigest())
+        self._sources.append(path)
 
 
-def _files_of(path: Path) -> Iterator[tuple[Path, Any]]:
-    """The files of an input; with those of JSON their content, None if it is damaged."""
-    suffix = path.suffix.lower()
-    if os.path.isdir(path):  # also of a name that no file can have
-        yield from _files_in(path)
-    elif suffix in (*LINES, TABLE):
-        yield path, None
-    else:
-        data = _content(path)
-        if kind_of(data) not in (DETECTOR, OBSERVATION):
+def _files_of(path: Path) -> Iterator[tuple[Path, str | None]]:
+    """The files of an input with their kinds; of a folder's JSON files those of observations."""
+    if not os.path.isdir(path):  # also of a name that no file can have
+        kind = _kind_of(path)
+        if kind not in (DETECTOR, OBSERVATION):
             refuse_other_file(path, OBSERVATION)
-        yield path, data
-
-
-def _files_in(folder: Path) -> Iterator[tuple[Path, Any]]:
-    """The observations of a folder, whose other JSON files are passed over."""
+        yield path, kind
+        return
     is_empty = True
-    for path in listed(folder):
-        suffix = path.suffix.lower()
-        if not path.is_file() or suffix not in (".json", *LINES):
-            continue
-        data = _content(path) if suffix == ".json" else None
-        if data is None or kind_of(data) == OBSERVATION:
-            is_empty = False
-            yield path, data
+    for each in listed(path):
+        if each.suffix.lower() in (".json", *LINES) and each.is_file():
+            kind = _kind_of(each)
+            if kind in (OBSERVATION, _DAMAGED):
+                is_empty = False
+                yield each, kind
     if is_empty:
         fix = "`cadalign annotate` and `cadalign observe` write them"
-        raise DataError("the folder holds no observation", where=str(folder), fix=fix)
+        raise DataError("the folder holds no observation", where=str(path), fix=fix)
 
 
-def _content(path: Path) -> Any:
-    with suppress(DataError, *_INVALID):
-        return msgspec.json.decode(read_bytes(path))
-    with suppress(DataError):
-        return read_json(path)  # slower, but knows the NaN that Python's JSON has
-    return None
+def _kind_of(path: Path) -> str | None:
+    suffix = path.suffix.lower()
+    if suffix in (*LINES, TABLE):
+        return DETECTOR if suffix == TABLE else OBSERVATION
+    try:
+        return kind_of(read_json(path))
+    except DataError:
+        return _DAMAGED

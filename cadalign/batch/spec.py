@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Self
 
 import msgspec
 import numpy as np
 import pyarrow as pa
 
-from cadalign.batch.experiment import FitRunOptions, plan_run
 from cadalign.batch.outputs import COLUMNS as TABLE_COLUMNS
 from cadalign.batch.outputs import NAMING, RECORD_COLUMNS, page_names, warnings_text, without_lists
+from cadalign.batch.runs import FitRunOptions, plan_run
 from cadalign.errors import DataError
 from cadalign.estimation.result import Result
 from cadalign.evaluation import metrics
@@ -25,29 +25,18 @@ from cadalign.evaluation.plots import Plot, cumulative_curves
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.runs.work import FAILED, Columns, Outcome, Row
-from cadalign.evaluation.summary import (
-    Summary,
-    mean,
-    medians,
-    milliseconds,
-    summarize,
-)
+from cadalign.evaluation.summary import mean, medians, milliseconds, summarize
 from cadalign.geometry.alignment import extent
 from cadalign.io.observation import Observation
-
-if TYPE_CHECKING:
-    from cadalign.evaluation.summary import Statistics
 
 METHOD = "alignment"
 """Name of the estimate on the page, the same in all runs, such that they can be compared."""
 ROTATION_STD = Metric("rotation_std_deg", "rotation uncertainty", "deg", head="R std. dev.")
-DISTANCE_STD = Metric(
-    "distance_std", "distance uncertainty", "%", factor=100.0, head="distance std. dev."
-)
-"""Standard deviation of the translation's depth over that depth."""
 WARNINGS = Metric("warning_count", "warnings", digits=1, log=False)
-MATCHED = Metric("matched", "keypoints kept", "%", 0, better="high", factor=100.0, log=False)
-_GALLERY = (metrics.RMS, ROTATION_STD, DISTANCE_STD, WARNINGS, MATCHED)
+INLIERS = Metric("inliers", "keypoints kept", digits=1, better="high", log=False)
+SCORE = Metric("match_score", "score", "%", 0, better="high", factor=100.0, log=False)
+NONE = Metric("none_probability", "none of these", "%", 0, factor=100.0, log=False)
+_GALLERY = (SCORE, NONE, metrics.RMS, ROTATION_STD, WARNINGS, INLIERS)  # a fit has no score
 _HEADLINE = (
     *(metrics.INSTANCES, metrics.FAILED, metrics.KEYPOINTS),
     *_GALLERY,
@@ -68,26 +57,20 @@ class FitRun(Run):
 
     def records(self, columns: Columns) -> Iterator[Row]:
         """The records of the observations that could be read, made of their stored results."""
-        table = self.results.select(["category", "model_id", "view", "reason"])
-        places = {row: place for place, row in enumerate(self.results["row"].to_pylist())}
+        names = self.results.select(["row", "category", "model_id", "view", "reason"]).to_pylist()
+        of_row = {each.pop("row"): each for each in names}
         for stored in super().records(RECORD_COLUMNS):
-            if stored["observation"]:
-                (names,) = table.slice(places[stored["row"]], 1).to_pylist()
-                yield _record(stored, names | {"method": METHOD})
+            if stored["observation"] or stored["result"]:
+                yield _record(stored, of_row[stored["row"]] | {"method": METHOD})
 
 
 def _as_instances(table: pa.Table) -> pa.Table:
-    """The table of results with the names of instances, and the numbers of the gallery."""
+    """The table of results with the names of instances, the estimates of all by one name."""
     shown = without_lists(table)
     naming = [name for name in NAMING if name in shown.column_names]
     names = [page_names(row) for row in shown.select(naming).to_pylist()]
-    for name in ("category", "model_id", "view", "model_name"):
+    for name in ("category", "model_id", "view"):
         shown = shown.append_column(name, pa.array([each[name] for each in names]))
-    inliers, keypoints, std, depth = (
-        shown[name].to_numpy().astype(float) for name in ("inliers", "keypoints", "tz_std", "tz")
-    )
-    shown = shown.append_column(MATCHED.key, pa.array(inliers / np.maximum(keypoints, 1)))
-    shown = shown.append_column(DISTANCE_STD.key, pa.array(std / np.abs(depth)))
     place = shown.schema.get_field_index("method")
     return shown.set_column(place, "method", pa.array([METHOD] * len(shown), pa.string()))
 
@@ -130,11 +113,6 @@ _STATISTICS = {
 }
 
 
-def summarize_by(further: Statistics, **groups: Any) -> Callable[[Run], list[Summary]]:
-    """Medians for every category, and for all, or for other groups, with further statistics."""
-    return partial(summarize, statistics={**_STATISTICS, **further}, **groups)
-
-
 def _plots(runs: Sequence[Run]) -> list[Plot]:
     curves = [(metric, _PLACES) for metric in (metrics.RMS, ROTATION_STD)]
     return cumulative_curves(runs, curves=curves, of="of the observations")
@@ -142,9 +120,10 @@ def _plots(runs: Sequence[Run]) -> list[Plot]:
 
 def _describe(run: Run) -> str:
     inputs = [Path(each).name for each in run.config.get("inputs", ())]
-    listed = ", ".join(inputs[:3]) + (f" and {len(inputs) - 3} more" if len(inputs) > 3 else "")
+    more = f" and {len(inputs) - 3} more" if len(inputs) > 3 else ""
+    listed = f" of {', '.join(inputs[:3])}{more}" if inputs else ""
     said = warnings_text(run.results)
-    return f"on {run.total:,} observations of {listed}" + (f"; {said}" if said else "")
+    return f"on {run.total:,} observations{listed}" + (f"; {said}" if said else "")
 
 
 SPEC = Spec(
@@ -153,7 +132,7 @@ SPEC = Spec(
     results=TABLE_COLUMNS,
     run=FitRun,
     columns=_HEADLINE,
-    summarize=summarize_by({}),
+    summarize=partial(summarize, statistics=_STATISTICS, by=()),
     plots=_plots,
     topic="alignments",
     joins=True,
@@ -162,7 +141,7 @@ SPEC = Spec(
     about="Red is the estimate: its box, and the model warped to the estimated shape.",
     note=(
         "Medians over the observations that did not fail; of keypoints and warnings the mean. "
-        "Uncertainties are the stated standard deviations, those of the distance relative. No "
-        "truth is known here: a small residual alone does not tell that an alignment is right."
+        "Uncertainties are the stated standard deviations. No truth is known here: a small "
+        "residual alone does not tell that an alignment is right."
     ),
 )

@@ -14,7 +14,6 @@ from cadalign.batch.observation_fit import ObservationFit
 from cadalign.cli.common import answer, beside, make_folder, say, waiting
 from cadalign.cli.options import CameraOptions, ManyCommand, named_as_flags
 from cadalign.errors import InputError, refuse_unused
-from cadalign.estimation.options import FitOptions
 from cadalign.io.documents import read_json
 from cadalign.io.files import keeping, write_text
 from cadalign.io.kinds import OBSERVATION, is_of_many
@@ -46,22 +45,13 @@ class Fit(ManyCommand, ObservationFit, CameraOptions):
     focal: Literal["known", "estimate"] | float | None = None  # type: ignore[assignment]
     """Focal length [px], in the place of the file's, or: known (the file's) or estimate; by default
     known, if every view has one. Views of equal cameras share an estimated one."""
-    loss: str = FitOptions.loss
-    """Loss on the length of a residual: linear (squared), huber or cauchy; the robust ones tolerate
-    outliers."""
-    method: str = FitOptions.method
-    """Solver: optimal (maximum likelihood, searched globally), aepnp (linear), aepnp-paper (linear,
-    as published) or epnp (OpenCV's, without stretch)."""
-    stretch: str | None = None
-    """Axes whose scale is estimated: yz by default; y, z or none."""
 
     @property
     def estimate(self) -> ObservationFit:
         """The options of the estimate."""
         given = {each.name: getattr(self, each.name) for each in fields(ObservationFit)}
         given["focal"] = self.focal if isinstance(self.focal, str) else None
-        fitting = FitOptions(method=self.method, loss=self.loss, stretch=self.stretch)
-        return ObservationFit(**given | {"fitting": fitting})
+        return ObservationFit(**given)
 
     def run(self) -> int:
         """Run the fit, or the fits; returns the exit code."""
@@ -73,7 +63,9 @@ class Fit(ManyCommand, ObservationFit, CameraOptions):
         with named_as_flags(self):
             data = read_json(path, OBSERVATION) if data is None else data
             how = self.estimate
+            how.check()
             seen = how.read(data, str(path), folder=path.parent, changes=self.changes)
+            seen = how.changed(seen)
             self.refuse_of_many()
             if self.overlay is not None and seen.shape is None and seen.model is None:
                 fix = "give the file's `model` a mesh, or leave out the option"
@@ -107,7 +99,7 @@ class Fit(ManyCommand, ObservationFit, CameraOptions):
 
     def _fit_many(self) -> int:
         """Align all observations; returns the exit code."""
-        from cadalign.batch.experiment import FitRunOptions
+        from cadalign.batch.runs import FitRunOptions
         from cadalign.cli.runs import inputs_of, run_command
 
         with named_as_flags(self):

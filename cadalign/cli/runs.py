@@ -26,7 +26,7 @@ from cadalign.io.observation import DetectorOptions
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from cadalign.batch.experiment import ManyOptions
+    from cadalign.batch.runs import FitRunOptions
     from cadalign.cli.options import ManyCommand
     from cadalign.evaluation.registry import Spec
     from cadalign.evaluation.runs.engine import Progress as RunProgress
@@ -110,7 +110,7 @@ def run_progress(label: str) -> Iterator[Callable[[RunProgress], None]]:
 
 
 def inputs_of(command: Any) -> dict[str, Any]:
-    """The fields of `ManyOptions` that a command states."""
+    """The fields of `FitRunOptions` that a command states."""
     names = DetectorOptions.__dataclass_fields__
     return {
         "inputs": command.observations,
@@ -120,15 +120,15 @@ def inputs_of(command: Any) -> dict[str, Any]:
     }
 
 
-def run_command(command: ManyCommand, options: ManyOptions, *, done: str) -> int:
+def run_command(command: ManyCommand, options: FitRunOptions, *, done: str) -> int:
     """Do the run of a command; returns the exit code, 3 where some observations have failed.
 
     ``done`` is what was done to those that have not. The reasons of failures are said.
     """
     import pyarrow.parquet as pq
 
-    from cadalign.batch.fits import run_many
     from cadalign.batch.outputs import WARNED, warnings_text, without_lists
+    from cadalign.batch.runs import run_many
 
     folder = run_folder(command, options)
     with run_progress(options.experiment) as on_progress:
@@ -192,7 +192,7 @@ def _say_reasons(reasons: Sequence[tuple[str, int]], *, most: int = _MOST_REASON
         say(f"failed {sum(count for _, count in rest):,}: {others}")
 
 
-def run_folder(command: ManyCommand, options: ManyOptions) -> RunFolder:
+def run_folder(command: ManyCommand, options: FitRunOptions) -> RunFolder:
     """The run's folder, by default beside the first input."""
     from cadalign.evaluation.runs.folder import RunFolder
 

@@ -12,6 +12,7 @@ and then adds distortion: OpenCV's model with k1, k2, p1, p2, k3 to k6, or that 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from functools import lru_cache
 from typing import Literal, get_args
@@ -73,8 +74,9 @@ def unmeasured(points_2d: FloatArray, *, least: int = _SEVERAL) -> BoolArray:
         bad |= here
     known = points_2d[~bad]
     if len(known) >= _CROWD and np.ptp(known, axis=0).max() >= _CROWDED_SPAN:
-        _, of, counts = np.unique(known, axis=0, return_inverse=True, return_counts=True)
-        bad[~bad] = counts[of.reshape(-1)] >= _CROWD
+        rows = list(map(tuple, known.tolist()))
+        times = Counter(rows)
+        bad[~bad] = [times[row] >= _CROWD for row in rows]
     return np.asarray(bad)
 
 

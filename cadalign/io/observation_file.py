@@ -5,7 +5,7 @@ The format is described in docs/formats/observation.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -147,17 +147,6 @@ def read_fields(data: Any) -> tuple[ObservationFields, Sequence[ViewFields]]:
         what = f"{len(sigma)} numbers for {len(read.keypoints)} keypoints"
         raise DataError(what, where="fit.sigma", fix="give one for each, or one for all")
     return read, (read,)
-
-
-def named_files(data: Any, folder: Path) -> Iterator[Path]:
-    """Photos, masks and meshes that an observation names, in its parsed form, valid or not."""
-    given = data if isinstance(data, Mapping) else {}
-    views = given.get("views")
-    for part in (given, *(views if isinstance(views, list) else ())):
-        for name in ("image", "model", "shape", *_PATHS):
-            path = part.get(name) if isinstance(part, Mapping) else None
-            if isinstance(path, str) and path:
-                yield path_from(path, folder)
 
 
 def read_image_fields(

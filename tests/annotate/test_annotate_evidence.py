@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.annotating import Case, agree_with_fit, place_all
 
-from cadalign import Size, Symmetry
+from cadalign import Size
 from cadalign.annotate.actions import perform
 from cadalign.annotate.page_state import page_state
 from cadalign.errors import CadalignError
@@ -100,14 +100,6 @@ def test_evidence_is_kept_used_as_by_fit_and_named(
         assert words.get(piece, piece) in shown["also_used"]
     assert shown["facts"]
     assert shown["box"]
-
-
-def test_the_symmetry_of_a_file_is_kept(case: Case) -> None:
-    given = replace(observed(case, "up"), symmetry=Symmetry.around((0, 1, 0), fold=2))
-    given.save(case.observation)
-    before = stored(case)["symmetry"]
-    perform(case.open(), 0, {"do": "move", "pair": 1, "uv": [200, 200]})
-    assert stored(case)["symmetry"] == before
 
 
 def test_evidence_outlives_the_last_pair(case: Case) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import http.client
 import json
 import re
-import shutil
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -116,46 +115,7 @@ def test_folder_keeps_annotators_of_its_photos_out(
     assert [path.name for path in out.iterdir()] == [".annotate-lock"]
 
 
-def test_what_cannot_be_saved_is_said_at_the_end(case: Case) -> None:
-    out = case.folder / "out"
-    with annotator(case, case.photo, "--out", out) as first:
-        first.act({"do": "place_uv", "uv": [10, 20]})
-        shutil.rmtree(out)
-        state = first.act({"do": "place_uv", "uv": [30, 40]})
-        assert state["saved"]["trouble"].startswith(f"{out}/")
-        code, err = first.end()
-    assert code == 1
-    assert err.strip().splitlines()[-1].startswith(f"Not saved: {out}/")
-
-
-@pytest.mark.skipif(not Path("/sys/kernel").is_dir(), reason="no folder that refuses all users")
-def test_folder_that_cannot_be_written_to_is_refused_before_any_work(
-    case: Case, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = Path("/sys/kernel")
-    message = second(case, capsys, case.photo, "--out", out)
-    assert re.fullmatch(
-        r"/sys/kernel: cannot be written \(.+\); make room or choose another folder; .+",
-        message,
-    )
-
-
 # --- several photos, several tabs --------------------------------------------------------------
-
-
-def test_photos_that_could_not_be_saved_are_saved_with_the_next(case: Case) -> None:
-    shutil.copy(case.photo, case.folder / "z.png")
-    out = case.folder / "out"
-    out.mkdir()
-    session = case.open(image=case.folder, out=out)
-    shutil.rmtree(out)
-    place(session, 0, [10, 20], image=0)
-    assert page_state(session, 0)["saved"]["trouble"].startswith(str(out))
-    out.mkdir()
-    place(session, 1, [30, 40], image=1)
-    assert Observation.load(out / "photo.json").points_2d.tolist() == [[10, 20]]
-    assert Observation.load(out / "z.json").points_2d.tolist() == [[30, 40]]
-    assert page_state(session, 0)["saved"]["trouble"] == ""
 
 
 def test_pairs_of_a_renamed_photo_go_on(case: Case) -> None:

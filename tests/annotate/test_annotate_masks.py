@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,15 +16,12 @@ from support.annotating import (
     place_all,
 )
 
-from cadalign import ShapeModel
 from cadalign.annotate.actions import perform
 from cadalign.annotate.page_state import page_state
-from cadalign.datasets import KeypointNet
 from cadalign.errors import CadalignError
 from cadalign.io.images import read_grey, write_image
 from cadalign.metrics import rotation_error
 from cadalign.render import cast_geometry
-from cadalign.shapes.examples import Example
 
 pytestmark = pytest.mark.long
 
@@ -112,19 +108,6 @@ def test_box_is_cut_out(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
     np.testing.assert_array_equal(session.annotation(0).mask, found | box(20, 20))
 
 
-def test_a_mask_that_was_taken_from_the_file_does_not_come_back(case: Case) -> None:
-    session = case.open(prepared=False)
-    place_all(session, case, count=4)
-    draw_mask(session, box(200, 200))
-    assert case.open(prepared=False).photos[0].marks.mask is not None
-    data = json.loads(case.observation.read_text())
-    assert data.pop("mask") == "photo.mask.png"
-    case.observation.write_text(json.dumps(data))
-    again = case.open(prepared=False)
-    assert again.photos[0].marks.mask is None
-    assert len(again.photos[0].marks.pairs) == 4
-
-
 def test_a_mask_of_another_size_is_said_and_kept_out(case: Case) -> None:
     session = case.open()
     place_all(session, case, count=6)
@@ -135,18 +118,6 @@ def test_a_mask_of_another_size_is_said_and_kept_out(case: Case) -> None:
     assert "32 x 24" in message
     with pytest.raises(CadalignError, match="the mask has 32 x 24 pixels, the photo 640 x 480"):
         _ = again.photos[0].mask
-
-
-def test_a_mask_of_noise_keeps_no_server_busy(case: Case) -> None:
-    session = case.open()
-    place_all(session, case, count=6)
-    noise = np.random.default_rng(0).uniform(size=(480, 640)) < 0.5
-    draw_mask(session, noise)
-    shown = page_state(session, 0)["alignment"]
-    assert shown["status"] == "none"
-    assert "photo.png.mask: has a contour of 56," in shown["message"]
-    perform(session, 0, {"do": "undo"})
-    assert page_state(session, 0)["alignment"]["status"] == "done"
 
 
 def test_a_mask_of_others_is_not_written_over(case: Case) -> None:
@@ -181,27 +152,6 @@ def test_a_mask_alone_is_aligned(case: Case, capsys: pytest.CaptureFixture[str])
     live = session.live(session.photos[0])
     assert rotation_error(est=live.result.alignment, gt=truth) < 0.5
     agree_with_fit(session, case, capsys, rtol=1e-6)
-
-
-@pytest.mark.parametrize("own", ["shape", "shape_sigma"])
-def test_a_mask_alone_does_not_align_an_own_shape(case: Case, sample_root: Path, own: str) -> None:
-    if own == "shape":
-        model, rng = KeypointNet(sample_root)["chair", "sample_chair_000"], np.random.default_rng(0)
-        ids, points = model.keypoints.ids.tolist(), model.keypoints.xyz
-        bounds, noises = model.load_mesh().bounds, rng.normal(0, 1e-3, (4, *points.shape))
-        examples = [
-            Example(str(k), ids, points + each, bounds, model.mesh_path)
-            for k, each in enumerate(noises)
-        ]
-        path = case.folder / "chair.shape"
-        ShapeModel.learn(examples, category="chair", up_axis="y").save(path)
-        session = case.open(shape=path)
-    else:
-        session = case.open(shape_sigma=0.06)
-    draw_mask(session, true_mask(case))
-    alignment = page_state(session, 0)["alignment"]
-    assert alignment["status"] == "none"
-    assert alignment["message"].startswith("3 more pairs to the first alignment")
 
 
 def test_few_pairs_beside_a_mask_wait(case: Case, capsys: pytest.CaptureFixture[str]) -> None:

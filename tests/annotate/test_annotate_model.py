@@ -98,12 +98,6 @@ def test_display_bytes_hold_triangles_normals_and_colours() -> None:
     np.testing.assert_allclose(model.from_display(edges), model.wireframe.creases, atol=1e-6)
 
 
-def test_of_faces_in_one_place_one_is_shown() -> None:
-    faces = [[0, 1, 2], [0, 2, 3], [2, 1, 0], [1, 2, 0]]
-    model = ClickableModel(Mesh(SQUARE, faces))
-    assert np.frombuffer(model.display_bytes[:4], "<u4") == 2
-
-
 @pytest.mark.long
 def test_half_a_million_faces_are_shown_decimated_and_picked_exactly() -> None:
     mesh = sphere(500, dent=0.1)

@@ -51,13 +51,6 @@ def test_every_photo_of_a_folder_keeps_its_own_pairs(case: Case) -> None:
     assert ModelKeypoints.load(folder / "sample_chair_000.keypoints.json").keypoints
 
 
-@pytest.mark.parametrize("option", ["image", "model", "camera", "keypoints", "observation"])
-def test_names_too_long_for_a_file_are_refused(case: Case, option: str) -> None:
-    path = case.folder / ("n" * 300 + ".ply")
-    message = refusal_text(lambda: case.open(**{option: path}))
-    assert message.startswith(str(path.with_suffix("")))
-
-
 @pytest.mark.parametrize("option", ["image", "model"])
 def test_names_with_no_room_for_an_ending_are_refused(case: Case, option: str) -> None:
     source = case.photo if option == "image" else case.model
@@ -143,22 +136,3 @@ def test_observation_of_another_photo_is_refused_by_name(case: Case) -> None:
         f"{case.observation}: belongs to the photo photo.png, not other.png; "
         "give another --observation, or correct the field image in this one"
     )
-
-
-@pytest.mark.long
-def test_names_that_are_not_utf_8(case: Case, caplog: pytest.LogCaptureFixture) -> None:
-    folder = case.folder / "photos"
-    folder.mkdir()
-    shutil.copy(case.photo, folder / "a.png")
-    odd = folder / os.fsdecode(b"caf\xe9.png")
-    try:
-        shutil.copy(case.photo, odd)
-    except OSError:
-        pytest.skip("this file system has no such names")
-    session = case.open(image=folder, prepared=False)
-    assert [each.photo.path.name for each in session.photos] == ["a.png"]
-    assert r"caf\udce9.png': the path is not UTF-8; rename it" in caplog.text
-    assert "the path is not UTF-8; rename it" in refusal_text(lambda: case.open(image=odd))
-    model = folder / os.fsdecode(b"caf\xe9.ply")
-    shutil.copy(case.model, model)
-    assert "the path is not UTF-8; rename it" in refusal_text(lambda: case.open(model=model))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -251,25 +250,6 @@ def test_keys_nudge_select_suggest_and_delete(opened: Driver, case: Case) -> Non
     expect(page.locator("dialog")).not_to_be_visible()
 
 
-def test_both_views_can_be_used_by_the_keyboard_alone(opened: Driver) -> None:
-    driver = opened
-    page = driver.page
-    page.locator("section[aria-label=Photo] canvas").focus()
-    page.keyboard.press("+")
-    page.keyboard.press("Enter")
-    state = driver.wait_for_state(lambda state: len(state["pairs"]) == 1)
-    middle = page.evaluate("annotator.photo.toPixel(annotator.photo.middle)")
-    np.testing.assert_allclose(state["pairs"][0]["uv"], middle)
-    page.locator("section[aria-label=Model] canvas").focus()
-    eye = "annotator.model.stage.camera.position.toArray()"
-    before = page.evaluate(eye)
-    page.keyboard.press("ArrowLeft")
-    page.keyboard.press("ArrowUp")
-    driver.wait(f"{eye}.some((value, i) => Math.abs(value - {before}[i]) > 1e-5)")
-    page.get_by_label("Keypoints of the model that are not marked").select_option(index=1)
-    driver.wait_for_state(lambda state: state["pairs"][0]["keypoint"] is not None)
-
-
 def test_wheel_and_drag_zoom_and_pan_without_placing(opened: Driver) -> None:
     driver = opened
     page = driver.page
@@ -374,23 +354,6 @@ def test_shape_is_drawn_and_an_unknown_point_identified(browser: Browser, case: 
         choice.select_option(f"keypoint {ids[-1]}")
         driver.wait_for_state(lambda state: state["pairs"][4]["counts"])
         expect(choice).to_have_count(0)
-
-
-def test_an_answer_that_takes_long_is_waited_for_in_sight(
-    opened: Driver, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    driver = opened
-    released = threading.Event()
-
-    def late(*given: Any, **options: Any) -> Any:
-        released.wait(60)
-        return perform(*given, **options)
-
-    monkeypatch.setattr("cadalign.annotate.server.perform", late)
-    driver.page.evaluate("void annotator.act({ do: 'delete', pair: 9 }).catch(() => null)")
-    driver.wait("annotator.layout.status.textContent === 'Working…'")
-    released.set()
-    driver.wait("annotator.idle && annotator.layout.status.textContent.includes('no pair 9')")
 
 
 # --- what stands beside the photo ------------------------------------------------------------

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from PIL import Image
@@ -110,17 +107,3 @@ def test_fit_finds_what_the_page_does_of_a_similar_model_with_its_outline(
     else:
         perform(session, 0, {"do": "use_photo", "on": True})
     agree_with_fit(session, case, capsys)
-
-
-def test_an_estimated_focal_length_has_square_pixels_as_in_fit(
-    case: Case, capsys: pytest.CaptureFixture[str]
-) -> None:
-    calibrated = case.instance.camera
-    case.camera.write_text(json.dumps(replace(calibrated, fy=1.1 * calibrated.fx).to_dict()))
-    session = case.open()
-    place_all(session, case)
-    perform(session, 0, {"do": "focal", "pixels": None})
-    agree_with_fit(session, case, capsys)
-    result = session.live(session.photos[0]).result
-    assert result is not None
-    assert result.camera.fy == result.camera.fx

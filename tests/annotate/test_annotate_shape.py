@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from support.annotating import Case, agree_with_fit, place, place_all
+from support.annotating import Case, agree_with_fit, place_all
 
 from cadalign import CadalignError, ShapeModel
 from cadalign.annotate.actions import perform
@@ -97,23 +95,6 @@ def test_page_shows_box_lines_keypoints_and_regions(case: Case, shape_file: Path
     assert labels[:5] == [*(f"Length {axis}" for axis in "xyz"), "Rotation", "Distance"]
 
 
-def test_three_pairs_give_an_estimate_that_more_make_certain(case: Case, shape_file: Path) -> None:
-    session = case.open(shape=shape_file)
-    known = [click for click in case.clicks if click[0] in ShapeModel.open(shape_file).ids]
-    for keypoint, uv in known[:2]:
-        place(session, keypoint, uv)
-    assert page_state(session, 0)["alignment"]["message"].startswith("1 more pair to the first")
-    place(session, *known[2])
-    few = page_state(session, 0)
-    assert few["suggestion"]["keypoint"] not in [keypoint for keypoint, _ in known[:3]]
-    for keypoint, uv in known[3:]:
-        place(session, keypoint, uv)
-    regions = [np.ptp(np.reshape(r, (-1, 2)), axis=0).max() for r in few["alignment"]["regions"]]
-    many = page_state(session, 0)["alignment"]
-    shrunk = [np.ptp(np.reshape(r, (-1, 2)), axis=0).max() for r in many["regions"]]
-    assert max(shrunk) < 0.5 * max(regions)
-
-
 def test_warp_carries_points_that_the_shape_lacks(case: Case, shape_file: Path) -> None:
     """They don't count, are shown with where the warp puts them, and are not lost."""
     session = case.open(shape=shape_file)
@@ -158,25 +139,6 @@ def test_points_of_the_model_can_be_identified(
     assert not page_state(session, 0)["pairs"][0]["counts"]
 
 
-def test_shape_of_named_keypoints(
-    case: Case, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    keypoints = ModelKeypoints.load(case.keypoints)
-    named = replace(
-        keypoints,
-        keypoints=tuple(replace(each, semantic_id=None) for each in keypoints.keypoints),
-    )
-    named.save(case.keypoints)
-    path = tmp_path / "named.shape"
-    learn(named.xyz, list(named.names)).save(path)
-    session = case.open(shape=path)
-    by_name = {point.name: number for number, point in session.model.registry}
-    for semantic_id, uv in case.clicks:
-        place(session, by_name[f"keypoint {semantic_id}"], uv)
-    assert live_shape(session).counts.all()
-    agree_with_fit(session, case, capsys)
-
-
 @pytest.mark.parametrize("kind", ["learned", "similar"])
 def test_unknown_focal_length_is_estimated_with_the_shape(
     case: Case, capsys: pytest.CaptureFixture[str], shape_file: Path, kind: str
@@ -213,22 +175,6 @@ def test_contradicting_pair_is_named(case: Case, shape_file: Path) -> None:
     off = {pair["pair"]: pair["off"] for pair in page_state(session, 0)["pairs"] if pair["off"]}
     assert list(off) == [wrong["pair"]]
     assert off[wrong["pair"]] == pytest.approx(72, abs=20)
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (lambda file: {"shape": file, "shape_sigma": 0.1}, "give one of the two options"),
-        (lambda file: {"shape_sigma": -1.0}, "--shape-sigma: -1 is not a standard deviation"),
-        (lambda file: {"shape": file.with_name("no.shape")}, "no.shape"),
-    ],
-)
-def test_bad_options_are_refused(
-    case: Case, shape_file: Path, options: Callable[[Path], dict[str, Any]], words: str
-) -> None:
-    with pytest.raises(CadalignError) as refused:
-        case.open(**options(shape_file))
-    assert words in str(refused.value)
 
 
 def test_a_stored_shape_is_named_where_it_is_not_used(

@@ -51,11 +51,6 @@ def test_the_up_axis_is_written_and_kept(case: Case) -> None:
     assert page_state(z_up.open(), 0)["image"]["up_axis"] == "z"
 
 
-def test_a_model_with_y_up_needs_no_word(case: Case) -> None:
-    place(case.open(), *case.clicks[0])
-    assert "up_axis" not in json.loads(case.observation.read_text())
-
-
 def test_gravity_is_that_of_the_up_axis(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
     z_up = turned(case, "z")
     place_all(z_up.open(up_axis="z"), z_up)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Iterator
 from dataclasses import replace
@@ -15,10 +14,10 @@ import pyarrow.parquet as pq
 import pytest
 
 import cadalign
-from cadalign import Alignment, CadalignError, Camera, FocalPrior, Observation, Result, Results
-from cadalign.batch.experiment import FitRunOptions, plan_run
+from cadalign import Alignment, CadalignError, Camera, Observation, Result, Results
 from cadalign.batch.observation_fit import ObservationFit
 from cadalign.batch.outputs import COLUMNS
+from cadalign.batch.runs import FitRunOptions, plan_run
 from cadalign.cli import main
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.runs.folder import RunFolder
@@ -115,7 +114,7 @@ def test_workers_may_have_been_started_elsewhere(
     options = FitRunOptions(
         inputs=(Path("given"),), estimate=ObservationFit(shape=Path("chair.shape"))
     )
-    monkeypatch.setattr(FitRunOptions, "check_files", lambda self: None)
+    monkeypatch.setattr(FitRunOptions, "keypoints", lambda self: None)
     plan = plan_run(options, RunFolder(Path("run")))
     (task,) = plan.tasks[:]
     (tmp_path / "elsewhere").mkdir()
@@ -156,32 +155,11 @@ def test_bad_observations_are_rows_and_stop_nothing(tmp_path: Path) -> None:
 def test_another_input_or_option_is_refused(tmp_path: Path) -> None:
     source = lines(tmp_path / "o.jsonl", 3)
     cadalign.fit_many(source, out=tmp_path / "run", method="aepnp")
-    with pytest.raises(DataError, match=r"another configuration: estimate\.fitting\.method is"):
+    with pytest.raises(DataError, match=r"another configuration: estimate\.method is"):
         cadalign.fit_many(source, out=tmp_path / "run")
     lines(source, 4)
     with pytest.raises(DataError, match="another configuration: contents is"):
         cadalign.fit_many(source, out=tmp_path / "run", method="aepnp")
-
-
-@pytest.mark.parametrize("name", ["o.json", "o.jsonl"])
-def test_a_run_does_not_go_on_with_another_photo_or_mesh(tmp_path: Path, name: str) -> None:
-    photo, mesh = tmp_path / "photo.jpg", tmp_path / "chair.ply"
-    photo.write_bytes(b"one")
-    mesh.write_bytes(b"one")
-    data = json.loads(lines(tmp_path / "o.jsonl", 1).read_text())
-    (tmp_path / "o.jsonl").unlink()
-    data |= {"image": photo.name, "model": mesh.name}
-    (tmp_path / name).write_text(json.dumps(data), encoding="utf-8")
-    assert not isinstance(cadalign.fit_many(tmp_path, out=tmp_path / "run")[0], CadalignError)
-    cadalign.fit_many(tmp_path, out=tmp_path / "run")
-    for changed in (photo, mesh):
-        before = changed.stat().st_mtime_ns
-        changed.write_bytes(b"another")
-        with pytest.raises(DataError, match="another configuration: contents is"):
-            cadalign.fit_many(tmp_path, out=tmp_path / "run")
-        changed.write_bytes(b"one")
-        os.utime(changed, ns=(before, before))
-    cadalign.fit_many(tmp_path, out=tmp_path / "run")
 
 
 @pytest.mark.parametrize(
@@ -194,14 +172,12 @@ def test_a_run_does_not_go_on_with_another_photo_or_mesh(tmp_path: Path, name: s
         ({"robust": "no"}, "robust"),
         ({"focal": "guess"}, "focal"),
         ({"focal": -5.0}, "focal"),
-        ({"focal_prior": "foo"}, "focal_prior"),
         ({"sigma": np.ones(8)}, "sigma"),
         ({"camera": CAMERA}, "camera"),
         ({"shape": 3}, "shape"),
         ({"shape": "none.shape"}, "none.shape"),
         ({"images": 5}, "images"),
         ({"size": 3}, "size"),
-        ({"ransac": True}, "ransac"),
         ({"workers": "a"}, "workers"),
     ],
 )
@@ -222,17 +198,6 @@ def test_numbers_as_focal_are_the_focal_length_of_all_cameras() -> None:
     assert cameras == [650.0, 650.0]
 
 
-def test_priors_of_focal_lengths_are_taken_as_such_and_none_is_the_default() -> None:
-    given, usual = (
-        cadalign.fit_many(observations(1), focal="estimate", focal_prior=prior)[0]
-        for prior in (FocalPrior(900.0, 0.1), None)
-    )
-    assert isinstance(given, Result)
-    assert given.focal_prior == FocalPrior(900.0, 0.1)
-    assert isinstance(usual, Result)
-    assert usual.focal_prior == FocalPrior.of_usual_lenses(640, 480)
-
-
 def test_what_is_no_observation_is_refused() -> None:
     with pytest.raises(InputError, match=r"observations\[1\]: expected a cadalign.Observation"):
         cadalign.fit_many([next(observations(1)), 5])  # type: ignore[list-item]
@@ -244,7 +209,7 @@ def test_what_is_no_observation_is_refused() -> None:
 
 
 def test_files_of_others_and_of_another_run_are_not_written_over(tmp_path: Path) -> None:
-    for name in ("observations.jsonl", "results.csv", "report.html"):
+    for name in ("results.csv", "report.html"):
         folder = tmp_path / name.partition(".")[0]
         folder.mkdir()
         (folder / name).write_text("mine")
@@ -253,10 +218,8 @@ def test_files_of_others_and_of_another_run_are_not_written_over(tmp_path: Path)
         assert (folder / name).read_text() == "mine"
     run = tmp_path / "run"
     first = cadalign.fit_many(observations(2), out=run)
-    kept = (run / "observations.jsonl").read_bytes()
-    with pytest.raises(DataError, match=r"another configuration: observations.jsonl holds other"):
+    with pytest.raises(DataError, match="another configuration: contents is"):
         cadalign.fit_many(observations(3), out=run)
-    assert (run / "observations.jsonl").read_bytes() == kept
     again = cadalign.fit_many(observations(2), out=run)
     np.testing.assert_array_equal(again.rotation, first.rotation)
 
@@ -275,18 +238,21 @@ def test_names_of_numpy_are_texts() -> None:
 
 
 def test_the_contents_are_those_of_every_file_that_options_name(tmp_path: Path) -> None:
-    camera, model = paths = [tmp_path / name for name in ("K.txt", "model.keypoints.json")]
-    changes = ObservationChanges(camera=camera)
-    detector = DetectorOptions(model=model, images=tmp_path)
-    options = FitRunOptions(inputs=(tmp_path / "o.json",), changes=changes, detector=detector)
-    seen = [options.contents()]
-    assert "files" not in seen[0]
-    for path in paths:
-        for text in ("1", "2"):  # of the same size, written in the same moment
+    source = lines(tmp_path / "o.jsonl", 1)
+    camera, model = tmp_path / "K.txt", tmp_path / "model.keypoints.json"
+    np.savetxt(camera, CAMERA.matrix)
+    options: dict[str, Any] = {"camera": camera, "model": model}
+    seen = {plan_run(FitRunOptions(inputs=(source,)), RunFolder(tmp_path)).config["contents"]}
+    for path in (model, camera):
+        for text in ("700 0 320 0 700 240 0 0 1", "700 0 321 0 700 240 0 0 1"):
             path.write_text(text)
-            seen.append(options.contents())
-            assert seen[-1] != seen[-2]
-    assert set(seen[-1]["files"]) == set(map(str, paths))
+            chosen = FitRunOptions(
+                inputs=(source,),
+                changes=ObservationChanges(camera=options["camera"]),
+                detector=DetectorOptions(model=options["model"]),
+            )
+            seen.add(plan_run(chosen, RunFolder(tmp_path)).config["contents"])
+    assert len(seen) == 5
 
 
 def test_failures_are_counted_by_reason(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -95,13 +95,6 @@ def test_the_table_holds_the_best_match_of_each(
     assert "none_probability" in line["cells"]
 
 
-def test_matches_of_a_run_are_exported_as_fits_are(case: Case, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    out = ["--out", str(run), "--no-picture"]
-    assert main(["retrieve", *case.arguments, *out]) == 0
-    assert main(["export", str(run), "--to", str(tmp_path / "glb")]) == 0
-
-
 def test_a_query_that_fails_is_a_row(
     case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

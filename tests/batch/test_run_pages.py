@@ -13,7 +13,6 @@ from support.pages import Opened, embedded_payload, watched
 
 import cadalign
 from cadalign import Alignment, Camera, Observation
-from cadalign.batch.spec import SPEC, FitRun
 from cadalign.datasets import write_sample_dataset
 from cadalign.evaluation.api import run as do_run
 from cadalign.evaluation.experiments.keypointnet import KeypointNetOptions
@@ -62,13 +61,6 @@ def test_runs_are_joined_by_observation_whatever_the_model(
     instances = embedded_payload(page)["tables"]["instances"]
     assert instances["id"] == [*range(6), *range(6)]
     assert len(set(instances["category"])) == 2
-
-
-def test_a_category_has_a_line(runs: dict[str, Path]) -> None:
-    lines = SPEC.summarize(FitRun.open(runs["cauchy"]))
-    assert [(line.group, line["instances"]) for line in lines] == [("chair", 6)]
-    groups = [line.group for line in SPEC.summarize(FitRun.open(runs["plain"]))]
-    assert groups == ["no model"]
 
 
 def test_a_run_stands_beside_one_with_truth(

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -139,25 +137,6 @@ def test_a_rejected_keypoint_behind_the_camera_is_written_and_drawn(
     assert has_color(overlay, REPROJECTED_COLOR)
 
 
-def test_full_disk_is_reported_and_leaves_earlier_results(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = write_observation(tmp_path / "chair.json")
-    assert main(["fit", str(path)]) == 0
-    written = tmp_path / "chair_fit" / "fit.json"
-    before = written.read_bytes()
-    capsys.readouterr()
-
-    def full(*_: object, **__: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "replace", full)
-    assert refusal_line(capsys, "fit", str(path), "--method", "aepnp").startswith(
-        f"{written}: cannot be written (No space left on device); "
-    )
-    assert written.read_bytes() == before
-
-
 def test_photo_and_model_are_drawn(tmp_path: Path) -> None:
     blue = np.full((480, 640, 3), (200, 90, 40), dtype=np.uint8)
     cv2.imwrite(str(tmp_path / "photo.png"), blue)
@@ -223,32 +202,6 @@ def test_photo_that_cannot_be_used(tmp_path: Path, capsys: pytest.CaptureFixture
     cv2.imwrite(str(photo), np.zeros((10, 20, 3), dtype=np.uint8))
     assert refusal_line(capsys, "fit", path) == (
         f"{photo}: the image is 20 x 10, the camera 640 x 480; give the camera of this image"
-    )
-
-
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (("fit", "a\0b.json"), r"'a\x00b.json': the path holds a NUL character"),
-        (("fit", "{file}", "--out", "a\0b"), r"'a\x00b': the path holds a NUL character"),
-        (("report", "a\0b"), r"'a\x00b': the path holds a NUL character"),
-    ],
-)
-def test_paths_with_a_nul(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], text: str
-) -> None:
-    path = write_observation(tmp_path / "chair.json")
-    assert refusal_line(capsys, *(word.format(file=path) for word in arguments)) == text
-
-
-def test_output_folder_that_cannot_be_made(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write_observation(tmp_path / "chair.json")
-    (tmp_path / "out").write_text("a file in the way")
-    line = refusal_line(capsys, "fit", str(path), "--out", str(tmp_path / "out"))
-    assert line == (
-        f"{tmp_path / 'out'}: the folder cannot be created (File exists); choose another --out"
     )
 
 

@@ -109,16 +109,6 @@ def test_keypoints_without_ids_are_the_same_at_the_same_point(tmp_path: Path) ->
     np.testing.assert_allclose(found.scale, expected.scale, rtol=1e-6)
 
 
-def test_depths_of_keypoints_are_used(tmp_path: Path) -> None:
-    depths = in_camera(POINTS, TRUTH, np.eye(4))[:, 2]
-    depths[3:] = np.nan
-    path = write(tmp_path, replace(observed(), depths=depths))
-    assert main(["fit", str(path)]) == 0
-    found = result_in(tmp_path).alignment
-    expected = align(Model(points_3d=POINTS), View(CAMERA, observed().points_2d, depth=depths))
-    assert found == expected.alignment
-
-
 def without_focal(path: Path) -> Path:
     """Take the focal lengths away from the cameras of a file."""
     data = json.loads(path.read_text())
@@ -142,16 +132,6 @@ def test_unknown_focal_length_of_two_views_is_estimated(
     assert found.std is not None
     assert abs(np.log(found.camera.fx / CAMERA.fx)) < 4 * found.std.focal
     assert capsys.readouterr().out == f"{expected}\n"
-
-
-def test_similar_models_noise_is_estimated_beside_evidence(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write(tmp_path, observed(up=UP))
-    assert main(["fit", str(path), "--similar"]) == 0
-    view = View(CAMERA, observed().points_2d, up=UP, sigma=None)
-    expected = align(Model(points_3d=POINTS, stretch_sigma=0.2), view)
-    assert capsys.readouterr().out.startswith(f"{expected}\n")
 
 
 def test_prior_of_the_photo_is_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -178,14 +158,6 @@ def write_box(folder: Path, truth: Alignment) -> np.ndarray:
     mask = cast_geometry(Scene(load_mesh(folder / "box.obj")), CAMERA, truth).mask
     cv2.imwrite(str(folder / "mask.png"), np.where(mask, 255, 0).astype(np.uint8))
     return corners
-
-
-def test_start_is_where_keypoints_are_aligned_from(tmp_path: Path) -> None:
-    path = write(tmp_path, observed(), init=TRUTH)
-    assert main(["fit", str(path)]) == 0
-    found = result_in(tmp_path).alignment
-    expected = align(Model(points_3d=POINTS), View(CAMERA, observed().points_2d), init=TRUTH)
-    assert found == expected.alignment
 
 
 def _note_opened(opened: list[str], folder: str, event: str, arguments: Any) -> None:

@@ -85,17 +85,6 @@ def test_the_overlay_shows_the_model_over_the_photo(tmp_path: Path, flags: list[
 
 
 @pytest.mark.slow
-def test_the_overlay_of_every_view_is_written(tmp_path: Path) -> None:
-    first = write_observation(tmp_path)
-    view = json.loads(first.read_text())
-    several = {name: view.pop(name) for name in ("model", "fit")}
-    path = tmp_path / "views.json"
-    path.write_text(json.dumps({**several, "views": [view, view]}))
-    assert main(["fit", str(path), "--overlay", str(tmp_path / "o.png")]) == 0
-    assert sorted(each.name for each in tmp_path.glob("o*.png")) == ["o.png", "o_1.png"]
-
-
-@pytest.mark.slow
 def test_overlays_that_cannot_be_drawn_are_refused_before_the_fit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,6 @@ from support.refusals import refusal_line
 from cadalign import ShapeModel
 from cadalign.cli import main
 from cadalign.datasets import write_sample_dataset
-from cadalign.errors import DataError
 
 
 @pytest.mark.long
@@ -66,16 +64,3 @@ def test_refusals(sample_root: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     wrong.write_text("no shape")
     line = refusal_line(capsys, "shape", "show", wrong)
     assert line == f"{wrong}: not a shape file; learn it with: cadalign shape learn"
-
-
-@pytest.mark.long
-def test_folders_that_are_not_utf_8(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = tmp_path / os.fsdecode(b"caf\xe9")
-    try:
-        root = write_sample_dataset(folder, per_category=4, categories=["chair"])
-    except DataError:
-        pytest.skip("this file system has no such names")
-    for call in (["shape", "learn", "--category", "chair"], ["library", "build"]):
-        line = refusal_line(capsys, *call, root, "--out", tmp_path / "out")
-        assert line.endswith("the path is not UTF-8; rename it, or the folder that it is in")
-    assert not (tmp_path / "out").exists()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cadalign.annotate.server
 import cadalign.annotate.session
-import cadalign.batch.fits
+import cadalign.batch.runs
 import cadalign.cli.annotate
 import cadalign.cli.evaluate
 import cadalign.evaluation.experiments.keypointnet

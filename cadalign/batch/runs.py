@@ -1,0 +1,373 @@
+"""Runs over many observations: options, their tasks and rows, `fit_many`."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import chain, starmap
+from pathlib import Path
+from typing import Any, ClassVar, get_args, get_type_hints
+
+from cadalign.arrays import is_number, worker_count
+from cadalign.batch.observation_fit import ObservationFit, opened_shape, photo_doubt
+from cadalign.batch.outputs import (
+    COLUMNS,
+    RECORD_COLUMNS,
+    draw_fit,
+    json_of,
+    naming_row,
+    result_row,
+    write_csv,
+)
+from cadalign.batch.sources import ObservationTask, ObservationTasks
+from cadalign.datasets.detections.image_keypoints import ImageKeypoints, observed_in, photo_in
+from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
+from cadalign.errors import CadalignError, DataError, InputError, require_kind, unknown
+from cadalign.estimation.result import Result
+from cadalign.estimation.results import Results
+from cadalign.evaluation.options import ExperimentOptions, absolute_paths
+from cadalign.evaluation.runs.engine import OnProgress, execute, workers_of
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.work import Columns, Plan, Row, fingerprint
+from cadalign.export.results import failed_row
+from cadalign.io.documents import Positive, convert, in_file, parse_json
+from cadalign.io.files import as_path, read_bytes
+from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
+
+LARGEST_CHUNK = 256
+"""Most observations that a worker gets at a time, as of every long run."""
+_LEAST_CHUNKS = 64  # of a run, such that workers share the last ones evenly
+_FEW = 200  # observations, which are aligned sooner than processes start
+
+Observed = str | os.PathLike[str] | Iterable[str | os.PathLike[str]] | Iterable[Observation]
+Estimated = tuple[Observation, Result, Row]
+"""What is aligned, its result, and further cells of the tables."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitRunOptions(ExperimentOptions):
+    """A run that aligns many observations, as ``estimate`` says."""
+
+    experiment: ClassVar[str] = "fit"
+    command: ClassVar[str] = "fit"
+    columns: ClassVar[Columns] = ()
+    """Columns of the table beside those of every run."""
+    threads: ClassVar[int] = 1
+    """Number of threads of a run without workers, -1 for one for each core."""
+
+    inputs: tuple[Path, ...] = ()
+    """Observation files, folders of such, JSON lines, files of detectors."""
+    changes: ObservationChanges = field(default_factory=ObservationChanges)
+    """Takes the place of the observations' own."""
+    detector: DetectorOptions = field(default_factory=DetectorOptions)
+    pictures: int = 0
+    """Number of observations whose photos the page shows, the first ones."""
+    estimate: ObservationFit = field(default_factory=ObservationFit)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_least(pictures=0)
+
+    @property
+    def files(self) -> tuple[Path | None, ...]:
+        """The files that the estimates depend on, beside the observations."""
+        return self.changes.camera, self.detector.model, self.estimate.shape
+
+    def keypoints(self) -> ModelKeypoints | None:
+        """Those that a detector's are paired with, where no model's are given.
+
+        Raises CadalignError if an option of the estimate is invalid, or its file cannot be read.
+        """
+        self.estimate.check()
+        if self.estimate.shape is None:
+            return None
+        shape = opened_shape(self.estimate.shape)
+        named = isinstance(shape.ids[0], str)
+        pairs = zip(shape.ids, shape.components[0].mean.tolist(), strict=False)
+        return ModelKeypoints(
+            tuple(ModelKeypoint(str(k), tuple(xyz), None if named else int(k)) for k, xyz in pairs)
+        )
+
+    def read(self, data: Any, where: str, *, folder: Path) -> Observation:
+        """Read the parsed form of an observation, which messages call ``where``."""
+        return self.estimate.read(data, where, folder=folder, changes=self.changes)
+
+    def estimate_of(self, seen: Observation, where: str) -> Estimated:
+        """Estimate the object of an observation; raises CadalignError if it cannot be."""
+        seen = self.estimate.changed(seen)
+        return seen, self.estimate.fit(seen, where), {}
+
+
+@dataclass(frozen=True)
+class ManyEstimates:
+    """Estimates of observations; see `cadalign.evaluation.runs.work.Experiment`."""
+
+    options: FitRunOptions
+    model: ModelKeypoints | None = None
+    """The keypoints that a detector's are paired with."""
+    folder: RunFolder | None = field(default=None, repr=False)
+    """The folder that pictures go to; none are drawn without."""
+    record_columns: Columns = RECORD_COLUMNS
+
+    @property
+    def columns(self) -> Columns:
+        """The columns of the table."""
+        return COLUMNS + self.options.columns
+
+    def evaluate(self, tasks: Sequence[ObservationTask]) -> list[Row]:
+        """The rows of some observations."""
+        return [self._evaluate(task) for task in tasks]
+
+    def failure(self, task: ObservationTask, reason: str) -> list[Row]:
+        """The row of an observation whose worker died, or that raised what nobody foresaw."""
+        named = naming_row(task.row, task.name, None)
+        return [named | failed_row(reason) | {"observation": "", "result": ""}]
+
+    def _evaluate(self, task: ObservationTask) -> Row:
+        start, seen, result = time.perf_counter(), None, None
+        try:
+            seen = self._observation(task)
+            seen, result, cells = self.options.estimate_of(seen, task.name)
+            row = result_row(result) | cells | {"seconds": time.perf_counter() - start}
+        except CadalignError as error:
+            text = "" if seen is None else json_of(seen.to_dict()).decode()
+            row = failed_row(str(error)) | {"observation": text, "result": ""}
+        row |= naming_row(task.row, task.name, seen)
+        if seen is not None:
+            undrawn: tuple[str, ...] = ()
+            if self.folder is not None and task.row < self.options.pictures:
+                undrawn = draw_fit(self.folder, row, seen, result)
+            if result is not None:
+                told = [*(("picture", text) for text in undrawn), *_doubts(seen)]
+                row["warning_count"] += len(told)
+                for column, name in enumerate(("warning_kinds", "warnings")):
+                    texts = row[name], *(each[column] for each in told)
+                    row[name] = "; ".join(filter(None, texts))
+        return row
+
+    def _observation(self, task: ObservationTask) -> Observation:
+        folder, content, options = Path(task.folder), task.content, self.options
+        if isinstance(content, DataError):
+            raise content
+        if not isinstance(content, ImageKeypoints):
+            return options.read(parse_json(content, task.name), task.name, folder=folder)
+        detector = options.detector
+        assert self.model is not None
+        photos, named = detector.images or folder, content.image
+        with in_file(content.source):
+            return observed_in(
+                content,
+                self.model,
+                options.changes,
+                image=None if named is None else _photo_in(photos, named),
+                min_score=detector.min_score,
+                ignore_unknown=detector.ignore_unknown,
+            )
+
+
+_photo_in = lru_cache(maxsize=1024)(photo_in)
+
+
+def _doubts(seen: Observation) -> Iterator[tuple[str, str]]:
+    """Kinds and texts of warnings about an observation's views: keypoints left out, the photo.
+
+    A photo that cannot be read is told of where it is drawn.
+    """
+    for view in seen.views:
+        if view.text_of_not_found:
+            yield "left-out", view.text_of_not_found
+        if doubt := photo_doubt(view):
+            yield "camera", doubt
+
+
+def plan_run(
+    options: FitRunOptions, folder: RunFolder, given: Iterable[bytes] = ()
+) -> Plan[ObservationTask]:
+    """Plan the estimates of the observations of all inputs, and of ``given`` lines.
+
+    Raises CadalignError if an option is invalid, an input or the camera cannot be read, or what a
+    detector's file needs is missing.
+    """
+    options.changes.read_camera((1, 1))  # whatever the size: else every row would say its error
+    model, photos = options.keypoints(), options.detector.images
+    tasks = ObservationTasks(options.inputs, given)
+    if photos is not None and not photos.is_dir():
+        what = f"{photos} is not a folder of photos"
+        raise InputError(what, where="images", fix="give the photos' folder, or leave it out")
+    if options.detector.model is not None and tasks.has_detections:
+        model = ModelKeypoints.load(options.detector.model)
+    if model is None and tasks.has_detections:
+        fix = "give the model's NAME.keypoints.json, or a learned shape"
+        raise InputError("the keypoints of the model are not known", where="model", fix=fix)
+    read = (read_bytes(path) for path in options.files if path is not None and path.is_file())
+    config = options.as_config() | {"contents": fingerprint(tasks.fingerprint, *read)}
+    drawn_in = folder.made_for_pictures() if options.pictures else None
+    chunk = max(1, min(LARGEST_CHUNK, len(tasks) // _LEAST_CHUNKS))
+    estimates = ManyEstimates(absolute_paths(options), model, drawn_in)
+    return Plan(estimates, tasks, config, chunk)
+
+
+def run_many(
+    options: FitRunOptions,
+    folder: RunFolder,
+    *,
+    given: Iterable[bytes] = (),
+    workers: int | None,
+    dask: str | None,
+    on_progress: OnProgress = lambda progress: None,
+) -> None:
+    """Do the run that the options describe, or what is left of it; see `fit_many`.
+
+    By default processes do it, but few observations.
+    """
+    plan = plan_run(options, folder, given)
+    if workers is None:
+        workers = 0 if len(plan.tasks) < _FEW else -1
+    pool = workers_of(workers, dask, threads=worker_count(options.threads))
+    execute(plan, folder, workers=pool, on_progress=on_progress)
+    write_csv(folder)
+
+
+def fit_many(
+    observations: Observed,
+    *,
+    out: str | os.PathLike[str] | None = None,
+    workers: int | None = None,
+    dask: str | None = None,
+    pictures: int = 0,
+    on_progress: OnProgress = lambda progress: None,
+    **options: Any,
+) -> Results:
+    """Align many observations, as a run that goes on where it was killed.
+
+    Parameters
+    ----------
+    observations : path, or iterable of path or of Observation
+        Observation files, folders of such, JSON lines, and detectors' files (COCO's JSON or CSV);
+        or observations, for example of a generator, all of which memory holds as JSON.
+    out : path-like, optional
+        The run's folder: ``results.parquet`` and ``results.csv``, and what `Results.open` needs.
+        Started again with the same arguments, a run that was killed goes on, and a finished one is
+        read. Without it nothing is kept.
+    workers : int, optional
+        Processes; -1 for one for each core, 0 for none. By default -1, for few observations 0.
+    dask : str, optional
+        Address of a Dask scheduler, whose workers are used instead.
+    pictures : int
+        Number of observations whose photos are kept for `cadalign.report.write_report`, the first
+        ones.
+    on_progress : callable
+        Is told of every chunk that is done.
+    **options
+        Fields of `cadalign.batch.observation_fit.ObservationFit`, such as ``method``, ``similar``,
+        ``robust``, ``shape``; of `cadalign.batch.DetectorOptions`, such as ``model``, ``images``;
+        and ``camera``, the file of a camera for all. A number as ``focal`` is the focal length [px]
+        of all images. What an observation stores holds where an option is None: unlike those of
+        `cadalign.fit`, ``sigma=None`` means the observation's, or 1; ``sigma="none"`` estimates it.
+
+    Returns
+    -------
+    Results
+        In the order of the observations; the error takes the place of a result that there is not.
+
+    Raises
+    ------
+    InputError
+        If an option is invalid or not known.
+    DataError
+        If an input cannot be read, or the folder holds another run or cannot be written to.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from cadalign import Camera, Observation
+    >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
+    >>> seen = (
+    ...     Observation(corners, camera.project(corners + [0.1, 0.2, depth]), camera)
+    ...     for depth in (5.0, 6.0)
+    ... )
+    >>> results = fit_many(seen, method="aepnp")
+    >>> results.translation[:, 2].round(3).tolist()
+    [5.0, 6.0]
+    """
+    with ExitStack() as stack:
+        is_kept = out is not None
+        if out is None:
+            out = stack.enter_context(tempfile.TemporaryDirectory(prefix="cadalign-"))
+        folder = RunFolder(as_path(out, "out"))
+        parts = _parts_of({"pictures": pictures, **options})
+        inputs, given = _inputs(observations)
+        chosen = FitRunOptions(inputs=inputs, **parts)
+        run_many(chosen, folder, given=given, workers=workers, dask=dask, on_progress=on_progress)
+        results = Results.open(folder.path)
+        if not is_kept:
+            list(results)  # reads each, before the folder goes away
+        return results
+
+
+_PARTS: dict[str, Any] = {
+    "changes": ObservationChanges,
+    "detector": DetectorOptions,
+    "estimate": ObservationFit,
+}
+"""Dataclasses of a run's options; of a name that two have, the last one's is meant."""
+
+
+def _parts_of(given: dict[str, Any]) -> dict[str, Any]:
+    """Fields of `FitRunOptions` by options of any of their dataclasses; see `fit_many`.
+
+    Paths may be texts. Raises InputError if an option is not known, or of another type.
+    """
+    known = {
+        name: (part, kind)
+        for part, owner in _PARTS.items()
+        for name, kind in get_type_hints(owner, include_extras=True).items()
+    }
+    found: dict[str, dict[str, Any]] = {part: {} for part in _PARTS}
+    pictures = _converted(given.pop("pictures"), int, "pictures")
+    for name, value in given.items():
+        if name not in known:
+            raise unknown("option", name, known, where=name)
+        part, kind = known[name]
+        if name == "focal" and is_number(value):
+            part, kind = "changes", Positive
+        if value is not None:
+            found[part][name] = _converted(value, kind, name)
+    return {"pictures": pictures} | {part: owner(**found[part]) for part, owner in _PARTS.items()}
+
+
+def _converted(value: Any, kind: Any, name: str) -> Any:
+    if Path in get_args(kind):
+        return as_path(value, name)
+    try:
+        return convert(value, kind, name)
+    except DataError as error:
+        raise InputError(error.what, where=error.where, fix=error.fix) from None
+
+
+def _inputs(observations: Observed) -> tuple[tuple[Path, ...], list[bytes]]:
+    """The paths of observations, or observations as lines."""
+    if isinstance(observations, str | os.PathLike):
+        return (as_path(observations, "observations"),), []
+    try:
+        source = iter(observations)
+    except TypeError:
+        what = f"expected paths or Observations, got {type(observations).__name__}"
+        raise InputError(what, where="observations", fix="give a list of them") from None
+    first = next(source, None)
+    if first is None:
+        raise InputError("there are none", where="observations")
+    if isinstance(first, Observation):
+        return (), list(starmap(_line, enumerate(chain([first], source))))
+    return tuple(as_path(each, "observations") for each in (first, *source)), []
+
+
+def _line(number: int, observation: Any) -> bytes:
+    require_kind(observation, Observation, f"observations[{number}]")
+    return json_of(observation.to_dict())

@@ -46,7 +46,7 @@ def test_refusals(sample_root: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     line = refusal_line(capsys, "shape", "learn", sample_root, "--category", "zebra")
     assert "zebra" in line
     line = refusal_line(capsys, "shape", "learn", sample_root, "--category", "chair")
-    assert line == "models: 1 models are too few to learn a shape from; give at least 4"
+    assert line == "chair: 1 models are too few to learn a shape from; at least 4 are needed"
     line = refusal_line(
         capsys, "shape", "learn", sample_root, "--category", "chair", "--split", "none"
     )

@@ -124,7 +124,7 @@ def _mistakes(
 
 
 def _outcome(case: _Case) -> Row:
-    """Whether an estimate is warned of, far off, and silently wrong."""
+    """The estimate of a case: is it warned of, far off, silently wrong?"""
     view = View(case.camera, case.points_2d, ids=case.ids, sigma=_NOISE_PX)
     result = align(case.model, view, **case.options)
     poses = [result.alignment, *(each.alignment for each in result.alternatives)]

@@ -15,6 +15,7 @@ from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import VIEW_NAMES
+from cadalign.evaluation.experiments.retrieval import opened_library
 from cadalign.evaluation.methods import LIMIT, SHAPE
 from cadalign.evaluation.options import ViewOptions
 from cadalign.evaluation.plots import Plot, Trace, cumulative_curves
@@ -185,7 +186,7 @@ class LearnedFiles:
 
     def library(self) -> Library:
         """The library."""
-        return _open_library(self.folder / "library.cadalign")
+        return opened_library(self.folder / "library.cadalign")
 
 
 @lru_cache(maxsize=32)
@@ -193,13 +194,6 @@ def _open_shape(path: Path) -> ShapeModel:
     from cadalign.shapes.model import ShapeModel
 
     return ShapeModel.open(path)
-
-
-@lru_cache(maxsize=2)
-def _open_library(path: Path) -> Library:
-    from cadalign.retrieval.library import Library
-
-    return Library.open(path)
 
 
 def learn(

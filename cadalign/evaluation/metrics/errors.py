@@ -126,7 +126,7 @@ def estimate_errors(
 def _pose_errors(
     est: Alignments, gt: Alignments, bounds: FloatArray, diagonals: FloatArray
 ) -> dict[str, FloatArray]:
-    """The columns `POSE_ERRORS`; the box IoU of a model without volume is NaN."""
+    """Errors that a symmetry changes; the box IoU of a model without volume is NaN."""
     boxes, gt_boxes = Boxes.from_models(bounds, est), Boxes.from_models(bounds, gt)
     solid = have_volume(boxes) & have_volume(gt_boxes)
     ious = np.full(len(bounds), np.nan)

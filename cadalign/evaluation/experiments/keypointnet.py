@@ -358,9 +358,12 @@ def plan_demo(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
             where=str(dataset.root),
             fix="put the meshes beside the annotations, or name the folder that holds both",
         )
-    given = {"noise_px": options.noise_px, "seed": options.seed}
     views = KeypointNetOptions(
-        root, methods=(_DEMO_METHOD,), max_models=options.per_category, **given
+        root,
+        methods=(_DEMO_METHOD,),
+        noise_px=options.noise_px,
+        seed=options.seed,
+        max_models=options.per_category,
     )
     tasks = KeypointTasks(dataset, views)
     benchmark = keypointnet_benchmark(views, folder.made_for_pictures())

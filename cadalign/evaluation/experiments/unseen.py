@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
 from cadalign.evaluation import metrics
@@ -18,7 +19,7 @@ from cadalign.evaluation.benchmark import VIEW_NAMES
 from cadalign.evaluation.experiments.retrieval import opened_library
 from cadalign.evaluation.methods import LIMIT, SHAPE
 from cadalign.evaluation.options import ViewOptions
-from cadalign.evaluation.plots import Plot, Trace, cumulative_curves
+from cadalign.evaluation.plots import Plot, cumulative_curves, share_traces
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Columns, Plan
 from cadalign.evaluation.summary import (
@@ -36,7 +37,7 @@ from cadalign.io.files import made_folder
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.instance import KeypointTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.tables import Run
+    from cadalign.evaluation.runs.tables import Cells, Run
     from cadalign.retrieval.library import Library
     from cadalign.shapes.model import ShapeModel
 
@@ -153,19 +154,15 @@ def plots(runs: Sequence[Run]) -> list[Plot]:
 
 
 def _calibration(runs: Sequence[Run], column: str, name: str) -> Plot:
-    traces = []
-    for index, run in enumerate(runs):
-        for method in run.methods:
-            levels = known(run.cells[column][run.cells["method"] == method])
-            if len(levels):
-                shares = (levels <= _LEVELS[:, None]).mean(axis=1)
-                places = (100 * _LEVELS).tolist()
-                traces.append(Trace.of(index, method, places, shares.tolist(), metrics.COVERED))
+    def shares(rows: Cells) -> FloatArray | None:
+        levels = known(rows[column])
+        return (levels <= _LEVELS[:, None]).mean(axis=1) if len(levels) else None
+
     return Plot(
         id=f"calibration_{name}",
         x=metrics.NOMINAL,
         y=metrics.COVERED,
-        traces=traces,
+        traces=share_traces(runs, 100 * _LEVELS, shares),
         note="over all categories; uncertainties are right where both are equal",
         title=f"Calibration of the {name}",
     )

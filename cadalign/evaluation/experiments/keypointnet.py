@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from cadalign.arrays import BoolArray
-from cadalign.datasets import KeypointNet, write_sample_dataset
+from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import (
@@ -80,8 +80,7 @@ class KeypointNetOptions(ViewOptions):
 
 
 COLUMNS: Columns = (
-    *VIEW_NAMES,
-    *(("status", str), ("reason", str), ("visibility", str), ("keypoints", int)),
+    *(*VIEW_NAMES, ("status", str), ("reason", str), ("visibility", str), ("keypoints", int)),
     *((name, float) for name in ("stretch_y", "stretch_z", "rotation_error_deg")),
     *((name, float) for name in ("translation_error", "scale_y_error", "scale_z_error")),
     *(("box_iou", float), ("rms_px", float), ("symmetry", str)),
@@ -103,8 +102,7 @@ class KeypointTasks(Sequence[KeypointTask]):
     """
 
     def __init__(self, dataset: KeypointNet, options: Any) -> None:
-        self.dataset, self._visibility = dataset, options.visibility
-        self._views: int = options.views_per_model
+        self.dataset, self._views = dataset, int(options.views_per_model)
         self.keys = [
             key
             for category in dataset.categories
@@ -222,9 +220,8 @@ def keypointnet_benchmark(
     options: KeypointNetOptions, drawn_in: RunFolder | None = None
 ) -> Benchmark:
     """The methods of the options on views of models."""
-    found = Benchmark.chosen(
-        KeypointViews(options, drawn_in), options.methods, metrics=options.metrics
-    )
+    setting = KeypointViews(options, drawn_in)
+    found = Benchmark.chosen(setting, options.methods, metrics=options.metrics)
     batched = frozenset(each.name for each in found.methods if not each.has_statistics)
     return replace(found, batched=batched)
 
@@ -277,8 +274,7 @@ _CURVES = (
 
 
 # A chunk is three files: with few instances in each, large runs spend their time on files.
-_CHUNK, _CHUNK_DRAWN, _LARGE_CHUNK = 64, 8, 256
-_LARGE = 5_000  # views
+_CHUNK, _CHUNK_DRAWN, _LARGE_CHUNK, _LARGE = 64, 8, 256, 5_000  # the last in views
 
 
 def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
@@ -307,7 +303,6 @@ def _check_drawable(dataset: KeypointNet, options: KeypointNetOptions) -> None:
 
 # Demonstration ------------------------------------------------------------------------------------
 
-_DEMO_METHOD = "optimal"
 _LEAST_SAMPLE = 12  # models of each category of a sample dataset
 
 
@@ -348,6 +343,8 @@ def plan_demo(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
     """Plan one view of the first models with a mesh of every category."""
     root = options.root
     if root is None:
+        from cadalign.datasets import write_sample_dataset
+
         folder.make()
         least = max(options.per_category, _LEAST_SAMPLE)
         root = write_sample_dataset(folder.path / "sample_dataset", per_category=least)
@@ -360,14 +357,14 @@ def plan_demo(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
         )
     views = KeypointNetOptions(
         root,
-        methods=(_DEMO_METHOD,),
+        methods=("optimal",),
         noise_px=options.noise_px,
         seed=options.seed,
         max_models=options.per_category,
     )
     tasks = KeypointTasks(dataset, views)
     benchmark = keypointnet_benchmark(views, folder.made_for_pictures())
-    more = {"methods": [_DEMO_METHOD], "annotations": tasks.fingerprint()}
+    more = {"methods": list(views.methods), "annotations": tasks.fingerprint()}
     return benchmark.plan(replace(options, root=root), tasks, chunk=1, **more)
 
 

@@ -157,6 +157,16 @@ def test_the_limits_errors_have_the_cramer_rao_bound_as_their_covariance() -> No
     assert np.allclose(correlation, bound / np.outer(spread, spread), atol=0.08)
 
 
+def test_the_covariance_of_a_fit_without_noise_is_the_cramer_rao_bound() -> None:
+    for seed in range(20):
+        problem = simulate_problem(np.random.default_rng(seed), points=12, noise_px=0.0)
+        result = fit(problem.points_3d, problem.points_2d, problem.camera, sigma=1.0)
+        bound = cramer_rao_bound(problem, sigma=1.0, focal="known")
+        spread = np.sqrt(bound.diagonal())
+        gap = np.abs(result.fisher_covariance - bound)
+        assert (gap <= 1e-3 * np.outer(spread, spread)).all()
+
+
 def test_the_limit_refuses_keypoints_in_one_plane() -> None:
     points = cloud()
     points[:, 2] = 0.0

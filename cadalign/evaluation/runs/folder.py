@@ -129,8 +129,12 @@ class RunFolder:
         if differences:
             listed, rest = differences[:_MOST_DIFFERENCES], len(differences) - _MOST_DIFFERENCES
             more = f"; and {rest} more differences" if rest > 0 else ""
-            what = "the folder holds a run with another configuration: "
-            raise DataError(what + "; ".join(listed) + more, where=str(self.path), fix=_FIX)
+            raise self.another("; ".join(listed) + more)
+
+    def another(self, differences: str) -> DataError:
+        """The error of a folder that holds another run."""
+        what = f"the folder holds a run with another configuration: {differences}"
+        return DataError(what, where=str(self.path), fix=_FIX)
 
 
 class _Config(ForeignDocument):

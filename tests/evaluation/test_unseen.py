@@ -176,22 +176,6 @@ class TestRun:
         assert iou["shape"] > 0.85
         assert rotation["exact"] == pytest.approx(rotation["limit"], rel=0.5)
 
-    @pytest.mark.slow
-    def test_scale_is_forgiven_and_nothing_else(self, finished: RunFolder) -> None:
-        for name in METHODS:
-            absolute, relative = (
-                column(finished, key, name) for key in ("box_iou", "box_iou_up_to_scale")
-            )
-            assert (relative >= absolute).all()
-            far, near = (
-                column(finished, key, name)
-                for key in ("translation_error", "translation_error_up_to_scale")
-            )
-            assert (near <= far).all()
-            # The bound may put a box behind the camera.
-            error = column(finished, "keypoint_error", name)
-            assert (error < 0.5).all()
-
     def test_only_methods_with_covariances_have_levels(self, finished: RunFolder) -> None:
         for name in ("nearest", "limit"):
             assert np.isnan(column(finished, "rotation_level", name)).all()

@@ -228,6 +228,7 @@ def total(a):
 total(np.ones((3, 3)))
 """
 _LIBRARIES = "import numpy, numba"
+_SPAN = 3.0  # of simulated keypoints [model units]; that of the mesh is 1
 
 
 def cold(given: BenchmarkData) -> Tables:
@@ -279,7 +280,8 @@ def _small_observation(folder: Path) -> Path:
     camera = problem.camera
     photo, path = folder / "photo.jpg", folder / "chair.obj"
     write_image(photo, np.full((camera.height, camera.width, 3), 180, dtype=np.uint8))
-    lines = [f"v {x} {y} {z}" for x, y, z in mesh.vertices]
+    vertices = _SPAN * mesh.vertices  # of the size of the keypoints' cloud
+    lines = [f"v {x} {y} {z}" for x, y, z in vertices]
     lines += [f"f {a} {b} {c}" for a, b, c in (mesh.faces + 1).tolist()]
     path.write_text("\n".join(lines) + "\n")
     seen = Observation(problem.points_3d, problem.points_2d, camera, image=photo, model=path)

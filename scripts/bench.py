@@ -22,10 +22,9 @@ from benchmarks.coverage import coverage
 from benchmarks.evidence import evidence
 from benchmarks.photo import photo
 from benchmarks.retrieval import retrieval
-from benchmarks.runs import runs
+from benchmarks.runs import cold, runs, speed
 from benchmarks.section import BenchmarkData, NotGivenError, Row, Section, markdown
 from benchmarks.shapes import shapes
-from benchmarks.speed import cold, speed
 
 from cadalign.io.files import write_json
 

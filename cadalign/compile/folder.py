@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept, and what is said while they are made."""
+"""Folder of compiled kernels, and messages while they are compiled."""
 
 from __future__ import annotations
 

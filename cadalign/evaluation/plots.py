@@ -1,9 +1,9 @@
-"""Figures of runs: the look of each method, lines with quartile bands, and cumulative curves."""
+"""Figures of runs: lines with quartile bands, and curves of shares, a colour for each method."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,14 +18,14 @@ from cadalign.evaluation import metrics
 from cadalign.evaluation.methods import LIMIT
 from cadalign.evaluation.metrics import HIGH, Metric
 from cadalign.evaluation.runs.work import FAILED, OK
-from cadalign.evaluation.summary import Quartiles, Summary, known
+from cadalign.evaluation.summary import Quartiles, Summary, known, where
 from cadalign.io.files import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from cadalign.evaluation.runs.tables import Run
+    from cadalign.evaluation.runs.tables import Cells, Run
 
 # Colours that colour-blind people tell apart, too: Okabe and Ito's (jfly.uni-koeln.de/color), then
 # dark ones of Paul Tol's "muted" (personal.sron.nl/~pault).
@@ -37,20 +37,9 @@ COLORS = (
 _MARKERS = "os^DvP<X>phd"
 
 
-@dataclass(frozen=True)
-class Look:
-    """Line of a method; the marker and the dash are matplotlib's."""
-
-    color: str
-    marker: str
-    dash: str
-
-
-def look_of(method: str, place: int) -> Look:
-    """The look of a method by its place; that of the Cramer-Rao bound is without markers."""
-    if method == LIMIT:
-        return Look("black", "", "--")
-    return Look(COLORS[place % len(COLORS)], _MARKERS[place % len(_MARKERS)], "-")
+def color_of(method: str, place: int) -> str:
+    """The colour of a method by its place; that of the Cramer-Rao bound is black."""
+    return "black" if method == LIMIT else COLORS[place % len(COLORS)]
 
 
 STYLE: dict[Any, Any] = {
@@ -220,27 +209,38 @@ def _draw_lines(axes: Axes, plot: Plot) -> list[tuple[Any, Any, Any, str]]:
     bands = []
     methods = list(dict.fromkeys(trace.method for trace in plot.traces))
     for trace in plot.traces:
-        look = look_of(trace.method, methods.index(trace.method))
+        place, is_limit = methods.index(trace.method), trace.method == LIMIT
+        color = color_of(trace.method, place)
+        has_markers = not is_limit and len(trace.x) <= _MOST_TICKS
         middle = np.array(trace.y, dtype=float)
         if not np.isfinite(middle).any():
             continue
         axes.plot(
             trace.x,
             middle,
-            color=look.color,
-            linestyle=look.dash,
-            marker=look.marker if len(trace.x) <= _MOST_TICKS else "",
+            color=color,
+            linestyle="--" if is_limit else "-",
+            marker=_MARKERS[place % len(_MARKERS)] if has_markers else "",
             label=trace.method,
         )
-        # The Cramer-Rao bound, without markers, is a floor whose band would hide the others.
-        if trace.low is not None and trace.high is not None and look.marker:
+        # The Cramer-Rao bound is a floor whose band would hide the others.
+        if trace.low is not None and trace.high is not None and not is_limit:
             low, high = (np.array(end, dtype=float) for end in (trace.low, trace.high))
             axes.plot(trace.x, low, trace.x, high, alpha=0)  # make room for the band
-            bands.append((trace.x, low, high, look.color))
+            bands.append((trace.x, low, high, color))
     return bands
 
 
-_SHARE = replace(metrics.COVERED, key="share", label="objects", better=HIGH)
+def share_traces(
+    runs: Sequence[Run], places: FloatArray, shares: Callable[[Cells], FloatArray | None]
+) -> list[Trace]:
+    """Lines of shares of a method's rows at places (k,) of the axis; None where there is no row."""
+    return [
+        Trace.of(index, method, places.tolist(), found.tolist(), metrics.COVERED)
+        for index, run in enumerate(runs)
+        for method in run.methods
+        if (found := shares(where(run.cells, run.cells["method"] == method))) is not None
+    ]
 
 
 def cumulative(runs: Sequence[Run], metric: Metric, places: FloatArray, *, title: str) -> Plot:
@@ -250,23 +250,19 @@ def cumulative(runs: Sequence[Run], metric: Metric, places: FloatArray, *, title
     that were left out, skipped or have no value do not count; ``places`` (k,) are the errors, in
     the column's unit.
     """
-    traces = []
-    for index, run in enumerate(runs):
-        for method in run.methods:
-            chosen, status = run.cells["method"] == method, run.cells["status"]
-            errors = known(run.cells[metric.key][chosen & (status == OK)])
-            count = max(len(errors) + int((chosen & (status == FAILED)).sum()), 1)
-            within = (
-                errors >= places[:, None] if metric.better == HIGH else errors <= places[:, None]
-            )
-            shares = within.sum(axis=1) / count
-            traces.append(Trace.of(index, method, places.tolist(), shares.tolist(), _SHARE))
+    is_within = np.greater_equal if metric.better == HIGH else np.less_equal
     words = "at least this overlap" if metric.better == HIGH else "at most this error"
+
+    def shares(rows: Cells) -> FloatArray:
+        errors = known(rows[metric.key][rows["status"] == OK])
+        count = len(errors) + int((rows["status"] == FAILED).sum())
+        return np.asarray(is_within(errors, places[:, None]).sum(axis=1) / max(count, 1))
+
     return Plot(
         id=f"within_{metric.key}",
         x=metric,
-        y=replace(_SHARE, label=f"objects with {words}"),
-        traces=traces,
+        y=replace(metrics.COVERED, key="share", label=f"objects with {words}", better=HIGH),
+        traces=share_traces(runs, places, shares),
         note="over all categories; failures count",
         title=title,
     )

@@ -126,12 +126,18 @@ class Spec:
         return summaries
 
 
-# In the order in which they are named to users, with their modules.
-_NAMES = ("keypointnet", "demo", "simulate", "correspondences", "retrieval", "unseen", "photos")
-_EXPERIMENTS = {name: f"cadalign.evaluation.experiments.{name}" for name in _NAMES}
-_EXPERIMENTS["simulate"] = "cadalign.evaluation.experiments.simulation"
+# In the order in which they are named to users, with module and name of their specifications.
+_EXPERIMENTS = {
+    "keypointnet": "cadalign.evaluation.experiments.keypointnet:SPEC",
+    "demo": "cadalign.evaluation.experiments.keypointnet:DEMO",
+    "simulate": "cadalign.evaluation.experiments.simulation:SPEC",
+    "correspondences": "cadalign.evaluation.experiments.correspondences:SPEC",
+    "retrieval": "cadalign.evaluation.experiments.retrieval:SPEC",
+    "unseen": "cadalign.evaluation.experiments.unseen:SPEC",
+    "photos": "cadalign.evaluation.experiments.photos:SPEC",
+}
 BATCHES: dict[str, str] = {}
-"""Modules of runs over many observations, which `cadalign.report` shows as experiments are."""
+"""Specifications of runs over many observations, which `cadalign.report` shows likewise."""
 
 
 def known_options() -> Iterator[type[ExperimentOptions]]:
@@ -141,10 +147,11 @@ def known_options() -> Iterator[type[ExperimentOptions]]:
 
 def spec_named(name: str) -> Spec:
     """The specification of an experiment."""
-    module = (_EXPERIMENTS | BATCHES).get(name)
-    if module is None:
+    place = (_EXPERIMENTS | BATCHES).get(name)
+    if place is None:
         raise unknown("experiment", name, list(_EXPERIMENTS))
-    spec: Spec = import_module(module).SPEC
+    module, _, attribute = place.partition(":")
+    spec: Spec = getattr(import_module(module), attribute or "SPEC")
     return spec
 
 

@@ -47,7 +47,7 @@ from pathlib import Path
 from typing import Any
 
 from cadalign.evaluation.methods import LIMIT
-from cadalign.evaluation.plots import Plot, look_of
+from cadalign.evaluation.plots import Plot, color_of
 from cadalign.evaluation.runs.tables import Run
 from cadalign.io.files import (
     as_path,
@@ -170,7 +170,7 @@ def _plots(runs: Sequence[Run]) -> list[Plot]:
 
 def method_dict(name: str, place: int) -> dict[str, Any]:
     """A method for the page, by its place among all."""
-    is_limit, color = name == LIMIT, look_of(name, place).color
+    is_limit, color = name == LIMIT, color_of(name, place)
     return {
         "key": name,
         "color": _INK if is_limit else color,

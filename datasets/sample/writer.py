@@ -97,7 +97,7 @@ def write_sample_dataset(
 
 
 def _stored(folder: Path) -> dict[str, Any]:
-    """What the data set in a folder was made of, and its files."""
+    """Read from a folder the parameters of its data set, and its files."""
     with suppress(DataError):
         stored = read_json(folder / _MARKER)
         if isinstance(stored, dict) and isinstance(stored.get("files"), dict):

@@ -60,7 +60,7 @@ _LITERALS = {
 
 @dataclass
 class _Named:
-    """What a pickle calls by its name; an array or a type of arrays is made first, then filled."""
+    """A name that a pickle calls; an array or a type of arrays is made first, then filled."""
 
     name: str
     value: Any = None
@@ -177,7 +177,7 @@ def _named(module: str, attribute: str) -> _Named:
 
 
 def _made(name: str, *arguments: Any) -> Any:
-    """What calling a name makes: an array or its type is filled later."""
+    """Make what a name is called for: an array or its type is filled later."""
     if name == _DTYPE:
         code = arguments[0]
         if not _PLAIN_DTYPE.fullmatch(code):

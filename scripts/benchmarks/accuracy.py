@@ -14,12 +14,13 @@ from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Camera, RansacOptions
 from cadalign.arrays import FloatArray
-from cadalign.evaluation.metrics.errors import alignment_errors, cramer_rao_bound
+from cadalign.evaluation.metrics.errors import alignment_errors, scaled_columns
 from cadalign.evaluation.simulation import (
     SIMULATION_CAMERA,
     SimulatedProblem,
     simulate_problem,
 )
+from cadalign.geometry.camera import projection_jacobian
 from cadalign.metrics import rotation_error
 from cadalign.solvers.linear import aepnp
 
@@ -29,7 +30,7 @@ _METHODS = ("optimal", "aepnp", "aepnp-paper")
 _TITLE = "Rotation, median (90th percentile): the bound, and errors over it"
 _UNKNOWN = Camera.without_focal(SIMULATION_CAMERA.width, SIMULATION_CAMERA.height)
 _ROBUST_POINTS = 100
-_FOCAL = 9  # row of the focal length in a bound
+_SCALE_X, _FOCAL = 6, 9  # rows of a bound
 
 
 def accuracy(given: BenchmarkData) -> Tables:
@@ -79,11 +80,24 @@ def _ideal_errors(
     """Errors of an ideal estimator on all problems, by name; see `cramer_rao_bound`."""
     draws = []
     for each in problems:
-        given = each.points_3d, each.camera, each.alignment
-        bound = section.attempt(cramer_rao_bound, *given, sigma=sigma, focal=focal)
+        bound = section.attempt(cramer_rao_bound, each, sigma=sigma, focal=focal)
         if bound is not None:
             draws.append(sample_limit(bound, rng=rng, draws=section.LIMIT_DRAWS))
     return {error: np.concatenate([draw[error] for draw in draws]) for error in draws[0]}
+
+
+def cramer_rao_bound(problem: SimulatedProblem, *, sigma: float, focal: str) -> FloatArray:
+    """The least covariance of an unbiased estimate: inverse of the Fisher information at the truth.
+
+    As `cadalign.Result.covariance`, (9, 9) or (10, 10); ``focal`` is that of `cadalign.fit`.
+    """
+    size = _FOCAL + 1 if focal == "estimate" else _FOCAL
+    used = [row for row in range(size) if row != _SCALE_X]
+    jacobian = projection_jacobian(problem.points_3d, problem.camera, problem.alignment)
+    scaled, norms = scaled_columns(jacobian[:, :, used].reshape(-1, len(used)) / sigma)
+    covariance = np.zeros((size, size))
+    covariance[np.ix_(used, used)] = np.linalg.inv(scaled.T @ scaled) / np.outer(norms, norms)
+    return covariance
 
 
 def sample_limit(

@@ -16,7 +16,7 @@ import pytest
 
 from cadalign.cli import main
 from cadalign.errors import CadalignError
-from cadalign.evaluation.api import run, simulate
+from cadalign.evaluation.api import run
 from cadalign.evaluation.experiments.simulation import SweepOptions
 from cadalign.evaluation.runs.engine import Progress
 from cadalign.evaluation.runs.folder import RunFolder
@@ -55,18 +55,6 @@ def test_a_worker_killed_in_the_middle_leaves_the_bytes_as_they_are(
     run(KIND, hit, workers=None, dask=cluster.scheduler_address, on_progress=kill_one)
     assert killed
     assert hit.results.read_bytes() == calm.results.read_bytes()
-
-
-def test_simulate_takes_the_address(cluster: Any) -> None:
-    table = simulate(
-        "noise",
-        values=[1],
-        points=20,
-        runs=5,
-        methods=["aepnp"],
-        dask=cluster.scheduler_address,
-    )
-    assert table.status.tolist() == ["ok"] * 5
 
 
 @pytest.mark.timing

@@ -1,14 +1,18 @@
-"""Errors of many estimates at once: those of each alone, and special cases."""
+"""Errors of many estimates at once, and the alignment of a model's box to an estimated one."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from cadalign import metrics
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, Instance
+from cadalign.evaluation.instances.record import box_alignment
 from cadalign.evaluation.metrics.errors import estimate_errors
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.rotations import rotation_from_vector
@@ -84,3 +88,17 @@ def test_flat_models_have_no_overlap_and_estimates_that_are_not_finite_no_errors
     assert isinstance(second, InputError)
     assert "NaN" in str(second)
     assert third["box_iou"] == pytest.approx(1)
+
+
+@pytest.mark.slow
+@given(seed=st.integers(0, 10_000))
+def test_box_alignment_gives_the_same_box(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rotation = Rotation.random(random_state=seed).as_matrix()
+    found = Alignment(rotation, rng.normal(size=3), rng.uniform(0.5, 2, 3))
+    bounds, own = (np.sort(rng.normal(size=(2, 3)), axis=0) for _ in range(2))
+    own[1] += 0.1
+    bounds[1] += 0.1
+    box = Box.from_model(own, box_alignment(found, bounds, model_bounds=own))
+    wanted = Box.from_model(bounds, found)
+    np.testing.assert_allclose(box.corners, wanted.corners, atol=1e-9)

@@ -112,22 +112,11 @@ def finished(colmap: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolde
     return folder
 
 
-class TestFormats:
-    def test_blind_pnp_is_recognised(self, tmp_path):
-        write_pickles(tmp_path, ("matches", "R", "t"))
-        assert isinstance(open_correspondences(tmp_path), BlindPnP)
-
-    def test_an_empty_folder_is_refused_and_says_what_was_sought(self, tmp_path):
-        with pytest.raises(
-            DataError, match=r"no data set of correspondences .*points3D.*matches\.pkl"
-        ):
-            open_correspondences(tmp_path)
-
-    def test_a_missing_folder_and_a_file_are_refused(self, tmp_path, colmap):
-        with pytest.raises(DataError, match="no such folder"):
-            open_correspondences(colmap / "images.txt")
-        with pytest.raises(DataError, match="no such folder"):
-            open_correspondences(tmp_path / "nowhere")
+def test_formats_are_recognised(tmp_path):
+    with pytest.raises(DataError, match=r"no data set of corresp.*points3D.*matches\.pkl"):
+        open_correspondences(tmp_path)
+    write_pickles(tmp_path, ("matches", "R", "t"))
+    assert isinstance(open_correspondences(tmp_path), BlindPnP)
 
 
 class TestInputs:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from benchmarks.accuracy import cramer_rao_bound
 
 from cadalign import Alignment, fit
 from cadalign.arrays import FloatArray
@@ -18,7 +19,7 @@ from cadalign.evaluation.instances.instance import (
     sample_hull_views,
 )
 from cadalign.evaluation.methods import LIMIT, fit_methods, fit_options
-from cadalign.evaluation.metrics.errors import cramer_rao_bound, limit_estimate
+from cadalign.evaluation.metrics.errors import limit_estimate
 from cadalign.evaluation.simulation import simulate_problem
 from cadalign.geometry.alignment import Box
 from cadalign.geometry.camera import Camera
@@ -148,12 +149,22 @@ def test_the_limits_errors_have_the_cramer_rao_bound_as_their_covariance() -> No
         steps.append(
             [*vector / 2, *(est.translation - gt.translation), *np.log(est.scale / gt.scale)[1:]]
         )
-    bound = cramer_rao_bound(problem.points_3d, problem.camera, gt, sigma=0.01, focal="known")
+    bound = cramer_rao_bound(problem, sigma=0.01, focal="known")
     bound = np.delete(np.delete(bound, 6, axis=0), 6, axis=1)  # x has the scale 1
     spread = np.sqrt(np.diag(bound))
     assert np.allclose(np.std(steps, axis=0) / spread, 1.0, atol=0.05)
     correlation = np.cov(np.transpose(steps)) / np.outer(spread, spread)
     assert np.allclose(correlation, bound / np.outer(spread, spread), atol=0.08)
+
+
+def test_the_covariance_of_a_fit_without_noise_is_the_cramer_rao_bound() -> None:
+    for seed in range(20):
+        problem = simulate_problem(np.random.default_rng(seed), points=12, noise_px=0.0)
+        result = fit(problem.points_3d, problem.points_2d, problem.camera, sigma=1.0)
+        bound = cramer_rao_bound(problem, sigma=1.0, focal="known")
+        spread = np.sqrt(bound.diagonal())
+        gap = np.abs(result.fisher_covariance - bound)
+        assert (gap <= 1e-3 * np.outer(spread, spread)).all()
 
 
 def test_the_limit_refuses_keypoints_in_one_plane() -> None:

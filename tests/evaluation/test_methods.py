@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.pages import embedded_payload
 from support.refusals import refusal_line
 from support.solving import BAD, linear, weighted
 
@@ -76,20 +75,6 @@ def test_a_method_of_an_experiment_is_not_hidden(tmp_path: Path) -> None:
 
 
 # --- every experiment --------------------------------------------------------------------------
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("no_figures")
-def test_on_views_of_models_with_tables_and_page(sample_root: Path, tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    table = cadalign.evaluate(sample_root, methods=[linear, "optimal"], workers=0, out=out)
-    assert (table.status == "ok").all()
-    assert main(["report", str(out)]) == 0
-    page = embedded_payload(out / "report.html")
-    methods = {each["key"]: each for each in page["methods"]}
-    assert list(methods) == ["linear", "optimal"]
-    assert len({each["color"] for each in methods.values()}) == 2
-    assert {row["method"] for row in page["headline"]["rows"]} == set(methods)
 
 
 # --- processes and clusters --------------------------------------------------------------------

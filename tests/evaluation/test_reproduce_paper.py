@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import importlib
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -48,15 +47,3 @@ def test_everything_is_in_one_folder_beside_the_papers_numbers(
     ours = {(row["category"], row["method"]): float(row["R [deg]"]) for row in rows}
     for category in script.PAPER_TABLE:
         assert ours[category, "optimal"] < ours[category, "aepnp-paper"]
-
-
-@pytest.mark.long
-def test_the_script_says_what_is_wrong_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "file").touch()
-    monkeypatch.syspath_prepend(SCRIPT.parent)
-    monkeypatch.setattr(sys, "argv", [str(SCRIPT), "--out", str(tmp_path / "file" / "x")])
-    assert importlib.import_module(SCRIPT.stem).main() == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("reproduce_paper: ")

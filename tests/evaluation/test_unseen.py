@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from cadalign import Alignment, Box
-from cadalign.cli import main
 from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
 from cadalign.evaluation.api import run
@@ -177,22 +176,6 @@ class TestRun:
         assert iou["shape"] > 0.85
         assert rotation["exact"] == pytest.approx(rotation["limit"], rel=0.5)
 
-    @pytest.mark.slow
-    def test_scale_is_forgiven_and_nothing_else(self, finished: RunFolder) -> None:
-        for name in METHODS:
-            absolute, relative = (
-                column(finished, key, name) for key in ("box_iou", "box_iou_up_to_scale")
-            )
-            assert (relative >= absolute).all()
-            far, near = (
-                column(finished, key, name)
-                for key in ("translation_error", "translation_error_up_to_scale")
-            )
-            assert (near <= far).all()
-            # The bound may put a box behind the camera.
-            error = column(finished, "keypoint_error", name)
-            assert (error < 0.5).all()
-
     def test_only_methods_with_covariances_have_levels(self, finished: RunFolder) -> None:
         for name in ("nearest", "limit"):
             assert np.isnan(column(finished, "rotation_level", name)).all()
@@ -283,21 +266,6 @@ class TestOptions:
 
 @pytest.mark.usefixtures("no_figures")
 class TestCommand:
-    @pytest.mark.long
-    def test_a_run_is_made_and_shown_again(
-        self, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        out = tmp_path / "run"
-        options = ["--max-models", "2", "--keypoints", "7", "--methods", "mean-rigid", "shape"]
-        arguments = ["evaluate", "unseen", str(root), *options, "--workers", "0"]
-        assert main([*arguments, "--out", str(out)]) == 0
-        captured = capsys.readouterr()
-        assert "mean-rigid" in captured.out
-        assert f"Run: {out} (0 of 4 rows failed)" in captured.err
-        assert main([*arguments, "--workers", "0", "--out", str(out)]) == 0
-        assert capsys.readouterr().out == captured.out
-        assert "unseen objects" in (out / "report.html").read_text()
-
     def test_table_and_plots_are_written(self, finished: RunFolder) -> None:
         summaries = SPEC.write(Run.open(finished.path))
         with finished.summary.open() as file:

@@ -1,4 +1,4 @@
-"""The experiment on KeypointNet: methods on views of annotated models, their errors, pictures."""
+"""The experiment on KeypointNet: methods on views of annotated models; and the demonstration."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import lru_cache, partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -34,7 +35,7 @@ from cadalign.evaluation.instances.record import RECORD_COLUMNS, record_of
 from cadalign.evaluation.methods import LIMIT, Method, MethodInput, pose_of
 from cadalign.evaluation.metrics import INSTANCE_METRICS
 from cadalign.evaluation.metrics.errors import estimate_errors
-from cadalign.evaluation.options import ViewOptions
+from cadalign.evaluation.options import ExperimentOptions, ViewOptions
 from cadalign.evaluation.plots import cumulative_curves
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Columns, Outcome, Plan, Row, fingerprint_of_files
@@ -78,16 +79,13 @@ class KeypointNetOptions(ViewOptions):
         self.check_known(visibility=("auto", "hull"), render=("none", "overlay"))
 
 
-POSE_ERRORS = ("rotation_error_deg", "translation_error", "box_iou")
-"""Errors that the symmetries of a model bear on."""
 COLUMNS: Columns = (
-    *VIEW_NAMES,
-    *(("status", str), ("reason", str), ("visibility", str), ("keypoints", int)),
+    *(*VIEW_NAMES, ("status", str), ("reason", str), ("visibility", str), ("keypoints", int)),
     *((name, float) for name in ("stretch_y", "stretch_z", "rotation_error_deg")),
     *((name, float) for name in ("translation_error", "scale_y_error", "scale_z_error")),
     *(("box_iou", float), ("rms_px", float), ("symmetry", str)),
-    *((f"sym_{name}", float) for name in POSE_ERRORS),
-    ("translation_error_up_to_scale", float),
+    *(("sym_rotation_error_deg", float), ("sym_translation_error", float)),
+    *(("sym_box_iou", float), ("translation_error_up_to_scale", float)),
 )
 """Columns of every run; see docs/formats/runs.md."""
 
@@ -104,8 +102,7 @@ class KeypointTasks(Sequence[KeypointTask]):
     """
 
     def __init__(self, dataset: KeypointNet, options: Any) -> None:
-        self.dataset, self._visibility = dataset, options.visibility
-        self._views: int = options.views_per_model
+        self.dataset, self._views = dataset, int(options.views_per_model)
         self.keys = [
             key
             for category in dataset.categories
@@ -223,9 +220,8 @@ def keypointnet_benchmark(
     options: KeypointNetOptions, drawn_in: RunFolder | None = None
 ) -> Benchmark:
     """The methods of the options on views of models."""
-    found = Benchmark.chosen(
-        KeypointViews(options, drawn_in), options.methods, metrics=options.metrics
-    )
+    setting = KeypointViews(options, drawn_in)
+    found = Benchmark.chosen(setting, options.methods, metrics=options.metrics)
     batched = frozenset(each.name for each in found.methods if not each.has_statistics)
     return replace(found, batched=batched)
 
@@ -270,19 +266,15 @@ def summarize_views(run: Run) -> list[Summary]:
     ]
 
 
-_CURVES = tuple(
-    (metric, np.linspace(0, end, 41))
-    for metric, end in (
-        (metrics.SYM_ROTATION, 20.0),
-        (metrics.SYM_TRANSLATION, 0.2),
-        (metrics.SCALE_Y, 0.2),
-    )
+_CURVES = (
+    (metrics.SYM_ROTATION, np.linspace(0, 20.0, 41)),
+    (metrics.SYM_TRANSLATION, np.linspace(0, 0.2, 41)),
+    (metrics.SCALE_Y, np.linspace(0, 0.2, 41)),
 )
 
 
 # A chunk is three files: with few instances in each, large runs spend their time on files.
-_CHUNK, _CHUNK_DRAWN, _LARGE_CHUNK = 64, 8, 256
-_LARGE = 5_000  # views
+_CHUNK, _CHUNK_DRAWN, _LARGE_CHUNK, _LARGE = 64, 8, 256, 5_000  # the last in views
 
 
 def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
@@ -309,37 +301,100 @@ def _check_drawable(dataset: KeypointNet, options: KeypointNetOptions) -> None:
         )
 
 
-ON_INSTANCES: dict[str, Any] = {
-    "columns": (
+# Demonstration ------------------------------------------------------------------------------------
+
+_LEAST_SAMPLE = 12  # models of each category of a sample dataset
+
+
+@dataclass(frozen=True)
+class DemoOptions(ExperimentOptions):
+    """Align stretched models to pictures of the originals and show the result.
+
+    For each model: choose a view, render it, stretch the model by factors from 0.5 to 2 along y
+    and z, add noise to its visible keypoints, fit, and draw true (green) and predicted (red) box.
+    Writes results.parquet and index.html.
+    """
+
+    experiment = "demo"
+    command = "demo"
+
+    root: Path | None = None
+    """Folder of a dataset in KeypointNet's layout; by default a sample dataset is generated."""
+    _: KW_ONLY
+    categories: tuple[str, ...] | None = None
+    """Categories to take; all by default."""
+    per_category: int = 6
+    """Largest number of models of each category."""
+    noise_px: float = 1.0
+    """Standard deviation of the keypoints' noise, in pixels."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_least(per_category=1)
+        self.check_noise("noise_px")
+
+    @property
+    def default_workers(self) -> int:
+        """A demonstration is over before worker processes have started."""
+        return 0
+
+
+def plan_demo(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
+    """Plan one view of the first models with a mesh of every category."""
+    root = options.root
+    if root is None:
+        from cadalign.datasets import write_sample_dataset
+
+        folder.make()
+        least = max(options.per_category, _LEAST_SAMPLE)
+        root = write_sample_dataset(folder.path / "sample_dataset", per_category=least)
+    dataset = KeypointNet(root).subset(categories=options.categories, with_mesh=True)
+    if not dataset.ids():
+        raise DataError(
+            "none of the annotated models has a mesh",
+            where=str(dataset.root),
+            fix="put the meshes beside the annotations, or name the folder that holds both",
+        )
+    views = KeypointNetOptions(
+        root,
+        methods=("optimal",),
+        noise_px=options.noise_px,
+        seed=options.seed,
+        max_models=options.per_category,
+    )
+    tasks = KeypointTasks(dataset, views)
+    benchmark = keypointnet_benchmark(views, folder.made_for_pictures())
+    more = {"methods": list(views.methods), "annotations": tasks.fingerprint()}
+    return benchmark.plan(replace(options, root=root), tasks, chunk=1, **more)
+
+
+SPEC = Spec(
+    options=KeypointNetOptions,
+    plan=plan,
+    plots=partial(cumulative_curves, curves=_CURVES, of="of views"),
+    columns=(
         *(*_COUNTS, *TABLE, metrics.TRANSLATION_UP_TO_SCALE, metrics.SYM_ROTATION),
         *(metrics.SUCCESS_5, metrics.SUCCESS_10, metrics.OVER_BOUND),
     ),
-    "results": COLUMNS,
-    "summarize": summarize_views,
-    "console": (*_COUNTS, *TABLE, metrics.SYM_ROTATION, metrics.SUCCESS_5),
-    "console_note": "t in model diagonals; * rotations that map a model onto itself are no errors",
-    "metrics": INSTANCE_METRICS,
-    "kind": lambda run: "views of models",
-    "topic": "alignment",
-    "subject": "views of models",
-    "about": (
+    results=COLUMNS,
+    summarize=summarize_views,
+    console=(*_COUNTS, *TABLE, metrics.SYM_ROTATION, metrics.SUCCESS_5),
+    console_note="t in model diagonals; * rotations that map a model onto itself are no errors",
+    metrics=INSTANCE_METRICS,
+    kind=lambda run: "views of models",
+    topic="alignment",
+    subject="views of models",
+    about=(
         "Each picture shows a model as it is; methods get its visible keypoints, with noise, and "
         "the model stretched by unknown factors along y and z. Green is the truth, red the "
         "prediction."
     ),
-    "note": (
+    note=(
         "Medians over the instances that did not fail; the rates count failures, and not "
         "the instances that were skipped, since no view shows enough of their keypoints. The "
         "symmetry-aware error (sym.) takes rotations that map a model onto itself for right. A "
         "rate counts instances whose symmetry-aware rotation, translation in diagonals of the "
         "model and both scales are that good."
     ),
-}
-"""Members of the specification of every experiment on views of models."""
-
-SPEC = Spec(
-    options=KeypointNetOptions,
-    plan=plan,
-    plots=partial(cumulative_curves, curves=_CURVES, of="of views"),
-    **ON_INSTANCES,
 )
+DEMO = replace(SPEC, options=DemoOptions, plan=plan_demo, plots=lambda runs: [])

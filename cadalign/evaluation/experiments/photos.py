@@ -49,7 +49,7 @@ from cadalign.evaluation.summary import (
 from cadalign.io.files import read_bytes
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.photos.target import PhotoTask
+    from cadalign.evaluation.instances.sighting import PhotoTask
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.tables import Run
     from cadalign.shapes.model import ShapeModel
@@ -221,8 +221,8 @@ _LARGE = 500  # photos
 
 def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
     """Plan a run over the photos of a data set."""
-    from cadalign.evaluation.photos.objects import photos_benchmark
-    from cadalign.evaluation.photos.target import annotations_of, photo_tasks, reopened
+    from cadalign.evaluation.instances.photos import photos_benchmark
+    from cadalign.evaluation.instances.sighting import annotations_of, photo_tasks, reopened
 
     dataset = reopened(options.root)
     shapes = shapes_of(options.shape)

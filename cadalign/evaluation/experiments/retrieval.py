@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, replace
 from functools import lru_cache, partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -37,7 +38,6 @@ from cadalign.evaluation.plots import Plot, plot_against
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Columns, Plan, Row
 from cadalign.evaluation.summary import (
-    ALL,
     Group,
     Summary,
     known,
@@ -106,15 +106,12 @@ class RetrievalRunOptions(ModelOptions):
                 raise InputError(f"{values[0]:g} is less than {least}", where=name)
 
 
-NAMES: Columns = (
-    *(("category", str), ("model_id", str), ("noise_px", float), ("keypoints", int)),
-    *(("protocol", str), ("method", str)),
-)
 COLUMNS: Columns = (
-    *(*NAMES, ("status", str), ("reason", str), ("alike", int), ("rank", int)),
-    *(("matched_category", str), ("matched_id", str), ("score", float), ("shared", int)),
-    ("none_probability", float),
-    *(("rms_px", float), ("shape_distance", float), ("box_iou", float)),
+    *(("category", str), ("model_id", str), ("noise_px", float), ("keypoints", int)),
+    *(("protocol", str), ("method", str), ("status", str), ("reason", str)),
+    *(("alike", int), ("rank", int), ("matched_category", str), ("matched_id", str)),
+    *(("score", float), ("shared", int), ("none_probability", float), ("rms_px", float)),
+    *(("shape_distance", float), ("box_iou", float)),
     *(("box_iou_up_to_scale", float), ("rotation_error_deg", float)),
 )
 
@@ -205,7 +202,7 @@ class RetrievalQueries(Setting):
     options: RetrievalRunOptions
 
     def case(self, task: RetrievalTask) -> Case:
-        library = _opened(self.library)
+        library = opened_library(self.library)
         model = library[task.category, task.model_id]
         same_shapes(library, model.key)  # kept at hand: no query's time holds it
         query = observe_model(model, task, seed=self.options.seed)
@@ -215,7 +212,7 @@ class RetrievalQueries(Setting):
         """Compare matches with the true model; errors are those of the first match."""
         from cadalign.retrieval.absence import shape_distance
 
-        (task, query), library, first = instance, _opened(self.library), matches[0]
+        (task, query), library, first = instance, opened_library(self.library), matches[0]
         gt = library[task.category, task.model_id]
         alike = same_shapes(library, gt.key)
         best = library[first.category, first.model_id]
@@ -248,7 +245,7 @@ def retrieval_benchmark(library: str, options: RetrievalRunOptions) -> Benchmark
 def _retrieve(
     instance: RetrievalInstance, *, method: str, library: str, options: RetrievalRunOptions
 ) -> list[Match]:
-    (task, query), opened = instance, _opened(library)
+    (task, query), opened = instance, opened_library(library)
     alike = same_shapes(opened, (task.category, task.model_id))
     is_exact = task.protocol == LEAVE_IN and method == "optimal"
     return opened.retrieve(
@@ -266,7 +263,8 @@ def _retrieve(
 
 
 @lru_cache(maxsize=2)
-def _opened(path: str) -> Library:
+def opened_library(path: str | Path) -> Library:
+    """The library of a file, read once in every process."""
     from cadalign.retrieval.library import Library
 
     return Library.open(path)
@@ -278,20 +276,10 @@ def same_shapes(library: Library, key: ModelKey) -> frozenset[ModelKey]:
     from cadalign.retrieval.absence import SAME_SHAPE, distances
 
     gt = library[key]
-    keys, xyz = _by_keypoints(library)[gt.category, tuple(gt.ids.tolist())]
-    near = distances(xyz, gt.xyz) <= SAME_SHAPE
-    return frozenset([key, *(keys[k] for k in np.flatnonzero(near).tolist())])
-
-
-@lru_cache(maxsize=2)
-def _by_keypoints(library: Library) -> dict[Any, tuple[list[ModelKey], FloatArray]]:
-    groups: dict[Any, list[LibraryModel]] = {}
-    for model in library:
-        groups.setdefault((model.category, tuple(model.ids.tolist())), []).append(model)
-    return {
-        ids: ([model.key for model in models], np.array([model.xyz for model in models]))
-        for ids, models in groups.items()
-    }
+    models = [library[each] for each in library.keys if each[0] == gt.category]
+    models = [model for model in models if np.array_equal(model.ids, gt.ids)]
+    near = distances(np.array([model.xyz for model in models]), gt.xyz) <= SAME_SHAPE
+    return frozenset([key, *(models[k].key for k in np.flatnonzero(near).tolist())])
 
 
 # Summary ------------------------------------------------------------------------------------------
@@ -345,26 +333,24 @@ def summarize_queries(run: Run) -> list[Summary]:
 
 def plots(runs: Sequence[Run]) -> list[Plot]:
     """Rates and medians against the number of keypoints, over all categories, for each noise."""
-    found = []
-    for run in runs:
-        summaries = summarize_queries(run)
-        whole = {each["category"] for each in summaries}
-        kept = ALL if len(whole) > 1 else next(iter(whole))
-        found.append([each for each in summaries if each["category"] == kept])
+    # All categories together, or the only one, come last.
+    found = [
+        [each for each in summaries if each["category"] == summaries[-1]["category"]]
+        for summaries in map(summarize_queries, runs)
+    ]
     drawn = []
-    for metric, protocol in _PLOTS:
-        for noise in sorted({each["noise_px"] for summaries in found for each in summaries}):
-            chosen = [
-                [s for s in some if (s["protocol"], s["noise_px"]) == (protocol, noise)]
-                for some in found
-            ]
-            if any(chosen):
-                words = {
-                    "id": f"{protocol.replace('-', '_')}_{metric.key}_{noise:g}",
-                    "note": "over all categories",
-                    "title": f"{metric.label}, {noise:g} px of noise, {protocol}",
-                }
-                drawn.append(plot_against(chosen, _KEYPOINTS, metric, place="keypoints", **words))
+    noises = sorted({each["noise_px"] for summaries in found for each in summaries})
+    for (metric, protocol), noise in product(_PLOTS, noises):
+        words = {
+            "id": f"{protocol.replace('-', '_')}_{metric.key}_{noise:g}",
+            "note": "over all categories",
+            "title": f"{metric.label}, {noise:g} px of noise, {protocol}",
+        }
+        chosen = [
+            [s for s in some if (s["protocol"], s["noise_px"]) == (protocol, noise)]
+            for some in found
+        ]
+        drawn.append(plot_against(chosen, _KEYPOINTS, metric, place="keypoints", **words))
     return drawn
 
 
@@ -373,7 +359,13 @@ _CHUNK = 16
 
 def plan(options: RetrievalRunOptions, folder: RunFolder) -> Plan[RetrievalTask]:
     """Plan a run over the models of a library, which the folder gets as ``library.cadalign``."""
-    library = _library_of(options)
+    from cadalign.retrieval.library import Library
+
+    if options.root.is_file():
+        library = Library.open(options.root)
+    else:
+        dataset = KeypointNet(options.root, shapenet_root=options.shapenet)
+        library = Library.from_dataset(dataset, categories=options.categories)
     tasks = retrieval_tasks(library, options)
     folder.make()
     file = folder.path / "library.cadalign"
@@ -385,16 +377,6 @@ def plan(options: RetrievalRunOptions, folder: RunFolder) -> Plan[RetrievalTask]
         library.save(file)
     benchmark = retrieval_benchmark(str(file.absolute()), options)
     return benchmark.plan(options, tasks, chunk=_CHUNK, library=name)
-
-
-def _library_of(options: RetrievalRunOptions) -> Library:
-    """The library at a place, or one of the data set there."""
-    from cadalign.retrieval.library import Library
-
-    if options.root.is_file():
-        return Library.open(options.root)
-    dataset = KeypointNet(options.root, shapenet_root=options.shapenet)
-    return Library.from_dataset(dataset, categories=options.categories)
 
 
 SPEC = Spec(

@@ -11,13 +11,15 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import VIEW_NAMES
+from cadalign.evaluation.experiments.retrieval import opened_library
 from cadalign.evaluation.methods import LIMIT, SHAPE
 from cadalign.evaluation.options import ViewOptions
-from cadalign.evaluation.plots import Plot, Trace, cumulative_curves
+from cadalign.evaluation.plots import Plot, cumulative_curves, share_traces
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Columns, Plan
 from cadalign.evaluation.summary import (
@@ -35,7 +37,7 @@ from cadalign.io.files import made_folder
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.instance import KeypointTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.tables import Run
+    from cadalign.evaluation.runs.tables import Cells, Run
     from cadalign.retrieval.library import Library
     from cadalign.shapes.model import ShapeModel
 
@@ -152,19 +154,15 @@ def plots(runs: Sequence[Run]) -> list[Plot]:
 
 
 def _calibration(runs: Sequence[Run], column: str, name: str) -> Plot:
-    traces = []
-    for index, run in enumerate(runs):
-        for method in run.methods:
-            levels = known(run.cells[column][run.cells["method"] == method])
-            if len(levels):
-                shares = (levels <= _LEVELS[:, None]).mean(axis=1)
-                places = (100 * _LEVELS).tolist()
-                traces.append(Trace.of(index, method, places, shares.tolist(), metrics.COVERED))
+    def shares(rows: Cells) -> FloatArray | None:
+        levels = known(rows[column])
+        return (levels <= _LEVELS[:, None]).mean(axis=1) if len(levels) else None
+
     return Plot(
         id=f"calibration_{name}",
         x=metrics.NOMINAL,
         y=metrics.COVERED,
-        traces=traces,
+        traces=share_traces(runs, 100 * _LEVELS, shares),
         note="over all categories; uncertainties are right where both are equal",
         title=f"Calibration of the {name}",
     )
@@ -185,7 +183,7 @@ class LearnedFiles:
 
     def library(self) -> Library:
         """The library."""
-        return _open_library(self.folder / "library.cadalign")
+        return opened_library(self.folder / "library.cadalign")
 
 
 @lru_cache(maxsize=32)
@@ -193,13 +191,6 @@ def _open_shape(path: Path) -> ShapeModel:
     from cadalign.shapes.model import ShapeModel
 
     return ShapeModel.open(path)
-
-
-@lru_cache(maxsize=2)
-def _open_library(path: Path) -> Library:
-    from cadalign.retrieval.library import Library
-
-    return Library.open(path)
 
 
 def learn(
@@ -226,7 +217,12 @@ def learn(
         file = place / f"{category}.shape"
         if not file.is_file():
             logger.info("learning the shape of %s from %d models", category, len(train[category]))
-            ShapeModel.from_dataset(dataset, category, split=split, meshes=False).save(file)
+            try:
+                shape = ShapeModel.from_dataset(dataset, category, split=split, meshes=False)
+            except InputError as error:
+                where = f"{category}, split {split}"
+                raise InputError(error.what, where=where, fix=error.fix) from None
+            shape.save(file)
     if not (place / "library.cadalign").is_file():
         library.save(place / "library.cadalign")
     return LearnedFiles(place.absolute())

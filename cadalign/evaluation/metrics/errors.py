@@ -1,7 +1,4 @@
-"""Errors of estimates by column of the result table, their Cramer-Rao bound, stated levels.
-
-The bound is the least covariance of an unbiased estimate.
-"""
+"""Errors of estimates by column of the result table, those of an ideal estimator, stated levels."""
 
 from __future__ import annotations
 
@@ -13,7 +10,6 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError, InputError
-from cadalign.estimation.options import Sigma, pixel_information
 from cadalign.evaluation.runs.work import Row
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera, projection_jacobian
@@ -45,8 +41,7 @@ _LEAST_INFORMATION = 1e-12
 _LARGEST_LOG = 50.0
 # Smallest share of a covariance's largest eigenvalue that counts as variance.
 _NO_VARIANCE = 1e-12
-_FOCAL = 9  # row of the focal length
-_OF_STRETCHED = [0, 1, 2, 3, 4, 5, 7, 8, _FOCAL]  # unknowns where x has the scale 1
+_OF_STRETCHED = [0, 1, 2, 3, 4, 5, 7, 8]  # unknowns where x has the scale 1, focal length known
 
 
 def alignment_errors(*, est: Alignment, gt: Alignment, length: float = 1.0) -> dict[str, float]:
@@ -126,7 +121,7 @@ def estimate_errors(
 def _pose_errors(
     est: Alignments, gt: Alignments, bounds: FloatArray, diagonals: FloatArray
 ) -> dict[str, FloatArray]:
-    """The columns `POSE_ERRORS`; the box IoU of a model without volume is NaN."""
+    """Errors that a symmetry changes; the box IoU of a model without volume is NaN."""
     boxes, gt_boxes = Boxes.from_models(bounds, est), Boxes.from_models(bounds, gt)
     solid = have_volume(boxes) & have_volume(gt_boxes)
     ious = np.full(len(bounds), np.nan)
@@ -154,31 +149,10 @@ def _rms_px(estimates: Sequence[Alignment], instances: Sequence[Instance]) -> Fl
     return np.sqrt(means)
 
 
-# Cramer-Rao bound ---------------------------------------------------------------------------------
+# An ideal estimator, and stated uncertainties -----------------------------------------------------
 
 
-def cramer_rao_bound(
-    points_3d: FloatArray, camera: Camera, gt: Alignment, *, sigma: Sigma, focal: str
-) -> FloatArray:
-    """The least covariance that any unbiased estimate of an alignment can have.
-
-    The inverse of the Fisher information (J' W J)^-1 at the truth, which has the scale 1 along x,
-    for independent Gaussian noise of the keypoints; as `cadalign.Result.covariance`, (9, 9) or
-    (10, 10). ``sigma`` and ``focal`` are as for `cadalign.fit`.
-    """
-    used = _OF_STRETCHED if focal == "estimate" else _OF_STRETCHED[:-1]
-    whitening = np.linalg.cholesky(pixel_information(sigma, len(points_3d))).swapaxes(1, 2)
-    rows = (whitening @ projection_jacobian(points_3d, camera, gt)[:, :, used]).reshape(
-        -1, len(used)
-    )
-    scaled, norms = _scaled(rows)
-    size = _FOCAL + 1 if focal == "estimate" else _FOCAL
-    covariance = np.zeros((size, size))
-    covariance[np.ix_(used, used)] = np.linalg.inv(scaled.T @ scaled) / np.outer(norms, norms)
-    return covariance
-
-
-def _scaled(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+def scaled_columns(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Equations with columns of length 1, and the lengths; raises DegenerateError if degenerate."""
     norms = np.linalg.norm(rows, axis=0)
     scaled = rows / np.where(norms > 0, norms, 1.0)
@@ -197,10 +171,10 @@ def limit_estimate(
     the compared methods, so that no chance enters the comparison. The truth has the scale 1 along
     x, the camera no lens distortion.
     """
-    jacobian = projection_jacobian(points_3d, camera, gt)[:, :, _OF_STRETCHED[:-1]]
+    jacobian = projection_jacobian(points_3d, camera, gt)[:, :, _OF_STRETCHED]
     jacobian = jacobian.reshape(-1, UNKNOWNS)
     noise = (points_2d - camera.project(gt.apply(points_3d))).ravel()
-    scaled, norms = _scaled(jacobian)
+    scaled, norms = scaled_columns(jacobian)
     step = np.linalg.solve(scaled.T @ scaled, scaled.T @ noise) / norms
     # The exponential of a weakly determined scale would overflow.
     factors = np.exp(np.clip(step[6:], -_LARGEST_LOG, _LARGEST_LOG))

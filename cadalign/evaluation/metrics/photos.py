@@ -30,7 +30,7 @@ from cadalign.geometry.symmetry import Symmetry
 from cadalign.metrics import box_iou, rotation_error, scale_error
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.photos.target import PhotoTarget
+    from cadalign.evaluation.instances.sighting import PhotoTarget
     from cadalign.evaluation.runs.tables import Cells
     from cadalign.evaluation.summary import Statistics
 

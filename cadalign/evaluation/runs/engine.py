@@ -12,38 +12,25 @@ from __future__ import annotations
 
 import copy
 import logging
-import multiprocessing
-import os
 import pickle
 import shutil
-import signal
-import sys
-import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    CancelledError,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    ThreadPoolExecutor,
-    wait,
-)
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from types import ModuleType
 from typing import Any, TypeVar
 
 from cadalign.arrays import is_whole as is_integer
 from cadalign.arrays import worker_count
-from cadalign.errors import CadalignError, DataError, InputError, quote
+from cadalign.errors import CadalignError, InputError, quote
+from cadalign.evaluation.runs.executors import cluster, in_threads, processes
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import SECONDS, is_whole, read_cells, write_rows, write_tables
 from cadalign.evaluation.runs.work import AbortError, Columns, Experiment, Plan, Row, reason_of
-from cadalign.io.files import made_folder, printable
+from cadalign.io.files import made_folder
 
 logger = logging.getLogger("cadalign")
 
@@ -52,8 +39,6 @@ Chunk = tuple[int, Sequence[Any]]
 """Number of a chunk, and its tasks."""
 
 KILLED_REASON = "its chunk killed a worker process twice (a crash, or out of memory)"
-# Sums that several threads share are rounded in another order than those of one.
-_ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 _MOST_DEATHS = 3  # of executors in succession that finish nothing
 
 
@@ -91,7 +76,7 @@ def workers_of(count: int, dask: str | None, *, threads: int = 1) -> Workers:
             fix = "pip install 'cadalign[dask]'"
             raise CadalignError("Dask is not installed", where="--dask", fix=fix) from None
         # Of a scheduler that is gone, all calls are cancelled; to connect anew tells of it.
-        return Workers(partial(_cluster, dask), (KilledWorker, CancelledError))
+        return Workers(partial(cluster, dask), (KilledWorker, CancelledError))
     if not is_integer(count) or count < -1:
         raise InputError(
             f"{quote(count)} is not a number of processes",
@@ -99,8 +84,8 @@ def workers_of(count: int, dask: str | None, *, threads: int = 1) -> Workers:
             fix="give 1 or more, -1 for one for each core, 0 for none",
         )
     if count:
-        return Workers(partial(_processes, worker_count(count)), (BrokenProcessPool,))
-    return Workers(partial(_threads, threads))
+        return Workers(partial(processes, worker_count(count)), (BrokenProcessPool,))
+    return Workers(partial(in_threads, threads))
 
 
 def execute(
@@ -286,102 +271,3 @@ _unpickled = lru_cache(maxsize=1)(pickle.loads)
 
 def _evaluate_pickled(pickled: bytes, tasks: Sequence[Any]) -> list[Row]:
     return evaluate_chunk(_unpickled(pickled), tasks)
-
-
-# Executors ----------------------------------------------------------------------------------------
-
-
-@contextmanager
-def _threads(count: int) -> Iterator[tuple[Executor, int]]:
-    """Threads of this process, for what lets go of the interpreter lock."""
-    with _cancelling(ThreadPoolExecutor(count)) as executor:
-        yield executor, count
-
-
-@contextmanager
-def _processes(count: int) -> Iterator[tuple[Executor, int]]:
-    """Processes of one thread each, which do not run this one's script again."""
-    main, kept = sys.modules["__main__"], {name: os.environ.get(name) for name in _ENVIRONMENT}
-    sys.modules["__main__"] = ModuleType("__main__")
-    os.environ.update(_ENVIRONMENT)
-    try:
-        context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
-        with _cancelling(pool) as executor:
-            yield executor, count + 1
-    finally:
-        sys.modules["__main__"] = main
-        for name, value in kept.items():
-            os.environ.pop(name)
-            if value is not None:
-                os.environ[name] = value
-
-
-@contextmanager
-def _cancelling(executor: Executor) -> Iterator[Executor]:
-    """The executor; at the end it finishes what it is doing, and does not begin anything else."""
-    try:
-        yield executor
-    finally:
-        executor.shutdown(cancel_futures=True)
-
-
-def _start_worker() -> None:
-    sys.stdout = sys.stderr  # what functions print is not the command's output
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # without a traceback from each
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
-
-
-@contextmanager
-def _cluster(address: str, *, timeout: float = 15.0) -> Iterator[tuple[Executor, int]]:
-    """The Dask cluster of a scheduler's address, such as tcp://10.0.0.1:8786.
-
-    Its workers need the same version of cadalign, and the same folders under the same names. Dask
-    itself hands a chunk whose worker dies to others, until its ``allowed-failures`` are exceeded.
-    ``timeout`` is that of the scheduler, and of its first worker [s].
-    """
-    from distributed import Client
-
-    with _quiet():
-        try:
-            # `distributed` is not typed throughout.
-            client: Any = Client(  # type: ignore[no-untyped-call]
-                address, timeout=timeout, set_as_default=False
-            )
-        except (OSError, ValueError) as error:
-            raise DataError(
-                f"no Dask scheduler answers ({str(error)[:200]})",
-                where=printable(address),
-                fix="start one with `dask scheduler`, and give its address, tcp://host:8786",
-            ) from None
-        with client:
-            try:
-                client.wait_for_workers(1, timeout=timeout)
-            except TimeoutError:
-                fix = "start some with `dask worker ADDRESS`"
-                raise DataError("the Dask cluster has no workers", where=address, fix=fix) from None
-            # Named by chance: to name a chunk by its content takes longer than to evaluate it.
-            executor = client.get_executor(pure=False)
-            # Clusters grow, and a round trip may cost more than a chunk.
-            yield executor, 2 * sum(client.nthreads().values()) + 2
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep the client's tracebacks about lost connections from the user, who gets an error."""
-    loggers = [logging.getLogger(f"distributed.{name}") for name in ("client", "utils")]
-    levels = [logger.level for logger in loggers]
-    try:
-        for logger in loggers:
-            logger.setLevel(logging.CRITICAL)
-        yield
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)

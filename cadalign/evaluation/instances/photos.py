@@ -46,10 +46,7 @@ from cadalign.evaluation.instances.record import (
     record_of,
     record_stem,
 )
-from cadalign.evaluation.methods import SHAPE, Method, MethodInput
-from cadalign.evaluation.metrics.photos import score_alignment
-from cadalign.evaluation.options import is_function
-from cadalign.evaluation.photos.target import (
+from cadalign.evaluation.instances.sighting import (
     PhotoTarget,
     PhotoTask,
     Sighting,
@@ -57,6 +54,9 @@ from cadalign.evaluation.photos.target import (
     sight,
     targets_of,
 )
+from cadalign.evaluation.methods import SHAPE, Method, MethodInput
+from cadalign.evaluation.metrics.photos import score_alignment
+from cadalign.evaluation.options import is_function
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import LeftOutError, Outcome, Row
 from cadalign.geometry.alignment import Alignment, Box

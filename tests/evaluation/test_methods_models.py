@@ -13,8 +13,8 @@ from support.photo_sets import write_pascal3d
 import cadalign.datasets
 from cadalign import Model
 from cadalign.evaluation.experiments import photos as options
-from cadalign.evaluation.photos.objects import _model
-from cadalign.evaluation.photos.target import PhotoTarget
+from cadalign.evaluation.instances.photos import _model
+from cadalign.evaluation.instances.sighting import PhotoTarget
 
 BOUNDS = np.array([[-1.0, -0.5, -1.0], [1.0, 0.5, 1.0]])  # of a diagonal of 3
 

@@ -29,10 +29,10 @@ from cadalign.errors import DegenerateError
 from cadalign.evaluation.api import run
 from cadalign.evaluation.benchmark import Benchmark
 from cadalign.evaluation.experiments.photos import COLUMNS, SPEC, PhotosOptions, summarize_objects
+from cadalign.evaluation.instances.photos import PhotoEstimate, PhotoObjects
 from cadalign.evaluation.instances.pictures import cut_out
+from cadalign.evaluation.instances.sighting import Sighting, annotations_of, opened, photo_tasks
 from cadalign.evaluation.methods import Method
-from cadalign.evaluation.photos.objects import PhotoEstimate, PhotoObjects
-from cadalign.evaluation.photos.target import Sighting, annotations_of, opened, photo_tasks
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.summary import Summary

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,9 +13,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cadalign import Alignment
+from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics.photos import (
+    ROTATION,
     VIEWPOINT,
     scan2cad_errors,
+    score_alignment,
+    score_columns,
     statistics_of,
     symmetric_box_iou,
 )
@@ -43,6 +49,24 @@ def test_accuracy_at_pi_6():
     arrays = {name: np.array(values, dtype=object) for name, values in cells.items()}
     found = statistics_of([VIEWPOINT], arrays)
     assert found["accuracy_pi_6"](Group(arrays, arrays)) == 0.5
+
+
+def test_a_new_metric_is_a_line_of_a_set() -> None:
+    """A function of one's own is a metric, too: see `test_metrics`."""
+    depth = Metric("depth_off", "depth error", "m")
+    extended = replace(
+        VIEWPOINT,
+        measure=lambda target, est, gt, box: {depth.key: abs(float((est - gt).sum()))},
+        medians=(*VIEWPOINT.medians, depth),
+    )
+    assert score_columns([extended])[-1] == (depth.key, float)
+    target: Any = SimpleNamespace(gt=np.array([0.0, 0.0, 2.0]))
+    ests: list[Any] = [target.gt + [0, 0, off] for off in (0.25, 0.5, 2.0)]
+    box: Any = None
+    rows = [score_alignment(target, [extended], est, box) for est in ests]
+    cells = {depth.key: np.array([row[depth.key] for row in rows])}
+    found = statistics_of([extended], cells | {ROTATION.key: np.full(3, np.nan)})
+    assert found[depth.key](Group(cells, cells)) == 0.5
 
 
 # Scan2CAD -----------------------------------------------------------------------------------------

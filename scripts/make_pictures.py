@@ -34,7 +34,7 @@ from cadalign.render import (
     pose_in_view,
     visible_keypoints,
 )
-from cadalign.render.drawing.canvas import ByteImage
+from cadalign.render.canvas import ByteImage
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"

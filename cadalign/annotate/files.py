@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cadalign.datasets.models.model_keypoints import SUFFIX
+from cadalign.datasets.model_keypoints import SUFFIX
 from cadalign.errors import DataError, InputError
 from cadalign.io.documents import path_from, read_json
 from cadalign.io.files import checksum, locked, read_bytes

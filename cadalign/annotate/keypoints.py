@@ -10,7 +10,7 @@ import numpy as np
 
 from cadalign.annotate.options import SessionOptions
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.datasets.models.model_keypoints import ModelKeypoint
+from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import KeypointId

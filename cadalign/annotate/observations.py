@@ -23,7 +23,7 @@ from cadalign.annotate.marks import Marks, Pair
 from cadalign.annotate.model import OpenedModel
 from cadalign.annotate.photos import MarkedMask, PhotoFile, camera_of
 from cadalign.arrays import FloatArray
-from cadalign.datasets.models.model_keypoints import ModelKeypoint
+from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import (

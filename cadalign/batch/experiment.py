@@ -17,8 +17,8 @@ import numpy as np
 from cadalign.batch.observation_fit import ObservationFit, opened_shape
 from cadalign.batch.outputs import COLUMNS, RECORD_COLUMNS, draw_fit, naming_row, result_row
 from cadalign.batch.sources import ObservationTask, ObservationTasks
-from cadalign.datasets.detections.image_keypoints import ImageKeypoints, observed_in, photo_in
-from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
+from cadalign.datasets.image_keypoints import ImageKeypoints, observed_in, photo_in
+from cadalign.datasets.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.estimation.result import Result
 from cadalign.evaluation.options import ExperimentOptions, absolute_paths

@@ -17,7 +17,7 @@ from cadalign.io.documents import in_file, parse_json, read_json
 from cadalign.io.files import keeping
 from cadalign.io.kinds import FIT
 from cadalign.io.observation import Observation
-from cadalign.render.drawing.model_overlay import mesh_of
+from cadalign.render.overlay import mesh_of
 from cadalign.shapes.model import ShapeModel
 
 

@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
-from cadalign.datasets.models.shapenet import name_of_synset
+from cadalign.datasets.shapenet import name_of_synset
 from cadalign.errors import CadalignError, RenderError
 from cadalign.estimation.result import Result
 from cadalign.evaluation.benchmark import write_picture
@@ -31,7 +31,7 @@ from cadalign.geometry.alignment import Box
 from cadalign.io.files import write_whole
 from cadalign.io.images import read_image
 from cadalign.io.observation import Observation
-from cadalign.render.drawing.model_overlay import mesh_of
+from cadalign.render.overlay import mesh_of
 
 _LISTS: Columns = (
     *(("covariance", list[float]), ("residuals", list[float]), ("is_inlier", list[bool])),

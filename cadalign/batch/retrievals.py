@@ -13,7 +13,7 @@ from cadalign.arrays import worker_count
 from cadalign.batch.experiment import Estimated, ManyOptions, plan_run
 from cadalign.batch.spec import SPEC as FIT_SPEC
 from cadalign.batch.spec import summarize_by
-from cadalign.datasets.models.model_keypoints import ModelKeypoints
+from cadalign.datasets.model_keypoints import ModelKeypoints
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.runs.work import Columns
 from cadalign.evaluation.summary import median

@@ -18,8 +18,8 @@ from typing import Any, BinaryIO, NamedTuple
 
 import msgspec
 
-from cadalign.datasets.detections.image_keypoints import ImageKeypoints
-from cadalign.datasets.detections.keypoint_files import read_image_keypoints
+from cadalign.datasets.image_keypoints import ImageKeypoints
+from cadalign.datasets.keypoint_files import read_image_keypoints
 from cadalign.errors import DataError
 from cadalign.evaluation.runs.work import fingerprint, fingerprint_of_files
 from cadalign.io.documents import read_json

@@ -22,7 +22,7 @@ from cadalign.io.kinds import OBSERVATION, is_of_many
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
     from cadalign.io.observation import Observation
-    from cadalign.render.drawing.canvas import ByteImage
+    from cadalign.render.canvas import ByteImage
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +128,7 @@ def drawn(
         return [], []
     from cadalign.io.images import read_mask
     from cadalign.render import Scene, overlay_model
-    from cadalign.render.drawing.model_overlay import draw_result, mesh_of, photo_of
+    from cadalign.render.overlay import draw_result, mesh_of, photo_of
 
     seen = list(zip(observation.views, result.views, strict=True))
     photos = [photo_of(image.image, view.camera) for image, view in seen]

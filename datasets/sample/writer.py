@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import require_counts
-from cadalign.datasets.models.shapenet import SYNSETS
 from cadalign.datasets.sample.kinds import bottle, car, chair, vessel
 from cadalign.datasets.sample.parts import has_area
+from cadalign.datasets.shapenet import SYNSETS
 from cadalign.errors import DataError, unknown
 from cadalign.geometry.mesh import Mesh, join
 from cadalign.io.documents import read_json

@@ -18,7 +18,7 @@ from cadalign.datasets import (
     join_keypoints,
     read_image_keypoints,
 )
-from cadalign.datasets.detections.image_keypoints import photo_in
+from cadalign.datasets.image_keypoints import photo_in
 from cadalign.errors import CadalignError, DataError, InputError
 
 CAMERA = Camera.without_focal(640, 480)

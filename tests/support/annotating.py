@@ -25,7 +25,7 @@ from cadalign.annotate.server import Access, listen, make_app, make_server
 from cadalign.annotate.session import Session, open_session
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, ModelKeypoints
-from cadalign.datasets.models.model_keypoints import ModelKeypoint
+from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.evaluation.instances.instance import Instance, load_scene, make_instance
 from cadalign.io.images import write_image
 from cadalign.render import RaycastRenderer

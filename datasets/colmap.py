@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.datasets.sfm.correspondences import (
+from cadalign.datasets.correspondences import (
     Correspondences,
     CorrespondenceSet,
     find_layout,

@@ -20,8 +20,8 @@ import numpy.typing as npt
 from msgspec import field
 
 from cadalign.arrays import BoolArray, FloatArray, is_number
-from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
-from cadalign.datasets.photos.dataset import leaving_out
+from cadalign.datasets.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
+from cadalign.datasets.records import leaving_out
 from cadalign.errors import DataError, InputError, quote
 from cadalign.io.documents import Count, Finite, ForeignDocument, Text, convert, in_file, read_json
 from cadalign.io.kinds import DETECTOR

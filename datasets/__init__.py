@@ -31,7 +31,7 @@ if TYPE_CHECKING:
         Truth,
     )
     from cadalign.datasets.pix3d import Pix3D
-    from cadalign.datasets.sample.writer import write_sample_dataset
+    from cadalign.datasets.sample import write_sample_dataset
     from cadalign.datasets.scan2cad import Scan2CAD
     from cadalign.datasets.shapenet import SYNSETS, ShapeNet, ShapeNetModel
     from cadalign.io.meshes.files import check_solid, load_mesh

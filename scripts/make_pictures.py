@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 
 from cadalign import Box, Camera, Observation, fit
-from cadalign.annotate.options import SessionOptions
+from cadalign.annotate.files import SessionOptions
 from cadalign.annotate.session import open_session
 from cadalign.datasets import AnnotatedModel, KeypointNet, ModelKeypoints, write_sample_dataset
 from cadalign.evaluation.instances.instance import load_scene, make_instance

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cadalign.annotate.keypoints import KeypointRegistry, ObjectShape, positions_of
+from cadalign.annotate.marks import KeypointRegistry, ObjectShape, positions_of
 from cadalign.annotate.model import Wireframe
 from cadalign.annotate.observations import LEAST_JOINT_PAIRS
 from cadalign.annotate.problem import LiveEstimate

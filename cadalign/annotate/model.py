@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.annotate.files import LastContent, keypoints_file, refuse_other_model
-from cadalign.annotate.keypoints import KeypointRegistry, ObjectShape
-from cadalign.annotate.marks import Pair
+from cadalign.annotate.marks import KeypointRegistry, ObjectShape, Pair
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats
 from cadalign.datasets.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import InputError

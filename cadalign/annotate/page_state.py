@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from cadalign.annotate.actions import ActionOutcome
-from cadalign.annotate.keypoints import ObjectShape
 from cadalign.annotate.live import LiveAlignment, short
+from cadalign.annotate.marks import ObjectShape
 from cadalign.annotate.model import box_lines
 from cadalign.annotate.session import Annotation, Session
 from cadalign.arrays import FloatArray

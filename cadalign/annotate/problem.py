@@ -15,7 +15,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.annotate.keypoints import ObjectShape, positions_of
+from cadalign.annotate.marks import ObjectShape, positions_of
 from cadalign.annotate.observations import LIKELY_STRETCH
 from cadalign.arrays import FloatArray
 from cadalign.batch.observed import model_of, views_of

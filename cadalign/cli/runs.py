@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from cadalign.batch.experiment import ManyOptions
-    from cadalign.cli.common import ManyCommand
+    from cadalign.cli.options import ManyCommand
     from cadalign.evaluation.registry import Spec
     from cadalign.evaluation.runs.engine import Progress as RunProgress
     from cadalign.evaluation.runs.folder import RunFolder

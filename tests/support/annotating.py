@@ -18,7 +18,7 @@ from playwright.sync_api import Browser, ConsoleMessage, Page
 
 from cadalign import Result, View, align
 from cadalign.annotate.actions import perform
-from cadalign.annotate.options import SessionOptions
+from cadalign.annotate.files import SessionOptions
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.photos import MarkedMask
 from cadalign.annotate.server import Access, listen, make_app, make_server

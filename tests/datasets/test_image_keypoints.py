@@ -141,13 +141,6 @@ def test_detectors_files_are_read(tmp_path: Path, data: Any, score: float | None
     assert found.source == f"{tmp_path / 'keypoints.json'}: [0]"
 
 
-def test_mmpose_predictions_name_their_keypoints(tmp_path: Path) -> None:
-    instance = {"keypoints": POINTS, "keypoint_scores": [0.9, 0.8, 0.1]}
-    meta = {"keypoint_id2name": {str(n): name for n, name in enumerate(NAMES)}}
-    (image,) = read(tmp_path, {"meta_info": meta, "instance_info": [instance]})
-    assert image.names == tuple(NAMES)
-
-
 @pytest.mark.parametrize(
     ("third", "scores"),
     [
@@ -171,8 +164,8 @@ def test_flags_are_told_from_scores(
         (3, "{path}: 3 is not an object or a list; is it COCO's keypoint JSON"),
         (
             {"frames": []},
-            "{path}: top level: neither annotations nor instance_info; is it COCO's keypoint "
-            "JSON, or a detector's? see cadalign's page on keypoints of detectors",
+            "{path}: annotations: missing; is it COCO's keypoint JSON, or a detector's? see "
+            "cadalign's page on keypoints of detectors",
         ),
         ([], "{path}: there are no keypoints"),
         ({"annotations": []}, "{path}: there are no keypoints"),
@@ -230,10 +223,8 @@ def test_flags_are_told_from_scores(
             [{"keypoints": [[1, 2, -0.5]]}],
             "[0]: scores: keypoint 0 has the value -0.5, which is negative",
         ),
-        (
-            {"instance_info": [{"keypoints": [[1, 2]]}], "meta_info": {"keypoint_id2name": {}}},
-            "{path}: instance_info[0].keypoints: 1 keypoints, but the category names 0",
-        ),
+        ([{"keypoints": [[1, 2]], "score": "high"}], "{path}: [0].score: 'high' is not a "),
+        (changed("images.0.width", 0), "{path}: images[0].width: 0 is "),
         ("[", "{path}, line 1: not valid JSON: Expecting value"),
     ],
 )

@@ -135,14 +135,6 @@ def test_splits(root):
         dataset.split("test")
 
 
-def test_hidden_files_of_archives_made_on_a_mac_are_passed_over(root):
-    for path in ("annotations/._chair.json", "splits/._train.txt"):
-        (root / path).write_bytes(b"\0\5\26\7\0\2\0\0Mac OS X")
-    dataset = KeypointNet(root)
-    assert (dataset.categories, dataset.splits) == (("chair", "mug"), ("test", "train"))
-    assert len(dataset) == 3
-
-
 def test_subsets_narrow_each_other(root):
     dataset = KeypointNet(root)
     chairs = dataset.subset(categories=["chair"])
@@ -157,11 +149,6 @@ def test_subsets_narrow_each_other(root):
 
 
 # --- meshes
-
-
-def test_mesh_is_loaded_and_matches(root):
-    model = KeypointNet(root)["chair", "a"]
-    np.testing.assert_allclose(model.keypoints.on_mesh(model.load_mesh()), model.keypoints.xyz)
 
 
 def test_model_without_mesh_says_so(root):
@@ -282,13 +269,6 @@ def test_model_that_occurs_twice_counts_once(root):
     dataset = KeypointNet(root)
     assert [model.model_id for model in dataset["chair"]] == ["z", "a"]
     assert "occurs twice" in str(dataset.problems["chair", "z#2"])
-
-
-def test_malformed_models_with_a_mesh_stay_in_a_subset_with_meshes(root):
-    bad = entry("a")
-    del bad["keypoints"]
-    write_json(root / "annotations/chair.json", [entry("z"), bad])
-    assert KeypointNet(root).subset(with_mesh=True).ids() == (("chair", "a"),)
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[{}", "\xff"])

@@ -14,7 +14,6 @@ from scipy.spatial import cKDTree
 
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.datasets.sample import MAKERS
-from cadalign.datasets.sample.parts import box, lathe
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh, join
 
@@ -257,18 +256,6 @@ def test_models_are_mirror_symmetric(models: Models) -> None:
 
 def _volume(mesh: Mesh) -> float:
     return float(trimesh.Trimesh(mesh.vertices, mesh.faces).volume)
-
-
-def test_parts_have_the_size_and_volume_they_should() -> None:
-    block = box((1, 2, 3), (2, 4, 6), (1, 2, 3))
-    assert _volume(block) == pytest.approx(48.0)
-    np.testing.assert_allclose(block.bounds, [[0, 0, 0], [2, 4, 6]])
-    soft = box((0, 0, 0), (2, 4, 6), (1, 2, 3), radius=0.2)
-    np.testing.assert_allclose(np.ptp(soft.vertices, axis=0), (2, 4, 6))
-    assert 0.95 * 48 < _volume(soft) < 48
-    angle = np.linspace(0, np.pi, 33)
-    ball = lathe(np.stack([np.sin(angle), -2 * np.cos(angle)], axis=1), (1, 2, 3), count=64)
-    assert _volume(ball) == pytest.approx(4 * np.pi * 2 / 3, rel=0.01)
 
 
 def moments(mesh: Mesh) -> list[float]:

@@ -96,8 +96,7 @@ def draw_overlay(
     unseen : (n, 2) float, optional
         Predicted keypoints that were not observed [px].
     regions : (r, j, 2) float, optional
-        Outlines of regions that hold keypoints [px]; see
-        `cadalign.render.layers.confidence_regions`.
+        Outlines of regions that hold keypoints [px], as of `confidence_regions`.
     outliers : (n, 2) float, optional
         Observed keypoints that the estimate left out [px]: their rings are grey.
     axes : bool
@@ -249,10 +248,7 @@ def _draw_strokes(canvas: Canvas, strokes: list[_Stroke]) -> None:
 
 
 def overlay_model(
-    image: npt.ArrayLike,
-    camera: Camera,
-    mesh: Mesh | Scene,
-    alignment: Alignment,
+    image: npt.ArrayLike, camera: Camera, mesh: Mesh | Scene, alignment: Alignment
 ) -> ByteImage:
     """Draw an aligned model over its photo, shaded, with its edges, its box and its axes.
 
@@ -399,11 +395,9 @@ def drawable_mesh(result: Any, mesh: Mesh | str | os.PathLike[str] | None = None
     """The mesh of a result; None where there is none to warp, or the model's cannot be read."""
     try:
         return cast(Mesh, result.mesh(mesh))
-    except InputError:
+    except (InputError, DataError) as error:
         if mesh is not None:
             raise
-    except DataError as error:
-        if mesh is not None:
-            raise
-        logger.warning("the nearest training model is not drawn: %s", error)
+        if isinstance(error, DataError):
+            logger.warning("the nearest training model is not drawn: %s", error)
     return None

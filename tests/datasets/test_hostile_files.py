@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import pickle
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,11 @@ from support.timing import Measure, ratio, reference_seconds, timed
 from cadalign.datasets import (
     BlindPnP,
     load_mesh,
+    read_image_keypoints,
 )
 from cadalign.errors import CadalignError, DataError
 from cadalign.io.documents import read_json
+from cadalign.io.images import read_photo
 from cadalign.io.observation import Observation
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
@@ -191,3 +194,9 @@ def test_long_names_of_textures_and_materials_are_cut(
     for record in caplog.records:
         assert record.getMessage().isprintable()
         assert len(record.getMessage()) < 600
+
+
+@pytest.mark.parametrize("read", [read_photo, read_image_keypoints, load_mesh])
+def test_paths_with_a_nul_are_refused(read: Callable[[str], object]) -> None:
+    with pytest.raises(CadalignError):
+        read("a\0b.obj")

@@ -157,12 +157,6 @@ def test_models_that_lack_keypoints_are_ranked_below_the_same_with_them() -> Non
     assert next(match for match in matches if match.model_id == "part").missing_ids == (9,)
 
 
-def test_excluded_models_are_left_out() -> None:
-    best = first(OBJECTS[0])
-    other = first(OBJECTS[0], exclude=[(best.category, best.model_id)])
-    assert other.model_id != best.model_id
-
-
 @pytest.mark.slow
 def test_outliers_do_not_count_with_a_robust_loss() -> None:
     model = OBJECTS[5]

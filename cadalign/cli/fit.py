@@ -1,4 +1,4 @@
-"""`cadalign fit`: align the models of observation files."""
+"""`cadalign fit`: align the models of observation files; `export`: a fit for another tool."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
 
 from cadalign.batch.observation_fit import ObservationFit
-from cadalign.cli.common import answer, beside, make_folder, say, waiting
+from cadalign.cli.common import SOME_FAILED, SUCCESS, answer, beside, make_folder, say, waiting
 from cadalign.cli.options import CameraOptions, ManyCommand, named_as_flags
 from cadalign.errors import InputError, refuse_unused
 from cadalign.estimation.options import FitOptions
+from cadalign.export.aligned_object import FORMATS, export_object, format_of
 from cadalign.io.documents import read_json
 from cadalign.io.files import keeping, write_text
 from cadalign.io.kinds import OBSERVATION, is_of_many
@@ -23,6 +26,8 @@ if TYPE_CHECKING:
     from cadalign.estimation.result import Result
     from cadalign.io.observation import Observation
     from cadalign.render.canvas import ByteImage
+
+_MOST_LISTED = 10
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,3 +174,53 @@ def write_pictures(path: Path, pictures: Sequence[ByteImage]) -> list[Path]:
     for each, picture in zip(paths, pictures, strict=True):
         write_image(each, picture)
     return paths
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a fit for another tool.
+
+    GLB holds the textured model, stretched or warped, the cameras and the photos behind it: it
+    opens in Blender, three.js and viewers as the overlay shows it. OBJ and PLY hold the mesh.
+    A run of many fits becomes a folder with a file of each.
+    """
+
+    fit: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FIT.JSON|RUN")]
+    """Result of `cadalign fit`, or its folder; or the folder of a run of many fits."""
+    to: Path
+    """File to write. For a run the folder, whose name is the format's unless one is given."""
+    format: str | None = None
+    """Format, by default what the name's ending tells: glb, obj, ply."""
+    metres: float = 1.0
+    """Length of one unit of the model [m]. Written are metres."""
+    frame: Literal["camera", "rig", "model"] = "camera"
+    """Frame of the exported coordinates: the first photo's camera, the frame that cameras of known
+    motion share, or the stretched model's own."""
+
+    def run(self) -> int:
+        """Write the file; returns the exit code."""
+        from cadalign.batch.exported import read_exported
+
+        fit = self.fit
+        if (fit / "fit.json").is_file():  # the folder that a fit of one observation writes
+            fit = fit / "fit.json"
+        if fit.is_dir():
+            return self._export_run()
+        with named_as_flags(self):
+            name = self.format or format_of(self.to)
+            exported = read_exported(fit, metres=self.metres)
+            path = export_object(self.to, exported, format=name, frame=self.frame)
+        say(f"{path}: {FORMATS[name].about}")
+        return 0
+
+    def _export_run(self) -> int:
+        """Write a run; returns the exit code, 3 where some objects are left out."""
+        from cadalign.batch.exported import export_run
+
+        with named_as_flags(self):
+            refuse_unused(self, ["frame"], "on a run")
+            count, left_out = export_run(self.fit, self.to, format=self.format, metres=self.metres)
+        for error in left_out[:_MOST_LISTED]:
+            say(f"left out: {error}")
+        say(f"{self.to}: {count:,} objects, {len(left_out):,} left out")
+        return SOME_FAILED if left_out else SUCCESS

@@ -1,7 +1,7 @@
 """What a change touches: a new experiment on photos, a new data set of photos, a new metric.
 
 In the tree an experiment is its module in ``cadalign/evaluation/experiments`` and its line in
-``registry.py``; a data set its module in ``datasets/photos`` and its line in ``formats.py``, see
+``registry.py``; a data set its module in ``datasets`` and its line in ``formats.py``, see
 `test_written_photos`; a metric a line of a set in ``cadalign/evaluation/metrics``, or a function.
 """
 

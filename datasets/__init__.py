@@ -5,29 +5,35 @@ from typing import TYPE_CHECKING
 from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
-    from cadalign.datasets.detections.image_keypoints import (
-        ImageKeypoints,
-        choose_object,
-        join_keypoints,
-    )
-    from cadalign.datasets.detections.keypoint_files import read_image_keypoints
+    from cadalign.datasets.blind_pnp import BlindPnP
+    from cadalign.datasets.colmap import Colmap
+    from cadalign.datasets.correspondences import Correspondences, CorrespondenceSet
 
     # `open` is not in __all__: a star import must not hide the built-in function.
     from cadalign.datasets.formats import open_correspondences, open_photos
     from cadalign.datasets.formats import open_photos as open  # noqa: F401
-    from cadalign.datasets.models.keypointnet import AnnotatedModel, KeypointNet
-    from cadalign.datasets.models.keypoints import Circle, Keypoints, RotationalSymmetry, Symmetries
-    from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
-    from cadalign.datasets.models.shapenet import SYNSETS, ShapeNet, ShapeNetModel
-    from cadalign.datasets.photos.dataset import PhotoDataset
-    from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
-    from cadalign.datasets.photos.photo import CadModel, Photo, PhotoKeypoints, PhotoObject, Truth
-    from cadalign.datasets.photos.pix3d import Pix3D
-    from cadalign.datasets.photos.scan2cad import Scan2CAD
-    from cadalign.datasets.sample.writer import write_sample_dataset
-    from cadalign.datasets.sfm.blind_pnp import BlindPnP
-    from cadalign.datasets.sfm.colmap import Colmap
-    from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet
+    from cadalign.datasets.image_keypoints import (
+        ImageKeypoints,
+        choose_object,
+        join_keypoints,
+    )
+    from cadalign.datasets.keypoint_files import read_image_keypoints
+    from cadalign.datasets.keypointnet import AnnotatedModel, KeypointNet
+    from cadalign.datasets.keypoints import Circle, Keypoints, RotationalSymmetry, Symmetries
+    from cadalign.datasets.model_keypoints import ModelKeypoint, ModelKeypoints
+    from cadalign.datasets.pascal3d import Pascal3D
+    from cadalign.datasets.photo import (
+        CadModel,
+        Photo,
+        PhotoDataset,
+        PhotoKeypoints,
+        PhotoObject,
+        Truth,
+    )
+    from cadalign.datasets.pix3d import Pix3D
+    from cadalign.datasets.sample import write_sample_dataset
+    from cadalign.datasets.scan2cad import Scan2CAD
+    from cadalign.datasets.shapenet import SYNSETS, ShapeNet, ShapeNetModel
     from cadalign.io.meshes.files import check_solid, load_mesh
 
 __all__ = [
@@ -45,7 +51,6 @@ __all__ = [
     "ModelKeypoint",
     "ModelKeypoints",
     "Pascal3D",
-    "Pascal3DDetections",
     "Photo",
     "PhotoDataset",
     "PhotoKeypoints",

@@ -6,17 +6,17 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
-from cadalign.datasets.photos.dataset import PhotoDataset
-from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
-from cadalign.datasets.photos.pix3d import Pix3D
-from cadalign.datasets.photos.scan2cad import Scan2CAD
-from cadalign.datasets.sfm.blind_pnp import BlindPnP
-from cadalign.datasets.sfm.colmap import Colmap
-from cadalign.datasets.sfm.correspondences import CorrespondenceSet
+from cadalign.datasets.blind_pnp import BlindPnP
+from cadalign.datasets.colmap import Colmap
+from cadalign.datasets.correspondences import CorrespondenceSet
+from cadalign.datasets.pascal3d import Pascal3D
+from cadalign.datasets.photo import PhotoDataset
+from cadalign.datasets.pix3d import Pix3D
+from cadalign.datasets.scan2cad import Scan2CAD
 from cadalign.errors import DataError
 from cadalign.io.files import as_path
 
-PHOTO_FORMATS = (Scan2CAD, Pix3D, Pascal3D, Pascal3DDetections)
+PHOTO_FORMATS = (Scan2CAD, Pix3D, Pascal3D)
 """The known formats of photos, in the order in which they are looked for."""
 CORRESPONDENCE_FORMATS = (Colmap, BlindPnP)
 """The known formats of correspondences, in the order in which they are looked for."""
@@ -28,8 +28,7 @@ def open_photos(path: str | os.PathLike[str]) -> PhotoDataset:
     Parameters
     ----------
     path : str or path-like
-        The folder; see the classes for what may lie in it: `Scan2CAD`, `Pix3D`, `Pascal3D`,
-        `Pascal3DDetections`.
+        The folder; see the classes for what may lie in it: `Scan2CAD`, `Pix3D`, `Pascal3D`.
 
     Returns
     -------

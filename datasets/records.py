@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Hashable, Iterable, Iterator, MutableMapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from cadalign.errors import CadalignError, DataError
+from cadalign.errors import CadalignError, DataError, quote
+from cadalign.io.documents import read_json
+from cadalign.io.files import damaged
 
 logger = logging.getLogger("cadalign")
 
 T = TypeVar("T")
+K = TypeVar("K", bound=Hashable)
 # Warnings of one data set that are logged; `problems` has all.
 _LOGGED = 20
 
@@ -110,3 +114,31 @@ class RecordSet(ABC, Generic[T]):
             more = " (further problems are counted only)" if len(self.problems) == _LOGGED else ""
             logger.warning("%s: left out: %s%s", self.kind, error, more)
         self.problems[name] = error.with_traceback(None)
+
+
+@contextmanager
+def leaving_out(name: K, problems: MutableMapping[K, DataError] | None) -> Iterator[None]:
+    """Leave out a record that cannot be read, and keep the reason why in ``problems``.
+
+    Without problems the reason is raised.
+    """
+    try:
+        yield
+    except DataError as error:
+        if problems is None:
+            raise
+        problems[name] = error
+
+
+def read_list(path: Path) -> list[Any]:
+    """Read a JSON file that holds a list.
+
+    Raises DataError if it cannot be read, is no valid JSON (cut short, say), or holds no list.
+    """
+    try:
+        found = read_json(path)
+    except DataError as error:
+        raise damaged(error.what, error.where) from None
+    if not isinstance(found, list):
+        raise DataError(f"{quote(found)} is not a list", where=str(path))
+    return found

@@ -18,7 +18,7 @@ from sphinx.application import Sphinx
 from sphinx.util.nodes import nested_parse_with_titles
 
 from cadalign.cli import main
-from cadalign.datasets.models import model_keypoints
+from cadalign.datasets import model_keypoints
 from cadalign.estimation import document
 from cadalign.io.observation_file import ObservationFields
 

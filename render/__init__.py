@@ -5,12 +5,11 @@ from typing import TYPE_CHECKING
 from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
-    from cadalign.render.drawing.model_overlay import overlay_model
-    from cadalign.render.drawing.overlay import draw_overlay
+    from cadalign.render.overlay import draw_overlay, overlay_model
     from cadalign.render.probe import Probe, make_renderer, probe_renderer
-    from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry
-    from cadalign.render.raycast.surface import Studio
+    from cadalign.render.raycast import RaycastRenderer, cast_geometry
     from cadalign.render.scene import Frame, Geometry, Renderer, Scene
+    from cadalign.render.surface import Studio
     from cadalign.render.viewpoints import (
         Angles,
         Viewpoint,

@@ -24,16 +24,16 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import OPENGL_AXES, opengl_from_model
 from cadalign.geometry.mesh import Material
 from cadalign.geometry.pixels import PIXEL_CENTRE
-from cadalign.render.drawing.canvas import ByteImage, LinearArray
-from cadalign.render.raycast.posed import Rectangle, pose_scene
-from cadalign.render.raycast.renderer import (
+from cadalign.render.canvas import ByteImage, LinearArray
+from cadalign.render.posed import Rectangle, pose_scene
+from cadalign.render.raycast import (
     RaycastRenderer,
     check_samples,
     darken_corners,
     geometry_of,
 )
-from cadalign.render.raycast.surface import DARKEST, Studio, linear_colors
 from cadalign.render.scene import Frame, Scene, check_image_size
+from cadalign.render.surface import DARKEST, Studio, linear_colors
 
 # pyrender and PyOpenGL read these when they are imported.
 os.environ.setdefault("PYOPENGL_PLATFORM", "egl")

@@ -16,13 +16,13 @@ from cadalign.errors import CadalignError, RenderError, unknown
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.render.raycast.surface import Studio
 from cadalign.render.scene import Renderer, Scene
+from cadalign.render.surface import Studio
 
 RENDERERS: dict[str, str] = {
     "pyrender": "cadalign.render.opengl:PyrenderRenderer",
-    "open3d": "cadalign.render.raycast.renderer:Open3DRenderer",
-    "raycast": "cadalign.render.raycast.renderer:RaycastRenderer",
+    "open3d": "cadalign.render.raycast:Open3DRenderer",
+    "raycast": "cadalign.render.raycast:RaycastRenderer",
 }
 """Module and class of each renderer."""
 

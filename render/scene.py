@@ -15,8 +15,8 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh, face_normals
 from cadalign.geometry.raycaster import Open3DEngine, RayCaster
-from cadalign.render.drawing.canvas import ByteImage, composite
-from cadalign.render.raycast.surface import SurfaceColors, coincident_faces, corner_normals
+from cadalign.render.canvas import ByteImage, composite
+from cadalign.render.surface import SurfaceColors, coincident_faces, corner_normals
 
 
 class Scene:

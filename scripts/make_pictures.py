@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 
 from cadalign import Box, Camera, Observation, fit
-from cadalign.annotate.options import SessionOptions
+from cadalign.annotate.files import SessionOptions
 from cadalign.annotate.session import open_session
 from cadalign.datasets import AnnotatedModel, KeypointNet, ModelKeypoints, write_sample_dataset
 from cadalign.evaluation.instances.instance import load_scene, make_instance
@@ -34,7 +34,7 @@ from cadalign.render import (
     pose_in_view,
     visible_keypoints,
 )
-from cadalign.render.drawing.canvas import ByteImage
+from cadalign.render.canvas import ByteImage
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"

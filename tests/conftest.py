@@ -56,7 +56,7 @@ COMPILED = pytest.StashKey[Future[None]]()
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile the usual kernels while the processes of xdist, which run the tests, collect them."""
     if session.config.getoption("numprocesses", None):
-        from cadalign.cli.compile_ahead import compile_ahead
+        from cadalign.cli.doctor import compile_ahead
 
         session.config.stash[COMPILED] = ThreadPoolExecutor(1).submit(compile_ahead)
 

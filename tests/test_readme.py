@@ -14,7 +14,7 @@ from support.layers import layers
 
 import cadalign
 from cadalign.cli import main
-from cadalign.cli.sample import FOUND, KEYPOINTS
+from cadalign.cli.evaluate import FOUND, KEYPOINTS
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Files of an annotator: their names, their lock, and what others have changed.
+"""Files of an annotator: options that name them, their lock, and what others have changed.
 
 The observation of `photo.jpg` is `photo.json`, or `photo.jpg.json` where the shorter name is
 another photo's. An observation of an earlier session is found under either name.
@@ -12,9 +12,9 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from cadalign.datasets.models.model_keypoints import SUFFIX
+from cadalign.datasets.model_keypoints import SUFFIX
 from cadalign.errors import DataError, InputError
 from cadalign.io.documents import path_from, read_json
 from cadalign.io.files import checksum, locked, read_bytes
@@ -24,6 +24,38 @@ logger = logging.getLogger("cadalign")
 _MOST_BYTES = 255  # of a file's name, in the common file systems
 _OTHER_FOLDER = "give another --observation or --out"
 _LOCK = ".annotate-lock"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SessionOptions:
+    """Photos, model, the files beside them, and the object's shape."""
+
+    image: Path
+    """A photo, or a folder of photos."""
+    model: Path
+    """OBJ, PLY, GLB, glTF, STL or OFF file."""
+    observation: Path | None = None
+    """Observation file of a single photo, continued if it exists; by default beside the photo."""
+    out: Path | None = None
+    """Folder for the observations; by default the photos'."""
+    camera: Path | None = None
+    """File of the calibrated camera: a matrix K (text, .npy or JSON), or JSON in COLMAP's form.
+    Without one the focal length is estimated."""
+    focal: float | None = None
+    """Focal length of the photos [px], where no file has it, or in its place."""
+    fov: float | None = None
+    """Horizontal field of view of the photos [degrees], in the place of the focal length."""
+    keypoints: Path | None = None
+    """The model's keypoints: model.keypoints.json."""
+    up_axis: Literal["x", "y", "z"] | None = None
+    """The model's axis that points up, for its view and for gravity; by default the observation
+    file's, or y."""
+    shape: Path | None = None
+    """File of `cadalign shape learn`: estimate the object's own shape, of that category, from
+    keypoints that it knows by semantic id or name."""
+    shape_sigma: float | None = None
+    """Estimate the object's own shape from the model's: standard deviation of the keypoints'
+    positions on the object about those on the stretched model [model units]."""
 
 
 @contextmanager

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cadalign.annotate.keypoints import KeypointRegistry, ObjectShape, positions_of
+from cadalign.annotate.marks import KeypointRegistry, ObjectShape, positions_of
 from cadalign.annotate.model import Wireframe
 from cadalign.annotate.observations import LEAST_JOINT_PAIRS
 from cadalign.annotate.problem import LiveEstimate
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.datasets.models.model_keypoints import ModelKeypoint
+from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.estimation.result import Result
 from cadalign.geometry.camera import predicted_covariances, projection_jacobian
 from cadalign.io.observation import Observation

@@ -1,4 +1,4 @@
-"""Marks of an object in a photo, and the history of them for undo and redo.
+"""Marks of an object in a photo, their history for undo and redo, and the model's keypoints.
 
 Marks are immutable: every edit makes others, which the history keeps. They are read from the
 observation file and written to it.
@@ -6,14 +6,24 @@ observation file and written to it.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
+import numpy as np
+
+from cadalign.annotate.files import SessionOptions
 from cadalign.annotate.photos import MarkedMask
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.parts import KeypointId
 
 _LONGEST = 1000  # marks in memory
+_LONGEST_NAME = 80
 
 Pixel = tuple[float, float]
 
@@ -157,3 +167,163 @@ class History:
         target.append(self.marks)
         self.marks = source.pop()
         return True
+
+
+# Keypoints of the model, and the kind of shape that its objects have -----------------------------
+
+
+class KeypointRegistry:
+    """Keypoints by semantic id; points can be added and renamed, but not moved or removed.
+
+    New points don't get ids that are ``reserved``. Points at most ``tolerance`` apart count as one
+    [model units]. The attribute ``given`` holds the ids of those that were read from files.
+    """
+
+    def __init__(self, *, reserved: Iterable[int] = (), tolerance: float = 0.0) -> None:
+        self._tolerance = tolerance
+        self._points: dict[int, ModelKeypoint] = {}
+        self._last_reserved = max(reserved, default=0)
+        self.given = frozenset[int]()
+
+    def __getitem__(self, semantic_id: int) -> ModelKeypoint:
+        try:
+            return self._points[semantic_id]
+        except KeyError:
+            what = f"there is no keypoint {semantic_id}"
+            raise InputError(what, where="keypoint", fix="reload the page") from None
+
+    def __iter__(self) -> Iterator[tuple[int, ModelKeypoint]]:
+        return iter(self._points.items())
+
+    def __contains__(self, semantic_id: object) -> bool:
+        return semantic_id in self._points
+
+    def add(self, point: ModelKeypoint) -> int:
+        """Add a point and return its semantic id; missing ids and names are assigned."""
+        number = point.semantic_id
+        if number is None:
+            number = 1 + max(self._last_reserved, *self._points, 0)
+        name = self._free_name(point.name or f"point {number}")
+        self._points[number] = replace(point, semantic_id=number, name=name)
+        return number
+
+    def merge(self, points: Iterable[ModelKeypoint]) -> None:
+        """Add points of a file; one with the id and the position of a known one renames that."""
+        # Points with an id come first, so that new ids differ from theirs.
+        for point in sorted(points, key=lambda each: each.semantic_id is None):
+            number = point.semantic_id
+            if number in self._points:
+                if self.has(point):
+                    del self._points[number]  # or its own name would be taken
+                else:
+                    point = replace(point, semantic_id=None)
+            self.given |= {self.add(point)}
+
+    def has(self, point: ModelKeypoint) -> bool:
+        """True if the keypoint of the point's id lies where the point does."""
+        own = None if point.semantic_id is None else self._points.get(point.semantic_id)
+        return own is not None and self.find(point.xyz, among=[own]) is not None
+
+    def find(
+        self, xyz: Sequence[float], *, among: Iterable[ModelKeypoint] | None = None
+    ) -> int | None:
+        """Find the id of the nearest keypoint within the tolerance."""
+        points = list(self._points.values() if among is None else among)
+        if not points:
+            return None
+        gaps = np.linalg.norm(np.array([each.xyz for each in points]) - np.array(xyz), axis=1)
+        nearest = int(np.argmin(gaps))
+        return points[nearest].semantic_id if gaps[nearest] <= self._tolerance else None
+
+    def rename(self, semantic_id: int, name: str) -> None:
+        """Rename a keypoint; raises InputError if the name is empty, too long or taken."""
+        name = " ".join(name.split())
+        if not name or len(name) > _LONGEST_NAME:
+            what = f"the name {name[:_LONGEST_NAME]!r} is empty or too long"
+            raise InputError(what, where="name", fix=f"give 1 to {_LONGEST_NAME} characters")
+        point = self[semantic_id]
+        if name != point.name and name in self._names:
+            what = f"another keypoint is called {name!r}"
+            raise InputError(what, where="name", fix="choose another name")
+        self._points[semantic_id] = replace(point, name=name)
+
+    @property
+    def _names(self) -> set[str]:
+        return {point.name for point in self._points.values()}
+
+    def _free_name(self, name: str) -> str:
+        taken, free, number = self._names, name, 2
+        while free in taken:
+            free, number = f"{name} ({number})", number + 1
+        return free
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectShape:
+    """Objects' shape: a category's learned one with its file, a similar model's, or the model's.
+
+    ``sigma`` is the ``shape_sigma`` of `cadalign.Model`, for a similar one.
+    """
+
+    learned: ShapeModel | None = None
+    path: Path | None = None
+    sigma: float | None = None
+
+    @classmethod
+    def open(cls, options: SessionOptions) -> ObjectShape:
+        """Read the shape that the options name. Raises a CadalignError."""
+        path, sigma = options.shape, options.shape_sigma
+        if path is not None and sigma is not None:
+            what = "--shape has learned how far objects of the category differ"
+            raise InputError(what, where="--shape-sigma", fix="give one of the two options")
+        if sigma is not None and not 0 < sigma < np.inf:
+            what = f"{sigma:g} is not a standard deviation"
+            raise InputError(what, where="--shape-sigma", fix="give a positive number")
+        return cls(None if path is None else ShapeModel.open(path), path, sigma)
+
+    @property
+    def is_estimated(self) -> bool:
+        """True if objects have a shape of their own, not that of the stretched model."""
+        return self.learned is not None or self.sigma is not None
+
+    @property
+    def ids(self) -> tuple[KeypointId, ...]:
+        """Ids or names of the learned keypoints; empty for a similar model."""
+        return () if self.learned is None else self.learned.ids
+
+    @property
+    def is_named(self) -> bool:
+        """True if the learned keypoints are known by their names."""
+        return bool(self.ids) and isinstance(self.ids[0], str)
+
+    @property
+    def has_outline(self) -> bool:
+        """True if masks and photos say something of the shape, which then has meshes."""
+        training = None if self.learned is None else self.learned.training
+        return self.learned is None or bool(training and training.rows_with_mesh)
+
+    @property
+    def average(self) -> str:
+        """The noun that the object is compared with in a sentence."""
+        return "the model" if self.learned is None else f"the average {self.learned.category}"
+
+    @property
+    def unit(self) -> str:
+        """Unit of lengths."""
+        return "model units" if self.learned is None else self.learned.unit
+
+    def id_of(self, point: ModelKeypoint) -> KeypointId | None:
+        """The id of a model's point in the estimate; None for one that was not learned."""
+        if self.learned is None:
+            return point.semantic_id
+        label: KeypointId | None = point.name if self.is_named else point.semantic_id
+        return label if label in self.ids else None
+
+    def known(self, points: Sequence[ModelKeypoint]) -> BoolArray:
+        """The points (n,) of which pairs count."""
+        return np.array([self.id_of(point) is not None for point in points], dtype=bool)
+
+
+def positions_of(points: Iterable[ModelKeypoint]) -> FloatArray:
+    """Positions (k, 3) of points [model units]."""
+    return np.array([point.xyz for point in points], dtype=float).reshape(-1, 3)

@@ -11,10 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.annotate.files import LastContent, keypoints_file, refuse_other_model
-from cadalign.annotate.keypoints import KeypointRegistry, ObjectShape
-from cadalign.annotate.marks import Pair
+from cadalign.annotate.marks import KeypointRegistry, ObjectShape, Pair
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats
-from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
+from cadalign.datasets.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import BOX_EDGES, Alignment, Box
 from cadalign.geometry.camera import Camera
@@ -23,8 +22,8 @@ from cadalign.geometry.raycaster import FaceArray
 from cadalign.geometry.simplify import cluster, mesh_edges, simplify
 from cadalign.io.files import require_utf8
 from cadalign.io.meshes.files import load_mesh
-from cadalign.render.raycast.surface import coincident_faces
 from cadalign.render.scene import Scene
+from cadalign.render.surface import coincident_faces
 from cadalign.render.viewpoints import visible_keypoints
 from cadalign.shapes.warp import warp_mesh
 

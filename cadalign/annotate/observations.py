@@ -18,12 +18,11 @@ import msgspec
 import numpy as np
 
 from cadalign.annotate.files import LastContent, refuse_other_model, refuse_other_photo
-from cadalign.annotate.keypoints import KeypointRegistry, ObjectShape, positions_of
-from cadalign.annotate.marks import Marks, Pair
+from cadalign.annotate.marks import KeypointRegistry, Marks, ObjectShape, Pair, positions_of
 from cadalign.annotate.model import OpenedModel
 from cadalign.annotate.photos import MarkedMask, PhotoFile, camera_of
 from cadalign.arrays import FloatArray
-from cadalign.datasets.models.model_keypoints import ModelKeypoint
+from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import (

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from cadalign.annotate.actions import ActionOutcome
-from cadalign.annotate.keypoints import ObjectShape
 from cadalign.annotate.live import LiveAlignment, short
+from cadalign.annotate.marks import ObjectShape
 from cadalign.annotate.model import box_lines
 from cadalign.annotate.session import Annotation, Session
 from cadalign.arrays import FloatArray
@@ -20,7 +20,7 @@ from cadalign.geometry.alignment import (
 )
 from cadalign.io.evidence import LENGTHS
 from cadalign.io.observation import Observation
-from cadalign.render.drawing.layers import confidence_regions
+from cadalign.render.layers import confidence_regions
 
 _LABELS = {"up": "gravity", "camera_height": "camera height", "cam_from_rig": "camera pose"}
 _LEFT_OPEN = 0.8  # share of a prior's standard deviation beyond which the pairs say nothing

@@ -15,11 +15,11 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.annotate.keypoints import ObjectShape, positions_of
+from cadalign.annotate.marks import ObjectShape, positions_of
 from cadalign.annotate.observations import LIKELY_STRETCH
 from cadalign.arrays import FloatArray
 from cadalign.batch.observation_fit import model_of, views_of
-from cadalign.datasets.models.model_keypoints import ModelKeypoint
+from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.estimation.align import align
 from cadalign.estimation.model import Model

@@ -11,13 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.annotate.files import keypoints_file, observation_file, refuse_collisions
-from cadalign.annotate.keypoints import ObjectShape
+from cadalign.annotate.files import (
+    SessionOptions,
+    keypoints_file,
+    observation_file,
+    refuse_collisions,
+)
 from cadalign.annotate.live import LiveAlignment, live_alignment, missing_text
-from cadalign.annotate.marks import History, Marks, Pixel
+from cadalign.annotate.marks import History, Marks, ObjectShape, Pixel
 from cadalign.annotate.model import OpenedModel, open_model
 from cadalign.annotate.observations import ObservationFile
-from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.photos import PhotoFile, camera_of, find_photos
 from cadalign.annotate.problem import Known, LiveEstimate, LiveProblem, warm_up
 from cadalign.arrays import BoolArray

@@ -31,7 +31,7 @@ from cadalign.geometry.alignment import Box
 from cadalign.io.files import write_whole
 from cadalign.io.images import read_image
 from cadalign.io.observation import Observation
-from cadalign.render.drawing.model_overlay import mesh_of
+from cadalign.render.overlay import mesh_of
 
 COLUMNS: Columns = (
     *(("row", int), ("source", str), ("image", str), ("object", str), ("model", str)),

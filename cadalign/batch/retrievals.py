@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 from cadalign.batch.runs import Estimated, FitRunOptions
 from cadalign.batch.spec import SPEC as FIT_SPEC
-from cadalign.datasets.models.model_keypoints import ModelKeypoints
+from cadalign.datasets.model_keypoints import ModelKeypoints
 from cadalign.evaluation.runs.work import Columns
 from cadalign.io.observation import Observation
 from cadalign.retrieval.query import ObservationRetrieval

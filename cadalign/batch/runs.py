@@ -25,8 +25,8 @@ from cadalign.batch.outputs import (
     write_csv,
 )
 from cadalign.batch.sources import ObservationTask, ObservationTasks
-from cadalign.datasets.detections.image_keypoints import ImageKeypoints, observed_in, photo_in
-from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
+from cadalign.datasets.image_keypoints import ImageKeypoints, observed_in, photo_in
+from cadalign.datasets.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError, DataError, InputError, require_kind, unknown
 from cadalign.estimation.result import Result
 from cadalign.estimation.results import Results

@@ -16,8 +16,8 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
-from cadalign.datasets.detections.image_keypoints import ImageKeypoints
-from cadalign.datasets.detections.keypoint_files import read_image_keypoints
+from cadalign.datasets.image_keypoints import ImageKeypoints
+from cadalign.datasets.keypoint_files import read_image_keypoints
 from cadalign.errors import DataError
 from cadalign.io.documents import read_json
 from cadalign.io.files import listed, open_input, read_bytes, read_text

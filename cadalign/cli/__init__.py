@@ -36,7 +36,7 @@ COMMANDS = {  # the class of each in its module, and the first sentence of its d
         "retrieve.Retrieve",
         "Find the models of a library that explain an image's keypoints best.",
     ),
-    "library": ("library.LibraryCommand", "Build and inspect libraries of CAD models."),
+    "library": ("retrieve.LibraryCommand", "Build and inspect libraries of CAD models."),
     "shape": ("shape.ShapeCommand", "Learn and inspect the shapes of categories."),
     "evaluate": ("evaluate.Evaluate", "Evaluate methods on a dataset."),
     "simulate": (
@@ -44,7 +44,7 @@ COMMANDS = {  # the class of each in its module, and the first sentence of its d
         "Repeat the AEPnP paper's simulation: tables, a page, and figures as PNG and PDF.",
     ),
     "report": ("evaluate.ReportCommand", "Show the result of one or more runs."),
-    "export": ("export.Export", "Write a fit for another tool."),
+    "export": ("fit.Export", "Write a fit for another tool."),
     "render": (
         "render.Render",
         "Draw a model: a still, or a contact sheet of several views.",

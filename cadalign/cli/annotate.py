@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from cadalign.annotate.options import SessionOptions
+from cadalign.annotate.files import SessionOptions, only_annotator
 from cadalign.cli.common import UsageError, answer, make_folder, say, waiting
 from cadalign.io.files import writing
 from cadalign.io.kinds import MESH, PHOTO, kind_of_file
@@ -42,7 +42,6 @@ class Annotate(SessionOptions):
         """Serve until interrupted; returns the exit code."""
         import webbrowser
 
-        from cadalign.annotate.files import only_annotator
         from cadalign.annotate.server import Access, listen, make_app, make_server
         from cadalign.annotate.session import find_session_files, open_session
 

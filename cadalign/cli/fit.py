@@ -1,4 +1,4 @@
-"""`cadalign fit`: align the models of observation files."""
+"""`cadalign fit`: align the models of observation files; `export`: a fit for another tool."""
 
 from __future__ import annotations
 
@@ -6,22 +6,27 @@ import json
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
 
 from cadalign.batch.observation_fit import ObservationFit
 from cadalign.cli.common import answer, beside, make_folder, say, waiting
 from cadalign.cli.options import CameraOptions, ManyCommand, named_as_flags
-from cadalign.errors import InputError, refuse_unused
-from cadalign.io.documents import read_json
+from cadalign.errors import DataError, InputError, refuse_unused
+from cadalign.export.aligned_object import FORMATS, AlignedObject, export_object, format_of
+from cadalign.io.documents import in_file, read_json
 from cadalign.io.files import keeping, write_text
-from cadalign.io.kinds import OBSERVATION, is_of_many
+from cadalign.io.kinds import FIT, OBSERVATION, is_of_many
 
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
     from cadalign.io.observation import Observation
-    from cadalign.render.drawing.canvas import ByteImage
+    from cadalign.render.canvas import ByteImage
+
+_MOST_LISTED = 10
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +125,7 @@ def drawn(
         return [], []
     from cadalign.io.images import read_mask
     from cadalign.render import Scene, overlay_model
-    from cadalign.render.drawing.model_overlay import draw_result, mesh_of, photo_of
+    from cadalign.render.overlay import draw_result, mesh_of, photo_of
 
     seen = list(zip(observation.views, result.views, strict=True))
     photos = [photo_of(image.image, view.camera) for image, view in seen]
@@ -161,3 +166,63 @@ def write_pictures(path: Path, pictures: Sequence[ByteImage]) -> list[Path]:
     for each, picture in zip(paths, pictures, strict=True):
         write_image(each, picture)
     return paths
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a fit for another tool.
+
+    GLB holds the textured model, stretched or warped, the cameras and the photos behind it: it
+    opens in Blender, three.js and viewers as the overlay shows it. OBJ and PLY hold the mesh.
+    """
+
+    fit: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FIT.JSON")]
+    """Result of `cadalign fit`, or its folder."""
+    to: Path
+    """File to write."""
+    format: str | None = None
+    """Format, by default what the name's ending tells: glb, obj, ply."""
+    metres: float = 1.0
+    """Length of one unit of the model [m]. Written are metres."""
+    frame: Literal["camera", "rig", "model"] = "camera"
+    """Frame of the exported coordinates: the first photo's camera, the frame that cameras of known
+    motion share, or the stretched model's own."""
+
+    def run(self) -> int:
+        """Write the file; returns the exit code."""
+        fit = self.fit / "fit.json" if self.fit.is_dir() else self.fit
+        with named_as_flags(self):
+            name = self.format or format_of(self.to)
+            path = export_object(self.to, self._object(fit), format=name, frame=self.frame)
+        say(f"{path}: {FORMATS[name].about}")
+        return 0
+
+    def _object(self, fit: Path) -> AlignedObject:
+        """The aligned object of a fit's file, with the observation that it holds."""
+        from cadalign.estimation.result import Result
+        from cadalign.export.results import object_of
+        from cadalign.io.observation import Observation
+        from cadalign.render.overlay import mesh_of
+        from cadalign.shapes.model import ShapeModel
+
+        data = read_json(fit, FIT)
+        if not isinstance(data, dict) or not isinstance(data.get("observation"), dict):
+            what = "the file holds no fit with the observation that was fitted"
+            raise DataError(what, where=str(fit), fix="give the fit.json of `cadalign fit`")
+        with in_file(fit):
+            seen = Observation.from_dict(data["observation"], folder=fit.parent, needs_xyz=False)
+            result = Result.from_dict(data)
+            if result.method == "align" and seen.shape is not None:
+                model = ShapeModel.open(seen.shape)
+                if tuple(model.ids) != result.ids:
+                    what = f"{len(model.ids)} keypoints that are not the fit's {len(result.ids)}"
+                    raise DataError(what, where=str(seen.shape), fix="fit the observation again")
+                result = replace(result, model=model)
+            exported = object_of(
+                result,
+                mesh=mesh_of(seen, result),
+                images=[view.image for view in seen.views],
+                name="model" if seen.model is None else seen.model.stem,
+                metres=self.metres,
+            )
+        return replace(exported, sources=(fit, *seen.files))

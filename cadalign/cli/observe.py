@@ -12,8 +12,8 @@ import tyro
 from cadalign.cli.common import answer, make_folder_of, say
 from cadalign.cli.options import CameraOptions, named_as_flags
 from cadalign.datasets import ModelKeypoints, choose_object, read_image_keypoints
-from cadalign.datasets.detections.coco import decode_segmentation
-from cadalign.datasets.detections.image_keypoints import ImageKeypoints, observed_in
+from cadalign.datasets.coco import decode_segmentation
+from cadalign.datasets.image_keypoints import ImageKeypoints, observed_in
 from cadalign.errors import DataError
 from cadalign.geometry.plausible_camera import camera_doubts
 from cadalign.io.documents import in_file

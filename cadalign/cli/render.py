@@ -16,7 +16,7 @@ from cadalign.io.images import JPEG_ENDING
 
 if TYPE_CHECKING:
     from cadalign.arrays import FloatArray
-    from cadalign.render.drawing.canvas import ByteImage
+    from cadalign.render.canvas import ByteImage
     from cadalign.render.scene import Renderer, Scene
     from cadalign.render.viewpoints import Angles
 
@@ -52,10 +52,10 @@ class Render:
 
     def run(self) -> int:
         """Draw and write; returns the exit code."""
-        from cadalign.datasets.models.model_keypoints import ModelKeypoints
+        from cadalign.datasets.model_keypoints import ModelKeypoints
         from cadalign.io.images import write_image
         from cadalign.io.meshes.files import load_mesh
-        from cadalign.render.drawing.layers import contact_sheet
+        from cadalign.render.layers import contact_sheet
         from cadalign.render.probe import make_renderer
         from cadalign.render.scene import Scene
 
@@ -116,7 +116,7 @@ class Render:
         keypoints: FloatArray | None,
     ) -> ByteImage:
         """One picture, (h, w, 3) uint8."""
-        from cadalign.render.drawing.layers import keypoint_picture
+        from cadalign.render.layers import keypoint_picture
         from cadalign.render.viewpoints import pose_in_view, visible_keypoints
 
         pose = pose_in_view(scene, camera, view, scale=self.scale)

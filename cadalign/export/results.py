@@ -142,7 +142,7 @@ def plot_result(
     if not 0 <= view < len(result.views):
         what = f"{view} is not one of the {len(result.views)} views"
         raise InputError(what, where="view", fix="views count from 0")
-    from cadalign.render.drawing.model_overlay import (  # takes time to import
+    from cadalign.render.overlay import (  # takes time to import
         draw_result,
         drawable_mesh,
         photo_of,
@@ -193,7 +193,7 @@ def object_of(
     if len(photos) != len(result.views):
         what = f"{len(photos)}, but the result has {len(result.views)} views"
         raise InputError(what, where="images", fix="give one or None for each")
-    from cadalign.render.drawing.model_overlay import drawable_mesh  # takes time to import
+    from cadalign.render.overlay import drawable_mesh  # takes time to import
 
     known = drawable_mesh(result, mesh)
     if known is None:

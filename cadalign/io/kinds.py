@@ -66,7 +66,7 @@ def kind_of(data: object) -> str | None:
     fields = set(data)
     if "alignment" in fields:
         return FIT
-    if {"annotations", "instance_info"} & fields:
+    if "annotations" in fields:
         return DETECTOR
     if "keypoints" in fields and "camera" not in fields:
         points = data["keypoints"]

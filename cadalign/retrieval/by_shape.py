@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.datasets.models.shapenet import require_category
+from cadalign.datasets.shapenet import require_category
 from cadalign.errors import DegenerateError, InputError, refuse_unused, require_kind
 from cadalign.estimation.align import align
 from cadalign.estimation.estimates import linearised

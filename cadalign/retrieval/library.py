@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from cadalign.arrays import IntArray
 from cadalign.datasets import AnnotatedModel, KeypointNet
-from cadalign.datasets.detections.image_keypoints import plain_name, some_of
-from cadalign.datasets.models.model_keypoints import SUFFIX, ModelKeypoint, ModelKeypoints
+from cadalign.datasets.image_keypoints import plain_name, some_of
+from cadalign.datasets.model_keypoints import SUFFIX, ModelKeypoint, ModelKeypoints
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.files import as_path, checksum, listed

@@ -18,7 +18,7 @@ from cadalign.io.files import made_folder, remove_earlier, write_json, write_tex
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 from cadalign.render import Geometry, Scene, cast_geometry, draw_overlay
-from cadalign.render.drawing.canvas import ByteImage
+from cadalign.render.canvas import ByteImage
 from cadalign.render.scene import LIGHT_GREY
 from cadalign.retrieval.match import Match
 from cadalign.web import asset, fill

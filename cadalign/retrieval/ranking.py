@@ -23,8 +23,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, worker_count
-from cadalign.datasets.detections.image_keypoints import some_of
-from cadalign.datasets.models.shapenet import require_category
+from cadalign.datasets.image_keypoints import some_of
+from cadalign.datasets.shapenet import require_category
 from cadalign.errors import DegenerateError, InputError, require_kind
 from cadalign.estimation.options import LOSSES
 from cadalign.estimation.problems import rays_of, whitening_of

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from support.problems import problem_of
 
 from cadalign import Camera, fit
-from cadalign.annotate.keypoints import KeypointRegistry, ObjectShape
 from cadalign.annotate.live import LiveAlignment, live_alignment, missing_text, suggest
+from cadalign.annotate.marks import KeypointRegistry, ObjectShape
 from cadalign.annotate.model import Wireframe
 from cadalign.annotate.observations import LIKELY_STRETCH
 from cadalign.annotate.page_state import facts_of

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cadalign.annotate.keypoints import KeypointRegistry
-from cadalign.annotate.marks import History, Marks, Pair
+from cadalign.annotate.marks import History, KeypointRegistry, Marks, Pair
 from cadalign.datasets import ModelKeypoint
 from cadalign.errors import InputError
 from cadalign.geometry.camera import Camera

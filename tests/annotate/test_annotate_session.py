@@ -16,7 +16,7 @@ from support.refusals import refusal_text
 
 from cadalign import Camera
 from cadalign.annotate.actions import perform
-from cadalign.annotate.options import SessionOptions
+from cadalign.annotate.files import SessionOptions
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.photos import PhotoFile, find_photos
 from cadalign.annotate.session import Session, open_session

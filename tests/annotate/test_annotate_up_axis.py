@@ -12,7 +12,7 @@ from support.annotating import Case, agree_with_fit, corners_of, opened_page, pl
 
 from cadalign.annotate.actions import perform
 from cadalign.annotate.page_state import page_state
-from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
+from cadalign.datasets.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.io.meshes.files import load_mesh, write_obj_mesh
 from cadalign.io.observation import Observation
 

@@ -20,7 +20,7 @@ from cadalign import Alignment, Result, fit
 from cadalign.cli import main
 from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
 from cadalign.io.observation import Observation
-from cadalign.render.drawing.layers import REPROJECTED_COLOR
+from cadalign.render.layers import REPROJECTED_COLOR
 
 PROBLEM = simulate_problem(np.random.default_rng(0), points=10, noise_px=0.5)
 SIGMA = np.linspace(0.2, 5, 10)

@@ -23,7 +23,7 @@ from cadalign.datasets import load_mesh
 from cadalign.io.evidence import ImageEvidence, ObservedImage
 from cadalign.io.observation import Observation
 from cadalign.render import Scene, cast_geometry
-from cadalign.render.drawing.overlay import EST_COLOR
+from cadalign.render.overlay import EST_COLOR
 
 POINTS = keypoints()
 CONTOUR_COLOR = (70, 190, 250)

@@ -26,8 +26,8 @@ from cadalign import (
 )
 from cadalign.cli import main
 from cadalign.io.observation import Observation
-from cadalign.render.drawing.layers import UNSEEN_COLOR
-from cadalign.render.drawing.overlay import EST_COLOR
+from cadalign.render.layers import UNSEEN_COLOR
+from cadalign.render.overlay import EST_COLOR
 from cadalign.shapes.examples import Example
 
 CAMERA = Camera(640, 480, 900.0, 900.0, 319.5, 239.5)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cadalign.datasets.models.keypoints import (
+from cadalign.datasets.keypoints import (
     Circle,
     RotationalSymmetry,
     Symmetries,

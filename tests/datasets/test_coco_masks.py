@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pycocotools import mask as coco
 from support.refusals import refusal_text
 
-from cadalign.datasets.detections.coco import decode_segmentation
+from cadalign.datasets.coco import decode_segmentation
 
 WIDTH, HEIGHT = 37, 23
 

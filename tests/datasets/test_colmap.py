@@ -123,7 +123,7 @@ def assert_same(one: Correspondences, other: Correspondences) -> None:
         other.camera,
         other.cam_from_world,
     )
-    for name in ("points_3d", "points_2d", "point_ids"):
+    for name in ("points_3d", "points_2d"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
@@ -146,7 +146,6 @@ def test_what_was_written_arrives(tmp_path, write):
     _, _, translation, _, name, observations = model.images[1]
     seen = Colmap(write(model, tmp_path))[name]
     kept = [entry for entry in observations if entry[2] != -1]
-    assert seen.point_ids.tolist() == [i for _, _, i in kept]
     np.testing.assert_array_equal(seen.points_3d, [model.points[i] for _, _, i in kept])
     # COLMAP's pixel centres are at (0.5, 0.5), for observations and principal point alike.
     np.testing.assert_allclose(seen.points_2d, [(x - 0.5, y - 0.5) for x, y, _ in kept])
@@ -340,15 +339,13 @@ def test_correspondences_are_checked_and_cannot_be_changed():
     camera = Camera(64, 48, 50, 50, 31.5, 23.5)
     pose = Alignment(np.eye(3), [0, 0, 2], [1, 1, 1])
     points = np.zeros((3, 3))
-    seen = Correspondences("a", points, np.ones((3, 2)), camera, pose, np.array([4, 5, 6]))
+    seen = Correspondences("a", points, np.ones((3, 2)), camera, pose)
     points[0] = 7  # the caller's array stays the caller's
     assert seen.points_3d[0, 0] == 0
     with pytest.raises(ValueError, match="read-only"):
         seen.points_2d[0] = 0
     with pytest.raises(InputError, match="points_2d: 2 rows"):
         Correspondences("a", points, np.ones((2, 2)), camera, pose)
-    with pytest.raises(InputError, match="point_ids: 1 rows"):
-        Correspondences("a", points, np.ones((3, 2)), camera, pose, np.array([4]))
     with pytest.raises(InputError, match="does not stretch"):
         Correspondences(
             "a", points, np.ones((3, 2)), camera, Alignment(np.eye(3), [0, 0, 2], [1, 2, 1])

@@ -18,7 +18,7 @@ from cadalign.datasets import (
     join_keypoints,
     read_image_keypoints,
 )
-from cadalign.datasets.detections.image_keypoints import photo_in
+from cadalign.datasets.image_keypoints import photo_in
 from cadalign.errors import CadalignError, DataError, InputError
 
 CAMERA = Camera.without_focal(640, 480)
@@ -79,73 +79,32 @@ def flat(scores: list[float]) -> list[float]:
     return [n for point, score in zip(POINTS, scores, strict=True) for n in (*point, score)]
 
 
+SCORES = [0.9, 0.8, 0.1]
+X, Y = zip(*POINTS, strict=True)
+
+
 @pytest.mark.parametrize(
-    ("data", "score"),
+    ("entry", "score"),
     [
         # MMPose's and Detectron2's result files, ultralytics' predictions.json.
-        (
-            [
-                {
-                    "image_id": 7,
-                    "category_id": 1,
-                    "keypoints": flat([0.9, 0.8, 0.1]),
-                    "score": 0.75,
-                }
-            ],
-            0.75,
-        ),
+        ({"image_id": 7, "category_id": 1, "keypoints": flat(SCORES), "score": 0.75}, 0.75),
         # MMPose's inferencer.
-        (
-            [
-                {
-                    "keypoints": POINTS,
-                    "keypoint_scores": [0.9, 0.8, 0.1],
-                    "bbox": [[1, 2, 3, 4]],
-                    "bbox_score": 0.75,
-                }
-            ],
-            0.75,
-        ),
+        ({"keypoints": POINTS, "keypoint_scores": SCORES, "bbox_score": 0.75}, 0.75),
         # ultralytics' results.to_json().
-        (
-            [
-                {
-                    "name": "cat",
-                    "class": 0,
-                    "confidence": 0.75,
-                    "box": {"x1": 1, "y1": 2, "x2": 3, "y2": 4},
-                    "keypoints": {
-                        "x": [100.5, 80.0, 130.0],
-                        "y": [200.25, 120.0, 121.0],
-                        "visible": [0.9, 0.8, 0.1],
-                    },
-                }
-            ],
-            0.75,
-        ),
+        ({"confidence": 0.75, "keypoints": {"x": X, "y": Y, "visible": SCORES}}, 0.75),
         # Pairs with scores beside them, nested.
-        (
-            [{"keypoints": [[*p, s] for p, s in zip(POINTS, [0.9, 0.8, 0.1], strict=True)]}],
-            None,
-        ),
+        ({"keypoints": [[*p, s] for p, s in zip(POINTS, SCORES, strict=True)]}, None),
     ],
     ids=["results", "mmpose", "ultralytics", "rows"],
 )
-def test_detectors_files_are_read(tmp_path: Path, data: Any, score: float | None) -> None:
-    (found,) = read(tmp_path, data)
+def test_detectors_files_are_read(tmp_path: Path, entry: Any, score: float | None) -> None:
+    (found,) = read(tmp_path, [entry])
     assert found.points_2d.tolist() == POINTS
     assert found.scores is not None
-    assert found.scores.tolist() == [0.9, 0.8, 0.1]
+    assert found.scores.tolist() == SCORES
     assert found.score == score
     assert found.names is None
     assert found.source == f"{tmp_path / 'keypoints.json'}: [0]"
-
-
-def test_mmpose_predictions_name_their_keypoints(tmp_path: Path) -> None:
-    instance = {"keypoints": POINTS, "keypoint_scores": [0.9, 0.8, 0.1]}
-    meta = {"keypoint_id2name": {str(n): name for n, name in enumerate(NAMES)}}
-    (image,) = read(tmp_path, {"meta_info": meta, "instance_info": [instance]})
-    assert image.names == tuple(NAMES)
 
 
 @pytest.mark.parametrize(
@@ -165,84 +124,60 @@ def test_flags_are_told_from_scores(
     assert found.scores.tolist() == scores
 
 
+AT = "annotations[0].keypoints"
+
+
 @pytest.mark.parametrize(
     ("data", "text"),
     [
-        (3, "{path}: 3 is not an object or a list; is it COCO's keypoint JSON"),
+        (3, "3 is not an object or a list; is it COCO's keypoint JSON"),
         (
             {"frames": []},
-            "{path}: top level: neither annotations nor instance_info; is it COCO's keypoint "
-            "JSON, or a detector's? see cadalign's page on keypoints of detectors",
+            "annotations: missing; is it COCO's keypoint JSON, or a detector's? see cadalign's "
+            "page on keypoints of detectors",
         ),
-        ([], "{path}: there are no keypoints"),
-        ({"annotations": []}, "{path}: there are no keypoints"),
-        (
-            [{"bbox": [1, 2, 3, 4]}],
-            "{path}: [0].keypoints: missing; is it COCO's keypoint JSON, or a detector's? "
-            "see cadalign's page on keypoints of detectors",
-        ),
-        (
-            changed("annotations.0.keypoints", []),
-            "{path}: annotations[0].keypoints: expected a list of numbers",
-        ),
+        ([], "there are no keypoints"),
+        ([{"bbox": [1, 2, 3, 4]}], "[0].keypoints: missing; is it COCO's keypoint JSON"),
+        (changed("annotations.0.keypoints", []), f"{AT}: expected a list of numbers"),
         (
             changed("annotations.0.keypoints", [1, 2, 2, 3]),
-            "{path}: annotations[0].keypoints: 4 numbers are not x, y and visibility of keypoints",
+            f"{AT}: 4 numbers are not x, y and visibility of keypoints",
         ),
         (
             changed("annotations.0.keypoints", [1, 2, 2]),
-            "{path}: annotations[0].keypoints: 1 keypoints, but the category names 3",
+            f"{AT}: 1 keypoints, but the category names 3",
         ),
         (
             changed("annotations.0.keypoints", [1, 2, "two"] * 3),
-            "{path}: annotations[0].keypoints[2]: 'two' is not a finite number",
+            f"{AT}[2]: 'two' is not a finite number",
         ),
-        (
-            changed("annotations.0.image_id", 12),
-            "{path}: annotations[0].image_id: there is no image 12",
-        ),
-        (changed("annotations.0.image_id", ...), "{path}: annotations[0].image_id: missing"),
-        (
-            changed("categories.0.id", [1]),
-            "{path}: categories[0].id: [1] is not a whole number or a text",
-        ),
+        (changed("annotations.0.image_id", 12), "annotations[0].image_id: there is no image 12"),
+        (changed("annotations.0.image_id", ...), "annotations[0].image_id: missing"),
+        (changed("categories.0.id", [1]), "categories[0].id: [1] is not a whole number or a text"),
         (
             changed("categories.0.keypoints.2", "nose"),
-            "{path}: categories[0].keypoints[2]: 'nose' occurs twice",
+            "categories[0].keypoints[2]: 'nose' occurs twice",
         ),
-        (
-            {**ANNOTATIONS, "images": [*ANNOTATIONS["images"], {"id": 3, "file_name": "c"}]},
-            "{path}: images[2].id: 3 is the id of another entry, too; ",
-        ),
-        (
-            [{"keypoints": {"x": [1, 2], "y": [1]}}],
-            "{path}: [0].keypoints.y: 1 values, but x has 2",
-        ),
+        (changed("images.1.id", 3), "images[1].id: 3 is the id of another entry, too; "),
+        (changed("images.0.width", 0), "images[0].width: 0 is "),
+        ([{"keypoints": {"x": [1, 2], "y": [1]}}], "[0].keypoints.y: 1 values, but x has 2"),
         (
             [{"keypoints": [[1, 2, 3, 4]]}],
-            "{path}: [0].keypoints: [[1.0, 2.0, 3.0, 4.0]] are not x, y and score of each keypoint",
+            "[0].keypoints: [[1.0, 2.0, 3.0, 4.0]] are not x, y and score of each keypoint",
         ),
         (
             [{"keypoints": [[1, 2]], "keypoint_scores": [1, 2]}],
-            "{path}: [0].keypoints: 2 scores of 1 keypoints",
+            "[0].keypoints: 2 scores of 1 keypoints",
         ),
-        (
-            [{"keypoints": [[1, 2, -0.5]]}],
-            "[0]: scores: keypoint 0 has the value -0.5, which is negative",
-        ),
-        (
-            {"instance_info": [{"keypoints": [[1, 2]]}], "meta_info": {"keypoint_id2name": {}}},
-            "{path}: instance_info[0].keypoints: 1 keypoints, but the category names 0",
-        ),
-        ("[", "{path}, line 1: not valid JSON: Expecting value"),
+        ([{"keypoints": [[1, 2, -1]]}], "[0]: scores: keypoint 0 has the value -1, which is nega"),
+        ([{"keypoints": [[1, 2]], "score": "high"}], "[0].score: 'high' is not a "),
     ],
 )
 def test_malformed_json_is_refused_by_file_and_field(tmp_path: Path, data: Any, text: str) -> None:
     path = write_json(tmp_path / "keypoints.json", data)
     with pytest.raises(DataError) as caught:
         read_image_keypoints(path)
-    assert text.format(path=path) in str(caught.value)
-    assert str(caught.value).startswith(str(path))
+    assert str(caught.value).startswith(f"{path}: {text}")
 
 
 # --- CSV --------------------------------------------------------------------------------------

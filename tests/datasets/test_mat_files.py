@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from cadalign.datasets.photos.mat_files import read_structs, structs_of
+from cadalign.datasets.pascal3d import read_structs, structs_of
 from cadalign.errors import DataError
 
 TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")

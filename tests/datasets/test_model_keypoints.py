@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import copy
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from support.files import TETRAHEDRON, write_json
+from support.files import TETRAHEDRON, replaced, write_json
 
 from cadalign.datasets import KeypointNet, ModelKeypoint, ModelKeypoints
 from cadalign.errors import DataError
@@ -29,18 +28,6 @@ DATA: dict[str, Any] = {
 def write(path: Path, data: Any = DATA) -> Path:
     (path.parent / "tetrahedron.obj").write_text(TETRAHEDRON)
     return write_json(path, data)
-
-
-def changed(row: int, **fields: Any) -> dict[str, Any]:
-    """The data with fields of one keypoint replaced; removed where the value is `...`."""
-    data = copy.deepcopy(DATA)
-    entry = data["keypoints"][row]
-    for name, value in fields.items():
-        if value is ...:
-            entry.pop(name, None)
-        else:
-            entry[name] = value
-    return data
 
 
 def test_fields_arrive(tmp_path: Path) -> None:
@@ -97,18 +84,21 @@ def test_annotated_model_is_written(sample_root: Path, tmp_path: Path) -> None:
             "{path}: top level: unknown field 'points', did you mean 'keypoints'?; "
             "known are format, keypoints, model, version",
         ),
-        (changed(1, name=""), "{path}: keypoints[1].name: '' is not a text"),
+        (replaced(DATA, "keypoints.1.name", ""), "{path}: keypoints[1].name: '' is not a text"),
         (
-            changed(1, name="top"),
+            replaced(DATA, "keypoints.1.name", "top"),
             "{path}: keypoints[1].name: 'top' occurs twice, first in keypoints[0]",
         ),
         (
-            changed(1, semantic_id=7),
+            replaced(DATA, "keypoints.1.semantic_id", 7),
             "{path}: keypoints[1].semantic_id: 7 occurs twice, first in keypoints[0]",
         ),
-        (changed(0, xyz=[1, 2]), "{path}: keypoints[0].xyz: [1, 2] is not a list of 3"),
         (
-            changed(0, colour="red"),
+            replaced(DATA, "keypoints.0.xyz", [1, 2]),
+            "{path}: keypoints[0].xyz: [1, 2] is not a list of 3",
+        ),
+        (
+            replaced(DATA, "keypoints.0.colour", "red"),
             "{path}: keypoints[0]: unknown field 'colour'; known are name, semantic_id, xyz",
         ),
     ],

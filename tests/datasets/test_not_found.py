@@ -135,20 +135,3 @@ def test_flags_are_read_one_way_in_a_whole_file(tmp_path: Path) -> None:
         first, _ = read_image_keypoints(path)
         assert first.scores is not None
         assert first.scores.tolist() == [expected] * COUNT
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [{"score": "high"}, {"bbox_score": [1]}, {"num_keypoints": "17"}, {"segmentation": [[1, 2]]}],
-)
-def test_a_flaw_of_an_optional_part_leaves_out_the_part(
-    tmp_path: Path, changes: dict[str, Any]
-) -> None:
-    path = tmp_path / "found.json"
-    (entry,) = coco_results(PROBLEM.points_2d.tolist())
-    del entry["score"]
-    image = {"id": 1, "file_name": "a.png", "width": "wide", "height": 480}
-    path.write_text(json.dumps({"images": [image], "annotations": [entry | changes]}))
-    (found,) = read_image_keypoints(path)
-    assert found.is_found.all()
-    assert (found.score, found.size) == (None, None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from cadalign.datasets import SYNSETS, ShapeNet
-from cadalign.datasets.models.shapenet import require_category
+from cadalign.datasets.shapenet import require_category
 from cadalign.errors import DataError, InputError
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"

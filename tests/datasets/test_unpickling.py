@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from cadalign.datasets.sfm.unpickling import load_pickle
+from cadalign.datasets.unpickling import load_pickle
 from cadalign.errors import DataError
 
 VALUES = [
@@ -225,7 +225,7 @@ def test_hostile_pickles_are_refused_quickly(tmp_path, name):
     # In its own process, which may neither crash nor take more than 300 MB on top.
     code = (
         "import resource, sys\n"
-        "from cadalign.datasets.sfm.unpickling import load_pickle\n"
+        "from cadalign.datasets.unpickling import load_pickle\n"
         "from cadalign.errors import DataError\n"
         "size = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()\n"
         "resource.setrlimit(resource.RLIMIT_AS, (size + 300_000_000,) * 2)\n"

@@ -24,7 +24,7 @@ from support.refusals import refusal_line, refusal_text
 import cadalign.datasets
 from cadalign import Alignment, Camera
 from cadalign.cli import main
-from cadalign.datasets.photos.dataset import PhotoDataset
+from cadalign.datasets.photo import PhotoDataset
 from cadalign.errors import DegenerateError
 from cadalign.evaluation.api import run
 from cadalign.evaluation.benchmark import Benchmark

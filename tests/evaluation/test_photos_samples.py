@@ -38,13 +38,3 @@ def test_chairs_of_scan2cad_are_aligned(real_data: Path, tmp_path: Path) -> None
     assert (line["instances"], line["failed"], line["left_out"]) == (2, 0, 1)
     assert line["rotation_error_deg"] <= 5
     assert line["scan2cad_aligned"] == 1.0
-
-
-def test_photos_without_a_pose_are_fitted_and_drawn(real_data: Path, tmp_path: Path) -> None:
-    options = {"methods": ("similar",), "categories": ("bottle", "car"), "pictures": 100}
-    found = evaluated(real_data / "real/pascal3d", tmp_path, **options)
-    statuses = found.column("status").tolist()
-    assert statuses.count("ok") == 1
-    assert statuses.count("left out") == 1  # a car without a model
-    assert statuses.count("failed") == 5  # photos that are not there
-    assert len(list((tmp_path / "thumbs").iterdir())) == 1

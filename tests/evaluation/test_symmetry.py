@@ -7,7 +7,7 @@ import pytest
 
 from cadalign import Alignment
 from cadalign.arrays import FloatArray
-from cadalign.datasets.models.keypoints import (
+from cadalign.datasets.keypoints import (
     Circle,
     RotationalSymmetry,
     Symmetries,

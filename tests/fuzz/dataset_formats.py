@@ -18,7 +18,7 @@ from support.photo_sets import WRITERS
 
 from cadalign import Alignment, Camera, ShapeModel
 from cadalign.datasets import load_mesh
-from cadalign.datasets.detections.coco import decode_segmentation
+from cadalign.datasets.coco import decode_segmentation
 from cadalign.io.documents import read_json
 from cadalign.io.images import read_grey, read_photo
 from cadalign.io.observation import read_camera

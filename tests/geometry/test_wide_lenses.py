@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from support.files import write_cameras
 
 from cadalign import Camera
-from cadalign.datasets.sfm.colmap import Colmap
+from cadalign.datasets.colmap import Colmap
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.pixels import largest_angle

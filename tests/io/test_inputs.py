@@ -26,9 +26,10 @@ from cadalign.datasets import (
     open_photos,
     read_image_keypoints,
 )
-from cadalign.datasets.photos.dataset import read_list, read_matrix
-from cadalign.datasets.photos.mat_files import read_structs
-from cadalign.datasets.sfm.unpickling import load_pickle
+from cadalign.datasets.pascal3d import read_structs
+from cadalign.datasets.photo import read_matrix
+from cadalign.datasets.records import read_list
+from cadalign.datasets.unpickling import load_pickle
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.io.evidence import ImageEvidence

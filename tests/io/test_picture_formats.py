@@ -16,7 +16,7 @@ from support.gltf_files import CORNERS, POSITIONS, SQUARE, VIEWS, data_uri, writ
 from cadalign import FocalPrior
 from cadalign.annotate.photos import PhotoFile
 from cadalign.datasets import load_mesh
-from cadalign.datasets.photos.photo import PhotoObject
+from cadalign.datasets.photo import PhotoObject
 from cadalign.errors import DataError
 from cadalign.io.images import photo_size, read_grey, read_mask, read_photo
 

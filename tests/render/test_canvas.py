@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cadalign.render.drawing.canvas import Canvas, _dashes
+from cadalign.render.canvas import Canvas, _dashes
 
 RED = (255, 0, 0)
 NOWHERE = np.zeros((0, 2))

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from cadalign import Box, Camera, Mesh
 from cadalign.errors import InputError
 from cadalign.render import Geometry, Scene, cast_geometry, draw_overlay, look_at, overlay_model
-from cadalign.render.drawing.canvas import linear_from_bytes
-from cadalign.render.drawing.layers import (
+from cadalign.render.canvas import linear_from_bytes
+from cadalign.render.layers import (
     OBSERVED_COLOR,
     OUTLIER_COLOR,
     REGION_SHARE,
@@ -21,7 +21,7 @@ from cadalign.render.drawing.layers import (
     UNSEEN_COLOR,
     confidence_regions,
 )
-from cadalign.render.drawing.overlay import AXIS_COLORS, EST_COLOR, GT_COLOR
+from cadalign.render.overlay import AXIS_COLORS, EST_COLOR, GT_COLOR
 
 CAMERA = Camera.from_fov(640, 480, fov_x=50)
 LARGE = Camera.from_fov(1600, 1200, fov_x=50)

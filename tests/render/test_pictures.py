@@ -9,7 +9,7 @@ import trimesh
 from cadalign import Camera, Mesh
 from cadalign.errors import InputError
 from cadalign.render import Angles, Scene, cast_geometry, look_at, pose_in_view
-from cadalign.render.drawing.layers import contact_sheet, feature_lines, keypoint_picture
+from cadalign.render.layers import contact_sheet, feature_lines, keypoint_picture
 
 CAMERA = Camera.from_fov(160, 120, fov_x=50)
 

@@ -12,8 +12,8 @@ import trimesh
 from cadalign import Alignment, Camera, Material, Mesh
 from cadalign.errors import InputError
 from cadalign.render import RaycastRenderer, Scene, cast_geometry, look_at
-from cadalign.render.drawing.canvas import bytes_from_linear, linear_from_bytes
-from cadalign.render.raycast.surface import coincident_faces, corner_normals
+from cadalign.render.canvas import bytes_from_linear, linear_from_bytes
+from cadalign.render.surface import coincident_faces, corner_normals
 
 CAMERA = Camera(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 SKEWED = Camera(width=160, height=120, fx=170.0, fy=140.0, cx=60.25, cy=71.75)

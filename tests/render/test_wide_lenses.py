@@ -11,8 +11,8 @@ from cadalign import Alignment, Camera, Mesh, Model, View, align
 from cadalign.export.glb import photo_plane
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.render import Scene, cast_geometry
-from cadalign.render.drawing.model_overlay import draw_result, photo_of
-from cadalign.render.raycast.renderer import RaycastRenderer
+from cadalign.render.overlay import draw_result, photo_of
+from cadalign.render.raycast import RaycastRenderer
 from cadalign.render.scene import LIGHT_GREY
 from cadalign.render.viewpoints import visible_keypoints
 

@@ -16,7 +16,7 @@ from cadalign import Alignment, Camera, Library
 from cadalign.arrays import FloatArray
 from cadalign.cli import main
 from cadalign.datasets import ModelKeypoints
-from cadalign.datasets.models.model_keypoints import ModelKeypoint
+from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.meshes.files import write_obj_mesh

@@ -17,7 +17,6 @@ from support.refusals import refusal_line
 from cadalign import Library, Match, Result
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, write_sample_dataset
-from cadalign.errors import DataError
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA as CAMERA
 from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
@@ -268,13 +267,6 @@ def test_an_observation_is_not_retrieved_into_its_own_folder(
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
 
 
-def test_an_old_overlay_that_cannot_be_removed_is_one_line(case: Case, tmp_path: Path) -> None:
-    (tmp_path / "matches.json").write_text("[{}, {}]")
-    (tmp_path / "overlay_02.png").mkdir()
-    with pytest.raises(DataError, match=f"{tmp_path}: cannot be written"):
-        write_retrieval(tmp_path, case.retrieve(top=1), CAMERA, title="t", library="l", image=None)
-
-
 def test_names_are_escaped(case: Case, tmp_path: Path) -> None:
     evil = "<script>alert(1)</script>"
     match = replace(case.retrieve(top=1)[0], model_id=evil, category='"><b>', mesh_path=None)
@@ -310,26 +302,6 @@ def test_a_query_needs_no_model_points_but_ids_or_names(
     write_json(Path(path), data)
     line = refusal_line(capsys, "retrieve", path, *options)
     assert f"{path}: the keypoints have no semantic_id and no name; give each" in line
-
-
-def test_malformed_queries_are_refused(
-    case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    library = case.arguments[1:]
-    path = tmp_path / "query.json"
-
-    def refused(value: Any) -> str:
-        text = refusal_line(capsys, "retrieve", write_json(path, value), *library)
-        assert text.startswith(f"{path}: ")
-        return text.removeprefix(f"{path}: ")
-
-    camera = CAMERA.to_dict()
-    assert refused([]) == "there are no keypoints"
-    assert refused({"camera": camera}).startswith("keypoints: missing; ")
-    keypoint = {"uv": [1.0, 2.0], "semantic_id": 0}
-    assert "keypoints[0].uv" in refused({"camera": camera, "keypoints": [{"semantic_id": 0}]})
-    assert "keypoints[0]" in refused({"camera": camera, "keypoints": [3]})
-    assert "'uvw'" in refused({"camera": camera, "keypoints": [{**keypoint, "uvw": 1}]})
 
 
 def test_what_the_library_refuses_is_one_line(

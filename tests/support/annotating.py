@@ -18,14 +18,14 @@ from playwright.sync_api import Browser, ConsoleMessage, Page
 
 from cadalign import Result, View, align
 from cadalign.annotate.actions import perform
-from cadalign.annotate.options import SessionOptions
+from cadalign.annotate.files import SessionOptions
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.photos import MarkedMask
 from cadalign.annotate.server import Access, listen, make_app, make_server
 from cadalign.annotate.session import Session, open_session
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, ModelKeypoints
-from cadalign.datasets.models.model_keypoints import ModelKeypoint
+from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.evaluation.instances.instance import Instance, load_scene, make_instance
 from cadalign.io.images import write_image
 from cadalign.render import RaycastRenderer

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
-from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
-from cadalign.datasets.photos.scan2cad import Scan2CAD
+from cadalign.datasets.pascal3d import Pascal3D
+from cadalign.datasets.scan2cad import Scan2CAD
 from cadalign.errors import InputError, quote
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import VIEW_NAMES
@@ -133,7 +133,6 @@ _PROTOCOLS = {
     # Annotators' points on scan and model are about 5 cm apart, 8 px in an image of 480.
     Scan2CAD.kind: Protocol((VIEWPOINT, SCAN2CAD, BOX), sigma_of_width=1 / 60),
     Pascal3D.kind: Protocol((VIEWPOINT,), up_axis="z"),
-    Pascal3DDetections.kind: Protocol((VIEWPOINT,), up_axis="z"),
 }
 _OTHER = Protocol((VIEWPOINT, BOX))
 

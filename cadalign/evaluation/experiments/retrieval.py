@@ -20,7 +20,7 @@ import tyro
 
 from cadalign.arrays import FloatArray, IntArray, instance_rng
 from cadalign.datasets import KeypointNet
-from cadalign.datasets.models.shapenet import require_category
+from cadalign.datasets.shapenet import require_category
 from cadalign.errors import InputError, unknown
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting

@@ -7,7 +7,7 @@ keypoints' extent. Keypoints in one plane, or fewer than 4, all count as visible
 holes and no parts that stand before others, so the rule is kinder to things such as chairs.
 
 An estimate that is off by a rotation that maps the object onto itself shows the same object in the
-same place: that is no error. `cadalign.datasets.models.keypoints.annotated_symmetry` finds
+same place: that is no error. `cadalign.datasets.keypoints.annotated_symmetry` finds
 these rotations.
 """
 
@@ -22,7 +22,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, instance_rng
 from cadalign.datasets import AnnotatedModel, KeypointNet, check_solid
-from cadalign.datasets.models.keypoints import symmetry_group
+from cadalign.datasets.keypoints import symmetry_group
 from cadalign.errors import CadalignError, TooFewVisibleError
 from cadalign.evaluation.runs.work import Row
 from cadalign.geometry.alignment import Alignment, Box

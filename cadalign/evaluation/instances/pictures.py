@@ -25,7 +25,7 @@ from cadalign.geometry.pixels import rescaled_pixels
 from cadalign.geometry.simplify import cluster, mesh_edges, simplify
 from cadalign.io.files import dense_json, write_text, write_whole
 from cadalign.render import RaycastRenderer, draw_overlay
-from cadalign.render.drawing.canvas import ByteImage
+from cadalign.render.canvas import ByteImage
 
 NO_PHOTO = 225
 """Grey of a photo that is not there."""

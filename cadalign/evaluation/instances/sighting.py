@@ -11,11 +11,11 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.formats import open_photos
-from cadalign.datasets.photos.dataset import PhotoDataset
-from cadalign.datasets.photos.photo import (
+from cadalign.datasets.photo import (
     CadModel,
     NamedPoints,
     Photo,
+    PhotoDataset,
     PhotoKeypoints,
     PhotoObject,
 )

@@ -39,7 +39,7 @@ from cadalign import (
 )
 from cadalign.cli import main
 from cadalign.datasets import ModelKeypoint, ModelKeypoints, read_image_keypoints
-from cadalign.datasets.detections.image_keypoints import join_keypoints
+from cadalign.datasets.image_keypoints import join_keypoints
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.observation import Observation
 

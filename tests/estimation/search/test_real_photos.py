@@ -42,7 +42,7 @@ def test_chairs_that_are_only_similar_to_their_models(real_data: Path, name: str
 
 def test_points_of_a_scene_are_aligned_in_its_frame(scene: Colmap) -> None:
     images = scene[0], scene[1]
-    rows = [{int(each): k for k, each in enumerate(image.point_ids)} for image in images]
+    rows = [{str(xyz): k for k, xyz in enumerate(image.points_3d.tolist())} for image in images]
     errors = [np.linalg.norm(image.residuals(), axis=1) for image in images]
     # The points that the fewest pixels of error have in both photos stand for an object.
     shared = sorted(

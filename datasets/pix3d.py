@@ -14,16 +14,18 @@ from typing import TypeVar
 import numpy as np
 from msgspec import field
 
-from cadalign.datasets.photos.dataset import PhotoDataset, read_list, read_matrix
-from cadalign.datasets.photos.photo import (
+from cadalign.datasets.photo import (
     CadModel,
     NamedPoints,
     Photo,
+    PhotoDataset,
     PhotoKeypoints,
     PhotoObject,
     Truth,
     existing,
+    read_matrix,
 )
+from cadalign.datasets.records import read_list
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera

@@ -13,10 +13,10 @@ from cadalign.errors import InputError, RenderError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.raycaster import FaceArray, RayCaster
-from cadalign.render.drawing.canvas import ByteImage, LinearArray, bytes_from_linear
-from cadalign.render.raycast.posed import PosedScene, Rectangle, in_threads, pose_scene
-from cadalign.render.raycast.surface import Studio
+from cadalign.render.canvas import ByteImage, LinearArray, bytes_from_linear
+from cadalign.render.posed import PosedScene, Rectangle, in_threads, pose_scene
 from cadalign.render.scene import Frame, Geometry, Scene, check_image_size
+from cadalign.render.surface import Studio
 
 # Small enough for the processor's caches, large enough for NumPy's overhead not to show.
 _RAYS_AT_ONCE = 1 << 15

@@ -13,15 +13,15 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from msgspec import field
+from msgspec import Meta
 
-from cadalign.arrays import BoolArray, FloatArray, is_number
-from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
-from cadalign.datasets.photos.dataset import leaving_out
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.datasets.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
+from cadalign.datasets.records import leaving_out
 from cadalign.errors import DataError, InputError, quote
 from cadalign.io.documents import Count, Finite, ForeignDocument, Text, convert, in_file, read_json
 from cadalign.io.kinds import DETECTOR
@@ -32,7 +32,7 @@ _FIX = "is it COCO's keypoint JSON, or a detector's? see cadalign's page on keyp
 _Id = int | str
 _Reader = tuple[str, Callable[[], ImageKeypoints | None]]
 """The place of an object in its file, and what reads it."""
-_LARGEST = 2**31  # width or height of an image
+_Side = Annotated[int, Meta(ge=1, le=2**31)]
 
 
 class _ByAxis(ForeignDocument):
@@ -48,31 +48,27 @@ class _Object(ForeignDocument):
 
     keypoints: list[Any] | _ByAxis | None = None
     keypoint_scores: list[float | None] | None = None
-    score: Any = None
-    bbox_score: Any = None
-    confidence: Any = None
+    score: Finite | None = None
+    bbox_score: Finite | None = None
+    confidence: Finite | None = None
     image_id: _Id | None = None
     category_id: _Id | None = None
-    num_keypoints: Any = None
+    num_keypoints: int | None = None
     segmentation: Any = None
 
 
 class _Image(ForeignDocument):
     id: _Id
     file_name: Text | None = None
-    width: Any = None
-    height: Any = None
+    width: _Side | None = None
+    height: _Side | None = None
 
     @property
     def size(self) -> tuple[int, int] | None:
-        """Width and height; None where either is missing or is none."""
-        given = (self.width, self.height)
-        if given == (None, None):
+        """Width and height; None where either is missing."""
+        if self.width is None or self.height is None:
             return None
-        if all(is_number(each) and 1 <= each <= _LARGEST for each in given):
-            return int(self.width), int(self.height)
-        logger.warning("images: %s x %s is not a size; left out", *map(quote, given))
-        return None
+        return self.width, self.height
 
 
 class _Category(ForeignDocument):
@@ -90,19 +86,17 @@ _Entry = TypeVar("_Entry", _Image, _Category)
 
 
 class _File(ForeignDocument):
-    """COCO's annotations, or MMPose's predictions: the last two fields."""
+    """COCO's annotations."""
 
-    annotations: list[Any] = field(default_factory=list)
+    annotations: list[Any]
     images: list[_Image] | None = None
     categories: list[_Category] | None = None
-    instance_info: list[_Object] = field(default_factory=list)
-    meta_info: dict[str, Any] | None = None
 
 
 def read_coco_keypoints(
     path: Path, problems: dict[str, DataError] | None = None
 ) -> list[ImageKeypoints]:
-    """Read any of the four forms, one entry for each object in each image.
+    """Read any of the forms, one entry for each object in each image.
 
     For ``problems`` see `cadalign.datasets.read_image_keypoints`.
     """
@@ -125,13 +119,11 @@ def read_coco_keypoints(
 def _readers(data: Any) -> Iterable[_Reader]:
     if isinstance(data, list):
         return ((f"[{row}]", partial(_bare, each, f"[{row}]")) for row, each in enumerate(data))
-    if isinstance(data, dict) and "annotations" in data:
-        return _from_annotations(convert(data, _File))
-    if isinstance(data, dict) and "instance_info" in data:
-        return _from_predictions(convert(data, _File))
     if not isinstance(data, dict):
         raise DataError(f"{quote(data)} is not an object or a list", fix=_FIX)
-    raise DataError("neither annotations nor instance_info", where="top level", fix=_FIX)
+    if "annotations" not in data:
+        raise DataError("missing", where="annotations", fix=_FIX)
+    return _from_annotations(convert(data, _File))
 
 
 def _bare(data: Any, where: str) -> ImageKeypoints:
@@ -176,17 +168,6 @@ def _annotated(
     return replace(found, image=called, size=image.size, images=len(images))
 
 
-def _from_predictions(data: _File) -> Iterator[_Reader]:
-    names, given = None, (data.meta_info or {}).get("keypoint_id2name")
-    if given is not None:
-        place = "meta_info.keypoint_id2name"
-        by_number = convert(given, dict[str, Text], place)
-        names = convert([by_number.get(str(n)) for n in range(len(by_number))], list[Text], place)
-    for row, entry in enumerate(data.instance_info):
-        where = f"instance_info[{row}]"
-        yield where, partial(_image_keypoints, entry, where, names=names)
-
-
 def _image_keypoints(entry: _Object, where: str, *, names: list[str] | None) -> ImageKeypoints:
     place = f"{where}.keypoints"
     points, third = _points(entry, place)
@@ -195,7 +176,7 @@ def _image_keypoints(entry: _Object, where: str, *, names: list[str] | None) -> 
         raise DataError(what, where=place)
     if third is not None and len(third) != len(points):
         raise DataError(f"{len(third)} scores of {len(points)} keypoints", where=place)
-    given = (_number(entry, name, where) for name in ("score", "bbox_score", "confidence"))
+    given = (entry.score, entry.bbox_score, entry.confidence)
     return ImageKeypoints(
         points_2d=points,
         scores=None if third is None else np.array(third, dtype=float),
@@ -239,15 +220,6 @@ def _points(entry: _Object, where: str) -> tuple[FloatArray, Any]:
 def _floats(values: Any) -> FloatArray:
     """Numbers as an array, NaN for None."""
     return np.array(values, dtype=float)
-
-
-def _number(entry: _Object, name: str, where: str) -> float | None:
-    """A number that an object can do without; what is none is warned of and left out."""
-    value = getattr(entry, name)
-    if value is None or is_number(value):
-        return None if value is None else float(value)
-    logger.warning("%s.%s: %s is not a number; left out", where, name, quote(value))
-    return None
 
 
 def _are_flags(scores: Sequence[FloatArray]) -> bool:

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.datasets.sfm.correspondences import (
+from cadalign.datasets.correspondences import (
     Correspondences,
     CorrespondenceSet,
     find_layout,
@@ -112,14 +112,12 @@ class Colmap(CorrespondenceSet):
         name, read_view = self._images[position]
         view = read_view()
         rows = view.point_ids != _INVALID_POINT
-        point_ids = view.point_ids[rows]
         return Correspondences(
             id=name,
-            points_3d=self._points[self._point_rows(point_ids, name)],
+            points_3d=self._points[self._point_rows(view.point_ids[rows], name)],
             points_2d=view.points_2d[rows] - PIXEL_CENTRE,
             camera=self._camera(view.camera_id, name),
             cam_from_world=rigid_pose(rotation_from_quat_wxyz(view.pose[:4]), view.pose[4:]),
-            point_ids=point_ids,
         )
 
     def _point_rows(self, point_ids: IntArray, name: str) -> IntArray:

@@ -15,24 +15,21 @@ import numpy as np
 from msgspec import Meta
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.models.shapenet import MESH_FILES, name_of_synset
-from cadalign.datasets.photos.dataset import (
-    PhotoDataset,
-    leaving_out,
-    read_each,
-    read_list,
-    read_matrix,
-)
-from cadalign.datasets.photos.photo import (
+from cadalign.datasets.photo import (
     CadModel,
     NamedPoints,
     Photo,
+    PhotoDataset,
     PhotoKeypoints,
     PhotoObject,
     Truth,
     existing,
     first_existing,
+    read_each,
+    read_matrix,
 )
+from cadalign.datasets.records import leaving_out, read_list
+from cadalign.datasets.shapenet import MESH_FILES, name_of_synset
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera

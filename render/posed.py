@@ -18,9 +18,9 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import barycentric_of
 from cadalign.geometry.pixels import perspective
 from cadalign.geometry.raycaster import FaceArray, RayCaster
-from cadalign.render.drawing.canvas import LinearArray
-from cadalign.render.raycast.surface import Studio
+from cadalign.render.canvas import LinearArray
 from cadalign.render.scene import Scene
+from cadalign.render.surface import Studio
 
 _MAX_LAYERS = 8
 # What is hidden to this share is left out.

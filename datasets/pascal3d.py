@@ -6,7 +6,10 @@ Xiang et al., "ObjectNet3D: A Large Scale Database for 3D Object Recognition", E
 
 from __future__ import annotations
 
+import io
 import os
+import struct
+import zlib
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -15,19 +18,19 @@ import numpy as np
 from msgspec import field
 
 from cadalign.arrays import FloatArray, as_floats
-from cadalign.datasets.photos.dataset import PhotoDataset, read_each
-from cadalign.datasets.photos.mat_files import read_structs, structs_of
-from cadalign.datasets.photos.photo import (
+from cadalign.datasets.photo import (
     CadModel,
     NamedPoints,
     Photo,
+    PhotoDataset,
     PhotoKeypoints,
     PhotoObject,
     Truth,
     existing,
     first_existing,
+    read_each,
 )
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError, InputError, brief
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import OPENGL_AXES
@@ -37,20 +40,16 @@ from cadalign.io.documents import (
     Finite,
     ForeignDocument,
     Id,
-    PathText,
     Point2,
     Positive,
     Text,
     convert,
     in_file,
-    read_json,
 )
-from cadalign.io.files import as_path, listed
+from cadalign.io.files import as_path, listed, read_bytes
 from cadalign.io.images import photo_size
 
 ANNOTATIONS = "Annotations"
-DETECTED = "annot"
-_OBSERVATIONS = "observations"
 _MOST_VERTICES = 2**31
 # MATLAB counts pixels from 1.
 _FIRST_PIXEL = 1.0
@@ -161,98 +160,6 @@ class Pascal3D(PhotoDataset):
         return Photo(name, image, camera, objects, problems=problems)
 
 
-class _Photos(ForeignDocument):
-    imgname: list[PathText]
-    category: list[Id] = field(name="class")
-    cad_index: list[Finite]
-
-    def __post_init__(self) -> None:
-        if len({len(each) for each in (self.imgname, self.category, self.cad_index)}) != 1:
-            raise InputError("its lists have different lengths")
-
-
-class _Keypoint(ForeignDocument):
-    uv: Point2
-    name: Text
-    confidence: Finite | None = None
-
-
-class _Observation(ForeignDocument):
-    image: PathText
-    keypoints: list[_Keypoint]
-
-
-class Pascal3DDetections(PhotoDataset):
-    """Photos of PASCAL3D+ with the keypoints of a detector, and without viewpoints.
-
-    The layout of the data of Pavlakos et al., "6-DoF Object Pose from Semantic Keypoints", ICRA
-    2017::
-
-        annot/*.mat           a struct ``annot`` of lists: imgname, class, cad_index
-        images/<imgname>.jpg
-        cad/<category>.mat    as in PASCAL3D+
-        observations/*.json   {"image", "keypoints": [{"name", "uv", "confidence"}]} of each photo
-
-    There are no poses, and the file's squares around the objects are crops, no rectangles of
-    theirs. Photos that are listed but not there are problems.
-
-    Raises DataError if there are no lists of photos, or one cannot be read.
-    """
-
-    kind = "PASCAL3D+ photos with detected keypoints"
-    signature = f"PASCAL3D+ photos with detected keypoints: {DETECTED}/*.mat"
-    marks = (f"{DETECTED}/*.mat",)
-    patterns = (f"{DETECTED}/*.mat", f"{_OBSERVATIONS}/*.json", _CAD)
-
-    def __init__(self, root: str | os.PathLike[str]) -> None:
-        folder = as_path(root, "root")
-        self._records: list[tuple[str, int]] = []  # category and number of the CAD model
-        names: list[str] = []
-        for path in listed(folder / DETECTED, "*.mat"):
-            with in_file(path):
-                found: _Photos = convert(read_structs(path, "annot")[0], _Photos)
-            names += found.imgname
-            self._records += zip(found.category, map(int, found.cad_index), strict=True)
-        if not names:
-            raise DataError(f"there are no {DETECTED}/*.mat", where=str(folder))
-        super().__init__(folder, names)
-        self._observed: dict[str, list[_Keypoint]] | None = None  # by the photos' names
-
-    def read(self, index: int) -> Photo:
-        """Read the photo of a number from 0."""
-        name, (category, cad_index) = self.names[index], self._records[index]
-        image = find_image(self.root, name)
-        if image is None:
-            raise DataError("the image is missing", where=f"{self.root}, photo {name}")
-        shown = PhotoObject(
-            object_id="0",
-            category=category,
-            keypoints=self._keypoints(name),
-            model=cad_model(self.root, category, cad_index),
-        )
-        return Photo(name, image, Camera.without_focal(*photo_size(image)), (shown,))
-
-    def _keypoints(self, name: str) -> PhotoKeypoints | None:
-        if self._observed is None:
-            self._observed = {}
-            for path in listed(self.root / _OBSERVATIONS, "*.json"):
-                try:
-                    with in_file(path):
-                        observation = convert(read_json(path), _Observation)
-                    self._observed[Path(observation.image).stem] = observation.keypoints
-                except DataError as error:
-                    self._tell(str(path), error)
-        if name not in self._observed:
-            return None
-        found = self._observed[name]
-        scores = [each.confidence for each in found if each.confidence is not None]
-        return PhotoKeypoints(
-            points_2d=np.array([each.uv for each in found], dtype=float).reshape(-1, 2),
-            names=tuple(each.name for each in found),
-            scores=np.array(scores) if scores else None,
-        )
-
-
 def find_image(root: Path, name: str) -> Path | None:
     """Find the image of an annotation, named without its ending; None where it is missing."""
     return first_existing(
@@ -359,6 +266,78 @@ def _find_cad(path: Path, category: str, index: int) -> dict[str, Any]:
     if not 1 <= index <= len(models):
         raise DataError(f"there is no model {index}, only {len(models)}", where=str(path))
     return models[index - 1]
+
+
+# MATLAB's files --------------------------------------------------------------------------------
+
+_HEADER = 128
+_COMPRESSED = 15
+# Of the largest variable when it is uncompressed, and beyond that for each byte of the file.
+_FREE_BYTES, _EXPANSION = 2**26, 32
+_FIX = "get the file again; save one of MATLAB's version 7.3 with the option -v7"
+
+
+def read_structs(path: Path, name: str) -> list[dict[str, Any]]:
+    """Read the struct, or the array of structs, that a .mat file holds under a name.
+
+    Structs are dictionaries, arrays of them and of texts are lists; what is empty is None.
+
+    Raises DataError if the file cannot be read, is none of MATLAB's up to version 7, or holds no
+    such structs.
+    """
+    from scipy.io import loadmat, matlab  # takes a while to import
+
+    data = read_bytes(path)
+    try:
+        if matlab.matfile_version(io.BytesIO(data))[0] == 1:
+            data = _uncompressed(data)
+        found = loadmat(io.BytesIO(data), variable_names=[name], simplify_cells=True)
+    except Exception as error:  # damaged files make SciPy raise what it likes
+        what = f"not a MATLAB file that can be read ({brief(error)})"
+        raise DataError(what, where=str(path), fix=_FIX) from None
+    structs = structs_of(_plain(found.get(name)))
+    if not structs:
+        raise DataError(f"there are no structs named {name} in this file", where=str(path))
+    return structs
+
+
+def structs_of(value: Any) -> list[dict[str, Any]]:
+    """The structs of a field: one is no list."""
+    values = value if isinstance(value, list) else [value]
+    return [each for each in values if isinstance(each, dict)]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _plain(each) for name, each in value.items()}
+    if isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype == object):
+        return [_plain(each) for each in value] or None
+    return None if np.size(value) == 0 else value
+
+
+def _uncompressed(data: bytes) -> bytes:
+    """A file of version 5 to 7 whose variables are uncompressed, and their checksums compared.
+
+    SciPy compares them after it has read a variable, and what is damaged can crash it before.
+    """
+    tag = "<II" if data[_HEADER - 2 : _HEADER] == b"IM" else ">II"
+    most = _FREE_BYTES + _EXPANSION * len(data)
+    parts, start = [data[:_HEADER]], _HEADER
+    while start < len(data):
+        kind, size = struct.unpack_from(tag, data, start)
+        content = start + struct.calcsize(tag)
+        end = content + size
+        if end > len(data):
+            raise ValueError("it is cut short")
+        if kind == _COMPRESSED:
+            stream = zlib.decompressobj()
+            parts.append(stream.decompress(data[content:end], most))
+            if not stream.eof:
+                raise ValueError(f"a variable is cut short, or has more than {most} bytes")
+        else:
+            parts.append(data[start:end])
+        start = end
+    return b"".join(parts)
 
 
 # A category's file takes a second to read, and all of a category's objects need it.

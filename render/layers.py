@@ -14,7 +14,7 @@ from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.render.drawing.canvas import (
+from cadalign.render.canvas import (
     CASING,
     ByteImage,
     Canvas,

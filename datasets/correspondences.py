@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_only
+from cadalign.arrays import FloatArray, as_floats, as_points, read_only
 from cadalign.datasets.records import RecordSet
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
@@ -33,8 +33,6 @@ class Correspondences:
         The calibrated camera.
     cam_from_world : Alignment
         The true pose; its scale is 1.
-    point_ids : (n,) int, optional
-        The points' numbers in the file that they come from.
 
     Raises
     ------
@@ -56,19 +54,13 @@ class Correspondences:
     points_2d: FloatArray
     camera: Camera
     cam_from_world: Alignment
-    point_ids: IntArray | None = None
 
     def __post_init__(self) -> None:
         points_3d = as_points(self.points_3d, name="points_3d", dimension=3)
         points_2d = as_points(self.points_2d, name="points_2d", dimension=2)
-        lengths = {"points_2d": len(points_2d)}
-        if self.point_ids is not None:
-            point_ids = np.asarray(self.point_ids, dtype=np.int64)
-            lengths["point_ids"] = len(point_ids)
-            object.__setattr__(self, "point_ids", read_only(point_ids))
-        for name, length in lengths.items():
-            if length != len(points_3d):
-                raise InputError(f"{length} rows, but points_3d has {len(points_3d)}", where=name)
+        if len(points_2d) != len(points_3d):
+            what = f"{len(points_2d)} rows, but points_3d has {len(points_3d)}"
+            raise InputError(what, where="points_2d")
         if (self.cam_from_world.scale != 1).any():
             what = f"the scale is {self.cam_from_world.scale.tolist()}"
             fix = "a true pose does not stretch the scene: give the scale (1, 1, 1)"

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.models.keypointnet import AnnotatedModel
+from cadalign.datasets.keypointnet import AnnotatedModel
 from cadalign.errors import DataError, InputError
 from cadalign.io.documents import (
     Document,

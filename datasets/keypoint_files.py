@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.datasets.detections.coco import read_coco_keypoints
-from cadalign.datasets.detections.image_keypoints import ImageKeypoints
-from cadalign.datasets.photos.dataset import leaving_out
+from cadalign.datasets.coco import read_coco_keypoints
+from cadalign.datasets.image_keypoints import ImageKeypoints
+from cadalign.datasets.records import leaving_out
 from cadalign.errors import DataError, InputError, brief, quote
 from cadalign.io.documents import in_file
 from cadalign.io.files import as_path, read_text

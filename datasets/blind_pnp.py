@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import FloatArray, as_floats
-from cadalign.datasets.sfm.correspondences import (
+from cadalign.datasets.correspondences import (
     Correspondences,
     CorrespondenceSet,
     find_layout,
     rigid_pose,
 )
-from cadalign.datasets.sfm.unpickling import load_pickle
+from cadalign.datasets.unpickling import load_pickle
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -49,7 +49,7 @@ class BlindPnP(CorrespondenceSet):
     virtual camera of the sample's focal length, by default 800 px, whose image is just large
     enough for them.
 
-    No pickle can run code; see `cadalign.datasets.sfm.unpickling`.
+    No pickle can run code; see `cadalign.datasets.unpickling`.
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import FaceArray
 from cadalign.geometry.simplify import number_rows
-from cadalign.render.drawing.canvas import LinearArray, linear_from_bytes, linear_from_srgb
+from cadalign.render.canvas import LinearArray, linear_from_bytes, linear_from_srgb
 
 
 class SurfaceColors:

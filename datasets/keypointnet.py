@@ -16,20 +16,20 @@ from typing import overload
 
 import numpy as np
 
-from cadalign.datasets.models.keypoints import (
+from cadalign.datasets.keypoints import (
     Keypoints,
     Symmetries,
     annotated_symmetry,
     entry_id,
     parse_entry,
 )
-from cadalign.datasets.models.shapenet import (
+from cadalign.datasets.records import read_list
+from cadalign.datasets.shapenet import (
     MeshLocator,
     name_of_synset,
     require_category,
     synset_of_name,
 )
-from cadalign.datasets.photos.dataset import read_list
 from cadalign.errors import DataError, InputError, quote, unknown
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats
-from cadalign.datasets.models.model_keypoints import ModelKeypoints
+from cadalign.datasets.model_keypoints import ModelKeypoints
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import check_pixels, unmeasured
@@ -53,7 +53,7 @@ class ImageKeypoints:
     `cadalign.geometry.pixels.unmeasured`."""
     segmentation: Any = field(default=None, kw_only=True)
     """The object's mask as COCO writes it, unchecked; see
-    `cadalign.datasets.detections.coco.decode_segmentation`."""
+    `cadalign.datasets.coco.decode_segmentation`."""
 
     def __post_init__(self) -> None:
         where = f"{self.source}: keypoints"

@@ -1,1 +1,0 @@
-"""Keypoints in images, from detectors and annotation tools."""

@@ -1,1 +1,0 @@
-"""Annotated CAD models: KeypointNet, ShapeNet, and keypoint files."""

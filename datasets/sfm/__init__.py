@@ -1,1 +1,0 @@
-"""Structure-from-motion models and other 2D-3D correspondences."""

@@ -1,1 +1,0 @@
-"""Draw on images: overlays, pictures of geometry, stills."""

@@ -1,1 +1,0 @@
-"""Draw by ray casting: exact geometry and shaded colour on any machine."""

@@ -71,7 +71,7 @@ class ObservationFit:
 
     @property
     def given(self) -> dict[str, Any]:
-        """What is given, as the entry ``fit`` of an observation's file has it."""
+        """Options that are given, as the entry ``fit`` of an observation's file has it."""
         values = {name: getattr(self, name) for name in _STORED}
         given = {name: value for name, value in values.items() if value is not None}
         if self.sigma == "none" or (self.similar and self.sigma is None):
@@ -314,7 +314,7 @@ def views_of(
 
 
 def photo_doubt(image: ObservedImage) -> str | None:
-    """What is wrong with the size of an image's photo; None where there is none to be read."""
+    """Doubt about the size of an image's photo; None where there is none to be read."""
     if image.image is None:
         return None
     with suppress(DataError):

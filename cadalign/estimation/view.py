@@ -71,8 +71,7 @@ class View(BeyondKeypoints):
         an array of floats.
     up : (3,) float, optional
         The direction of the model's up axis in the camera's frame (OpenCV's: y points down), of any
-        length; `cadalign.geometry.conventions` computes it from gravity, pitch and roll, a phone's
-        pose, or clicks on vertical edges.
+        length.
     up_sigma_deg : float or (3, 3) float
         Its standard deviation about each axis across it [degrees], or the covariance of the
         direction [degrees squared].

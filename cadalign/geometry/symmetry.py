@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -69,8 +68,8 @@ class Symmetry:
 
     Examples
     --------
-    >>> Symmetry.none().is_trivial, len(Symmetry.around((0, 1, 0), fold=4).poses())
-    (True, 4)
+    >>> Symmetry.none().is_trivial, len(Symmetry.around((0, 1, 0), fold=4).motions)
+    (True, 3)
     """
 
     motions: FloatArray
@@ -166,20 +165,6 @@ class Symmetry:
     def is_trivial(self) -> bool:
         """True if there is no motion but the identity."""
         return not len(self.motions) and not self.axes
-
-    def poses(self, *, max_step: float = 0.01) -> FloatArray:
-        """All motions, those about axes in steps; (n, 4, 4) float, the identity first.
-
-        BOP's definition: the product of every step about every axis with every discrete motion.
-        From one of the ``ceil(pi / max_step)`` steps to the next, a point as far from the axis as
-        the model's diameter moves by ``max_step`` at most, as a share of that diameter.
-        """
-        count = int(np.ceil(np.pi / max_step))
-        about = [
-            axis.turned(2 * np.pi * step / count) for axis in self.axes for step in range(count)
-        ]
-        discrete = [np.eye(4), *self.motions]
-        return np.array([turn @ motion for motion, turn in product(discrete, about or [np.eye(4)])])
 
 
 def _check_fold(fold: Any, where: str) -> None:

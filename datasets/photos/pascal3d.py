@@ -28,9 +28,8 @@ from cadalign.datasets.photos.photo import (
     first_existing,
 )
 from cadalign.errors import DataError, InputError
-from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.alignment import OPENGL_AXES, Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.conventions import OPENGL_AXES
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.documents import (

@@ -154,7 +154,7 @@ class Scan2CAD(PhotoDataset):
         """Read the photo of a number from 0."""
         scan, frame = self._records[index]
         camera, cam_from_scan = frame.camera(), frame.cam_from_scan()
-        cam_from_world = cam_from_scan @ _inverse(scan.trs.alignment())
+        cam_from_world = _composed(cam_from_scan, _inverse(scan.trs.alignment()))
 
         def read_object(number: int, model: Any) -> PhotoObject | None:
             found: _Model = convert(model, _Model)
@@ -176,7 +176,7 @@ def _object(
 ) -> PhotoObject | None:
     """An object of the scan as a photo shows it; None where its box is not in the image."""
     world_from_model = found.trs.alignment()
-    cam_from_model = cam_from_world @ world_from_model
+    cam_from_model = _composed(cam_from_world, world_from_model)
     center = np.array(found.center or (0.0, 0.0, 0.0))
     distance = float(np.linalg.norm(cam_from_model.apply(center[None])))
     if distance > _FARTHEST:
@@ -239,6 +239,12 @@ def _rectangle(box: Box, camera: Camera) -> FloatArray | None:
     low = np.maximum(pixels.min(axis=0), -0.5)
     high = np.minimum(pixels.max(axis=0), np.array([camera.width, camera.height]) - 0.5)
     return np.concatenate([low, high]) if (low < high).all() else None
+
+
+def _composed(second: Alignment, first: Alignment) -> Alignment:
+    """The alignment of one after another, where the second stretches all axes alike."""
+    (moved,) = second.apply(first.translation[None])
+    return Alignment(second.rotation @ first.rotation, moved, second.scale * first.scale)
 
 
 def _inverse(alignment: Alignment) -> Alignment:

@@ -11,7 +11,7 @@ import hashlib
 import os
 from array import array
 from codecs import BOM_UTF8
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -22,10 +22,9 @@ from cadalign.datasets.detections.image_keypoints import ImageKeypoints
 from cadalign.datasets.detections.keypoint_files import read_image_keypoints
 from cadalign.errors import DataError
 from cadalign.evaluation.runs.work import fingerprint, fingerprint_of_files
-from cadalign.io.documents import read_json
+from cadalign.io.documents import path_from, read_json
 from cadalign.io.files import listed, open_input, read_bytes, read_text
 from cadalign.io.kinds import DETECTOR, LINES, OBSERVATION, TABLE, kind_of, refuse_other_file
-from cadalign.io.observation_file import named_files
 
 _INVALID = (msgspec.MsgspecError, UnicodeError, RecursionError)
 _CELLS = 3  # of a task: the number of its file, its own in it, and the byte where it begins
@@ -115,7 +114,7 @@ class ObservationTasks(Sequence[ObservationTask]):
         else:
             self._marks.append(fingerprint_of_files([path]))
             self._cells.extend((number, 0, 0))
-            self._named.update(dict.fromkeys(named_files(data, path.parent)))
+            self._named.update(dict.fromkeys(_named_files(data, path.parent)))
 
     def _add_lines(self, number: int, path: Path) -> None:
         """Find where the lines of a file begin; empty ones are passed over."""
@@ -126,7 +125,7 @@ class ObservationTasks(Sequence[ObservationTask]):
                 if line[mark:].strip():  # behind the mark that programs of Windows write
                     self._cells.extend((number, own, place + mark))
                     with suppress(*_INVALID):  # whoever reads it says so
-                        named = named_files(msgspec.json.decode(line[mark:]), path.parent)
+                        named = _named_files(msgspec.json.decode(line[mark:]), path.parent)
                         self._named.update(dict.fromkeys(named))
                 place += len(line)
                 digest.update(line)
@@ -171,3 +170,14 @@ def _content(path: Path) -> Any:
     with suppress(DataError):
         return read_json(path)  # slower, but knows the NaN that Python's JSON has
     return None
+
+
+def _named_files(data: Any, folder: Path) -> Iterator[Path]:
+    """Photos, masks and meshes that an observation names, in its parsed form, valid or not."""
+    given = data if isinstance(data, Mapping) else {}
+    views = given.get("views")
+    for part in (given, *(views if isinstance(views, list) else ())):
+        for name in ("image", "model", "shape", "mask", "depth"):
+            path = part.get(name) if isinstance(part, Mapping) else None
+            if isinstance(path, str) and path:
+                yield path_from(path, folder)

@@ -146,10 +146,10 @@ class Alignment:
     def from_dict(cls, data: Mapping[str, Any]) -> Alignment:
         """Read what `to_dict` wrote; raises InputError if a field is missing or invalid."""
         if not isinstance(data, Mapping):
-            raise InputError(f"expected an object, got {type(data).__name__}", where="alignment")
-        missing = [key for key in _FIELDS if key not in data]
-        if missing:
-            raise InputError(f"missing {', '.join(missing)}", where="alignment")
+            raise InputError(f"expected an object, got {type(data).__name__}")
+        for name in _FIELDS:
+            if name not in data:
+                raise InputError("missing", where=name)
         return cls(*(data[key] for key in _FIELDS))
 
 

@@ -172,7 +172,7 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
             changed("keypoints.5.semantic_id", True),
             "{path}: keypoints[5].semantic_id: True is not a whole number",
         ),
-        (changed("image", 5), "{path}: image: 5 is not a text"),
+        (changed("image", 5), "{path}: image: 5 is not a path"),
         (
             changed("camera.params.0", 0),
             "{path}: camera.fx: the focal length is 0; give the calibrated focal length in pixels",

@@ -37,7 +37,7 @@ from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import nearest_rotation, rotation_from_quat_wxyz
-from cadalign.geometry.symmetry import SCAN2CAD_FOLDS, Symmetry
+from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.documents import Finite, ForeignDocument, Id, Point3, Positive, convert, in_file
 from cadalign.io.files import as_path, listed
 from cadalign.io.images import photo_size
@@ -48,6 +48,13 @@ _SAMPLES = ("example_annotation.json", "annot.json", "samples/annot.json")
 _FRAME_FOLDERS = (".", "scans", "scannet", "ScanNet", "ScanNet/scans", "samples")
 _MODEL_FOLDERS = ("ShapeNetCore.v2", "shapenet", "ShapeNet", "Meshes", "samples/Meshes", ".")
 _UP = (0.0, 1.0, 0.0)
+_FOLDS: dict[str, int | None] = {
+    "__SYM_NONE": 1,
+    "__SYM_ROTATE_UP_2": 2,
+    "__SYM_ROTATE_UP_4": 4,
+    "__SYM_ROTATE_UP_INF": None,
+}
+"""Numbers of rotations about y by Scan2CAD's names; None for any angle."""
 # Corners nearer than this are as good as behind the camera [m].
 _NEAR = 0.05
 _FARTHEST = 1000.0  # distance of an object in a scan of rooms [m]
@@ -183,8 +190,8 @@ def _object(
         what = f"the object lies {distance:.3g} m from the camera, as with millimetres for metres"
         fix = "give the frame's pose and the annotations in metres, such as divided by 1000"
         raise InputError(what, where="trs.translation", fix=fix)
-    if found.sym not in SCAN2CAD_FOLDS:
-        known = ", ".join(SCAN2CAD_FOLDS)
+    if found.sym not in _FOLDS:
+        known = ", ".join(_FOLDS)
         raise InputError(f"{quote(found.sym)} is no symmetry", where="sym", fix=f"known: {known}")
     bounds = box = bbox = None
     if found.bbox is not None:
@@ -207,7 +214,7 @@ def _object(
         truth=Truth(cam_from_model=cam_from_model, box=box, metres=1.0),
         keypoints=keypoints,
         model=CadModel(found.id_cad, mesh, points, bounds),
-        symmetry=Symmetry.around(_UP, fold=SCAN2CAD_FOLDS[found.sym], offset=center),
+        symmetry=Symmetry.around(_UP, fold=_FOLDS[found.sym], offset=center),
         bbox=bbox,
     )
 

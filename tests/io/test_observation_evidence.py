@@ -148,14 +148,11 @@ def test_views_need_no_xyz_where_a_shape_has_them(tmp_path: Path) -> None:
     [
         (ONE | {"mask": ""}, "{path}: mask: '' is not a path"),
         (replaced(ONE, "mask", ...), "{path}: mask_sigma: given without mask; give mask, too"),
-        (ONE | {"depth_scale": -1}, "{path}: depth_scale: -1 is not a positive number"),
         (ONE | {"up": [0, 1]}, "{path}: up: [0, 1] is not a list of 3"),
         (
             ONE | {"up": [0, float("inf"), 1]},
             "{path}: up[1]: inf is not a finite number",
         ),
-        (ONE | {"camera_height": "1 m"}, "{path}: camera_height: '1 m' is not a finite number"),
-        (ONE | {"cam_from_rig": np.eye(3).tolist()}, "{path}: cam_from_rig: "),
         (
             ONE | {"size": {"depth": 3}},
             "{path}: size: unknown field 'depth'; known are height, length, sigma, width",
@@ -177,10 +174,6 @@ def test_views_need_no_xyz_where_a_shape_has_them(tmp_path: Path) -> None:
             replaced(ONE, "init.translation", ...),
             "{path}: init.translation: missing",
         ),
-        (
-            replaced(ONE, "init.rotation.0.0", 1.0),
-            "{path}: init.rotation: ",
-        ),
         (replaced(ONE, "init.scale.1", 0.0), "{path}: init.scale: "),
         (SEVERAL | {"views": []}, "{path}: views: [] is not a list of at least 1"),
         (
@@ -188,11 +181,6 @@ def test_views_need_no_xyz_where_a_shape_has_them(tmp_path: Path) -> None:
             "{path}: camera: given beside `views`; give it in each of the views",
         ),
         (replaced(SEVERAL, "views.1.camera", ...), "{path}: views[1].camera: missing"),
-        (
-            replaced(SEVERAL, "views.0.keypoints.2.semantic_id", ...),
-            "{path}: views[0].keypoints[2].semantic_id: missing, though other keypoints have it; "
-            "give it for all keypoints or for none",
-        ),
         (
             replaced(SEVERAL, "views.2.mask", ...) | {"fit": {"sigma": [1.0]}},
             "{path}: fit.sigma: a list, but there are several views; "

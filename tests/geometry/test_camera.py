@@ -310,11 +310,6 @@ def test_project_refuses_what_are_no_points(points: Any, text: str) -> None:
     assert str(caught.value) == text
 
 
-def test_no_points_have_no_projections() -> None:
-    assert PLAIN.project(np.empty((0, 3))).shape == (0, 2)
-    assert camera_with(LENSES["opencv4"]).normalize(np.empty((0, 2))).shape == (0, 2)
-
-
 # --- without focal length ---------------------------------------------------------------------
 
 

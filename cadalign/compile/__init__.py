@@ -55,7 +55,9 @@ def borrowing(function: F) -> F:
 
 
 def _compiled(function: F, *, counts: bool = True, **chosen: Any) -> F:
-    options: Any = {"nogil": True, "error_model": "numpy", "boundscheck": False, **chosen}
+    # Options that are not said are those of the kernel that calls a function.
+    options: Any = {"nogil": True, "error_model": "numpy", "boundscheck": False}
+    options |= {"fastmath": False, "forceinline": False, **chosen}
     if KernelDispatcher is None:
         return cast(F, numba.njit(cache=True, **options)(function))
     own = {"nopython": True, "_nrt": counts, "no_cfunc_wrapper": True}

@@ -31,9 +31,8 @@ from cadalign.datasets.photo import (
     read_each,
 )
 from cadalign.errors import DataError, InputError, brief
-from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.alignment import OPENGL_AXES, Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.conventions import OPENGL_AXES
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.documents import (

@@ -34,7 +34,7 @@ from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import nearest_rotation, rotation_from_quat_wxyz
-from cadalign.geometry.symmetry import SCAN2CAD_FOLDS, Symmetry
+from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.documents import Finite, ForeignDocument, Id, Point3, Positive, convert, in_file
 from cadalign.io.files import as_path, listed
 from cadalign.io.images import photo_size
@@ -45,6 +45,13 @@ _SAMPLES = ("example_annotation.json", "annot.json", "samples/annot.json")
 _FRAME_FOLDERS = (".", "scans", "scannet", "ScanNet", "ScanNet/scans", "samples")
 _MODEL_FOLDERS = ("ShapeNetCore.v2", "shapenet", "ShapeNet", "Meshes", "samples/Meshes", ".")
 _UP = (0.0, 1.0, 0.0)
+_FOLDS: dict[str, int | None] = {
+    "__SYM_NONE": 1,
+    "__SYM_ROTATE_UP_2": 2,
+    "__SYM_ROTATE_UP_4": 4,
+    "__SYM_ROTATE_UP_INF": None,
+}
+"""Numbers of rotations about y by Scan2CAD's names; None for any angle."""
 # Corners nearer than this are as good as behind the camera [m].
 _NEAR = 0.05
 _FARTHEST = 1000.0  # distance of an object in a scan of rooms [m]
@@ -151,7 +158,7 @@ class Scan2CAD(PhotoDataset):
         """Read the photo of a number from 0."""
         scan, frame = self._records[index]
         camera, cam_from_scan = frame.camera(), frame.cam_from_scan()
-        cam_from_world = cam_from_scan @ _inverse(scan.trs.alignment())
+        cam_from_world = _composed(cam_from_scan, _inverse(scan.trs.alignment()))
 
         def read_object(number: int, model: Any) -> PhotoObject | None:
             found: _Model = convert(model, _Model)
@@ -173,15 +180,15 @@ def _object(
 ) -> PhotoObject | None:
     """An object of the scan as a photo shows it; None where its box is not in the image."""
     world_from_model = found.trs.alignment()
-    cam_from_model = cam_from_world @ world_from_model
+    cam_from_model = _composed(cam_from_world, world_from_model)
     center = np.array(found.center or (0.0, 0.0, 0.0))
     distance = float(np.linalg.norm(cam_from_model.apply(center[None])))
     if distance > _FARTHEST:
         what = f"the object lies {distance:.3g} m from the camera, as with millimetres for metres"
         fix = "give the frame's pose and the annotations in metres, such as divided by 1000"
         raise InputError(what, where="trs.translation", fix=fix)
-    if found.sym not in SCAN2CAD_FOLDS:
-        known = ", ".join(SCAN2CAD_FOLDS)
+    if found.sym not in _FOLDS:
+        known = ", ".join(_FOLDS)
         raise InputError(f"{quote(found.sym)} is no symmetry", where="sym", fix=f"known: {known}")
     bounds = box = bbox = None
     if found.bbox is not None:
@@ -204,7 +211,7 @@ def _object(
         truth=Truth(cam_from_model=cam_from_model, box=box, metres=1.0),
         keypoints=keypoints,
         model=CadModel(found.id_cad, mesh, points, bounds),
-        symmetry=Symmetry.around(_UP, fold=SCAN2CAD_FOLDS[found.sym], offset=center),
+        symmetry=Symmetry.around(_UP, fold=_FOLDS[found.sym], offset=center),
         bbox=bbox,
     )
 
@@ -236,6 +243,12 @@ def _rectangle(box: Box, camera: Camera) -> FloatArray | None:
     low = np.maximum(pixels.min(axis=0), -0.5)
     high = np.minimum(pixels.max(axis=0), np.array([camera.width, camera.height]) - 0.5)
     return np.concatenate([low, high]) if (low < high).all() else None
+
+
+def _composed(second: Alignment, first: Alignment) -> Alignment:
+    """The alignment of one after another, where the second stretches all axes alike."""
+    (moved,) = second.apply(first.translation[None])
+    return Alignment(second.rotation @ first.rotation, moved, second.scale * first.scale)
 
 
 def _inverse(alignment: Alignment) -> Alignment:

@@ -20,7 +20,7 @@ from sphinx.util.nodes import nested_parse_with_titles
 from cadalign.cli import main
 from cadalign.datasets import model_keypoints
 from cadalign.estimation import document
-from cadalign.io.observation_file import ObservationFields
+from cadalign.io.observation import ObservationFields
 
 COLUMNS = "96"
 FORMATS: dict[str, tuple[Any, ...]] = {
@@ -62,7 +62,9 @@ def help_text(command: list[str]) -> str:
 def schema(name: str) -> bytes:
     """The JSON schema of a format, indented."""
     forms, definitions = msgspec.json.schema_components(
-        FORMATS[name], ref_template="#/$defs/{name}"
+        FORMATS[name],
+        schema_hook=lambda _: {"type": "string"},  # a path
+        ref_template="#/$defs/{name}",
     )
     form = forms[0] if len(forms) == 1 else {"anyOf": list(forms)}
     return msgspec.json.format(msgspec.json.encode({**form, "$defs": definitions}), indent=1)

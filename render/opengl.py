@@ -19,9 +19,8 @@ from trimesh.geometry import align_vectors
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import RenderError
-from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.alignment import OPENGL_AXES, OPENGL_FLIP, Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.conventions import OPENGL_AXES, opengl_from_model
 from cadalign.geometry.mesh import Material
 from cadalign.geometry.pixels import PIXEL_CENTRE
 from cadalign.render.canvas import ByteImage, LinearArray
@@ -288,7 +287,7 @@ class GlStage:
                 self.scene.remove_node(node)
             self._nodes = tuple(self.scene.add(mesh) for mesh in gl_meshes(scene))
             self._shown = scene
-        pose = opengl_from_model(cam_from_model)
+        pose = OPENGL_FLIP @ cam_from_model.cam_from_model
         for node in self._nodes:
             self.scene.set_pose(node, pose)
         self._turn(self._sky, pose[:3, 1])

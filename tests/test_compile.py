@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from support.forked import Program
 
-from cadalign.compile import folder, kernel
+from cadalign.compile import folder, kernel, once
 from cadalign.compile.folder import kernel_folder
 
 pytestmark = pytest.mark.slow
@@ -224,7 +224,7 @@ def test_a_terminal_is_told_once_that_compiling_takes_its_time(
         return 2.0 * x
 
     monkeypatch.setattr(sys, "stderr", stream)
-    folder.tell_compiling.cache_clear()
+    once.tell_compiling.cache_clear()
     assert (doubled(1.0), doubled(1)) == (2.0, 2.0)
     told = "Compiling cadalign's solvers, once for this version: this takes up to a minute\n"
     assert stream.getvalue() == (told if stream.isatty() else "")

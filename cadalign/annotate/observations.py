@@ -35,10 +35,10 @@ from cadalign.io.documents import (
     read_json,
     within,
 )
+from cadalign.io.evidence import SeenKeypoint
 from cadalign.io.focal import FocalPrior
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
-from cadalign.io.observation_file import SeenKeypoint
 
 logger = logging.getLogger("cadalign")
 
@@ -170,9 +170,10 @@ class ObservationFile:
         depths = np.array([np.nan if pair.depth is None else pair.depth for pair in pairs])
         has_depths = bool(np.isfinite(depths).any())
         mask_sigma = None if marks.mask is None else marks.mask.sigma
-        evidence = replace(self.stored.evidence, mask=self._mask_file(marks), mask_sigma=mask_sigma)
+        mask = {"mask": self._mask_file(marks), "mask_sigma": mask_sigma}
+        evidence = msgspec.structs.replace(self.stored.evidence, **mask)
         if not has_depths and evidence.depth is None:  # all keypoints with depths may be gone
-            evidence = replace(evidence, depth_sigma=None)
+            evidence = msgspec.structs.replace(evidence, depth_sigma=None)
         halves = [self._half(pair) for pair in marks.pairs if pair not in pairs]
         return replace(
             self.stored,

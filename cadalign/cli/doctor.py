@@ -9,6 +9,7 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -59,7 +60,7 @@ class Doctor:
         return 0 if renderers[-1].works else 1
 
     def _compile(self) -> int:
-        from cadalign.compile.folder import can_write, kernel_folder
+        from cadalign.compile.folder import kernel_folder
 
         folder = kernel_folder()
         if not can_write(folder):
@@ -79,9 +80,15 @@ def probed_renderers() -> list[Probe]:
     return [probe_renderer(name) for name in RENDERERS]
 
 
+def can_write(folder: Path) -> bool:
+    """True if a folder, or the nearest above it that exists, can be written to."""
+    existing = next((place for place in (folder, *folder.parents) if place.is_dir()), Path("/"))
+    return os.access(existing, os.W_OK)
+
+
 def compiled_cache() -> str:
     """Describe the cache of compiled solvers: its folder, and how many functions it holds."""
-    from cadalign.compile.folder import can_write, kernel_folder
+    from cadalign.compile.folder import kernel_folder
 
     folder = kernel_folder()
     count = sum(1 for _ in folder.rglob("*.nbc")) if folder.is_dir() else 0

@@ -97,7 +97,7 @@ class CameraOptions:
     """The calibrated camera."""
 
     camera: Path | None = None
-    """File of the calibrated camera: a matrix K as text, .npy or JSON, or JSON in COLMAP's form:
+    """File of the calibrated camera: a matrix K as text or JSON, or JSON in COLMAP's form:
     model, width, height, params."""
     focal: float | None = None
     """Focal length [px], where no file has it, or in its place."""

@@ -6,6 +6,7 @@ Nothing else in cadalign calls Numba's compiler.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Protocol, TypeVar, cast
 
 import numba
@@ -53,20 +54,10 @@ def borrowing(function: F) -> F:
     return _compiled(function, counts=False)
 
 
-def _compiled(
-    function: F,
-    *,
-    fastmath: set[str] | bool = False,
-    forceinline: bool = False,
-    counts: bool = True,
-) -> F:
-    options: Any = {
-        "nogil": True,
-        "error_model": "numpy",
-        "fastmath": fastmath,
-        "boundscheck": False,
-        "forceinline": forceinline,
-    }
+def _compiled(function: F, *, counts: bool = True, **chosen: Any) -> F:
+    # Options that are not said are those of the kernel that calls a function.
+    options: Any = {"nogil": True, "error_model": "numpy", "boundscheck": False}
+    options |= {"fastmath": False, "forceinline": False, **chosen}
     if KernelDispatcher is None:
         return cast(F, numba.njit(cache=True, **options)(function))
     own = {"nopython": True, "_nrt": counts, "no_cfunc_wrapper": True}
@@ -91,12 +82,8 @@ def kernel_family(name: str) -> KernelFamily:
     def family(first: Any, *others: Any) -> Any:
         return members[type(first)](first, *others)
 
-    def of(kind: type) -> Callable[[F], F]:
-        def add(member: F) -> F:
-            members[kind] = member
-            return member
-
-        return add
+    def of(kind: type) -> Any:
+        return partial(members.setdefault, kind)
 
     @overload(family)
     def choose(first, *others):  # type: ignore[no-untyped-def]

@@ -1,4 +1,4 @@
-"""Folder of compiled kernels, and messages while they are compiled."""
+"""Folder of compiled kernels."""
 
 from __future__ import annotations
 
@@ -28,9 +28,8 @@ def kernel_folder() -> Path:
     Numba alone compiles a function anew when its own file changes, but not when one that it calls
     in another file does.
     """
-    chosen = os.environ.get("NUMBA_CACHE_DIR")
-    users = Path(platformdirs.user_cache_dir("cadalign", appauthor=False)) / "kernels"
-    return (Path(chosen) if chosen else users) / _version(_PACKAGE)
+    users = Path(platformdirs.user_cache_dir("cadalign", appauthor=False), "kernels")
+    return Path(os.environ.get("NUMBA_CACHE_DIR") or users) / _version(_PACKAGE)
 
 
 @cache
@@ -42,18 +41,3 @@ def _version(package: Path) -> str:
         for source in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
             content.update(source.read_bytes())
     return content.hexdigest()[:16]
-
-
-def can_write(folder: Path) -> bool:
-    """True if a folder, or the nearest above it that exists, can be written to."""
-    existing = next((place for place in (folder, *folder.parents) if place.is_dir()), Path("/"))
-    return os.access(existing, os.W_OK)
-
-
-@cache
-def tell_compiling() -> None:
-    """Say on a terminal or in a notebook, once in a process, that compiling takes its time."""
-    if sys.stderr.isatty() or "ipykernel" in sys.modules:
-        told = "Compiling cadalign's solvers, once for this version: this takes up to a minute\n"
-        sys.stderr.write(told)
-        sys.stderr.flush()

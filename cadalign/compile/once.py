@@ -11,8 +11,9 @@ import hashlib
 import io
 import os
 import pickle
+import sys
 from contextlib import suppress
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from numba.core.registry import CPUDispatcher
 from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 
-from cadalign.compile.folder import kernel_folder, tell_compiling
+from cadalign.compile.folder import kernel_folder
 
 _KIND = "part"
 _DIGITS = 20  # of the code that names a form
@@ -40,9 +41,8 @@ class KernelDispatcher(CPUDispatcher):
 
     @cached_property
     def _part(self) -> Any:
-        compiler = FastPartCompiler if self.targetoptions["fastmath"] else PartCompiler
         bare = {**self.targetoptions, "no_cpython_wrapper": True}
-        part: Any = CPUDispatcher(self.py_func, targetoptions=bare, pipeline_class=compiler)
+        part: Any = CPUDispatcher(self.py_func, targetoptions=bare, pipeline_class=KernelCompiler)
         part._cache = KernelCache(self.py_func, _KIND)
         return part
 
@@ -69,7 +69,7 @@ class KernelLibrary(JITCodeLibrary):
 class PartLibrary(JITCodeLibrary):
     """Code that is linked into kernels: intermediate code, optimized there, without an address."""
 
-    optimized = False
+    is_optimized = False  # what may be reordered is, by itself: that once, for the same bits in all
 
     @property
     def codegen(self) -> Any:
@@ -95,7 +95,7 @@ class PartLibrary(JITCodeLibrary):
         return library
 
     def _optimize_final_module(self) -> None:
-        if self.optimized:
+        if self.is_optimized:
             super()._optimize_final_module()
 
     def _finalize_final_module(self) -> None:
@@ -104,34 +104,32 @@ class PartLibrary(JITCodeLibrary):
         self._finalized = True
 
 
-class KernelCompiler(compiler.Compiler):
-    """Compiler of a kernel that Python calls."""
+@cache
+def tell_compiling() -> None:
+    """Say on a terminal or in a notebook, once in a process, that compiling takes its time."""
+    if sys.stderr.isatty() or "ipykernel" in sys.modules:
+        told = "Compiling cadalign's solvers, once for this version: this takes up to a minute\n"
+        sys.stderr.write(told)
+        sys.stderr.flush()
 
-    library: type[JITCodeLibrary] = KernelLibrary
+
+class KernelCompiler(compiler.Compiler):
+    """Compiler of a kernel that Python calls, or of one that other kernels call."""
 
     def compile_extra(self, function: Any) -> Any:
         """Compile a function; what it calls, Numba's own functions among it, becomes its parts."""
         tell_compiling()
         codegen = self.state.targetctx.codegen()
-        self.state.library = self.library(codegen, function.__qualname__)
+        is_part, is_fast = self.state.flags.no_cpython_wrapper, bool(self.state.flags.fastmath)
+        library = PartLibrary if is_part else KernelLibrary
+        self.state.library = library(codegen, function.__qualname__)
+        self.state.library.is_optimized = is_fast
         self.state.library.enable_object_caching()
         before, codegen._library_class = codegen._library_class, PartLibrary  # under Numba's lock
         try:
             return super().compile_extra(function)
         finally:
             codegen._library_class = before
-
-
-class PartCompiler(KernelCompiler):
-    """Compiler of what kernels call."""
-
-    library = PartLibrary
-
-
-class FastPartCompiler(KernelCompiler):
-    """Compiler of what kernels call and may be reordered: that once, for the same bits in all."""
-
-    library = type("FastPartLibrary", (PartLibrary,), {"optimized": True})
 
 
 class _CodeReader(pickle.Unpickler):

@@ -21,7 +21,6 @@ from cadalign.errors import (
     require_kind,
 )
 from cadalign.estimation.agreement import DiagnosisCase
-from cadalign.estimation.contours import refine
 from cadalign.estimation.diagnose import diagnose, diagnose_refusal
 from cadalign.estimation.estimates import as_given, single_posterior
 from cadalign.estimation.fit import fit_one
@@ -33,7 +32,7 @@ from cadalign.estimation.prior import Lenses, prior_of
 from cadalign.estimation.problem import Problem, compile_problem, no_pose_error
 from cadalign.estimation.problems import each_of, pack_one
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import LEAST_LIKELIHOOD, FitStats
+from cadalign.estimation.result_parts import LEAST_LIKELIHOOD, NO_NOTES, FitStats
 from cadalign.estimation.results import Results
 from cadalign.estimation.search import search, widened_by_noise
 from cadalign.estimation.view import View, numbered
@@ -168,7 +167,11 @@ def _estimate(problem: Problem, start: float) -> Result:
     problem, found, iterations, hypotheses = search(problem, starts)
     if not found:
         raise no_pose_error(problem)
-    minima, notes = refine(problem, found)
+    minima, notes = found, NO_NOTES
+    if problem.uses_outlines:
+        from cadalign.estimation.contours.engine import refine  # with OpenCV and embree
+
+        minima, notes = refine(problem, found)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
     likely = widened_by_noise(problem, minima)
     return result_of_minima(problem, likely, stats, notes=notes)

@@ -221,7 +221,8 @@ def _measured(view: View, *, name: str, factor: float) -> View:
 
 def _remeasured(size: Size, factor: float) -> Size:
     lengths = {name: getattr(size, name) for name in LENGTHS}
-    return replace(size, **{name: each and each * factor for name, each in lengths.items()})
+    scaled = {name: each and each * factor for name, each in lengths.items()}
+    return Size(**scaled, sigma=size.sigma)
 
 
 def _without_rows(view: View, *, number: int, rows: tuple[int, ...]) -> View:

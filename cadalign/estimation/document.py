@@ -182,7 +182,7 @@ _VALUES: Mapping[str, Callable[[Any], Any]] = {
     "points_2d": _pixels,
     "inliers": partial(np.array, dtype=bool),
     "points_3d": lambda rows: np.array(rows).reshape(-1, 3),
-    **dict.fromkeys(("alignment", "rig_from_model"), Alignment.from_dict),
+    **{name: within(name)(Alignment.from_dict) for name in ("alignment", "rig_from_model")},
     **dict.fromkeys(("own_bounds", "own_stretch"), np.array),
     **dict.fromkeys(_OF_POINTS, lambda rows: np.array(rows).reshape(-1, 3, 3)),
 }

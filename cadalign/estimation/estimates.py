@@ -17,7 +17,7 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.problem import Problem
 from cadalign.estimation.symmetry import carried, distinct_ones, without_free_turns
-from cadalign.estimation.uncertainty.residuals import loss_slopes, whitening_matrices
+from cadalign.estimation.uncertainty.residuals import loss_weights, whitening_matrices
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, turned_alignment, turned_covariance
 from cadalign.geometry.pixels import perspective
@@ -259,7 +259,7 @@ def linearised(
     rays = perspective(points @ pose.linear.T + pose.translation)
     errors = (matrices @ (rays - seen.rays)[:, :, None])[:, :, 0]
     by_pose = matrices @ ray_derivatives(points, pose.packed)[:, :, :POSE_UNKNOWNS]
-    weights, _ = loss_slopes((errors**2).sum(axis=1), seen.loss, seen.loss_scale)
+    weights = loss_weights((errors**2).sum(axis=1), seen.loss, seen.loss_scale)
     roots = np.sqrt(weights)[:, None]
     by_pose *= roots[..., None]
     blocks = np.zeros((count, 2, count, 3))  # a translation moves every point alike

@@ -10,13 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import as_floats, as_points, as_positive, read_only
-from cadalign.errors import InputError, quote, require_kind
+from cadalign.errors import InputError, require_kind
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions
 from cadalign.estimation.symmetry import check_symmetry
 from cadalign.geometry.alignment import extent
 from cadalign.geometry.mesh import Mesh, check_near
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.shapes.parts import check_axis
+from cadalign.shapes.parts import check_axis, check_ids
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -125,14 +125,7 @@ def checked_ids(ids: Iterable[Any] | None, count: int) -> tuple[Hashable, ...]:
     if isinstance(ids, str | bytes) or not isinstance(ids, Iterable):
         what = f"expected a sequence of numbers or names, got {type(ids).__name__}"
         raise InputError(what, where="ids", fix="give the id of each keypoint")
-    listed = tuple(ids.tolist() if isinstance(ids, np.ndarray) else ids)
+    listed = list(ids)
     if len(listed) != count:
         raise InputError(f"{len(listed)} ids for {count} keypoints", where="ids")
-    seen: set[Hashable] = set()
-    for name in listed:
-        if not isinstance(name, str | int | np.integer) or isinstance(name, bool):
-            raise InputError(f"{quote(name)} is neither a number nor a name", where="ids")
-        if name in seen:
-            raise InputError(f"{quote(name)} occurs twice", where="ids", fix="give each once")
-        seen.add(name)
-    return listed
+    return check_ids(listed, "ids") if listed else ()

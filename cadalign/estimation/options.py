@@ -40,15 +40,21 @@ Sigma = float | npt.ArrayLike
 
 
 @dataclass(frozen=True)
-class AlignmentOptions:
-    """Options of every estimate of an alignment, of a fit and of a retrieval."""
+class FitOptions:
+    """Options of a fit.
+
+    Raises
+    ------
+    InputError
+        If a value is out of range or unknown, or options exclude each other.
+    """
 
     method: str = "optimal"
-    """Solver: optimal (maximum likelihood, searched globally) or epnp (OpenCV's, without stretch);
-    a fit also knows aepnp (linear) and aepnp-paper (linear, as published)."""
+    """Solver: optimal (maximum likelihood, searched globally), epnp (OpenCV's, without stretch),
+    aepnp (linear) or aepnp-paper (linear, as published)."""
     sigma: Sigma | None = 1.0
     """Standard deviation of the keypoints [px], one per keypoint, or a 2 x 2 covariance per
-    keypoint; None, for a fit, estimates it from the residuals: the choice for a model that is only
+    keypoint; None estimates it from the residuals: the choice for a model that is only
     similar to the object."""
     loss: str = "linear"
     """Loss on the length of a whitened residual: linear (squared), huber or cauchy; the robust ones
@@ -58,18 +64,6 @@ class AlignmentOptions:
     stretch: str | None = None
     """Axes whose scale is estimated: by default both unknown ones; one of them, such as "y"; or
     "none"."""
-
-
-@dataclass(frozen=True)
-class FitOptions(AlignmentOptions):
-    """Options of a fit.
-
-    Raises
-    ------
-    InputError
-        If a value is out of range or unknown, or options exclude each other.
-    """
-
     stretch_sigma: float | None = None
     """Standard deviation of a Gaussian prior on the logarithm of each scale, about scale 1; by
     default one that is flat from 1/5 to 5, and falls off beyond."""

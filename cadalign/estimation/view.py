@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Hashable, Iterable, Sequence
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
@@ -29,11 +29,11 @@ from cadalign.estimation.options import Sigma
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import check_pixels
 from cadalign.geometry.rotations import nearest_rigid
-from cadalign.io.evidence import BeyondKeypoints
 from cadalign.io.images import ByteImage, exif_note, read_grey, read_mask, read_photo
 
 _FILE_SCALE = 0.001  # of a 16-bit depth image: millimetres to metres
 _SYMMETRY_TOLERANCE = 1e-9
+_SOURCES = ("mask", "depth", "up", "camera_height", "cam_from_rig", "image")
 _DEFAULTS = {"depth_sigma": 0.01, "up_sigma_deg": 1.0, "camera_height_sigma": 0.02}
 
 
@@ -42,7 +42,7 @@ class _Numbers(tuple[int, ...]):
 
 
 @dataclass(frozen=True, eq=False)
-class View(BeyondKeypoints):
+class View:
     """Evidence of one image about an object.
 
     Parameters
@@ -71,8 +71,7 @@ class View(BeyondKeypoints):
         an array of floats.
     up : (3,) float, optional
         The direction of the model's up axis in the camera's frame (OpenCV's: y points down), of any
-        length; `cadalign.geometry.conventions` computes it from gravity, pitch and roll, a phone's
-        pose, or clicks on vertical edges.
+        length.
     up_sigma_deg : float or (3, 3) float
         Its standard deviation about each axis across it [degrees], or the covariance of the
         direction [degrees squared].
@@ -118,9 +117,20 @@ class View(BeyondKeypoints):
     ids: Sequence[Hashable] | None = None
     sigma: Sigma | None = 1.0
     scores: npt.ArrayLike | None = None
-    image: npt.ArrayLike | str | os.PathLike[str] | None = field(default=None, kw_only=True)
-    photo: str | os.PathLike[str] | None = field(default=None, kw_only=True, repr=False)
-    number: int = field(default=0, kw_only=True, repr=False)
+    _: KW_ONLY
+    mask: npt.ArrayLike | str | os.PathLike[str] | None = None
+    mask_sigma: float | None = None
+    depth: npt.ArrayLike | str | os.PathLike[str] | None = None
+    depth_scale: float | None = None
+    depth_sigma: npt.ArrayLike | None = None
+    up: npt.ArrayLike | None = None
+    up_sigma_deg: npt.ArrayLike | None = None
+    camera_height: float | None = None
+    camera_height_sigma: float | None = None
+    cam_from_rig: npt.ArrayLike | None = None
+    image: npt.ArrayLike | str | os.PathLike[str] | None = None
+    photo: str | os.PathLike[str] | None = field(default=None, repr=False)
+    number: int = field(default=0, repr=False)
 
     def __post_init__(self) -> None:
         for name, value in _DEFAULTS.items():
@@ -170,7 +180,7 @@ class View(BeyondKeypoints):
     @property
     def sources(self) -> tuple[str, ...]:
         """Names of the fields beside keypoints that are evidence by themselves."""
-        return super().sources if self.image is None else (*super().sources, "image")
+        return tuple(name for name in _SOURCES if getattr(self, name) is not None)
 
     @property
     def is_numbered(self) -> bool:

@@ -30,9 +30,8 @@ from trimesh.visual.color import srgb_to_linear
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.export.aligned_object import AlignedObject, Frame
-from cadalign.geometry.alignment import bounds_corners
+from cadalign.geometry.alignment import OPENGL_AXES, OPENGL_FLIP, bounds_corners
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.conventions import OPENGL_AXES, OPENGL_FLIP
 from cadalign.geometry.mesh import Material, Mesh
 from cadalign.io.files import write_whole
 from cadalign.io.images import ByteImage

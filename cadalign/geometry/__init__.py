@@ -5,16 +5,8 @@ from typing import TYPE_CHECKING
 from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
-    from cadalign.geometry.conventions import (
-        opengl_from_model,
-        opengl_projection,
-    )
     from cadalign.geometry.symmetry import SymmetryAxis
 
-__all__ = [
-    "SymmetryAxis",
-    "opengl_from_model",
-    "opengl_projection",
-]
+__all__ = ["SymmetryAxis"]
 
 __getattr__ = lazy_names(__name__)

@@ -26,6 +26,12 @@ _THIN = 0.1  # spread along an axis over the largest that counts as nearly a pla
 _END_ON = math.cos(math.radians(15.0))
 _ROUNDING = 1e-12  # relative standard deviation below which a length is known
 
+OPENGL_AXES = np.array([1.0, -1.0, -1.0])
+"""Signs of OpenGL's camera axes (x right, y up, z backward; also those of NeRF, ARKit and ARCore)
+in cadalign's: multiply coordinates (n, 3) to go either way. The only place for them."""
+OPENGL_FLIP = np.diag([*OPENGL_AXES, 1.0])
+"""Motion (4, 4) between the axes of the two cameras, either way."""
+
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
@@ -132,24 +138,6 @@ class Alignment:
         points = as_points(points_cam, name="points_cam", dimension=3)
         return (points - self.translation) @ self.rotation / self.scale
 
-    def __matmul__(self, first: Alignment) -> Alignment:
-        """Compose: ``(second @ first).apply(x) == second.apply(first.apply(x))``.
-
-        Raises
-        ------
-        InputError
-            If ``second`` stretches its axes differently: the result would shear the model, which
-            is not an alignment any more.
-        """
-        if not isinstance(first, Alignment):
-            return NotImplemented
-        if np.ptp(self.scale) > 1e-12 * self.scale.max():
-            what = f"the outer alignment has the stretch {self.scale.tolist()}"
-            fix = "only an alignment with equal scales can follow another one"
-            raise InputError(what, where="second @ first", fix=fix)
-        (moved,) = self.apply(first.translation[None])
-        return Alignment(self.rotation @ first.rotation, moved, self.scale * first.scale)
-
     def to_dict(self) -> dict[str, list[Any]]:
         """Write the alignment as plain lists, for JSON."""
         return {name: getattr(self, name).tolist() for name in _FIELDS}
@@ -158,10 +146,10 @@ class Alignment:
     def from_dict(cls, data: Mapping[str, Any]) -> Alignment:
         """Read what `to_dict` wrote; raises InputError if a field is missing or invalid."""
         if not isinstance(data, Mapping):
-            raise InputError(f"expected an object, got {type(data).__name__}", where="alignment")
-        missing = [key for key in _FIELDS if key not in data]
-        if missing:
-            raise InputError(f"missing {', '.join(missing)}", where="alignment")
+            raise InputError(f"expected an object, got {type(data).__name__}")
+        for name in _FIELDS:
+            if name not in data:
+                raise InputError("missing", where=name)
         return cls(*(data[key] for key in _FIELDS))
 
 

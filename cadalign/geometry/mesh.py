@@ -308,13 +308,6 @@ def check_near(points_3d: FloatArray, bounds: FloatArray, *, where: str) -> None
     InputError
         If the keypoints fit the mesh in another unit only, or one lies more than a diagonal from
         the mesh's box.
-
-    Examples
-    --------
-    >>> corners = np.array([[x, y, z] for x in (0, 800) for y in (0, 900) for z in (0, 500.0)])
-    >>> check_near(corners, np.array([[0, 0, 0], [0.8, 0.9, 0.5]]), where="points_3d")
-    Traceback (most recent call last):
-    cadalign.errors.InputError: points_3d: the keypoints span 1.31e+03 model units, the mesh 1.31...
     """
     diagonal = float(np.linalg.norm(bounds[1] - bounds[0]))
     if not len(points_3d) or not diagonal > 0:

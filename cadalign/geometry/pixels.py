@@ -48,11 +48,6 @@ def rescaled_pixels(pixels: FloatArray, factor: float | FloatArray) -> FloatArra
     """Pixels (n, 2), or coordinates (n,), in an image ``factor`` times as large.
 
     Borders stay in place, centres do not.
-
-    Examples
-    --------
-    >>> rescaled_pixels(np.array([[0.0, 9.5]]), 2).tolist()
-    [[0.5, 19.5]]
     """
     return np.asarray((pixels + PIXEL_CENTRE) * factor - PIXEL_CENTRE)
 
@@ -63,11 +58,6 @@ def unmeasured(points_2d: FloatArray, *, least: int = _SEVERAL) -> BoolArray:
     These are what detectors write for keypoints that they did not find: values that are not finite;
     exactly (0, 0) or (-1, -1), if it is written ``least`` times; and a pixel that three or more
     share.
-
-    Examples
-    --------
-    >>> unmeasured(np.array([[0.0, 0.0], [51, 20], [np.nan, 3], [0, 0]])).tolist()
-    [True, False, True, True]
     """
     bad = np.asarray(~np.isfinite(points_2d).all(axis=1))
     for _, here in _placeholders(points_2d, least):
@@ -193,13 +183,7 @@ def _terms(kind: LensKind, coefficients: tuple[float, ...]) -> tuple[float, ...]
 
 @lru_cache(maxsize=64)
 def largest_angle(coefficients: tuple[float, ...]) -> float:
-    """Angle off the axis [rad] up to which a fisheye maps outer directions farther out.
-
-    Examples
-    --------
-    >>> round(largest_angle((-0.1, 0.0, 0.0, 0.0)), 6)  # 1 = 3 * 0.1 * theta^2
-    1.825742
-    """
+    """Angle off the axis [rad] up to which a fisheye maps outer directions farther out."""
     n1, n2, n3, n4 = coefficients
     with np.errstate(over="ignore"):
         # The slope of theta (1 + n1 theta^2 + n2 theta^4 + ...), by the square of theta.
@@ -213,13 +197,7 @@ def largest_angle(coefficients: tuple[float, ...]) -> float:
 def image_of(
     points: FloatArray, kind: LensKind, coefficients: tuple[float, ...]
 ) -> tuple[FloatArray, FloatArray]:
-    """Place (n, 2) of points (n, 3) in the image, and its derivatives (n, 2, 3) by the points.
-
-    Examples
-    --------
-    >>> image_of(np.array([[1.0, 0.0, 0.0]]), "fisheye", (0.0,) * 4)[0].round(6).tolist()
-    [[1.570796, 0.0]]
-    """
+    """Place (n, 2) of points (n, 3) in the image, and its derivatives (n, 2, 3) by the points."""
     plane, by_point = _plane_of(points, kind)
     distorted, by_plane = distort(plane, kind, coefficients)
     return distorted, by_plane @ by_point

@@ -29,15 +29,6 @@ def camera_doubts(camera: Calibration, *, is_tested: bool = False) -> tuple[str,
     camera : Camera
     is_tested : bool
         Keypoints that agree with a wide camera confirm its focal length.
-
-    Examples
-    --------
-    >>> from cadalign import Camera
-    >>> camera_doubts(Camera(640, 480, 900, 900, 319.5, 239.5))
-    ()
-    >>> (doubt,) = camera_doubts(Camera(640, 480, 28, 28, 319.5, 239.5))
-    >>> doubt
-    'the camera sees 170 deg without a lens model: is the focal length, 28, in pixels?'
     """
     found, own = [], np.array([camera.width, camera.height], dtype=float)
     size = f"{camera.width} x {camera.height} px"

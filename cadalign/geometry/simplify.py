@@ -36,13 +36,6 @@ def mesh_edges(vertices: FloatArray, faces: IntArray, *, crease_angle: float) ->
     """Find the edges of a mesh whose triangles, sharing vertices, may face either way.
 
     Triangles whose planes meet at a larger angle than ``crease_angle`` [degrees] make a crease.
-
-    Examples
-    --------
-    >>> square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    >>> edges = mesh_edges(square, np.array([[0, 1, 2], [0, 2, 3]]), crease_angle=30)
-    >>> edges.ends[~edges.creased].tolist(), edges.opposite[~edges.creased].tolist()
-    ([[0, 2]], [[1, 3]])
     """
     sides = triangle_sides(faces)
     key = sides @ [len(vertices), 1]
@@ -89,14 +82,6 @@ def cluster(mesh: Mesh, *, cells: float) -> Simplified:
     (1993). The first of triangles in one place remains. A triangle that becomes a line remains as a
     wire, so that masts and railings don't vanish. ``cells``, at most `FINEST`, are those along the
     longest side of the mesh.
-
-    Examples
-    --------
-    >>> from cadalign import Mesh
-    >>> mesh = Mesh([[0, 0, 0], [4, 0, 0], [0, 3, 0], [0.1, 3, 0]], [[0, 1, 2], [0, 2, 3]])
-    >>> small = cluster(mesh, cells=4)
-    >>> small.vertices.tolist(), small.faces.tolist()
-    ([[0.0, 0.0, 0.0], [0.05, 3.0, 0.0], [4.0, 0.0, 0.0]], [[0, 2, 1]])
     """
     used = mesh.is_used
     vertices = mesh.vertices[used]
@@ -128,13 +113,6 @@ def simplify(mesh: Mesh, *, max_faces: int) -> Simplified:
 
     The grid is made coarser or finer until about as many triangles are left as may be. If none has
     a fitting number, the largest triangles of the mesh remain.
-
-    Examples
-    --------
-    >>> from cadalign import Mesh
-    >>> mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
-    >>> simplify(mesh, max_faces=10).faces.tolist()
-    [[0, 1, 2]]
     """
     if len(mesh.faces) <= max_faces:
         return Simplified(mesh.vertices, mesh.faces, np.arange(len(mesh.faces)))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -14,18 +13,9 @@ from cadalign.arrays import FloatArray, as_floats, is_whole, read_only
 from cadalign.errors import InputError, quote
 from cadalign.geometry.rotations import nearest_rigid, rotation_from_vector
 
-_UP = (0.0, 1.0, 0.0)
-SCAN2CAD_FOLDS: dict[str, int | None] = {
-    "__SYM_NONE": 1,
-    "__SYM_ROTATE_UP_2": 2,
-    "__SYM_ROTATE_UP_4": 4,
-    "__SYM_ROTATE_UP_INF": None,
-}
-"""Numbers of rotations about y by Scan2CAD's names; None for any angle."""
 _DISCRETE, _CONTINUOUS = "symmetries_discrete", "symmetries_continuous"
 _FORMS = (
-    f"give one of {', '.join(SCAN2CAD_FOLDS)}, an `axis` with `fold` (null for any angle), or "
-    f"BOP's `{_DISCRETE}` and `{_CONTINUOUS}`"
+    f"give an `axis` with `fold` (null for any angle), or BOP's `{_DISCRETE}` and `{_CONTINUOUS}`"
 )
 
 
@@ -69,8 +59,8 @@ class Symmetry:
 
     Examples
     --------
-    >>> Symmetry.none().is_trivial, len(Symmetry.around((0, 1, 0), fold=4).poses())
-    (True, 4)
+    >>> Symmetry.none().is_trivial, len(Symmetry.around((0, 1, 0), fold=4).motions)
+    (True, 3)
     """
 
     motions: FloatArray
@@ -110,15 +100,14 @@ class Symmetry:
 
     @classmethod
     def from_dict(cls, data: object) -> Symmetry:
-        """Read a symmetry as data sets and observation files write it.
+        """Read a symmetry as observation files write it.
 
         Parameters
         ----------
-        data : str or mapping
-            Scan2CAD's name, ``"__SYM_ROTATE_UP_2"``, ``_4``, ``_INF`` or ``"__SYM_NONE"``, about
-            y through the model's origin; ``{"axis": (3,), "fold": int or None}`` with an optional
-            ``offset``, a point on the axis; or BOP's ``symmetries_discrete``, matrices row by row,
-            and ``symmetries_continuous``, each an ``axis`` with an ``offset``, as `to_dict` writes.
+        data : mapping
+            ``{"axis": (3,), "fold": int or None}`` with an optional ``offset``, a point on the
+            axis; or BOP's ``symmetries_discrete``, matrices row by row, and
+            ``symmetries_continuous``, each an ``axis`` with an ``offset``, as `to_dict` writes.
 
         Raises
         ------
@@ -127,17 +116,11 @@ class Symmetry:
 
         Examples
         --------
-        >>> len(Symmetry.from_dict("__SYM_ROTATE_UP_4").motions)
-        3
         >>> Symmetry.from_dict({"axis": [0, 0, 1], "fold": None}).axes[0].direction.tolist()
         [0.0, 0.0, 1.0]
         """
-        if isinstance(data, str):
-            if data not in SCAN2CAD_FOLDS:
-                raise InputError(f"{quote(data)} is no symmetry", where="symmetry", fix=_FORMS)
-            return cls.around(_UP, fold=SCAN2CAD_FOLDS[data])
         if not isinstance(data, Mapping):
-            what = f"expected a name or an object, got {type(data).__name__}"
+            what = f"expected an object, got {type(data).__name__}"
             raise InputError(what, where="symmetry", fix=_FORMS)
         names = set(data)
         if names <= {"axis", "fold", "offset"} and {"axis", "fold"} <= names:
@@ -166,20 +149,6 @@ class Symmetry:
     def is_trivial(self) -> bool:
         """True if there is no motion but the identity."""
         return not len(self.motions) and not self.axes
-
-    def poses(self, *, max_step: float = 0.01) -> FloatArray:
-        """All motions, those about axes in steps; (n, 4, 4) float, the identity first.
-
-        BOP's definition: the product of every step about every axis with every discrete motion.
-        From one of the ``ceil(pi / max_step)`` steps to the next, a point as far from the axis as
-        the model's diameter moves by ``max_step`` at most, as a share of that diameter.
-        """
-        count = int(np.ceil(np.pi / max_step))
-        about = [
-            axis.turned(2 * np.pi * step / count) for axis in self.axes for step in range(count)
-        ]
-        discrete = [np.eye(4), *self.motions]
-        return np.array([turn @ motion for motion, turn in product(discrete, about or [np.eye(4)])])
 
 
 def _check_fold(fold: Any, where: str) -> None:

@@ -24,8 +24,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, read_only
 from cadalign.errors import InputError
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.conventions import OPENGL_AXES
+from cadalign.geometry.alignment import OPENGL_AXES, Alignment
 from cadalign.geometry.rotations import angle_between, nearest_rotation, rotation_from_vector
 from cadalign.geometry.symmetry import Symmetry
 

@@ -123,19 +123,27 @@ def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return fields
 
 
-def convert(data: Any, kind: type[T] | Any, where: str = "") -> T | Any:
+def convert(
+    data: Any, kind: type[T] | Any, where: str = "", *, folder: Path | None = None
+) -> T | Any:
     """Convert parsed JSON to a `Document`, or to any type of which its fields can be.
 
     ``where`` is the place of ``data``: a `DataError` names the path of the field below it, as
-    ``keypoints[3].uv``.
+    ``keypoints[3].uv``. Declared paths are relative to ``folder``.
     """
+
+    def read(_: type, text: Any) -> Path:  # a path is the only declared type that JSON lacks
+        if not isinstance(text, str) or not text or "\0" in text:
+            raise InputError(f"{quote(text)} is not a path")
+        return path_from(text, folder)
+
     try:
         try:
-            return msgspec.convert(data, kind)
+            return msgspec.convert(data, kind, dec_hook=read)
         except msgspec.ValidationError:  # perhaps of NumPy's arrays and numbers
             with suppress(TypeError, RecursionError):
-                data = msgspec.to_builtins(data, enc_hook=_plain)
-        return msgspec.convert(data, kind)
+                data = msgspec.to_builtins(data, enc_hook=plain)
+        return msgspec.convert(data, kind, dec_hook=read)
     except msgspec.ValidationError as error:
         raise _located(error, data, kind, where) from None
     except UnicodeEncodeError:
@@ -201,7 +209,7 @@ _WORDS = {
 _PATTERN_WORDS = {repr(_PATH): "a path", repr(_FILE_NAME): "an id"}
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """NumPy's array or number as Python's."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()

@@ -1,27 +1,42 @@
-"""Evidence beyond keypoints: the fields of an image, and an object's known lengths."""
+"""One image of an object: keypoints, evidence beyond them, and the fields of both in a file.
+
+The format is described in docs/formats/observation.md.
+"""
 
 from __future__ import annotations
 
-import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
-import numpy.typing as npt
+from msgspec import Struct
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_one_or_each, as_points, as_positive
-from cadalign.errors import InputError, require_kind
+from cadalign.errors import DataError, InputError, quote, require_kind
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.pixels import PixelOrigin, check_pixels, shift_of, unmeasured
+from cadalign.io.documents import (
+    Document,
+    Finite,
+    Index,
+    NotNegative,
+    Point3,
+    Positive,
+    Text,
+    require_unique,
+    written_path,
+)
 from cadalign.io.files import as_path
 
 LENGTHS = ("width", "height", "length")
 """Names of the lengths along the model's x, y and z."""
 _LENGTH_SIGMA = 0.01  # relative
 _LISTED = 8  # rows of keypoints in a message
-
-
-REFINED = {
+_COLUMNS = ("name", "semantic_id", "sigma", "score")  # of all keypoints, or of none
+_REFINED = {
     "mask_sigma": "mask",
     "depth_scale": "depth",
     "depth_sigma": "depth",
@@ -29,76 +44,55 @@ REFINED = {
     "camera_height_sigma": "camera_height",
 }
 """The field without which a field means nothing."""
+_Row4 = tuple[Finite, Finite, Finite, Finite]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class BeyondKeypoints:
-    """Evidence of an image beyond keypoints; None for what is not known.
+class ImageEvidence(Document, kw_only=True, eq=False):
+    """Evidence of an image beyond keypoints, with files of mask and depth; None where unknown.
 
-    `cadalign.View` describes the fields.
-    """
-
-    mask: npt.ArrayLike | str | os.PathLike[str] | None = None
-    mask_sigma: float | None = None
-    depth: npt.ArrayLike | str | os.PathLike[str] | None = None
-    depth_scale: float | None = None
-    depth_sigma: npt.ArrayLike | None = None
-    up: npt.ArrayLike | None = None
-    up_sigma_deg: npt.ArrayLike | None = None
-    camera_height: float | None = None
-    camera_height_sigma: float | None = None
-    cam_from_rig: npt.ArrayLike | None = None
-
-    @property
-    def given(self) -> dict[str, Any]:
-        """The fields that are known, by name."""
-        values = {name: getattr(self, name) for name in EVIDENCE}
-        return {name: value for name, value in values.items() if value is not None}
-
-    @property
-    def sources(self) -> tuple[str, ...]:
-        """Names of the fields that are known and are evidence by themselves."""
-        return tuple(name for name in self.given if name not in REFINED)
-
-
-EVIDENCE = tuple(BeyondKeypoints.__dataclass_fields__)
-"""Names of the fields."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ImageEvidence(BeyondKeypoints):
-    """Evidence of an image as an observation file holds it, with paths of mask and depth image.
-
-    `cadalign.View` checks their values.
+    `cadalign.View` describes the fields, and checks arrays.
 
     Raises
     ------
     InputError
-        If a sigma or scale is given without its measurement, or an array has a wrong shape.
+        If a sigma or scale is given without its measurement.
     """
 
     mask: Path | None = None
+    mask_sigma: Positive | None = None
     depth: Path | None = None
-    depth_sigma: float | None = None
-    up: FloatArray | None = None
-    up_sigma_deg: float | None = None
-    cam_from_rig: FloatArray | None = None
+    depth_scale: Positive | None = None
+    depth_sigma: Positive | None = None
+    up: Point3 | None = None
+    up_sigma_deg: Positive | None = None
+    camera_height: Positive | None = None
+    camera_height_sigma: Positive | None = None
+    cam_from_rig: tuple[_Row4, _Row4, _Row4, _Row4] | None = None
 
     def __post_init__(self) -> None:
         given = self.given
         for name in given:
             # depth_sigma may be that of depths of the keypoints
-            if name != "depth_sigma" and (missing := REFINED.get(name, name)) not in given:
+            if name != "depth_sigma" and (missing := _REFINED.get(name, name)) not in given:
                 what, fix = f"given without {missing}", f"give {missing}, too"
                 raise InputError(what, where=name, fix=fix)
-        _keep_paths(self, "mask", "depth")
-        for name, shape in (("up", (3,)), ("cam_from_rig", (4, 4))):
-            if (value := getattr(self, name)) is not None:
-                object.__setattr__(self, name, as_floats(value, name=name, shape=shape))
+        for name in ("mask", "depth"):
+            if name in given:
+                setattr(self, name, as_path(given[name], name))
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """The fields that are known, by name."""
+        values = {name: getattr(self, name) for name in ImageEvidence.__struct_fields__}
+        return {name: value for name, value in values.items() if value is not None}
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names of the fields that are known and are evidence by themselves."""
+        return tuple(name for name in self.given if name not in _REFINED)
 
 
-@dataclass(frozen=True, eq=False)
-class Size:
+class Size(Struct, frozen=True, eq=False, omit_defaults=True, forbid_unknown_fields=True):
     """Known lengths of an object's box along the model's axes.
 
     Parameters
@@ -119,25 +113,19 @@ class Size:
     [nan, 0.81, nan]
     """
 
-    width: float | None = None
-    height: float | None = None
-    length: float | None = None
-    sigma: npt.ArrayLike | None = None
+    width: Positive | None = None
+    height: Positive | None = None
+    length: Positive | None = None
+    sigma: Any = None
 
     def __post_init__(self) -> None:
         for name in LENGTHS:
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, as_positive(getattr(self, name), name=name))
+            if (value := getattr(self, name)) is not None:
+                msgspec.structs.force_setattr(self, name, as_positive(value, name=name))
         if np.isnan(self.lengths).all():
-            fix = "give width, height or length"
-            raise InputError("no length is given", where="size", fix=fix)
+            raise InputError("no length is given", fix="give width, height or length")
         if self.sigma is not None:
-            as_one_or_each(self.sigma, name="size.sigma", count=3, entries="lengths")
-
-    @property
-    def given(self) -> dict[str, Any]:
-        """The arguments that are given, by name."""
-        return {name: value for name, value in vars(self).items() if value is not None}
+            as_one_or_each(self.sigma, name="sigma", count=3, entries="lengths")
 
     @property
     def lengths(self) -> FloatArray:
@@ -201,15 +189,17 @@ class ObservedImage:
     def __post_init__(self) -> None:
         require_kind(self.camera, Camera, "camera")
         points_3d = as_points(self.points_3d, name="points_3d", dimension=3)
-        points_2d = as_floats(self.points_2d, name="points_2d", shape=(len(points_3d), 2))
-        object.__setattr__(self, "points_3d", points_3d)
-        object.__setattr__(self, "points_2d", points_2d)
-        _keep_paths(self, "image")
+        count = len(points_3d)
+        checked: dict[str, Any] = {"points_3d": points_3d}
+        checked["points_2d"] = as_floats(self.points_2d, name="points_2d", shape=(count, 2))
         for name in ("sigma", "scores", "depths"):
             if (value := getattr(self, name)) is not None:
-                shape, finite = (len(points_3d),), name != "depths"
-                checked = as_floats(value, name=name, shape=shape, finite=finite)
-                object.__setattr__(self, name, checked)
+                finite = name != "depths"
+                checked[name] = as_floats(value, name=name, shape=(count,), finite=finite)
+        if self.image is not None:
+            checked["image"] = as_path(self.image, "image")
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
         if self.depths is not None and self.evidence.depth is not None:
             what, fix = (
                 "a depth image and depths of keypoints are given",
@@ -238,8 +228,123 @@ class ObservedImage:
         )
 
 
-def _keep_paths(given: object, *names: str) -> None:
-    """Make paths of the texts in some fields of a frozen dataclass; None stays."""
-    for name in names:
-        if (value := getattr(given, name)) is not None:
-            object.__setattr__(given, name, as_path(value, name))
+# Files --------------------------------------------------------------------------------------------
+
+
+class SeenKeypoint(Document, kw_only=True):
+    """Fields of a keypoint that a photo, or its detector, gives."""
+
+    semantic_id: Index | None = None
+    sigma: Positive | None = None
+    score: NotNegative | None = None
+    depth: Positive | None = None
+
+
+class KeypointFields(SeenKeypoint, kw_only=True):
+    """One entry of ``keypoints``."""
+
+    xyz: Point3 | None = None  # needed with a mesh
+    uv: tuple[float | None, float | None] | None  # null, or NaN, where it was not found
+    name: Text | None = None
+
+
+class ViewFields(ImageEvidence, kw_only=True):
+    """One entry of ``views``."""
+
+    camera: Any  # in the form of `Camera.from_dict`
+    pixel_origin: PixelOrigin = "center"  # of the keypoints' uv
+    image: Path | None = None
+    keypoints: list[KeypointFields] = msgspec.field(default_factory=list)
+
+
+def read_image_fields(read: ViewFields, *, needs_xyz: bool = True) -> ObservedImage:
+    """An image from its checked fields.
+
+    A missing ``xyz`` is zero, or refused where it is needed. Raises InputError if the camera is
+    invalid, or fields contradict each other.
+    """
+    for name in ("name", "semantic_id"):
+        require_unique(read.keypoints, name)
+    camera, points_2d = Camera.from_dict(read.camera), _pixels(read.keypoints)
+    kept = np.flatnonzero(~unmeasured(points_2d)).tolist()
+    keypoints = {row: read.keypoints[row] for row in kept}
+    points_2d = points_2d[kept]
+    names, ids, sigma, scores = (_column(keypoints, name) for name in _COLUMNS)
+    for row, each in keypoints.items():
+        if needs_xyz and each.xyz is None:
+            raise DataError("missing", where=f"keypoints[{row}].xyz")
+    check_pixels(points_2d, camera.width, camera.height, where="keypoints.uv")
+    places = [each.xyz or (0, 0, 0) for each in keypoints.values()]
+    depths = np.array([each.depth for each in keypoints.values()], dtype=float)  # NaN for None
+    return ObservedImage(
+        points_3d=np.array(places, dtype=float).reshape(-1, 3),
+        points_2d=points_2d - shift_of(read.pixel_origin),
+        camera=camera,
+        sigma=sigma,
+        ids=None if ids is None else np.array(ids, dtype=np.int64),
+        names=None if names is None else tuple(names),
+        scores=scores,
+        image=read.image,
+        depths=depths if np.isfinite(depths).any() else None,
+        not_found=tuple(sorted(set(range(len(read.keypoints))).difference(kept))),
+        evidence=ImageEvidence(**read.given),
+    )
+
+
+def _pixels(keypoints: Sequence[KeypointFields]) -> FloatArray:
+    """Pixels (n, 2) of keypoints; NaN where they were not found."""
+    pixels = np.array([each.uv or (None, None) for each in keypoints], dtype=float).reshape(-1, 2)
+    half = np.isnan(pixels) & ~np.isnan(pixels[:, ::-1])
+    for row, column in np.argwhere(np.isinf(pixels) | half).tolist():
+        value = (keypoints[row].uv or ())[column]
+        what, where = f"{quote(value)} is not a finite number", f"keypoints[{row}].uv[{column}]"
+        raise DataError(what, where=where)
+    return pixels
+
+
+def _column(keypoints: Mapping[int, KeypointFields], name: str) -> Any:
+    """One optional field of all keypoints, by rows, as a list; None where none has it."""
+    values = {row: getattr(keypoint, name) for row, keypoint in keypoints.items()}
+    missing = [row for row, value in values.items() if value is None]
+    if len(missing) == len(values):
+        return None
+    if missing:
+        raise DataError(
+            "missing, though other keypoints have it",
+            where=f"keypoints[{missing[0]}].{name}",
+            fix="give it for all keypoints or for none",
+        )
+    return list(values.values())
+
+
+def write_image_fields(image: ObservedImage, folder: Path | None) -> dict[str, Any]:
+    """Camera, keypoints, photo and evidence of an image as they are written."""
+    columns = {
+        "xyz": image.points_3d,
+        "uv": image.points_2d,
+        "sigma": image.sigma,
+        "semantic_id": image.ids,
+        "name": image.names,
+        "score": image.scores,
+        "depth": image.depths,
+    }
+    known = {
+        name: each.tolist() if isinstance(each, np.ndarray) else each
+        for name, each in columns.items()
+        if each is not None
+    }
+    rows = [dict(zip(known, row, strict=True)) for row in zip(*known.values(), strict=True)]
+    data: dict[str, Any] = {
+        "camera": image.camera.to_dict(pixel_origin="corner"),
+        "pixel_origin": "center",
+        # An unknown depth is NaN.
+        "keypoints": [
+            {name: value for name, value in row.items() if value == value} for row in rows
+        ],
+    }
+    for name, value in {"image": image.image, **image.evidence.given}.items():
+        if isinstance(value, Path):
+            data[name] = written_path(value, folder=folder)
+        elif value is not None:
+            data[name] = np.asarray(value).tolist()
+    return data

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
@@ -24,7 +23,6 @@ _USUAL_SIGMA = 0.6
 _EXIF_SIGMA = 0.05  # roundings, focusing, and corrections of the lens inside the camera
 _SAME_LENS = 0.01
 _FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
-_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of EXIF's focal plane
 
 
 @dataclass(frozen=True)
@@ -98,9 +96,9 @@ class FocalPrior:
     ) -> FocalPrior | None:
         """Read a photo's focal length from its EXIF data.
 
-        From the 35 mm equivalent (taken along the diagonal, as CIPA defines it), otherwise from the
-        focal length and the pixels' size on the sensor. A photo turned upright has the same focal
-        length. One that no camera has is ignored with a warning (logger "cadalign").
+        From the 35 mm equivalent, taken along the diagonal, as CIPA defines it. A photo turned
+        upright has the same focal length. One that no camera has is ignored with a warning (logger
+        "cadalign").
 
         Parameters
         ----------
@@ -119,16 +117,18 @@ class FocalPrior:
         DataError
             If the file is missing or not an image.
         """
-        from PIL.ExifTags import IFD, TAGS
+        from PIL.ExifTags import IFD, Base
 
         from cadalign.io.images import open_photo  # a known focal length needs no reader of images
 
         with open_photo(path) as image:
             found, size = image.getexif().get_ifd(IFD.Exif), image.size
-        tags = {TAGS.get(tag, ""): value for tag, value in found.items()}
-        focal, side = _focal_in_pixels(tags, *size), max(size)
-        if focal is None or SHORTEST * side < focal < LONGEST * side:
-            return None if focal is None else cls(focal, relative_sigma, "the photo's EXIF data")
+        equivalent = _positive(found.get(Base.FocalLengthIn35mmFilm))
+        if equivalent is None:
+            return None
+        focal = equivalent / _FULL_FRAME_DIAGONAL_MM * math.hypot(*size)
+        if SHORTEST < focal / max(size) < LONGEST:
+            return cls(focal, relative_sigma, "the photo's EXIF data")
         text = "%s: the EXIF data state a focal length of %.4g px, which no camera has; ignored"
         logger.warning(text, path, focal)
         return None
@@ -161,25 +161,10 @@ def check_prior(prior: object, *, focal: str) -> None:
         )
 
 
-def _focal_in_pixels(tags: Mapping[str, Any], width: int, height: int) -> float | None:
-    """The focal length [px] that EXIF tags state; None where they do not."""
-    equivalent = _positive(tags, "FocalLengthIn35mmFilm")
-    if equivalent is not None:
-        return equivalent / _FULL_FRAME_DIAGONAL_MM * math.hypot(width, height)
-    millimetres, density = _positive(tags, "FocalLength"), _positive(tags, "FocalPlaneXResolution")
-    x = _positive(tags, "ExifImageWidth") or float(width)
-    y = _positive(tags, "ExifImageHeight") or float(height)
-    is_cropped = abs(x * height - y * width) > 0.01 * y * width  # since it was taken
-    if millimetres is None or density is None or is_cropped:
-        return None
-    unit = _UNIT_MM.get(tags.get("FocalPlaneResolutionUnit", 2), 25.4)
-    return millimetres * density / unit * width / x
-
-
-def _positive(tags: Mapping[str, Any], tag: str) -> float | None:
-    """A tag's value; None where it is missing or no positive number: 0 says that it is unknown."""
+def _positive(tag: Any) -> float | None:
+    """A tag's value; None where it is no positive number: 0 says that it is unknown."""
     try:
-        value = float(tags.get(tag, 0.0))
+        value = float(tag)
     except (TypeError, ValueError, ZeroDivisionError):
         return None
     return value if 0 < value < math.inf else None

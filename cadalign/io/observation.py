@@ -1,39 +1,47 @@
 """Observations: one object's keypoints in one or more images, as a JSON file; files of cameras.
 
-The file is described in docs/formats/observation.md. A camera is a calibration matrix as text,
-NumPy array or JSON, or in COLMAP's form.
+The file is described in docs/formats/observation.md. A camera is a calibration matrix as text or
+JSON, or in COLMAP's form.
 """
 
 from __future__ import annotations
 
-import io
 import os
-import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
+from msgspec import UNSET, Meta, UnsetType
 
-from cadalign.errors import DataError, InputError, brief
+from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.documents import (
+    Document,
     Positive,
+    Text,
+    convert,
     in_file,
     parse_json,
-    path_from,
+    plain,
     read_json,
     within,
     written_path,
 )
-from cadalign.io.evidence import ObservedImage, Size
-from cadalign.io.files import as_path, once_per_file, read_bytes, read_text, write_json
+from cadalign.io.evidence import (
+    ObservedImage,
+    Size,
+    ViewFields,
+    read_image_fields,
+    write_image_fields,
+)
+from cadalign.io.files import as_path, once_per_file, read_text, write_json
 from cadalign.io.kinds import (
     CAMERA,
     CAMERA_FIX,
@@ -43,12 +51,71 @@ from cadalign.io.kinds import (
     other_kind,
     refuse_other_file,
 )
-from cadalign.io.observation_file import (
-    read_fields,
-    read_image_fields,
-    read_size,
-    write_image_fields,
-)
+
+
+class FocalPriorFields(Document, omit_defaults=True):
+    """The entry ``fit.focal_prior``."""
+
+    focal: Positive
+    relative_sigma: Positive
+    source: str = ""
+
+
+class FitFields(Document):
+    """The entry ``fit``; fields that are not given keep the defaults of `cadalign.fit`."""
+
+    method: Text | UnsetType = UNSET
+    sigma: Positive | list[Positive] | UnsetType | None = UNSET
+    loss: Text | UnsetType = UNSET
+    loss_scale: Positive | UnsetType = UNSET
+    stretch: Text | UnsetType | None = UNSET
+    stretch_sigma: Positive | UnsetType | None = UNSET
+    focal: Literal["known", "estimate"] | UnsetType = UNSET
+    focal_prior: FocalPriorFields | Literal["usual"] | UnsetType | None = UNSET
+    shape_sigma: Positive | UnsetType = UNSET
+    image: bool | UnsetType = UNSET
+
+
+class ObservationFields(ViewFields, kw_only=True):
+    """A file: fields of its only image, or ``views``, and what is known of the object."""
+
+    camera: Any = UNSET
+    views: Annotated[list[ViewFields], Meta(min_length=1)] | None = None
+    model: Path | None = None
+    shape: Path | None = None
+    size: Size | None = None
+    object: Text | None = None
+    up_axis: Literal["x", "y", "z"] | None = "y"
+    symmetry: Any = None  # in a form of `Symmetry.from_dict`
+    unfinished: Any = None  # the annotator's
+    init: Any = None  # in the form of `Alignment.from_dict`
+    fit: FitFields = msgspec.field(default_factory=FitFields)
+
+
+def _read_fields(data: Any, folder: Path | None) -> tuple[ObservationFields, Sequence[ViewFields]]:
+    """Check the parsed form of a file; returns its fields and those of its views.
+
+    Raises DataError if a field is missing, unknown or invalid.
+    """
+    read: ObservationFields = convert(data, ObservationFields, folder=folder)
+    sigma = read.fit.sigma
+    if read.views is not None:
+        for name in ViewFields.__struct_fields__:
+            if name in data:
+                fix = "give it in each of the views"
+                raise DataError("given beside `views`", where=name, fix=fix)
+        if isinstance(sigma, list):
+            fix = "give one for all, or `sigma` of every keypoint"
+            raise DataError("a list, but there are several views", where="fit.sigma", fix=fix)
+        return read, read.views
+    if read.camera is UNSET:
+        raise DataError("missing", where="camera")
+    if not read.keypoints and read.init is None and read.mask is None:
+        raise DataError("missing", where="keypoints", fix="give keypoints, `mask` or `init`")
+    if isinstance(sigma, list) and len(sigma) != len(read.keypoints):
+        what = f"{len(sigma)} numbers for {len(read.keypoints)} keypoints"
+        raise DataError(what, where="fit.sigma", fix="give one for each, or one for all")
+    return read, (read,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,13 +217,13 @@ class Observation(ObservedImage):
         """
         if error := other_kind(Path(), OBSERVATION, kind_of(data)):
             raise DataError(error.what, fix=error.fix)
-        read, fields = read_fields(data)
+        read, fields = _read_fields(data, folder)
         if needs_xyz is None:
             needs_xyz = read.shape is None
         images = []
         for number, each in enumerate(fields):
             with nullcontext() if each is read else within(f"views[{number}]"):
-                images.append(read_image_fields(each, folder, needs_xyz=needs_xyz))
+                images.append(read_image_fields(each, needs_xyz=needs_xyz))
         first, *others = images
         options = msgspec.to_builtins(read.fit)
         if first.not_found and isinstance(options.get("sigma"), list):
@@ -165,11 +232,11 @@ class Observation(ObservedImage):
             init = None if read.init is None else Alignment.from_dict(read.init)
         return cls(
             **vars(first),
-            model=None if read.model is None else path_from(read.model, folder),
+            model=read.model,
             fit_options=options,
             others=tuple(others),
-            size=read_size(read.size),
-            shape=None if read.shape is None else path_from(read.shape, folder),
+            size=read.size,
+            shape=read.shape,
             symmetry=None if read.symmetry is None else Symmetry.from_dict(read.symmetry),
             init=init,
             object_name=read.object,
@@ -188,7 +255,7 @@ class Observation(ObservedImage):
             "model": self.model and written_path(self.model, folder=folder),
             "shape": self.shape and written_path(self.shape, folder=folder),
             "object": self.object_name,
-            "size": self.size and self.size.given,
+            "size": self.size and msgspec.to_builtins(self.size, enc_hook=plain),
             "symmetry": self.symmetry and self.symmetry.to_dict(),
             "init": self.init and self.init.to_dict(),
             "unfinished": dict(self.unfinished or {}) or None,
@@ -247,13 +314,6 @@ class ObservationChanges:
         return replace(changed, camera=lens(changed.camera), others=views, fit_options=kept)
 
 
-@once_per_file(64)
-def _read_camera(path: Path, **given: Any) -> Camera:
-    """One file for many observations."""
-
-    return read_camera(path, **given)
-
-
 @dataclass(frozen=True, kw_only=True)
 class DetectorOptions:
     """Complements of a detector's file of keypoints, and which of its keypoints count."""
@@ -270,10 +330,6 @@ class DetectorOptions:
     """Leave out a detector's keypoints that the model does not have."""
 
 
-_ARRAY = ".npy"
-_MOST_BYTES = 2**20  # of an array, which has nine numbers
-
-
 def read_camera(
     path: str | os.PathLike[str],
     *,
@@ -284,7 +340,7 @@ def read_camera(
     Parameters
     ----------
     path : path-like
-        A calibration matrix K: text of 3 x 3 numbers, a ``.npy`` array, or JSON, bare or as
+        A calibration matrix K: text of 3 x 3 numbers, or JSON, bare or as
         ``matrix`` (also ``K``, ``camera_matrix``), by rows; or a camera in the form of
         `Camera.from_dict` as JSON.
     size : tuple of 2 int, optional
@@ -308,8 +364,6 @@ def read_camera(
 
 def _read_form(path: Path) -> dict[str, Any]:
     """The parsed form of a camera in a file."""
-    if path.suffix.lower() == _ARRAY:
-        return {"matrix": _read_array(path)}
     try:
         text = read_text(path)
         if path.suffix.lower() != ".json" and text.lstrip()[:1] not in ("{", "["):
@@ -330,20 +384,13 @@ def _read_form(path: Path) -> dict[str, Any]:
     return form
 
 
-def _read_array(path: Path) -> Any:
-    file = io.BytesIO(read_bytes(path, most=_MOST_BYTES))
-    try:
-        with warnings.catch_warnings(action="ignore"):
-            values = np.lib.format.read_array(file, allow_pickle=False)
-    except Exception as error:  # NumPy has Python parse the header, which raises what it likes
-        what = f"not a NumPy array that can be read ({brief(error)})"
-        raise DataError(what, where=str(path)) from None
-    return _square(values, path)
-
-
 def _square(values: Any, path: Path) -> Any:
     """A matrix (3, 3) of nine numbers by rows, however they are nested."""
     try:
         return np.asarray(values, dtype=float).reshape(3, 3)
     except (TypeError, ValueError, OverflowError):
         raise DataError("not a calibration matrix", where=str(path), fix=CAMERA_FIX) from None
+
+
+_read_camera = once_per_file(64)(read_camera)
+"""One file for many observations."""

@@ -13,7 +13,7 @@ from cadalign.estimation.assemble import KeypointPosterior
 from cadalign.estimation.options import LOSSES, FitOptions, pixel_information
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FittedKeypoints, Posterior, point_slopes, quickly
-from cadalign.estimation.uncertainty.residuals import loss_slopes
+from cadalign.estimation.uncertainty.residuals import loss_weights
 from cadalign.geometry.alignment import Alignment, Box, Uncertainty, deviation_text
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
@@ -151,7 +151,7 @@ def posterior_of_keypoints(
     """
     information = pixel_information(options.sigma, len(points_3d))
     squares = np.einsum("ni,nij,nj->n", residuals, information, residuals)
-    weights = loss_slopes(squares, LOSSES[options.loss], options.loss_scale)[0]
+    weights = loss_weights(squares, LOSSES[options.loss], options.loss_scale)
     slopes = camera.projection_slopes(alignment.apply(points_3d))
     slopes = slopes @ point_slopes(points_3d, alignment)
     total = np.einsum("nki,n,nkl,nlj->ij", slopes, weights, information, slopes)

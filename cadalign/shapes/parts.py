@@ -324,7 +324,7 @@ def check_ids(ids: Sequence[KeypointId], where: str) -> tuple[KeypointId, ...]:
         raise InputError("there are none", where=where)
     if len({type(label) for label in found}) > 1:
         raise InputError("some are numbers and some are names", where=where, fix="use one kind")
-    twice = next((label for row, label in enumerate(found) if label in found[:row]), None)
-    if twice is not None:
+    if len(set(found)) < len(found):
+        twice = next(label for row, label in enumerate(found) if label in found[:row])
         raise InputError(f"{twice!r} occurs twice", where=where)
     return tuple(found)

@@ -54,7 +54,9 @@ def with_symmetry(path: Path, symmetry: Any) -> Path:
 def test_turned_labels_give_the_same_alignment(tmp_path: Path, flags: list[str]) -> None:
     rotations = []
     for name, points in (("a.json", CORNERS), ("b.json", CORNERS @ QUARTER.T)):
-        path = with_symmetry(write_observation(tmp_path, name, points=points), "__SYM_ROTATE_UP_4")
+        path = with_symmetry(
+            write_observation(tmp_path, name, points=points), {"axis": [0, 1, 0], "fold": 4}
+        )
         assert main(["fit", str(path), *flags]) == 0
         fit = json.loads((tmp_path / f"{path.stem}_fit" / "fit.json").read_text())
         rotations.append(np.array(fit["alignment"]["rotation"]))

@@ -115,8 +115,8 @@ def test_a_camera_that_cannot_be_read_is_refused_before_the_run(
 
 def test_matrix_takes_the_place_of_the_camera(folder: Path) -> None:
     path = write_observations(folder) / "b.json"
-    np.save(folder / "K.npy", CAMERA.matrix * [[1.1], [1.1], [1]])
-    assert main(["fit", str(path), "--camera", str(folder / "K.npy")]) == 0
+    np.savetxt(folder / "K.txt", CAMERA.matrix * [[1.1], [1.1], [1]])
+    assert main(["fit", str(path), "--camera", str(folder / "K.txt")]) == 0
     camera = Result.load(path.with_name("b_fit") / "fit.json").camera
     assert camera.fx == pytest.approx(770)
     assert camera.cx == pytest.approx(1.1 * 319.5)

@@ -137,7 +137,7 @@ def test_the_state_of_the_cache_is_told(tmp_path, monkeypatch):
 
 def test_nothing_is_compiled_ahead_that_could_not_be_kept(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr("cadalign.compile.folder.can_write", lambda folder: False)
+    monkeypatch.setattr("cadalign.cli.doctor.can_write", lambda folder: False)
     fix = "set NUMBA_CACHE_DIR to a folder that can be"
     line = refusal_line(capsys, "doctor", "--compile")
     assert line == f"--compile: {kernel_folder()} cannot be written to; {fix}"

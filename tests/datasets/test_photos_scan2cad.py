@@ -73,7 +73,8 @@ def test_symmetries_turn_about_y_through_the_centre(tmp_path, name, motions, axe
     write_scan2cad(tmp_path, sym=f"__SYM_{name}", center=center)
     symmetry = Scan2CAD(tmp_path)[0].objects[0].symmetry
     assert (len(symmetry.motions), len(symmetry.axes)) == (motions, axes)
-    for motion in symmetry.poses(max_step=1.0):
+    turns = [axis.turned(angle) for axis in symmetry.axes for angle in (0.5, 2.0)]
+    for motion in (*symmetry.motions, *turns):
         np.testing.assert_allclose(motion @ [*center, 1], [*center, 1], atol=1e-12)
         np.testing.assert_allclose(motion[:3, 1], [0, 1, 0], atol=1e-12)
 

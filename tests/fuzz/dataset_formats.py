@@ -90,9 +90,6 @@ def _mask(name: str, segmentation: Any, width: int, height: int) -> Format:
 def _write_matrix(ending: str) -> Callable[[Path], Path]:
     def write(folder: Path) -> Path:
         path = folder / f"K.{ending}"
-        if ending == "npy":
-            np.save(path, CAMERA.matrix)
-            return path
         by_rows = {"matrix": CAMERA.matrix.tolist(), "width": 64, "height": 48}
         return write_text(
             path, json.dumps(by_rows) if ending == "json" else "60 0 31\n0 60 23\n0 0 1\n"
@@ -152,7 +149,7 @@ FORMATS = (
     _mask("compressed runs", _TEXT, 4, 2),
     *(
         Format(f"camera {ending}", _write_matrix(ending), _read_camera)
-        for ending in ("txt", "npy", "json")
+        for ending in ("txt", "json")
     ),
     *(
         Format(f"image {ending}", write_picture(ending), read_photo)

@@ -123,27 +123,19 @@ PARAMS = {
     "RADIAL_FISHEYE": [200.0, 320.0, 240.0, 0.1, -0.05],
     "OPENCV_FISHEYE": [200.0, 210.0, 320.0, 240.0, 0.1, -0.05, 0.01, -0.02],
 }
-EXPECTED = {
-    "SIMPLE_PINHOLE": Camera(640, 480, 500.0, 500.0, 319.5, 239.5),
-    "PINHOLE": Camera(640, 480, 500.0, 520.0, 319.5, 239.5),
-    "SIMPLE_RADIAL": Camera(640, 480, 500.0, 500.0, 319.5, 239.5, (0.1, 0, 0, 0)),
-    "RADIAL": Camera(640, 480, 500.0, 500.0, 319.5, 239.5, (0.1, -0.05, 0, 0)),
-    "OPENCV": Camera(640, 480, 500.0, 520.0, 319.5, 239.5, (0.1, -0.05, 0.01, -0.02)),
-    "FULL_OPENCV": Camera(
-        640, 480, 500.0, 520.0, 319.5, 239.5, (0.1, -0.05, 0.01, -0.02, 0.3, 0.4, -0.5, 0.6)
-    ),
-    "SIMPLE_RADIAL_FISHEYE": Camera(
-        640, 480, 200.0, 200.0, 319.5, 239.5, (0.1, 0, 0, 0), lens="fisheye"
-    ),
-    "RADIAL_FISHEYE": Camera(
-        640, 480, 200.0, 200.0, 319.5, 239.5, (0.1, -0.05, 0, 0), lens="fisheye"
-    ),
-    "OPENCV_FISHEYE": Camera(
-        640, 480, 200.0, 210.0, 319.5, 239.5, (0.1, -0.05, 0.01, -0.02), lens="fisheye"
-    ),
+RADIAL, ALL = (0.1, -0.05, 0, 0), (0.1, -0.05, 0.01, -0.02)
+# Focal lengths, coefficients and lens.
+EXPECTED: dict[str, tuple[float, float, tuple[float, ...], Any]] = {
+    "SIMPLE_PINHOLE": (500, 500, (), "perspective"),
+    "PINHOLE": (500, 520, (), "perspective"),
+    "SIMPLE_RADIAL": (500, 500, (0.1, 0, 0, 0), "perspective"),
+    "RADIAL": (500, 500, RADIAL, "perspective"),
+    "OPENCV": (500, 520, ALL, "perspective"),
+    "FULL_OPENCV": (500, 520, (*ALL, 0.3, 0.4, -0.5, 0.6), "perspective"),
+    "SIMPLE_RADIAL_FISHEYE": (200, 200, (0.1, 0, 0, 0), "fisheye"),
+    "RADIAL_FISHEYE": (200, 200, RADIAL, "fisheye"),
+    "OPENCV_FISHEYE": (200, 210, ALL, "fisheye"),
 }
-
-
 WRITTEN = {
     "SIMPLE_PINHOLE": "PINHOLE",
     "SIMPLE_RADIAL": "OPENCV",
@@ -163,7 +155,8 @@ def test_colmaps_models_are_read_and_written_as_the_smallest_that_holds_the_lens
 ) -> None:
     data = {"model": model, "width": 640, "height": 480, "params": PARAMS[model]}
     camera = Camera.from_dict(data)
-    assert camera == EXPECTED[model]
+    fx, fy, distortion, lens = EXPECTED[model]
+    assert camera == Camera(640, 480, fx, fy, 319.5, 239.5, distortion, lens=lens)
     written = camera.to_dict()
     assert written["model"] == WRITTEN.get(model, model)
     assert Camera.from_dict(written) == camera
@@ -317,11 +310,6 @@ def test_project_refuses_what_are_no_points(points: Any, text: str) -> None:
     assert str(caught.value) == text
 
 
-def test_no_points_have_no_projections() -> None:
-    assert PLAIN.project(np.empty((0, 3))).shape == (0, 2)
-    assert camera_with(LENSES["opencv4"]).normalize(np.empty((0, 2))).shape == (0, 2)
-
-
 # --- without focal length ---------------------------------------------------------------------
 
 
@@ -354,33 +342,21 @@ def test_camera_without_focal_length_is_not_used_as_if_it_had_one(use: str) -> N
     )
 
 
+NO_FOCAL = COLMAP_DATA | {"params": [None, None, 320.0, 240.0]}
+
+
 @pytest.mark.parametrize(
     "data",
     [
         {"width": 640, "height": 480},
-        {
-            "model": "SIMPLE_PINHOLE",
-            "width": 640,
-            "height": 480,
-            "params": [None, 320.0, 240.0],
-        },
-        {
-            "model": "PINHOLE",
-            "width": 640,
-            "height": 480,
-            "params": [None, None, 320.0, 240.0],
-        },
+        COLMAP_DATA | {"model": "SIMPLE_PINHOLE", "params": [None, 320.0, 240.0]},
+        NO_FOCAL,
     ],
 )
 def test_unknown_focal_length_is_null_in_files(data: dict[str, Any]) -> None:
     camera = Camera.from_dict(data)
     assert camera == Camera.without_focal(640, 480)
-    assert camera.to_dict() == {
-        "model": "PINHOLE",
-        "width": 640,
-        "height": 480,
-        "params": [None, None, 320.0, 240.0],
-    }
+    assert camera.to_dict() == NO_FOCAL
     assert Camera.from_dict(camera.to_dict()) == camera
 
 

@@ -10,16 +10,10 @@ import numpy as np
 import pytest
 
 from cadalign import Alignment, Camera, Mesh
-from cadalign.geometry.conventions import (
-    OPENGL_AXES,
-    opengl_from_model,
-    opengl_projection,
-)
 from cadalign.geometry.pixels import rescaled_pixels
-from cadalign.render import RaycastRenderer, Scene, look_at
+from cadalign.render import RaycastRenderer, Scene
 
 CAMERA = Camera(160, 120, 170.0, 140.0, 60.25, 71.75, (-0.25, 0.06, 0.004, -0.003))
-PLAIN = Camera(width=641, height=480, fx=510.25, fy=498.5, cx=321.75, cy=236.125)
 SOURCES = Path(__file__).parents[2]
 
 
@@ -64,12 +58,6 @@ def test_pixels_move_as_opencv_resizes_an_image() -> None:
     np.testing.assert_allclose(image_centroid(small), moved, atol=1e-6)
 
 
-def test_opengl_axes_are_the_model_view_matrix_without_a_pose() -> None:
-    matrix = opengl_from_model(Alignment.identity())
-    np.testing.assert_array_equal(matrix[:3, :3], np.diag(OPENGL_AXES))
-    np.testing.assert_array_equal(OPENGL_AXES**2, 1)
-
-
 def test_no_other_module_writes_the_conversions_out() -> None:
     patterns = re.compile(r"[\[(]1(\.0)?, -1(\.0)?, -1(\.0)?[\])]|c[xy] [+-] 0?\.5|PIXEL_CENTRE = ")
     found = [
@@ -78,23 +66,4 @@ def test_no_other_module_writes_the_conversions_out() -> None:
         for path in (SOURCES / folder).rglob("*.py")
         if patterns.search(path.read_text(encoding="utf-8"))
     ]
-    assert {Path(name).name for name in found} == {"conventions.py", "pixels.py"}, found
-
-
-def test_opengl_matrices_project_as_the_camera_does() -> None:
-    pose = look_at(azimuth=50, elevation=-20, distance=3, scale=(1, 0.5, 2))
-    points = np.random.default_rng(0).uniform(-0.4, 0.4, (50, 3))
-    homogeneous = np.column_stack([points, np.ones(50)])
-    for window in (None, (100, 50, 320, 200)):
-        projection = opengl_projection(PLAIN, near=0.5, far=9, window=window)
-        clip = homogeneous @ (projection @ opengl_from_model(pose)).T
-        device = clip[:, :3] / clip[:, 3:]
-        assert (np.abs(device[:, 2]) < 1).all()
-        ends = projection @ np.array([[0, 0, -0.5, 1], [0, 0, -9, 1]]).T
-        np.testing.assert_allclose(ends[2] / ends[3], [-1, 1], atol=1e-12)
-        left, top, width, height = window or (0, 0, PLAIN.width, PLAIN.height)
-        # In the window's pixels from its borders, y up.
-        x = left + (device[:, 0] + 1) / 2 * width - 0.5
-        y = top + (1 - device[:, 1]) / 2 * height - 0.5
-        expected = PLAIN.project(pose.apply(points))
-        np.testing.assert_allclose(np.column_stack([x, y]), expected, atol=1e-9)
+    assert {Path(name).name for name in found} == {"alignment.py", "pixels.py"}, found

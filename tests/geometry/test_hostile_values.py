@@ -78,10 +78,3 @@ def test_texts_are_no_numbers(value: Any) -> None:
     assert refusal_text(lambda: as_floats(value, name="sigma", shape=shape)) == (
         "sigma: not an array of numbers (they are texts)"
     )
-
-
-def test_an_overflowing_rotation_is_refused() -> None:
-    rotation = np.full((3, 3), 1e200)
-    assert refusal_text(lambda: Alignment(rotation, np.zeros(3), np.ones(3))) == (
-        "rotation: not a rotation matrix; its rows must be orthonormal and its determinant +1"
-    )

@@ -58,7 +58,7 @@ READERS = [
     *same(".png", read=read_grey),
     *same(".json", read=Observation.load),
     *same(".json", ".csv", read=read_image_keypoints),
-    *same(".json", ".txt", ".npy", read=lambda path: read_camera(path, size=(4, 4))),
+    *same(".json", ".txt", read=lambda path: read_camera(path, size=(4, 4))),
     *same(".shape", read=ShapeModel.open),
     *same(".cadalign", read=Library.open),
     *same(".pkl", read=load_pickle),

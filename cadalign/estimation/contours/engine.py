@@ -93,9 +93,7 @@ class Candidate:
         return self.start._replace(evidence=evidence, state=state, cost=cost, score=score)
 
 
-def refine_with_outlines(
-    problem: Problem, minima: Sequence[Minimum]
-) -> tuple[list[Minimum], OutlineNotes]:
+def refine(problem: Problem, minima: Sequence[Minimum]) -> tuple[list[Minimum], OutlineNotes]:
     """Refine likely minima with masks, or else photos, the likeliest first.
 
     Raises InputError if a mask has no contour, or the model no mesh; DegenerateError if outlines

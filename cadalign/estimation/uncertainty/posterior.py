@@ -26,7 +26,7 @@ from cadalign.estimation.result_parts import FittedKeypoints
 from cadalign.estimation.uncertainty.residuals import (
     chi_square_quantile,
     f_quantile,
-    loss_slopes,
+    loss_weights,
     whitening_matrices,
 )
 from cadalign.geometry.camera import faced, needs_facing, turned_alignment, turned_covariance
@@ -141,7 +141,7 @@ class Chart(NamedTuple):
         slopes = focal * camera.distortion_jacobian(rays)
         information = pixel_information(fitted.chosen_sigma, len(kept))[kept]
         squares = np.einsum("ni,nij,nj->n", residuals, information, residuals)
-        weights, _ = loss_slopes(squares, LOSSES[options.loss], options.loss_scale)
+        weights = loss_weights(squares, LOSSES[options.loss], options.loss_scale)
         information = (weights / widening)[:, None, None] * information
         whitening = whitening_matrices(whitening_by(information))
         fixed = pixels - (slopes @ rays[:, :, None])[:, :, 0]

@@ -43,16 +43,11 @@ def whitening_matrices(whitening: FloatArray) -> FloatArray:
     return matrices
 
 
-def loss_slopes(squares: FloatArray, loss: int, bend: float) -> tuple[FloatArray, FloatArray]:
-    """First and second derivatives of a loss by the squared length: the first are weights."""
+def loss_weights(squares: FloatArray, loss: int, bend: float) -> FloatArray:
+    """Derivatives of a loss by the squared lengths."""
     if loss == HUBER:
-        length = np.sqrt(np.maximum(squares, bend**2))
-        is_bent = squares > bend**2
-        return bend / length, np.where(is_bent, -bend / (2.0 * length**3), 0.0)
-    if loss == CAUCHY:
-        first = 1.0 / (1.0 + squares / bend**2)
-        return first, -(first**2) / bend**2
-    return np.ones_like(squares), np.zeros_like(squares)
+        return np.asarray(bend / np.sqrt(np.maximum(squares, bend**2)))
+    return 1.0 / (1.0 + squares / bend**2) if loss == CAUCHY else np.ones_like(squares)
 
 
 def chi_square_tail(value: float, freedom: int) -> float:

@@ -147,8 +147,7 @@ VIEWPOINT = MetricSet(_measure_viewpoint, (ROTATION,), (Rate(ACCURACY, ROTATION,
 
 # Boxes --------------------------------------------------------------------------------------------
 
-# NOCS tries 20 rotations about an axis of symmetry.
-_MAX_STEP = np.pi / 20
+_STEPS = 20  # about an axis of symmetry, as NOCS tries
 TRANSLATION = Metric("translation_cm", "translation error", "cm", symbol="t cm")
 
 
@@ -159,10 +158,11 @@ def symmetric_box_iou(*, est: Box, gt: Box, symmetry: Symmetry) -> float:
     about an axis in 20 steps; the boxes' axes are the model's. Raises InputError if a box has no
     volume.
     """
-    rotations = symmetry.poses(max_step=_MAX_STEP)[:, :3, :3]
-    return max(
-        box_iou(est=Box(est.center, est.rotation @ turn, est.extents), gt=gt) for turn in rotations
-    )
+    angles = 2 * np.pi * np.arange(_STEPS) / _STEPS
+    about = [axis.turned(angle) for axis in symmetry.axes for angle in angles] or [np.eye(4)]
+    turns = [turn @ motion for motion in (np.eye(4), *symmetry.motions) for turn in about]
+    boxes = (Box(est.center, est.rotation @ turn[:3, :3], est.extents) for turn in turns)
+    return max(box_iou(est=box, gt=gt) for box in boxes)
 
 
 def _measure_box(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:

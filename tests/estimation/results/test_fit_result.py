@@ -131,7 +131,7 @@ def with_view(**changes: Any) -> str:
         (changed(version=3), "result: version: 3 is not one of 1"),
         (
             with_view(alignment={"scale": [1, 1, 1]}),
-            "result: views[0].alignment: missing rotation, translation",
+            "result: views[0].alignment.rotation: missing",
         ),
         (
             with_view(residuals=[[1, 2, 3]]),

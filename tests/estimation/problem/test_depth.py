@@ -7,7 +7,7 @@ import pytest
 from support.scenes import CAMERA, depth_image, keypoints, seen, truth_of
 
 from cadalign import Model, align
-from cadalign.geometry.depth import sample_depth
+from cadalign.estimation.pack import sample_depth
 
 
 @pytest.mark.parametrize("axis", [0, 1])

@@ -28,31 +28,6 @@ def _plain(color):
     return PBRMaterial(baseColorFactor=color, metallicFactor=0.0, roughnessFactor=0.8)
 
 
-def write_crate_obj(folder: Path) -> Path:
-    """A crate with stripes on its front, checks on its right side, and one plain green lid."""
-    stripes = np.full((32, 32, 3), (240, 220, 60), np.uint8)
-    stripes[:, ::8] = stripes[:, 1::8] = stripes[:, 2::8] = (150, 30, 30)
-    checks = np.kron(np.indices((4, 4)).sum(axis=0) % 2, np.ones((8, 8)))
-    checks = np.where(checks[:, :, None] > 0, (255, 255, 255), (20, 20, 120)).astype(np.uint8)
-    Image.fromarray(stripes).save(folder / "stripes.png")
-    Image.fromarray(checks).save(folder / "checks.png")
-    (folder / "crate.mtl").write_text(
-        "newmtl striped\nKd 1 1 1\nmap_Kd stripes.png\n"
-        "newmtl checked\nKd 1 1 1\nmap_Kd checks.png\n"
-        "newmtl lid\nKd 0.1 0.7 0.2\n"
-    )
-    path = folder / "crate.obj"
-    path.write_text(
-        "mtllib crate.mtl\n"
-        "v -1 -1 1\nv 1 -1 1\nv 1 1 1\nv -1 1 1\nv -1 -1 -1\nv 1 -1 -1\nv 1 1 -1\nv -1 1 -1\n"
-        "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
-        "usemtl striped\nf 1/1 2/2 3/3 4/4\nf 6/1 5/2 8/3 7/4\n"
-        "usemtl checked\nf 2/1 6/2 7/3 3/4\nf 5/1 1/2 4/3 8/4\n"
-        "usemtl lid\nf 4 3 7 8\nf 1 5 6 2\n"
-    )
-    return path
-
-
 def write_glass_glb(path: Path) -> Path:
     """An orange ball in a bluish glass box, whose floor is a textured tile."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
@@ -88,21 +63,6 @@ def _color_at(frame, pose, point):
     part = frame.color[row - 1 : row + 2, column - 1 : column + 2]
     assert (part[:, :, 3] == 255).all()
     return part[:, :, :3].reshape(-1, 3).mean(axis=0)
-
-
-@pytest.mark.slow
-def test_an_obj_with_several_textures_shows_each_on_its_faces(renderer, tmp_path):
-    _, pose, frame = _drawn(renderer, write_crate_obj(tmp_path))
-    stripe = _color_at(frame, pose, (-1 + 1.5 / 16, 0, 1))
-    assert stripe[0] > stripe[2] + 50
-    yellow = _color_at(frame, pose, (-1 + 5.5 / 16, 0, 1))
-    assert min(yellow[0], yellow[1]) > yellow[2] + 60
-    white = _color_at(frame, pose, (1, -0.75, 0.75))
-    blue = _color_at(frame, pose, (1, -0.75, 0.25))
-    assert white.min() > 110
-    assert blue[2] > blue[0] + 30
-    green = _color_at(frame, pose, (0, 1, 0))
-    assert green[1] > max(green[0], green[2]) + 60
 
 
 def test_what_is_behind_glass_is_seen_through_it(renderer, tmp_path):

@@ -21,13 +21,15 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import DataError, quote
 from cadalign.estimation.agreement import (
     AS_MANY_AGREE,
+    UNIT,
     Agreement,
     AnyModel,
     DiagnosisCase,
     Rule,
+    named,
+    warning_of,
 )
 from cadalign.estimation.assemble import result_of_keypoints
-from cadalign.estimation.causes import UNIT, named, warning_of
 from cadalign.estimation.fit import fit_once
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions

@@ -146,7 +146,7 @@ def no_pose_error(problem: Problem) -> DegenerateError:
     """The error where no start leads to a pose; InputError of outlines without meshes."""
     shown = [view for view in problem.views if view.has_outline]
     if shown:
-        from cadalign.estimation.contours.surface import surface_of  # imports this package
+        from cadalign.estimation.contours.outline import surface_of  # imports this package
 
         keypoints = problem.prior.components[0].mean[: len(problem.prior.ids)]
         field = "image" if shown[0].mask is None else "mask"

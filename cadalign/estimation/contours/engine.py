@@ -15,12 +15,12 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
-from cadalign.estimation.contours.mask import MaskSource, convex_hull
 from cadalign.estimation.contours.outline import (
     OutlineSupport,
+    Surface,
     Track,
+    surface_of,
 )
-from cadalign.estimation.contours.photo import PhotoSource
 from cadalign.estimation.contours.photo_lines import photo_of
 from cadalign.estimation.contours.rounds import (
     OutlineFit,
@@ -29,7 +29,7 @@ from cadalign.estimation.contours.rounds import (
     last_fit,
     with_displacement_modes,
 )
-from cadalign.estimation.contours.surface import Surface, surface_of
+from cadalign.estimation.contours.sources import MaskSource, PhotoSource, convex_hull
 from cadalign.estimation.model import is_exact_model
 from cadalign.estimation.problem import Problem
 from cadalign.estimation.result_parts import OutlineNotes

@@ -17,17 +17,17 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.contours.contour import Sight
-from cadalign.estimation.contours.mask import MaskSource
 from cadalign.estimation.contours.outline import (
     LEAST_OFFSET,
     REGISTRATION,
     MeasuredOutline,
     Noise,
     Outline,
+    PosedSurface,
+    Surface,
     Track,
 )
-from cadalign.estimation.contours.photo import PhotoSource
-from cadalign.estimation.contours.surface import PosedSurface, Surface
+from cadalign.estimation.contours.sources import MaskSource, PhotoSource
 from cadalign.estimation.estimates import poses_of
 from cadalign.estimation.search import with_whitening_times
 from cadalign.solvers.constants import CAUCHY

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.contours.contour import Image, sampled
-from cadalign.estimation.contours.surface import rigid_surface
+from cadalign.estimation.contours.outline import rigid_surface
 from cadalign.estimation.model import Model
 from cadalign.estimation.problem import Inits, Problem
 from cadalign.geometry.alignment import Alignment, bounds_corners, model_rays

@@ -27,8 +27,7 @@ from cadalign.io.files import (
 from cadalign.io.images import write_image
 from cadalign.io.kinds import MESH, refuse_other_file
 from cadalign.io.meshes.gltf import read_gltf
-from cadalign.io.meshes.obj import read_obj
-from cadalign.io.meshes.polygons import read_off, read_ply, read_stl
+from cadalign.io.meshes.polygons import read_obj, read_off, read_ply, read_stl
 
 # Coordinates in ShapeNet's files have 6 decimals; less than ten of these steps is rounding.
 _FLAT = 1e-5

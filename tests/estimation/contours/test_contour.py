@@ -21,9 +21,9 @@ from cadalign.estimation.contours.contour import (
     mask_contour,
     sampled,
 )
-from cadalign.estimation.contours.mask import MaskSource
 from cadalign.estimation.contours.outline import Noise, OutlineSupport, correlation_length
 from cadalign.estimation.contours.rounds import likeliest_offset
+from cadalign.estimation.contours.sources import MaskSource
 
 WIDTH, HEIGHT = 160, 120
 

@@ -13,13 +13,13 @@ import pytest
 
 from cadalign import Alignment, Camera, Mesh, Model, View, align
 from cadalign.estimation.contours.contour import Sight
+from cadalign.estimation.contours.outline import RigidSurface
 from cadalign.estimation.contours.photo_lines import (
     changes_of,
     crossings_of,
     silhouette_of,
     with_neighbours,
 )
-from cadalign.estimation.contours.surface import RigidSurface
 from cadalign.estimation.result import Result
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.images import write_image

@@ -24,7 +24,7 @@ import re, sys
 from pathlib import Path
 
 import cadalign
-from cadalign.estimation.warning import MISFIT_KINDS
+from cadalign.estimation.result_parts import MISFIT_KINDS
 
 BAD = {*MISFIT_KINDS, "contradiction", "unit", "noise", "chance"}
 for page in sys.argv[1:]:

@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from cadalign.estimation.result import Result
     from cadalign.estimation.result_parts import (
         Alternative,
+        EstimateWarning,
         EvidenceSummary,
         FitStats,
         ViewResult,
     )
     from cadalign.estimation.results import Results
     from cadalign.estimation.view import View
-    from cadalign.estimation.warning import EstimateWarning
     from cadalign.geometry.alignment import Uncertainty
     from cadalign.io.evidence import Size
     from cadalign.io.focal import FocalPrior

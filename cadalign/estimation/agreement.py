@@ -13,7 +13,7 @@ import numpy as np
 from cadalign.errors import CadalignError, quote
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import RansacOptions, Sigma, pixel_information
-from cadalign.estimation.result_parts import listed
+from cadalign.estimation.result_parts import EstimateWarning, Kind, listed
 from cadalign.estimation.uncertainty.doubts import FALSE_ALARMS, is_large_sigma
 from cadalign.estimation.uncertainty.residuals import (
     area_of,
@@ -22,7 +22,6 @@ from cadalign.estimation.uncertainty.residuals import (
     named_keypoints,
 )
 from cadalign.estimation.view import View, numbered
-from cadalign.estimation.warning import EstimateWarning, Kind
 from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import inflation_with
@@ -265,10 +264,7 @@ class DiagnosisCase:
         return fall - rule.price * max(found.ratio, 1.0) ** 2 * fewer  # where sigma is too small
 
     def _may_be_wrong(self, found: Agreement, given: Agreement) -> bool:
-        """True if a piece of evidence adds more squares than right ones do.
-
-        What is integrated out grows with every piece, also with right ones.
-        """
+        """True if a piece of evidence adds more squares than right ones do."""
         fewer, noise = given.redundancy - found.redundancy, self.inflation * max(found.ratio, 1.0)
         squares, freedom = given.chi_square - found.chi_square, found.result.degrees_of_freedom
         return chance_of(squares / noise**2, max(fewer, 1), freedom) < _UNUSUAL

@@ -14,10 +14,10 @@ from cadalign.estimation.result_parts import (
     FittedKeypoints,
     Posterior,
     ViewResult,
+    Warnings,
     keypoint_summary,
     quickly,
 )
-from cadalign.estimation.warning import Warnings
 from cadalign.geometry.symmetry import Symmetry
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from cadalign.arrays import BoolArray, FloatArray, as_floats
 from cadalign.errors import CadalignError, DegenerateError, InputError, NoConsensusError
 from cadalign.estimation.options import MINIMAL_SOLVERS, FitOptions, RansacOptions
 from cadalign.estimation.problems import Problems, rays_of, whitening_of
-from cadalign.estimation.result_parts import FitStats, FittedKeypoints
+from cadalign.estimation.result_parts import EstimateWarning, FitStats, FittedKeypoints
 from cadalign.estimation.solve import fit_keypoints
 from cadalign.estimation.uncertainty.residuals import (
     SOLUTIONS_OF_FOUR,
@@ -23,7 +23,6 @@ from cadalign.estimation.uncertainty.residuals import (
     log_expected_by_chance,
     share_as_moderate,
 )
-from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.alignment import Alignment, describe_plane
 from cadalign.geometry.camera import faced, turned_poses
 from cadalign.solvers.alignment import Objective

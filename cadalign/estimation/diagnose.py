@@ -34,9 +34,8 @@ from cadalign.estimation.fit import fit_once
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.problems import pack_one
-from cadalign.estimation.result_parts import FittedKeypoints, listed
+from cadalign.estimation.result_parts import EstimateWarning, FittedKeypoints, listed
 from cadalign.estimation.view import View
-from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import rescaled_pixels
 from cadalign.geometry.plausible_camera import OTHER_SIZES

@@ -19,12 +19,12 @@ from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.result_parts import (
     Alternative,
+    EstimateWarning,
     EvidenceSummary,
     FitStats,
     Posterior,
     ViewResult,
 )
-from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry

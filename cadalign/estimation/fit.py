@@ -26,10 +26,9 @@ from cadalign.estimation.problems import (
     pack_one,
 )
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import FittedKeypoints
+from cadalign.estimation.result_parts import EstimateWarning, FittedKeypoints
 from cadalign.estimation.results import COLUMNS, Entry, Results
 from cadalign.estimation.solve import are_solved_at_once, fit_keypoints, solve
-from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.focal import PriorOption

@@ -39,12 +39,14 @@ from cadalign.estimation.result_parts import (
     LEAST_LIKELIHOOD,
     NO_NOTES,
     Alternative,
+    EstimateWarning,
     EvidenceSummary,
     FitStats,
     FittedKeypoints,
     OutlineNotes,
     Posterior,
     ViewResult,
+    Warnings,
     alternatives_of,
     keypoint_summary,
     quickly,
@@ -61,7 +63,6 @@ from cadalign.estimation.uncertainty.doubts import (
 )
 from cadalign.estimation.uncertainty.residuals import summaries_of
 from cadalign.estimation.view import View
-from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment, describe_plane
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.io.focal import prior_of_camera

@@ -41,8 +41,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from cadalign.estimation.model import Model
-    from cadalign.estimation.result_parts import EvidenceSummary
-    from cadalign.estimation.warning import EstimateWarning
+    from cadalign.estimation.result_parts import EstimateWarning, EvidenceSummary
     from cadalign.export.aligned_object import Frame
     from cadalign.geometry.mesh import Mesh
     from cadalign.shapes.model import ShapeModel

@@ -1,4 +1,4 @@
-"""Parts of a result: views, alternatives, evidence, the posterior, and keypoints that are fitted.
+"""Parts of a result: warnings, views, alternatives, evidence, the posterior, fitted keypoints.
 
 Covariances are those of the rotation vector in the camera frame [rad], the translation, the
 logarithms of the lengths along x, y, z, and, where it was estimated, of the focal length.
@@ -9,17 +9,95 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.options import FitOptions, RansacOptions, pixel_information
-from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment, Uncertainty, extent, uncertainty_of
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import by_rotation
 from cadalign.geometry.symmetry import Symmetry
+
+Kind = Literal[
+    "mistake",
+    "outlier",
+    "misfit",
+    "noise",
+    "chance",
+    "untested",
+    "outside-image",
+    "camera",
+    "stretch",
+    "contradiction",
+    "unit",
+    "mask",
+    "photo",
+    "left-out",
+    "focal",
+    "alternative",
+]
+
+
+@dataclass(frozen=True, repr=False)
+class EstimateWarning:
+    """A warning about an estimate.
+
+    ``str(warning)`` is its text, and warnings are printed as their texts.
+
+    Parameters
+    ----------
+    kind : str
+        What is doubtful:
+
+        - "mistake": a usual mistake in the data explains them better, a mirrored model for example;
+        - "outlier": keypoints do not fit the others;
+        - "misfit": residuals are larger than the stated noise explains, and no few keypoints are to
+          blame;
+        - "noise": the estimated noise is as large as the keypoints' spread;
+        - "chance": keypoints at random would agree as well;
+        - "untested": no equation is left that tests the estimate;
+        - "outside-image": keypoints lie outside of the image;
+        - "camera": the focal length is contradicted, or the camera is implausible;
+        - "stretch": the constraint on the stretch is contradicted, or the stretch implausible;
+        - "contradiction": a piece of evidence contradicts the rest;
+        - "unit": depths or distances are in another unit, or keypoints are no pixels;
+        - "mask", "photo": it is left out, or agrees in part;
+        - "left-out": a view is, or a keypoint that was not found or given twice;
+        - "focal": the estimated focal length contradicts its prior;
+        - "alternative": another pose is likely, too.
+    text : str
+        A sentence for the user.
+    view : int, optional
+        Number of the view that it is about; None for all of them together.
+    keypoints : tuple of int
+        Rows, among the view's keypoints, of those that it is about; empty where it is about no few.
+
+    Examples
+    --------
+    >>> warning = EstimateWarning("left-out", "views[1] is left out", view=1)
+    >>> print(warning)
+    views[1] is left out
+    """
+
+    kind: Kind
+    text: str
+    view: int | None = None
+    keypoints: tuple[int, ...] = ()
+
+    def __str__(self) -> str:
+        return self.text
+
+    def __repr__(self) -> str:
+        return repr(self.text)
+
+
+Warnings = tuple[EstimateWarning, ...]
+
+MISFIT_KINDS: frozenset[Kind] = frozenset({"misfit", "outlier", "stretch", "camera", "mistake"})
+"""Kinds about keypoints that do not fit."""
+
 
 T = TypeVar("T")
 

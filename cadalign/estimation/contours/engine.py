@@ -32,11 +32,10 @@ from cadalign.estimation.contours.rounds import (
 from cadalign.estimation.contours.sources import MaskSource, PhotoSource, convex_hull
 from cadalign.estimation.model import is_exact_model
 from cadalign.estimation.problem import Problem
-from cadalign.estimation.result_parts import OutlineNotes
+from cadalign.estimation.result_parts import EstimateWarning, OutlineNotes
 from cadalign.estimation.search import Minimum
 from cadalign.estimation.uncertainty.residuals import chi_square_quantile
 from cadalign.estimation.view import View
-from cadalign.estimation.warning import EstimateWarning
 from cadalign.geometry.rotations import angle_between, rotation_from_vector
 from cadalign.io.images import ByteImage
 from cadalign.solvers.joint.covariance import information_of, scaled_information

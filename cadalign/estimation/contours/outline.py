@@ -1,4 +1,4 @@
-"""Outlines: surfaces whose rims are sought, measurements of them, their noise, and their sources."""
+"""Outlines: surfaces whose rims are sought, measurements of these, and their noise."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.estimation.contours.contour import Contour
 from cadalign.estimation.model import Model
-from cadalign.estimation.result_parts import EvidenceSummary
-from cadalign.estimation.warning import EstimateWarning
+from cadalign.estimation.result_parts import EstimateWarning, EvidenceSummary
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh, barycentric_of
 from cadalign.geometry.raycaster import RayCaster

@@ -10,9 +10,8 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.options import USUAL_STRETCH, FitOptions, RansacOptions, Sigma
-from cadalign.estimation.result_parts import Diagnosis, FittedKeypoints
+from cadalign.estimation.result_parts import Diagnosis, EstimateWarning, FittedKeypoints, Warnings
 from cadalign.estimation.uncertainty.residuals import chance_of
-from cadalign.estimation.warning import EstimateWarning, Warnings
 from cadalign.geometry.alignment import Alignment, Uncertainty, uncertainty_of
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PIXEL_CENTRE

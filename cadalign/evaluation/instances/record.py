@@ -16,7 +16,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.result import Result
-from cadalign.estimation.warning import Warnings
+from cadalign.estimation.result_parts import Warnings
 from cadalign.evaluation.methods import pose_of
 from cadalign.evaluation.runs.work import Columns, Outcome
 from cadalign.geometry.alignment import Alignment, Uncertainty

@@ -16,7 +16,7 @@ from support.scenes import turned
 
 from cadalign import Camera, Model, RansacOptions, Result, Size, View, align, fit
 from cadalign.estimation import align as align_module
-from cadalign.estimation.warning import EstimateWarning
+from cadalign.estimation.result_parts import EstimateWarning
 
 SEEDS = range(12)
 

@@ -8,8 +8,8 @@ import numpy as np
 from support.problems import problem_of
 
 from cadalign import Alignment, Camera, Model, Result, View, align, fit
+from cadalign.estimation.result_parts import Warnings
 from cadalign.estimation.uncertainty.doubts import another_pose
-from cadalign.estimation.warning import Warnings
 from cadalign.geometry.rotations import angle_between, rotation_from_vector
 
 CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)

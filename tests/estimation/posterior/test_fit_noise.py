@@ -23,7 +23,7 @@ from support.problems import (
 
 from cadalign import Alignment, Camera, Model, RansacOptions, View, align, fit
 from cadalign.errors import DegenerateError
-from cadalign.estimation.warning import MISFIT_KINDS
+from cadalign.estimation.result_parts import MISFIT_KINDS
 from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem, simulate_problem
 from cadalign.metrics import rotation_error
 

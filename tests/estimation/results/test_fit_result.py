@@ -15,11 +15,11 @@ from cadalign import Alignment, FocalPrior, Result
 from cadalign.errors import InputError
 from cadalign.estimation.result_parts import (
     Alternative,
+    EstimateWarning,
     FitStats,
     Posterior,
     ViewResult,
 )
-from cadalign.estimation.warning import EstimateWarning
 from cadalign.evaluation.simulation import SIMULATION_CAMERA
 
 COVARIANCE = np.diag([1e-4, 1e-4, 1e-4, 0.0004, 0.0009, 0.01, 0, 0.0001, 0.0225])

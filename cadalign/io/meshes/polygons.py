@@ -110,12 +110,15 @@ def _lines(data: bytes) -> Iterator[tuple[int, bytes]]:
 
     The keyword is followed by a blank.
     """
-    begun = b""
-    for number, line in enumerate(data.replace(b"\t", b" ").splitlines(), start=1):
-        line = begun + line.strip()
-        begun = line[:-1] + b" " if line[-1:] == b"\\" else b""
-        if line and not begun:
-            yield number, line
+    begun: list[bytes] = []
+    lines = [*data.replace(b"\t", b" ").splitlines(), b""]  # the last one may be cut off
+    for number, line in enumerate(lines, start=1):
+        line = line.strip()
+        if line[-1:] == b"\\":
+            begun.append(line[:-1])
+        elif line or begun:
+            yield number, b" ".join([*begun, line])
+            begun.clear()
 
 
 @lru_cache(maxsize=2**16)  # each is named by several faces

@@ -13,13 +13,12 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from msgspec import Meta
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import BoolArray, FloatArray, is_number
 from cadalign.datasets.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
 from cadalign.datasets.records import leaving_out
 from cadalign.errors import DataError, InputError, quote
@@ -32,7 +31,7 @@ _FIX = "is it COCO's keypoint JSON, or a detector's? see cadalign's page on keyp
 _Id = int | str
 _Reader = tuple[str, Callable[[], ImageKeypoints | None]]
 """The place of an object in its file, and what reads it."""
-_Side = Annotated[int, Meta(ge=1, le=2**31)]
+_LARGEST = 2**31  # width or height of an image
 
 
 class _ByAxis(ForeignDocument):
@@ -48,27 +47,31 @@ class _Object(ForeignDocument):
 
     keypoints: list[Any] | _ByAxis | None = None
     keypoint_scores: list[float | None] | None = None
-    score: Finite | None = None
-    bbox_score: Finite | None = None
-    confidence: Finite | None = None
+    score: Any = None
+    bbox_score: Any = None
+    confidence: Any = None
     image_id: _Id | None = None
     category_id: _Id | None = None
-    num_keypoints: int | None = None
+    num_keypoints: Any = None
     segmentation: Any = None
 
 
 class _Image(ForeignDocument):
     id: _Id
     file_name: Text | None = None
-    width: _Side | None = None
-    height: _Side | None = None
+    width: Any = None
+    height: Any = None
 
     @property
     def size(self) -> tuple[int, int] | None:
-        """Width and height; None where either is missing."""
-        if self.width is None or self.height is None:
+        """Width and height; None where either is missing or is none."""
+        given = (self.width, self.height)
+        if given == (None, None):
             return None
-        return self.width, self.height
+        if all(is_number(each) and 1 <= each <= _LARGEST for each in given):
+            return int(self.width), int(self.height)
+        logger.warning("images: %s x %s is not a size; left out", *map(quote, given))
+        return None
 
 
 class _Category(ForeignDocument):
@@ -176,7 +179,7 @@ def _image_keypoints(entry: _Object, where: str, *, names: list[str] | None) -> 
         raise DataError(what, where=place)
     if third is not None and len(third) != len(points):
         raise DataError(f"{len(third)} scores of {len(points)} keypoints", where=place)
-    given = (entry.score, entry.bbox_score, entry.confidence)
+    given = (_number(entry, name, where) for name in ("score", "bbox_score", "confidence"))
     return ImageKeypoints(
         points_2d=points,
         scores=None if third is None else np.array(third, dtype=float),
@@ -232,6 +235,15 @@ def _with_flags_read(found: ImageKeypoints) -> ImageKeypoints:
     if found.scores is None:
         return found
     return replace(found, scores=np.choose(found.scores.astype(int), list(VISIBILITY_SCORES)))
+
+
+def _number(entry: _Object, name: str, where: str) -> float | None:
+    """A number that an object can do without; what is none is warned of and left out."""
+    value = getattr(entry, name)
+    if value is None or is_number(value):
+        return None if value is None else float(value)
+    logger.warning("%s.%s: %s is not a number; left out", where, name, quote(value))
+    return None
 
 
 # Masks ------------------------------------------------------------------------------------------

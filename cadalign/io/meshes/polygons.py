@@ -73,7 +73,7 @@ def read_obj(data: bytes, path: Path) -> Mesh:
         raise DataError(what, fix="is it an OBJ file, and whole?")
     if not vertices:
         raise damaged(f"{len(sizes)} faces, but no vertices")
-    named = np.array(corners, dtype=np.int64)
+    named = np.fromiter(chain.from_iterable(corners), np.int64, 2 * len(corners)).reshape(-1, 2)
     indices = np.where(named < 0, np.repeat(before, sizes, axis=0) + named, named - 1)
     has_uv = named[:, 1] != 0
     for kind, name, count, used in (
@@ -110,15 +110,13 @@ def _lines(data: bytes) -> Iterator[tuple[int, bytes]]:
 
     The keyword is followed by a blank.
     """
-    begun: list[bytes] = []
-    lines = [*data.replace(b"\t", b" ").splitlines(), b""]  # the last one may be cut off
-    for number, line in enumerate(lines, start=1):
+    number = 0
+    text = (data + b"\n").replace(b"\t", b" ").replace(b"\r\n", b"\n").replace(b"\\\n", b" \v")
+    for line in text.splitlines():
+        number += 1 + line.count(b"\v")
         line = line.strip()
-        if line[-1:] == b"\\":
-            begun.append(line[:-1])
-        elif line or begun:
-            yield number, b" ".join([*begun, line])
-            begun.clear()
+        if line:
+            yield number, line
 
 
 @lru_cache(maxsize=2**16)  # each is named by several faces

@@ -184,12 +184,11 @@ def test_objects_of_a_detector_that_cannot_be_read_fail_alone(
         {"keypoints": [1.0, 2.0, -0.5] * 8},
         {"keypoints": [1.0, "12.5", 0.5] * 8},
         {"image_id": 7},
-        {"score": "high"},
     ]
-    source = coco(tmp_path / "found.json", {}, *bad, {"category_id": 5})
+    source = coco(tmp_path / "found.json", {}, *bad, {"category_id": 5}, {"score": "high"})
     rows = detected(tmp_path, source)
-    assert [row["status"] for row in rows] == ["ok", "ok", *["failed"] * len(bad)]
-    assert rows[2]["reason"].startswith(f"{source}: annotations[1]: keypoints: keypoint 0 is at ")
+    assert [row["status"] for row in rows] == ["ok"] * 3 + ["failed"] * len(bad)
+    assert rows[3]["reason"].startswith(f"{source}: annotations[1]: keypoints: keypoint 0 is at ")
     assert "failed 1: " in capsys.readouterr().err
 
 

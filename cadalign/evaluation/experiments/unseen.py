@@ -217,12 +217,7 @@ def learn(
         file = place / f"{category}.shape"
         if not file.is_file():
             logger.info("learning the shape of %s from %d models", category, len(train[category]))
-            try:
-                shape = ShapeModel.from_dataset(dataset, category, split=split, meshes=False)
-            except InputError as error:
-                where = f"{category}, split {split}"
-                raise InputError(error.what, where=where, fix=error.fix) from None
-            shape.save(file)
+            ShapeModel.from_dataset(dataset, category, split=split, meshes=False).save(file)
     if not (place / "library.cadalign").is_file():
         library.save(place / "library.cadalign")
     return LearnedFiles(place.absolute())

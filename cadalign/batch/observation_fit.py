@@ -313,10 +313,10 @@ def views_of(
     return tuple(views)
 
 
-def photo_doubt(image: ObservedImage) -> str | None:
-    """Doubt about the size of an image's photo; None where there is none to be read."""
+def photo_doubt(image: ObservedImage) -> str:
+    """Doubt about the size of an image's photo; empty where there is none to be read."""
     if image.image is None:
-        return None
+        return ""
     with suppress(DataError):
         size = photo_size(image.image)
         known = {"its camera": (image.camera.width, image.camera.height), image.image.name: size}
@@ -324,8 +324,7 @@ def photo_doubt(image: ObservedImage) -> str | None:
             require_one_size(known, image.image)
         except DataError as error:
             return f"{error} (`Camera.resized`, `Camera.cropped`)"
-        return ""
-    return None
+    return ""
 
 
 def shape_ids(image: ObservedImage, shape: ShapeModel) -> tuple[KeypointId, ...]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from cadalign.batch.runs import Estimated, FitRunOptions
 from cadalign.batch.spec import SPEC as FIT_SPEC
@@ -40,9 +40,6 @@ class RetrieveRunOptions(FitRunOptions):
 
     def keypoints(self) -> ModelKeypoints:
         return self.estimate.opened()[0].keypoints
-
-    def read(self, data: Any, where: str, *, folder: Path) -> Observation:
-        return self.estimate.read(data, where, folder=folder, changes=self.changes)
 
     def estimate_of(self, seen: Observation, where: str) -> Estimated:
         seen = self.estimate.with_ids(seen, where)

@@ -181,9 +181,7 @@ class PosedScene:
     def _weights(self, rays: FloatArray, face: FaceArray, depth: FloatArray) -> LinearArray:
         """Barycentric coordinates of hits, (n, 3)."""
         points = self._origin + self._directions(rays) * depth[:, None]
-        with np.errstate(divide="ignore", invalid="ignore"):  # triangles without area
-            triangles = self.scene.triangles[face]
-            weights = barycentric_of(triangles, points)
+        weights = barycentric_of(self.scene.triangles[face], points)
         # The float32 caster may hit a triangle a hair outside of it.
         return np.asarray(np.clip(np.nan_to_num(weights), 0, 1), dtype=np.float32)
 

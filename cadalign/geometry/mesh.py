@@ -276,11 +276,15 @@ def spread_colors(mesh: Mesh, palette: FloatArray | None = None) -> FloatArray:
 
 
 def barycentric_of(triangles: FloatArray, points: FloatArray) -> FloatArray:
-    """Barycentric coordinates (n, 3) of points (n, 3) in triangles (n, 3, 3)."""
+    """Barycentric coordinates (n, 3) of points (n, 3) in triangles (n, 3, 3).
+
+    They are not finite where a triangle has no area.
+    """
     edges, offsets = triangles[:, 1:] - triangles[:, :1], points - triangles[:, 0]
     a, b = np.einsum("nik,nk->in", edges, offsets)
     (aa, ab), (_, bb) = np.einsum("nik,njk->ijn", edges, edges)
-    later = np.stack([bb * a - ab * b, aa * b - ab * a]) / (aa * bb - ab * ab)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        later = np.stack([bb * a - ab * b, aa * b - ab * a]) / (aa * bb - ab * ab)
     return np.column_stack([1 - later.sum(axis=0), *later])
 
 

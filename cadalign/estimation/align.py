@@ -144,8 +144,8 @@ def align(
         return _estimate(compile_problem(model, views, size, some, own, ransac), start)
 
     seen = [given[number] for number in problem.numbers]
-    case = DiagnosisCase(model, seen, again, ransac, size)
-    case = replace(case, photo=given[0].photo, is_tolerant=loss != FitOptions.loss)
+    photo, is_tolerant = given[0].photo, loss != FitOptions.loss
+    case = DiagnosisCase(model, seen, again, ransac, size, photo=photo, is_tolerant=is_tolerant)
     try:
         result = _estimate(problem, start)
     except (NoConsensusError, DegenerateError) as error:

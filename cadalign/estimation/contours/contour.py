@@ -274,8 +274,7 @@ def find_rims(sight: Sight, contour: Contour, reach: float) -> Rims:
     count = len(contour.points)
     intervals = 2 * min(int(np.ceil(reach / _LONGEST_STEP)), _MOST_STEPS)
     steps = np.linspace(-reach, reach, intervals + 1)
-    places = np.repeat(steps[:, None], count, axis=1)
-    first, found = _nearest_exits(sight.covers(contour.at(places)), steps)
+    first, found = _rim_intervals(sight, contour, steps)
     rows = np.flatnonzero(found)
     some = contour.taken(rows)
     inner, outer = steps[first[rows]], steps[first[rows] + 1]
@@ -293,6 +292,26 @@ def find_rims(sight: Sight, contour: Contour, reach: float) -> Rims:
     surface[rows] = points[hit]
     faces[rows] = face[hit]
     return Rims(found, offset, surface, faces)
+
+
+def _rim_intervals(
+    sight: Sight, contour: Contour, steps: FloatArray
+) -> tuple[IntArray, BoolArray]:
+    """`_nearest_exits` of the object at steps along normals; most rims are beside the contour."""
+    middle = len(steps) // 2
+    near = slice(middle - 1, middle + 2)
+    first, found = _nearest_exits(_covered_steps(sight, contour, steps[near]), steps[near])
+    first += near.start
+    rest = np.flatnonzero(~found)
+    if len(rest) and len(steps) > 3:
+        covered = _covered_steps(sight, contour.taken(rest), steps)
+        first[rest], found[rest] = _nearest_exits(covered, steps)
+    return first, found
+
+
+def _covered_steps(sight: Sight, contour: Contour, steps: FloatArray) -> BoolArray:
+    """Tell where the object is seen, (steps, S), at steps along the normals of samples."""
+    return sight.covers(contour.at(np.repeat(steps[:, None], len(contour.points), axis=1)))
 
 
 def without_steep(contour: Contour, rims: Rims, bias: FloatArray | float = 0.0) -> Rims:

@@ -46,7 +46,7 @@ Source = MaskSource | PhotoSource
 """A mask or a photo of a view."""
 _OWN_MODES = 3
 """Unknowns of a contour: its offset outwards, its registration along x and along y."""
-_MOST_ROUNDS = 16
+_MOST_ROUNDS, _MOST_LAST_ROUNDS = 16, 8  # the last ones begin at an estimate
 _ITERATIONS = 4  # of a round, whose rims are not those of its end
 _LEAST_GAIN = 2.0  # of the objective, -2 log likelihood, in a round
 _LEAST_FREEDOM = 0.1  # share of the residuals' degrees of freedom that the unknowns leave
@@ -225,22 +225,23 @@ def first_fit(
     with_own = evidence._replace(shape=shape._replace(modes=modes))
     start = state._replace(coefficients=np.append(state.coefficients, own))
     problem = OutlineProblem(with_own, keypoints, sources, surface)
-    return _approached(problem, start, [source.first() for source in sources])
+    return _approached(problem, start, [source.first() for source in sources], _MOST_ROUNDS)
 
 
 def last_fit(fit: OutlineFit) -> OutlineFit | None:
     """The end near another estimate; None without an outline."""
     begun = zip(fit.problem.sources, fit.tracks, strict=True)
-    end = _approached(fit.problem, fit.state, [source.last(track) for source, track in begun])
+    tracks = [source.last(track) for source, track in begun]
+    end = _approached(fit.problem, fit.state, tracks, _MOST_LAST_ROUNDS)
     return None if end is None else _with_wider_noise(end)
 
 
 def _approached(
-    problem: OutlineProblem, state: State, tracks: Sequence[Track]
+    problem: OutlineProblem, state: State, tracks: Sequence[Track], rounds: int
 ) -> OutlineFit | None:
-    """The last of the rounds, at the last level where noise and objective stay."""
+    """The last of at most so many rounds, at the last level where noise and objective stay."""
     fit: OutlineFit | None = None
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(rounds):
         posed = problem.surface.at(problem.evidence.shape, state)
         sights, offsets = problem.sights(state, posed), problem.offsets(state, tracks)
         outlines = [

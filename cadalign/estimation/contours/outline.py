@@ -164,7 +164,7 @@ INLIER = 3.5
 _TO_SIGMA = 1.4826  # from the median of absolute values to the standard deviation of a Gaussian
 _MOST_LAGS = 100
 _LEAST_PAIRS = 20
-_ALIKE = 0.2  # change of a variance's logarithm
+_ALIKE, _ALIKE_OFFSETS = 0.2, 0.8  # changes of logarithms of variances
 
 
 class Noise(NamedTuple):
@@ -300,10 +300,10 @@ class Track(NamedTuple):
     is_fine: bool = False
 
     def is_like(self, other: Track) -> bool:
-        """True if samples weigh about the same."""
+        """True if samples weigh about the same, and the prior of their common offset."""
         one, two = self.noise, other.noise
-        ratios = one.deviation / two.deviation, one.offset / two.offset
-        return bool(2 * np.abs(np.log(ratios)).max() < _ALIKE)
+        changes = 2 * np.log([one.deviation / two.deviation, one.offset / two.offset])
+        return bool((np.abs(changes) < (_ALIKE, _ALIKE_OFFSETS)).all())
 
     @property
     def next(self) -> Track:

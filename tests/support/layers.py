@@ -12,5 +12,4 @@ def layers() -> list[str]:
     """Packages and modules in the order of the README's list, such as ``solvers``, ``errors``."""
     text = README.read_text(encoding="utf-8")
     found = re.search(r"## How it is built\n\n```\n(.*?)```", text, re.S)
-    names = [re.split(r"/|\.py| ", line.strip())[0] for line in found[1].splitlines()]
-    return [name for name in names if name != "cadalign"]
+    return [name for line in found[1].splitlines() for name in line.split("   ")[0].split()]

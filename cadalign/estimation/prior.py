@@ -6,7 +6,7 @@ import math
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -103,18 +103,9 @@ def _of_category(model: ShapeModel) -> ShapePrior:
     weights = tuple(component.weight for component in model.components)
     up = axis_vector(model.up_axis)
     held = ScalePriors(np.zeros(3), np.zeros((3, 3)), _NO_BOUND)
-    return ShapePrior(
-        model.ids,
-        shapes,
-        weights,
-        held,
-        up,
-        inflation=model.inflation,
-        degrees_of_freedom=model.degrees_of_freedom,
-        has_box=model.has_box,
-        box_margins=model.box_margins,
-        few_keypoints=model.few_keypoints,
-    )
+    names = ("inflation", "degrees_of_freedom", "has_box", "box_margins", "few_keypoints")
+    own: dict[str, Any] = {name: getattr(model, name) for name in names}
+    return ShapePrior(model.ids, shapes, weights, held, up, **own)
 
 
 def axis_vector(axis: str | None) -> FloatArray | None:

@@ -74,10 +74,6 @@ class Problem(NamedTuple):
         return any(view.has_outline for view in self.views)
 
     @property
-    def pose_count(self) -> int:
-        return 1 if self.is_rig else len(self.numbers)
-
-    @property
     def is_mask_alone(self) -> bool:
         """True if the mask of the only view is all evidence of the pose of a model with a mesh."""
         if len(self.views) > 1 or any(self.inits) or not is_exact_model(self.model):

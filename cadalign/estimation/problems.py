@@ -28,8 +28,6 @@ T = TypeVar("T")
 
 _SAME_DIGITS = 6  # decimals of keypoints that are the same
 _MOST_COMPARED = 64  # keypoints: one of more that counts twice changes little
-_NO_RESIDUALS = np.empty((0, 2))
-_NO_ERRORS: Mapping[int, CadalignError] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,8 +195,8 @@ class Solutions(NamedTuple):
     covariances: FloatArray | None
     statuses: IntArray
     info: IntArray
-    residuals: FloatArray = _NO_RESIDUALS
-    errors: Mapping[int, CadalignError] = _NO_ERRORS
+    residuals: FloatArray = np.empty((0, 2))
+    errors: Mapping[int, CadalignError] = MappingProxyType({})
 
 
 def solver_error(

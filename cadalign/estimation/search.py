@@ -228,7 +228,7 @@ def search(problem: Problem, starts: Sequence[Inits]) -> SearchResult:
     """
     if problem.lacks_sigma:
         counts = [len(view.keypoint_ids) for view in problem.views if view.sigma is None]
-        if 2 * sum(counts) <= 6 * problem.pose_count:
+        if sum(counts) <= 3 * (1 if problem.is_rig else len(problem.numbers)):
             raise no_redundancy_error(sum(counts))
     minima: list[Minimum] = []
     effort = np.zeros(2, dtype=int)

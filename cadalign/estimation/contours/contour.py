@@ -294,24 +294,18 @@ def find_rims(sight: Sight, contour: Contour, reach: float) -> Rims:
     return Rims(found, offset, surface, faces)
 
 
-def _rim_intervals(
-    sight: Sight, contour: Contour, steps: FloatArray
-) -> tuple[IntArray, BoolArray]:
+def _rim_intervals(sight: Sight, contour: Contour, steps: FloatArray) -> tuple[IntArray, BoolArray]:
     """`_nearest_exits` of the object at steps along normals; most rims are beside the contour."""
-    middle = len(steps) // 2
-    near = slice(middle - 1, middle + 2)
-    first, found = _nearest_exits(_covered_steps(sight, contour, steps[near]), steps[near])
-    first += near.start
-    rest = np.flatnonzero(~found)
-    if len(rest) and len(steps) > 3:
-        covered = _covered_steps(sight, contour.taken(rest), steps)
-        first[rest], found[rest] = _nearest_exits(covered, steps)
+
+    def exits(some: Contour, places: FloatArray) -> tuple[IntArray, BoolArray]:
+        along = np.repeat(places[:, None], len(some.points), axis=1)
+        return _nearest_exits(sight.covers(some.at(along)), places)
+
+    near = len(steps) // 2 - 1
+    first, found = exits(contour, steps[near : near + 3])
+    first, rest = first + near, np.flatnonzero(~found)
+    first[rest], found[rest] = exits(contour.taken(rest), steps)
     return first, found
-
-
-def _covered_steps(sight: Sight, contour: Contour, steps: FloatArray) -> BoolArray:
-    """Tell where the object is seen, (steps, S), at steps along the normals of samples."""
-    return sight.covers(contour.at(np.repeat(steps[:, None], len(contour.points), axis=1)))
 
 
 def without_steep(contour: Contour, rims: Rims, bias: FloatArray | float = 0.0) -> Rims:

@@ -45,8 +45,8 @@ format: $(VENV)/.installed-dev  ## format the code
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-docs: $(VENV)/.installed-dev  ## build the documentation site in docs/_build, its tutorials executed
-	MPLBACKEND=agg $(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build
+docs: $(VENV)/.installed-dev  ## build the documentation site in docs/_build
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build
 	! grep -E '(src|href)="(https?:)?//[^"]+\.(js|css|woff2?)"' docs/_build/index.html
 
 web:  ## bundle the scripts of the report and the annotator anew (needs Node)

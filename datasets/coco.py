@@ -1,6 +1,6 @@
 """COCO: keypoints in images, read from its JSON and what detectors make of it; masks.
 
-The forms that are read are described in docs/formats/detections.md.
+The forms that are read are described in docs/how_to/detectors.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Files of keypoints in images: JSON in COCO's forms, or CSV; see docs/formats/detections.md."""
+"""Files of keypoints in images: JSON in COCO's forms, or CSV; see docs/how_to/detectors.md."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def read_image_keypoints(
     Parameters
     ----------
     path : str or path-like
-        A .csv or JSON file as described in docs/formats/detections.md.
+        A .csv or JSON file as described in docs/how_to/detectors.md.
     problems : dict of str to DataError, optional
         Gets the reasons why objects of COCO's JSON and CSV could not be read, by their places;
         without it, and where none could be read, the first is raised.

@@ -1,6 +1,6 @@
 """A model's keypoints with their names, as a file beside the model: `chair.keypoints.json`.
 
-The file is described in docs/formats/model_keypoints.md.
+The file is described in docs/formats/files.md.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ class ModelKeypoints:
         Parameters
         ----------
         path : str or path-like
-            A file as described in docs/formats/model_keypoints.md; or a mesh, beside which such a
+            A file as described in docs/formats/files.md; or a mesh, beside which such a
             file lies.
 
         Raises

@@ -19,10 +19,9 @@ extensions = [
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
     "sphinx_design",
-    "sphinx_gallery.gen_gallery",
     "directives",
 ]
-exclude_patterns = ["_build", "tutorials/*.md", "tutorials/*.rst", "sg_execution_times.rst"]
+exclude_patterns = ["_build"]
 suppress_warnings = ["myst.xref_missing", "config.cache"]
 
 myst_enable_extensions = ["colon_fence", "deflist"]
@@ -34,20 +33,6 @@ autodoc_class_signature = "mixed"
 napoleon_google_docstring = False
 napoleon_use_rtype = False
 default_role = "code"
-
-sphinx_gallery_conf = {
-    "examples_dirs": "tutorials",
-    "gallery_dirs": "auto_tutorials",
-    "filename_pattern": r".*\.py",
-    "within_subsection_order": "FileNameSortKey",
-    "abort_on_example_error": True,
-    "download_all_examples": False,
-    "show_memory": False,
-    "min_reported_time": 1e9,
-    "remove_config_comments": True,
-    "image_scrapers": ("matplotlib",),
-    "reset_modules": (),
-}
 
 html_show_copyright = False
 html_theme = "furo"

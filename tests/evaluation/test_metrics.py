@@ -184,8 +184,8 @@ def test_sets_of_metrics_have_columns_of_their_own() -> None:
 
 @pytest.mark.long
 def test_the_how_to_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    page = Path(__file__).parents[2] / "docs" / "how_to" / "own_metric.md"
-    (block,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.S)
+    page = Path(__file__).parents[2] / "docs" / "how_to" / "own_method.md"
+    _, block = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.S)
     monkeypatch.chdir(tmp_path)
     space: dict[str, Any] = {}
     exec(block, space)

@@ -34,7 +34,7 @@ from cadalign import (
 from cadalign.metrics import rotation_error
 
 FILE = Path(__file__).with_name("refusals.json")
-PAGE = Path(__file__).parents[3] / "docs" / "how_to" / "combinations.md"
+PAGE = Path(__file__).parents[3] / "docs" / "how_to" / "what_to_ask.md"
 
 # --- keypoints of one view ------------------------------------------------------------------------
 

@@ -15,6 +15,8 @@ from support.layers import layers as listed
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "cadalign"
+PUBLISHED = {"_asdict", "_exit", "_fields", "_make", "_replace", "_typeshed"}
+"""Names with an underscore that their documentation has."""
 
 
 @cache
@@ -151,3 +153,25 @@ def test_no_circle_of_imports_is_larger_than_two_modules() -> None:
     sources = {name_of(path): path.read_text(encoding="utf-8") for path in modules()}
     graph = {name: imported_by(source, set(sources)) for name, source in sources.items()}
     assert [circle for circle in circles(graph) if len(circle) > 2] == []
+
+
+def private_names(tree: ast.AST, own: set[str]) -> set[str]:
+    """Names with an underscore that code takes from others than the package."""
+    taken = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and not (node.module or "").startswith("cadalign"):
+            taken.update([*(node.module or "").split("."), *(alias.name for alias in node.names)])
+    private = {name for name in taken if name.startswith("_") and not name.startswith("__")}
+    return private - own - PUBLISHED
+
+
+def test_private_names_of_libraries_stand_in_one_module() -> None:
+    sources = {path: ast.parse(path.read_text(encoding="utf-8")) for path in modules()}
+    own: set[str] = set()
+    for node in (node for tree in sources.values() for node in ast.walk(tree)):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            own.add(node.name)
+        elif isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store):
+            own.add(node.id if isinstance(node, ast.Name) else node.attr)
+    found = {name_of(path): private_names(tree, own) for path, tree in sources.items()}
+    assert [name for name, private in found.items() if private] == ["cadalign.compile.once"]

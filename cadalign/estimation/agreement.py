@@ -21,7 +21,7 @@ from cadalign.estimation.uncertainty.residuals import (
     f_quantile,
     named_keypoints,
 )
-from cadalign.estimation.view import View, numbered
+from cadalign.estimation.view import View, number_views
 from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import inflation_with
@@ -162,7 +162,7 @@ class DiagnosisCase:
             if rule is not None:
                 undone = map(rule.undo_view, views)
                 views = [each for each in undone if each is not None and each.has_evidence]
-            views = numbered(views)
+            views = number_views(views)
             result = self.again(model, views, **changes)
             return replace(self, model=model, views=views).agreement(result)
         except CadalignError:
@@ -329,7 +329,7 @@ def warning_of(
     wrong, view, keypoints = "", None, tuple[int, ...]()
     if rule.kind in ("outlier", "misfit"):
         wrong, view, keypoints = _wrong_keypoints(case, best, all_agree=rule.kind == "misfit")
-    words = {"named": clauses, "compared": _compared(best, given), "scale": scale, "wrong": wrong}
+    words = {"named": clauses, "compared": _comparison(best, given), "scale": scale, "wrong": wrong}
     words |= {"posture": posture, "asked": asked, "do": "does" if len(keypoints) == 1 else "do"}
     text = _TEXTS[rule.kind].format(best=best, given=given, **words)
     return EstimateWarning(rule.kind, text, 0 if rule.kind == "camera" else view, keypoints)
@@ -372,7 +372,7 @@ def named(likely: Sequence[tuple[Rule, Agreement]]) -> str:
     return clauses
 
 
-def _compared(best: Agreement, given: Agreement) -> str:
+def _comparison(best: Agreement, given: Agreement) -> str:
     rejected = given.keypoints - given.inliers
     if rejected:
         share = f"{rejected} ({100 * rejected / given.keypoints:.0f} %)"

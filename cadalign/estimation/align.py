@@ -22,9 +22,9 @@ from cadalign.errors import (
 )
 from cadalign.estimation.agreement import DiagnosisCase
 from cadalign.estimation.diagnose import diagnose, diagnose_refusal
-from cadalign.estimation.estimates import as_given, single_posterior
+from cadalign.estimation.estimates import single_posterior, undo_turns
 from cadalign.estimation.fit import fit_one
-from cadalign.estimation.joint import result_of, result_of_minima, with_cause
+from cadalign.estimation.joint import add_diagnosis, result_of, result_of_minima
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.pack import seen_keypoints
@@ -35,7 +35,7 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import LEAST_LIKELIHOOD, NO_NOTES, FitStats
 from cadalign.estimation.results import Results
 from cadalign.estimation.search import search, widened_by_noise
-from cadalign.estimation.view import View, numbered
+from cadalign.estimation.view import View, number_views
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import turned_alignment
 from cadalign.io.evidence import Size
@@ -120,7 +120,7 @@ def align(
     ((8, 3), 0.19)
     """
     start = time.perf_counter()
-    given = numbered(_checked_views(views))
+    given = number_views(_checked_views(views))
     if size is not None:
         require_kind(size, Size, "size")
     inits = _checked_inits(init, given)
@@ -152,7 +152,7 @@ def align(
         named = diagnose_refusal(case, with_keypoints=isinstance(error, NoConsensusError))
         error.fix = named or error.fix
         raise
-    return with_cause(result, partial(diagnose, case, result=result), problem.views, ransac)
+    return add_diagnosis(result, partial(diagnose, case, result=result), problem.views, ransac)
 
 
 def _estimate(problem: Problem, start: float) -> Result:
@@ -217,7 +217,7 @@ def _align_single(problem: Problem, start: float) -> Result:
     weights, means, covariances = model.gaussians
     mixture = Mixture(means, covariances, -2 * np.log(weights))
     seen = seen_keypoints(view, view.pixels, rows, options)
-    minima, hypotheses = search_view(mixture, seen, _given(init))
+    minima, hypotheses = search_view(mixture, seen, _start_of(init))
     count, iterations = minima.counts.tolist()
     if not count:
         raise no_pose_error(problem)
@@ -237,7 +237,7 @@ def _align_single(problem: Problem, start: float) -> Result:
 
     return result_of(
         problem,
-        [as_given(each, problem) for each in estimates],
+        [undo_turns(each, problem) for each in estimates],
         inliers=[np.ones(len(rows), dtype=bool)],
         is_curved=bool(covariances.any()),
         redundancy=2 * len(rows) - POSE_UNKNOWNS,
@@ -249,7 +249,7 @@ def _align_single(problem: Problem, start: float) -> Result:
     )
 
 
-def _given(init: Alignment | None) -> FloatArray:
+def _start_of(init: Alignment | None) -> FloatArray:
     if init is None:
         return np.empty((0, 12))
     return np.append(init.rotation, init.translation / init.scale.mean())[None]

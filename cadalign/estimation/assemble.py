@@ -114,13 +114,17 @@ def _canonical(
     fitted: FittedKeypoints, points: FloatArray, symmetry: Symmetry
 ) -> tuple[FittedKeypoints, FloatArray]:
     """Keypoints as the canonical one of equal alignments has them, and so points (m, 3)."""
-    from cadalign.estimation.symmetry import carried, distinct_ones, held_axes  # few have one
+    from cadalign.estimation.symmetry import (  # few have one
+        distinct_ones,
+        held_axes,
+        transform_covariance,
+    )
 
     held, covariance = held_axes(fitted.options.stretched_axes), fitted.fisher_covariance
     poses = [fitted.alignment, *(each.alignment for each in fitted.alternatives)]
     (_, best), *others = distinct_ones(poses, covariance, symmetry, held)
     if covariance is not None:
-        covariance = carried(covariance, fitted.alignment, best, held)
+        covariance = transform_covariance(covariance, fitted.alignment, best, held)
     alternatives = tuple(
         replace(each, alignment=equal.alignment, points_3d=equal.relabelled(each.points_3d))
         for k, equal in others

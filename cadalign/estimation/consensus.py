@@ -155,7 +155,7 @@ def _fit_to_inliers(search: RobustSearch, start: float) -> FittedKeypoints:
     points, camera = problems.points_3d, problems.camera
     found = FittedKeypoints(points, residuals, inliers, alignment, camera, options)
     if ransac.refine:
-        found = _refined(search, inliers)
+        found = _refine(search, inliers)
     return replace(
         found,
         method=f"ransac-{found.method if ransac.refine else ransac.minimal}",
@@ -165,7 +165,7 @@ def _fit_to_inliers(search: RobustSearch, start: float) -> FittedKeypoints:
     )
 
 
-def _refined(search: RobustSearch, inliers: BoolArray) -> FittedKeypoints:
+def _refine(search: RobustSearch, inliers: BoolArray) -> FittedKeypoints:
     """The optimum of the inliers (n,), until these don't change; CadalignError if there is none."""
     problems, sigma = search.problems, search.options.sigma
     points, pixels = problems.points_3d, problems.points_2d

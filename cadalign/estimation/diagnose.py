@@ -64,9 +64,9 @@ def diagnose(case: DiagnosisCase, *, result: Result | None = None) -> EstimateWa
         return None
     given = None if result is None else case.agreement(result)
     if given is not None and not (case.is_doubtful(given) or _contradicts(case, given)):
-        return _of_another_size(case, given)
+        return _size_warning(case, given)
     if given is None or any(view.has_outline for view in case.views):
-        case = replace(case, views=_without_outlines(case.views))
+        case = replace(case, views=_remove_outlines(case.views))
         given = case.without(None)
     if given is None or not case.is_doubtful(given):
         return None
@@ -95,7 +95,7 @@ def _likeliest(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
     return warning_of(case, rule, best, given, clauses=named(likely))
 
 
-def _without_outlines(views: Sequence[View]) -> tuple[View, ...]:
+def _remove_outlines(views: Sequence[View]) -> tuple[View, ...]:
     given = [
         replace(view, mask=None, mask_sigma=None, image=None) if view.has_outline else view
         for view in views
@@ -103,7 +103,7 @@ def _without_outlines(views: Sequence[View]) -> tuple[View, ...]:
     return tuple(view for view in given if view.has_evidence)
 
 
-def _of_another_size(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
+def _size_warning(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
     """The warning about measured lengths that make the object larger than any of its kind."""
     size = float(np.exp(np.log(given.result.alignment.scale).mean()))
     fields = listed([f"`{name}`" for name in _measures_of(case)] or [""])
@@ -144,7 +144,7 @@ def diagnose_fit(
 @np.errstate(all="ignore")
 def diagnose_refusal(case: DiagnosisCase, *, with_keypoints: bool = True) -> str | None:
     """Name the mistake (in keypoints if ``with_keypoints``) without which there is an estimate."""
-    shown = replace(case, views=_without_outlines(case.views))
+    shown = replace(case, views=_remove_outlines(case.views))
     if not shown.views:
         return None
     found = [
@@ -189,20 +189,20 @@ def case_of_fit(
 # Undone ------------------------------------------------------------------------------------------
 
 
-def _mirrored(model: Model) -> Model:
+def _mirror(model: Model) -> Model:
     mirror = np.array([-1.0, 1.0, 1.0])
     bounds = np.sort(cast(FloatArray, model.bounds) * mirror, axis=0)
     points = cast(FloatArray, model.points_3d) * mirror
     return replace(model, points_3d=points, bounds=bounds, symmetry=None)
 
 
-def _flipped(view: View, *, axis: int) -> View:
+def _flip(view: View, *, axis: int) -> View:
     pixels = view.pixels.copy()
     pixels[:, axis] = (view.camera.width, view.camera.height)[axis] - 1.0 - pixels[:, axis]
     return replace(view, points_2d=pixels)
 
 
-def _resized(view: View, *, size: tuple[int, int], noise: float) -> View:
+def _resize(view: View, *, size: tuple[int, int], noise: float) -> View:
     """The view of images of another size, with keypoints whose noise is larger by a factor."""
     sigma, power = view.sigma, 2 if np.ndim(cast(FloatArray, view.sigma)) == 3 else 1
     if sigma is not None:
@@ -210,7 +210,7 @@ def _resized(view: View, *, size: tuple[int, int], noise: float) -> View:
     return replace(view, camera=view.camera.resized(*size), sigma=sigma)
 
 
-def _measured(view: View, *, name: str, factor: float) -> View:
+def _scale_measure(view: View, *, name: str, factor: float) -> View:
     value = getattr(view, name, None)
     if value is None:
         return view
@@ -220,13 +220,13 @@ def _measured(view: View, *, name: str, factor: float) -> View:
     return replace(view, **changed)
 
 
-def _remeasured(size: Size, factor: float) -> Size:
+def _scale_size(size: Size, factor: float) -> Size:
     lengths = {name: getattr(size, name) for name in LENGTHS}
     scaled = {name: each and each * factor for name, each in lengths.items()}
     return Size(**scaled, sigma=size.sigma)
 
 
-def _without_rows(view: View, *, number: int, rows: tuple[int, ...]) -> View:
+def _remove_rows(view: View, *, number: int, rows: tuple[int, ...]) -> View:
     if view.number != number:
         return view
     kept = np.delete(np.arange(len(view.pixels)), rows)
@@ -236,7 +236,7 @@ def _without_rows(view: View, *, number: int, rows: tuple[int, ...]) -> View:
     return replace(view, points_2d=view.pixels[kept], ids=ids, **some)
 
 
-def _left_out(view: View, *, number: int, name: str | None) -> View | None:
+def _remove_field(view: View, *, number: int, name: str | None) -> View | None:
     """The view without a field, or None for the whole view, if it has the number."""
     if view.number != number:
         return view
@@ -246,14 +246,14 @@ def _left_out(view: View, *, number: int, name: str | None) -> View | None:
 
 # Rules -------------------------------------------------------------------------------------------
 
-MIRRORED = Rule("mistake", "the model is mirrored", undo_model=_mirrored)
+MIRRORED = Rule("mistake", "the model is mirrored", undo_model=_mirror)
 SWAPPED = Rule(
     "mistake",
     "u and v are swapped",
     lambda view: replace(view, points_2d=view.pixels[:, ::-1].copy()),
 )
-FLIPPED = Rule("mistake", "the photo is flipped", partial(_flipped, axis=0))
-UPSIDE_DOWN = Rule("mistake", "v counts from the bottom", partial(_flipped, axis=1))
+FLIPPED = Rule("mistake", "the photo is flipped", partial(_flip, axis=0))
+UPSIDE_DOWN = Rule("mistake", "v counts from the bottom", partial(_flip, axis=1))
 DOWNWARD = Rule(
     "mistake",
     "`up` points down (give its opposite)",
@@ -303,8 +303,8 @@ def _mistakes_in(case: DiagnosisCase) -> Iterator[Rule]:
                 yield Rule("mistake", clause, undo_model=partial(replace, up_axis=axis))
     for name in _measures_of(case):
         for factor in (1e-3, 1e3):
-            undo = partial(_measured, name=name, factor=factor)
-            lengths = None if case.size is None else _remeasured(case.size, factor)
+            undo = partial(_scale_measure, name=name, factor=factor)
+            lengths = None if case.size is None else _scale_size(case.size, factor)
             changes = {"size": lengths} if name == "size" else {}
             yield Rule("unit", f"`{name}`", undo, changes=changes)
 
@@ -321,7 +321,7 @@ def _pairs_apart(case: DiagnosisCase) -> Iterator[Rule]:
             if apart > _APART and np.array_equal(places[a], places[b]):
                 clause = f"keypoints {quote(names[a])} and {quote(names[b])} are one point of the "
                 clause += f"model and lie {apart:.3g} px apart"
-                undo = partial(_without_rows, number=view.number, rows=(a, b))
+                undo = partial(_remove_rows, number=view.number, rows=(a, b))
                 yield Rule("mistake", clause, undo)
 
 
@@ -354,7 +354,7 @@ def _other_sizes(case: DiagnosisCase) -> Iterator[Rule]:
         width, height = (max(1, round(side * factor)) for side in (camera.width, camera.height))
         clause = f"the keypoints are of images of {width} x {height} px, the camera of {own}"
         for noise in sorted({1.0, 1.0 if is_inside else max(factor, 1.0)}):
-            undo = partial(_resized, size=(width, height), noise=noise)
+            undo = partial(_resize, size=(width, height), noise=noise)
             yield Rule("mistake", clause, undo, gain=_CAMERA_GAIN)
 
 
@@ -377,7 +377,7 @@ def _pieces_of(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
         pieces = {name: name for name in fields if getattr(view, name) is not None}
         whole = {("cam_from_rig" if is_rig else "points_2d"): None} if len(case.views) > 1 else {}
         for name, field in (pieces | whole).items():
-            undo = partial(_left_out, number=view.number, name=field)
+            undo = partial(_remove_field, number=view.number, name=field)
             yield piece(f"views[{view.number}].{name}", undo_view=undo)
     if case.size is not None:
         yield piece("size", changes={"size": None})

@@ -136,10 +136,10 @@ def write_result(result: Any) -> dict[str, Any]:
     posterior = {name: getattr(result.posterior, name) for name in _OF_POSTERIOR}
     others = {"version": 1, **posterior, "own_stretch": result.stretch}
     repeated = {name: _plain(getattr(result, name)) for name in _REPEATED}
-    return _written(result, _Result, others) | repeated
+    return _fields(result, _Result, others) | repeated
 
 
-def _written(value: Any, form: type[ForeignDocument], others: Mapping[str, Any]) -> dict[str, Any]:
+def _fields(value: Any, form: type[ForeignDocument], others: Mapping[str, Any]) -> dict[str, Any]:
     """The fields of a value, and ``others``, that a form declares, by its names in files."""
     names = zip(form.__struct_fields__, form.__struct_encode_fields__, strict=True)
     return {
@@ -165,7 +165,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Alignment | Camera | Symmetry):
         return value.to_dict()
     if kind in _FORMS:
-        return _written(value, _FORMS[kind], {})
+        return _fields(value, _FORMS[kind], {})
     if is_dataclass(value):
         return {name: _plain(each) for name, each in vars(value).items()}
     return _plain(value.item())  # of NumPy

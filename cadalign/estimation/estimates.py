@@ -16,7 +16,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.problem import Problem
-from cadalign.estimation.symmetry import carried, distinct_ones, without_free_turns
+from cadalign.estimation.symmetry import distinct_ones, remove_free_turns, transform_covariance
 from cadalign.estimation.uncertainty.residuals import loss_weights, whitening_matrices
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, turned_alignment, turned_covariance
@@ -100,7 +100,7 @@ def curvature_of_rotations(covariance: FloatArray) -> FloatArray:
     return np.asarray((axes * [y * z, x * z, x * y]) @ axes.T / 2)
 
 
-def with_box(evidence: Evidence, state: State, prior: ShapePrior) -> tuple[Evidence, State]:
+def estimate_box(evidence: Evidence, state: State, prior: ShapePrior) -> tuple[Evidence, State]:
     """Evidence and state whose box has those faces that outermost keypoints determine at these.
 
     Where measured distances determine the box, it remains the linear one.
@@ -172,7 +172,7 @@ class Estimate(NamedTuple):
         return np.asarray((self.points[-1] - self.points[-2]) * self.scale)
 
 
-def as_given(estimate: Estimate, problem: Problem) -> Estimate:
+def undo_turns(estimate: Estimate, problem: Problem) -> Estimate:
     """An estimate in the frames of turned lenses as that in the frames that were given."""
     numbers = problem.numbers
     turns = [problem.turns[number] for number in numbers]
@@ -224,10 +224,10 @@ def one_of_equals(
         return likely
     poses, covariance = [each.poses[0] for each in likely], likely[0].covariances[0]
     found = distinct_ones(poses, covariance, symmetry, held)
-    return [_carried(likely[k], equal) for k, equal in found]
+    return [_transform(likely[k], equal) for k, equal in found]
 
 
-def _carried(estimate: Estimate, best: Equal) -> Estimate:
+def _transform(estimate: Estimate, best: Equal) -> Estimate:
     turn, shift, scale = best.motion[:3, :3], best.motion[:3, 3], best.alignment.scale
     poses: list[Alignment] = []
     covariances = []
@@ -235,7 +235,7 @@ def _carried(estimate: Estimate, best: Equal) -> Estimate:
         pose = Alignment(given.rotation @ turn, given.translation + given.linear @ shift, scale)
         equal = replace(best, alignment=pose if poses else best.alignment)
         poses.append(equal.alignment)
-        covariances.append(without_free_turns(carried(covariance, given, equal), equal))
+        covariances.append(remove_free_turns(transform_covariance(covariance, given, equal), equal))
     points = best.relabelled(estimate.points)
     entries = np.abs(turn)
     if (np.minimum(entries, 1 - entries) > _ALONG_AXES).any():
@@ -251,7 +251,7 @@ def _carried(estimate: Estimate, best: Equal) -> Estimate:
     )
 
 
-def linearised(
+def linearise(
     points: FloatArray, pose: Alignment, seen: Seen
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Weighted errors (2 n,), and their derivatives by points (2 n, 3 n) and pose (2 n, 6)."""
@@ -291,7 +291,7 @@ def single_posterior(
         own = np.append(np.arange(3 * m - 6), 3 * faces + np.arange(3))
         prior = prior[np.ix_(own, own)]
     boxed, still = widened_boxes(points, seen.points), np.ones(3)
-    _, rows, jacobian = linearised(points[seen.points], pose, seen)
+    _, rows, jacobian = linearise(points[seen.points], pose, seen)
     # Behind the points, the difference of the box's corners.
     prior = np.concatenate([prior, prior[-3:] - prior[-6:-3]])
     prior = np.concatenate([prior, prior[:, -3:] - prior[:, -6:-3]], axis=1)

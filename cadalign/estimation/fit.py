@@ -21,7 +21,7 @@ from cadalign.estimation.problems import (
     each_of,
     first_rows,
     in_threads,
-    joined,
+    join_problems,
     pack_many,
     pack_one,
 )
@@ -359,7 +359,7 @@ def fit_batch(
 
 def _solve_at_once(each: Sequence[Problems], options: FitOptions) -> tuple[list[Entry], FloatArray]:
     """The entries of `Results`, each made when it is asked for, and their table (B, 17)."""
-    problems = joined(each)
+    problems = join_problems(each)
     solutions = solve(problems, options)
     squares = np.append((solutions.residuals**2).sum(axis=1), 0.0)
     means = np.add.reduceat(squares, problems.offsets[:-1]) / np.maximum(problems.counts, 1)

@@ -19,19 +19,19 @@ from cadalign.arrays import BoolArray, is_number
 from cadalign.errors import DegenerateError
 from cadalign.estimation.estimates import (
     Estimate,
-    as_given,
     curvature_of_rotations,
+    estimate_box,
     one_of_equals,
     pose_and_lengths,
     poses_of,
     second_moments,
     steps_between,
+    undo_turns,
     widened_boxes,
-    with_box,
 )
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
-from cadalign.estimation.prior import camera_like, is_exact, redundancy_of, widened
+from cadalign.estimation.prior import camera_like, is_exact, redundancy_of, widen_prior
 from cadalign.estimation.problem import Problem, compile_problem
 from cadalign.estimation.problems import Problems, no_alignment_error, too_few_error
 from cadalign.estimation.result import Result
@@ -56,10 +56,10 @@ from cadalign.estimation.symmetry import SAME_SQUARES, stretched_axes
 from cadalign.estimation.uncertainty.doubts import (
     another_pose,
     first_of_camera,
+    noise_doubts,
     outside_image,
     rejections,
     stretch_doubts,
-    unexplained,
 )
 from cadalign.estimation.uncertainty.residuals import summaries_of
 from cadalign.estimation.view import View
@@ -205,7 +205,7 @@ def result_of_minima(
     for each in minima:
         likelihood = float(np.exp((minimum.score - each.score) / 2))
         if likelihood >= LEAST_LIKELIHOOD or each is optimum:
-            evidence, state = widened(each.evidence, each.state, inflation)
+            evidence, state = widen_prior(each.evidence, each.state, inflation)
             wide = each._replace(evidence=evidence, state=state)
             estimate = _estimate_at(wide, likelihood, problem)._replace(is_optimum=each is optimum)
             if all(np.isfinite(own).all() for own in estimate.covariances):
@@ -259,7 +259,7 @@ class DiagnosedPosterior(Posterior):
         return {name: own[name] for name in own if name != "causes"}
 
 
-def with_cause(
+def add_diagnosis(
     result: Result,
     diagnosis: Callable[[], EstimateWarning | None],
     views: Sequence[View],
@@ -282,7 +282,7 @@ def _causes(
     causes: Warnings = ()
     lacking = [view.pixels for view in views if view.sigma is None and len(view.keypoint_ids)]
     if lacking and sigma is not None and not (cause and cause.kind == "mistake"):
-        causes = unexplained(sigma, lacking)
+        causes = noise_doubts(sigma, lacking)
     placed = tuple(
         warning
         for view in views
@@ -319,7 +319,7 @@ def _undetermined_error() -> DegenerateError:
 def _estimate_at(minimum: Minimum, likelihood: float, problem: Problem) -> Estimate:
     prior, evidence, state = problem.prior, minimum.evidence, minimum.state
     keypoints = len(prior.ids)
-    evidence, state = with_box(evidence, state, prior)
+    evidence, state = estimate_box(evidence, state, prior)
     scale = np.exp(state.log_scales)
     rows = np.r_[:keypoints, -2:0]  # without what stands between keypoints and box
     stretched = points_of(evidence.shape, state)[rows]
@@ -343,7 +343,7 @@ def _estimate_at(minimum: Minimum, likelihood: float, problem: Problem) -> Estim
         likelihood,
         tuple(cameras[number] for number in problem.numbers),
     )
-    return as_given(estimate, problem)
+    return undo_turns(estimate, problem)
 
 
 def _inliers(problem: Problem, minimum: Minimum) -> list[BoolArray]:

@@ -27,7 +27,7 @@ from cadalign.solvers.joint.evidence import (
     Shape,
     Sightings,
     kept_rows,
-    stacked,
+    stack_tables,
 )
 from cadalign.solvers.marginal.problem import Seen
 
@@ -100,7 +100,7 @@ def _sightings(
                 np.full(count, float(options.loss_scale)),
             )
         )
-    whole = stacked(tables)
+    whole = stack_tables(tables)
     return kept_rows(whole, np.argsort(whole.point, kind="stable"))
 
 
@@ -182,7 +182,7 @@ def known_directions(prior: ShapePrior, views: Sequence[View]) -> Directions:
     told = [number for number, view in enumerate(views) if view.up is not None]
     ups = [cast(FloatArray, views[number].up) for number in told]
     whitening = [
-        _across(up, views[number].up_sigma_deg) for number, up in zip(told, ups, strict=True)
+        _whitening(up, views[number].up_sigma_deg) for number, up in zip(told, ups, strict=True)
     ]
     axes = [_upward("up", prior, views[number]) for number in told]
     return Directions(
@@ -193,7 +193,7 @@ def known_directions(prior: ShapePrior, views: Sequence[View]) -> Directions:
     )
 
 
-def _across(direction: FloatArray, sigma_deg: Any) -> FloatArray:
+def _whitening(direction: FloatArray, sigma_deg: Any) -> FloatArray:
     """Whitening (3, 3) of a unit vector [1/rad], by a deviation or covariance (3, 3) [degrees]."""
     sigma = np.asarray(sigma_deg, dtype=np.float64)
     if not sigma.ndim:

@@ -70,14 +70,14 @@ class ShapePrior:
 def prior_of(model: object) -> ShapePrior:
     """The prior of an exact, a stretched or a learned model; InputError of none of these."""
     if isinstance(model, Model):
-        return _of_model(model)
+        return _model_prior(model)
     if isinstance(model, ShapeModel):
-        return _of_category(model)
+        return _category_prior(model)
     what = f"expected a cadalign.Model or a cadalign.ShapeModel, got {type(model).__name__}"
     raise InputError(what, where="model")
 
 
-def _of_model(model: Model) -> ShapePrior:
+def _model_prior(model: Model) -> ShapePrior:
     points = cast(FloatArray, model.points_3d)
     mean = np.concatenate([points, cast(FloatArray, model.bounds)])
     spread = np.full(len(mean), model.shape_sigma or 0.0)
@@ -91,7 +91,7 @@ def _of_model(model: Model) -> ShapePrior:
 
 
 @lru_cache(maxsize=4)
-def _of_category(model: ShapeModel) -> ShapePrior:
+def _category_prior(model: ShapeModel) -> ShapePrior:
     shapes = tuple(
         Shape(
             np.array(component.mean),
@@ -146,7 +146,7 @@ def redundancy_of(evidence: Evidence) -> int:
     return count - 6 * int(evidence.rig.pose.max() + 1) - int(evidence.scales.free.sum())
 
 
-def widened(evidence: Evidence, state: State, factor: float) -> tuple[Evidence, State]:
+def widen_prior(evidence: Evidence, state: State, factor: float) -> tuple[Evidence, State]:
     """The same points under a prior of wider standard deviations."""
     if factor == 1:
         return evidence, state

@@ -135,7 +135,7 @@ def compile_problem(
     problem = Problem(
         model, prior, tuple(views), tuple(facing), size, inits, options, ransac, lenses, turns
     )
-    return _with_poses(problem)
+    return _drop_views_without_pose(problem)
 
 
 def no_pose_error(problem: Problem) -> DegenerateError:
@@ -154,7 +154,7 @@ def no_pose_error(problem: Problem) -> DegenerateError:
     )
 
 
-def _with_poses(problem: Problem) -> Problem:
+def _drop_views_without_pose(problem: Problem) -> Problem:
     """The problem without views of unknown motion, without a start, that determine no pose.
 
     Raises DegenerateError if the first is one of these.

@@ -54,7 +54,7 @@ class Problems:
         return self.offsets[1:] - self.offsets[:-1]
 
 
-def joined(problems: Sequence[Problems]) -> Problems:
+def join_problems(problems: Sequence[Problems]) -> Problems:
     return Problems(
         np.concatenate([each.points_3d for each in problems]),
         np.concatenate([each.points_2d for each in problems]),

@@ -13,7 +13,7 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
 from cadalign.estimation.options import MINIMAL_SOLVERS, RansacOptions
 from cadalign.estimation.prior import Lenses, is_exact
 from cadalign.estimation.problem import Inits, Problem
-from cadalign.estimation.starts import Start, Starts, in_rig, starts_of
+from cadalign.estimation.starts import Start, Starts, rig_pose, starts_of
 from cadalign.solvers.constants import CAUCHY, LINEAR, SAMPLE_SIZES
 from cadalign.solvers.joint.evidence import Evidence, Shape
 from cadalign.solvers.joint.search import costs_at, keypoints_of
@@ -51,7 +51,7 @@ def propose(problem: Problem, shape: Shape, init: Inits) -> tuple[Lenses, Starts
         starts = Starts(*(column[:most] for column in starts))
         found.append(_AtFocals(there, starts, costs_at(evidence, *starts)))
     leaves_out = problem.ransac is None and is_exact(evidence)
-    return lenses, _merged(found, lenses, leaves_out=leaves_out)
+    return lenses, _merge(found, lenses, leaves_out=leaves_out)
 
 
 def _starts_at(problem: Problem, evidence: Evidence, init: Inits) -> Starts:
@@ -59,12 +59,12 @@ def _starts_at(problem: Problem, evidence: Evidence, init: Inits) -> Starts:
     if ransac is None:
         return starts_of(evidence, first)
     trusted = [cast("FloatArray | None", view.scores) for view in problem.views]
-    starts = starts_of(under_cauchy(evidence), first)
+    starts = starts_of(add_cauchy_loss(evidence), first)
     if evidence.rig.pose.max() > 0:
         return starts
     samples = np.array(
         [
-            in_rig(pose, camera)
+            rig_pose(pose, camera)
             for view, camera in enumerate(evidence.rig.cam_from_rig)
             for pose in _hypotheses(evidence, view, ransac, trusted[view])
         ]
@@ -77,8 +77,8 @@ def _starts_at(problem: Problem, evidence: Evidence, init: Inits) -> Starts:
     )
 
 
-def _merged(found: list[_AtFocals], lenses: Lenses, *, leaves_out: bool) -> Starts:
-    """All starts by cost, relative to ``lenses``, or those that `_unimproved` leaves."""
+def _merge(found: list[_AtFocals], lenses: Lenses, *, leaves_out: bool) -> Starts:
+    """All starts by cost, relative to ``lenses``, or those that `_local_minima` leaves."""
     number = np.repeat(np.arange(len(found)), [len(each.costs) for each in found])
     costs = np.concatenate([each.costs for each in found])
     poses = np.concatenate([each.starts.poses for each in found])
@@ -86,11 +86,11 @@ def _merged(found: list[_AtFocals], lenses: Lenses, *, leaves_out: bool) -> Star
     logs = np.log([each.lenses.focal_lengths / lenses.focal_lengths for each in found])
     order = np.argsort(costs, kind="stable")
     if leaves_out:
-        order = order[_unimproved(poses, costs, number)[order]]
+        order = order[_local_minima(poses, costs, number)[order]]
     return Starts(poses[order], logs[number[order]], log_scales[order])
 
 
-def _unimproved(poses: FloatArray, costs: FloatArray, number: IntArray) -> BoolArray:
+def _local_minima(poses: FloatArray, costs: FloatArray, number: IntArray) -> BoolArray:
     """True for starts (S,) that none on the same way, at a neighbouring focal length, betters."""
     turns = poses[:, None, :, :9] - poses[None, :, :, :9]
     is_one = (np.linalg.norm(turns, axis=-1) < _SAME_BRANCH).all(axis=-1)
@@ -118,7 +118,7 @@ def _start(init: Inits, evidence: Evidence) -> Start | None:
     return poses, np.log(scale)
 
 
-def under_cauchy(evidence: Evidence) -> Evidence:
+def add_cauchy_loss(evidence: Evidence) -> Evidence:
     old = evidence.sightings
     return evidence._replace(sightings=old._replace(loss=np.full(len(old.loss), CAUCHY)))
 

@@ -14,7 +14,7 @@ from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.prior import Lenses, redundancy_of
 from cadalign.estimation.problem import Inits, Problem
 from cadalign.estimation.problems import no_redundancy_error
-from cadalign.estimation.propose import propose, under_cauchy
+from cadalign.estimation.propose import add_cauchy_loss, propose
 from cadalign.estimation.starts import Starts
 from cadalign.estimation.uncertainty.posterior import widening_of
 from cadalign.estimation.uncertainty.residuals import Support, area_of, check_support
@@ -89,7 +89,7 @@ def search_at_noise(problem: Problem, init: Inits) -> SearchResult:
         if any(init) and _is_left_to_outlines(problem, whole.evidence):
             found, used = _states_of(whole, starts), 0
         else:
-            found, used = _searched(problem, whole, starts)
+            found, used = _find_minima(problem, whole, starts)
         iterations += used
         prior_score = -2 * float(np.log(problem.prior.weights[number]))
         minima.extend(each._replace(score=each.score + prior_score) for each in found)
@@ -120,7 +120,7 @@ def _states_of(whole: Minimum, starts: Starts) -> list[Minimum]:
     return [whole._replace(state=each, score=score_state(whole.evidence, each)) for each in states]
 
 
-def _searched(problem: Problem, whole: Minimum, starts: Starts) -> tuple[list[Minimum], int]:
+def _find_minima(problem: Problem, whole: Minimum, starts: Starts) -> tuple[list[Minimum], int]:
     """Minima of the evidence of ``whole`` from starts, the best first, and the iterations."""
     if problem.ransac is not None:
         return _robust_minima(problem.ransac, problem.threshold(problem.ransac), whole, starts)
@@ -143,10 +143,10 @@ def _robust_minima(
     """
     evidence = whole.evidence
     threshold = thresholds(evidence, whole.lenses, limit)
-    minima, iterations = search_joint(under_cauchy(evidence), *starts)
+    minima, iterations = search_joint(add_cauchy_loss(evidence), *starts)
     found = []
     for state in minima.states[:_KEPT]:
-        displaced = _WIDENING * _projected(evidence, state) * (ransac.max_reproj_error is None)
+        displaced = _WIDENING * _spread(evidence, state) * (ransac.max_reproj_error is None)
         rounds = _INLIER_ROUNDS if ransac.refine else 1
         settled = _settle(whole._replace(state=state), np.hypot(threshold, displaced), rounds)
         if settled is not None:
@@ -252,20 +252,20 @@ def widened_by_noise(problem: Problem, minima: Sequence[Minimum]) -> Sequence[Mi
     """The minima with less information, where the noise itself is uncertain."""
     if not problem.lacks_sigma:
         return minima
-    unknown = _without_sigma(problem.views, minima[0])
+    unknown = _unknown_noise(problem.views, minima[0])
     unknowns = 6 * len(minima[0].state.poses) + int(minima[0].evidence.scales.free.sum())
     redundancy = max(2 * int(unknown.sum()) - unknowns, 1)
     factor = 1 / math.sqrt(widening_of(unknowns, redundancy))
-    return [_scaled(each, _without_sigma(problem.views, each), factor) for each in minima]
+    return [_scale_noise(each, _unknown_noise(problem.views, each), factor) for each in minima]
 
 
 def _likeliest(problem: Problem, minimum: Minimum) -> float:
     """The noise [px] with the best score of one minimum."""
-    unknown = _without_sigma(problem.views, minimum)
+    unknown = _unknown_noise(problem.views, minimum)
     count = int(unknown.sum())
 
     def score(noise: float) -> float:
-        scaled = _scaled(minimum, unknown, problem.noise / noise)
+        scaled = _scale_noise(minimum, unknown, problem.noise / noise)
         _, least, _ = refine_joint(scaled.evidence, _NOISE_ITERATIONS, scaled.state)
         prior = (math.log(noise / _USUAL) / _USUAL_LOG_SIGMA) ** 2
         return least + 4 * count * math.log(noise) + prior
@@ -283,15 +283,15 @@ def _likeliest(problem: Problem, minimum: Minimum) -> float:
     return math.exp((low + high) / 2)
 
 
-def _without_sigma(views: Sequence[View], minimum: Minimum) -> BoolArray:
+def _unknown_noise(views: Sequence[View], minimum: Minimum) -> BoolArray:
     """Marks the sightings (N,) of views whose keypoints have no sigma."""
     lacking = np.array([view.sigma is None for view in views])
     sightings = minimum.evidence.sightings
     return np.asarray(lacking[sightings.image] & (sightings.whitening[:, 2] > 0))
 
 
-def _scaled(minimum: Minimum, chosen: BoolArray, factor: float) -> Minimum:
-    return minimum._replace(evidence=with_whitening_times(factor, chosen, minimum.evidence))
+def _scale_noise(minimum: Minimum, chosen: BoolArray, factor: float) -> Minimum:
+    return minimum._replace(evidence=scale_whitening(factor, chosen, minimum.evidence))
 
 
 def whitened_lengths(evidence: Evidence, state: State) -> FloatArray:
@@ -306,7 +306,7 @@ def whitened_lengths(evidence: Evidence, state: State) -> FloatArray:
     return np.where(seen[:, 2] > 0, lengths, np.inf)
 
 
-def _projected(evidence: Evidence, state: State) -> FloatArray:
+def _spread(evidence: Evidence, state: State) -> FloatArray:
     """Whitened standard deviations (N,) that the points' displacements project to."""
     sightings, shape = evidence.sightings, evidence.shape
     points = points_of(shape, state)[sightings.point]
@@ -316,7 +316,7 @@ def _projected(evidence: Evidence, state: State) -> FloatArray:
     return np.asarray(root * scale * shape.spread[sightings.point] / np.maximum(depths, _NEAREST))
 
 
-def with_whitening_times(factor: float, chosen: BoolArray, evidence: Evidence) -> Evidence:
+def scale_whitening(factor: float, chosen: BoolArray, evidence: Evidence) -> Evidence:
     """The evidence with the whitening of ``chosen`` sightings (N,) times a factor."""
     old = evidence.sightings
     whitening = np.where(chosen[:, None], factor, 1.0) * old.whitening

@@ -56,7 +56,7 @@ def starts_of(evidence: Evidence, init: Start | None = None) -> Starts:
     Of several poses the likeliest are taken together, then one of them replaced by the next. A
     given start comes first, poses half a turn away come last.
     """
-    found = _proposed(evidence, init)
+    found = _propose(evidence, init)
     return Starts(
         np.array([poses for poses, _ in found]).reshape(-1, int(evidence.rig.pose.max()) + 1, 12),
         np.zeros((len(found), len(evidence.focals.low))),
@@ -64,7 +64,7 @@ def starts_of(evidence: Evidence, init: Start | None = None) -> Starts:
     )
 
 
-def _proposed(evidence: Evidence, init: Start | None) -> list[_Start]:
+def _propose(evidence: Evidence, init: Start | None) -> list[_Start]:
     rig = evidence.rig
     poses = int(rig.pose.max()) + 1
     per_pose: list[list[_Start]] = [[] for _ in range(poses)]
@@ -76,8 +76,8 @@ def _proposed(evidence: Evidence, init: Start | None) -> list[_Start]:
         is_weak = is_several and 2 * counts[view] <= unknowns
         found, logs = view_starts(held if is_weak else evidence, view)
         turned = _half_turned(evidence, view, found)
-        moved = [(in_rig(pose, camera), scales) for pose, scales in zip(found, logs, strict=True)]
-        moved += [(in_rig(pose, camera), np.zeros(3)) for pose in turned]
+        moved = [(rig_pose(pose, camera), scales) for pose, scales in zip(found, logs, strict=True)]
+        moved += [(rig_pose(pose, camera), np.zeros(3)) for pose in turned]
         per_pose[rig.pose[view]].extend(moved)
     is_metric = init is None and bool(evidence.scales.free.all())
     if init is not None:
@@ -94,7 +94,7 @@ def _proposed(evidence: Evidence, init: Start | None) -> list[_Start]:
             # Of points nearly in a plane, the scales that a rotation leaves to linear equations
             # are noise: the likeliest poses that keypoints alone suggest come after them.
             first = [(pose[None], logs) for pose, logs in per_pose[0][:_MOST_SIZED]]
-            return placed + [_sized(evidence, *each) for each in first]
+            return placed + [_match_size(evidence, *each) for each in first]
         if rig.is_shared.any():  # nothing tells the size
             return []
     if not all(per_pose):
@@ -109,10 +109,10 @@ def _proposed(evidence: Evidence, init: Start | None) -> list[_Start]:
     chosen = [likeliest, *others][:_MOST_STARTS]
     told = rig.pose[int(np.argmax(counts))] if init is None else 0  # the pose whose stretch counts
     starts = [(np.array([pose for pose, _ in each]), each[told][1]) for each in chosen]
-    return [_sized(evidence, *each) for each in starts] if is_metric else starts
+    return [_match_size(evidence, *each) for each in starts] if is_metric else starts
 
 
-def _sized(evidence: Evidence, poses: FloatArray, log_scales: FloatArray) -> _Start:
+def _match_size(evidence: Evidence, poses: FloatArray, log_scales: FloatArray) -> _Start:
     """A start enlarged about each view's camera such that depths and distances agree."""
     factor = _size_factor(evidence, poses, np.exp(log_scales))
     if not np.isfinite(factor) or not factor > 0:
@@ -135,7 +135,7 @@ def _size_factor(evidence: Evidence, poses: FloatArray, scale: FloatArray) -> fl
     return float(np.median(told)) if len(told) else float("nan")
 
 
-def in_rig(pose: FloatArray, camera: FloatArray) -> FloatArray:
+def rig_pose(pose: FloatArray, camera: FloatArray) -> FloatArray:
     """A camera's pose (12,) of the model as the rig's."""
     rotation, translation = camera[:9].reshape(3, 3), camera[9:]
     turned = rotation.T @ pose[:9].reshape(3, 3)

@@ -44,7 +44,7 @@ def stretched_axes(held: tuple[bool, bool, bool]) -> str:
     return "".join(axis for axis, is_held in zip("xyz", held, strict=True) if not is_held)
 
 
-def without_free_turns(covariance: FloatArray, best: Equal) -> FloatArray:
+def remove_free_turns(covariance: FloatArray, best: Equal) -> FloatArray:
     """A covariance of pose and others without turns about the symmetry's axes."""
     size = len(covariance)
     arm, left = best.alignment.linear @ best.center, np.eye(size)
@@ -80,7 +80,7 @@ def distinct_ones(
     return [first, *(each for each in others if not is_same(each[1].alignment))]
 
 
-def carried(
+def transform_covariance(
     covariance: FloatArray,
     given: Alignment,
     best: Equal,

@@ -224,7 +224,7 @@ class View:
         return cast("FloatArray | BoolArray | None", self.mask)
 
 
-def numbered(views: Iterable[View]) -> list[View]:
+def number_views(views: Iterable[View]) -> list[View]:
     """The views, each with its place among them."""
     same = list(map(copy, views))  # what was checked need not be checked again
     for place, view in enumerate(same):

@@ -29,7 +29,7 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets.shapenet import require_category
 from cadalign.errors import DegenerateError, InputError, refuse_unused, require_kind
 from cadalign.estimation.align import align
-from cadalign.estimation.estimates import linearised
+from cadalign.estimation.estimates import linearise
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.pack import seen_keypoints
 from cadalign.estimation.prior import prior_of
@@ -289,7 +289,7 @@ def shape_posterior(
     seen = Seen(seen.points[kept], seen.rays[kept], seen.whitening[kept], *seen[3:])
     pose = turned_alignment(result.alignment, camera.lens_from_camera.T)
     estimate, columns = np.concatenate([result.points_3d, result.bounds]), coordinates_of(seen)
-    errors, rows, by_pose = linearised(estimate[seen.points], pose, seen)
+    errors, rows, by_pose = linearise(estimate[seen.points], pose, seen)
     full, triangle = np.linalg.qr(by_pose, mode="complete")
     rest = full[:, POSE_UNKNOWNS:].T
     rows, right = rest @ rows, rest @ (rows @ estimate[seen.points].ravel() - errors)

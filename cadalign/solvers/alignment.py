@@ -153,14 +153,14 @@ def _are_same(objective: Objective, first: FloatArray, second: FloatArray) -> bo
 
 
 @kernel
-def with_keypoints(objective: Objective, keypoints: KeypointEvidence) -> Objective:
+def replace_keypoints(objective: Objective, keypoints: KeypointEvidence) -> Objective:
     return Objective(objective.free, keypoints, objective.scale_prior)
 
 
 @kernel
-def with_points(objective: Objective, points: FloatArray) -> Objective:
+def replace_points(objective: Objective, points: FloatArray) -> Objective:
     old = objective.keypoints
-    return with_keypoints(
+    return replace_keypoints(
         objective, KeypointEvidence(points, old.rays, old.whitening, old.loss, old.loss_scale)
     )
 
@@ -172,9 +172,9 @@ def with_points(objective: Objective, points: FloatArray) -> Objective:
 def covariance_of(objective: Objective, pose: FloatArray, covariance: FloatArray) -> int:
     """Write the covariance (8, 8) at a pose (15,); returns -1, or an undetermined unknown."""
     center, unit = center_and_unit(objective.keypoints.points)
-    local = with_points(objective, (objective.keypoints.points - center) / unit)
+    local = replace_points(objective, (objective.keypoints.points - center) / unit)
     equations = room_for(UNKNOWNS)
-    evaluate_alignment(local, _centered(pose, center, unit), equations)
+    evaluate_alignment(local, _center(pose, center, unit), equations)
     undetermined = _invert(equations.hessian, objective.free, covariance)
     _uncenter_covariance(pose, center, unit, covariance)
     return undetermined
@@ -196,7 +196,7 @@ def center_and_unit(points: FloatArray) -> tuple[FloatArray, float]:
 
 
 @kernel
-def _centered(pose: FloatArray, center: FloatArray, unit: float) -> FloatArray:
+def _center(pose: FloatArray, center: FloatArray, unit: float) -> FloatArray:
     """The pose of points (x - center) / unit, in these units."""
     centered = pose.copy()
     uncenter(centered, -center, 1.0)

@@ -20,7 +20,7 @@ COORDINATES = 10
 _MOST_LOG_RATIO = 3.0  # of distance, scales and focal length to the estimates: priors end there
 
 
-class Centred(NamedTuple):
+class CentredAlignment(NamedTuple):
     """An alignment of keypoints about their centroid."""
 
     pose: FloatArray  # (15,) packed; the translation is the centroid in the camera
@@ -48,7 +48,7 @@ class LogPriors(NamedTuple):
 
 @kernel
 def weigh_draws(
-    centred: Centred, keypoints: WhitenedPixels, priors: LogPriors, steps: FloatArray
+    centred: CentredAlignment, keypoints: WhitenedPixels, priors: LogPriors, steps: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Deviations (k, 10), costs (k,) and log densities (k,) at coordinates (k, 10).
 

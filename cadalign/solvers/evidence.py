@@ -81,7 +81,7 @@ def _write_rows(
     return cost if nearest > 0 else np.inf
 
 
-class Weighed(NamedTuple):
+class Weight(NamedTuple):
     """Cost of a ray's error, whitened residual (u, v) and whitening, times the weight's root."""
 
     cost: float
@@ -92,12 +92,12 @@ class Weighed(NamedTuple):
 
 
 @inlined
-def weigh_error(weights: Triple, du: float, dv: float, loss: int, loss_scale: float) -> Weighed:
+def weigh_error(weights: Triple, du: float, dv: float, loss: int, loss_scale: float) -> Weight:
     """Whiten an error (du, dv) of a ray, and weigh it by its loss."""
     u, v = weights[0] * du + weights[1] * dv, weights[2] * dv
     cost, root = loss_and_root(loss, loss_scale, u * u + v * v)
     whitening = root * weights[0], root * weights[1], root * weights[2]
-    return Weighed(cost, root, root * u, root * v, whitening)
+    return Weight(cost, root, root * u, root * v, whitening)
 
 
 @inlined

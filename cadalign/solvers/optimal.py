@@ -10,8 +10,8 @@ from cadalign.solvers.alignment import (
     Objective,
     center_and_unit,
     covariance_of,
-    with_keypoints,
-    with_points,
+    replace_keypoints,
+    replace_points,
 )
 from cadalign.solvers.constants import (
     DEGENERATE,
@@ -114,7 +114,7 @@ def _solve_one(
     center, unit = center_and_unit(points)
     if not unit > 0:
         return 0, 0, 0, 0
-    local = with_points(objective, (points - center) / unit)
+    local = replace_points(objective, (points - center) / unit)
     counts = np.zeros(2, dtype=np.int64)
     found = Minima(poses, costs, costs.copy(), np.zeros(MAX_MINIMA, dtype=np.int64), counts)
     hypotheses = _search_minima(local, rigid, found)
@@ -137,7 +137,7 @@ def _search_minima(objective: Objective, rigid: bool | None, minima: Minima) -> 
     if n <= _COARSE_POINTS:
         return _search_from_all_starts(objective, rigid, linear, is_solved, minima)
     chosen = np.arange(_COARSE_POINTS) * n // _COARSE_POINTS  # evenly spread over their order
-    coarse = with_keypoints(objective, take_keypoints(keypoints, chosen))
+    coarse = replace_keypoints(objective, take_keypoints(keypoints, chosen))
     hypotheses = _search_from_all_starts(coarse, rigid, linear, is_solved, minima)
     found = minima.counts[0]
     starts = np.empty((found + 1, POSE_SIZE))

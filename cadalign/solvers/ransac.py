@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.compile import kernel
-from cadalign.solvers.alignment import Objective, with_keypoints
+from cadalign.solvers.alignment import Objective, replace_keypoints
 from cadalign.solvers.constants import AP4P, OK, POSE_SIZE, UNKNOWNS, ScalePrior
 from cadalign.solvers.evidence import KeypointEvidence, squared_error, take_keypoints
 from cadalign.solvers.linalg import copy_into
@@ -218,7 +218,7 @@ def _inliers_of(objective: Objective, threshold: float, pose: FloatArray, most: 
         if squared_error(objective.keypoints, scalars, k) < limit:
             chosen[count] = k
             count += 1
-    return with_keypoints(objective, take_keypoints(objective.keypoints, chosen[:count]))
+    return replace_keypoints(objective, take_keypoints(objective.keypoints, chosen[:count]))
 
 
 @kernel

@@ -23,7 +23,7 @@ from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.fit import fit_once
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.prior import log_focal_range
-from cadalign.estimation.problems import Problems, in_threads, joined, rays_of
+from cadalign.estimation.problems import Problems, in_threads, join_problems, rays_of
 from cadalign.estimation.solve import are_solved_at_once, solve
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.constants import OK
@@ -273,7 +273,7 @@ def _searched(
                 fit_alone(b)
             return
         part = replace(options, sigma=sigmas[first:last][present[first:last]])
-        found = solve(joined(problems[first:last]), part)
+        found = solve(join_problems(problems[first:last]), part)
         solved = first + np.flatnonzero(found.statuses == OK)
         poses[solved], valid[solved] = found.poses[solved - first, 0], True
 

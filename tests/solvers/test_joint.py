@@ -24,7 +24,7 @@ from cadalign.solvers.joint.evidence import (
     kept_rows,
     packed,
     points_of,
-    unpacked,
+    unpack_state,
 )
 from cadalign.solvers.joint.search import equations_at, refine_joint
 from cadalign.solvers.joint.system import joint_system
@@ -109,7 +109,7 @@ def moved(evidence: Evidence, state: State, step: np.ndarray) -> State:
     evaluate(system, row, room)
     there = row.copy()
     move(system, row, room, 0.0, step, there)
-    return unpacked(evidence.shape, len(evidence.focals.low), there)
+    return unpack_state(evidence.shape, len(evidence.focals.low), there)
 
 
 def state_of(seed: int, poses: int, focals: int = 0) -> State:

@@ -32,7 +32,7 @@ def poses_of(points: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArr
 
 def seen(points: FloatArray, rotation: FloatArray, translation: FloatArray) -> FloatArray:
     in_camera = points @ rotation.T + translation
-    assert in_camera[:, 2].min() > 0.1
+    assert in_camera[:, 2].min() > 0
     return in_camera[:, :2] / in_camera[:, 2:]
 
 

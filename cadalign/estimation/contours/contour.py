@@ -81,17 +81,17 @@ def contour_of(probability: FloatArray | BoolArray) -> Contour:
     on.
     """
     image = np.ascontiguousarray(probability, dtype=np.float32)
-    level = smoothed(image)
-    soft = smoothed(image, _NORMAL_SMOOTHING)
+    level = smooth(image)
+    soft = smooth(image, _NORMAL_SMOOTHING)
     slope_x: Image = np.asarray(cv2.Sobel(soft, cv2.CV_32F, 1, 0, ksize=3), dtype=np.float32)
     slope_y: Image = np.asarray(cv2.Sobel(soft, cv2.CV_32F, 0, 1, ksize=3), dtype=np.float32)
     points, normals, curves = [np.empty((0, 2))], [np.empty((0, 2))], [np.empty(0, dtype=int)]
     count = 0
     for chain in _chains(level):
-        places, outwards = _on_level(chain, level, slope_x, slope_y)
+        places, outwards = _level_line(chain, level, slope_x, slope_y)
         if len(places) < 3:
             continue
-        for piece, directions in _inside(*_resampled(places, outwards), image.shape):
+        for piece, directions in _inside(*_resample(places, outwards), image.shape):
             points.append(piece)
             normals.append(directions)
             curves.append(np.full(len(piece), count))
@@ -109,7 +109,7 @@ def sampled(image: Image, points: FloatArray) -> FloatArray:
     return np.asarray(values)
 
 
-def smoothed(image: Image, sigma: float = _SMOOTHING) -> Image:
+def smooth(image: Image, sigma: float = _SMOOTHING) -> Image:
     """The image (h, w) whose level line 0.5 is the contour of a mask."""
     return np.asarray(
         cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE), dtype=np.float32
@@ -132,7 +132,7 @@ def _chains(level: Image) -> list[FloatArray]:
     ]
 
 
-def _on_level(
+def _level_line(
     chain: FloatArray, level: Image, slope_x: Image, slope_y: Image
 ) -> tuple[FloatArray, FloatArray]:
     """Points (n, 2) of the level line next to boundary pixels (n, 2), and outward normals."""
@@ -180,7 +180,7 @@ def _nearest_exits(inside: BoolArray, steps: FloatArray) -> tuple[IntArray, Bool
     return nearest, exits[nearest, np.arange(inside.shape[1])]
 
 
-def _resampled(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _resample(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Samples `SPACING` apart along a closed curve of points (n, 2)."""
     rows = np.hstack([points, normals])
     ring = np.vstack([rows, rows[:1]])
@@ -308,7 +308,7 @@ def _rim_intervals(sight: Sight, contour: Contour, steps: FloatArray) -> tuple[I
     return first, found
 
 
-def without_steep(contour: Contour, rims: Rims, bias: FloatArray | float = 0.0) -> Rims:
+def remove_steep(contour: Contour, rims: Rims, bias: FloatArray | float = 0.0) -> Rims:
     """The rims without those that run at a steep angle to the contour: the two don't match.
 
     The ``bias`` (S,) of the contour's extraction counts: it rounds corners of the rim off.
@@ -321,7 +321,7 @@ def without_steep(contour: Contour, rims: Rims, bias: FloatArray | float = 0.0) 
     return rims._replace(found=found)
 
 
-def across_rims(contour: Contour, rims: Rims) -> FloatArray:
+def rim_normals(contour: Contour, rims: Rims) -> FloatArray:
     """Directions (S, 2) across the rims, of length 1 along the contour's normals.
 
     A point of the rim that moves along it does not change the rim's distance from the contour.
@@ -350,7 +350,7 @@ def mask_image(mask: FloatArray | BoolArray, contour: Contour) -> MaskImage:
     """A mask with the places of its contour's samples."""
     inside = np.ascontiguousarray(mask, dtype=np.float32)
     none = np.zeros(len(contour.points))
-    return inside, crossings(smoothed(inside), contour.points, contour.normals, none)
+    return inside, crossings(smooth(inside), contour.points, contour.normals, none)
 
 
 def extraction_bias(sight: Sight, mask: MaskImage, contour: Contour, rims: Rims) -> FloatArray:
@@ -364,13 +364,13 @@ def extraction_bias(sight: Sight, mask: MaskImage, contour: Contour, rims: Rims)
         return bias
     some, offsets = contour.taken(rows), rims.offset[rows]
     inside, places = mask
-    corner, rendered = _rendered(sight, inside, some.at(offsets))
-    own = crossings(smoothed(rendered), some.points - corner, some.normals, offsets)
+    corner, rendered = _render_band(sight, inside, some.at(offsets))
+    own = crossings(smooth(rendered), some.points - corner, some.normals, offsets)
     bias[rows] = np.nan_to_num(offsets - (own - places[rows]))
     return np.where(np.abs(bias) < REACH, bias, 0.0)
 
 
-def _rendered(sight: Sight, mask: Image, rims: FloatArray) -> tuple[IntArray, Image]:
+def _render_band(sight: Sight, mask: Image, rims: FloatArray) -> tuple[IntArray, Image]:
     """The silhouette near rims (S, 2) [px], the mask about them; first the corner (2,) of it."""
     height, width = mask.shape
     places = np.clip(np.rint(rims).astype(int), 0, [width - 1, height - 1])

@@ -25,9 +25,9 @@ from cadalign.estimation.contours.photo_lines import photo_of
 from cadalign.estimation.contours.rounds import (
     OutlineFit,
     Source,
+    add_displacement_modes,
     first_fit,
     last_fit,
-    with_displacement_modes,
 )
 from cadalign.estimation.contours.sources import MaskSource, PhotoSource, convex_hull
 from cadalign.estimation.model import is_exact_model
@@ -145,7 +145,7 @@ def _candidates(
     starts = [(each, each.state) for each in likely]
     has_photo = not all(each.learns_sigma for each in sources)
     if not is_open and (surface.is_exact or has_photo):
-        starts += _displaced(likely[0], is_exact=surface.is_exact)
+        starts += _neighbouring_starts(likely[0], is_exact=surface.is_exact)
     near = []
     for start, state in starts:
         fit = first_fit(start.evidence, state, keypoints, sources, surface)
@@ -195,7 +195,7 @@ def _is_determined(minimum: Minimum) -> bool:
     return bool(np.linalg.eigvalsh(scaled_information(information)[0])[0] > _LEAST_INFORMATION)
 
 
-def _displaced(start: Minimum, *, is_exact: bool) -> list[tuple[Minimum, State]]:
+def _neighbouring_starts(start: Minimum, *, is_exact: bool) -> list[tuple[Minimum, State]]:
     """States beside an estimate, along its weakest directions if these change it by much."""
     _, information = information_of(*reduced(start.evidence, start.state))
     poses, rest = 6 * len(start.state.poses), len(start.state.log_focals) + 3
@@ -209,11 +209,11 @@ def _displaced(start: Minimum, *, is_exact: bool) -> list[tuple[Minimum, State]]
         turn = np.linalg.norm(step[:poses].reshape(-1, 6)[:, :3], axis=1).max()
         stretch = np.abs(step[-3:]).max()
         if max(turn / _LEAST_TURN, stretch / _LEAST_STRETCH) > 1 and turn < _MOST_TURN:
-            found += [(start, _moved(start.state, sign * step)) for sign in _SIDEWAYS]
+            found += [(start, _move(start.state, sign * step)) for sign in _SIDEWAYS]
     return found
 
 
-def _moved(state: State, step: FloatArray) -> State:
+def _move(state: State, step: FloatArray) -> State:
     """The state after a step (U,) of poses, log focals and log scales."""
     poses, focals = state.poses.copy(), len(state.log_focals)
     turns, by_focal, by_scale = np.split(step, 6 * len(poses) + np.array([0, focals]))
@@ -255,7 +255,7 @@ def _tension(candidate: Candidate) -> str | None:
     equations = 2 * int((evidence.sightings.whitening[:, 2] > 0).sum())
     if not equations:
         return None
-    still = with_displacement_modes(evidence, start.state)
+    still = add_displacement_modes(evidence, start.state)
     alone, joint = cost_of(*still), cost_of(problem.evidence, state)
     free = 6 * len(state.poses) + int(evidence.scales.free.sum())
     redundancy = equations - free

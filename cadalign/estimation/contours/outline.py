@@ -18,7 +18,7 @@ from cadalign.estimation.result_parts import EstimateWarning, EvidenceSummary
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh, barycentric_of
 from cadalign.geometry.raycaster import RayCaster
-from cadalign.io.meshes.files import load_mesh
+from cadalign.io.meshes.files import mesh_at
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.warp import LinearWarp, linear_warp
 from cadalign.solvers.joint.evidence import Shape, State, points_of
@@ -145,10 +145,7 @@ def _nearest_with_mesh(
     row = rows[int(distances.argmin())]
     source = training.points_3d[row].astype(np.float64)
     known = np.flatnonzero(np.isfinite(source).all(axis=1))
-    return _mesh_at(cast(Path, training.mesh_paths[row])), source[known], known
-
-
-_mesh_at = lru_cache(maxsize=16)(load_mesh)
+    return mesh_at(cast(Path, training.mesh_paths[row])), source[known], known
 
 
 LOSS_SCALE = 2.4

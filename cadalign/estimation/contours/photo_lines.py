@@ -19,10 +19,10 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.contours.contour import (
     Contour,
     Sight,
-    across_rims,
     contour_of,
     find_rims,
-    without_steep,
+    remove_steep,
+    rim_normals,
 )
 from cadalign.estimation.contours.outline import Outline
 from cadalign.geometry.alignment import bounds_corners
@@ -81,7 +81,7 @@ def changes_of(odds: FloatArray, valid: BoolArray) -> FloatArray:
     return np.asarray(np.log(0.5 + step * known[:, None, :]).sum(axis=2))
 
 
-def with_neighbours(logs: FloatArray, are_neighbours: BoolArray) -> FloatArray:
+def add_neighbours(logs: FloatArray, are_neighbours: BoolArray) -> FloatArray:
     """Add a share of the log likelihoods (S, 2 K + 1) of the next lines along the outline.
 
     These are displaced by nearly the same, and help to choose between crossings. Their colours are
@@ -224,9 +224,9 @@ def silhouette_of(sight: Sight, cells: int) -> Silhouette | None:
     if not len(rough.points):
         return None
     contour = rough._replace(points=corner + cell * rough.points)
-    rims = without_steep(contour, find_rims(sight, contour, _RIM_REACH * cell))
+    rims = remove_steep(contour, find_rims(sight, contour, _RIM_REACH * cell))
     on_rim = contour._replace(points=contour.at(rims.offset))
-    across = across_rims(on_rim, rims._replace(offset=np.zeros(len(rims.offset))))
+    across = rim_normals(on_rim, rims._replace(offset=np.zeros(len(rims.offset))))
     within = (on_rim.points > _BORDER) & (
         on_rim.points < [sight.camera.width - 3, sight.camera.height - 3]
     )
@@ -276,11 +276,11 @@ def outline_of(photo: PhotoPyramid, silhouette: Silhouette, reach: float) -> Out
     steps = step * np.arange(-STEPS, STEPS + 1)
     pixels = contour.points[:, None] + steps[:, None] * contour.normals[:, None]
     colors = photo.colors(pixels, step)
-    valid = _on_own_side(photo, silhouette, pixels)
+    valid = _visible_pixels(photo, silhouette, pixels)
     logs = changes_of(odds[bins_of(colors)], valid)
     if step <= _EDGE_STEP:
         logs += edges_of(colors.astype(np.float64), valid, step)
-        logs = with_neighbours(logs, contour.neighbours(np.ones(len(logs), dtype=bool)))
+        logs = add_neighbours(logs, contour.neighbours(np.ones(len(logs), dtype=bool)))
     places, variances = crossings_of(logs)
     found = np.isfinite(variances)
     sigmas = step * np.sqrt(np.where(found, variances, 1.0))
@@ -321,7 +321,7 @@ def _colors_beside(
     return bins_of(colors[own]), bins_of(colors[other])
 
 
-def _on_own_side(photo: PhotoPyramid, silhouette: Silhouette, pixels: FloatArray) -> BoolArray:
+def _visible_pixels(photo: PhotoPyramid, silhouette: Silhouette, pixels: FloatArray) -> BoolArray:
     """Pixels (S, 2 K + 1, 2) of lines, up to where a line leaves the image or enters again."""
     kept = silhouette.at(pixels) == (np.arange(2 * STEPS + 1) < STEPS)
     kept &= photo.camera.contains(pixels, margin=PIXEL_CENTRE)

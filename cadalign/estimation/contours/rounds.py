@@ -29,7 +29,7 @@ from cadalign.estimation.contours.outline import (
 )
 from cadalign.estimation.contours.sources import MaskSource, PhotoSource
 from cadalign.estimation.estimates import poses_of
-from cadalign.estimation.search import with_whitening_times
+from cadalign.estimation.search import scale_whitening
 from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.joint.covariance import information_of, scaled_information
 from cadalign.solvers.joint.evidence import (
@@ -38,7 +38,7 @@ from cadalign.solvers.joint.evidence import (
     Sightings,
     State,
     log_focals_of,
-    stacked,
+    stack_tables,
 )
 from cadalign.solvers.joint.search import displaced_modes, objective_of, refine_joint
 
@@ -106,15 +106,15 @@ class OutlineProblem(NamedTuple):
         places = np.full(sum(map(len, means)), first)
         mean = np.insert(shape.mean, places, np.concatenate(means), axis=0)
         moved = np.insert(shape.modes, places, np.concatenate(modes, axis=1), axis=1)
-        own = stacked(sightings)._replace(point=first + np.arange(len(places)))
-        evidence = self._with_room(len(places))
+        own = stack_tables(sightings)._replace(point=first + np.arange(len(places)))
+        evidence = self._shift_points(len(places))
         evidence = evidence._replace(
             shape=Shape(mean, moved, np.insert(shape.spread, places, 0.0)),
-            sightings=stacked([evidence.sightings, own]),
+            sightings=stack_tables([evidence.sightings, own]),
         )
         return evidence, state._replace(displacements=np.zeros_like(mean))
 
-    def _with_room(self, count: int) -> Evidence:
+    def _shift_points(self, count: int) -> Evidence:
         """The evidence with the numbers that points have behind so many more of outlines."""
 
         def moved(points: IntArray) -> IntArray:
@@ -166,7 +166,7 @@ class OutlineProblem(NamedTuple):
         return mean, every, sightings
 
 
-def with_displacement_modes(evidence: Evidence, state: State) -> tuple[Evidence, State]:
+def add_displacement_modes(evidence: Evidence, state: State) -> tuple[Evidence, State]:
     """The same with the points' own displacements as modes, which a warped surface follows."""
     shape, rows = evidence.shape, np.flatnonzero(evidence.shape.spread > 0)
     modes = displaced_modes(shape, rows)
@@ -219,24 +219,24 @@ def first_fit(
     evidence: Evidence, state: State, keypoints: int, sources: Sequence[Source], surface: Surface
 ) -> OutlineFit | None:
     """The estimate that rounds lead to, of evidence and a state without outlines; or None."""
-    evidence, state = with_displacement_modes(evidence, state)
+    evidence, state = add_displacement_modes(evidence, state)
     shape, own = evidence.shape, np.zeros(_OWN_MODES * len(sources))
     modes = np.concatenate([shape.modes, np.zeros((len(own), *shape.mean.shape))])
     with_own = evidence._replace(shape=shape._replace(modes=modes))
     start = state._replace(coefficients=np.append(state.coefficients, own))
     problem = OutlineProblem(with_own, keypoints, sources, surface)
-    return _approached(problem, start, [source.first() for source in sources], _MOST_ROUNDS)
+    return _run_rounds(problem, start, [source.first() for source in sources], _MOST_ROUNDS)
 
 
 def last_fit(fit: OutlineFit) -> OutlineFit | None:
     """The end near another estimate; None without an outline."""
     begun = zip(fit.problem.sources, fit.tracks, strict=True)
     tracks = [source.last(track) for source, track in begun]
-    end = _approached(fit.problem, fit.state, tracks, _MOST_LAST_ROUNDS)
-    return None if end is None else _with_wider_noise(end)
+    end = _run_rounds(fit.problem, fit.state, tracks, _MOST_LAST_ROUNDS)
+    return None if end is None else _widen_noise(end)
 
 
-def _approached(
+def _run_rounds(
     problem: OutlineProblem, state: State, tracks: Sequence[Track], rounds: int
 ) -> OutlineFit | None:
     """The last of at most so many rounds, at the last level where noise and objective stay."""
@@ -262,7 +262,7 @@ def _approached(
         if not least < np.inf:
             return None
         gain = objective_of(evidence, before) - objective_of(evidence, after)
-        learned, state = _with_likeliest_offsets(problem, evidence, after, learned)
+        learned, state = _update_offsets(problem, evidence, after, learned)
         fit = OutlineFit(problem, (evidence, after), state, outlines, learned)
         is_settled = gain < _LEAST_GAIN and all(map(Track.is_like, learned, tracks))
         is_settled |= not any(source.learns_sigma for source in problem.sources)
@@ -272,7 +272,7 @@ def _approached(
     return fit
 
 
-def _with_likeliest_offsets(
+def _update_offsets(
     problem: OutlineProblem, evidence: Evidence, state: State, tracks: Sequence[Track]
 ) -> tuple[list[Track], State]:
     """Tracks whose offsets have the likeliest deviations, and the bare state in terms of these."""
@@ -285,7 +285,7 @@ def _with_likeliest_offsets(
     own = problem.own_of(bare)
     _, information = information_of(evidence, state)
     rows = len(information) - own.size + _OWN_MODES * learning
-    variances = _solved(information, np.eye(len(information))[:, rows])[rows].diagonal()
+    variances = _solve_information(information, np.eye(len(information))[:, rows])[rows].diagonal()
     for number, variance in zip(learning, variances, strict=True):
         noise = learned[number].noise
         offset = likeliest_offset(own[number, 0], variance, noise)
@@ -302,27 +302,26 @@ def likeliest_offset(own: float, variance: float, noise: Noise) -> float:
     return max(float(np.sqrt(square)), LEAST_OFFSET)
 
 
-def _with_wider_noise(fit: OutlineFit) -> OutlineFit:
+def _widen_noise(fit: OutlineFit) -> OutlineFit:
     """The same, its outlines' noise widened by the degrees of freedom that they determine."""
     evidence, state = fit.with_outlines
     rows = np.arange(len(evidence.sightings.point))
     is_outline = rows >= len(fit.problem.evidence.sightings.point)
     (_, whole), (_, rest) = (
-        information_of(with_whitening_times(times, is_outline, evidence), state)
-        for times in (1.0, 0.0)
+        information_of(scale_whitening(times, is_outline, evidence), state) for times in (1.0, 0.0)
     )
-    fitted = float(np.trace(_solved(whole, whole - rest)))
+    fitted = float(np.trace(_solve_information(whole, whole - rest)))
     independent = sum(
         float(outline.found.sum()) / track.noise.correlation
         for outline, track in zip(fit.outlines, fit.tracks, strict=True)
         if outline is not None
     )
     factor = np.sqrt(max(1 - fitted / max(independent, 1.0), _LEAST_FREEDOM))
-    wider = with_whitening_times(factor, is_outline, evidence)
+    wider = scale_whitening(factor, is_outline, evidence)
     return fit._replace(with_outlines=(wider, state))
 
 
-def _solved(information: FloatArray, right: FloatArray) -> FloatArray:
+def _solve_information(information: FloatArray, right: FloatArray) -> FloatArray:
     """The covariance times columns (U, k), of unknowns of which next to nothing may be known."""
     matrix, sizes = scaled_information(information)
     matrix = matrix + _LEAST_INFORMATION * np.eye(len(sizes))

@@ -59,7 +59,7 @@ _RESEMBLING = 12  # silhouettes from which a mask alone starts
 _LARGEST_FOCAL_SIGMA = 0.25  # relative: poses are sought at the focal length of the prior
 
 
-class Whitened(NamedTuple):
+class WhitenedSilhouettes(NamedTuple):
     """Silhouettes by their first and second moments, N of them.
 
     ``mean`` (N, 2), ``spread`` (N, 2, 2), the square root of the covariance, and ``rings`` (N,
@@ -77,7 +77,7 @@ class Atlas(NamedTuple):
     caster: RayCaster
     corners: FloatArray
     bases: FloatArray
-    views: Whitened
+    views: WhitenedSilhouettes
 
 
 def starts_of_mask(problem: Problem) -> list[Inits]:
@@ -145,10 +145,10 @@ def atlas_of(mesh: Mesh, eye: float) -> Atlas:
         covered = caster.covered(middle - far * direction, (grid / far) @ base + direction)
         if covered.sum() >= _LEAST_CELLS:
             image = covered.reshape(rows, columns).astype(np.float32)
-            views.append(_whitened(image, low + base @ middle, cell))
+            views.append(_whiten(image, low + base @ middle, cell))
             bases.append(base)
     every = [np.concatenate(column) for column in zip(*views, strict=True)]
-    return Atlas(caster, corners, np.array(bases), Whitened(*every))
+    return Atlas(caster, corners, np.array(bases), WhitenedSilhouettes(*every))
 
 
 def _directions() -> FloatArray:
@@ -161,7 +161,7 @@ def _directions() -> FloatArray:
     return np.concatenate([half, -half])
 
 
-def _eye_of(mesh: Mesh, query: Whitened) -> float:
+def _eye_of(mesh: Mesh, query: WhitenedSilhouettes) -> float:
     """One of `_EYES` from which a box of the mesh's size looks as large as a silhouette."""
     sides = np.ptp(mesh.bounds, axis=0)
     area = float((sides * np.roll(sides, 1)).sum()) / 2  # a quarter of the surface (Cauchy)
@@ -170,7 +170,7 @@ def _eye_of(mesh: Mesh, query: Whitened) -> float:
     return min(_EYES, key=lambda eye: abs(np.log(eye / far)))
 
 
-def _whitened(image: Image, corner: FloatArray, cell: float) -> Whitened:
+def _whiten(image: Image, corner: FloatArray, cell: float) -> WhitenedSilhouettes:
     """The silhouette of an image whose cells lie ``cell`` apart from the ``corner`` (2,) on."""
     points = np.argwhere(image > 0.5)[:, ::-1].astype(float)
     mean = points.mean(axis=0)
@@ -180,7 +180,7 @@ def _whitened(image: Image, corner: FloatArray, cell: float) -> Whitened:
     rays = (_RADII[:, None, None] * _AROUND).reshape(-1, 2)
     covered = sampled(np.pad(image, 1), mean + rays @ spread + 1)
     rings = np.rint(255 * covered).astype(np.uint8).reshape(1, _RINGS, _TURNS)
-    return Whitened((corner + cell * mean)[None], cell * spread[None], rings)
+    return WhitenedSilhouettes((corner + cell * mean)[None], cell * spread[None], rings)
 
 
 class FacedMask(NamedTuple):
@@ -190,7 +190,7 @@ class FacedMask(NamedTuple):
     ``rays`` (m, 3) through them, and lie in the photo where ``is_seen`` (m,).
     """
 
-    outline: Whitened
+    outline: WhitenedSilhouettes
     inside: FloatArray
     rays: FloatArray
     is_seen: BoolArray
@@ -224,7 +224,7 @@ class FacedMask(NamedTuple):
         image = sampled(np.pad(soft, 1), pixels + 1).reshape(_CELLS, _CELLS).astype(np.float32)
         some = np.arange(_CELLS**2).reshape(_CELLS, _CELLS)[::2, ::2].ravel()
         compared = image.ravel()[some].astype(float), rays[some], camera.contains(pixels)[some]
-        return cls(_whitened(image, corner, cell), *compared, turn)
+        return cls(_whiten(image, corner, cell), *compared, turn)
 
     def overlap(self, caster: RayCaster, pose: Alignment) -> float:
         """Intersection over union of the mask and the silhouette of a pose in this view."""
@@ -234,7 +234,7 @@ class FacedMask(NamedTuple):
         return common / (float(self.inside.sum()) + int(seen.sum()) - common)
 
 
-def _overlaps(views: Whitened, query: Whitened) -> FloatArray:
+def _overlaps(views: WhitenedSilhouettes, query: WhitenedSilhouettes) -> FloatArray:
     """Intersections over unions (N, turns) of silhouettes and one that is turned."""
     rings = query.rings[0].astype(np.float32) / 255
     weights = np.repeat(_RADII, _TURNS).astype(np.float32)
@@ -246,7 +246,7 @@ def _overlaps(views: Whitened, query: Whitened) -> FloatArray:
     return np.asarray(common / (areas[:, None] + weighted[:, 0].sum() - common), dtype=np.float64)
 
 
-def _affine_cameras(atlas: Atlas, query: Whitened) -> tuple[FloatArray, FloatArray]:
+def _affine_cameras(atlas: Atlas, query: WhitenedSilhouettes) -> tuple[FloatArray, FloatArray]:
     """Maps (n, 2, 3), (n, 2) ``M x + b`` of the model to the query's plane of the best overlaps."""
     overlap = _overlaps(atlas.views, query)
     # A whitened silhouette may fit at several turns.

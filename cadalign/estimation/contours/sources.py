@@ -23,12 +23,12 @@ from cadalign.estimation.contours.contour import (
     Contour,
     MaskImage,
     Sight,
-    across_rims,
     extraction_bias,
     find_rims,
     mask_contour,
     mask_image,
-    without_steep,
+    remove_steep,
+    rim_normals,
 )
 from cadalign.estimation.contours.outline import (
     LEAST_LOSS_SCALE,
@@ -115,8 +115,8 @@ class MaskSource(OutlineSource):
         bias = np.zeros(len(rims.found))
         if track.is_fine:
             bias = extraction_bias(sight, self.mask, self.contour, rims)
-        rims = without_steep(self.contour, rims, bias)
-        across = np.einsum("ni,nij->nj", across_rims(self.contour, rims), self.slopes)
+        rims = remove_steep(self.contour, rims, bias)
+        across = np.einsum("ni,nij->nj", rim_normals(self.contour, rims), self.slopes)
         return Outline(
             self.contour,
             rims.found,

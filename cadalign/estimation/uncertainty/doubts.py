@@ -55,7 +55,7 @@ def keypoint_warnings(
         return tuple(found)
     options, kept = fitted.options, fitted.points_3d[fitted.inliers]
     if fitted.sigma is not None and options.sigma is None:
-        found += unexplained(fitted.sigma, [observed])
+        found += noise_doubts(fitted.sigma, [observed])
     if fitted.search is not None:
         agreeing = residuals[counted], fitted.inliers[counted]
         chance = fitted.search.doubt(*agreeing)
@@ -214,7 +214,7 @@ def outside_image(
     return tuple(found)
 
 
-def unexplained(sigma: float, points_2d: Sequence[FloatArray]) -> Warnings:
+def noise_doubts(sigma: float, points_2d: Sequence[FloatArray]) -> Warnings:
     """Warn of an estimated sigma [px] that is nearly the spread of the keypoints of views (n, 2).
 
     It is a smaller share in 98 % of pairs of a category's models, in 2 % of keypoints in random

@@ -32,7 +32,7 @@ from cadalign.estimation.uncertainty.residuals import (
 from cadalign.geometry.camera import faced, needs_facing, turned_alignment, turned_covariance
 from cadalign.geometry.rotations import by_rotation
 from cadalign.io.focal import FocalPrior
-from cadalign.solvers.draws import Centred, LogPriors, WhitenedPixels, weigh_draws
+from cadalign.solvers.draws import CentredAlignment, LogPriors, WhitenedPixels, weigh_draws
 
 MOST_POINTS = 100
 """Keypoints beyond which the inverse Fisher information is accurate, and sampling is slow."""
@@ -68,12 +68,12 @@ def keypoint_covariance(fitted: FittedKeypoints) -> FloatArray | None:
         covariance = _posterior_covariance(fitted)
     if fitted.symmetry is None:
         return covariance
-    from cadalign.estimation.symmetry import held_axes, without_free_turns
+    from cadalign.estimation.symmetry import held_axes, remove_free_turns
     from cadalign.geometry.symmetry_group import group_of  # most models have none
 
     held = held_axes(fitted.options.stretched_axes)
     best = group_of(fitted.symmetry).canonical(fitted.alignment, held=held)
-    return without_free_turns(covariance, best)
+    return remove_free_turns(covariance, best)
 
 
 def _posterior_covariance(fitted: FittedKeypoints) -> FloatArray:
@@ -92,10 +92,10 @@ def _posterior_covariance(fitted: FittedKeypoints) -> FloatArray:
         with suppress(np.linalg.LinAlgError, InputError):
             sampled = _sample(fitted, covariance, widening)
             covariance = covariance if sampled is None else sampled
-    return _within_prior(covariance, fitted)
+    return _limit_to_prior(covariance, fitted)
 
 
-def _within_prior(covariance: FloatArray, result: FittedKeypoints) -> FloatArray:
+def _limit_to_prior(covariance: FloatArray, result: FittedKeypoints) -> FloatArray:
     """The covariance (m, m), with log scales that vary no more than their prior does by itself.
 
     A parabola, or an ellipsoid about a curved region, reaches past the ends of the prior, whose
@@ -124,7 +124,7 @@ def widening_of(unknowns: int, redundancy: float) -> float:
 class Chart(NamedTuple):
     """Coordinates (10,) about an alignment; see `cadalign.solvers.draws`."""
 
-    centred: Centred
+    centred: CentredAlignment
     keypoints: WhitenedPixels
     priors: LogPriors
 
@@ -150,7 +150,7 @@ class Chart(NamedTuple):
         center = points.mean(axis=0)
         keypoints = WhitenedPixels(points - center, whitening @ slopes, fixed.copy(), seen.copy())
         moved = alignment.rotation.ravel(), alignment.apply(center[None])[0], alignment.scale
-        centred = Centred(np.concatenate(moved), center, alignment.translation)
+        centred = CentredAlignment(np.concatenate(moved), center, alignment.translation)
         prior = options.focal_prior
         of_focal = 0.0, 0.0
         if isinstance(prior, FocalPrior):
@@ -223,7 +223,7 @@ def _sample(fitted: FittedKeypoints, first: FloatArray, widening: float) -> Floa
     covariance, among = np.zeros_like(first), np.ix_(free, free)
     prior = _prior_information(fitted.options, size)[free]
     moved = deviations[:, free]
-    covariance[among] = _widened(first[among], prior, moved, weights, likely, limit)
+    covariance[among] = _widen(first[among], prior, moved, weights, likely, limit)
     return covariance if np.isfinite(covariance).all() else None
 
 
@@ -238,7 +238,7 @@ def _draws(round_: int, size: int) -> tuple[FloatArray, FloatArray]:
     return draws, logs
 
 
-def _widened(
+def _widen(
     variance: FloatArray,
     prior: FloatArray,
     moved: FloatArray,

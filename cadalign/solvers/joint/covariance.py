@@ -50,7 +50,7 @@ def joint_covariance(evidence: Evidence, state: State) -> JointCovariance:
     held = first - 3 + np.flatnonzero(evidence.scales.free == 0)
     inverse.border[held, held] = 0.0
     rows, own = _points_by_unknowns(evidence, reduced, fewer, equations, sighted_points(evidence))
-    turn, rows_seen = _in_first_camera(reduced, fewer, rows)
+    turn, rows_seen = _first_camera_frame(reduced, fewer, rows)
     unknowns = pose_and_border(inverse, evidence.rig.pose[0])
     # The modes that the evidence does not tell apart keep their prior.
     basis = reduction.basis[:modes]
@@ -107,7 +107,7 @@ def _points_by_unknowns(
     return rows, own
 
 
-def _in_first_camera(
+def _first_camera_frame(
     evidence: Evidence, state: State, rows: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Rotation (3, 3) of the first camera from the model, and derivatives (m, 3, 6 + b) there."""

@@ -26,8 +26,8 @@ from cadalign.solvers.joint.evidence import (
     Shape,
     State,
     exp_of,
+    remove_displacements,
     stretched_point,
-    undisplaced,
     unstretched,
 )
 from cadalign.solvers.joint.rows import count_block_equations, write_block_row
@@ -226,7 +226,7 @@ def _add_block_slopes(evidence: Evidence, state: State, arrow: Arrow, factor: Fl
     """Add half the derivatives that blocks give: how rows move along the responses to them."""
     first, total = 6 + evidence.focals.low.shape[0] + 3, count_block_equations(evidence)
     row, moved_row = np.empty(6 + arrow.border.shape[0]), np.empty(6 + arrow.border.shape[0])
-    still, moved = undisplaced(state), undisplaced(state)
+    still, moved = remove_displacements(state), remove_displacements(state)
     response = np.empty((factor.shape[0], total))
     for q in range(total):
         equation = write_block_row(evidence, still, q, row)

@@ -159,7 +159,7 @@ class State(NamedTuple):
 
 
 @kernel
-def unpacked(shape: Shape, focals: int, row: FloatArray) -> State:
+def unpack_state(shape: Shape, focals: int, row: FloatArray) -> State:
     """The parts of a state that is a row of numbers; they share its memory."""
     modes, points = shape.modes.shape[0], shape.mean.shape[0]
     a = row.shape[0] - 3 * points
@@ -172,7 +172,7 @@ def unpacked(shape: Shape, focals: int, row: FloatArray) -> State:
 
 
 @kernel
-def undisplaced(state: State) -> State:
+def remove_displacements(state: State) -> State:
     still = np.zeros_like(state.displacements)
     return State(state.poses, state.log_focals, state.log_scales, state.coefficients.copy(), still)
 
@@ -183,7 +183,7 @@ def kept_rows(table: Table, kept: BoolArray | IntArray) -> Table:
     return type(table)(*columns)
 
 
-def stacked(tables: Sequence[Table]) -> Table:
+def stack_tables(tables: Sequence[Table]) -> Table:
     """The rows of all tables, one after the other."""
     return type(tables[0])(*map(np.concatenate, zip(*tables, strict=True)))
 

@@ -26,8 +26,8 @@ from cadalign.solvers.joint.evidence import (
     Shape,
     State,
     exp_of,
+    remove_displacements,
     stretched_point,
-    undisplaced,
     unstretched,
 )
 from cadalign.solvers.linalg import cross, dot, scaled, triple
@@ -249,7 +249,7 @@ def add_blocks(evidence: Evidence, state: State, arrow: Arrow, products: FloatAr
     """Add all evidence but sightings; returns its cost. ``products`` are as of `add_rows`."""
     cost = _add_priors(evidence.focals, evidence.scales, state, arrow)
     column = np.empty(products.shape[0])
-    row, rows, still = column[:-1], column.reshape((-1, 1)), undisplaced(state)
+    row, rows, still = column[:-1], column.reshape((-1, 1)), remove_displacements(state)
     for q in range(count_block_equations(evidence)):
         equation = write_block_row(evidence, still, q, row)
         cost += equation.cost

@@ -41,7 +41,7 @@ from cadalign.solvers.joint.evidence import (
     State,
     exp_of,
     stretched_point,
-    unpacked,
+    unpack_state,
 )
 from cadalign.solvers.joint.rows import add_blocks, bounded_scales, write_rows
 from cadalign.solvers.linalg import copy_into, damp, expected_decrease
@@ -93,7 +93,7 @@ def evaluate_joint(system: Joint, row: FloatArray, equations: JointEquations) ->
     """Write the normal equations at a state; see `cadalign.solvers.search.evaluate`."""
     evidence, arrow, layout = system.evidence, equations.arrow, system.layout
     first = evidence.focals.low.shape[0]
-    state = unpacked(evidence.shape, first, row)
+    state = unpack_state(evidence.shape, first, row)
     poses = state.poses.shape[0]
     clear(arrow)
     equations.log_determinant[0] = 0.0
@@ -166,20 +166,20 @@ def _move(
 ) -> None:
     evidence = system.evidence
     shape, focals = evidence.shape, evidence.focals.low.shape[0]
-    state, moved = unpacked(shape, focals, row), unpacked(shape, focals, moved_row)
+    state, moved = unpack_state(shape, focals, row), unpack_state(shape, focals, moved_row)
     poses = state.poses.shape[0]
     for p in range(poses):
         move_rigid(state.poses[p], step[6 * p : 6 * p + 6], moved.poses[p])
         orthonormalize(moved.poses[p])
     first = 6 * poses
     for f in range(focals):
-        value = state.log_focals[f] + _bounded(step[first + f])
+        value = state.log_focals[f] + _bound_step(step[first + f])
         moved.log_focals[f] = min(max(value, evidence.focals.low[f]), evidence.focals.high[f])
     if evidence.rig.pose.shape[0] == poses:
         _follow_focals(evidence, state, step[first:], moved)
     first += focals
     for a in range(3):
-        moved.log_scales[a] = state.log_scales[a] + _bounded(step[first + a])
+        moved.log_scales[a] = state.log_scales[a] + _bound_step(step[first + a])
     for k in range(state.coefficients.shape[0]):
         moved.coefficients[k] = state.coefficients[k] + step[first + 3 + k]
     for i in range(state.displacements.shape[0]):
@@ -201,7 +201,7 @@ def _follow_focals(evidence: Evidence, state: State, log_steps: FloatArray, move
 
 
 @inlined
-def _bounded(log_step: float) -> float:
+def _bound_step(log_step: float) -> float:
     return min(max(log_step, -_LARGEST_LOG_STEP), _LARGEST_LOG_STEP)
 
 
@@ -219,7 +219,7 @@ def _score_of(system: Joint, row: FloatArray, cost: float) -> float:
     if not factorize_arrow(arrow):
         return np.inf
     score = cost + log_determinant(arrow) + equations.log_determinant[0]
-    return float(score + _score_of_distances(evidence, unpacked(evidence.shape, first, row)))
+    return float(score + _score_of_distances(evidence, unpack_state(evidence.shape, first, row)))
 
 
 @kernel
@@ -257,7 +257,7 @@ def _score_of_distances(evidence: Evidence, state: State) -> float:
 @kernel
 def _are_same(system: Joint, first_row: FloatArray, second_row: FloatArray) -> bool:
     shape, focals = system.evidence.shape, system.evidence.focals.low.shape[0]
-    first, second = unpacked(shape, focals, first_row), unpacked(shape, focals, second_row)
+    first, second = unpack_state(shape, focals, first_row), unpack_state(shape, focals, second_row)
     square = 0.0
     for p in range(first.poses.shape[0]):
         for i in range(9):

@@ -64,7 +64,7 @@ def _search_mixture(
     firsts[components] = count
     likely = room_for_minima(_MOST, POSE + 6 * n)
     for g in range(components):
-        chosen = _chosen(starts[:count], given.shape[0], firsts[g], firsts[g + 1])
+        chosen = _select_starts(starts[:count], given.shape[0], firsts[g], firsts[g + 1])
         states = np.zeros((chosen.shape[0], POSE + 6 * n))
         for s in range(chosen.shape[0]):
             copy_into(states[s, :POSE], starts[chosen[s]])
@@ -103,7 +103,7 @@ def _add_starts(
 
 
 @kernel
-def _chosen(starts: FloatArray, given: int, first: int, end: int) -> IntArray:
+def _select_starts(starts: FloatArray, given: int, first: int, end: int) -> IntArray:
     """Numbers of a component's starts: given ones, its own, and of the others what these lack."""
     count = starts.shape[0]
     chosen = np.empty(count, dtype=np.int64)

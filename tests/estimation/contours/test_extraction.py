@@ -13,7 +13,7 @@ from cadalign.estimation.contours.contour import (
     extraction_bias,
     find_rims,
     mask_image,
-    without_steep,
+    remove_steep,
 )
 from cadalign.geometry.raycaster import RayCaster
 from cadalign.render import Scene, cast_geometry
@@ -53,5 +53,5 @@ def test_corners_that_are_rounded_off_are_not_steep() -> None:
     offset = np.array([0, 0, 0, 0, 3.0, 0, 0, 0, 0])
     nothing = np.zeros((9, 3)), np.zeros(9, dtype=int)
     rims = contours.Rims(np.ones(9, dtype=bool), offset, *nothing)
-    assert without_steep(contour, rims).found.tolist() == [*[True] * 3, *[False] * 3, *[True] * 3]
-    assert without_steep(contour, rims, offset).found.all()
+    assert remove_steep(contour, rims).found.tolist() == [*[True] * 3, *[False] * 3, *[True] * 3]
+    assert remove_steep(contour, rims, offset).found.all()

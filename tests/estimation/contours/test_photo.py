@@ -15,10 +15,10 @@ from cadalign import Alignment, Camera, Mesh, Model, View, align
 from cadalign.estimation.contours.contour import Sight
 from cadalign.estimation.contours.outline import RigidSurface
 from cadalign.estimation.contours.photo_lines import (
+    add_neighbours,
     changes_of,
     crossings_of,
     silhouette_of,
-    with_neighbours,
 )
 from cadalign.estimation.result import Result
 from cadalign.geometry.rotations import rotation_from_vector
@@ -228,7 +228,7 @@ class TestLines:
         several = np.where((np.arange(21) >= 15) & (np.arange(21) < 18), 0.9, single)
         logs = changes_of(np.stack([single, several, single]), np.ones((3, 21), dtype=bool))
         alone, _ = crossings_of(logs)
-        beside, _ = crossings_of(with_neighbours(logs, np.array([True, True])))
-        others, _ = crossings_of(with_neighbours(logs, np.array([False, False])))
+        beside, _ = crossings_of(add_neighbours(logs, np.array([True, True])))
+        others, _ = crossings_of(add_neighbours(logs, np.array([False, False])))
         assert abs(beside[1] - beside[0]) < 0.3 * abs(alone[1] - alone[0])
         assert others == pytest.approx(alone, abs=0.1)

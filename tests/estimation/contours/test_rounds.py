@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from cadalign import Alignment, Camera, Model, Result, View, align
 from cadalign.datasets import KeypointNet
-from cadalign.estimation.contours.contour import Contour, Rims, across_rims
+from cadalign.estimation.contours.contour import Contour, Rims, rim_normals
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.metrics import rotation_error
 from cadalign.render import Scene, cast_geometry, sample_view
@@ -118,7 +118,7 @@ def test_directions_across_rims_are_the_rims_own() -> None:
     found = np.ones(count, dtype=bool)
     found[10:13] = False
     rims = Rims(found, np.where(found, offset, 0.0), np.zeros((count, 3)), np.zeros(count, int))
-    across = across_rims(contour, rims)
+    across = rim_normals(contour, rims)
     assert np.allclose((across * normals).sum(axis=1), 1)
     assert np.allclose(across[found] @ [1.0, slope], 0, atol=1e-9)
     assert np.allclose(across[11], normals[11])

@@ -22,7 +22,7 @@ from support.scenes import (
 )
 
 from cadalign import Alignment, Model, ShapeModel, Size, View, align
-from cadalign.estimation.estimates import with_box
+from cadalign.estimation.estimates import estimate_box
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import Lenses, ShapePrior, prior_of, redundancy_of
@@ -272,7 +272,7 @@ def test_points_that_are_no_keypoints_end_no_box() -> None:
     margins = BoxMargins(np.full((2, 3), 0.01), np.full((2, 3), 9.0))
     farthest = int(mean[2:12, 0].argmax()) + 2
     some = replace(prior, ids=prior.ids[:farthest], has_box=True, box_margins=margins)
-    placed, _ = with_box(evidence, state, some)
+    placed, _ = estimate_box(evidence, state, some)
     known = mean[:farthest]
     expected = [known.min(axis=0) - 0.01, known.max(axis=0) + 0.01]
     np.testing.assert_allclose(placed.shape.mean[-2:], expected)

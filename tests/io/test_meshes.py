@@ -142,9 +142,9 @@ def test_obj_materials_and_textures(write, tmp_path):
 @pytest.mark.parametrize(
     ("library", "told"),
     [
-        (None, "no material library"),
+        (None, "model.mtl cannot be read (no such file)"),
         ("newmtl other\nKd 1 0 0\n", "'a' is not defined"),
-        ("newmtl a\nKd 1 0 0\nmap_Kd gone.png\n", "gone.png is missing"),
+        ("newmtl a\nKd 1 0 0\nmap_Kd gone.png\n", "gone.png cannot be read (no such file)"),
         ("newmtl a\nKd 1 0 0\nmap_Kd bad.png\n", "bad.png cannot be read"),
         ("\0\x01garbage\nKd\nmap_Kd x\nKd 1 1 1\n", "'a' is not defined"),
     ],

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DataError, InputError, brief
-from cadalign.geometry.mesh import Mesh, check_near, face_normals, spread_colors
+from cadalign.geometry.mesh import GREY, Mesh, check_near, face_normals, spread_colors
 from cadalign.io.documents import in_file
 from cadalign.io.files import (
     as_path,
@@ -20,11 +20,9 @@ from cadalign.io.files import (
     made_folder,
     once_per_file,
     read_bytes,
-    refuse_folder,
     write_text,
     write_whole,
 )
-from cadalign.io.images import write_image
 from cadalign.io.kinds import MESH, refuse_other_file
 from cadalign.io.meshes.gltf import read_gltf
 from cadalign.io.meshes.polygons import read_obj, read_off, read_ply, read_stl
@@ -99,11 +97,10 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
             mesh = reader(data.removeprefix(BOM_UTF8), path)
             if not np.linalg.norm(face_normals(mesh.triangles), axis=1).any():
                 raise DataError("no face of the mesh has an area")
-    except CadalignError:
-        refuse_other_file(path, MESH)
-        raise
     except Exception as error:  # of damaged content any kind
         refuse_other_file(path, MESH)
+        if isinstance(error, CadalignError):
+            raise
         reason = f"{type(error).__name__}: {brief(error)}"
         kind = path.suffix[1:].upper()
         raise damaged(f"cannot be read as a {kind} file ({reason})", path) from None
@@ -165,32 +162,28 @@ def check_solid(mesh: Mesh) -> None:
 
 
 def write_obj_mesh(path: Path, mesh: Mesh) -> None:
-    """Write a mesh as OBJ, with its materials as MTL and PNG beside it; folders are made.
+    """Write a mesh as OBJ, its faces in their order, with colours as `write_ply_mesh`.
 
-    Faces keep their order and polygons their corners' texture coordinates; vertex colours follow
-    the coordinates, as MeshLab reads them.
+    The colours stand behind the coordinates, as MeshLab reads them; a surface that is plainly grey
+    has none. Folders are made.
 
-    Raises DataError if a file cannot be written.
+    Raises DataError if the file cannot be written.
     """
-    refuse_folder(path)
+    colors = spread_colors(mesh, _palette(mesh))
+    form, rows = "v" + 3 * f" {{:.{_digits(mesh)}g}}", mesh.vertices
+    if (colors != GREY).any():
+        form, rows = form + 3 * " {:.9g}", np.hstack([rows, colors[:, :3]])
+    lines = [form.format(*row) for row in rows.tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (mesh.faces + 1).tolist()]
     made_folder(path.parent)
-    library = path.with_suffix(".mtl")
-    names = [f"material_{number}" for number in range(len(mesh.materials))]
-    lines = [f"mtllib {library.name}", *_vertex_lines(mesh)]
-    uv_rows = None
-    if mesh.corner_uv is not None and any(each.texture is not None for each in mesh.materials):
-        distinct, rows = np.unique(mesh.corner_uv.reshape(-1, 2), axis=0, return_inverse=True)
-        uv_rows = rows.reshape(-1, 3) + 1
-        lines += [f"vt {u:.9g} {v:.9g}" for u, v in distinct.tolist()]
-    lines += _face_lines(mesh, names, uv_rows)
-    write_text(library, "\n".join(_material_lines(mesh, names, path)) + "\n")
     write_text(path, "\n".join(lines) + "\n")
 
 
 def write_ply_mesh(path: Path, mesh: Mesh) -> None:
     """Write a mesh as binary PLY, its faces in their order, with colours of its vertices.
 
-    A surface without vertex colours has its materials'; PLY has no textures. Folders are made.
+    A surface without vertex colours has its materials', those of textures on average. Folders are
+    made.
 
     Raises DataError if the file cannot be written.
     """
@@ -229,38 +222,3 @@ def _palette(mesh: Mesh) -> FloatArray:
         if each.texture is not None:
             palette[row, :3] = each.texture[..., :3].reshape(-1, 3).mean(axis=0) / 255
     return palette
-
-
-def _vertex_lines(mesh: Mesh) -> list[str]:
-    form, rows = "v" + 3 * f" {{:.{_digits(mesh)}g}}", mesh.vertices
-    if mesh.vertex_colors is not None:
-        form, rows = form + 3 * " {:.9g}", np.hstack([rows, mesh.vertex_colors[:, :3]])
-    return [form.format(*row) for row in rows.tolist()]
-
-
-def _face_lines(mesh: Mesh, names: list[str], uv_rows: IntArray | None) -> list[str]:
-    """Faces in file order, with the material's name where it changes."""
-    lines, current = [], -1
-    form, rows = "f {} {} {}", mesh.faces + 1
-    if uv_rows is not None:
-        rows = np.stack([rows, uv_rows], axis=2).reshape(-1, 6)
-        form = "f {}/{} {}/{} {}/{}"
-    for row, material in zip(rows.tolist(), mesh.face_material.tolist(), strict=True):
-        if material != current:
-            lines.append(f"usemtl {names[material]}")
-            current = material
-        lines.append(form.format(*row))
-    return lines
-
-
-def _material_lines(mesh: Mesh, names: list[str], path: Path) -> list[str]:
-    """The material library; writes the textures beside the OBJ file."""
-    lines = []
-    for name, material in zip(names, mesh.materials, strict=True):
-        red, green, blue, alpha = material.color
-        lines += [f"newmtl {name}", f"Kd {red:.6g} {green:.6g} {blue:.6g}", f"d {alpha:.6g}"]
-        if material.texture is not None:
-            image = path.with_name(f"{path.stem}_{name}.png")
-            write_image(image, material.texture)
-            lines.append(f"map_Kd {image.name}")
-    return lines

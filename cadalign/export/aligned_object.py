@@ -17,7 +17,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.files import as_path, keeping, made_folder, printable, refuse_nul
 from cadalign.io.images import ByteImage, read_image
-from cadalign.io.meshes.files import write_obj_mesh, write_ply_mesh
+from cadalign.io.meshes.files import write_mesh
 
 Frame = Literal["camera", "rig", "model"]
 FRAMES: tuple[Frame, ...] = get_args(Frame)
@@ -166,11 +166,11 @@ FORMATS: dict[str, Format] = {
     "glb": Format("textured model, cameras and photos, for viewers", _glb),
     "obj": Format(
         "the mesh, with vertex colours",
-        lambda path, *given: write_obj_mesh(path, _mesh_in_metres(*given)),
+        lambda path, *given: write_mesh(path, _mesh_in_metres(*given), kind="obj"),
     ),
     "ply": Format(
         "the mesh, with vertex colours",
-        lambda path, *given: write_ply_mesh(path, _mesh_in_metres(*given)),
+        lambda path, *given: write_mesh(path, _mesh_in_metres(*given), kind="ply"),
     ),
 }
 """The formats by name."""

@@ -16,7 +16,7 @@ from cadalign.errors import InputError
 from cadalign.export import AlignedObject, ExportView, export_object
 from cadalign.io.evidence import ImageEvidence, ObservedImage
 from cadalign.io.images import write_image
-from cadalign.io.meshes.files import write_obj_mesh
+from cadalign.io.meshes.files import write_mesh
 from cadalign.io.observation import Observation
 from cadalign.shapes.examples import Example
 
@@ -136,7 +136,7 @@ def test_views_and_warped_mesh_of_a_joint_fit(tmp_path: Path, observed: Path) ->
 def test_results_of_learned_shapes_export_the_nearest_training_mesh(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    write_obj_mesh(tmp_path / "wedge.obj", wedge())
+    write_mesh(tmp_path / "wedge.obj", wedge(), kind="obj")
     rng, ids = np.random.default_rng(0), list(range(len(MORE)))
     paths = [tmp_path / "wedge.obj"] * 8
     examples = [

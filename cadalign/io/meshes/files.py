@@ -6,12 +6,13 @@ import os
 from codecs import BOM_UTF8
 from contextlib import suppress
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import CadalignError, DataError, InputError, brief
-from cadalign.geometry.mesh import GREY, Mesh, check_near, face_normals, spread_colors
+from cadalign.errors import CadalignError, DataError, brief
+from cadalign.geometry.mesh import Mesh, check_near, face_normals, spread_colors
 from cadalign.io.documents import in_file
 from cadalign.io.files import (
     as_path,
@@ -20,7 +21,6 @@ from cadalign.io.files import (
     made_folder,
     once_per_file,
     read_bytes,
-    write_text,
     write_whole,
 )
 from cadalign.io.kinds import MESH, refuse_other_file
@@ -29,8 +29,8 @@ from cadalign.io.meshes.polygons import read_obj, read_off, read_ply, read_stl
 
 # Coordinates in ShapeNet's files have 6 decimals; less than ten of these steps is rounding.
 _FLAT = 1e-5
-_DIGITS = 9  # of coordinates in OBJ files
-
+_DIGITS = 12  # behind the point, in OBJ files
+_FAR = 1000.0  # distance from the origin of a mesh in a PLY file [its extent]
 
 _READERS = {
     ".obj": read_obj,
@@ -123,19 +123,6 @@ mesh_at = once_per_file(16)(load_mesh)
 """As `load_mesh`, and remembers the last meshes: many objects of a run may share one."""
 
 
-def as_mesh(given: object, *, where: str) -> Mesh:
-    """A mesh, or the one that a path names.
-
-    Raises InputError if it is neither, DataError if the file cannot be read.
-    """
-    if isinstance(given, Mesh):
-        return given
-    if isinstance(given, str | os.PathLike):
-        return load_mesh(given)
-    what = f"expected a cadalign.Mesh or a path, got {type(given).__name__}"
-    raise InputError(what, where=where, fix="read it with cadalign.load_mesh")
-
-
 def check_solid(mesh: Mesh) -> None:
     """Refuse a mesh that has no thickness along an axis: less than 1e-5 of its box's diagonal.
 
@@ -161,58 +148,27 @@ def check_solid(mesh: Mesh) -> None:
         raise DataError(what, where=mesh.source, fix="leave it out")
 
 
-def write_obj_mesh(path: Path, mesh: Mesh) -> None:
-    """Write a mesh as OBJ, its faces in their order, with colours as `write_ply_mesh`.
-
-    The colours stand behind the coordinates, as MeshLab reads them; a surface that is plainly grey
-    has none. Folders are made.
-
-    Raises DataError if the file cannot be written.
-    """
-    colors = spread_colors(mesh, _palette(mesh))
-    form, rows = "v" + 3 * f" {{:.{_digits(mesh)}g}}", mesh.vertices
-    if (colors != GREY).any():
-        form, rows = form + 3 * " {:.9g}", np.hstack([rows, colors[:, :3]])
-    lines = [form.format(*row) for row in rows.tolist()]
-    lines += [f"f {a} {b} {c}" for a, b, c in (mesh.faces + 1).tolist()]
-    made_folder(path.parent)
-    write_text(path, "\n".join(lines) + "\n")
-
-
-def write_ply_mesh(path: Path, mesh: Mesh) -> None:
-    """Write a mesh as binary PLY, its faces in their order, with colours of its vertices.
+def write_mesh(path: Path, mesh: Mesh, *, kind: Literal["obj", "ply"]) -> None:
+    """Write a mesh as OBJ or binary PLY, its faces in their order, with colours of its vertices.
 
     A surface without vertex colours has its materials', those of textures on average. Folders are
     made.
 
-    Raises DataError if the file cannot be written.
+    Raises DataError if the file cannot be written, or the mesh is too far from its origin for PLY.
     """
-    number, kind = ("float", "<f4") if _digits(mesh) <= _DIGITS else ("double", "<f8")
-    vertices = np.empty(len(mesh.vertices), [("place", kind, 3), ("color", "u1", 4)])
-    vertices["place"] = mesh.vertices
-    vertices["color"] = np.round(255 * spread_colors(mesh, _palette(mesh)))
-    faces = np.empty(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
-    faces["count"], faces["corners"] = 3, mesh.faces
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(vertices)}",
-        *(f"property {number} {axis}" for axis in "xyz"),
-        *(f"property uchar {channel}" for channel in ("red", "green", "blue", "alpha")),
-        f"element face {len(faces)}",
-        "property list uchar int vertex_indices",
-        "end_header\n",
-    ]
-    data = "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
+    import trimesh  # takes time
+
+    extents = np.ptp(mesh.bounds, axis=0)
+    if kind == "ply" and np.abs(mesh.bounds).max() > _FAR * extents.max():
+        what = f"the mesh lies more than {_FAR:g} times its size from its origin; PLY has 7 digits"
+        raise DataError(what, where=str(path), fix="write OBJ, or in another frame")
+    colors = np.round(255 * spread_colors(mesh, _palette(mesh))).astype(np.uint8)
+    written = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
+    options: dict[str, Any] = {"digits": _DIGITS, "header": None} if kind == "obj" else {}
+    data: Any = written.export(file_type=kind, **options)
+    content = data.encode() if isinstance(data, str) else data
     made_folder(path.parent)
-    write_whole(path, lambda unfinished: unfinished.write_bytes(data))
-
-
-def _digits(mesh: Mesh) -> int:
-    """Digits of the coordinates that are written: more of a mesh far from its origin."""
-    extent = float(np.ptp(mesh.bounds, axis=0).max())
-    distance = float(np.abs(mesh.bounds).max())
-    return min(17, _DIGITS + max(0, int(np.log10(distance / extent)))) if extent else 17
+    write_whole(path, lambda unfinished: unfinished.write_bytes(content))
 
 
 def _palette(mesh: Mesh) -> FloatArray:

@@ -183,7 +183,7 @@ class _GltfFile:
         cos, sin = np.cos(change.get("rotation", 0.0)), np.sin(change.get("rotation", 0.0))
         scaled = self._array(attributes[name]) * change.get("scale", (1, 1))
         turned = scaled @ np.array([[cos, -sin], [sin, cos]]) + change.get("offset", (0, 0))
-        return turned * (1, -1) + (0, 1)
+        return np.asarray(turned * (1, -1) + (0, 1))
 
 
 def _nth(document: _Part, name: str, number: int) -> _Part:

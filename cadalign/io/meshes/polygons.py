@@ -222,9 +222,9 @@ def _blocks(
     blocks, left, wanted = list[Any](), element.count if element.properties else 0, element.count
     while left > 0:
         kind = _row_type(data, place, element, form)
-        count = 0 if kind is None else min(left, wanted, (len(data) - place) // kind.itemsize)
-        rows: Any = np.frombuffer(data, kind, count, place) if count else np.empty(0)
-        if not len(rows):
+        count = min(left, wanted, (len(data) - place) // kind.itemsize)
+        rows: Any = np.ndarray(count, kind, data, place)
+        if not count:
             what = {"vertex": "vertices", "face": "faces"}.get(element.name, element.name)
             require_count(what, element.count, element.count - left, 0, path)
         names = [name for name in rows.dtype.names or () if name.startswith(_LENGTH)]
@@ -235,16 +235,15 @@ def _blocks(
     return blocks, place
 
 
-def _row_type(data: bytes, place: int, element: _Element, form: str) -> np.dtype[Any] | None:
-    """The type of the row at a place, by the lengths of its lists; None where the data end."""
+def _row_type(data: bytes, place: int, element: _Element, form: str) -> np.dtype[Any]:
+    """The type of the row at a place, by the lengths of its lists, 0 where the data end."""
     fields: list[tuple[Any, ...]] = []
     for name, codes in element.properties.items():
         kinds = [_ORDERS[form] + ("d" if form == "ascii" else code) for code in codes]
         if len(kinds) > 1:
             length, start = np.dtype(kinds[0]), place + np.dtype(fields).itemsize
-            if start + length.itemsize > len(data):
-                return None
-            count = int(np.frombuffer(data, length, 1, start)[0])
+            given = data[start : start + length.itemsize].ljust(length.itemsize, b"\0")
+            count = int(np.frombuffer(given, length)[0])
             fields += [(_LENGTH + name, length), (name, kinds[1], (count,))]
         else:
             fields.append((name, kinds[0]))

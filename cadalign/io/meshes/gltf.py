@@ -47,7 +47,7 @@ def read_gltf(data: bytes, path: Path) -> Mesh:
 
     Raises DataError if it is no glTF 2.0 file, has no faces, is no tree of nodes, needs an
     extension that is not read, or repeats its meshes to more than a million faces and one for every
-    two bytes.
+    two bytes of its buffers.
     """
     text, binary = _chunks(data, path) if data[:4] == b"glTF" else (data, b"")
     with reading(path):

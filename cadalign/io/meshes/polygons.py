@@ -27,7 +27,7 @@ from cadalign.geometry.mesh import GREY, Material, Mesh
 from cadalign.io.files import damaged, require_count
 from cadalign.io.meshes.materials import WHITE, load_materials, vertex_colors
 
-_NO_COLOR = (b"nan", b"nan", b"nan")
+_NO_COLOR = (np.nan, np.nan, np.nan)
 
 
 def read_obj(data: bytes, path: Path) -> Mesh:
@@ -47,8 +47,8 @@ def read_obj(data: bytes, path: Path) -> Mesh:
         words = body.partition(b"#")[0].split()
         try:
             if key == b"v":
-                color = words[-3:] if words[5:] else _NO_COLOR
-                vertices.append([*map(float, (*words[:3], *color))])
+                color = map(float, words[-3:]) if words[5:] else _NO_COLOR
+                vertices.append([*map(float, words[:3]), *color])
                 if len(words) < 3:
                     raise ValueError("a vertex has fewer than 3 coordinates")
             elif key == b"vt":

@@ -197,12 +197,12 @@ def write_example(folder: Path) -> None:
     from cadalign.geometry.rotations import rotation_from_vector
     from cadalign.io.files import write_json
     from cadalign.io.images import write_image
-    from cadalign.io.meshes.files import write_obj_mesh
+    from cadalign.io.meshes.files import write_mesh
     from cadalign.render import RaycastRenderer, Scene
 
     make_folder(folder)
     mesh = Mesh(np.array(KEYPOINTS + _FEET), np.array(_FACES))
-    write_obj_mesh(folder / "chair.obj", mesh)
+    write_mesh(folder / "chair.obj", mesh, kind="obj")
     named = tuple(map(ModelKeypoint, NAMES, KEYPOINTS))
     ModelKeypoints(named, folder / "chair.obj").save(folder / "chair.keypoints.json")
     camera = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)

@@ -319,7 +319,8 @@ class Result:
         InputError
             If there is no mesh to warp.
         """
-        from cadalign.io.meshes.files import as_mesh
+        from cadalign.geometry.mesh import Mesh
+        from cadalign.io.meshes.files import load_mesh
         from cadalign.shapes.model import ShapeModel
         from cadalign.shapes.warp import warp_mesh
 
@@ -332,7 +333,7 @@ class Result:
             mesh = model.mesh if mesh is None else mesh
         if mesh is None:
             raise InputError("the model has no mesh", where="mesh", fix="give one")
-        own = as_mesh(mesh, where="mesh")
+        own = mesh if isinstance(mesh, Mesh) else load_mesh(as_path(mesh, "mesh"))
         if source is None:
             return own
         known = np.isfinite(source).all(axis=1)

@@ -15,9 +15,9 @@ from cadalign.errors import InputError, quote
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.files import as_path, keeping, made_folder, printable, refuse_input, refuse_nul
+from cadalign.io.files import as_path, keeping, made_folder, printable, refuse_nul
 from cadalign.io.images import ByteImage, read_image
-from cadalign.io.meshes.files import write_obj_mesh, write_ply_mesh
+from cadalign.io.meshes.files import write_mesh
 
 Frame = Literal["camera", "rig", "model"]
 FRAMES: tuple[Frame, ...] = get_args(Frame)
@@ -165,12 +165,12 @@ def _mesh_in_metres(exported: AlignedObject, frame: Frame) -> Mesh:
 FORMATS: dict[str, Format] = {
     "glb": Format("textured model, cameras and photos, for viewers", _glb),
     "obj": Format(
-        "the mesh, with materials and textures",
-        lambda path, *given: write_obj_mesh(path, _mesh_in_metres(*given)),
+        "the mesh, with vertex colours",
+        lambda path, *given: write_mesh(path, _mesh_in_metres(*given), kind="obj"),
     ),
     "ply": Format(
         "the mesh, with vertex colours",
-        lambda path, *given: write_ply_mesh(path, _mesh_in_metres(*given)),
+        lambda path, *given: write_mesh(path, _mesh_in_metres(*given), kind="ply"),
     ),
 }
 """The formats by name."""
@@ -242,6 +242,5 @@ def export_object(
     made_folder(path.parent)
     photos = (view.image for view in exported.views if isinstance(view.image, Path))
     with keeping([*exported.sources, *photos]):
-        refuse_input(path)  # first: files beside it are written before it
         FORMATS[name].write(path, exported, frame)
     return path

@@ -18,7 +18,7 @@ from cadalign.errors import DataError, unknown
 from cadalign.geometry.mesh import Mesh, join
 from cadalign.io.documents import read_json
 from cadalign.io.files import as_path, dense_json, writing_folder
-from cadalign.io.meshes.files import write_ply_mesh
+from cadalign.io.meshes.files import write_mesh
 
 MAKERS = {"chair": chair, "bottle": bottle, "car": car, "vessel": vessel}
 """By category: draws and builds the model with a number; the styles take turns with the number."""
@@ -80,7 +80,8 @@ def write_sample_dataset(
             annotations[name].append(entry)
             synset, model_id = entry["class_id"], entry["model_id"]
             splits[_SPLITS[index % len(_SPLITS)]] += f"{synset}-{model_id}\n"
-            write_ply_mesh(data / "ShapeNetCore.v2.ply" / synset / f"{model_id}.ply", mesh)
+            ply = data / "ShapeNetCore.v2.ply" / synset / f"{model_id}.ply"
+            write_mesh(ply, mesh, kind="ply")
         texts = {f"annotations/{name}.json": dense_json(annotations[name]) for name in names}
         texts |= {f"splits/{split}.txt": text for split, text in splits.items()}
         texts[_MARKER] = dense_json(made_of)

@@ -13,7 +13,7 @@ from support.annotating import Case, agree_with_fit, corners_of, opened_page, pl
 from cadalign.annotate.actions import perform
 from cadalign.annotate.page_state import page_state
 from cadalign.datasets.model_keypoints import ModelKeypoint, ModelKeypoints
-from cadalign.io.meshes.files import load_mesh, write_obj_mesh
+from cadalign.io.meshes.files import load_mesh, write_mesh
 from cadalign.io.observation import Observation
 
 pytestmark = pytest.mark.long
@@ -27,7 +27,7 @@ FROM_Y_UP = {
 def turned(case: Case, axis: str) -> Case:
     """The same photo with the model turned such that an axis of it points up."""
     mesh, path = load_mesh(case.model), case.folder / f"{axis}_up.obj"
-    write_obj_mesh(path, replace(mesh, vertices=mesh.vertices @ FROM_Y_UP[axis].T))
+    write_mesh(path, replace(mesh, vertices=mesh.vertices @ FROM_Y_UP[axis].T), kind="obj")
     given = ModelKeypoints.load(case.keypoints)
     points = [
         ModelKeypoint(each.name, tuple(FROM_Y_UP[axis] @ each.xyz), each.semantic_id)

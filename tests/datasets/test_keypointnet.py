@@ -13,7 +13,7 @@ from support.files import TETRAHEDRON, replaced, write_json
 
 from cadalign.datasets import KeypointNet, load_mesh
 from cadalign.errors import DataError, InputError
-from cadalign.io.meshes.files import write_ply_mesh
+from cadalign.io.meshes.files import write_mesh
 
 CHAIR, MUG = "03001627", "03797390"
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
@@ -159,7 +159,7 @@ def test_model_without_mesh_says_so(root):
 
 def test_meshes_of_every_layout_are_found(root, tmp_path):
     ply = tmp_path / f"ShapeNetCore.v2.ply/{CHAIR}/a.ply"
-    write_ply_mesh(ply, load_mesh(KeypointNet(root)["chair", "a"].mesh_path))
+    write_mesh(ply, load_mesh(KeypointNet(root)["chair", "a"].mesh_path), kind="ply")
     other = write_obj(tmp_path / f"elsewhere/{CHAIR}/a/model.obj")
     dataset = KeypointNet(root, shapenet_root=tmp_path / "elsewhere")
     assert dataset["chair", "a"].mesh_path == other

@@ -11,7 +11,7 @@ from support.exported import POSE, aligned, wedge
 
 from cadalign import Alignment
 from cadalign.datasets import load_mesh
-from cadalign.errors import InputError
+from cadalign.errors import DataError, InputError
 from cadalign.export import FORMATS, export_object, format_of
 from cadalign.export.aligned_object import Frame
 
@@ -33,14 +33,14 @@ def test_mesh_files_hold_the_placed_mesh(tmp_path: Path, ending: str, frame: Fra
     np.testing.assert_array_equal(mesh.faces, wedge().faces)
 
 
-def test_obj_keeps_materials_and_texture(tmp_path: Path) -> None:
-    mesh = load_mesh(export_object(tmp_path / "wedge.obj", aligned(tmp_path)))
-    expected = wedge()
-    np.testing.assert_array_equal(mesh.face_material, expected.face_material)
-    np.testing.assert_array_equal(mesh.materials[0].texture, expected.materials[0].texture)
-    assert mesh.materials[1].color == pytest.approx(expected.materials[1].color)
-    assert mesh.corner_uv is not None
-    np.testing.assert_allclose(mesh.corner_uv, expected.corner_uv, atol=1e-6)
+@pytest.mark.parametrize("name", ["wedge.obj", "wedge.ply"])
+def test_mesh_files_have_colours_of_materials(tmp_path: Path, name: str) -> None:
+    mesh = load_mesh(export_object(tmp_path / name, aligned(tmp_path)))
+    texture, (_, red) = wedge().materials[0].texture, wedge().materials
+    assert texture is not None
+    assert mesh.vertex_colors is not None
+    for vertex, expected in ((0, texture.mean(axis=(0, 1)) / 255), (2, red.color[:3])):
+        np.testing.assert_allclose(mesh.vertex_colors[vertex, :3], expected, atol=1 / 255)
 
 
 def test_names_tell_formats() -> None:
@@ -57,10 +57,11 @@ def test_unknown_options_are_refused(tmp_path: Path) -> None:
         export_object(tmp_path / "a.obj", aligned(tmp_path), frame="moon")  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("name", ["far.ply", "far.obj"])
-def test_mesh_files_far_from_their_origin_keep_their_form(tmp_path: Path, name: str) -> None:
+def test_meshes_far_from_their_origin_keep_their_form(tmp_path: Path) -> None:
     rig = replace(POSE, translation=np.array([400_000.123, 5_800_000.456, 30.0]))
     exported = aligned(tmp_path, rig_from_model=rig)
-    mesh = load_mesh(export_object(tmp_path / name, exported, frame="rig"))
+    mesh = load_mesh(export_object(tmp_path / "far.obj", exported, frame="rig"))
     expected = rig.apply(wedge().vertices)
     np.testing.assert_allclose(mesh.vertices, expected, rtol=0, atol=1e-7)
+    with pytest.raises(DataError, match="more than 1000 times its size from its origin; PLY has 7"):
+        export_object(tmp_path / "far.ply", exported, frame="rig")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import struct
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from support.refusals import refusal_text
 from cadalign import Mesh
 from cadalign.datasets import check_solid, load_mesh
 from cadalign.errors import DataError
-from cadalign.io.meshes.files import write_obj_mesh, write_ply_mesh
+from cadalign.io.meshes.files import write_mesh
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 
@@ -142,9 +142,9 @@ def test_obj_materials_and_textures(write, tmp_path):
 @pytest.mark.parametrize(
     ("library", "told"),
     [
-        (None, "no material library"),
+        (None, "model.mtl cannot be read (no such file)"),
         ("newmtl other\nKd 1 0 0\n", "'a' is not defined"),
-        ("newmtl a\nKd 1 0 0\nmap_Kd gone.png\n", "gone.png is missing"),
+        ("newmtl a\nKd 1 0 0\nmap_Kd gone.png\n", "gone.png cannot be read (no such file)"),
         ("newmtl a\nKd 1 0 0\nmap_Kd bad.png\n", "bad.png cannot be read"),
         ("\0\x01garbage\nKd\nmap_Kd x\nKd 1 1 1\n", "'a' is not defined"),
     ],
@@ -422,18 +422,14 @@ def test_what_is_cut_short_says_what_is_there(write, kind, cut, message):
 
 # --- written files
 
-WRITERS = {"obj": write_obj_mesh, "ply": write_ply_mesh}
 
-
-@pytest.mark.parametrize(("ending", "write"), WRITERS.items())
-def test_vertices_faces_and_colors_come_back(
-    tmp_path: Path, ending: str, write: Callable[[Path, Mesh], None]
-) -> None:
+@pytest.mark.parametrize("kind", ["obj", "ply"])
+def test_vertices_faces_and_colors_come_back(tmp_path: Path, kind: Literal["obj", "ply"]) -> None:
     colors = np.round(np.random.default_rng(0).uniform(0, 1, (6, 4)) * 255) / 255
     colors[:, 3] = 1
     mesh = replace(wedge(), vertex_colors=colors)
-    path = tmp_path / "new" / "folder" / f"wedge.{ending}"
-    write(path, mesh)
+    path = tmp_path / "new" / "folder" / f"wedge.{kind}"
+    write_mesh(path, mesh, kind=kind)
     read = load_mesh(path)
     np.testing.assert_allclose(read.vertices, mesh.vertices, rtol=1e-6)
     np.testing.assert_array_equal(read.faces, mesh.faces)

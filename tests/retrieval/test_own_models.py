@@ -19,7 +19,7 @@ from cadalign.datasets import ModelKeypoints
 from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import rotation_from_vector
-from cadalign.io.meshes.files import write_obj_mesh
+from cadalign.io.meshes.files import write_mesh
 
 NAMES = ("front left", "front right", "back right", "back left", "top right", "top left", "rest")
 CHAIR = np.array(
@@ -68,7 +68,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
         write_keypoints(folder / "chair" / f"c{number}.keypoints.json", points)
         if number < 7:
             faces = np.array([[0, 1, 2], [0, 2, 3], [3, 2, 4], [3, 4, 5]])
-            write_obj_mesh(folder / "chair" / f"c{number}.obj", Mesh(points[:6], faces))
+            write_mesh(folder / "chair" / f"c{number}.obj", Mesh(points[:6], faces), kind="obj")
     assert main(["library", "build", str(folder), "--out", str(folder / "chairs.cadalign")]) == 0
     rng, seen = np.random.default_rng(0), []
     for turn, number in enumerate(SHOWN):

@@ -6,11 +6,12 @@ import os
 from codecs import BOM_UTF8
 from contextlib import suppress
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray
-from cadalign.errors import CadalignError, DataError, InputError, brief
+from cadalign.arrays import FloatArray
+from cadalign.errors import CadalignError, DataError, brief
 from cadalign.geometry.mesh import Mesh, check_near, face_normals, spread_colors
 from cadalign.io.documents import in_file
 from cadalign.io.files import (
@@ -20,19 +21,16 @@ from cadalign.io.files import (
     made_folder,
     once_per_file,
     read_bytes,
-    refuse_folder,
-    write_text,
     write_whole,
 )
-from cadalign.io.images import write_image
 from cadalign.io.kinds import MESH, refuse_other_file
 from cadalign.io.meshes.gltf import read_gltf
 from cadalign.io.meshes.polygons import read_obj, read_off, read_ply, read_stl
 
 # Coordinates in ShapeNet's files have 6 decimals; less than ten of these steps is rounding.
 _FLAT = 1e-5
-_DIGITS = 9  # of coordinates in OBJ files
-
+_DIGITS = 12  # behind the point, in OBJ files
+_FAR = 1000.0  # distance from the origin of a mesh in a PLY file [its extent]
 
 _READERS = {
     ".obj": read_obj,
@@ -99,11 +97,10 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
             mesh = reader(data.removeprefix(BOM_UTF8), path)
             if not np.linalg.norm(face_normals(mesh.triangles), axis=1).any():
                 raise DataError("no face of the mesh has an area")
-    except CadalignError:
-        refuse_other_file(path, MESH)
-        raise
     except Exception as error:  # of damaged content any kind
         refuse_other_file(path, MESH)
+        if isinstance(error, CadalignError):
+            raise
         reason = f"{type(error).__name__}: {brief(error)}"
         kind = path.suffix[1:].upper()
         raise damaged(f"cannot be read as a {kind} file ({reason})", path) from None
@@ -124,19 +121,6 @@ def check_keypoints(points_3d: FloatArray, model: Path | None, *, where: str) ->
 
 mesh_at = once_per_file(16)(load_mesh)
 """As `load_mesh`, and remembers the last meshes: many objects of a run may share one."""
-
-
-def as_mesh(given: object, *, where: str) -> Mesh:
-    """A mesh, or the one that a path names.
-
-    Raises InputError if it is neither, DataError if the file cannot be read.
-    """
-    if isinstance(given, Mesh):
-        return given
-    if isinstance(given, str | os.PathLike):
-        return load_mesh(given)
-    what = f"expected a cadalign.Mesh or a path, got {type(given).__name__}"
-    raise InputError(what, where=where, fix="read it with cadalign.load_mesh")
 
 
 def check_solid(mesh: Mesh) -> None:
@@ -164,62 +148,27 @@ def check_solid(mesh: Mesh) -> None:
         raise DataError(what, where=mesh.source, fix="leave it out")
 
 
-def write_obj_mesh(path: Path, mesh: Mesh) -> None:
-    """Write a mesh as OBJ, with its materials as MTL and PNG beside it; folders are made.
+def write_mesh(path: Path, mesh: Mesh, *, kind: Literal["obj", "ply"]) -> None:
+    """Write a mesh as OBJ or binary PLY, its faces in their order, with colours of its vertices.
 
-    Faces keep their order and polygons their corners' texture coordinates; vertex colours follow
-    the coordinates, as MeshLab reads them.
+    A surface without vertex colours has its materials', those of textures on average. Folders are
+    made.
 
-    Raises DataError if a file cannot be written.
+    Raises DataError if the file cannot be written, or the mesh is too far from its origin for PLY.
     """
-    refuse_folder(path)
+    import trimesh  # takes time
+
+    extents = np.ptp(mesh.bounds, axis=0)
+    if kind == "ply" and np.abs(mesh.bounds).max() > _FAR * extents.max():
+        what = f"the mesh lies more than {_FAR:g} times its size from its origin; PLY has 7 digits"
+        raise DataError(what, where=str(path), fix="write OBJ, or in another frame")
+    colors = np.round(255 * spread_colors(mesh, _palette(mesh))).astype(np.uint8)
+    written = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
+    options: dict[str, Any] = {"digits": _DIGITS, "header": None} if kind == "obj" else {}
+    data: Any = written.export(file_type=kind, **options)
+    content = data.encode() if isinstance(data, str) else data
     made_folder(path.parent)
-    library = path.with_suffix(".mtl")
-    names = [f"material_{number}" for number in range(len(mesh.materials))]
-    lines = [f"mtllib {library.name}", *_vertex_lines(mesh)]
-    uv_rows = None
-    if mesh.corner_uv is not None and any(each.texture is not None for each in mesh.materials):
-        distinct, rows = np.unique(mesh.corner_uv.reshape(-1, 2), axis=0, return_inverse=True)
-        uv_rows = rows.reshape(-1, 3) + 1
-        lines += [f"vt {u:.9g} {v:.9g}" for u, v in distinct.tolist()]
-    lines += _face_lines(mesh, names, uv_rows)
-    write_text(library, "\n".join(_material_lines(mesh, names, path)) + "\n")
-    write_text(path, "\n".join(lines) + "\n")
-
-
-def write_ply_mesh(path: Path, mesh: Mesh) -> None:
-    """Write a mesh as binary PLY, its faces in their order, with colours of its vertices.
-
-    A surface without vertex colours has its materials'; PLY has no textures. Folders are made.
-
-    Raises DataError if the file cannot be written.
-    """
-    number, kind = ("float", "<f4") if _digits(mesh) <= _DIGITS else ("double", "<f8")
-    vertices = np.empty(len(mesh.vertices), [("place", kind, 3), ("color", "u1", 4)])
-    vertices["place"] = mesh.vertices
-    vertices["color"] = np.round(255 * spread_colors(mesh, _palette(mesh)))
-    faces = np.empty(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
-    faces["count"], faces["corners"] = 3, mesh.faces
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(vertices)}",
-        *(f"property {number} {axis}" for axis in "xyz"),
-        *(f"property uchar {channel}" for channel in ("red", "green", "blue", "alpha")),
-        f"element face {len(faces)}",
-        "property list uchar int vertex_indices",
-        "end_header\n",
-    ]
-    data = "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
-    made_folder(path.parent)
-    write_whole(path, lambda unfinished: unfinished.write_bytes(data))
-
-
-def _digits(mesh: Mesh) -> int:
-    """Digits of the coordinates that are written: more of a mesh far from its origin."""
-    extent = float(np.ptp(mesh.bounds, axis=0).max())
-    distance = float(np.abs(mesh.bounds).max())
-    return min(17, _DIGITS + max(0, int(np.log10(distance / extent)))) if extent else 17
+    write_whole(path, lambda unfinished: unfinished.write_bytes(content))
 
 
 def _palette(mesh: Mesh) -> FloatArray:
@@ -229,38 +178,3 @@ def _palette(mesh: Mesh) -> FloatArray:
         if each.texture is not None:
             palette[row, :3] = each.texture[..., :3].reshape(-1, 3).mean(axis=0) / 255
     return palette
-
-
-def _vertex_lines(mesh: Mesh) -> list[str]:
-    form, rows = "v" + 3 * f" {{:.{_digits(mesh)}g}}", mesh.vertices
-    if mesh.vertex_colors is not None:
-        form, rows = form + 3 * " {:.9g}", np.hstack([rows, mesh.vertex_colors[:, :3]])
-    return [form.format(*row) for row in rows.tolist()]
-
-
-def _face_lines(mesh: Mesh, names: list[str], uv_rows: IntArray | None) -> list[str]:
-    """Faces in file order, with the material's name where it changes."""
-    lines, current = [], -1
-    form, rows = "f {} {} {}", mesh.faces + 1
-    if uv_rows is not None:
-        rows = np.stack([rows, uv_rows], axis=2).reshape(-1, 6)
-        form = "f {}/{} {}/{} {}/{}"
-    for row, material in zip(rows.tolist(), mesh.face_material.tolist(), strict=True):
-        if material != current:
-            lines.append(f"usemtl {names[material]}")
-            current = material
-        lines.append(form.format(*row))
-    return lines
-
-
-def _material_lines(mesh: Mesh, names: list[str], path: Path) -> list[str]:
-    """The material library; writes the textures beside the OBJ file."""
-    lines = []
-    for name, material in zip(names, mesh.materials, strict=True):
-        red, green, blue, alpha = material.color
-        lines += [f"newmtl {name}", f"Kd {red:.6g} {green:.6g} {blue:.6g}", f"d {alpha:.6g}"]
-        if material.texture is not None:
-            image = path.with_name(f"{path.stem}_{name}.png")
-            write_image(image, material.texture)
-            lines.append(f"map_Kd {image.name}")
-    return lines

@@ -4,9 +4,8 @@ After the Khronos Group's specification of glTF 2.0 and of the extensions that a
 that is missing or of another type ends in one of Python's errors, which `cadalign.load_mesh` turns
 into a DataError.
 
-trimesh takes normalized integers as they stand and sparse values without their changes, makes room
-for arrays without data, and knows neither transforms of textures nor what a file says that it
-requires.
+trimesh takes normalized integers as they stand and sparse values without their changes, and makes
+room for arrays without data: what has to be checked before it sees a file is all but its reading.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, unquote_to_bytes
+from urllib.parse import unquote
 
 import numpy as np
 import numpy.typing as npt
@@ -27,17 +26,16 @@ from cadalign.geometry.mesh import GREY, Material, Mesh, join
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.io.documents import parse_json
 from cadalign.io.files import damaged, read_bytes, reading, require_count
-from cadalign.io.meshes.materials import WHITE, Texture, Textures
+from cadalign.io.meshes.materials import WHITE, Texture, Textures, beside, vertex_colors
 
 _Part = dict[str, Any]
 _NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 # What they add is read here, or is nothing but the look of surfaces and their light.
 _EXTENSIONS = (
-    *("EXT_texture_webp", "KHR_lights_punctual", "KHR_mesh_quantization", "KHR_texture_transform"),
-    "KHR_xmp_json_ld",
+    *("EXT_texture_webp", "KHR_lights_", "KHR_materials_", "KHR_mesh_quantization"),
+    *("KHR_texture_transform", "KHR_xmp_json_ld"),
 )
-_LOOKS = "KHR_materials_"
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6  # a primitive's modes; points and lines have others
 _FREE_FACES = 2**20  # of a scene; each takes up to 256 bytes
 
@@ -49,17 +47,17 @@ def read_gltf(data: bytes, path: Path) -> Mesh:
 
     Raises DataError if it is no glTF 2.0 file, has no faces, is no tree of nodes, needs an
     extension that is not read, or repeats its meshes to more than a million faces and one for every
-    two bytes.
+    two bytes of its buffers.
     """
     text, binary = _chunks(data, path) if data[:4] == b"glTF" else (data, b"")
     with reading(path):
         document = parse_json(str(text, "utf-8-sig"), str(path))
     _check(document)
-    file = _GltfFile(path, document, len(data), binary)
+    file = _GltfFile(path, document, binary)
     placed = [
         (primitive, transform)
         for number, transform in _placements(document)
-        for primitive in nth(document, "meshes", number)["primitives"]
+        for primitive in _nth(document, "meshes", number)["primitives"]
         if _count_faces(document, primitive)
     ]
     if not placed:
@@ -70,31 +68,32 @@ def read_gltf(data: bytes, path: Path) -> Mesh:
         what = f"its nodes repeat meshes to {faces} faces, from {file.size} bytes"
         raise DataError(what, fix="simplify it, or leave copies out")
     distinct = {id(primitive): primitive for primitive, _ in placed}
-    surfaces = {key: _surface(file, primitive) for key, primitive in distinct.items()}
+    surfaces = {key: file.surface(primitive) for key, primitive in distinct.items()}
     return join([_moved(surfaces[id(primitive)], at) for primitive, at in placed], str(path))
 
 
 class _GltfFile:
-    """The document of a file, and what its buffers hold; ``size`` is the bytes of all files."""
+    """The document of a file, and what its buffers hold; ``size`` is their bytes."""
 
-    def __init__(self, path: Path, document: _Part, size: int, binary: bytes) -> None:
-        self.path, self.document, self.size = path, document, size
-        self._textures = Textures()
+    def __init__(self, path: Path, document: _Part, binary: bytes) -> None:
+        self.path, self.document = path, document
         uris = [each.get("uri") for each in document.get("buffers", [])]
-        named: dict[str | None, bytes] = {None: binary}
-        for uri in uris:
-            if uri not in named:
-                data = _embedded(uri)
-                named[uri] = read_bytes(path.parent / unquote(uri)) if data is None else data
-                self.size += len(named[uri]) if data is None else 0
+        named = {uri: self._resource(uri) if uri else binary for uri in dict.fromkeys(uris)}
+        self.size = sum(map(len, named.values()))
         self._buffers = [named[uri] for uri in uris]
-        self.looks = [self._look(part) for part in document.get("materials", [])]
-        """Materials, and their references to textures, empty where they have none."""
+        self._textures = Textures()
+        self._materials = [self._material(part) for part in document.get("materials", [])]
 
-    def view(self, number: int) -> memoryview:
+    def _resource(self, uri: str) -> bytes:
+        """The bytes that stand in the text of a ``data:`` URI, or in the file of a name."""
+        if uri.startswith("data:"):
+            return base64.b64decode(uri.partition("base64,")[2])
+        return read_bytes(self.path.parent / unquote(uri))
+
+    def _view(self, number: int) -> memoryview:
         """The bytes of a buffer view."""
-        part = nth(self.document, "bufferViews", number)
-        announced = nth(self.document, "buffers", part["buffer"])["byteLength"]
+        part = _nth(self.document, "bufferViews", number)
+        announced = _nth(self.document, "buffers", part["buffer"])["byteLength"]
         data = self._buffers[part["buffer"]]
         start, length = part.get("byteOffset", 0), part["byteLength"]
         if len(data) < announced or not 0 <= start <= start + length <= len(data):
@@ -102,17 +101,18 @@ class _GltfFile:
             raise damaged(what, f"bufferViews[{number}]")
         return memoryview(data)[start : start + length]
 
-    def array(self, number: int) -> npt.NDArray[Any]:
+    def _array(self, number: int) -> npt.NDArray[Any]:
         """The array (n, width) of an accessor; of normalized integers as fractions."""
-        accessor = nth(self.document, "accessors", number)
+        accessor = _nth(self.document, "accessors", number)
         if "sparse" in accessor or "bufferView" not in accessor:
             what = "sparse values, or none, are not read"
             raise DataError(what, where=f"accessors[{number}]", fix="export it without them")
         dtype, width = np.dtype(_NUMBERS[accessor["componentType"]]), _WIDTHS[accessor["type"]]
-        data, row = self.view(accessor["bufferView"]), width * dtype.itemsize
+        data, row = self._view(accessor["bufferView"]), width * dtype.itemsize
         stride = self.document["bufferViews"][accessor["bufferView"]].get("byteStride", row)
         count, offset = accessor["count"], accessor.get("byteOffset", 0)
-        if stride < row or offset < 0 or offset + (count - 1) * stride + row > len(data):
+        needed = offset + (count - 1) * stride + row
+        if min(count - 1, offset, stride - row) < 0 or needed > len(data):
             what = f"{count} values of {row} bytes do not fit into {len(data)} bytes"
             raise damaged(what, f"accessors[{number}]")
         strides = (stride, dtype.itemsize)
@@ -121,43 +121,72 @@ class _GltfFile:
             return np.maximum(values / np.iinfo(dtype).max, -1.0)
         return values
 
-    def attribute(self, primitive: _Part, name: str, width: int = 0) -> npt.NDArray[Any]:
-        """The values (n, width) of a primitive's vertices."""
-        numbers = primitive["attributes"]
-        values = self.array(numbers[name])
-        count = self.document["accessors"][numbers["POSITION"]]["count"]
-        if len(values) != count or (width and values.shape[1] != width):
-            what = f"{values.shape} values of {name} for {count} vertices"
-            raise damaged(what, f"accessors[{numbers[name]}]")
-        return values
-
-    def _look(self, part: _Part) -> tuple[Material, _Part]:
+    def _material(self, part: _Part) -> tuple[Material, _Part]:
+        """A material, and its reference to its texture."""
         metallic = part.get("pbrMetallicRoughness", {})
         older = part.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
         factor = metallic.get("baseColorFactor") or older.get("diffuseFactor")
         use = metallic.get("baseColorTexture") or older.get("diffuseTexture") or {}
         texture = self._texture(use["index"]) if use else None
-        color = GREY if texture is None else WHITE
+        material = Material(str(part.get("name", "")), GREY if texture is None else WHITE, texture)
         if factor is not None:
             red, green, blue, opacity = _encoded(np.clip(factor, 0, 1)).tolist()
-            color = (red, green, blue, opacity)
-        material = Material(str(part.get("name", "")), color, texture)
-        return material, use if texture is not None else {}
+            material = replace(material, color=(red, green, blue, opacity))
+        return material, use
 
     def _texture(self, number: int) -> Texture | None:
-        part = nth(self.document, "textures", number)
-        part = {**part, **part.get("extensions", {}).get("EXT_texture_webp", {})}
-        if "source" not in part:
+        part = _nth(self.document, "textures", number)
+        source = part.get("extensions", {}).get("EXT_texture_webp", part).get("source")
+        if source is None:
             return None
-        image = nth(self.document, "images", part["source"])
-        uri = image.get("uri", "")
-        data = _embedded(uri) if uri else bytes(self.view(image["bufferView"]))
-        if data is None:
-            return self._textures.read(self.path, unquote(uri))
-        return self._textures.decode(data, within=self.path, name=f"images[{part['source']}]")
+        image = _nth(self.document, "images", source)
+        picture: Path | bytes = b""
+        if "uri" not in image:
+            picture = bytes(self._view(image["bufferView"]))
+        elif image["uri"].startswith("data:"):
+            picture = self._resource(image["uri"])
+        else:
+            picture = beside(self.path, unquote(image["uri"]))
+        return self._textures.read(picture, name=f"images[{source}]", within=self.path)
+
+    def surface(self, primitive: _Part) -> Mesh:
+        """The mesh of a primitive in its own frame."""
+        attributes, material, colors, uv = primitive["attributes"], Material(), None, None
+        if "material" in primitive:
+            material, use = self._materials[primitive["material"]]
+            uv = None if material.texture is None else self._texture_coordinates(attributes, use)
+        vertices = self._array(attributes["POSITION"]).astype(np.float64)
+        corners = np.arange(len(vertices))
+        if "indices" in primitive:
+            corners = self._array(primitive["indices"])[:, 0].astype(np.int64)
+        faces = corners[: len(corners) // 3 * 3].reshape(-1, 3)
+        if "COLOR_0" in attributes:
+            values = self._array(attributes["COLOR_0"])
+            # Exporters leave out that integers are normalized.
+            scale = 1.0 if values.dtype.kind == "f" else np.iinfo(values.dtype).max
+            colors = _encoded(vertex_colors(values / scale))
+        if len(vertices) > faces.size:  # they are shared with other primitives
+            kept, faces = np.unique(faces, return_inverse=True)
+            vertices, faces = vertices[kept], faces.reshape(-1, 3)
+            uv, colors = (None if each is None else each[kept] for each in (uv, colors))
+        if "material" not in primitive and colors is not None:
+            material = Material(color=WHITE)
+        uv = None if uv is None else uv[faces]
+        return Mesh(vertices, faces, vertex_colors=colors, corner_uv=uv, materials=(material,))
+
+    def _texture_coordinates(self, attributes: _Part, use: _Part) -> FloatArray | None:
+        """Texture coordinates (n, 2) from the bottom left, which glTF has from the top left."""
+        change = use.get("extensions", {}).get("KHR_texture_transform", {})
+        name = f"TEXCOORD_{change.get('texCoord', use.get('texCoord', 0))}"
+        if name not in attributes:
+            return None
+        cos, sin = np.cos(change.get("rotation", 0.0)), np.sin(change.get("rotation", 0.0))
+        scaled = self._array(attributes[name]) * change.get("scale", (1, 1))
+        turned = scaled @ np.array([[cos, -sin], [sin, cos]]) + change.get("offset", (0, 0))
+        return np.asarray(turned * (1, -1) + (0, 1))
 
 
-def nth(document: _Part, name: str, number: int) -> _Part:
+def _nth(document: _Part, name: str, number: int) -> _Part:
     """The part of a list of the document by its number; raises DataError where there is none."""
     parts = document.get(name, [])
     if not 0 <= number < len(parts):
@@ -166,30 +195,17 @@ def nth(document: _Part, name: str, number: int) -> _Part:
     return found
 
 
-def _embedded(uri: str) -> bytes | None:
-    """The data that stand in the text of a ``data:`` URI; None of the name of a file."""
-    if not uri.startswith("data:"):
-        return None
-    form, _, data = uri.partition(",")
-    return base64.b64decode(data) if form.endswith(";base64") else unquote_to_bytes(data)
-
-
 def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes]:
     """The document of a GLB file, and its binary part."""
-    found: list[bytes] = []
+    found = {b"JSON": b"", b"BIN\0": b""}
     place = 12
-    for kind in (b"JSON", b"BIN\0"):
-        length = int.from_bytes(data[place : place + 4], "little")
-        if data[place + 4 : place + 8] != kind:
-            break
-        found.append(data[place + 8 : place + 8 + length])
-        place += 8 + length
+    for kind in found:
+        if data[place + 4 : place + 8] == kind:
+            end = place + 8 + int.from_bytes(data[place : place + 4], "little")
+            found[kind], place = data[place + 8 : end], end
     announced = max(place, int.from_bytes(data[8:12], "little"))
-    surplus = max(len(data) - announced, 0)
-    require_count("bytes", announced, len(data), surplus, path)
-    if not found:
-        raise damaged("the GLB file has no part that describes it", path)
-    return found[0], b"".join(found[1:])
+    require_count("bytes", announced, len(data), max(len(data) - announced, 0), path)
+    return found[b"JSON"], found[b"BIN\0"]
 
 
 def _check(document: _Part) -> None:
@@ -198,22 +214,16 @@ def _check(document: _Part) -> None:
     if not version.startswith("2."):
         what = f"version {quote(version)} of glTF; only version 2 is read"
         raise DataError(what, where="asset")
-    unknown = [
-        name
-        for name in document.get("extensionsRequired", [])
-        if name not in _EXTENSIONS and not name.startswith(_LOOKS)
-    ]
-    if unknown:
-        raise DataError(
-            f"{brief(', '.join(unknown))} is needed to read this file, and not known",
-            where="extensionsRequired",
-            fix="export it without this extension; of compressed geometry, uncompressed",
-        )
+    required = document.get("extensionsRequired", [])
+    if unknown := [name for name in required if not name.startswith(_EXTENSIONS)]:
+        what = f"{brief(', '.join(unknown))} is needed to read this file, and not known"
+        fix = "export it without this extension; of compressed geometry, uncompressed"
+        raise DataError(what, where="extensionsRequired", fix=fix)
 
 
 def _placements(document: _Part) -> Iterator[tuple[int, FloatArray]]:
     """Meshes and their transforms, in the order of the nodes from the scene's roots down."""
-    roots = nth(document, "scenes", document.get("scene", 0)).get("nodes", [])
+    roots = _nth(document, "scenes", document.get("scene", 0)).get("nodes", [])
     waiting = [(root, np.eye(4)) for root in reversed(roots)]
     seen: set[int] = set()
     while waiting:
@@ -222,7 +232,7 @@ def _placements(document: _Part) -> Iterator[tuple[int, FloatArray]]:
             what = "the node has two parents, or is its own ancestor"
             raise DataError(what, where=f"nodes[{number}]", fix="the nodes of a scene are a tree")
         seen.add(number)
-        node = nth(document, "nodes", number)
+        node = _nth(document, "nodes", number)
         transform = parent @ _local(node)
         if "mesh" in node:
             yield node["mesh"], transform
@@ -250,54 +260,8 @@ def _count_faces(document: _Part, primitive: _Part) -> int:
         raise DataError(what, where="meshes", fix="export single triangles")
     if position is None or mode != _TRIANGLES:
         return 0
-    count: int = nth(document, "accessors", primitive.get("indices", position))["count"]
+    count: int = _nth(document, "accessors", primitive.get("indices", position))["count"]
     return count // 3
-
-
-def _surface(file: _GltfFile, primitive: _Part) -> Mesh:
-    """The mesh of a primitive in its own frame."""
-    material, use = Material(), _Part()
-    if "material" in primitive:
-        material, use = file.looks[primitive["material"]]
-    vertices = file.attribute(primitive, "POSITION", 3).astype(np.float64)
-    corners = np.arange(len(vertices))
-    if "indices" in primitive:
-        corners = file.array(primitive["indices"])[:, 0].astype(np.int64)
-    faces = corners[: len(corners) // 3 * 3].reshape(-1, 3)
-    uv, colors = _texture_coordinates(file, primitive, use), _colors(file, primitive)
-    if len(vertices) > faces.size:  # they are shared with other primitives
-        kept, faces = np.unique(faces, return_inverse=True)
-        vertices, faces = vertices[kept], faces.reshape(-1, 3)
-        uv, colors = (None if each is None else each[kept] for each in (uv, colors))
-    if "material" not in primitive and colors is not None:
-        material = Material(color=WHITE)
-    uv = None if uv is None else uv[faces]
-    return Mesh(vertices, faces, vertex_colors=colors, corner_uv=uv, materials=(material,))
-
-
-def _texture_coordinates(file: _GltfFile, primitive: _Part, use: _Part) -> FloatArray | None:
-    """Texture coordinates (n, 2) from the bottom left, which glTF has from the top left."""
-    change = use.get("extensions", {}).get("KHR_texture_transform", {})
-    name = f"TEXCOORD_{change.get('texCoord', use.get('texCoord', 0))}"
-    if not use or name not in primitive["attributes"]:
-        return None
-    uv = file.attribute(primitive, name, 2)
-    cos, sin = np.cos(change.get("rotation", 0.0)), np.sin(change.get("rotation", 0.0))
-    turned = uv * change.get("scale", (1, 1)) @ np.array([[cos, -sin], [sin, cos]])
-    turned = turned + change.get("offset", (0, 0))
-    return np.stack([turned[:, 0], 1 - turned[:, 1]], axis=1)
-
-
-def _colors(file: _GltfFile, primitive: _Part) -> FloatArray | None:
-    """Vertex colours (n, 4), sRGB from 0 to 1."""
-    if "COLOR_0" not in primitive["attributes"]:
-        return None
-    values = file.attribute(primitive, "COLOR_0")
-    if values.dtype.kind in "ui":  # of exporters that leave out that they are normalized
-        values = values / np.iinfo(values.dtype).max
-    colors = np.ones((len(values), 4))
-    colors[:, : values.shape[1]] = np.nan_to_num(np.clip(values, 0, 1))
-    return _encoded(colors)
 
 
 def _encoded(colors: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ the triangles.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import chain
@@ -19,12 +19,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, parse_numbers
+from cadalign.arrays import parse_numbers
 from cadalign.errors import DataError, brief
 from cadalign.geometry.mesh import GREY, Material, Mesh
 from cadalign.io.files import damaged, require_count
-from cadalign.io.meshes.materials import WHITE, load_materials
+from cadalign.io.meshes.materials import WHITE, load_materials, vertex_colors
 
 _NO_COLOR = (np.nan, np.nan, np.nan)
 
@@ -36,17 +37,18 @@ def read_obj(data: bytes, path: Path) -> Mesh:
     that a triangle comes from. Lines and points (``l``, ``p``) have no number. Normals, groups,
     curves and surfaces are not read.
     """
-    vertices, colors = list[list[float]](), list[object]()
-    coordinates, corners = list[list[float]](), list[tuple[int, int]]()
-    sizes, looks, before = list[int](), list[int](), list[tuple[int, int]]()
+    vertices = list[list[float]]()  # with their colours
+    coordinates = [[0.0, 0.0]]  # the first is that of corners that name none
+    corners, before = list[tuple[int, int]](), list[tuple[int, int]]()
+    sizes, looks = list[int](), list[int]()
     libraries, numbers, look = list[str](), {"": 0}, 0  # numbers of materials, by name
     for number, line in _lines(data):
         key, _, body = line.partition(b" ")
         words = body.partition(b"#")[0].split()
         try:
             if key == b"v":
-                vertices.append([*map(float, words[:3])])
-                colors.append([*map(float, words[-3:])] if words[5:] else _NO_COLOR)
+                color = map(float, words[-3:]) if words[5:] else _NO_COLOR
+                vertices.append([*map(float, words[:3]), *color])
                 if len(words) < 3:
                     raise ValueError("a vertex has fewer than 3 coordinates")
             elif key == b"vt":
@@ -58,7 +60,7 @@ def read_obj(data: bytes, path: Path) -> Mesh:
                 sizes.append(len(words))
                 looks.append(look)
                 # Negative indices count back from here.
-                before.append((len(vertices), len(coordinates)))
+                before.append((len(vertices) + 1, len(coordinates)))
             elif key == b"usemtl":
                 look = numbers.setdefault(_text(body), len(numbers))
             elif key == b"mtllib":
@@ -73,33 +75,31 @@ def read_obj(data: bytes, path: Path) -> Mesh:
         raise DataError(what, fix="is it an OBJ file, and whole?")
     if not vertices:
         raise damaged(f"{len(sizes)} faces, but no vertices")
-    named = np.fromiter(chain.from_iterable(corners), np.int64, 2 * len(corners)).reshape(-1, 2)
-    indices = np.where(named < 0, np.repeat(before, sizes, axis=0) + named, named - 1)
-    has_uv = named[:, 1] != 0
-    for kind, name, count, used in (
-        (0, "vertex", len(vertices), np.ones_like(has_uv)),
-        (1, "texture coordinate", len(coordinates), has_uv),
-    ):
-        wrong = np.flatnonzero(used & ((indices[:, kind] < 0) | (indices[:, kind] >= count)))
-        if len(wrong):
-            face = np.repeat(np.arange(len(sizes)), sizes)[wrong[0]]
-            what = f"face {face} (counted from 0) names {name} {named[wrong[0], kind]}"
-            raise damaged(f"{what}, but there are {count}")
-    corner_uv = np.zeros((len(named), 2))  # where a corner names no texture coordinate
-    if has_uv.any():
-        corner_uv[has_uv] = np.array(coordinates)[indices[has_uv, 1]]
+    named = np.array(corners)
+    indices = np.where(named < 0, np.repeat(before, sizes, axis=0) + named, named)
+    counts = len(vertices), len(coordinates) - 1
+    is_none = (named == 0) & [False, True]
+    wrong = np.argwhere(((indices < 1) & ~is_none) | (indices > counts))
+    if len(wrong):
+        corner, kind = wrong[0]
+        face = np.repeat(np.arange(len(sizes)), sizes)[corner]
+        what = f"{('vertex', 'texture coordinate')[kind]} {named[corner, kind]}"
+        raise damaged(f"face {face} (counted from 0) names {what}, but there are {counts[kind]}")
     used, rows_of = np.unique(looks, return_inverse=True)
     names = np.array([*numbers], dtype=object)[used].tolist()
     known = load_materials(path, libraries, [name for name in names if name])
-    vertex_colors = _vertex_colors(np.array(colors, dtype=float))
-    plain = Material() if vertex_colors is None else Material(color=WHITE)
+    rows = np.array(vertices)
+    given, colors = rows[:, 3:], None
+    if not np.isnan(given).all():
+        colors = vertex_colors(given / (255.0 if np.nanmax(given) > 1 else 1.0))
+    plain = Material(color=GREY if colors is None else WHITE)
     return Mesh.from_polygons(
-        np.array(vertices),
-        indices[:, 0],
+        rows[:, :3],
+        indices[:, 0] - 1,
         np.array(sizes),
-        corner_uv=corner_uv if has_uv.any() else None,
+        corner_uv=np.array(coordinates)[indices[:, 1]] if named[:, 1].any() else None,
         polygon_material=rows_of.reshape(-1),
-        vertex_colors=vertex_colors,
+        vertex_colors=colors,
         materials=tuple(known.get(name, plain) for name in names),
         source=str(path),
     )
@@ -127,16 +127,6 @@ def _corner(word: bytes) -> tuple[int, int]:
     if len(values) > 2:
         raise ValueError(f"{word!r} is not a corner")
     return int(vertex), values[0] if values else 0
-
-
-def _vertex_colors(colors: FloatArray) -> FloatArray | None:
-    """Colours (n, 4) of vertices, of ``x y z [w] r g b``, from their rows; NaN where none is."""
-    if np.isnan(colors).all():
-        return None
-    scale = 255.0 if np.nanmax(colors) > 1 else 1.0
-    found = np.ones((len(colors), 4))  # white, where only others have a colour
-    found[:, :3] = np.nan_to_num(np.clip(colors / scale, 0, 1), nan=1.0)
-    return found
 
 
 def _text(body: bytes) -> str:
@@ -192,11 +182,15 @@ def read_ply(data: bytes, path: Path) -> Mesh:
     name = next((name for name in _INDICES if faces and name in faces[0].dtype.names), None)
     if name is None:
         raise DataError("the PLY file has no faces")
-    vertices = read["vertex"]
     (kinds,) = (each.properties for each in elements if each.name == "vertex")
-    colors = _colors(vertices, kinds)
+    colors = None
+    if kinds.keys() >= {"red", "green", "blue"}:
+        channels = [each for each in ("red", "green", "blue", "alpha") if each in kinds]
+        codes = [kinds[each][-1] for each in channels]
+        scales = [1 if code in "fd" else np.iinfo(np.dtype(code)).max for code in codes]
+        colors = vertex_colors(_columns(read["vertex"], channels) / scales)
     return Mesh.from_polygons(
-        np.stack([_column(vertices, axis) for axis in "xyz"], axis=1).astype(np.float64),
+        _columns(read["vertex"], "xyz").astype(np.float64),
         np.concatenate([block[name].ravel() for block in faces]).astype(np.int64),
         np.concatenate([np.full(len(block), block[name].shape[1]) for block in faces]),
         vertex_colors=colors,
@@ -228,9 +222,9 @@ def _blocks(
     blocks, left, wanted = list[Any](), element.count if element.properties else 0, element.count
     while left > 0:
         kind = _row_type(data, place, element, form)
-        count = 0 if kind is None else min(left, wanted, (len(data) - place) // kind.itemsize)
-        rows: Any = np.frombuffer(data, kind, count, place) if count else np.empty(0)
-        if not len(rows):
+        count = min(left, wanted, (len(data) - place) // kind.itemsize)
+        rows: Any = np.ndarray(count, kind, data, place)
+        if not count:
             what = {"vertex": "vertices", "face": "faces"}.get(element.name, element.name)
             require_count(what, element.count, element.count - left, 0, path)
         names = [name for name in rows.dtype.names or () if name.startswith(_LENGTH)]
@@ -241,38 +235,24 @@ def _blocks(
     return blocks, place
 
 
-def _row_type(data: bytes, place: int, element: _Element, form: str) -> np.dtype[Any] | None:
-    """The type of the row at a place, by the lengths of its lists; None where the data end."""
+def _row_type(data: bytes, place: int, element: _Element, form: str) -> np.dtype[Any]:
+    """The type of the row at a place, by the lengths of its lists, 0 where the data end."""
     fields: list[tuple[Any, ...]] = []
     for name, codes in element.properties.items():
         kinds = [_ORDERS[form] + ("d" if form == "ascii" else code) for code in codes]
         if len(kinds) > 1:
             length, start = np.dtype(kinds[0]), place + np.dtype(fields).itemsize
-            if start + length.itemsize > len(data):
-                return None
-            count = int(np.frombuffer(data, length, 1, start)[0])
+            given = data[start : start + length.itemsize].ljust(length.itemsize, b"\0")
+            count = int(np.frombuffer(given, length)[0])
             fields += [(_LENGTH + name, length), (name, kinds[1], (count,))]
         else:
             fields.append((name, kinds[0]))
     return np.dtype(fields)
 
 
-def _column(blocks: list[Any], name: str) -> Any:
-    """A property of all rows (n,)."""
-    return np.concatenate([block[name] for block in blocks])
-
-
-def _colors(blocks: list[Any], kinds: dict[str, tuple[str, ...]]) -> FloatArray | None:
-    """Colours (n, 4) of vertices from 0 to 1."""
-    if not {"red", "green", "blue"} <= kinds.keys():
-        return None
-    colors = np.ones((sum(map(len, blocks)), 4))
-    for channel, name in enumerate(("red", "green", "blue", "alpha")):
-        if name in kinds:
-            code = kinds[name][-1]
-            scale = 1 if code in "fd" else np.iinfo(np.dtype(code)).max
-            colors[:, channel] = _column(blocks, name) / scale
-    return np.clip(colors, 0, 1)
+def _columns(blocks: list[Any], names: Iterable[str]) -> npt.NDArray[Any]:
+    """Properties of all rows (n, k)."""
+    return np.stack([np.concatenate([block[name] for block in blocks]) for name in names], axis=1)
 
 
 def read_stl(data: bytes, path: Path) -> Mesh:

@@ -59,7 +59,7 @@ def _times(given: BenchmarkData) -> Tables:
 
 def _queries(path: Path, models: Sequence[LibraryModel], count: int) -> Iterator[Row]:
     opening, _, library = section.clocked(partial(Library.open, path))
-    yield {"noise px": "opening", "median ms": 1e3 * opening}
+    yield {"call": "opening", "median ms": 1e3 * opening}
     shown = [model for model in models if len(model.xyz) >= _KEYPOINTS]
     for noise_px in (1.0, 3.0, 5.0):
         calls = [
@@ -68,7 +68,8 @@ def _queries(path: Path, models: Sequence[LibraryModel], count: int) -> Iterator
         ]
         calls[0]()  # warm-up
         times = [1e3 * min(section.clocked(call)[0] for _ in range(_CALLS)) for call in calls]
-        yield {"noise px": noise_px, "median ms": float(np.median(times)), "longest": max(times)}
+        name = f"query, {noise_px:g} px"
+        yield {"call": name, "median ms": float(np.median(times)), "longest ms": max(times)}
 
 
 def _jittered(models: Sequence[LibraryModel], count: int) -> Library:
@@ -104,10 +105,10 @@ def _unseen(given: BenchmarkData) -> Iterator[Row]:
     root = given.folder("keypointnet")
     for category in _CATEGORIES:
         shape = section.learned_shape(root, category)
-        models = KeypointNet(root)[category]
-        library = Library.from_models(
-            [LibraryModel.of_annotated(model, with_mesh=False) for model in models]
+        models = (
+            LibraryModel.of_annotated(m, with_mesh=False) for m in KeypointNet(root)[category]
         )
+        library = Library.from_models(list(models))
         how = {"keypoints": None, "noise_px": _NOISE_PX}
         cases = []
         for _, seen in section.unseen_objects(root, category, given.count or 40, **how):

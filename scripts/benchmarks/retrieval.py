@@ -105,10 +105,8 @@ def _unseen(given: BenchmarkData) -> Iterator[Row]:
     root = given.folder("keypointnet")
     for category in _CATEGORIES:
         shape = section.learned_shape(root, category)
-        models = (
-            LibraryModel.of_annotated(m, with_mesh=False) for m in KeypointNet(root)[category]
-        )
-        library = Library.from_models(list(models))
+        without_mesh = partial(LibraryModel.of_annotated, with_mesh=False)
+        library = Library.from_models(list(map(without_mesh, KeypointNet(root)[category])))
         how = {"keypoints": None, "noise_px": _NOISE_PX}
         cases = []
         for _, seen in section.unseen_objects(root, category, given.count or 40, **how):

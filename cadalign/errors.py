@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import MISSING, fields
+from functools import partial
 from typing import Any
 
 _QUOTED_LENGTH = 200
-_REASONS = 3  # of many, that are listed
 _NEAR = 0.7  # similarity of names from which one may be meant by the other
 
 
@@ -42,13 +42,7 @@ class CadalignError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         # Worker processes pickle errors, and keyword-only arguments don't survive that by default.
-        return _rebuild, (type(self), self.what, self.where, self.fix)
-
-
-def _rebuild(
-    kind: type[CadalignError], what: str, where: str | None, fix: str | None
-) -> CadalignError:
-    return kind(what, where=where, fix=fix)
+        return partial(type(self), where=self.where, fix=self.fix), (self.what,)
 
 
 class InputError(CadalignError, ValueError):
@@ -60,32 +54,7 @@ class DegenerateError(CadalignError):
 
 
 class NoConsensusError(CadalignError):
-    """No alignment has more supporting keypoints than expected by chance.
-
-    Attributes
-    ----------
-    score : float
-        The best truncated score reached, a sum of squared errors [px^2].
-    inliers : int
-        Number of keypoints that supported it.
-    """
-
-    def __init__(
-        self,
-        what: str,
-        *,
-        where: str | None = None,
-        fix: str | None = None,
-        score: float = float("inf"),
-        inliers: int = 0,
-    ) -> None:
-        super().__init__(what, where=where, fix=fix)
-        self.score = score
-        self.inliers = inliers
-
-    def __reduce__(self) -> tuple[object, ...]:
-        rebuild, arguments = super().__reduce__()
-        return rebuild, arguments, {"score": self.score, "inliers": self.inliers}
+    """No alignment has more supporting keypoints than expected by chance."""
 
 
 class DataError(CadalignError):
@@ -124,23 +93,6 @@ def unknown(
     hint = f", did you mean {nearest[0]!r}?" if nearest else ""
     fix = f"known are {', '.join(names)}" if names else "there are none here"
     return InputError(f"unknown {kind} {quote(value)}{hint}", where=where or kind, fix=fix)
-
-
-def all_left_out(problems: Sequence[CadalignError]) -> CadalignError:
-    """The error of work that leaves out everything, with its first reasons; or the only reason.
-
-    Examples
-    --------
-    >>> print(all_left_out([InputError("no mesh", where="row 0"), InputError("no photo")]))
-    all 2 are left out: (1) row 0: no mesh; (2) no photo
-    """
-    reasons = list(dict.fromkeys(map(str, problems)))
-    if len(reasons) == 1:
-        return problems[0]
-    listed = (f"({number}) {text}" for number, text in enumerate(reasons[:_REASONS], start=1))
-    more = len(reasons) - _REASONS
-    rest = f"; and {more} more" if more > 0 else ""
-    return InputError(f"all {len(problems)} are left out: {'; '.join(listed)}{rest}")
 
 
 def quote(value: Any) -> str:

@@ -1,16 +1,11 @@
-"""Make the documentation's pictures: overview, chairs, annotator.
+"""Make the documentation's pictures of alignments.
 
-    python scripts/make_pictures.py overview
-
-The annotator's photo and model are those of `chairs`, whose files are needed:
-
-    python scripts/make_pictures.py chairs --files chairs
-    python scripts/make_pictures.py annotator --files chairs
+python scripts/make_pictures.py overview
+python scripts/make_pictures.py chairs --files chairs     # with the files of the worked example
 """
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,8 +15,6 @@ import numpy as np
 import tyro
 
 from cadalign import Box, Camera, Observation, fit
-from cadalign.annotate.files import SessionOptions
-from cadalign.annotate.session import open_session
 from cadalign.datasets import AnnotatedModel, KeypointNet, ModelKeypoints, write_sample_dataset
 from cadalign.evaluation.instances.instance import load_scene, make_instance
 from cadalign.io.images import read_image, write_image
@@ -36,8 +29,7 @@ from cadalign.render import (
 )
 from cadalign.render.canvas import ByteImage
 
-ROOT = Path(__file__).resolve().parents[1]
-DOCS = ROOT / "docs"
+DOCS = Path(__file__).resolve().parents[1] / "docs"
 MODELS = (("chair", "000"), ("car", "002"), ("bottle", "002"), ("vessel", "003"))
 CHAIR_CAMERA = Camera.from_fov(640, 720, fov_x=33.0)
 CHAIR_VIEW = Angles(azimuth=143.0, elevation=24.0)
@@ -140,25 +132,5 @@ def write_row(path: Path, pictures: Sequence[np.ndarray], *, width: int) -> None
     write_image(path, cv2.resize(row, (width, height), interpolation=cv2.INTER_AREA))
 
 
-def annotator(*, files: Path) -> None:
-    """The annotator in a headless browser, with the files that `chairs` has written."""
-    sys.path.insert(0, str(ROOT / "tests"))
-    from support.annotating import IDLE, opened_page, wait
-    from support.chromium import chromium
-
-    observation = files / "photo.json"
-    model = Observation.load(observation).model
-    options = SessionOptions(image=files / "photo.png", model=model, observation=observation)
-    session = open_session(options)
-    session.warm_up()
-    with chromium() as browser, opened_page(browser, session, width=1280, height=800) as page:
-        wait(page, f"{IDLE} && annotator.state.alignment.status === 'done'")
-        page.keyboard.press("v")
-        page.wait_for_timeout(1000)  # until everything is drawn
-        page.screenshot(path=DOCS / "annotator.png")
-
-
 if __name__ == "__main__":
-    tyro.extras.subcommand_cli_from_dict(
-        {each.__name__: each for each in (overview, chairs, annotator)}
-    )
+    tyro.extras.subcommand_cli_from_dict({each.__name__: each for each in (overview, chairs)})

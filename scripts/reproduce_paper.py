@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
+from benchmarks.section import markdown
 
 from cadalign import CadalignError
 from cadalign.cli.runs import run_progress
@@ -96,14 +97,15 @@ def _sweep_section(plan: PaperPlan, name: str) -> str:
     summaries = SIMULATION.write(_run(plan, options, f"simulate_{name}"))
     keys = [metric.key for metric in ERRORS]
     rows = [
-        [f"{value:g}", *(f"{s[keys[0]].median:.3g}" for s in summaries if s[kind.column] == value)]
+        {kind.column: value}
+        | {s.method: s[keys[0]].median for s in summaries if s[kind.column] == value}
         for value in kind.values
     ]
     images = "\n".join(f"![{name}: {key}](simulate_{name}/figures/{key}.png)" for key in keys)
     return (
         f"## Simulation: {name}\n\n{images}\n\n"
         f"Median {keys[0]} by {kind.column}; the paper states no numbers, only the figure.\n\n"
-        f"{_markdown(['', *kind.methods], rows, words=0)}\n"
+        f"{markdown(rows)}\n"
     )
 
 
@@ -118,18 +120,17 @@ def _table_section(plan: PaperPlan) -> str:
     for name, (root, views) in roots.items():
         options = KeypointNetOptions(root, views_per_model=views, seed=plan.seed)
         table = _table_rows(KEYPOINTNET.write(_run(plan, options, f"evaluate_{name}")))
-        rows += [[name, *row] for row in table]
+        rows += [[name, *row.values()] for row in table]
         figure = f"evaluate_{name}/figures/within_{metrics.SYM_ROTATION.key}.png"
         sections.append(
-            f"### {_DATASETS[name]}\n\n{_markdown(_HEAD, table, words=2)}\n\n"
-            f"![rotation errors]({figure})\n"
+            f"### {_DATASETS[name]}\n\n{markdown(table)}\n\n![rotation errors]({figure})\n"
         )
     write_text(plan.out / "table1.csv", csv_text([["dataset", *_HEAD], *rows]))
     body = "\n".join(sections)
     return f"## Table 1: sparse keypoints, 1 px noise\n\n{PERCENT_NOTE}\n\n{body}"
 
 
-def _table_rows(summaries: Sequence[Summary]) -> list[list[str]]:
+def _table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
     """The rows of Table 1: our medians, and the paper's beneath where it states them."""
     rows = []
     categories = dict.fromkeys(summary.group for summary in summaries)
@@ -145,13 +146,7 @@ def _table_rows(summaries: Sequence[Summary]) -> list[list[str]]:
             errors = f"{rotation:.3f}", f"{translation:.3f}"
             scales = f"{100 * scale_y:.1f}", f"{100 * scale_z:.1f}"
             rows.append([category, STATED, f"{keypoints:.0f}", *errors, *scales, ""])
-    return rows
-
-
-def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]], *, words: int) -> str:
-    """A table whose first columns, so many, hold words, and the others numbers."""
-    marks = [":---"] * words + ["---:"] * (len(head) - words)
-    return "\n".join(f"| {' | '.join(line)} |" for line in (head, marks, *rows))
+    return [dict(zip(_HEAD, row, strict=True)) for row in rows]
 
 
 def main() -> int:

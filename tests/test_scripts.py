@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import importlib
-import json
 import runpy
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks import section
 from benchmarks.evidence import SeenObject, aligned, draw_object, moved
+from benchmarks.section import BenchmarkData, Row, Tables
 
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet
+from cadalign.errors import DegenerateError
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.metrics import rotation_error
 
@@ -70,53 +71,47 @@ def test_the_worked_photo_aligns_as_its_page_says(
         assert line in printed
 
 
-class TestComparingRatios:
-    """`bench.py` with a section whose one ratio is 1.19."""
+def toy(given: BenchmarkData) -> Tables:
+    cases = (({"place": place}, place) for place in ("near", "far", "far"))
+
+    def refused(place: str) -> Row:
+        raise DegenerateError(place)
+
+    methods = {"fit": lambda place: {"error": len(place) / 4, "good": False}, "none": refused}
+    yield "sizes", section.summaries(section.measured(cases, methods), "method", "place")
+    given.folder("keypointnet")
+
+
+class TestSections:
+    """`bench.py` with a section of three cases and two methods, the second of which refuses all."""
 
     @pytest.fixture
-    def bench(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., int]:
+    def bench(self, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
         monkeypatch.syspath_prepend(ROOT / "scripts")
         module = importlib.import_module("bench")
-        figure = importlib.import_module("benchmarks.section").figure
-
-        def toy(given: Any) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-            yield "sizes", [{"points": 7, "R": (0.5, 1.25)}]
-            yield "times", [figure("fit", 9.0, "us", 1.19)]
-
         monkeypatch.setattr(module, "SECTIONS", {"toy": toy})
-        named = ["--stored", str(tmp_path / "stored.json"), "--out", str(tmp_path)]
-        return lambda *options: int(module.main([*named, *options]))
+        return lambda *options: module.main([*options, "--data", "None"])
 
-    @pytest.mark.parametrize(("stored", "status"), [(1.0, 0), (0.98, 1)])
-    def test_a_fifth_worse_than_stored_fails(
-        self,
-        stored: float,
-        status: int,
-        bench: Callable[..., int],
-        tmp_path: Path,
-        capsys: pytest.CaptureFixture[str],
+    def test_cases_by_methods_are_a_table(
+        self, bench: Callable[..., None], capsys: pytest.CaptureFixture[str]
     ) -> None:
-        (tmp_path / "stored.json").write_text(f'{{"fit": {stored}}}')
-        assert bench() == status
-        printed = capsys.readouterr().out
-        assert ("more than 20% worse than stored: fit" in printed) == bool(status)
-        assert "0.5 (1.25)" in printed
-        assert json.loads((tmp_path / "toy.json").read_text())["times"][0]["ratio"] == 1.19
-
-    def test_stored_ratios_are_compared_with_next_time(
-        self, bench: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        (tmp_path / "stored.json").write_text('{"other": 2.0}')
-        assert bench("--store") == 0
-        assert json.loads((tmp_path / "stored.json").read_text()) == {"fit": 1.19, "other": 2.0}
-        capsys.readouterr()
         bench()
-        (line,) = (each for each in capsys.readouterr().out.splitlines() if " fit " in each)
-        assert line.split(" | ")[-1] == "1.19 |"
+        printed = capsys.readouterr().out
+        assert "| fit | near | 1 | 1 (1) | 0 |\n| fit | far | 2 | 0.75 (0.75) | 0 |" in printed
+        assert "the rest of toy is left out: give --data, or CADALIGN_DATA" in printed
 
-    def test_an_unknown_section_is_refused(self, bench: Callable[..., int]) -> None:
-        with pytest.raises(SystemExit, match="no section nothing; known are toy"):
-            bench("nothing")
+    @pytest.mark.parametrize(
+        ("name", "message"),
+        [
+            ("toy", "toy: give --data, or CADALIGN_DATA"),
+            ("nothing", "no section nothing; known are toy"),
+        ],
+    )
+    def test_a_named_section_must_run(
+        self, name: str, message: str, bench: Callable[..., None]
+    ) -> None:
+        with pytest.raises(SystemExit, match=message):
+            bench(name)
 
 
 @pytest.fixture(scope="module")
@@ -129,11 +124,13 @@ class TestEvidenceWithoutNoise:
 
     def test_shots_show_the_truth(self, car: SeenObject) -> None:
         points = np.asarray(car.model.points_3d)
-        for shot in car.shots:
-            seen = moved(car.instance.gt, shot.cam_from_first).apply(points[shot.rows])
-            np.testing.assert_allclose(KEYPOINT_CAMERA.project(seen), shot.points_2d, atol=1e-8)
-        rows, columns = np.nonzero(car.mask())
-        low, high = car.shots[0].points_2d.min(axis=0), car.shots[0].points_2d.max(axis=0)
+        for view in car.views:
+            motion = np.asarray(view.cam_from_rig)
+            seen = moved(car.instance.gt, motion).apply(points[np.asarray(view.ids)])
+            np.testing.assert_allclose(KEYPOINT_CAMERA.project(seen), view.points_2d, atol=1e-8)
+        rows, columns = np.nonzero(car.mask("exact"))
+        pixels = np.asarray(car.views[0].points_2d)
+        low, high = pixels.min(axis=0), pixels.max(axis=0)
         assert (low >= [columns.min() - 3, rows.min() - 3]).all()
         assert (high <= [columns.max() + 3, rows.max() + 3]).all()
 

@@ -14,7 +14,6 @@ from cadalign.arrays import is_number
 from cadalign.errors import InputError, require_kind
 from cadalign.estimation.options import FitOptions
 from cadalign.geometry.camera import Camera
-from cadalign.io.focal import PriorOption
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -38,9 +37,7 @@ class PoseBatch:
     valid : (B,) bool tensor
         Marks the estimates that exist and that the keypoints determine; the others have no
         gradients, and those that do not exist are an identity.
-    focal : (B,) tensor or None
-        Focal lengths along the image's x [px], where they were estimated.
-    covariance : (B, 10, 10) tensor
+    covariance : (B, 9, 9) tensor
         Inverse of the cost's Hessian, without gradients, in the order of
         `cadalign.Result.covariance`; 0 for what is held or not determined.
     """
@@ -49,7 +46,6 @@ class PoseBatch:
     translation: Tensor
     scale: Tensor
     valid: Tensor
-    focal: Tensor | None
     covariance: Tensor
 
     def apply(self, points_3d: Tensor) -> Tensor:
@@ -69,8 +65,6 @@ def fit(
     loss_scale: float = FitOptions.loss_scale,
     stretch: str | None = FitOptions.stretch,
     stretch_sigma: float | None = FitOptions.stretch_sigma,
-    focal: str = FitOptions.focal,
-    focal_prior: PriorOption = FitOptions.focal_prior,
     workers: int = -1,
 ) -> PoseBatch:
     """Fit a batch of models to their keypoints, as `cadalign.fit` does, with gradients.
@@ -92,8 +86,8 @@ def fit(
     mask : (B, n) bool tensor, optional
         Marks the keypoints that are present. Those that are not finite, or whose sigma is not
         positive, count as absent.
-    loss, loss_scale, stretch, stretch_sigma, focal, focal_prior
-        As for `cadalign.fit`; with ``focal="estimate"`` all images have one size.
+    loss, loss_scale, stretch, stretch_sigma
+        As for `cadalign.fit`.
     workers : int
         Number of threads that share the problems; -1 for all cores.
 
@@ -127,12 +121,7 @@ def fit(
     from cadalign.torch.layer import FitTask, optima_of
 
     options = FitOptions(
-        loss=loss,
-        loss_scale=loss_scale,
-        stretch=stretch,
-        stretch_sigma=stretch_sigma,
-        focal=focal,
-        focal_prior=focal_prior,
+        loss=loss, loss_scale=loss_scale, stretch=stretch, stretch_sigma=stretch_sigma
     )
     _check_pixels(points_2d)
     shape = tuple(points_2d.shape[:2])
@@ -146,10 +135,9 @@ def fit(
         _expanded(sigma, shape, "sigma").double().cpu(),
         _expanded(mask, shape, "mask").bool().cpu(),
     )
-    rotation, translation, scale, focals, covariance = (each.to(points_2d) for each in found[:5])
-    estimated = focals if focal == "estimate" else None
+    rotation, translation, scale, covariance = (each.to(points_2d) for each in found[:4])
     valid = found.valid.to(points_2d.device)
-    return PoseBatch(rotation, translation, scale, valid, estimated, covariance)
+    return PoseBatch(rotation, translation, scale, valid, covariance)
 
 
 def _cameras(camera: Camera | Sequence[Camera], count: int) -> tuple[Camera, ...]:

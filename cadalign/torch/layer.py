@@ -7,7 +7,7 @@ backpropagating PnP optimization*, CVPR 2020). One Newton step, ``t - H^-1 g(t, 
 has these derivatives, and removes what the search's tolerance leaves: PyTorch differentiates it.
 
 The unknowns t are those of `cadalign.Result.covariance`: rotation vector in the camera frame,
-translation, logarithms of the scales, logarithm of the focal length.
+translation, logarithms of the scales.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.fit import fit_once
 from cadalign.estimation.options import FitOptions
-from cadalign.estimation.prior import log_focal_range
 from cadalign.estimation.problems import Problems, in_threads, join_problems, rays_of
 from cadalign.estimation.solve import are_solved_at_once, solve
 from cadalign.geometry.camera import Camera
@@ -36,22 +35,19 @@ except ImportError:
         "PyTorch is not installed", where="cadalign.torch", fix="pip install 'cadalign[torch]'"
     ) from None
 
-_UNKNOWNS = 10
+_UNKNOWNS = 9
 _LARGEST_POLISH = 0.02  # turn [rad] or change of a logarithm beyond which a step is no polish
-_AT_BOUND = 1e-9
-_HELD = 1e12  # information about a log focal length at its bound
 _NO_POSE = np.array([1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1, 1, 1, 1])
 _LEAST_DEPTH = 1e-9  # of points behind the camera
 _LEAST_SHARE = 1e-10  # of an unknown's information that the others must leave
 
 
 class Optima(NamedTuple):
-    """Fits of B problems; the covariance (B, 10, 10) and the mask have no derivatives."""
+    """Fits of B problems; the covariance (B, 9, 9) and the mask have no derivatives."""
 
     rotation: Tensor  # (B, 3, 3)
     translation: Tensor  # (B, 3)
     scale: Tensor  # (B, 3)
-    focal: Tensor  # (B,)
     covariance: Tensor
     valid: Tensor  # (B,) bool
 
@@ -71,16 +67,9 @@ class FitTask:
         if any(each.is_wide for each in self.cameras):
             what = "wide lenses have no gradients"
             raise InputError(what, where="camera", fix="undistort keypoints and camera first")
-        if self.options.focal == "known":
-            for each in self.cameras:
-                each.require_focal()
-            return
-        if len({(each.width, each.height) for each in self.cameras}) > 1:
-            what = "with an unknown focal length all images must have one size"
-            raise InputError(what, where="camera", fix="call fit for each size")
-        if any(each.distortion for each in self.cameras):
-            what = "an unknown focal length and lens distortion have no gradients together"
-            raise InputError(what, where="focal", fix="undistort keypoints and camera first")
+        if not all(each.focal_known for each in self.cameras):
+            what = "the focal length is unknown"
+            raise InputError(what, where="camera", fix="give it: camera.with_focal(...)")
 
 
 class _Once(torch.autograd.Function):
@@ -104,17 +93,15 @@ def optima_of(
 
     The derivatives are those before the Newton step: it is far below the noise.
     """
-    options, cameras = task.options, task.cameras
+    options = task.options
     points, pixels, sigmas = map(_Once.apply, (points, pixels, sigmas))
-    if options.focal == "estimate":
-        options = options.for_camera(cameras[0])
     present = mask & points.isfinite().all(2) & pixels.isfinite().all(2)
     present &= sigmas.isfinite() & (sigmas > 0)
     points, pixels = (torch.where(present[..., None], each, 0.0) for each in (points, pixels))
     sigmas = torch.where(present, sigmas, 1.0)
     given = [each.detach().numpy() for each in (points, pixels, sigmas, present)]
-    poses, focals, found = _searched(task, options, *given)
-    cost = _Cost(task, options, poses, focals, given[1], given[3])
+    poses, found = _searched(task, *given)
+    cost = _Cost(task, poses, given[1], given[3])
     with torch.enable_grad():  # by the step, also where the caller wants none
         step = torch.zeros(len(poses), _UNKNOWNS, dtype=torch.float64, requires_grad=True)
         total = cost.half_of(step, points, pixels, sigmas)
@@ -133,14 +120,13 @@ def optima_of(
     if not any(each.requires_grad for each in (points, pixels, sigmas)):
         gradient = gradient.detach()
     polish = -(covariance @ gradient[..., None])[..., 0]
-    is_small = polish.detach()[:, [0, 1, 2, 6, 7, 8, 9]].abs().amax(1) < _LARGEST_POLISH
+    is_small = polish.detach()[:, [0, 1, 2, 6, 7, 8]].abs().amax(1) < _LARGEST_POLISH
     # Of a larger one the derivatives remain.
     polish = polish - torch.where(is_small[:, None], 0.0, polish.detach())
     return Optima(
         torch.linalg.matrix_exp(_crossed(polish[:, :3])) @ cost.rotation,
         cost.translation + polish[:, 3:6],
         cost.scale * polish[:, 6:9].exp(),
-        torch.as_tensor(focals) * polish[:, 9].exp(),
         covariance,
         valid,
     )
@@ -150,49 +136,31 @@ class _Cost:
     """Half the cost of problems as a function of a step from their optima, and of the data."""
 
     def __init__(
-        self,
-        task: FitTask,
-        options: FitOptions,
-        poses: FloatArray,
-        focals: FloatArray,
-        pixels: FloatArray,
-        present: BoolArray,
+        self, task: FitTask, poses: FloatArray, pixels: FloatArray, present: BoolArray
     ) -> None:
-        self._options, cameras = options, task.cameras
+        self._options = task.options
         packed, self._present = torch.as_tensor(poses), torch.as_tensor(present)
         self.rotation, self.translation = packed[:, :9].reshape(-1, 3, 3), packed[:, 9:12]
         self.scale = packed[:, 12:]
-        rays, by_rays = _rays(pixels, present, cameras)
-        ratio = (focals / np.array([camera.fx for camera in cameras]))[:, None, None]
-        self._rays = torch.as_tensor(rays / ratio)
-        self._by_rays = torch.as_tensor(by_rays * ratio[..., None])
+        rays, by_rays = _rays(pixels, present, task.cameras)
+        self._rays, self._by_rays = torch.as_tensor(rays), torch.as_tensor(by_rays)
         self._pixels = torch.as_tensor(pixels)
-        offset = weight = np.zeros(len(focals))
-        if options.focal == "estimate":
-            low, high, mean, of_prior = log_focal_range(cameras[0], options.focal_prior)
-            logs = np.log(focals)
-            is_held = (logs < low + _AT_BOUND) | (logs > high - _AT_BOUND)
-            weight = np.where(is_held, _HELD, of_prior)
-            offset = np.where(is_held, 0.0, logs - mean)
-        self._offset, self._weight = torch.as_tensor(offset), torch.as_tensor(weight)
 
     def half_of(self, step: Tensor, points: Tensor, pixels: Tensor, sigmas: Tensor) -> Tensor:
-        """Half the cost of all problems; exact in the step (B, 10) to the second order."""
+        """Half the cost of all problems; exact in the step (B, 9) to the second order."""
         turn = _crossed(step[:, :3])
         turned = self.rotation + turn @ self.rotation + turn @ turn @ self.rotation / 2
         scale = self.scale * step[:, 6:9].exp()
         center = self.translation + step[:, 3:6]
         in_camera = (points * scale[:, None]) @ turned.mT + center[:, None]
         rays = in_camera[..., :2] / in_camera[..., 2:].clamp(min=_LEAST_DEPTH)
-        apart = step[:, 9, None, None].exp() * rays - self._rays
-        errors = (self._by_rays @ apart[..., None])[..., 0] - (pixels - self._pixels)
+        errors = (self._by_rays @ (rays - self._rays)[..., None])[..., 0] - (pixels - self._pixels)
         squares = (errors**2).sum(-1) / sigmas**2
         total = torch.where(self._present, self._lost(squares), 0.0).sum()
         prior = self._options.scale_prior
         logs = scale.log()
         beyond = logs - logs.clamp(-prior.width, prior.width)
-        total = total + prior.weight * (beyond**2).sum()
-        return (total + (self._weight * (self._offset + step[:, 9]) ** 2).sum()) / 2
+        return (total + prior.weight * (beyond**2).sum()) / 2
 
     def _lost(self, squares: Tensor) -> Tensor:
         bend = self._options.loss_scale
@@ -244,27 +212,21 @@ def _rays(
 
 
 def _searched(
-    task: FitTask,
-    options: FitOptions,
-    points: FloatArray,
-    pixels: FloatArray,
-    sigmas: FloatArray,
-    present: BoolArray,
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Poses (B, 15) and focal lengths (B,) of the best minima, and for which problems (B,)."""
-    cameras = task.cameras * (len(points) if len(task.cameras) == 1 else 1)
+    task: FitTask, points: FloatArray, pixels: FloatArray, sigmas: FloatArray, present: BoolArray
+) -> tuple[FloatArray, BoolArray]:
+    """Poses (B, 15) of the best minima, and for which problems there are any (B,)."""
+    cameras, options = task.cameras * (len(points) if len(task.cameras) == 1 else 1), task.options
     problems = [
         Problems(points[b, kept], pixels[b, kept], np.array([0, kept.sum()]), cameras[b])
         for b, kept in enumerate(present)
     ]
-    focals = np.array([camera.fx for camera in task.cameras]) * np.ones(len(points))
     poses, valid = np.tile(_NO_POSE, (len(points), 1)), np.zeros(len(points), dtype=bool)
 
     def fit_alone(b: int) -> None:
         part = replace(options, sigma=sigmas[b, present[b]])
         with suppress(CadalignError):
-            found = fit_once(problems[b], part, None, None, 0.0)
-            poses[b], focals[b], valid[b] = found.alignment.packed, found.camera.fx, True
+            poses[b] = fit_once(problems[b], part, None, None, 0.0).alignment.packed
+            valid[b] = True
 
     @np.errstate(all="ignore")  # holds for one thread only
     def run(first: int, last: int) -> None:
@@ -278,4 +240,4 @@ def _searched(
         poses[solved], valid[solved] = found.poses[solved - first, 0], True
 
     in_threads(run, len(points), task.workers)
-    return poses, focals, valid
+    return poses, valid

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,9 +26,13 @@ from cadalign.shapes.basis import find_reflection
 
 _LEAST_KEYPOINTS, _SURE = 6, 0.4  # score of a keypoint
 _CELLS = 64  # of a network's heatmap along the longer side of a car's rectangle
-_SHAPE_SIGMA = 0.04  # of the similar model's keypoints [diagonals]
 _SIZE = (1242, 375)  # of a photo that is not there [px]
 _MEAN_CAR = np.array([1.63, 3.88, 1.53])  # width, length and height of cars in KITTI [m]
+_MODELS: dict[str, dict[str, Any]] = {  # options of the mean car's model
+    "rigid": {"stretch": "none"},
+    "stretched": {},
+    "similar": {"shape_sigma": 0.04 * float(np.linalg.norm(_MEAN_CAR))},
+}
 _LENGTH_SIGMAS = (0.05, 0.11, 0.08)  # of their logs
 _MODE_DEVIATION = 1.5  # of modes of unit norm, on a mean of about 8 units of length
 _REST = 0.03  # what the modes leave of a keypoint's place [m]
@@ -44,15 +49,11 @@ def cars(given: BenchmarkData) -> Tables:
     """
     folder = given.folder("real", "kitti_cars")
     shape = _car_shape(folder)
-    seen = [each for each in _read_cars(folder) if len(each.names) >= _LEAST_KEYPOINTS]
-    rows = []
-    for method in ("epnp", "rigid", "stretched", "similar", "shape"):
-        errors = [_box_errors(_box_of(car, method, shape), car.box) for car in seen]
-        yaws, depths, ious, ious_above = np.array(errors).T
-        row: Row = {"method": method, "yaw, deg": section.spread(yaws)}
-        row |= {"depth, %": 100 * float(np.median(depths)), "3D IoU": float(np.median(ious))}
-        rows.append(row | {"bird's-eye IoU": float(np.median(ious_above))})
-    yield f"{len(seen)} cars", rows
+    seen = [({}, car) for car in _read_cars(folder) if len(car.names) >= _LEAST_KEYPOINTS]
+    methods = {
+        each: partial(_errors, method=each, shape=shape) for each in ("epnp", *_MODELS, "shape")
+    }
+    yield "Cars of KITTI", section.summaries(section.measured(seen, methods), "method")
 
 
 class _Car(NamedTuple):
@@ -64,11 +65,7 @@ class _Car(NamedTuple):
     names: tuple[str, ...]  # (k,)
     points_2d: FloatArray  # (k, 2), [px]
     side: float  # the longer one of its rectangle [px]
-
-    @property
-    def bounds(self) -> FloatArray:
-        """The mean car's box."""
-        return _car_bounds(np.array(list(self.mean.values())))
+    bounds: FloatArray  # (2, 3), the mean car's box [m]
 
 
 def _read_cars(folder: Path) -> Iterator[_Car]:
@@ -96,6 +93,7 @@ def _car(entry: dict[str, Any], size: tuple[int, int]) -> _Car:
         tuple(np.array(entry["names"])[sure].tolist()),
         np.array(entry["uv"], dtype=float)[sure],
         max(right - left, bottom - top),
+        _car_bounds(np.array(entry["xyz"])),
     )
 
 
@@ -137,22 +135,27 @@ def _car_shape(folder: Path) -> cadalign.ShapeModel:
     )
 
 
+def _errors(car: _Car, *, method: str, shape: cadalign.ShapeModel) -> Row:
+    """Errors of yaw and depth, and the overlap of the upright boxes."""
+    est, gt = _box_of(car, method, shape), car.box
+    turn = _yaw(est.rotation) - _yaw(gt.rotation)
+    return {
+        "yaw, deg": float(np.degrees(abs((turn + np.pi) % (2 * np.pi) - np.pi))),
+        "depth, %": 100 * float(abs(est.center[2] / gt.center[2] - 1)),
+        "3D IoU": box_iou(est=_upright(est), gt=_upright(gt)),
+    }
+
+
 def _box_of(car: _Car, method: str, shape: cadalign.ShapeModel) -> cadalign.Box:
     """The estimated box of a car."""
     if method == "epnp":
         points = np.array([car.mean[name] for name in car.names])
         found = cadalign.fit(points, car.points_2d, car.camera, method="epnp")
         return cadalign.Box.from_model(car.bounds, found.alignment)
-    kinds: dict[str, dict[str, Any]] = {
-        "rigid": {"stretch": "none"},
-        "stretched": {},
-        "similar": {"shape_sigma": _SHAPE_SIGMA * float(np.linalg.norm(_MEAN_CAR))},
-    }
     model: Any = shape
-    if method != "shape":
-        points = np.array(list(car.mean.values()))
-        known: dict[str, Any] = {"points_3d": points, "ids": list(car.mean), "bounds": car.bounds}
-        model = cadalign.Model(**known, up_axis="z", **kinds[method])
+    if method in _MODELS:
+        points, how = np.array(list(car.mean.values())), {"up_axis": "z", **_MODELS[method]}
+        model = cadalign.Model(points_3d=points, ids=list(car.mean), bounds=car.bounds, **how)
     sigma = max(car.side / _CELLS, 0.5)
     view = cadalign.View(car.camera, car.points_2d, ids=car.names, sigma=sigma)
     result = cadalign.align(model, view)
@@ -165,23 +168,6 @@ def _yaw(rotation: FloatArray) -> float:
     return float(np.arctan2(-forward[2], forward[0]))
 
 
-def _box_errors(est: cadalign.Box, gt: cadalign.Box) -> tuple[float, float, float, float]:
-    """Errors of yaw [deg] and depth, relative; overlaps of the boxes and of their footprints."""
-    upright, flat = zip(*((_upright(box), _footprint(box)) for box in (est, gt)), strict=True)
-    turn = _yaw(est.rotation) - _yaw(gt.rotation)
-    return (
-        float(np.degrees(abs((turn + np.pi) % (2 * np.pi) - np.pi))),
-        float(abs(est.center[2] / gt.center[2] - 1)),
-        box_iou(est=upright[0], gt=upright[1]),
-        box_iou(est=flat[0], gt=flat[1]),
-    )
-
-
 def _upright(box: cadalign.Box) -> cadalign.Box:
     bottom = box.center + [0, box.extents[2] / 2, 0]
     return _car_box(box.extents, bottom, _yaw(box.rotation))
-
-
-def _footprint(box: cadalign.Box) -> cadalign.Box:
-    """The prism of height 1 on the footprint: volumes of prisms are areas of footprints."""
-    return _car_box([*box.extents[:2], 1.0], box.center * [1, 0, 1], _yaw(box.rotation))

@@ -1,11 +1,11 @@
-"""Evidence beside keypoints: errors, how near they come to the Cramer-Rao bound, and masks."""
+"""Evidence beside keypoints: errors, and how near they come to the Cramer-Rao bound."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from itertools import chain
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Alignment, Model, Result, View, align
-from cadalign.arrays import BoolArray, FloatArray, IntArray, instance_rng
+from cadalign.arrays import BoolArray, FloatArray, instance_rng
 from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.evaluation.instances.instance import (
     KEYPOINT_CAMERA,
@@ -39,53 +39,38 @@ _DRAWS = 1000  # of an ideal estimator's errors
 _WANDER = 2.0  # [px], standard deviation of a smoothed contour
 _WANDER_LENGTH = 5.0  # [px], over which it wanders
 _HIDDEN = 0.25  # share of the area
-_ALL = ("mask", "depth", "gravity", "length", "views-2")
 _KINDS = (
-    *("keypoints", "gravity", "length", "depth", "views-2-free", "views-5-free"),
-    *("views-2", "views-5", "mask", "mask-dilated", "mask-hidden", "mask-smoothed", "all"),
+    *("keypoints", "gravity", "length", "depth", "views-2-free", "views-5-free", "views-2"),
+    *("views-5", "mask-exact", "mask-dilated", "mask-hidden", "mask-smoothed"),
 )
+_FIELDS = {  # of a view by the kind that uses them
+    "depth": ("depth", "depth_sigma"),
+    "gravity": ("up", "up_sigma_deg"),
+    "views-2": ("cam_from_rig",),
+    "views-5": ("cam_from_rig",),
+}
 
 
 def evidence(given: BenchmarkData) -> Tables:
-    """Medians with keypoints alone, and with further evidence.
+    """Errors with keypoints alone, and with one kind of further evidence.
 
     Each view shows a model with a mesh as it is; the alignment gets its visible keypoints with
     noise of 1 px and the model stretched by factors from 0.5 to 2 along y and z. The last column is
     the ratio of the rotation error to that of an ideal estimator, from the inverse of the Fisher
     information of the view without noise; masks, whose noise is estimated from themselves, have
-    none.
-
-    Kinds are keypoints alone, these and one kind of evidence, and all: mask, depth, gravity, length
-    and two views. Views with -free have an unknown motion.
+    none. Views with -free have an unknown motion.
     """
     dataset = KeypointNet(given.folder("keypointnet")).subset(with_mesh=True)
-    drawn = [
-        (
-            section.attempt(draw_object, model, view, noise=1.0, seed=given.seed),
-            section.attempt(draw_object, model, view, noise=0.0, seed=given.seed),
-        )
-        for model in dataset
-        for view in range(given.count or 8)
-    ]
-    seen = [each for each in drawn if None not in each]
-    rows = []
-    for kind in _KINDS:
-        found = [(noisy, section.attempt(_measured, kind, noisy, ideal)) for noisy, ideal in seen]
-        solved = [row for _, row in found if row is not None]
-        bottles = [row["box IoU"] for each, row in found if row and each.category == "bottle"]
-        medians = section.summary(solved)
-        rows.append({"evidence": kind, **medians, "of bottles": float(np.median(bottles))})
-    yield f"evidence beside keypoints, {len(seen)} views: medians", rows
-
-
-class Shot(NamedTuple):
-    """One camera's image."""
-
-    cam_from_first: FloatArray  # (4, 4), motion of the camera
-    rows: IntArray  # (n,), the visible keypoints
-    points_2d: FloatArray  # (n, 2), with noise [px]
-    depths: FloatArray  # (n,), with noise [model units]
-    up: FloatArray  # (3,), with noise
+    cases = []
+    for model in dataset:
+        for view in range(given.count or 8):
+            draw = partial(section.attempt, draw_object, model, view, seed=given.seed)
+            drawn = draw(noise=1.0), draw(noise=0.0)
+            if None not in drawn:
+                cases.append(({}, drawn))
+    methods = {kind: partial(_measured, kind) for kind in _KINDS}
+    rows = list(section.measured(cases, methods))
+    yield f"evidence beside keypoints, {len(cases)} views", section.summaries(rows, "method")
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +80,11 @@ class SeenObject:
     category: str
     instance: Instance  # in the first camera
     model: Model  # the stretched model with its mesh
-    shots: tuple[Shot, ...]
+    views: tuple[View, ...]  # with depths, gravity and known motion
     height: float  # of the object, with noise [model units]
     rng_of: Callable[..., np.random.Generator]  # streams by name
 
-    def mask(self, damage: str = "exact") -> BoolArray:
+    def mask(self, damage: str) -> BoolArray:
         """The object's mask in the first camera; see `damaged_mask`."""
         shown = self.instance.scene, KEYPOINT_CAMERA, self.instance.cam_from_model
         return damaged_mask(cast_geometry(*shown).mask, damage, self.rng_of(damage))
@@ -118,12 +103,12 @@ def draw_object(model: AnnotatedModel, view: int, *, noise: float, seed: int) ->
     shown, pose, stretch = instance.scene, instance.cam_from_model, 1 / instance.gt.scale
     rng = rng_of("evidence")
     centre = pose.apply(shown.bounds.mean(axis=0)[None])[0]
-    shots = []
+    views = []
     for place in _TURNS:
         motion = np.eye(4)
         motion[:3, :3] = rotation_from_vector(np.radians([0.0, place * _TURN_DEG, 0.0]))
         motion[:3, 3] = centre - motion[:3, :3] @ centre
-        shots.append(_shoot(instance, model.keypoints.xyz, motion, rng, noise))
+        views.append(_view(instance, model.keypoints.xyz, motion, rng, noise))
     off = noise * _LENGTH_SIGMA * rng.standard_normal()
     return SeenObject(
         category=model.category,
@@ -133,28 +118,31 @@ def draw_object(model: AnnotatedModel, view: int, *, noise: float, seed: int) ->
             bounds=instance.bounds,
             mesh=Mesh(shown.mesh.vertices * stretch, shown.mesh.faces),
         ),
-        shots=tuple(shots),
+        views=tuple(views),
         height=float(np.ptp(shown.bounds[:, 1]) * (1 + off)),
         rng_of=rng_of,
     )
 
 
-def _shoot(
+def _view(
     instance: Instance, xyz: FloatArray, motion: FloatArray, rng: np.random.Generator, noise: float
-) -> Shot:
+) -> View:
     pose = moved(instance.cam_from_model, motion)
     of_pixels = noise * rng.standard_normal((len(xyz), 2))
     of_depths = noise * _DEPTH_SIGMA * rng.standard_normal(len(xyz))
     about = noise * np.radians(_UP_SIGMA_DEG) * rng.standard_normal(2)
     rows = np.flatnonzero(visible_keypoints(instance.scene, xyz, KEYPOINT_CAMERA, pose))
     in_camera = pose.apply(xyz[rows])
-    return Shot(
-        motion,
-        rows,
+    return View(
+        KEYPOINT_CAMERA,
         KEYPOINT_CAMERA.project(in_camera) + of_pixels[rows],
-        in_camera[:, 2] * (1 + of_depths[rows]),
+        ids=rows.tolist(),
+        depth=in_camera[:, 2] * (1 + of_depths[rows]),
+        depth_sigma=_DEPTH_SIGMA,
         # The model's y axis, turned about the two axes across it.
-        rotation_from_vector(pose.rotation[:, [0, 2]] @ about) @ pose.rotation[:, 1],
+        up=rotation_from_vector(pose.rotation[:, [0, 2]] @ about) @ pose.rotation[:, 1],
+        up_sigma_deg=_UP_SIGMA_DEG,
+        cam_from_rig=motion,
     )
 
 
@@ -165,53 +153,40 @@ def moved(pose: Alignment, motion: FloatArray) -> Alignment:
 
 
 def aligned(kind: str, seen: SeenObject) -> Result:
-    """The estimate from a kind of evidence."""
-    kinds = _ALL if kind == "all" else (kind,)
-    counts = [int(each.split("-")[1]) for each in kinds if each.startswith("views-")]
-    shots = seen.shots[: counts[0] if counts else 1]
-    is_free = kind.endswith("-free")
-    if is_free:
-        shots = (shots[0], *(shot for shot in shots[1:] if len(shot.rows) >= _LEAST_FREE))
-    fields: dict[str, Any] = {}
-    if "depth" in kinds:
-        fields |= {"depth": shots[0].depths, "depth_sigma": _DEPTH_SIGMA}
-    if "gravity" in kinds:
-        fields |= {"up": shots[0].up, "up_sigma_deg": _UP_SIGMA_DEG}
-    for each in kinds:
-        if each.startswith("mask"):
-            fields["mask"] = seen.mask(each.removeprefix("mask").removeprefix("-") or "exact")
-    views = tuple(
-        View(
-            KEYPOINT_CAMERA,
-            shot.points_2d,
-            ids=shot.rows.tolist(),
-            sigma=1.0,
-            cam_from_rig=shot.cam_from_first if counts and not is_free else None,
-            **({} if number else fields),
-        )
-        for number, shot in enumerate(shots)
-    )
-    size = Size(height=seen.height, sigma=_LENGTH_SIGMA) if "length" in kinds else None
+    """The estimate from keypoints and a kind of evidence."""
+    count = int(kind.split("-")[1]) if kind.startswith("views") else 1
+    first, *others = seen.views[:count]
+    if kind.endswith("-free"):
+        others = [view for view in others if len(view.ids or ()) >= _LEAST_FREE]
+    fields = dict.fromkeys(chain.from_iterable(_FIELDS.values()))
+    for name in _FIELDS.get(kind, ()):
+        del fields[name]
+    views = [replace(view, **fields) for view in (first, *others)]
+    if kind.startswith("mask"):
+        views = [replace(views[0], mask=seen.mask(kind.removeprefix("mask-")))]
+    size = Size(height=seen.height, sigma=_LENGTH_SIGMA) if kind == "length" else None
     return align(seen.model, views, size=size)
 
 
-def _measured(kind: str, noisy: SeenObject, ideal: SeenObject) -> Row:
-    instance = noisy.instance
+def _measured(kind: str, drawn: tuple[SeenObject, SeenObject]) -> Row:
+    (noisy, ideal), instance = drawn, drawn[0].instance
     est, gt = aligned(kind, noisy).alignment, instance.gt
     errors = alignment_errors(est=est, gt=gt, length=instance.diagonal)
     est_box, gt_box = (Box.from_model(instance.bounds, each) for each in (est, gt))
+    box_iou = overlap(est=est_box, gt=gt_box)
     row: Row = {
         "R, deg": errors["rotation_error_deg"],
         "t": errors["translation_error"],
         "s_y, %": 100 * errors["scale_y_error"],
         "s_z, %": 100 * errors["scale_z_error"],
-        "box IoU": overlap(est=est_box, gt=gt_box),
+        "box IoU": box_iou,
+        "of bottles": box_iou if noisy.category == "bottle" else None,
     }
-    if "mask" in kind or kind == "all":
+    if kind.startswith("mask"):
         return row
     bound = aligned(kind, ideal).fisher_covariance
-    drawn = noisy.rng_of("bound").multivariate_normal(np.zeros(9), bound, _DRAWS, method="eigh")
-    turn = float(np.median(np.degrees(np.linalg.norm(drawn[:, :3], axis=1))))
+    turns = noisy.rng_of("bound").multivariate_normal(np.zeros(9), bound, _DRAWS, method="eigh")
+    turn = float(np.median(np.degrees(np.linalg.norm(turns[:, :3], axis=1))))
     return row | {"R over bound": errors["rotation_error_deg"] / turn}
 
 

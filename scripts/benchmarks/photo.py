@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -18,6 +17,7 @@ from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Alignment, Camera, Mesh, Model, Result, Symmetry, View, align
 from cadalign.arrays import FloatArray
+from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.evaluation.metrics.errors import probability_level
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.io.images import read_photo
@@ -44,36 +44,21 @@ def photo(given: BenchmarkData) -> Tables:
     """
     draws = given.count or 25
     cases = [(case, 1) for case in _composites(given, 8 * draws)]
-    cases += [(case, draws) for case in _real_cases(given, "bop_samples")]
-    cases += [(case, max(draws // 5, 1)) for case in _real_cases(given, "lmo_multiview")]
-    for stretched in (False, True):
-        rows: dict[str, list[Row]] = defaultdict(list)
-        for number, (case, count) in enumerate(cases):
-            for draw in range(count):
-                rng = np.random.default_rng([given.seed, 3, number, draw])
-                rows[case.group].append(_compared(case.clicked(rng, stretched=stretched)))
-        title = "an unknown stretch" if stretched else "a rigid model"
-        table = [{"photos": name, **section.summary(found)} for name, found in rows.items()]
-        yield f"photos beside rough clicks, {title}: medians", table
-
-
-def _compared(clicks: PhotoClicks) -> Row:
-    first, _, alone = section.clocked(clicks.aligned)
-    second, _, joint = section.clocked(partial(clicks.aligned, image=clicks.case.pixels))
-    before, after = clicks.errors(alone), clicks.errors(joint)
-    row: Row = {}
-    for error, *values in zip(("R", "t", "stretch"), before, after, strict=True):
-        row |= dict(zip((f"{error} clicks", f"{error} photo"), values, strict=True))
-    row["better"] = after[0] < before[0]
-    row["warned"] = any(each.kind == "photo" for each in joint.warnings)
-    row["silently worse"] = not row["warned"] and after[0] > before[0] + _WORSE_DEG
-    row["covered R"], row["covered t"] = clicks.covered_by(joint)
-    return row | {"seconds": second - first}
+    cases += [(case, draws) for case in _samples(given.folder("real", "bop_samples"))]
+    occluded = _occluded(given.folder("real", "lmo_multiview"))
+    cases += [(case, max(draws // 5, 1)) for case in occluded]
+    rows = [
+        {"model": model, "photos": case.group} | _compared(case, _clicked(case, rng, model))
+        for model in ("rigid", "stretched")
+        for number, (case, count) in enumerate(cases)
+        for rng in (np.random.default_rng([given.seed, 3, number, draw]) for draw in range(count))
+    ]
+    yield "photos beside rough clicks", section.summaries(rows, "photos", "model")
 
 
 @dataclass(frozen=True)
 class PhotoCase:
-    """An object in a photo: its model, the true alignment, and clicks on visible points."""
+    """An object in a photo: its model and the true alignment."""
 
     group: str
     camera: Camera
@@ -82,60 +67,61 @@ class PhotoCase:
     truth: Alignment
     symmetry: Symmetry = field(default_factory=Symmetry.none)
 
-    def clicked(self, rng: np.random.Generator, *, stretched: bool) -> PhotoClicks:
-        """Rough clicks on points spread over the visible surface."""
-        scale = np.exp(rng.normal(0, _STRETCH_SIGMA, 3) * [0, 1, 1]) if stretched else np.ones(3)
-        truth = replace(self.truth, scale=scale)
-        mesh = Mesh(self.mesh.vertices / scale, self.mesh.faces)
-        geometry = cast_geometry(Scene(mesh), self.camera, truth)
-        places = _spread_places(geometry.mask, rng)
-        rays = self.camera.normalize(places.astype(float))
-        depths = geometry.depth[places[:, 1], places[:, 0]]
-        seen = np.column_stack([rays, np.ones(len(rays))]) * depths[:, None]
-        sigma = _CLICK_SHARE * self.camera.width
-        model = Model(
-            points_3d=(seen - truth.translation) @ truth.rotation / scale,
-            mesh=mesh,
-            stretch="yz" if stretched else "none",
-            stretch_sigma=_STRETCH_SIGMA if stretched else None,
-        )
-        return PhotoClicks(self, model, truth, places + rng.normal(0, sigma, places.shape), sigma)
 
+class Clicks(NamedTuple):
+    """Clicks (6, 2) in a photo [px], the model that they are on, and the true alignment."""
 
-@dataclass(frozen=True)
-class PhotoClicks:
-    """Clicks in a photo, the model that they are on, and the true alignment."""
-
-    case: PhotoCase
     model: Model
     truth: Alignment
     pixels: FloatArray
     sigma: float
 
-    def aligned(self, **evidence: Any) -> Result:
-        """The estimate by the clicks, and further evidence of the view."""
-        return align(self.model, View(self.case.camera, self.pixels, sigma=self.sigma, **evidence))
 
-    def true_for(self, est: Alignment) -> Alignment:
-        """The true alignment, of those that are equal under the symmetry the nearest."""
-        return nearest_truth(est=est, gt=self.truth, symmetry=self.case.symmetry)
+def _clicked(case: PhotoCase, rng: np.random.Generator, model: str) -> Clicks:
+    """Rough clicks on points spread over the visible surface."""
+    is_stretched = model == "stretched"
+    scale = np.exp(rng.normal(0, _STRETCH_SIGMA, 3) * [0, 1, 1]) if is_stretched else np.ones(3)
+    truth = replace(case.truth, scale=scale)
+    mesh = Mesh(case.mesh.vertices / scale, case.mesh.faces)
+    geometry = cast_geometry(Scene(mesh), case.camera, truth)
+    places = _spread_places(geometry.mask, rng)
+    rays = case.camera.normalize(places.astype(float))
+    depths = geometry.depth[places[:, 1], places[:, 0]]
+    seen = np.column_stack([rays, np.ones(len(rays))]) * depths[:, None]
+    sigma = _CLICK_SHARE * case.camera.width
+    clicked = Model(
+        points_3d=(seen - truth.translation) @ truth.rotation / scale,
+        mesh=mesh,
+        stretch="yz" if is_stretched else "none",
+        stretch_sigma=_STRETCH_SIGMA if is_stretched else None,
+    )
+    return Clicks(clicked, truth, places + rng.normal(0, sigma, places.shape), sigma)
 
-    def errors(self, result: Result) -> tuple[float, float, float]:
-        """Rotation [deg], translation [diagonals], larger stretch error."""
-        est, gt = result.alignment, self.true_for(result.alignment)
-        diagonal = float(np.linalg.norm(np.ptp(self.case.mesh.vertices, axis=0)))
-        shift = float(np.linalg.norm(est.translation - gt.translation)) / diagonal
-        stretch = float(np.abs(est.scale / gt.scale - 1).max())
-        return rotation_error(est=est, gt=gt), shift, stretch
 
-    def covered_by(self, result: Result) -> list[bool]:
-        """True where the truth lies in the regions of rotation and of translation."""
-        error = section.deviation(est=result.alignment, gt=self.true_for(result.alignment))
-        levels = (
-            probability_level(error[rows], result.covariance[rows, rows])
-            for rows in (slice(3), slice(3, 6))
-        )
-        return [level is not None and level < _INNER for level in levels]
+def _compared(case: PhotoCase, clicks: Clicks) -> Row:
+    """Errors by the clicks and with the photo: rotation [deg], stretch."""
+
+    def aligned(**evidence: Any) -> Result:
+        view = View(case.camera, clicks.pixels, sigma=clicks.sigma, **evidence)
+        return align(clicks.model, view)
+
+    first, _, alone = section.clocked(aligned)
+    second, _, joint = section.clocked(partial(aligned, image=case.pixels))
+    row: Row = {}
+    for name, result in (("clicks", alone), ("photo", joint)):
+        est = result.alignment
+        gt = nearest_truth(est=est, gt=clicks.truth, symmetry=case.symmetry)
+        error = section.deviation(est=est, gt=gt)
+        row[f"R {name}"] = rotation_error(est=est, gt=gt)
+        row[f"stretch {name}"] = float(np.abs(est.scale / gt.scale - 1).max())
+    row["better"] = row["R photo"] < row["R clicks"]
+    row["warned"] = any(each.kind == "photo" for each in joint.warnings)
+    is_worse = row["R photo"] > row["R clicks"] + _WORSE_DEG
+    row["silently worse"] = not row["warned"] and is_worse
+    for name, part in (("R", slice(3)), ("t", slice(3, 6))):
+        level = probability_level(error[part], joint.covariance[part, part])
+        row[f"covered {name}"] = level is not None and level < _INNER
+    return row | {"seconds": second - first}
 
 
 def _spread_places(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -156,36 +142,27 @@ def _spread_places(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 # Real photos --------------------------------------------------------------------------------------
 
 
-def _real_cases(given: BenchmarkData, folder: str) -> Iterator[PhotoCase]:
-    """The objects of real photos: bop_samples (HANDAL, LINEMOD), lmo_multiview (occluded ones)."""
-    is_sample = folder == "bop_samples"
-    entries = (_posed if is_sample else _lmo)(given.folder("real", folder))
-    for photo, fields, model, rotation, shift in entries:
-        group = photo.parent.name if is_sample else "lmo"
-        camera = Camera(*(fields[name] for name in ("width", "height", "fx", "fy", "cx", "cy")))
-        truth = Alignment(nearest_rotation(rotation), shift, np.ones(3))
-        yield PhotoCase(group, camera, read_photo(photo), load_mesh(model), truth)
-
-
-_Posed = tuple[Path, dict[str, Any], Path, np.ndarray, np.ndarray]
-"""Photo, camera's fields, model, and its rotation and translation [mm]."""
-
-
-def _posed(root: Path) -> Iterator[_Posed]:
-    """The objects of `poses.json`: {photo: {"model", "cam_from_model", "camera"}}."""
+def _samples(root: Path) -> Iterator[PhotoCase]:
+    """Objects of HANDAL and LINEMOD, by poses.json: {photo: {model, cam_from_model, camera}}."""
     for name, entry in json.loads((root / "poses.json").read_text()).items():
-        pose = np.array(entry["cam_from_model"])
-        yield root / name, entry["camera"], root / entry["model"], pose[:3, :3], pose[:3, 3]
+        pose, group = np.array(entry["cam_from_model"]), (root / name).parent.name
+        yield _posed(root / name, group, entry["camera"], root / entry["model"], pose)
 
 
-def _lmo(root: Path) -> Iterator[_Posed]:
-    """The objects of `scene_gt.json`: {photo: [{"cam_R_m2c", "cam_t_m2c", "obj_id"}]}."""
+def _occluded(root: Path) -> Iterator[PhotoCase]:
+    """Objects of Linemod-Occluded, by scene_gt.json: {photo: [{cam_R_m2c, cam_t_m2c, obj_id}]}."""
     camera = json.loads((root / "camera.json").read_text())
     for number, objects in json.loads((root / "scene_gt.json").read_text()).items():
         for each in objects:
             model = root / "models" / f"obj_{each['obj_id']:06d}.ply"
-            rotation, shift = np.reshape(each["cam_R_m2c"], (3, 3)), np.array(each["cam_t_m2c"])
-            yield root / "rgb" / f"{int(number):06d}.png", camera, model, rotation, shift
+            pose = np.column_stack([np.reshape(each["cam_R_m2c"], (3, 3)), each["cam_t_m2c"]])
+            yield _posed(root / "rgb" / f"{int(number):06d}.png", "lmo", camera, model, pose)
+
+
+def _posed(photo: Path, group: str, fields: Row, model: Path, pose: FloatArray) -> PhotoCase:
+    camera = Camera(*(fields[name] for name in ("width", "height", "fx", "fy", "cx", "cy")))
+    truth = Alignment(nearest_rotation(pose[:3, :3]), pose[:3, 3], np.ones(3))
+    return PhotoCase(group, camera, read_photo(photo), load_mesh(model), truth)
 
 
 # Composites ---------------------------------------------------------------------------------------
@@ -195,7 +172,8 @@ def _composites(given: BenchmarkData, count: int) -> Iterator[PhotoCase]:
     """Models of ShapeNet and of the sample, rendered before real photos; some partly hidden."""
     root = given.folder()
     with tempfile.TemporaryDirectory() as folder:
-        sample, real = section.meshed_models(given, folder, per_category=2)
+        sample = KeypointNet(write_sample_dataset(Path(folder) / "sample", per_category=2))
+        real = [m for m in KeypointNet(root / "keypointnet") if str(m.mesh_path).endswith(".obj")]
         scenes = [(m, Scene(m.load_mesh())) for m in (*real, *sample)]
     photos = sorted((root / "sfm").rglob("*.jpg")) + sorted((root / "real").rglob("rgb/*.png"))
     size = _CAMERA.width, _CAMERA.height
@@ -219,14 +197,10 @@ def _composites(given: BenchmarkData, count: int) -> Iterator[PhotoCase]:
         if is_hidden:
             drawn = _hidden(drawn, frame.mask, behind[rng.integers(len(behind))], rng)
         group = f"composite {'hidden' if is_hidden else 'clear'}"
-        photo = _blurred(drawn, rng)
+        drawn = cv2.GaussianBlur(drawn, (0, 0), rng.uniform(0.4, 1.5))
+        noisy = drawn + rng.normal(0, rng.uniform(2, 10), drawn.shape)
+        photo = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
         yield PhotoCase(group, _CAMERA, photo, scene.mesh, truth, model.symmetry)
-
-
-def _blurred(drawn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    drawn = cv2.GaussianBlur(drawn, (0, 0), rng.uniform(0.4, 1.5))
-    noisy = drawn + rng.normal(0, rng.uniform(2, 10), drawn.shape)
-    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
 def _hidden(

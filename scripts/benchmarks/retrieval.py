@@ -1,22 +1,20 @@
-"""Retrieval: time and memory of queries, and objects that are not in the library."""
+"""Retrieval: time of queries, and objects that are not in the library."""
 
 from __future__ import annotations
 
 import tempfile
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from benchmarks import section
-from benchmarks.section import COMMAND, BenchmarkData, Row, Table, Tables
-from cadalign import Box, Library, Observation, ShapeModel
+from benchmarks.section import BenchmarkData, Row, Tables
+from cadalign import Box, Library, View
 from cadalign.datasets import KeypointNet
 from cadalign.evaluation.experiments.retrieval import (
     RetrievalQuery,
@@ -33,23 +31,21 @@ _CALLS = 3
 _LEAST_SHARED = 4
 _FLAT = 1e-9
 _NOISE_PX = 2.0  # of unseen objects
-_RUN_QUERIES = 1000
-_RANKINGS: dict[str, dict[str, Any]] = {"fit": {}, "fit, shape_sigma": {"shape_sigma": 0.02}}
+_CATEGORIES = ("chair", "airplane", "bottle", "mug", "guitar")
 
 
 def retrieval(given: BenchmarkData) -> Tables:
-    """Time and memory of queries, and objects that are not in the library."""
+    """Time of queries, and objects that are not in the library."""
     yield from _times(given)
-    yield _unseen(given)
+    yield "First matches", _unseen(given)
 
 
 def _times(given: BenchmarkData) -> Tables:
-    """Time of a query and memory, for real models and growing synthetic libraries.
+    """Time of a query, for real models and growing synthetic libraries.
 
     The synthetic models are the real ones with their keypoints moved by 3 % of the extent, models
     of all categories are compared. Times are the least of three calls with as many threads as there
-    are cores, after warm-up. Ratios are those of processor time to `reference_seconds`. A run of
-    `cadalign retrieve` has two processes.
+    are cores, after warm-up.
     """
     real = list(Library.from_dataset(KeypointNet(given.folder("keypointnet"))))
     mixed = [real[k] for k in np.random.default_rng(0).permutation(len(real)).tolist()]
@@ -57,57 +53,23 @@ def _times(given: BenchmarkData) -> Tables:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, "library")
             _jittered(mixed, size).save(path)
-            yield _measure(path, mixed[:size], given.count or 20)
-            if size in given.sizes:
-                yield "Queries as a run", [_run(path, mixed[:size])]
+            title = f"Queries among {size:,} models, {path.stat().st_size / 1e6:.1f} MB"
+            yield title, _queries(path, mixed[:size], given.count or 20)
 
 
-def _measure(path: Path, models: Sequence[LibraryModel], queries: int) -> Table:
-    reference = section.reference_seconds()
-    wall, busy, library = section.clocked(partial(Library.open, path))
-    size = f"{len(library):,}"
-    rows = [section.figure(f"opening {size} models", 1e3 * wall, "ms", busy / reference)]
+def _queries(path: Path, models: Sequence[LibraryModel], count: int) -> Iterator[Row]:
+    opening, _, library = section.clocked(partial(Library.open, path))
+    yield {"call": "opening", "median ms": 1e3 * opening}
     shown = [model for model in models if len(model.xyz) >= _KEYPOINTS]
-    _, warm_up = next(_observed(shown, 1.0, seed=1))
-    _retrieve(library, warm_up, 1.0)
     for noise_px in (1.0, 3.0, 5.0):
-        rows += _queries(library, shown, noise_px, queries)
-    return f"{size} models, {path.stat().st_size / 1e6:.1f} MB", rows
-
-
-def _run(path: Path, models: Sequence[LibraryModel]) -> Row:
-    seeds = range(1 + _RUN_QUERIES)  # each model may show enough keypoints once only
-    found = chain.from_iterable(_observed(models, 1.0, seed=seed) for seed in seeds)
-    file = path.with_name("queries.jsonl")
-    with file.open("wb") as queries:
-        for _, seen in islice(found, _RUN_QUERIES):
-            points, ids = np.zeros((len(seen.points_2d), 3)), np.asarray(seen.ids)
-            query = Observation(points, seen.points_2d, KEYPOINT_CAMERA, ids=ids)
-            queries.write(msgspec.json.encode(query.to_dict()) + b"\n")
-    command = ["retrieve", str(file), f"--library={path}", f"--out={path.with_name('run')}"]
-    call = partial(section.used_by, [*COMMAND, *command, "--no-picture", "--workers=2"])
-    used, reference = section.with_reference(call)
-    name = f"run of {_RUN_QUERIES:,} queries, two processes"
-    row = section.figure(name, _RUN_QUERIES / used.wall, "1/s", used.processor / reference)
-    return row | {"MB": used.megabytes}
-
-
-def _queries(
-    library: Library, models: Sequence[LibraryModel], noise_px: float, queries: int
-) -> list[Row]:
-    wall, busy = [], []
-    reference = section.reference_seconds()
-    for _, seen in islice(_observed(models, noise_px, seed=0), queries):
-        call = partial(_retrieve, library, seen, noise_px)
-        walls, busies, _ = zip(*(section.clocked(call) for _ in range(_CALLS)), strict=True)
-        wall.append(1e3 * min(walls))
-        busy.append(1e3 * min(busies))
-        reference = min(reference, section.reference_seconds())
-    name = f"query among {len(library):,}, {noise_px:g} px"
-    return [
-        section.figure(f"{name}, {which}", take(wall), "ms", take(busy) / (1e3 * reference))
-        for which, take in (("median", np.median), ("longest", max))
-    ]
+        calls = [
+            partial(library.retrieve, seen.points_2d, seen.ids, KEYPOINT_CAMERA, sigma=noise_px)
+            for seen in islice(_observed(shown, noise_px, seed=0), count)
+        ]
+        calls[0]()  # warm-up
+        times = [1e3 * min(section.clocked(call)[0] for _ in range(_CALLS)) for call in calls]
+        name = f"query, {noise_px:g} px"
+        yield {"call": name, "median ms": float(np.median(times)), "longest ms": max(times)}
 
 
 def _jittered(models: Sequence[LibraryModel], count: int) -> Library:
@@ -124,62 +86,48 @@ def _jittered(models: Sequence[LibraryModel], count: int) -> Library:
 
 def _observed(
     models: Sequence[LibraryModel], noise_px: float, *, seed: int
-) -> Iterator[tuple[LibraryModel, RetrievalQuery]]:
+) -> Iterator[RetrievalQuery]:
     for model in models:
         task = RetrievalTask(*model.key, noise_px, _KEYPOINTS)
         seen = section.attempt(observe_model, model, task, seed=seed)
         if seen is not None:
-            yield model, seen
+            yield seen
 
 
-def _retrieve(library: Library, seen: RetrievalQuery, noise_px: float) -> Any:
-    return library.retrieve(seen.points_2d, seen.ids, KEYPOINT_CAMERA, sigma=noise_px)
-
-
-def _unseen(given: BenchmarkData) -> Table:
+def _unseen(given: BenchmarkData) -> Iterator[Row]:
     """Retrieval of objects that are not in the library: box IoU up to scale of the first match.
 
     Objects are those of the split val, with all keypoints and 2 px of noise; shape models are
     learned from the split train. The library holds all models but the object's own and those that
-    are the same after a stretch. Each column is a ranking: by the fit of each model, exact or with
-    an uncertainty of its shape, and by the estimated shape. Boxes are those of the keypoints.
+    are the same after a stretch. Rankings are by the fit of each model, exact or with an
+    uncertainty of its shape, and by the estimated shape. Boxes are those of the keypoints.
     """
-    dataset, rows = KeypointNet(given.folder("keypointnet")), []
-    for category in ("chair", "airplane", "bottle", "mug", "guitar"):
-        shape = section.learned_shape(dataset, category)
-        library = Library.from_models(
-            [LibraryModel.of_annotated(model, with_mesh=False) for model in dataset[category]]
-        )
-        rows.append({"category": category} | _ranked(dataset, library, shape, given.count or 40))
-    return "first matches: median IoU", rows
+    root = given.folder("keypointnet")
+    for category in _CATEGORIES:
+        shape = section.learned_shape(root, category)
+        without_mesh = partial(LibraryModel.of_annotated, with_mesh=False)
+        library = Library.from_models(list(map(without_mesh, KeypointNet(root)[category])))
+        how = {"keypoints": None, "noise_px": _NOISE_PX}
+        cases = []
+        for _, seen in section.unseen_objects(root, category, given.count or 40, **how):
+            box, view = Box.from_model(seen.task.hull.bounds, seen.gt), seen.view_of(shape)
+            if len(view.ids or ()) >= _LEAST_SHARED and box.volume >= _FLAT:
+                same = same_shapes(library, (category, seen.task.model_id))
+                cases.append(({"category": category}, (view, box, same)))
+        rankings = {"fit": {}, "fit, shape_sigma": {"shape_sigma": 0.02}, "shape": {"shape": shape}}
+        methods = {
+            name: partial(_first_iou, partial(library.retrieve, category=category, **options))
+            for name, options in rankings.items()
+        }
+        yield from section.summaries(section.measured(cases, methods), "category", "method")
 
 
-def _ranked(dataset: KeypointNet, library: Library, shape: ShapeModel, count: int) -> Row:
-    found: dict[str, list[float]] = defaultdict(list)
-    how = {"keypoints": None, "noise_px": _NOISE_PX}
-    for _, seen in section.unseen_objects(dataset, str(shape.category), count, **how):
-        known = np.isin(seen.ids, shape.ids)
-        gt = Box.from_model(seen.task.hull.bounds, seen.gt)
-        if known.sum() < _LEAST_SHARED or gt.volume < _FLAT:
-            continue
-        call = partial(
-            library.retrieve,
-            seen.points_2d[known],
-            seen.ids[known],
-            KEYPOINT_CAMERA,
-            top=1,
-            category=shape.category,
-            sigma=_NOISE_PX,
-            exclude=same_shapes(library, (str(shape.category), seen.task.model_id)),
-            workers=1,
-        )
-        for name, options in (_RANKINGS | {"shape": {"shape": shape}}).items():
-            found[name].append(_first_iou(section.attempt(call, **options), gt))
-    return {name: float(np.median(ious)) for name, ious in found.items()}
-
-
-def _first_iou(matches: list[Match] | None, gt: Box) -> float:
+def _first_iou(retrieve: Callable[..., list[Match]], case: tuple[View, Box, Any]) -> Row:
     """IoU of the first match of a query; 0 where there is none, or a flat one."""
+    view, gt, same = case
+    seen = view.points_2d, view.ids, KEYPOINT_CAMERA
+    how: Row = {"top": 1, "sigma": _NOISE_PX, "exclude": same, "workers": 1}
+    matches = section.attempt(retrieve, *seen, **how)
     if not matches or matches[0].box.volume < _FLAT:
-        return 0.0
-    return section.attempt(box_iou_up_to_scale, est=matches[0].box, gt=gt) or 0.0
+        return {"IoU": 0.0}
+    return {"IoU": section.attempt(box_iou_up_to_scale, est=matches[0].box, gt=gt) or 0.0}

@@ -149,7 +149,7 @@ def test_the_limits_errors_have_the_cramer_rao_bound_as_their_covariance() -> No
         steps.append(
             [*vector / 2, *(est.translation - gt.translation), *np.log(est.scale / gt.scale)[1:]]
         )
-    bound = cramer_rao_bound(problem, sigma=0.01, focal="known")
+    bound = cramer_rao_bound(problem, sigma=0.01)
     bound = np.delete(np.delete(bound, 6, axis=0), 6, axis=1)  # x has the scale 1
     spread = np.sqrt(np.diag(bound))
     assert np.allclose(np.std(steps, axis=0) / spread, 1.0, atol=0.05)
@@ -161,7 +161,7 @@ def test_the_covariance_of_a_fit_without_noise_is_the_cramer_rao_bound() -> None
     for seed in range(20):
         problem = simulate_problem(np.random.default_rng(seed), points=12, noise_px=0.0)
         result = fit(problem.points_3d, problem.points_2d, problem.camera, sigma=1.0)
-        bound = cramer_rao_bound(problem, sigma=1.0, focal="known")
+        bound = cramer_rao_bound(problem, sigma=1.0)
         spread = np.sqrt(bound.diagonal())
         gap = np.abs(result.fisher_covariance - bound)
         assert (gap <= 1e-3 * np.outer(spread, spread)).all()

@@ -29,17 +29,15 @@ def tensors(count: int = COUNT, **options: Any) -> tuple[Any, Any, Camera]:
     )
 
 
-@pytest.mark.parametrize("focal", ["known", "estimate"])
-def test_results_are_those_of_fit_batch(focal: str) -> None:
+def test_results_are_those_of_fit_batch() -> None:
     points, pixels, camera = tensors(12)
-    found = fit(points, pixels, camera, focal=focal, sigma=0.5)
-    expected = cadalign.fit_batch(points.numpy(), pixels.numpy(), camera, focal=focal, sigma=0.5)
+    found = fit(points, pixels, camera, sigma=0.5)
+    expected = cadalign.fit_batch(points.numpy(), pixels.numpy(), camera, sigma=0.5)
     assert found.valid.all()
     np.testing.assert_allclose(found.rotation, expected.rotation, atol=1e-4)
     np.testing.assert_allclose(found.scale, expected.scale, rtol=1e-4)
     deviations = found.covariance.diagonal(dim1=1, dim2=2).sqrt()
     assert (deviations[:, :6] > 0).all()
-    assert (found.focal is None) == (focal == "known")
 
 
 @pytest.mark.parametrize(
@@ -48,7 +46,6 @@ def test_results_are_those_of_fit_batch(focal: str) -> None:
         {},
         {"loss": "cauchy"},
         {"loss": "huber"},
-        {"focal": "estimate"},
         {"stretch": "none"},
         {"stretch": "y", "stretch_sigma": 0.2},
     ],
@@ -60,8 +57,7 @@ def test_gradcheck(options: dict[str, Any]) -> None:
 
     def layer(*given: Any) -> tuple[Any, ...]:
         found = fit(given[0], given[1], camera, sigma=given[2], **options)
-        parts = (found.rotation, found.translation, found.scale)
-        return parts if found.focal is None else (*parts, found.focal)
+        return found.rotation, found.translation, found.scale
 
     inputs = [each.clone().requires_grad_() for each in (points, pixels, sigma)]
     assert torch.autograd.gradcheck(layer, inputs, eps=1e-5, atol=1e-7, rtol=1e-3, fast_mode=True)
@@ -195,8 +191,7 @@ def test_single_precision_is_kept() -> None:
         ),
         (
             lambda p, x, c: fit(p, x, Camera.without_focal(640, 480)),
-            'camera: the focal length is unknown; estimate it with focal="estimate", or give it: '
-            "camera.with_focal(...)",
+            "camera: the focal length is unknown; give it: camera.with_focal(...)",
         ),
     ],
 )

@@ -140,8 +140,6 @@ def check_support(
         where=where,
         fix="check the correspondences and the camera, raise max_reproj_error or max_iterations, "
         'or use loss="cauchy" for a model that is only similar',
-        score=score,
-        inliers=inliers,
     )
 
 

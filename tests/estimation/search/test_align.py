@@ -291,10 +291,9 @@ class TestOutliers:
         model, rng = spreads(0.01, count=16), np.random.default_rng(1)
         for views in (1, 2):
             scattered = [View(CAMERA, rng.uniform(0, 480, (16, 2))) for _ in range(views)]
-            with pytest.raises(NoConsensusError, match="no alignment is supported") as refusal:
+            count = f"of {16 * views} keypoints"
+            with pytest.raises(NoConsensusError, match=f"no alignment is supported.*{count}"):
                 align(model, scattered, ransac=RansacOptions())
-            assert 0 < refusal.value.inliers < 16 * views
-            assert np.isfinite(refusal.value.score)
 
 
 def test_a_batch_is_its_single_results_and_keeps_errors() -> None:

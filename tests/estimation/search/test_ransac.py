@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from typing import Any
 
 import numpy as np
@@ -145,17 +144,13 @@ def test_batch_equals_single_fits_and_keeps_errors() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("points", [8, 300])
-def test_random_correspondences_are_refused_with_the_best_score(points: int) -> None:
+def test_random_correspondences_are_refused(points: int) -> None:
     for seed in range(3):
         rng = np.random.default_rng(seed)
         points_3d = rng.uniform(-1, 1, (points, 3))
         points_2d = rng.uniform([0, 0], [640, 480], (points, 2))
-        with pytest.raises(NoConsensusError, match="no alignment is supported") as refusal:
+        with pytest.raises(NoConsensusError, match="no alignment is supported"):
             fit(points_3d, points_2d, CAMERA, ransac=RansacOptions(seed=seed))
-        assert refusal.value.score > 0
-        assert refusal.value.inliers < points
-        copy = pickle.loads(pickle.dumps(refusal.value))
-        assert (copy.score, str(copy)) == (refusal.value.score, str(refusal.value))
 
 
 def test_scores_that_are_all_alike_guide_nothing() -> None:

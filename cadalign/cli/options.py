@@ -97,8 +97,8 @@ class CameraOptions:
     """The calibrated camera."""
 
     camera: Path | None = None
-    """File of the calibrated camera: a matrix K as text or JSON, or JSON in COLMAP's form:
-    model, width, height, params."""
+    """File of the calibrated camera: a matrix K as text, or JSON in COLMAP's form: model, width,
+    height, params."""
     focal: float | None = None
     """Focal length [px], where no file has it, or in its place."""
     fov: float | None = None

@@ -24,7 +24,7 @@ from msgspec import Meta, Struct
 
 from cadalign.errors import CadalignError, DataError, InputError, brief, quote, unknown
 from cadalign.io.files import read_text
-from cadalign.io.kinds import kind_of, other_kind, refuse_other_file
+from cadalign.io.kinds import kind_of, refuse_other, refuse_other_file
 
 _MAX = sys.float_info.max
 Finite = Annotated[float, Meta(ge=-_MAX, le=_MAX)]
@@ -75,9 +75,8 @@ def read_json(path: Path, wanted: str | None = None) -> Any:
         if wanted is not None:
             refuse_other_file(path, wanted)
         raise
-    error = None if wanted is None else other_kind(path, wanted, kind_of(data))
-    if error is not None:
-        raise error
+    if wanted is not None:
+        refuse_other(wanted, kind_of(data), path)
     return data
 
 

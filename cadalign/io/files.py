@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
-import io
 import json
 import logging
 import math
@@ -15,7 +14,7 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import lru_cache, wraps
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, BinaryIO, TypeVar, cast
 
 from cadalign.errors import DataError, InputError, quote
 
@@ -212,26 +211,8 @@ def reading(path: Path) -> Iterator[None]:
         raise DataError(f"cannot be read ({reason})", where=printable(path)) from None
 
 
-class InputFile(io.BufferedReader):
-    """A file that is read; ``size`` is that at its opening.
-
-    No read asks for more: Python makes room for all that is asked for, such as the length that a
-    damaged part of a picture announces, and some files of the system grow without end.
-    """
-
-    def __init__(self, path: Path) -> None:
-        # Opening a pipe would wait for its other end.
-        super().__init__(io.FileIO(path, opener=lambda p, flags: os.open(p, flags | os.O_NONBLOCK)))
-        self.status = os.fstat(self.fileno())
-        self.size = self.status.st_size
-
-    def read(self, size: int | None = -1) -> bytes:
-        """Read so many bytes, or all."""
-        return super().read(self.size if size is None or size < 0 else min(size, self.size))
-
-
 @contextmanager
-def open_input(path: Path, *, most: int = MOST_BYTES) -> Iterator[InputFile]:
+def open_input(path: Path, *, most: int = MOST_BYTES) -> Iterator[BinaryIO]:
     """Open a regular file of at most ``most`` bytes.
 
     Every file that somebody names is opened here: a device has no end, and a pipe may have no other
@@ -240,22 +221,19 @@ def open_input(path: Path, *, most: int = MOST_BYTES) -> Iterator[InputFile]:
     Raises DataError if it is missing, no regular file, larger, or cannot be read.
     """
     path = as_path(path)
-    with reading(path), InputFile(path) as file:
-        if not stat.S_ISREG(file.status.st_mode):
+    with reading(path), open(path, "rb", opener=_opened_at_once) as file:
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode):
             fix = "give a file, no pipe and no device"
             raise DataError("not a regular file", where=printable(path), fix=fix)
-        if file.size > most:
-            what = f"{file.size} bytes, more than the {most} that are read of such a file"
+        if status.st_size > most:
+            what = f"{status.st_size} bytes, more than the {most} that are read of such a file"
             raise DataError(what, where=printable(path))
         yield file
 
 
-def time_of(path: Path) -> int:
-    """Time at which a file was written, by which caches read it anew; 0 where there is none."""
-    try:
-        return path.stat().st_mtime_ns
-    except (OSError, ValueError):
-        return 0
+def _opened_at_once(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK)  # of a pipe, it would wait for the other end
 
 
 def once_per_file(most: int) -> Callable[[F], F]:
@@ -268,7 +246,11 @@ def once_per_file(most: int) -> Callable[[F], F]:
 
         @wraps(read)
         def opened(path: Path, **given: Any) -> Any:
-            return remembered(path, time_of(path), **given)
+            try:
+                written = path.stat().st_mtime_ns
+            except (OSError, ValueError):  # which the reader says
+                written = 0
+            return remembered(path, written, **given)
 
         return cast(F, opened)
 
@@ -278,7 +260,8 @@ def once_per_file(most: int) -> Callable[[F], F]:
 def read_bytes(path: Path, *, most: int = MOST_BYTES) -> bytes:
     """Read a regular file of at most ``most`` bytes; see `open_input`."""
     with open_input(path, most=most) as file:
-        return file.read()
+        # No more than it has at its opening: some files of the system grow without end.
+        return file.read(os.fstat(file.fileno()).st_size)
 
 
 def read_text(path: Path, *, most: int = MOST_BYTES, errors: str = "strict") -> str:

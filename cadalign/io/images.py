@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import os
 import struct
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -16,9 +17,8 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray
 from cadalign.errors import DataError, brief
 from cadalign.geometry.camera import Camera
-from cadalign.io.files import as_path, open_input, write_whole
+from cadalign.io.files import as_path, read_bytes, write_whole
 from cadalign.io.kinds import IMAGE, refuse_other_file
-from cadalign.io.kinds import PHOTO_ENDINGS as PHOTO_ENDINGS
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -39,14 +39,11 @@ _FREE_BYTES = 2**26
 
 @contextmanager
 def open_photo(path: str | os.PathLike[str]) -> Iterator[Image]:
-    """Open a photo; its pixels are read when they are asked for, errors then named as well."""
+    """Open a photo; its pixels are decoded when they are asked for, errors then named as well."""
     path = as_path(path)
-    with open_input(path) as file, ExitStack() as opened:
-        try:
-            image = opened.enter_context(open_picture(file, file.size, where=str(path)))
-        except DataError:
-            refuse_other_file(path, IMAGE)
-            raise
+    refuse_other_file(path, IMAGE)
+    data = read_bytes(path)
+    with open_picture(io.BytesIO(data), len(data), where=str(path)) as image:
         yield image
 
 
@@ -104,8 +101,8 @@ def upright_pixels(image: Image) -> ByteImage:
 
 
 def photo_size(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """Width and height [px] of a photo turned upright; its pixels are not read."""
-    with open_photo(as_path(path)) as image:
+    """Width and height [px] of a photo turned upright; its pixels are not decoded."""
+    with open_photo(path) as image:
         width, height = image.size
         is_on_its_side = image.getexif().get(_ORIENTATION) in _ON_ITS_SIDE
     return (height, width) if is_on_its_side else (width, height)
@@ -114,9 +111,8 @@ def photo_size(path: str | os.PathLike[str]) -> tuple[int, int]:
 def exif_note(path: Path, size: tuple[int, int]) -> str:
     """A note about a photo of another size than this (width, height), if EXIF turned it."""
     with open_photo(path) as image:
-        is_turned = image.size == size and image.getexif().get(_ORIENTATION) in _ON_ITS_SIDE
-    if not is_turned:
-        return ""
+        if image.size != size or photo_size(path) == size:
+            return ""
     return (
         f"; its EXIF data say that it was held on its side: as it is stored, it has {size[0]} x "
         f"{size[1]} pixels, but it is read upright, as photo programs show it"
@@ -143,14 +139,8 @@ def require_one_size(sizes: Mapping[str, tuple[int, int]], photo: Path | None) -
 def read_image(path: Path, camera: Camera) -> ByteImage:
     """Read a photo as `read_photo` does and require the camera's size of it."""
     pixels = read_photo(path)
-    height, width = pixels.shape[:2]
-    if (width, height) != (camera.width, camera.height):
-        note = exif_note(path, (camera.width, camera.height))
-        raise DataError(
-            f"the image is {width} x {height}, the camera {camera.width} x {camera.height}{note}",
-            where=str(path),
-            fix="give the camera of this image",
-        )
+    size = pixels.shape[1], pixels.shape[0]
+    require_one_size({"its camera": (camera.width, camera.height), str(path): size}, path)
     return pixels
 
 

@@ -1,7 +1,7 @@
 """Observations: one object's keypoints in one or more images, as a JSON file; files of cameras.
 
-The file is described in docs/formats/observation.md. A camera is a calibration matrix as text or
-JSON, or in COLMAP's form.
+The file is described in docs/formats/observation.md. A camera is a calibration matrix as text, or
+JSON in COLMAP's form.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from cadalign.io.documents import (
     Text,
     convert,
     in_file,
-    parse_json,
     plain,
     read_json,
     within,
@@ -45,10 +44,9 @@ from cadalign.io.files import as_path, once_per_file, read_text, write_json
 from cadalign.io.kinds import (
     CAMERA,
     CAMERA_FIX,
-    MATRIX_NAMES,
     OBSERVATION,
     kind_of,
-    other_kind,
+    refuse_other,
     refuse_other_file,
 )
 
@@ -215,8 +213,7 @@ class Observation(ObservedImage):
 
         ``needs_xyz`` is that of `load`.
         """
-        if error := other_kind(Path(), OBSERVATION, kind_of(data)):
-            raise DataError(error.what, fix=error.fix)
+        refuse_other(OBSERVATION, kind_of(data))
         read, fields = _read_fields(data, folder)
         if needs_xyz is None:
             needs_xyz = read.shape is None
@@ -340,9 +337,8 @@ def read_camera(
     Parameters
     ----------
     path : path-like
-        A calibration matrix K: text of 3 x 3 numbers, or JSON, bare or as
-        ``matrix`` (also ``K``, ``camera_matrix``), by rows; or a camera in the form of
-        `Camera.from_dict` as JSON.
+        A camera in the form of `Camera.from_dict` as JSON, a matrix possibly without width and
+        height; otherwise text of 3 x 3 numbers, a calibration matrix by rows.
     size : tuple of 2 int, optional
         Width and height of the photo [px], for a matrix whose file lacks them.
 
@@ -352,44 +348,22 @@ def read_camera(
         If the file cannot be read, holds no camera, or lacks the image's size.
     """
     path = as_path(path)
-    form = _read_form(path)
-    if "matrix" in form and not {"width", "height"} <= set(form):
+    if path.suffix.lower() == ".json":
+        form = read_json(path, CAMERA)
+    else:
+        refuse_other_file(path, CAMERA)
+        try:
+            numbers = np.array(read_text(path).replace(",", " ").split(), dtype=float)
+            form = {"matrix": numbers.reshape(3, 3)}
+        except ValueError:
+            raise DataError("not a calibration matrix", where=str(path), fix=CAMERA_FIX) from None
+    if isinstance(form, dict) and "matrix" in form and not {"width", "height"} <= set(form):
         if size is None:
             what = "the file has a matrix alone, and the size of the image is unknown"
             raise DataError(what, where=str(path), fix="give the photo, or width and height in it")
         form |= {"width": size[0], "height": size[1]}
     with in_file(path):
         return Camera.from_dict(form)
-
-
-def _read_form(path: Path) -> dict[str, Any]:
-    """The parsed form of a camera in a file."""
-    try:
-        text = read_text(path)
-        if path.suffix.lower() != ".json" and text.lstrip()[:1] not in ("{", "["):
-            return {"matrix": _square(text.replace(",", " ").replace(";", " ").split(), path)}
-        data = parse_json(text, str(path))
-    except DataError:
-        refuse_other_file(path, CAMERA)
-        raise
-    if error := other_kind(path, CAMERA, kind_of(data)):
-        raise error
-    form = {"matrix": data} if isinstance(data, list) else data
-    if not isinstance(form, dict):
-        what = f"camera: expected an object, got {type(data).__name__}"
-        raise DataError(what, where=str(path), fix=CAMERA_FIX)
-    name = next((name for name in MATRIX_NAMES if name in form), None)
-    if name is not None and "params" not in form:
-        form["matrix"] = _square(form.pop(name), path)
-    return form
-
-
-def _square(values: Any, path: Path) -> Any:
-    """A matrix (3, 3) of nine numbers by rows, however they are nested."""
-    try:
-        return np.asarray(values, dtype=float).reshape(3, 3)
-    except (TypeError, ValueError, OverflowError):
-        raise DataError("not a calibration matrix", where=str(path), fix=CAMERA_FIX) from None
 
 
 _read_camera = once_per_file(64)(read_camera)

@@ -43,8 +43,6 @@ class SessionOptions:
     focal length is estimated."""
     focal: float | None = None
     """Focal length of the photos [px], where no file has it, or in its place."""
-    fov: float | None = None
-    """Horizontal field of view of the photos [degrees], in the place of the focal length."""
     keypoints: Path | None = None
     """The model's keypoints: model.keypoints.json."""
     up_axis: Literal["x", "y", "z"] | None = None

@@ -172,7 +172,7 @@ class ObservationFile:
         mask_sigma = None if marks.mask is None else marks.mask.sigma
         mask = {"mask": self._mask_file(marks), "mask_sigma": mask_sigma}
         evidence = msgspec.structs.replace(self.stored.evidence, **mask)
-        if not has_depths and evidence.depth is None:  # all keypoints with depths may be gone
+        if not has_depths:  # all keypoints with depths may be gone
             evidence = msgspec.structs.replace(evidence, depth_sigma=None)
         halves = [self._half(pair) for pair in marks.pairs if pair not in pairs]
         return replace(

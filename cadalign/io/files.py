@@ -52,7 +52,8 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
 def writing_folder(path: Path) -> Iterator[Path]:
     """Write, within the block, a folder such that it is there whole or as it was.
 
-    What is written to the folder beside it that the block is given takes its place at the end.
+    What is written to the folder beside it that the block is given takes its place at the end. It
+    must be empty, if it is there.
     """
     import tempfile
 
@@ -63,9 +64,7 @@ def writing_folder(path: Path) -> Iterator[Path]:
             unfinished = Path(folder, "unfinished")
             unfinished.mkdir()
             yield unfinished
-            if path.exists():
-                path.rename(Path(folder, "replaced"))
-            unfinished.rename(path)
+            unfinished.replace(path)
 
 
 @contextmanager
@@ -246,6 +245,7 @@ def once_per_file(most: int) -> Callable[[F], F]:
 
         @wraps(read)
         def opened(path: Path, **given: Any) -> Any:
+            path = as_path(path)
             try:
                 written = path.stat().st_mtime_ns
             except (OSError, ValueError):  # which the reader says

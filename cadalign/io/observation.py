@@ -10,7 +10,6 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -28,7 +27,6 @@ from cadalign.io.documents import (
     Text,
     convert,
     in_file,
-    plain,
     read_json,
     within,
     written_path,
@@ -178,11 +176,6 @@ class Observation(ObservedImage):
         further = self.others, self.size, self.init, self.evidence.given
         return self.depths is None and not any(map(bool, further))
 
-    def __repr__(self) -> str:
-        counts = ", ".join(str(len(view.points_2d)) for view in self.views)
-        source = "" if self.image is None else f"{self.image.name!r}, "
-        return f"Observation({source}{len(self.views)} views with {counts} keypoints)"
-
     @classmethod
     def load(cls, path: str | Path, *, needs_xyz: bool | None = None) -> Observation:
         """Read an observation file.
@@ -191,8 +184,8 @@ class Observation(ObservedImage):
         ----------
         path : str or Path
         needs_xyz : bool, optional
-            Whether keypoints must have ``xyz``, which is zero otherwise where it is missing; by
-            default unless the file names a learned shape.
+            False where keypoints may lack ``xyz``, which is zero then; by default where the file
+            names a learned shape.
 
         Raises
         ------
@@ -215,8 +208,7 @@ class Observation(ObservedImage):
         """
         refuse_other(OBSERVATION, kind_of(data))
         read, fields = _read_fields(data, folder)
-        if needs_xyz is None:
-            needs_xyz = read.shape is None
+        needs_xyz = read.shape is None if needs_xyz is None else needs_xyz
         images = []
         for number, each in enumerate(fields):
             with nullcontext() if each is read else within(f"views[{number}]"):
@@ -252,13 +244,13 @@ class Observation(ObservedImage):
             "model": self.model and written_path(self.model, folder=folder),
             "shape": self.shape and written_path(self.shape, folder=folder),
             "object": self.object_name,
-            "size": self.size and msgspec.to_builtins(self.size, enc_hook=plain),
+            "size": self.size and msgspec.to_builtins(self.size),
             "symmetry": self.symmetry and self.symmetry.to_dict(),
             "init": self.init and self.init.to_dict(),
-            "unfinished": dict(self.unfinished or {}) or None,
-            "fit": dict(self.fit_options) or None,
+            "unfinished": self.unfinished,
+            "fit": self.fit_options,
         }
-        data |= {name: value for name, value in further.items() if value is not None}
+        data |= {name: value for name, value in further.items() if value}
         return data if self.up_axis == "y" else data | {"up_axis": self.up_axis}
 
     def save(self, path: str | Path) -> None:
@@ -267,29 +259,16 @@ class Observation(ObservedImage):
         write_json(path, self.to_dict(folder=path.parent))
 
 
-def with_lens(camera: Camera, focal: float | None = None, *, fov: float | None = None) -> Camera:
-    """The camera with a known focal length [px] or horizontal field of view [degrees], if given.
-
-    Raises InputError if both are given, or one is not possible.
-    """
-    if fov is None:
-        return camera if focal is None else camera.with_focal(focal)
-    if focal is not None:
-        raise InputError("given beside the focal length", where="fov", fix="give one of the two")
-    return camera.with_focal(Camera.from_fov(camera.width, camera.height, fov_x=fov).fx)
-
-
 @dataclass(frozen=True)
 class ObservationChanges:
     """A camera in the place of those of observations."""
 
     camera: Path | None = None  # file of the calibrated camera, see `read_camera`
     focal: Positive | None = None  # focal length of all cameras [px]
-    fov: Positive | None = None  # or their horizontal field of view [degrees]
 
     def read_camera(self, size: tuple[int, int] | None) -> Camera | None:
         """The camera, if there is one; ``size`` is the photo's, for a file of a matrix alone."""
-        return None if self.camera is None else _read_camera(self.camera, size=size)
+        return None if self.camera is None else read_camera(self.camera, size=size)
 
     def applied_to(self, observation: Observation, where: str | None = None) -> Observation:
         """The observation with all of this in the place of its own; ``where`` is its file.
@@ -302,13 +281,14 @@ class ObservationChanges:
             what = f"the file has {len(observation.views)} views, the camera is for one"
             raise InputError(what, where=where, fix="write cameras into its `views`")
         changed = observation if camera is None else replace(observation, camera=camera)
-        if self.focal is None and self.fov is None:
+        focal = self.focal
+        if focal is None:
             return changed
         # Options of the fit about the focal length are left out.
         kept = {key: given for key, given in changed.fit_options.items() if "focal" not in key}
-        lens = partial(with_lens, focal=self.focal, fov=self.fov)
-        views = tuple(replace(view, camera=lens(view.camera)) for view in changed.others)
-        return replace(changed, camera=lens(changed.camera), others=views, fit_options=kept)
+        others = [replace(view, camera=view.camera.with_focal(focal)) for view in changed.others]
+        camera = changed.camera.with_focal(focal)
+        return replace(changed, camera=camera, others=tuple(others), fit_options=kept)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -327,11 +307,8 @@ class DetectorOptions:
     """Leave out a detector's keypoints that the model does not have."""
 
 
-def read_camera(
-    path: str | os.PathLike[str],
-    *,
-    size: tuple[int, int] | None = None,
-) -> Camera:
+@once_per_file(64)  # which many observations may name
+def read_camera(path: str | os.PathLike[str], *, size: tuple[int, int] | None = None) -> Camera:
     """Read a camera from a file.
 
     Parameters
@@ -364,7 +341,3 @@ def read_camera(
         form |= {"width": size[0], "height": size[1]}
     with in_file(path):
         return Camera.from_dict(form)
-
-
-_read_camera = once_per_file(64)(read_camera)
-"""One file for many observations."""

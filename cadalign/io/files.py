@@ -10,7 +10,7 @@ import math
 import os
 import stat
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import lru_cache, wraps
 from pathlib import Path
@@ -113,22 +113,6 @@ def locked(path: Path, what: str, *, fix: str) -> Iterator[None]:
         yield
 
 
-def remove_earlier(folder: Path, files: Iterable[Path]) -> None:
-    """Remove files that earlier work wrote to a folder, and folders in it that are empty then.
-
-    Raises a DataError, before anything is removed, if something is made from one of them.
-    """
-    paths = list(files)
-    for path in paths:
-        refuse_input(path)
-    with writing(folder):
-        for path in paths:
-            path.unlink(missing_ok=True)
-            with suppress(OSError):  # something else is in it
-                if path.parent != folder:
-                    path.parent.rmdir()
-
-
 def refuse_folder(path: Path) -> None:
     """Raise a DataError for a folder in the place of a file that is to be written."""
     if not path.name or path.is_dir():
@@ -147,10 +131,7 @@ def write_json(path: Path, value: Any) -> None:
 
 def dense_json(value: Any) -> str:
     """JSON without blanks; numbers that are not finite become null."""
-    try:
-        return json.dumps(value, separators=(",", ":"), allow_nan=False)
-    except ValueError:
-        return json.dumps(finite(value), separators=(",", ":"))
+    return json.dumps(finite(value), separators=(",", ":"))
 
 
 def finite(value: Any) -> Any:

@@ -174,9 +174,6 @@ def write_image(path: Path, image: ByteImage) -> None:
     """
     from PIL import Image
 
-    kind: tuple[str, dict[str, int]] = ("PNG", {"compress_level": 1})
-    if path.suffix.lower() == JPEG_ENDING:
-        kind = ("JPEG", {"quality": _JPEG_QUALITY})
-    write_whole(
-        path, lambda unfinished: Image.fromarray(image).save(unfinished, kind[0], **kind[1])
-    )
+    form = "JPEG" if path.suffix.lower() == JPEG_ENDING else "PNG"
+    how = {"quality": _JPEG_QUALITY, "compress_level": 1}  # each is of one of the two
+    write_whole(path, lambda unfinished: Image.fromarray(image).save(unfinished, form, **how))

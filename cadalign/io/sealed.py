@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cadalign.errors import DataError
-from cadalign.io.files import checksum, write_whole
+from cadalign.io.files import checksum, damaged, require_count, write_whole
 from cadalign.io.kinds import kind_of_file
 
 _HEADER = struct.Struct("<16sIIQ32s")
@@ -31,18 +31,12 @@ class Seal:
         """Write a file atomically; ``payload`` is bytes or a buffer."""
         size = memoryview(payload).nbytes
         header = _HEADER.pack(self.magic, self.version, 0, size, checksum(payload))
-
-        def write(unfinished: Path) -> None:
-            with unfinished.open("wb") as file:
-                file.write(header)
-                file.write(payload)
-
-        write_whole(path, write)
+        write_whole(path, lambda unfinished: unfinished.write_bytes(header + payload))
 
     def unwrap(self, content: Any, where: str) -> memoryview:
         """Check the header and the checksum; returns the payload, which is not copied.
 
-        Raises DataError if the content is of another format or version, truncated or damaged.
+        Raises DataError if the content is of another format or version, cut short or damaged.
         """
         view = memoryview(content).cast("B")
         if len(view) < _HEADER.size or bytes(view[:16]) != self.magic:
@@ -52,20 +46,13 @@ class Seal:
         _, version, _, size, expected = _HEADER.unpack(view[: _HEADER.size])
         payload = view[_HEADER.size :]
         if version != self.version:
-            raise DataError(
-                f"a {self.noun} of version {version}, but this cadalign reads version "
-                f"{self.version}",
-                where=where,
-                fix=self.fix,
-            )
-        if len(payload) != size:
-            what = "truncated" if len(payload) < size else "too long"
-            raise self.error(f"is {what}: {len(payload)} bytes, {size} expected", where, again=True)
-        if checksum(payload) != expected:
-            raise self.error("is damaged: its checksum is wrong", where, again=True)
-        return payload
+            what = f"is of version {version}, but this cadalign reads version {self.version}"
+            raise self.error(what, where)
+        require_count("bytes", size, len(payload), len(payload) - size, Path(where))
+        if checksum(payload[:size]) != expected:
+            raise damaged("the checksum is wrong", where)
+        return payload[:size]
 
-    def error(self, what: str, where: str, *, again: bool = False) -> DataError:
+    def error(self, what: str, where: str) -> DataError:
         """The error of a file whose content is wrong."""
-        fix = f"copy it again, or {self.fix}" if again else self.fix
-        return DataError(f"the {self.noun} {what}", where=where, fix=fix)
+        return DataError(f"the {self.noun} {what}", where=where, fix=self.fix)

@@ -207,21 +207,16 @@ class ObservedImage:
 # Files --------------------------------------------------------------------------------------------
 
 
-class SeenKeypoint(Document, kw_only=True):
-    """Fields of a keypoint that a photo, or its detector, gives."""
-
-    semantic_id: Index | None = None
-    sigma: Positive | None = None
-    score: NotNegative | None = None
-    depth: Positive | None = None
-
-
-class KeypointFields(SeenKeypoint, kw_only=True):
+class KeypointFields(Document, kw_only=True):
     """One entry of ``keypoints``."""
 
     xyz: Point3 | None = None  # needed with a mesh
     uv: tuple[float | None, float | None] | None  # null where it was not found
     name: Text | None = None
+    semantic_id: Index | None = None
+    sigma: Positive | None = None
+    score: NotNegative | None = None
+    depth: Positive | None = None
 
 
 class ViewFields(ImageEvidence, kw_only=True):

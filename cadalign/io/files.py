@@ -1,4 +1,4 @@
-"""Atomic writes, and reads of regular files of bounded size; errors name the file."""
+"""Atomic writes, reads of regular files of bounded size, sealed files; errors name the file."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import fcntl
 import hashlib
 import json
 import logging
-import math
 import os
 import stat
+import struct
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from functools import lru_cache, wraps
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar, cast
@@ -21,8 +22,8 @@ from cadalign.errors import DataError, InputError, quote
 logger = logging.getLogger("cadalign")
 
 F = TypeVar("F", bound=Callable[..., Any])
-_MAX_NAME = 50  # such that the unfinished file's name stays below the 255 bytes of file systems
 _MAX_PATH = 1000  # of a path that is shown whole
+_SEAL = struct.Struct("<16sIIQ32s")
 MOST_BYTES = 2**32
 """Size of the largest file that is read where its reader states no other."""
 _kept: ContextVar[set[str] | None] = ContextVar("kept", default=None)
@@ -34,12 +35,12 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     ``write`` writes the file that it is given the name of, in the same folder. Raises DataError if
     it cannot be written, or something is made from it (`keeping`).
     """
-    # The true ending stays last: some writers go by it.
-    name = path.name if len(path.name) <= _MAX_NAME else f"{hash(path.name):x}{path.suffix}"
     with writing(path):
         refuse_folder(path)
         refuse_input(path)
-        unfinished = path.with_name(f".unfinished-{os.getpid()}-{name}")
+        # Of a short name, whose ending is the true one: some writers go by it.
+        name = f".unfinished-{os.getpid()}-{hash(path.name):x}{path.suffix}"
+        unfinished = path.with_name(name)
         try:
             write(unfinished)
             os.replace(unfinished, path)
@@ -136,11 +137,7 @@ def dense_json(value: Any) -> str:
 
 def finite(value: Any) -> Any:
     """Lists and mappings with None in the place of numbers that are not finite."""
-    if isinstance(value, dict):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return json.loads(json.dumps(value), parse_constant=lambda _: None)
 
 
 def damaged(what: str, where: object = None) -> DataError:
@@ -300,3 +297,45 @@ def require_utf8(path: Path) -> None:
 def checksum(payload: Any) -> bytes:
     """BLAKE2b checksum of 32 bytes."""
     return hashlib.blake2b(payload, digest_size=32).digest()
+
+
+@dataclass(frozen=True)
+class Seal:
+    """One format of sealed files: a header of 64 bytes, then the payload.
+
+    The header holds, in little-endian order, the 16 bytes that name the format, its version (4
+    bytes), 4 bytes of zero, the payload's length (8 bytes) and its BLAKE2b checksum (32 bytes).
+    """
+
+    magic: bytes  # the 16 bytes
+    version: int  # that is written and read
+    noun: str  # its name in messages, such as "library file"
+    fix: str  # how to make such a file
+
+    def write(self, path: Path, payload: Any) -> None:
+        """Write a file atomically; ``payload`` is bytes or a buffer."""
+        size = memoryview(payload).nbytes
+        header = _SEAL.pack(self.magic, self.version, 0, size, checksum(payload))
+        write_whole(path, lambda unfinished: unfinished.write_bytes(header + payload))
+
+    def unwrap(self, content: Any, where: str) -> memoryview:
+        """Check the header and the checksum; returns the payload, which is not copied.
+
+        Raises DataError if the content is of another format or version, cut short or damaged.
+        """
+        view = memoryview(content).cast("B")
+        if len(view) < _SEAL.size or bytes(view[:16]) != self.magic:
+            raise DataError(f"not a {self.noun}", where=where, fix=self.fix)
+        _, version, _, size, expected = _SEAL.unpack(view[: _SEAL.size])
+        payload = view[_SEAL.size :]
+        if version != self.version:
+            what = f"is of version {version}, but this cadalign reads version {self.version}"
+            raise self.error(what, where)
+        require_count("bytes", size, len(payload), len(payload) - size, Path(where))
+        if checksum(payload[:size]) != expected:
+            raise damaged("the checksum is wrong", where)
+        return payload[:size]
+
+    def error(self, what: str, where: str) -> DataError:
+        """The error of a file whose content is wrong."""
+        return DataError(f"the {self.noun} {what}", where=where, fix=self.fix)

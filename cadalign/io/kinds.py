@@ -39,6 +39,13 @@ _FIXES = {
     MESH: f"give a file that ends in {', '.join(MESH_ENDINGS)}",
     IMAGE: "give a picture, such as a PNG or a JPEG",
 }
+_FIXES_OF = {
+    (FIT, OBSERVATION): "give the observation that was fitted",
+    (OBSERVATION, FIT): "fit it first, `cadalign fit {}`, and give the fit.json that this writes",
+    (MESH, OBSERVATION): "mark keypoints with `cadalign annotate PHOTO {}`, which writes one",
+    (PHOTO, OBSERVATION): "mark keypoints with `cadalign annotate {} MODEL`, which writes one, or "
+    "use a detector's with `cadalign observe`",
+}
 
 
 def kind_of(data: object) -> str | None:
@@ -78,19 +85,12 @@ def kind_of_file(path: Path) -> str | None:
 
 def refuse_other(wanted: str, found: str | None, path: Path | None = None) -> None:
     """Raise a DataError for a file, or its parsed form, of another known kind than is wanted."""
-    if found in (None, wanted) or (found, wanted) == (PHOTO, IMAGE):
+    if found is None or found == wanted or (found, wanted) == (PHOTO, IMAGE):
         return
-    fix = _FIXES.get(wanted)
-    name = "" if path is None else path.name
-    if wanted == OBSERVATION and found in (MESH, PHOTO):
-        pair = f"PHOTO {name}" if found == MESH else f"{name} MODEL"
-        fix = f"mark keypoints with `cadalign annotate {pair}`, which writes one"
-        fix += ", or use a detector's with `cadalign observe`" if found == PHOTO else ""
-    if wanted == OBSERVATION and found == FIT:
-        fix = "give the observation that was fitted"
-    if wanted == FIT and found == OBSERVATION:
-        fix = f"fit it first, `cadalign fit {name}`, and give the fit.json that this writes"
-    raise DataError(f"{found}, not {wanted}", where=None if path is None else str(path), fix=fix)
+    where, name = (None, "") if path is None else (str(path), path.name)
+    special = _FIXES_OF.get((found, wanted))
+    fix = _FIXES.get(wanted) if special is None else special.format(name)
+    raise DataError(f"{found}, not {wanted}", where=where, fix=fix)
 
 
 def refuse_other_file(path: Path, wanted: str) -> None:

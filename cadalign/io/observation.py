@@ -162,13 +162,11 @@ class Observation(ObservedImage):
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The files that it names, and the materials beside the model."""
-        named: list[Any] = [self.model, self.shape]
-        if self.model is not None:
-            named.append(Path(f"{os.path.splitext(self.model)[0]}.mtl"))
+        """The files that it names."""
+        named = [self.model, self.shape]
         for view in self.views:
-            named += [view.image, *view.evidence.given.values()]
-        return tuple(each for each in named if isinstance(each, Path))
+            named += [view.image, view.evidence.mask]
+        return tuple(each for each in named if each is not None)
 
     @property
     def is_plain(self) -> bool:

@@ -13,7 +13,7 @@ from PIL import Image
 from support.files import TETRAHEDRON
 from support.refusals import refusal_text
 
-from cadalign import Result, ShapeModel, load_mesh
+from cadalign import Result, load_mesh
 from cadalign.datasets import ModelKeypoints, read_image_keypoints
 from cadalign.errors import DataError
 from cadalign.io.documents import parse_json
@@ -41,7 +41,6 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "keypoints of a model": ModelKeypoints.load,
     "the result of a fit": Result.load,
     "a camera": read_camera,
-    "a shape file": ShapeModel.open,
 }
 SAME = {("a photo", "an image")}
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cadalign.errors import DataError
-from cadalign.io.sealed import Seal
+from cadalign.io.files import Seal
 
 SEAL = Seal(b"cadalign tests\0\0", 3, "test file", "write it again")
 

@@ -19,7 +19,7 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
 from cadalign.geometry.rotations import vector_from_rotation
-from cadalign.io.sealed import Seal
+from cadalign.io.files import Seal
 from cadalign.shapes.basis import find_reflection
 from cadalign.shapes.examples import Example
 from cadalign.shapes.model import ShapeModel

@@ -253,13 +253,10 @@ def _wanted(text: str) -> str:
     rule, _, _ = found["rule"].partition(", got")
     if " matching regex " in rule:
         return _PATTERN_WORDS.get(rule.removeprefix(" matching regex "), words)
-    bound = re.fullmatch(r" (>|>=|<|<=) (\S+)", rule)
-    length = re.fullmatch(r" of length (>= )?(\d+)", rule)
-    if length:
-        return f"{words} of {'at least ' if length[1] else ''}{length[2]}"
-    if bound is None or abs(float(bound[2])) == _MAX:
-        return words
-    return "a positive number" if bound[0] == " > 0.0" else f"{words} {bound[1]} {bound[2]}"
+    if rule == " > 0.0":
+        return "a positive number"
+    bound = rule.replace("length >= ", "at least ").replace("length ", "")
+    return words if str(_MAX) in rule else words + bound
 
 
 def _parts_at(kind: Any, path: str, name: str) -> list[Any]:

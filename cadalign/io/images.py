@@ -145,26 +145,25 @@ def read_image(path: Path, camera: Camera) -> ByteImage:
 
 
 def read_grey(path: Path) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
-    """Read an image of one channel of 8 or 16 bits as it is stored, (h, w)."""
+    """Read an image of one channel of 8 or 16 bits as it is stored, (h, w).
+
+    A JPEG is refused: its compression leaves traces on both sides of every edge.
+    """
     with open_photo(path) as image:
-        mode = image.mode
+        mode, form = image.mode, image.format
         pixels = np.asarray(image.convert("L") if mode in ("1", "P") else image)
-    if pixels.ndim != 2 or not (mode.startswith("I") or mode in ("1", "L", "P")):
-        fix = "give an image of one grey channel, of 8 or 16 bits"
-        raise DataError(f"the image has the mode {brief(mode)}", where=str(path), fix=fix)
+    is_grey = pixels.ndim == 2 and (mode.startswith("I") or mode in ("1", "L", "P"))
+    if not is_grey or form == "JPEG":
+        what = f"the image is a {form} of the mode {brief(mode)}"
+        what += ", whose compression changes values" if is_grey else ""
+        fix = "give a PNG of one grey channel, of 8 or 16 bits"
+        raise DataError(what, where=str(path), fix=fix)
     return pixels if pixels.dtype == np.uint8 else pixels.astype(np.uint16)
 
 
 def read_mask(path: Path) -> BoolArray:
-    """Read an object's pixels (h, w): those that are not zero, as `read_grey` reads them.
-
-    Of a JPEG, whose compression leaves traces on both sides of every edge, those that are brighter
-    than half of the brightest.
-    """
-    with open_photo(path) as image:
-        is_lossy = image.format == "JPEG"
-    pixels = read_grey(path)
-    return np.asarray(pixels > (pixels.max() // 2 if is_lossy else 0))
+    """Read an object's pixels (h, w): those that are not zero, as `read_grey` reads them."""
+    return np.asarray(read_grey(path) > 0)
 
 
 def write_image(path: Path, image: ByteImage) -> None:

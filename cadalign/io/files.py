@@ -217,9 +217,7 @@ def once_per_file(most: int) -> Callable[[F], F]:
     """Remember what a reader gives of so many files, each until it is written anew."""
 
     def remembering(read: F) -> F:
-        @lru_cache(maxsize=most)
-        def remembered(path: Path, written: int, **given: Any) -> Any:
-            return read(path, **given)
+        remembered = lru_cache(most)(lambda path, written, **given: read(path, **given))
 
         @wraps(read)
         def opened(path: Path, **given: Any) -> Any:

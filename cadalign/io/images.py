@@ -18,7 +18,7 @@ from cadalign.arrays import BoolArray
 from cadalign.errors import DataError, brief
 from cadalign.geometry.camera import Camera
 from cadalign.io.files import as_path, read_bytes, write_whole
-from cadalign.io.kinds import IMAGE, refuse_other_file
+from cadalign.io.kinds import PHOTO, refuse_other_file
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -41,7 +41,7 @@ _FREE_BYTES = 2**26
 def open_photo(path: str | os.PathLike[str]) -> Iterator[Image]:
     """Open a photo; its pixels are decoded when they are asked for, errors then named as well."""
     path = as_path(path)
-    refuse_other_file(path, IMAGE)
+    refuse_other_file(path, PHOTO)
     data = read_bytes(path)
     with open_picture(io.BytesIO(data), len(data), where=str(path)) as image:
         yield image

@@ -11,7 +11,6 @@ from cadalign.errors import CadalignError, DataError
 from cadalign.io.files import read_bytes
 
 PHOTO = "a photo"
-IMAGE = "an image"
 MESH = "a mesh"
 OBSERVATION = "an observation"
 DETECTOR = "a detector's keypoints"
@@ -37,7 +36,7 @@ _FIXES = {
     FIT: "give the fit.json that `cadalign fit` writes",
     CAMERA: CAMERA_FIX,
     MESH: f"give a file that ends in {', '.join(MESH_ENDINGS)}",
-    IMAGE: "give a picture, such as a PNG or a JPEG",
+    PHOTO: "give a picture, such as a PNG or a JPEG",
 }
 _FIXES_OF = {
     (FIT, OBSERVATION): "give the observation that was fitted",
@@ -85,7 +84,7 @@ def kind_of_file(path: Path) -> str | None:
 
 def refuse_other(wanted: str, found: str | None, path: Path | None = None) -> None:
     """Raise a DataError for a file, or its parsed form, of another known kind than is wanted."""
-    if found is None or found == wanted or (found, wanted) == (PHOTO, IMAGE):
+    if found in (None, wanted):
         return
     where, name = (None, "") if path is None else (str(path), path.name)
     special = _FIXES_OF.get((found, wanted))

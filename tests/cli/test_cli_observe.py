@@ -145,7 +145,7 @@ def test_focal_length_is_given_in_the_command(
         (["--image", "{folder}/none.jpg"], "{folder}/none.jpg: no such file"),
         (
             ["--image", "{folder}/found.json"],
-            "{folder}/found.json: a detector's keypoints, not an image; give a picture",
+            "{folder}/found.json: a detector's keypoints, not a photo; give a picture",
         ),
         (
             ["--camera", "{folder}/found.json"],

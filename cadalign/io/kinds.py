@@ -74,7 +74,7 @@ def kind_of(data: object) -> str | None:
 def kind_of_file(path: Path) -> str | None:
     """Kind of a file that is there: that of its content as JSON, or else by its ending."""
     suffix, data = path.suffix.lower(), None
-    if path.is_file() and suffix in (*MESH_ENDINGS, *PHOTO_ENDINGS):
+    if os.path.isfile(path) and suffix in (*MESH_ENDINGS, *PHOTO_ENDINGS):
         return MESH if suffix in MESH_ENDINGS else PHOTO
     if suffix == ".json":
         with suppress(CadalignError, ValueError, RecursionError):

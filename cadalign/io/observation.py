@@ -162,8 +162,8 @@ class Observation(ObservedImage):
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The files that it names."""
-        named = [self.model, self.shape]
+        """The files that it names, and the materials beside the model."""
+        named = [self.model, self.shape, self.model and self.model.with_suffix(".mtl")]
         for view in self.views:
             named += [view.image, view.evidence.mask]
         return tuple(each for each in named if each is not None)

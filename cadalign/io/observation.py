@@ -163,7 +163,9 @@ class Observation(ObservedImage):
     @property
     def files(self) -> tuple[Path, ...]:
         """The files that it names, and the materials beside the model."""
-        named = [self.model, self.shape, self.model and self.model.with_suffix(".mtl")]
+        named = [self.model, self.shape]
+        if self.model is not None:
+            named.append(Path(f"{os.path.splitext(self.model)[0]}.mtl"))
         for view in self.views:
             named += [view.image, view.evidence.mask]
         return tuple(each for each in named if each is not None)

@@ -39,12 +39,10 @@ class SessionOptions:
     out: Path | None = None
     """Folder for the observations; by default the photos'."""
     camera: Path | None = None
-    """File of the calibrated camera: a matrix K (text or JSON), or JSON in COLMAP's form.
-    Without one the focal length is estimated."""
+    """File of the calibrated camera: a matrix K as text, or JSON in COLMAP's form. Without one the
+    focal length is estimated."""
     focal: float | None = None
     """Focal length of the photos [px], where no file has it, or in its place."""
-    fov: float | None = None
-    """Horizontal field of view of the photos [degrees], in the place of the focal length."""
     keypoints: Path | None = None
     """The model's keypoints: model.keypoints.json."""
     up_axis: Literal["x", "y", "z"] | None = None

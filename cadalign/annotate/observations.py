@@ -25,17 +25,8 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
-from cadalign.io.documents import (
-    Document,
-    Point2,
-    Point3,
-    Text,
-    convert,
-    in_file,
-    read_json,
-    within,
-)
-from cadalign.io.evidence import SeenKeypoint
+from cadalign.io.documents import Document, Point2, convert, in_file, read_json, within
+from cadalign.io.evidence import KeypointFields
 from cadalign.io.focal import FocalPrior
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
@@ -54,12 +45,10 @@ _OF_THE_OBJECT = (
 _OWN_OPTIONS = {"stretch_sigma", "focal_prior", "image"}
 
 
-class _Half(SeenKeypoint, kw_only=True):
+class _Half(KeypointFields, kw_only=True):
     """Pair with only the photo half or the model half, or both of which are of no use to a fit."""
 
     uv: Point2 | None = None
-    xyz: Point3 | None = None
-    name: Text | None = None
 
     def __post_init__(self) -> None:
         if self.uv is None and self.semantic_id is None:
@@ -172,7 +161,7 @@ class ObservationFile:
         mask_sigma = None if marks.mask is None else marks.mask.sigma
         mask = {"mask": self._mask_file(marks), "mask_sigma": mask_sigma}
         evidence = msgspec.structs.replace(self.stored.evidence, **mask)
-        if not has_depths and evidence.depth is None:  # all keypoints with depths may be gone
+        if not has_depths:  # all keypoints with depths may be gone
             evidence = msgspec.structs.replace(evidence, depth_sigma=None)
         halves = [self._half(pair) for pair in marks.pairs if pair not in pairs]
         return replace(

@@ -19,14 +19,8 @@ from cadalign.geometry.camera import Camera, require_perspective
 from cadalign.io.documents import in_file
 from cadalign.io.files import listed, read_bytes, reading, require_utf8
 from cadalign.io.focal import FocalPrior
-from cadalign.io.images import (
-    PHOTO_ENDINGS,
-    open_photo,
-    open_picture,
-    photo_size,
-    read_mask,
-    upright_pixels,
-)
+from cadalign.io.images import open_photo, open_picture, photo_size, read_mask, upright_pixels
+from cadalign.io.kinds import PHOTO_ENDINGS
 
 _MASK = re.compile(r"\.mask(-[0-9]+)?\.png$")  # at the end of the name of a mask's file
 _SHOWN_AS_IS = {"JPEG": "image/jpeg", "PNG": "image/png", "WEBP": "image/webp"}

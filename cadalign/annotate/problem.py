@@ -79,14 +79,13 @@ class Known:
         """The model that `cadalign fit` aligns to the observation.
 
         A similar one has keypoints that no pair shows, too, where they do not change the estimate:
-        without mask, photo and depth image, to which every keypoint warps the mesh.
+        without mask and photo, to which every keypoint warps the mesh.
         """
         shape, evidence = self.shape, observation.evidence
         if shape.learned is not None:
             return shape.learned
         has_photo = bool(observation.fit_options.get("image"))
-        shows_surface = has_photo or evidence.mask is not None or evidence.depth is not None
-        if shape.sigma is not None and not shows_surface:
+        if shape.sigma is not None and not has_photo and evidence.mask is None:
             return Model(
                 points_3d=positions_of(self.points),
                 ids=[point.semantic_id for point in self.points],

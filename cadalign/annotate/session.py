@@ -25,7 +25,7 @@ from cadalign.annotate.photos import PhotoFile, camera_of, find_photos
 from cadalign.annotate.problem import Known, LiveEstimate, LiveProblem, warm_up
 from cadalign.arrays import BoolArray
 from cadalign.errors import CadalignError, DataError, DegenerateError, InputError
-from cadalign.io.observation import Observation, read_camera, with_lens
+from cadalign.io.observation import Observation, read_camera
 
 logger = logging.getLogger("cadalign")
 
@@ -236,7 +236,9 @@ def open_session(options: SessionOptions, files: SessionFiles | None = None) -> 
     given = None if options.camera is None else read_camera(options.camera, size=size)
     session = Session(model, shape)
     for photo, path in files:
-        camera = with_lens(camera_of(photo, given), options.focal, fov=options.fov)
+        camera = camera_of(photo, given)
+        if options.focal is not None:
+            camera = camera.with_focal(options.focal)
         file = ObservationFile(path, photo, model, shape)
         marks = file.read(camera, up_axis=options.up_axis)
         session.photos.append(Annotation(file, History(marks)))

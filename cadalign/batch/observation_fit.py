@@ -90,9 +90,7 @@ class ObservationFit:
 
         Where a learned shape is fitted, keypoints need no ``xyz``.
         """
-        needs_xyz = None if self.shape_sigma is None else True
-        if self.shape is not None:
-            needs_xyz = False
+        needs_xyz = None if self.shape is None and self.shape_sigma is None else self.shape is None
         with in_file(where):
             seen = Observation.from_dict(data, folder=folder, needs_xyz=needs_xyz)
         return changes.applied_to(seen, where)  # whose errors name options

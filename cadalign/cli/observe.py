@@ -29,10 +29,10 @@ class Observe(CameraOptions):
     """Pair the keypoints of a detector in a photo with a model's.
 
     Writes an observation for `cadalign fit`, which takes a whole file of many objects itself.
-    Keypoints are paired by name, otherwise by semantic id, otherwise by order. Without --camera,
-    --focal or --fov the focal length is unknown. The mask that stands beside COCO keypoints is
-    written as PNG beside the observation where the camera and the model's mesh are known, which a
-    fit to it needs.
+    Keypoints are paired by name, otherwise by semantic id, otherwise by order. Without --camera or
+    --focal the focal length is unknown. The mask that stands beside COCO keypoints is written as
+    PNG beside the observation where the camera and the model's mesh are known, which a fit to it
+    needs.
     """
 
     keypoints: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="KEYPOINTS")]

@@ -97,18 +97,13 @@ class CameraOptions:
     """The calibrated camera."""
 
     camera: Path | None = None
-    """File of the calibrated camera: a matrix K as text or JSON, or JSON in COLMAP's form:
-    model, width, height, params."""
+    """File of the calibrated camera: a matrix K as text, or JSON in COLMAP's form: model, width,
+    height, params."""
     focal: float | None = None
     """Focal length [px], where no file has it, or in its place."""
-    fov: float | None = None
-    """Horizontal field of view [degrees], in the place of the focal length."""
 
     @property
     def changes(self) -> ObservationChanges:
         """Values of the options in the place of an observation's own."""
-        if self.focal is not None and self.fov is not None:
-            what = f"given beside --focal {self.focal}"
-            raise InputError(what, where="fov", fix="give one of the two options")
         focal = None if isinstance(self.focal, str) else self.focal  # which a fit may estimate
-        return ObservationChanges(self.camera, focal=focal, fov=self.fov)
+        return ObservationChanges(self.camera, focal=focal)

@@ -85,8 +85,7 @@ class View:
         cameras moved in an unknown way between them.
     mask : (h, w) bool or float, or path, optional
         Pixels of the object in an image of the camera's size: True, or their probabilities in
-        [0, 1], or an 8-bit grey PNG that is not zero there (a JPEG: of more than half of its
-        brightest value).
+        [0, 1], or an 8-bit grey PNG that is not zero there.
     mask_sigma : float, optional
         Standard deviation of the mask's contour along its normal [px]; None estimates it.
     image : (h, w, 3) uint8, or path, optional

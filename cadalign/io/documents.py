@@ -24,7 +24,7 @@ from msgspec import Meta, Struct
 
 from cadalign.errors import CadalignError, DataError, InputError, brief, quote, unknown
 from cadalign.io.files import read_text
-from cadalign.io.kinds import kind_of, other_kind, refuse_other_file
+from cadalign.io.kinds import kind_of, refuse_other, refuse_other_file
 
 _MAX = sys.float_info.max
 Finite = Annotated[float, Meta(ge=-_MAX, le=_MAX)]
@@ -75,9 +75,8 @@ def read_json(path: Path, wanted: str | None = None) -> Any:
         if wanted is not None:
             refuse_other_file(path, wanted)
         raise
-    error = None if wanted is None else other_kind(path, wanted, kind_of(data))
-    if error is not None:
-        raise error
+    if wanted is not None:
+        refuse_other(wanted, kind_of(data), path)
     return data
 
 
@@ -93,13 +92,12 @@ def parse_json(text: str | bytes, where: str) -> Any:
             if msgspec.json.encode(line).count(_FIELD_END) == text.count(_FIELD_END):
                 return line  # no field stands twice
     try:
-        text = str(text, "utf-8") if isinstance(text, bytes) else text
-        data = json.loads(text, object_pairs_hook=_distinct)
+        with in_file(where):
+            text = str(text, "utf-8") if isinstance(text, bytes) else text
+            data = json.loads(text, object_pairs_hook=_distinct)
         if _HALF_CHARACTER.search(text):  # perhaps one half of two
             json.dumps(data, ensure_ascii=False).encode("utf-8")
         return data
-    except InputError as error:
-        raise DataError(error.what, where=where, fix=error.fix) from None
     except json.JSONDecodeError as error:
         where = where if is_line else f"{where}, line {error.lineno}"
         reason = error.msg
@@ -119,7 +117,7 @@ def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         names = [name for name, _ in pairs]
         twice = next(name for name in names if names.count(name) > 1)
         what = f"the field {quote(twice)} stands twice in one object"
-        raise InputError(what, fix="leave one of the two out")
+        raise DataError(what, fix="leave one of the two out")
     return fields
 
 
@@ -138,11 +136,10 @@ def convert(
         return path_from(text, folder)
 
     try:
-        try:
+        with suppress(msgspec.ValidationError):  # perhaps of NumPy's arrays and numbers
             return msgspec.convert(data, kind, dec_hook=read)
-        except msgspec.ValidationError:  # perhaps of NumPy's arrays and numbers
-            with suppress(TypeError, RecursionError):
-                data = msgspec.to_builtins(data, enc_hook=plain)
+        with suppress(TypeError, RecursionError):
+            data = msgspec.to_builtins(data, enc_hook=_plain)
         return msgspec.convert(data, kind, dec_hook=read)
     except msgspec.ValidationError as error:
         raise _located(error, data, kind, where) from None
@@ -156,12 +153,10 @@ def in_file(path: Path | str) -> Iterator[None]:
     try:
         yield
     except CadalignError as error:
-        where = str(path)
-        if error.where == where or (error.where or "").startswith(f"{where}: "):
-            raise DataError(error.what, where=error.where, fix=error.fix) from None
-        if error.where:
-            where += (", " if error.where.startswith("line ") else ": ") + error.where
-        raise DataError(error.what, where=where, fix=error.fix) from None
+        whole, part = str(path), error.where or ""
+        if part != whole and not part.startswith(f"{whole}: "):
+            part = whole + (", " if part.startswith("line ") else ": " if part else "") + part
+        raise DataError(error.what, where=part, fix=error.fix) from None
 
 
 @contextmanager
@@ -170,12 +165,8 @@ def within(place: str) -> Iterator[None]:
     try:
         yield
     except CadalignError as error:
-        raise _below(place, error) from None
-
-
-def _below(place: str, error: CadalignError) -> DataError:
-    where = ".".join(part for part in (place, error.where) if part)
-    return DataError(error.what, where=where or None, fix=error.fix)
+        where = ".".join(part for part in (place, error.where) if part)
+        raise DataError(error.what, where=where or None, fix=error.fix) from None
 
 
 def path_from(text: str, folder: Path | None) -> Path:
@@ -209,7 +200,7 @@ _WORDS = {
 _PATTERN_WORDS = {repr(_PATH): "a path", repr(_FILE_NAME): "an id"}
 
 
-def plain(value: Any) -> Any:
+def _plain(value: Any) -> Any:
     """NumPy's array or number as Python's."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
@@ -223,9 +214,9 @@ def _located(error: msgspec.ValidationError, data: Any, kind: Any, where: str) -
     for step in _STEP.finditer(path):
         where += step[0] if step["row"] else f".{step['name']}" if where else step["name"]
         value = _entry(value, step)
-    cause = error.__cause__
-    if isinstance(cause, InputError):
-        return _below(where, cause)
+    if isinstance(cause := error.__cause__, InputError):
+        where = ".".join(part for part in (where, cause.where) if part)
+        return DataError(cause.what, where=where or None, fix=cause.fix)
     if field := _FIELD.fullmatch(text):
         is_missing, name = field[1] == "missing required", field[2].removesuffix("`")
         fields = _parts_at(kind, path, "fields")
@@ -262,13 +253,10 @@ def _wanted(text: str) -> str:
     rule, _, _ = found["rule"].partition(", got")
     if " matching regex " in rule:
         return _PATTERN_WORDS.get(rule.removeprefix(" matching regex "), words)
-    bound = re.fullmatch(r" (>|>=|<|<=) (\S+)", rule)
-    length = re.fullmatch(r" of length (>= )?(\d+)", rule)
-    if length:
-        return f"{words} of {'at least ' if length[1] else ''}{length[2]}"
-    if bound is None or abs(float(bound[2])) == _MAX:
-        return words
-    return "a positive number" if bound[0] == " > 0.0" else f"{words} {bound[1]} {bound[2]}"
+    if rule == " > 0.0":
+        return "a positive number"
+    bound = rule.replace("length >= ", "at least ").replace("length ", "")
+    return words if str(_MAX) in rule else words + bound
 
 
 def _parts_at(kind: Any, path: str, name: str) -> list[Any]:

@@ -5,7 +5,7 @@ The format is described in docs/formats/observation.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from cadalign.arrays import FloatArray, IntArray, as_floats, as_one_or_each, as_points, as_positive
-from cadalign.errors import DataError, InputError, quote, require_kind
+from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, as_positive
+from cadalign.errors import DataError, InputError, require_kind
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PixelOrigin, check_pixels, shift_of, unmeasured
 from cadalign.io.documents import (
@@ -33,36 +33,24 @@ from cadalign.io.files import as_path
 
 LENGTHS = ("width", "height", "length")
 """Names of the lengths along the model's x, y and z."""
-_LENGTH_SIGMA = 0.01  # relative
 _LISTED = 8  # rows of keypoints in a message
-_COLUMNS = ("name", "semantic_id", "sigma", "score")  # of all keypoints, or of none
-_REFINED = {
-    "mask_sigma": "mask",
-    "depth_scale": "depth",
-    "depth_sigma": "depth",
-    "up_sigma_deg": "up",
-    "camera_height_sigma": "camera_height",
-}
-"""The field without which a field means nothing."""
 _Row4 = tuple[Finite, Finite, Finite, Finite]
 
 
 class ImageEvidence(Document, kw_only=True, eq=False):
-    """Evidence of an image beyond keypoints, with files of mask and depth; None where unknown.
+    """Evidence of an image beyond keypoints, with the file of a mask; None where unknown.
 
     `cadalign.View` describes the fields, and checks arrays.
 
     Raises
     ------
     InputError
-        If a sigma or scale is given without its measurement.
+        If a standard deviation is given without its measurement.
     """
 
     mask: Path | None = None
     mask_sigma: Positive | None = None
-    depth: Path | None = None
-    depth_scale: Positive | None = None
-    depth_sigma: Positive | None = None
+    depth_sigma: Positive | None = None  # of depths that keypoints have
     up: Point3 | None = None
     up_sigma_deg: Positive | None = None
     camera_height: Positive | None = None
@@ -70,15 +58,13 @@ class ImageEvidence(Document, kw_only=True, eq=False):
     cam_from_rig: tuple[_Row4, _Row4, _Row4, _Row4] | None = None
 
     def __post_init__(self) -> None:
-        given = self.given
-        for name in given:
-            # depth_sigma may be that of depths of the keypoints
-            if name != "depth_sigma" and (missing := _REFINED.get(name, name)) not in given:
-                what, fix = f"given without {missing}", f"give {missing}, too"
+        if self.mask is not None:
+            self.mask = as_path(self.mask, "mask")
+        for name in self.given:
+            measured = name.partition("_sigma")[0]
+            if measured not in (*self.sources, "depth"):
+                what, fix = f"given without {measured}", f"give {measured}, too"
                 raise InputError(what, where=name, fix=fix)
-        for name in ("mask", "depth"):
-            if name in given:
-                setattr(self, name, as_path(given[name], name))
 
     @property
     def given(self) -> dict[str, Any]:
@@ -89,7 +75,7 @@ class ImageEvidence(Document, kw_only=True, eq=False):
     @property
     def sources(self) -> tuple[str, ...]:
         """Names of the fields that are known and are evidence by themselves."""
-        return tuple(name for name in self.given if name not in _REFINED)
+        return tuple(name for name in self.given if "_sigma" not in name)
 
 
 class Size(Struct, frozen=True, eq=False, omit_defaults=True, forbid_unknown_fields=True):
@@ -99,8 +85,8 @@ class Size(Struct, frozen=True, eq=False, omit_defaults=True, forbid_unknown_fie
     ----------
     width, height, length : float, optional
         Along x, y, z [the unit in which pose and size are wanted].
-    sigma : float or (3,) float, optional
-        Standard deviation of the lengths, relative; by default 0.01, 1 %.
+    sigma : float
+        Standard deviation of the lengths, relative: 0.01 is 1 %.
 
     Raises
     ------
@@ -116,16 +102,14 @@ class Size(Struct, frozen=True, eq=False, omit_defaults=True, forbid_unknown_fie
     width: Positive | None = None
     height: Positive | None = None
     length: Positive | None = None
-    sigma: Any = None
+    sigma: Positive = 0.01
 
     def __post_init__(self) -> None:
-        for name in LENGTHS:
+        for name in (*LENGTHS, "sigma"):
             if (value := getattr(self, name)) is not None:
                 msgspec.structs.force_setattr(self, name, as_positive(value, name=name))
         if np.isnan(self.lengths).all():
             raise InputError("no length is given", fix="give width, height or length")
-        if self.sigma is not None:
-            as_one_or_each(self.sigma, name="sigma", count=3, entries="lengths")
 
     @property
     def lengths(self) -> FloatArray:
@@ -135,8 +119,7 @@ class Size(Struct, frozen=True, eq=False, omit_defaults=True, forbid_unknown_fie
     @property
     def deviations(self) -> FloatArray:
         """Standard deviations (3,) of the lengths; NaN where unknown."""
-        relative = np.asarray(_LENGTH_SIGMA if self.sigma is None else self.sigma, dtype=float)
-        return np.asarray(self.lengths * relative)
+        return np.asarray(self.lengths * self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +154,7 @@ class ObservedImage:
     Raises
     ------
     InputError
-        If shapes don't match, a value is NaN or infinite, or depths are given twice.
+        If shapes don't match, or a value is NaN or infinite.
     """
 
     points_3d: FloatArray
@@ -189,23 +172,16 @@ class ObservedImage:
     def __post_init__(self) -> None:
         require_kind(self.camera, Camera, "camera")
         points_3d = as_points(self.points_3d, name="points_3d", dimension=3)
-        count = len(points_3d)
         checked: dict[str, Any] = {"points_3d": points_3d}
-        checked["points_2d"] = as_floats(self.points_2d, name="points_2d", shape=(count, 2))
-        for name in ("sigma", "scores", "depths"):
+        each = (len(points_3d),)
+        shapes = {"points_2d": (*each, 2), "sigma": each, "scores": each, "depths": each}
+        for name, shape in shapes.items():
             if (value := getattr(self, name)) is not None:
-                finite = name != "depths"
-                checked[name] = as_floats(value, name=name, shape=(count,), finite=finite)
+                checked[name] = as_floats(value, name=name, shape=shape, finite=name != "depths")
         if self.image is not None:
             checked["image"] = as_path(self.image, "image")
         for name, value in checked.items():
             object.__setattr__(self, name, value)
-        if self.depths is not None and self.evidence.depth is not None:
-            what, fix = (
-                "a depth image and depths of keypoints are given",
-                "leave out one of the two",
-            )
-            raise InputError(what, where="depth", fix=fix)
 
     @property
     def labels(self) -> tuple[str | int, ...]:
@@ -231,21 +207,16 @@ class ObservedImage:
 # Files --------------------------------------------------------------------------------------------
 
 
-class SeenKeypoint(Document, kw_only=True):
-    """Fields of a keypoint that a photo, or its detector, gives."""
+class KeypointFields(Document, kw_only=True):
+    """One entry of ``keypoints``."""
 
+    xyz: Point3 | None = None  # needed with a mesh
+    uv: tuple[float | None, float | None] | None  # null where it was not found
+    name: Text | None = None
     semantic_id: Index | None = None
     sigma: Positive | None = None
     score: NotNegative | None = None
     depth: Positive | None = None
-
-
-class KeypointFields(SeenKeypoint, kw_only=True):
-    """One entry of ``keypoints``."""
-
-    xyz: Point3 | None = None  # needed with a mesh
-    uv: tuple[float | None, float | None] | None  # null, or NaN, where it was not found
-    name: Text | None = None
 
 
 class ViewFields(ImageEvidence, kw_only=True):
@@ -265,56 +236,45 @@ def read_image_fields(read: ViewFields, *, needs_xyz: bool = True) -> ObservedIm
     """
     for name in ("name", "semantic_id"):
         require_unique(read.keypoints, name)
-    camera, points_2d = Camera.from_dict(read.camera), _pixels(read.keypoints)
-    kept = np.flatnonzero(~unmeasured(points_2d)).tolist()
-    keypoints = {row: read.keypoints[row] for row in kept}
-    points_2d = points_2d[kept]
-    names, ids, sigma, scores = (_column(keypoints, name) for name in _COLUMNS)
+    camera = Camera.from_dict(read.camera)
+    pixels = [each.uv or (None, None) for each in read.keypoints]
+    points_2d = np.array(pixels, dtype=float).reshape(-1, 2)  # NaN for None
+    is_found = ~unmeasured(points_2d)
+    points_2d = points_2d[is_found]
+    check_pixels(points_2d, camera.width, camera.height, where="keypoints.uv")
+    keypoints = {row: each for row, each in enumerate(read.keypoints) if is_found[row]}
     for row, each in keypoints.items():
         if needs_xyz and each.xyz is None:
             raise DataError("missing", where=f"keypoints[{row}].xyz")
-    check_pixels(points_2d, camera.width, camera.height, where="keypoints.uv")
     places = [each.xyz or (0, 0, 0) for each in keypoints.values()]
-    depths = np.array([each.depth for each in keypoints.values()], dtype=float)  # NaN for None
+    depths = np.array([each.depth for each in keypoints.values()], dtype=float)
+    names, ids = _column(keypoints, "name"), _column(keypoints, "semantic_id")
     return ObservedImage(
         points_3d=np.array(places, dtype=float).reshape(-1, 3),
         points_2d=points_2d - shift_of(read.pixel_origin),
         camera=camera,
-        sigma=sigma,
+        sigma=_column(keypoints, "sigma"),
         ids=None if ids is None else np.array(ids, dtype=np.int64),
         names=None if names is None else tuple(names),
-        scores=scores,
+        scores=_column(keypoints, "score"),
         image=read.image,
         depths=depths if np.isfinite(depths).any() else None,
-        not_found=tuple(sorted(set(range(len(read.keypoints))).difference(kept))),
+        not_found=tuple(np.flatnonzero(~is_found).tolist()),
         evidence=ImageEvidence(**read.given),
     )
-
-
-def _pixels(keypoints: Sequence[KeypointFields]) -> FloatArray:
-    """Pixels (n, 2) of keypoints; NaN where they were not found."""
-    pixels = np.array([each.uv or (None, None) for each in keypoints], dtype=float).reshape(-1, 2)
-    half = np.isnan(pixels) & ~np.isnan(pixels[:, ::-1])
-    for row, column in np.argwhere(np.isinf(pixels) | half).tolist():
-        value = (keypoints[row].uv or ())[column]
-        what, where = f"{quote(value)} is not a finite number", f"keypoints[{row}].uv[{column}]"
-        raise DataError(what, where=where)
-    return pixels
 
 
 def _column(keypoints: Mapping[int, KeypointFields], name: str) -> Any:
     """One optional field of all keypoints, by rows, as a list; None where none has it."""
     values = {row: getattr(keypoint, name) for row, keypoint in keypoints.items()}
     missing = [row for row, value in values.items() if value is None]
-    if len(missing) == len(values):
-        return None
-    if missing:
+    if missing and len(missing) < len(values):
         raise DataError(
             "missing, though other keypoints have it",
             where=f"keypoints[{missing[0]}].{name}",
             fix="give it for all keypoints or for none",
         )
-    return list(values.values())
+    return None if missing or not values else list(values.values())
 
 
 def write_image_fields(image: ObservedImage, folder: Path | None) -> dict[str, Any]:
@@ -328,11 +288,7 @@ def write_image_fields(image: ObservedImage, folder: Path | None) -> dict[str, A
         "score": image.scores,
         "depth": image.depths,
     }
-    known = {
-        name: each.tolist() if isinstance(each, np.ndarray) else each
-        for name, each in columns.items()
-        if each is not None
-    }
+    known = {name: np.asarray(each).tolist() for name, each in columns.items() if each is not None}
     rows = [dict(zip(known, row, strict=True)) for row in zip(*known.values(), strict=True)]
     data: dict[str, Any] = {
         "camera": image.camera.to_dict(pixel_origin="corner"),
@@ -343,8 +299,7 @@ def write_image_fields(image: ObservedImage, folder: Path | None) -> dict[str, A
         ],
     }
     for name, value in {"image": image.image, **image.evidence.given}.items():
-        if isinstance(value, Path):
-            data[name] = written_path(value, folder=folder)
-        elif value is not None:
-            data[name] = np.asarray(value).tolist()
+        if value is not None:
+            is_path = isinstance(value, Path)
+            data[name] = written_path(value, folder=folder) if is_path else np.array(value).tolist()
     return data

@@ -1,29 +1,29 @@
-"""Atomic writes, and reads of regular files of bounded size; errors name the file."""
+"""Atomic writes, reads of regular files of bounded size, sealed files; errors name the file."""
 
 from __future__ import annotations
 
 import fcntl
 import hashlib
-import io
 import json
 import logging
-import math
 import os
 import stat
+import struct
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from functools import lru_cache, wraps
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, BinaryIO, TypeVar, cast
 
 from cadalign.errors import DataError, InputError, quote
 
 logger = logging.getLogger("cadalign")
 
 F = TypeVar("F", bound=Callable[..., Any])
-_MAX_NAME = 50  # such that the unfinished file's name stays below the 255 bytes of file systems
 _MAX_PATH = 1000  # of a path that is shown whole
+_SEAL = struct.Struct("<16sIIQ32s")
 MOST_BYTES = 2**32
 """Size of the largest file that is read where its reader states no other."""
 _kept: ContextVar[set[str] | None] = ContextVar("kept", default=None)
@@ -35,12 +35,12 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     ``write`` writes the file that it is given the name of, in the same folder. Raises DataError if
     it cannot be written, or something is made from it (`keeping`).
     """
-    # The true ending stays last: some writers go by it.
-    name = path.name if len(path.name) <= _MAX_NAME else f"{hash(path.name):x}{path.suffix}"
     with writing(path):
         refuse_folder(path)
         refuse_input(path)
-        unfinished = path.with_name(f".unfinished-{os.getpid()}-{name}")
+        # Of a short name, whose ending is the true one: some writers go by it.
+        name = f".unfinished-{os.getpid()}-{hash(path.name):x}{path.suffix}"
+        unfinished = path.with_name(name)
         try:
             write(unfinished)
             os.replace(unfinished, path)
@@ -53,7 +53,8 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
 def writing_folder(path: Path) -> Iterator[Path]:
     """Write, within the block, a folder such that it is there whole or as it was.
 
-    What is written to the folder beside it that the block is given takes its place at the end.
+    What is written to the folder beside it that the block is given takes its place at the end. It
+    must be empty, if it is there.
     """
     import tempfile
 
@@ -64,9 +65,7 @@ def writing_folder(path: Path) -> Iterator[Path]:
             unfinished = Path(folder, "unfinished")
             unfinished.mkdir()
             yield unfinished
-            if path.exists():
-                path.rename(Path(folder, "replaced"))
-            unfinished.rename(path)
+            unfinished.replace(path)
 
 
 @contextmanager
@@ -115,22 +114,6 @@ def locked(path: Path, what: str, *, fix: str) -> Iterator[None]:
         yield
 
 
-def remove_earlier(folder: Path, files: Iterable[Path]) -> None:
-    """Remove files that earlier work wrote to a folder, and folders in it that are empty then.
-
-    Raises a DataError, before anything is removed, if something is made from one of them.
-    """
-    paths = list(files)
-    for path in paths:
-        refuse_input(path)
-    with writing(folder):
-        for path in paths:
-            path.unlink(missing_ok=True)
-            with suppress(OSError):  # something else is in it
-                if path.parent != folder:
-                    path.parent.rmdir()
-
-
 def refuse_folder(path: Path) -> None:
     """Raise a DataError for a folder in the place of a file that is to be written."""
     if not path.name or path.is_dir():
@@ -149,19 +132,12 @@ def write_json(path: Path, value: Any) -> None:
 
 def dense_json(value: Any) -> str:
     """JSON without blanks; numbers that are not finite become null."""
-    try:
-        return json.dumps(value, separators=(",", ":"), allow_nan=False)
-    except ValueError:
-        return json.dumps(finite(value), separators=(",", ":"))
+    return json.dumps(finite(value), separators=(",", ":"))
 
 
 def finite(value: Any) -> Any:
     """Lists and mappings with None in the place of numbers that are not finite."""
-    if isinstance(value, dict):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return json.loads(json.dumps(value), parse_constant=lambda _: None)
 
 
 def damaged(what: str, where: object = None) -> DataError:
@@ -212,26 +188,8 @@ def reading(path: Path) -> Iterator[None]:
         raise DataError(f"cannot be read ({reason})", where=printable(path)) from None
 
 
-class InputFile(io.BufferedReader):
-    """A file that is read; ``size`` is that at its opening.
-
-    No read asks for more: Python makes room for all that is asked for, such as the length that a
-    damaged part of a picture announces, and some files of the system grow without end.
-    """
-
-    def __init__(self, path: Path) -> None:
-        # Opening a pipe would wait for its other end.
-        super().__init__(io.FileIO(path, opener=lambda p, flags: os.open(p, flags | os.O_NONBLOCK)))
-        self.status = os.fstat(self.fileno())
-        self.size = self.status.st_size
-
-    def read(self, size: int | None = -1) -> bytes:
-        """Read so many bytes, or all."""
-        return super().read(self.size if size is None or size < 0 else min(size, self.size))
-
-
 @contextmanager
-def open_input(path: Path, *, most: int = MOST_BYTES) -> Iterator[InputFile]:
+def open_input(path: Path, *, most: int = MOST_BYTES) -> Iterator[BinaryIO]:
     """Open a regular file of at most ``most`` bytes.
 
     Every file that somebody names is opened here: a device has no end, and a pipe may have no other
@@ -240,35 +198,35 @@ def open_input(path: Path, *, most: int = MOST_BYTES) -> Iterator[InputFile]:
     Raises DataError if it is missing, no regular file, larger, or cannot be read.
     """
     path = as_path(path)
-    with reading(path), InputFile(path) as file:
-        if not stat.S_ISREG(file.status.st_mode):
+    with reading(path), open(path, "rb", opener=_opened_at_once) as file:
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode):
             fix = "give a file, no pipe and no device"
             raise DataError("not a regular file", where=printable(path), fix=fix)
-        if file.size > most:
-            what = f"{file.size} bytes, more than the {most} that are read of such a file"
+        if status.st_size > most:
+            what = f"{status.st_size} bytes, more than the {most} that are read of such a file"
             raise DataError(what, where=printable(path))
         yield file
 
 
-def time_of(path: Path) -> int:
-    """Time at which a file was written, by which caches read it anew; 0 where there is none."""
-    try:
-        return path.stat().st_mtime_ns
-    except (OSError, ValueError):
-        return 0
+def _opened_at_once(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK)  # of a pipe, it would wait for the other end
 
 
 def once_per_file(most: int) -> Callable[[F], F]:
     """Remember what a reader gives of so many files, each until it is written anew."""
 
     def remembering(read: F) -> F:
-        @lru_cache(maxsize=most)
-        def remembered(path: Path, written: int, **given: Any) -> Any:
-            return read(path, **given)
+        remembered = lru_cache(most)(lambda path, written, **given: read(path, **given))
 
         @wraps(read)
         def opened(path: Path, **given: Any) -> Any:
-            return remembered(path, time_of(path), **given)
+            path = as_path(path)
+            try:
+                written = path.stat().st_mtime_ns
+            except (OSError, ValueError):  # which the reader says
+                written = 0
+            return remembered(path, written, **given)
 
         return cast(F, opened)
 
@@ -278,7 +236,8 @@ def once_per_file(most: int) -> Callable[[F], F]:
 def read_bytes(path: Path, *, most: int = MOST_BYTES) -> bytes:
     """Read a regular file of at most ``most`` bytes; see `open_input`."""
     with open_input(path, most=most) as file:
-        return file.read()
+        # No more than it has at its opening: some files of the system grow without end.
+        return file.read(os.fstat(file.fileno()).st_size)
 
 
 def read_text(path: Path, *, most: int = MOST_BYTES, errors: str = "strict") -> str:
@@ -336,3 +295,45 @@ def require_utf8(path: Path) -> None:
 def checksum(payload: Any) -> bytes:
     """BLAKE2b checksum of 32 bytes."""
     return hashlib.blake2b(payload, digest_size=32).digest()
+
+
+@dataclass(frozen=True)
+class Seal:
+    """One format of sealed files: a header of 64 bytes, then the payload.
+
+    The header holds, in little-endian order, the 16 bytes that name the format, its version (4
+    bytes), 4 bytes of zero, the payload's length (8 bytes) and its BLAKE2b checksum (32 bytes).
+    """
+
+    magic: bytes  # the 16 bytes
+    version: int  # that is written and read
+    noun: str  # its name in messages, such as "library file"
+    fix: str  # how to make such a file
+
+    def write(self, path: Path, payload: Any) -> None:
+        """Write a file atomically; ``payload`` is bytes or a buffer."""
+        size = memoryview(payload).nbytes
+        header = _SEAL.pack(self.magic, self.version, 0, size, checksum(payload))
+        write_whole(path, lambda unfinished: unfinished.write_bytes(header + payload))
+
+    def unwrap(self, content: Any, where: str) -> memoryview:
+        """Check the header and the checksum; returns the payload, which is not copied.
+
+        Raises DataError if the content is of another format or version, cut short or damaged.
+        """
+        view = memoryview(content).cast("B")
+        if len(view) < _SEAL.size or bytes(view[:16]) != self.magic:
+            raise DataError(f"not a {self.noun}", where=where, fix=self.fix)
+        _, version, _, size, expected = _SEAL.unpack(view[: _SEAL.size])
+        payload = view[_SEAL.size :]
+        if version != self.version:
+            what = f"is of version {version}, but this cadalign reads version {self.version}"
+            raise self.error(what, where)
+        require_count("bytes", size, len(payload), len(payload) - size, Path(where))
+        if checksum(payload[:size]) != expected:
+            raise damaged("the checksum is wrong", where)
+        return payload[:size]
+
+    def error(self, what: str, where: str) -> DataError:
+        """The error of a file whose content is wrong."""
+        return DataError(f"the {self.noun} {what}", where=where, fix=self.fix)

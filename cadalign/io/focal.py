@@ -6,9 +6,9 @@ import logging
 import math
 import os
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
-from cadalign.arrays import as_positive
+from cadalign.arrays import as_positive, is_number
 from cadalign.errors import InputError
 from cadalign.geometry.camera import Camera
 
@@ -91,9 +91,7 @@ class FocalPrior:
         return cls(_USUAL_FOCAL * max(width, height), _USUAL_SIGMA, "usual lenses")
 
     @classmethod
-    def from_exif(
-        cls, path: str | os.PathLike[str], *, relative_sigma: float = _EXIF_SIGMA
-    ) -> FocalPrior | None:
+    def from_exif(cls, path: str | os.PathLike[str]) -> FocalPrior | None:
         """Read a photo's focal length from its EXIF data.
 
         From the 35 mm equivalent, taken along the diagonal, as CIPA defines it. A photo turned
@@ -104,8 +102,6 @@ class FocalPrior:
         ----------
         path : str or path-like
             The photo.
-        relative_sigma : float
-            How far to trust it.
 
         Returns
         -------
@@ -123,12 +119,12 @@ class FocalPrior:
 
         with open_photo(path) as image:
             found, size = image.getexif().get_ifd(IFD.Exif), image.size
-        equivalent = _positive(found.get(Base.FocalLengthIn35mmFilm))
-        if equivalent is None:
+        equivalent = found.get(Base.FocalLengthIn35mmFilm, 0)
+        if not is_number(equivalent) or equivalent <= 0:  # 0 says that it is unknown
             return None
         focal = equivalent / _FULL_FRAME_DIAGONAL_MM * math.hypot(*size)
         if SHORTEST < focal / max(size) < LONGEST:
-            return cls(focal, relative_sigma, "the photo's EXIF data")
+            return cls(focal, source="the photo's EXIF data")
         text = "%s: the EXIF data state a focal length of %.4g px, which no camera has; ignored"
         logger.warning(text, path, focal)
         return None
@@ -159,12 +155,3 @@ def check_prior(prior: object, *, focal: str) -> None:
             where="focal_prior",
             fix='give focal="estimate" with it',
         )
-
-
-def _positive(tag: Any) -> float | None:
-    """A tag's value; None where it is no positive number: 0 says that it is unknown."""
-    try:
-        value = float(tag)
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return value if 0 < value < math.inf else None

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import os
 import struct
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -16,9 +17,8 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray
 from cadalign.errors import DataError, brief
 from cadalign.geometry.camera import Camera
-from cadalign.io.files import as_path, open_input, write_whole
-from cadalign.io.kinds import IMAGE, refuse_other_file
-from cadalign.io.kinds import PHOTO_ENDINGS as PHOTO_ENDINGS
+from cadalign.io.files import as_path, read_bytes, write_whole
+from cadalign.io.kinds import PHOTO, refuse_other_file
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -39,14 +39,11 @@ _FREE_BYTES = 2**26
 
 @contextmanager
 def open_photo(path: str | os.PathLike[str]) -> Iterator[Image]:
-    """Open a photo; its pixels are read when they are asked for, errors then named as well."""
+    """Open a photo; its pixels are decoded when they are asked for, errors then named as well."""
     path = as_path(path)
-    with open_input(path) as file, ExitStack() as opened:
-        try:
-            image = opened.enter_context(open_picture(file, file.size, where=str(path)))
-        except DataError:
-            refuse_other_file(path, IMAGE)
-            raise
+    refuse_other_file(path, PHOTO)
+    data = read_bytes(path)
+    with open_picture(io.BytesIO(data), len(data), where=str(path)) as image:
         yield image
 
 
@@ -104,8 +101,8 @@ def upright_pixels(image: Image) -> ByteImage:
 
 
 def photo_size(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """Width and height [px] of a photo turned upright; its pixels are not read."""
-    with open_photo(as_path(path)) as image:
+    """Width and height [px] of a photo turned upright; its pixels are not decoded."""
+    with open_photo(path) as image:
         width, height = image.size
         is_on_its_side = image.getexif().get(_ORIENTATION) in _ON_ITS_SIDE
     return (height, width) if is_on_its_side else (width, height)
@@ -114,9 +111,8 @@ def photo_size(path: str | os.PathLike[str]) -> tuple[int, int]:
 def exif_note(path: Path, size: tuple[int, int]) -> str:
     """A note about a photo of another size than this (width, height), if EXIF turned it."""
     with open_photo(path) as image:
-        is_turned = image.size == size and image.getexif().get(_ORIENTATION) in _ON_ITS_SIDE
-    if not is_turned:
-        return ""
+        if image.size != size or photo_size(path) == size:
+            return ""
     return (
         f"; its EXIF data say that it was held on its side: as it is stored, it has {size[0]} x "
         f"{size[1]} pixels, but it is read upright, as photo programs show it"
@@ -143,38 +139,31 @@ def require_one_size(sizes: Mapping[str, tuple[int, int]], photo: Path | None) -
 def read_image(path: Path, camera: Camera) -> ByteImage:
     """Read a photo as `read_photo` does and require the camera's size of it."""
     pixels = read_photo(path)
-    height, width = pixels.shape[:2]
-    if (width, height) != (camera.width, camera.height):
-        note = exif_note(path, (camera.width, camera.height))
-        raise DataError(
-            f"the image is {width} x {height}, the camera {camera.width} x {camera.height}{note}",
-            where=str(path),
-            fix="give the camera of this image",
-        )
+    size = pixels.shape[1], pixels.shape[0]
+    require_one_size({"its camera": (camera.width, camera.height), str(path): size}, path)
     return pixels
 
 
 def read_grey(path: Path) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
-    """Read an image of one channel of 8 or 16 bits as it is stored, (h, w)."""
+    """Read an image of one channel of 8 or 16 bits as it is stored, (h, w).
+
+    A JPEG is refused: its compression leaves traces on both sides of every edge.
+    """
     with open_photo(path) as image:
-        mode = image.mode
+        mode, form = image.mode, image.format
         pixels = np.asarray(image.convert("L") if mode in ("1", "P") else image)
-    if pixels.ndim != 2 or not (mode.startswith("I") or mode in ("1", "L", "P")):
-        fix = "give an image of one grey channel, of 8 or 16 bits"
-        raise DataError(f"the image has the mode {brief(mode)}", where=str(path), fix=fix)
+    is_grey = pixels.ndim == 2 and (mode.startswith("I") or mode in ("1", "L", "P"))
+    if not is_grey or form == "JPEG":
+        what = f"the image is a {form} of the mode {brief(mode)}"
+        what += ", whose compression changes values" if is_grey else ""
+        fix = "give a PNG of one grey channel, of 8 or 16 bits"
+        raise DataError(what, where=str(path), fix=fix)
     return pixels if pixels.dtype == np.uint8 else pixels.astype(np.uint16)
 
 
 def read_mask(path: Path) -> BoolArray:
-    """Read an object's pixels (h, w): those that are not zero, as `read_grey` reads them.
-
-    Of a JPEG, whose compression leaves traces on both sides of every edge, those that are brighter
-    than half of the brightest.
-    """
-    with open_photo(path) as image:
-        is_lossy = image.format == "JPEG"
-    pixels = read_grey(path)
-    return np.asarray(pixels > (pixels.max() // 2 if is_lossy else 0))
+    """Read an object's pixels (h, w): those that are not zero, as `read_grey` reads them."""
+    return np.asarray(read_grey(path) > 0)
 
 
 def write_image(path: Path, image: ByteImage) -> None:
@@ -184,9 +173,6 @@ def write_image(path: Path, image: ByteImage) -> None:
     """
     from PIL import Image
 
-    kind: tuple[str, dict[str, int]] = ("PNG", {"compress_level": 1})
-    if path.suffix.lower() == JPEG_ENDING:
-        kind = ("JPEG", {"quality": _JPEG_QUALITY})
-    write_whole(
-        path, lambda unfinished: Image.fromarray(image).save(unfinished, kind[0], **kind[1])
-    )
+    form = "JPEG" if path.suffix.lower() == JPEG_ENDING else "PNG"
+    how = {"quality": _JPEG_QUALITY, "compress_level": 1}  # each is of one of the two
+    write_whole(path, lambda unfinished: Image.fromarray(image).save(unfinished, form, **how))

@@ -8,18 +8,15 @@ from contextlib import suppress
 from pathlib import Path
 
 from cadalign.errors import CadalignError, DataError
-from cadalign.io.files import open_input
+from cadalign.io.files import read_bytes
 
 PHOTO = "a photo"
-IMAGE = "an image"
 MESH = "a mesh"
 OBSERVATION = "an observation"
 DETECTOR = "a detector's keypoints"
 MODEL_KEYPOINTS = "keypoints of a model"
 FIT = "the result of a fit"
 CAMERA = "a camera"
-SHAPE = "a learned shape"
-LIBRARY = "a library of models"
 
 LINES = (".jsonl", ".ndjson")
 """Endings of files with an observation in every line."""
@@ -27,16 +24,7 @@ TABLE = ".csv"
 MESH_ENDINGS = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
 PHOTO_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
-_HEAD_BYTES = 1024
 _MOST_BYTES = 2**26  # of a JSON file that is read to name its kind
-_STARTS = {
-    PHOTO: (b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"II*\0", b"MM\0*"),
-    MESH: (b"glTF", b"ply\n", b"ply\r"),
-    SHAPE: (b"cadalign shape",),
-    LIBRARY: (b"cadalign library",),
-}
-MATRIX_NAMES = ("matrix", "K", "camera_matrix")
-"""Names of a calibration matrix in a JSON file."""
 CAMERA_FIX = (
     "give 3 x 3 numbers, or a JSON file with model, width, height and params as COLMAP does"
 )
@@ -48,19 +36,24 @@ _FIXES = {
     FIT: "give the fit.json that `cadalign fit` writes",
     CAMERA: CAMERA_FIX,
     MESH: f"give a file that ends in {', '.join(MESH_ENDINGS)}",
-    IMAGE: "give a picture, such as a PNG or a JPEG",
+    PHOTO: "give a picture, such as a PNG or a JPEG",
+}
+_FIXES_OF = {
+    (FIT, OBSERVATION): "give the observation that was fitted",
+    (OBSERVATION, FIT): "fit it first, `cadalign fit {}`, and give the fit.json that this writes",
+    (MESH, OBSERVATION): "mark keypoints with `cadalign annotate PHOTO {}`, which writes one",
+    (PHOTO, OBSERVATION): "mark keypoints with `cadalign annotate {} MODEL`, which writes one, or "
+    "use a detector's with `cadalign observe`",
 }
 
 
 def kind_of(data: object) -> str | None:
     """Kind of the parsed form of a JSON file, by its fields; None where these tell none."""
     if isinstance(data, list):
-        first = data[0] if data else None
-        if isinstance(first, dict) and "model_id" in first:
-            return MODEL_KEYPOINTS  # KeypointNet's annotations
-        if isinstance(first, list | float | int):
-            return CAMERA if len(data) in (3, 9) else None
-        return None if isinstance(first, str) else DETECTOR
+        first = data[0] if data else {}
+        if not isinstance(first, dict):
+            return None
+        return MODEL_KEYPOINTS if "model_id" in first else DETECTOR  # the former KeypointNet's
     if not isinstance(data, dict):
         return None
     fields = set(data)
@@ -75,50 +68,33 @@ def kind_of(data: object) -> str | None:
             return MODEL_KEYPOINTS
     if {"views", "keypoints"} & fields:
         return OBSERVATION
-    if {"asset", "meshes"} <= fields:
-        return MESH
-    return CAMERA if {*MATRIX_NAMES, "params"} & fields and "width" in fields else None
+    return CAMERA if {"matrix", "params"} & fields and "width" in fields else None
 
 
 def kind_of_file(path: Path) -> str | None:
-    """Kind of a file, by its first bytes, its content as JSON, or else its ending."""
-    suffix, is_there = path.suffix.lower(), False
-    with suppress(CadalignError, ValueError, RecursionError), open_input(path) as file:
-        is_there = True
-        head = file.read(_HEAD_BYTES)
-        for kind, starts in _STARTS.items():
-            if head.startswith(starts):
-                return kind
-        is_text = head.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"[")
-        if is_text and file.size <= _MOST_BYTES and suffix not in LINES:
-            file.seek(0)
-            if (kind_found := kind_of(json.loads(file.read()))) is not None:
-                return kind_found
-    if is_there and suffix in MESH_ENDINGS:
-        return MESH
-    return PHOTO if is_there and suffix in (*PHOTO_ENDINGS, ".gif", ".heic") else None
+    """Kind of a file that is there: that of its content as JSON, or else by its ending."""
+    suffix, data = path.suffix.lower(), None
+    if os.path.isfile(path) and suffix in (*MESH_ENDINGS, *PHOTO_ENDINGS):
+        return MESH if suffix in MESH_ENDINGS else PHOTO
+    if suffix == ".json":
+        with suppress(CadalignError, ValueError, RecursionError):
+            data = json.loads(read_bytes(path, most=_MOST_BYTES))
+    return kind_of(data)
 
 
-def other_kind(path: Path, wanted: str, found: str | None) -> DataError | None:
-    """The error of a file of a kind that is not wanted; None where its kind is not known."""
-    if found in (None, wanted) or (found, wanted) == (PHOTO, IMAGE):
-        return None
-    fix = _FIXES.get(wanted)
-    if wanted == OBSERVATION and found in (MESH, PHOTO):
-        pair = f"PHOTO {path.name}" if found == MESH else f"{path.name} MODEL"
-        fix = f"mark keypoints with `cadalign annotate {pair}`, which writes one"
-        fix += ", or use a detector's with `cadalign observe`" if found == PHOTO else ""
-    if wanted == OBSERVATION and found == FIT:
-        fix = "give the observation that was fitted"
-    if wanted == FIT and found == OBSERVATION:
-        fix = f"fit it first, `cadalign fit {path.name}`, and give the fit.json that this writes"
-    return DataError(f"{found}, not {wanted}", where=str(path), fix=fix)
+def refuse_other(wanted: str, found: str | None, path: Path | None = None) -> None:
+    """Raise a DataError for a file, or its parsed form, of another known kind than is wanted."""
+    if found in (None, wanted):
+        return
+    where, name = (None, "") if path is None else (str(path), path.name)
+    special = _FIXES_OF.get((found, wanted))
+    fix = _FIXES.get(wanted) if special is None else special.format(name)
+    raise DataError(f"{found}, not {wanted}", where=where, fix=fix)
 
 
 def refuse_other_file(path: Path, wanted: str) -> None:
     """Raise a DataError for a file of another known kind than the wanted one."""
-    if error := other_kind(path, wanted, kind_of_file(path)):
-        raise error
+    refuse_other(wanted, kind_of_file(path), path)
 
 
 def is_of_many(path: Path, data: object = None) -> bool:

@@ -1,7 +1,7 @@
 """Observations: one object's keypoints in one or more images, as a JSON file; files of cameras.
 
-The file is described in docs/formats/observation.md. A camera is a calibration matrix as text or
-JSON, or in COLMAP's form.
+The file is described in docs/formats/observation.md. A camera is a calibration matrix as text, or
+JSON in COLMAP's form.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -28,8 +27,6 @@ from cadalign.io.documents import (
     Text,
     convert,
     in_file,
-    parse_json,
-    plain,
     read_json,
     within,
     written_path,
@@ -45,10 +42,9 @@ from cadalign.io.files import as_path, once_per_file, read_text, write_json
 from cadalign.io.kinds import (
     CAMERA,
     CAMERA_FIX,
-    MATRIX_NAMES,
     OBSERVATION,
     kind_of,
-    other_kind,
+    refuse_other,
     refuse_other_file,
 )
 
@@ -167,23 +163,18 @@ class Observation(ObservedImage):
     @property
     def files(self) -> tuple[Path, ...]:
         """The files that it names, and the materials beside the model."""
-        named: list[Any] = [self.model, self.shape]
+        named = [self.model, self.shape]
         if self.model is not None:
             named.append(Path(f"{os.path.splitext(self.model)[0]}.mtl"))
         for view in self.views:
-            named += [view.image, *view.evidence.given.values()]
-        return tuple(each for each in named if isinstance(each, Path))
+            named += [view.image, view.evidence.mask]
+        return tuple(each for each in named if each is not None)
 
     @property
     def is_plain(self) -> bool:
         """True where nothing but keypoints in one image is known."""
         further = self.others, self.size, self.init, self.evidence.given
         return self.depths is None and not any(map(bool, further))
-
-    def __repr__(self) -> str:
-        counts = ", ".join(str(len(view.points_2d)) for view in self.views)
-        source = "" if self.image is None else f"{self.image.name!r}, "
-        return f"Observation({source}{len(self.views)} views with {counts} keypoints)"
 
     @classmethod
     def load(cls, path: str | Path, *, needs_xyz: bool | None = None) -> Observation:
@@ -193,8 +184,8 @@ class Observation(ObservedImage):
         ----------
         path : str or Path
         needs_xyz : bool, optional
-            Whether keypoints must have ``xyz``, which is zero otherwise where it is missing; by
-            default unless the file names a learned shape.
+            False where keypoints may lack ``xyz``, which is zero then; by default where the file
+            names a learned shape.
 
         Raises
         ------
@@ -215,11 +206,9 @@ class Observation(ObservedImage):
 
         ``needs_xyz`` is that of `load`.
         """
-        if error := other_kind(Path(), OBSERVATION, kind_of(data)):
-            raise DataError(error.what, fix=error.fix)
+        refuse_other(OBSERVATION, kind_of(data))
         read, fields = _read_fields(data, folder)
-        if needs_xyz is None:
-            needs_xyz = read.shape is None
+        needs_xyz = read.shape is None if needs_xyz is None else needs_xyz
         images = []
         for number, each in enumerate(fields):
             with nullcontext() if each is read else within(f"views[{number}]"):
@@ -255,13 +244,13 @@ class Observation(ObservedImage):
             "model": self.model and written_path(self.model, folder=folder),
             "shape": self.shape and written_path(self.shape, folder=folder),
             "object": self.object_name,
-            "size": self.size and msgspec.to_builtins(self.size, enc_hook=plain),
+            "size": self.size and msgspec.to_builtins(self.size),
             "symmetry": self.symmetry and self.symmetry.to_dict(),
             "init": self.init and self.init.to_dict(),
-            "unfinished": dict(self.unfinished or {}) or None,
-            "fit": dict(self.fit_options) or None,
+            "unfinished": self.unfinished,
+            "fit": self.fit_options,
         }
-        data |= {name: value for name, value in further.items() if value is not None}
+        data |= {name: value for name, value in further.items() if value}
         return data if self.up_axis == "y" else data | {"up_axis": self.up_axis}
 
     def save(self, path: str | Path) -> None:
@@ -270,29 +259,16 @@ class Observation(ObservedImage):
         write_json(path, self.to_dict(folder=path.parent))
 
 
-def with_lens(camera: Camera, focal: float | None = None, *, fov: float | None = None) -> Camera:
-    """The camera with a known focal length [px] or horizontal field of view [degrees], if given.
-
-    Raises InputError if both are given, or one is not possible.
-    """
-    if fov is None:
-        return camera if focal is None else camera.with_focal(focal)
-    if focal is not None:
-        raise InputError("given beside the focal length", where="fov", fix="give one of the two")
-    return camera.with_focal(Camera.from_fov(camera.width, camera.height, fov_x=fov).fx)
-
-
 @dataclass(frozen=True)
 class ObservationChanges:
     """A camera in the place of those of observations."""
 
     camera: Path | None = None  # file of the calibrated camera, see `read_camera`
     focal: Positive | None = None  # focal length of all cameras [px]
-    fov: Positive | None = None  # or their horizontal field of view [degrees]
 
     def read_camera(self, size: tuple[int, int] | None) -> Camera | None:
         """The camera, if there is one; ``size`` is the photo's, for a file of a matrix alone."""
-        return None if self.camera is None else _read_camera(self.camera, size=size)
+        return None if self.camera is None else read_camera(self.camera, size=size)
 
     def applied_to(self, observation: Observation, where: str | None = None) -> Observation:
         """The observation with all of this in the place of its own; ``where`` is its file.
@@ -305,13 +281,14 @@ class ObservationChanges:
             what = f"the file has {len(observation.views)} views, the camera is for one"
             raise InputError(what, where=where, fix="write cameras into its `views`")
         changed = observation if camera is None else replace(observation, camera=camera)
-        if self.focal is None and self.fov is None:
+        focal = self.focal
+        if focal is None:
             return changed
         # Options of the fit about the focal length are left out.
         kept = {key: given for key, given in changed.fit_options.items() if "focal" not in key}
-        lens = partial(with_lens, focal=self.focal, fov=self.fov)
-        views = tuple(replace(view, camera=lens(view.camera)) for view in changed.others)
-        return replace(changed, camera=lens(changed.camera), others=views, fit_options=kept)
+        others = [replace(view, camera=view.camera.with_focal(focal)) for view in changed.others]
+        camera = changed.camera.with_focal(focal)
+        return replace(changed, camera=camera, others=tuple(others), fit_options=kept)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -330,19 +307,15 @@ class DetectorOptions:
     """Leave out a detector's keypoints that the model does not have."""
 
 
-def read_camera(
-    path: str | os.PathLike[str],
-    *,
-    size: tuple[int, int] | None = None,
-) -> Camera:
+@once_per_file(64)  # which many observations may name
+def read_camera(path: str | os.PathLike[str], *, size: tuple[int, int] | None = None) -> Camera:
     """Read a camera from a file.
 
     Parameters
     ----------
     path : path-like
-        A calibration matrix K: text of 3 x 3 numbers, or JSON, bare or as
-        ``matrix`` (also ``K``, ``camera_matrix``), by rows; or a camera in the form of
-        `Camera.from_dict` as JSON.
+        A camera in the form of `Camera.from_dict` as JSON, a matrix possibly without width and
+        height; otherwise text of 3 x 3 numbers, a calibration matrix by rows.
     size : tuple of 2 int, optional
         Width and height of the photo [px], for a matrix whose file lacks them.
 
@@ -352,45 +325,19 @@ def read_camera(
         If the file cannot be read, holds no camera, or lacks the image's size.
     """
     path = as_path(path)
-    form = _read_form(path)
-    if "matrix" in form and not {"width", "height"} <= set(form):
+    if path.suffix.lower() == ".json":
+        form = read_json(path, CAMERA)
+    else:
+        refuse_other_file(path, CAMERA)
+        try:
+            numbers = np.array(read_text(path).replace(",", " ").split(), dtype=float)
+            form = {"matrix": numbers.reshape(3, 3)}
+        except ValueError:
+            raise DataError("not a calibration matrix", where=str(path), fix=CAMERA_FIX) from None
+    if isinstance(form, dict) and "matrix" in form and not {"width", "height"} <= set(form):
         if size is None:
             what = "the file has a matrix alone, and the size of the image is unknown"
             raise DataError(what, where=str(path), fix="give the photo, or width and height in it")
         form |= {"width": size[0], "height": size[1]}
     with in_file(path):
         return Camera.from_dict(form)
-
-
-def _read_form(path: Path) -> dict[str, Any]:
-    """The parsed form of a camera in a file."""
-    try:
-        text = read_text(path)
-        if path.suffix.lower() != ".json" and text.lstrip()[:1] not in ("{", "["):
-            return {"matrix": _square(text.replace(",", " ").replace(";", " ").split(), path)}
-        data = parse_json(text, str(path))
-    except DataError:
-        refuse_other_file(path, CAMERA)
-        raise
-    if error := other_kind(path, CAMERA, kind_of(data)):
-        raise error
-    form = {"matrix": data} if isinstance(data, list) else data
-    if not isinstance(form, dict):
-        what = f"camera: expected an object, got {type(data).__name__}"
-        raise DataError(what, where=str(path), fix=CAMERA_FIX)
-    name = next((name for name in MATRIX_NAMES if name in form), None)
-    if name is not None and "params" not in form:
-        form["matrix"] = _square(form.pop(name), path)
-    return form
-
-
-def _square(values: Any, path: Path) -> Any:
-    """A matrix (3, 3) of nine numbers by rows, however they are nested."""
-    try:
-        return np.asarray(values, dtype=float).reshape(3, 3)
-    except (TypeError, ValueError, OverflowError):
-        raise DataError("not a calibration matrix", where=str(path), fix=CAMERA_FIX) from None
-
-
-_read_camera = once_per_file(64)(read_camera)
-"""One file for many observations."""

@@ -28,8 +28,7 @@ from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_onl
 from cadalign.datasets import AnnotatedModel, load_mesh
 from cadalign.errors import CadalignError, InputError, quote
 from cadalign.geometry.alignment import extent
-from cadalign.io.files import as_path, open_input
-from cadalign.io.sealed import Seal
+from cadalign.io.files import Seal, as_path, open_input
 
 logger = logging.getLogger("cadalign")
 ModelKey = tuple[str, str]

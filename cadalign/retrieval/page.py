@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from contextlib import suppress
 from html import escape
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from cadalign.errors import CadalignError, DataError
+from cadalign.errors import CadalignError
 from cadalign.geometry.camera import Camera
-from cadalign.io.documents import read_json
-from cadalign.io.files import made_folder, remove_earlier, write_json, write_text
+from cadalign.io.files import made_folder, refuse_input, write_json, write_text
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 from cadalign.render import Geometry, Scene, cast_geometry, draw_overlay
@@ -23,7 +20,6 @@ from cadalign.render.scene import LIGHT_GREY
 from cadalign.retrieval.match import Match
 from cadalign.web import asset, fill
 
-_MATCHES = "matches.json"
 logger = logging.getLogger("cadalign")
 
 
@@ -41,14 +37,14 @@ def write_retrieval(
 
     The library is described by text. Without a photo the overlays are drawn on grey. For a query,
     ``match_01.json`` and so on are the observation of each match's model, and
-    ``match_01_fit/fit.json`` its result, which `cadalign export` takes. Those of an earlier
-    retrieval in the folder are removed.
+    ``match_01_fit/fit.json`` its result, which `cadalign export` takes.
     """
     if image is None:
         image = np.full((camera.height, camera.width, 3), LIGHT_GREY, dtype=np.uint8)
-    _remove_earlier(folder)
-    # First, since it says which of the files are a retrieval's.
-    write_json(folder / _MATCHES, [match.to_dict() for match in matches])
+    for rank in range(1, len(matches) + 1):
+        for path in _files(folder, rank):
+            refuse_input(path)
+    write_json(folder / "matches.json", [match.to_dict() for match in matches])
     for rank, match in enumerate(matches, start=1):
         overlay, observation, fit = _files(folder, rank)
         write_image(overlay, draw_match(image, camera, match))
@@ -70,15 +66,6 @@ def write_retrieval(
     page = folder / "index.html"
     write_text(page, html)
     return page
-
-
-def _remove_earlier(folder: Path) -> None:
-    """Remove the files of an earlier retrieval's matches, but none with similar names."""
-    earlier: Any = None
-    with suppress(DataError):  # there is none
-        earlier = read_json(folder / _MATCHES)
-    count = len(earlier) if isinstance(earlier, list) else 0
-    remove_earlier(folder, (path for rank in range(1, count + 1) for path in _files(folder, rank)))
 
 
 def _files(folder: Path, rank: int) -> tuple[Path, Path, Path]:

@@ -20,8 +20,7 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import BOX_EDGES, bounds_corners
 from cadalign.io.documents import Count, Document, PathText, in_file
-from cadalign.io.files import as_path, printable, read_bytes, refuse_input, write_whole
-from cadalign.io.sealed import Seal
+from cadalign.io.files import Seal, as_path, printable, read_bytes, refuse_input, write_whole
 from cadalign.shapes.parts import BOX_ROWS
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from cadalign.render import cast_geometry
 
 pytestmark = pytest.mark.long
 
-PIECES = ("mask", "keypoint depths", "depth image", "up", "camera_height", "size")
+PIECES = ("mask", "keypoint depths", "up", "camera_height", "size")
 
 
 def observed(case: Case, *pieces: str) -> Observation:
@@ -41,12 +41,6 @@ def observed(case: Case, *pieces: str) -> Observation:
         depths[1] = np.nan
         fields["depths"] = depths
         given["depth_sigma"] = 0.005
-    if "depth image" in pieces:
-        assert instance.scene is not None
-        depth = cast_geometry(instance.scene, camera, truth).depth
-        counts = np.where(np.isfinite(depth), depth * 2000, 0).astype(np.uint16)
-        write_image(case.folder / "m.depth.png", counts)
-        given |= {"depth": case.folder / "m.depth.png", "depth_scale": 1 / 2000}
     if "up" in pieces:
         given |= {"up": truth.rotation @ [0.0, 1.0, 0.0], "up_sigma_deg": 2.0}
     if "camera_height" in pieces:
@@ -79,7 +73,7 @@ def stored(case: Case) -> dict[str, Any]:
 def test_evidence_is_kept_used_as_by_fit_and_named(
     case: Case, capsys: pytest.CaptureFixture[str], pieces: tuple[str, ...]
 ) -> None:
-    if "camera_height" in pieces or "depth image" in pieces:
+    if "camera_height" in pieces:
         pytest.importorskip("embreex")
     observed(case, *pieces).save(case.observation)
     before = stored(case)
@@ -94,8 +88,7 @@ def test_evidence_is_kept_used_as_by_fit_and_named(
 
     shown = agree_with_fit(session, case, capsys)
     words = {"up": "gravity", "size": "known width and height"}
-    words |= {"keypoint depths": "depth", "depth image": "depth"}
-    words |= {"camera_height": "camera height"}
+    words |= {"keypoint depths": "depth", "camera_height": "camera height"}
     for piece in pieces:
         assert words.get(piece, piece) in shown["also_used"]
     assert shown["facts"]

@@ -201,7 +201,8 @@ def test_photo_that_cannot_be_used(tmp_path: Path, capsys: pytest.CaptureFixture
     assert line.startswith(f"{photo}: not an image that can be read (")
     cv2.imwrite(str(photo), np.zeros((10, 20, 3), dtype=np.uint8))
     assert refusal_line(capsys, "fit", path) == (
-        f"{photo}: the image is 20 x 10, the camera 640 x 480; give the camera of this image"
+        f"{photo}: the image has 20 x 10 pixels, that of its camera 640 x 480; "
+        "give keypoints, photo and camera of one image"
     )
 
 

@@ -20,9 +20,9 @@ from cadalign import Alignment, Camera, ShapeModel
 from cadalign.datasets import load_mesh
 from cadalign.datasets.coco import decode_segmentation
 from cadalign.io.documents import read_json
+from cadalign.io.files import Seal
 from cadalign.io.images import read_grey, read_photo
 from cadalign.io.observation import read_camera
-from cadalign.io.sealed import Seal
 from cadalign.shapes.outputs import SEAL
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)

@@ -121,12 +121,12 @@ _OBSERVATION = {
         for k, (xyz, uv) in enumerate(zip(POINTS.tolist(), PIXELS.tolist(), strict=True))
     ],
 }
-_IMAGES_TOLD = {"mask": "a.png", "mask_sigma": 1.5, "depth": "b.png", "depth_scale": 0.001}
+_IMAGES_TOLD = {"mask": "a.png", "mask_sigma": 1.5}
 _NUMBERS_TOLD = {"depth_sigma": 0.01, "camera_height": 1.4, "camera_height_sigma": 0.02}
 _POSE_TOLD = {"up": [0, -1, 0], "up_sigma_deg": 1.0, "cam_from_rig": np.eye(4).tolist()}
 _EVIDENCE = {
     "views": [_OBSERVATION | _IMAGES_TOLD | _NUMBERS_TOLD | _POSE_TOLD],
-    "size": {"width": 1.0, "sigma": [0.1, 0.1, 0.1]},
+    "size": {"width": 1.0, "sigma": 0.1},
     "shape": "a.shape",
     "model": "a.obj",
 }

@@ -33,7 +33,7 @@ from cadalign.datasets.unpickling import load_pickle
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.io.evidence import ImageEvidence
-from cadalign.io.files import open_input, read_bytes, read_text
+from cadalign.io.files import read_bytes, read_text
 from cadalign.io.images import photo_size, read_grey, read_photo
 from cadalign.io.observation import Observation, read_camera
 
@@ -89,8 +89,8 @@ def test_pipes_and_devices_are_no_inputs(tmp_path: Path, reader: Reader) -> None
 
 @pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.ending)
 def test_files_without_end_are_no_inputs(tmp_path: Path, reader: Reader) -> None:
-    if reader.ending in (".cadalign", ".png"):  # mapped into memory, and read as far as needed
-        pytest.skip("not read whole")
+    if reader.ending == ".cadalign":
+        pytest.skip("mapped into memory")
     path = tmp_path / f"huge{reader.ending}"
     path.touch()
     os.truncate(path, BYTES)
@@ -108,8 +108,7 @@ def test_no_more_is_read_than_a_file_had(tmp_path: Path) -> None:
     path = tmp_path / "a"
     path.write_bytes(b"\xef\xbb\xbfone\r\ntwo\rthree\n")
     assert read_text(path) == "one\ntwo\nthree\n"
-    with open_input(path) as file:
-        assert file.size == len(file.read(2**60)) == len(read_bytes(path))
+    assert len(read_bytes(path)) == 18
     with pytest.raises(DataError) as caught:
         read_bytes(path, most=5)
     assert str(caught.value) == f"{path}: 18 bytes, more than the 5 that are read of such a file"

@@ -28,8 +28,6 @@ KEYPOINTS = [
 EVIDENCE: dict[str, Any] = {
     "mask": "masks/a.png",
     "mask_sigma": 1.5,
-    "depth": "a.depth.png",
-    "depth_scale": 0.001,
     "depth_sigma": 0.02,
     "up": [0.0, -1.0, 0.1],
     "up_sigma_deg": 2.0,
@@ -44,7 +42,7 @@ ONE: dict[str, Any] = {
     **EVIDENCE,
     "model": "chair.obj",
     "shape": "chair.shape",
-    "size": {"height": 0.9, "length": 0.5, "sigma": [0.01, 0.02, 0.03]},
+    "size": {"height": 0.9, "length": 0.5, "sigma": 0.02},
     "init": {
         "rotation": [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]],
         "translation": [0.1, 0.0, 2.5],
@@ -67,10 +65,10 @@ SEVERAL = json.loads(json.dumps(_SHARED))  # in which no two views share a list
 def test_evidence_of_one_image_arrives(tmp_path: Path) -> None:
     observation = Observation.load(write_json(tmp_path / "a.json", ONE))
     evidence = observation.evidence
-    assert (evidence.mask, evidence.depth) == (tmp_path / "masks/a.png", tmp_path / "a.depth.png")
-    assert (evidence.mask_sigma, evidence.camera_height) == (1.5, 1.4)
+    assert (evidence.mask, evidence.mask_sigma) == (tmp_path / "masks/a.png", 1.5)
+    assert (evidence.depth_sigma, evidence.camera_height) == (0.02, 1.4)
     assert observation.size is not None
-    assert (observation.size.height, observation.size.sigma) == (0.9, [0.01, 0.02, 0.03])
+    assert (observation.size.height, observation.size.sigma) == (0.9, 0.02)
     assert observation.shape == tmp_path / "chair.shape"
     assert observation.views == (observation,)
     assert not observation.is_plain
@@ -163,12 +161,7 @@ def test_views_need_no_xyz_where_a_shape_has_them(tmp_path: Path) -> None:
         ),
         (
             ONE | {"size": {"width": 1, "sigma": [0.1, 0.1]}},
-            "{path}: size.sigma: 2 numbers; give one, or one for each of 3 lengths",
-        ),
-        (
-            replaced(ONE, "keypoints.2.depth", 1.0),
-            "{path}: depth: a depth image and depths of keypoints are given; "
-            "leave out one of the two",
+            "{path}: size.sigma: [0.1, 0.1] is not a finite number",
         ),
         (
             replaced(ONE, "init.translation", ...),

@@ -242,20 +242,6 @@ def test_a_page_shows_the_matches_side_by_side(
 
 
 @pytest.mark.slow
-def test_fewer_matches_leave_nothing_of_more(case: Case, tmp_path: Path) -> None:
-    mine = ["match_03_fit", "match_04.json", "overlay_03_old.png", "overlay_04.png"]
-    for top in (3, 1):
-        arguments = [*case.arguments, "--top", str(top), "--out", str(tmp_path)]
-        assert main(["retrieve", *arguments]) == 0
-        for name in mine[1:]:
-            (tmp_path / name).touch()
-        (tmp_path / "match_03_fit").mkdir(exist_ok=True)
-        (tmp_path / "match_03_fit" / "notes.txt").touch()
-    own = ["match_01.json", "match_01_fit", "overlay_01.png"]
-    assert sorted(path.name for path in tmp_path.glob("*_*")) == sorted([*own, *mine])
-    assert [path.name for path in (tmp_path / "match_03_fit").iterdir()] == ["notes.txt"]
-
-
 def test_an_observation_is_not_retrieved_into_its_own_folder(
     case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -19,7 +19,7 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
 from cadalign.geometry.rotations import vector_from_rotation
-from cadalign.io.sealed import Seal
+from cadalign.io.files import Seal
 from cadalign.shapes.basis import find_reflection
 from cadalign.shapes.examples import Example
 from cadalign.shapes.model import ShapeModel
@@ -395,10 +395,10 @@ def test_files_that_are_none_are_refused(content: bytes, tmp_path: Path) -> None
     assert refusal_text(lambda: ShapeModel.open(path)) == f"{path}: not a shape file; {again}"
     Seal(SEAL.magic, 9, SEAL.noun, SEAL.fix).write(path, content[64:])
     assert refusal_text(lambda: ShapeModel.open(path)) == (
-        f"{path}: a shape file of version 9, but this cadalign reads version 1; {again}"
+        f"{path}: the shape file is of version 9, but this cadalign reads version 1; {again}"
     )
     path.write_bytes(content[:-1])
-    assert "is truncated" in refusal_text(lambda: ShapeModel.open(path))
+    assert "bytes, but only" in refusal_text(lambda: ShapeModel.open(path))
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from cadalign.arrays import FloatArray, as_floats
 from cadalign.datasets.correspondences import (
     Correspondences,
     CorrespondenceSet,
-    find_layout,
+    require_files,
     rigid_pose,
 )
 from cadalign.datasets.unpickling import load_pickle
@@ -76,8 +76,7 @@ class BlindPnP(CorrespondenceSet):
     def __init__(self, path: str | os.PathLike[str]) -> None:
         folder = as_path(path)
         fix = "give a split's folder, which holds matches.pkl, R.pkl and t.pkl"
-        nothing = "there are no correspondences"
-        required = find_layout(folder, [self.marks], nothing=nothing, fix=fix)
+        required = require_files(folder, self.marks, fix=fix)
         optional = (folder / f"{name}.pkl" for name in _OPTIONAL)
         files = [*required, *filter(Path.is_file, optional)]
         self._data = {file.stem: _load_samples(file) for file in files}

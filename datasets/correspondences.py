@@ -98,22 +98,16 @@ class CorrespondenceSet(RecordSet[Correspondences]):
             raise DataError(what, where=str(root), fix="remove one of them")
 
 
-def find_layout(
-    root: Path, layouts: Iterable[tuple[str, ...]], *, nothing: str, fix: str
-) -> tuple[Path, ...]:
-    """Find the files of the first of some layouts, names below a folder, that is whole.
-
-    Raises DataError if none is, which names what is missing of the one that has most of its files.
-    """
-    if not root.is_dir():
-        raise DataError("no such folder", where=str(root), fix=fix)
-    sets = [[root / name for name in layout] for layout in layouts]
-    found = [(files, [file for file in files if not file.is_file()]) for files in sets]
-    files, missing = min(found, key=lambda each: len(each[1]) / len(each[0]))
-    if not missing:
-        return tuple(files)
-    what = f"{', '.join(map(str, missing))} {'is' if len(missing) == 1 else 'are'} missing"
-    raise DataError(nothing if missing == files else what, where=str(root), fix=fix)
+def require_files(folder: Path, names: Iterable[str], *, fix: str) -> tuple[Path, ...]:
+    """Return the files of some names in a folder; raises DataError that names those missing."""
+    if not folder.is_dir():
+        raise DataError("no such folder", where=str(folder), fix=fix)
+    files = tuple(folder / name for name in names)
+    missing = [file.name for file in files if not file.is_file()]
+    if missing:
+        what = f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing"
+        raise DataError(what, where=str(folder), fix=fix)
+    return files
 
 
 def rigid_pose(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Alignment:

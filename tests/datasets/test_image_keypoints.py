@@ -347,13 +347,9 @@ def test_ids_pair_where_there_are_no_names_and_order_where_there_is_neither() ->
     assert by_order.scores is None
 
 
-def test_scores_leave_out_or_weigh() -> None:
+def test_low_scores_leave_keypoints_out() -> None:
     found = ImageKeypoints(np.array(POINTS), scores=np.array([0.25, 0.8, 1.0]))
     assert len(join_keypoints(found, MODEL, CAMERA, min_score=0.5).points_2d) == 2
-    weighed = join_keypoints(found, MODEL, CAMERA, sigma_from_scores=2.0)
-    assert weighed.sigma is not None
-    assert weighed.sigma.tolist() == [8.0, 2.5, 2.0]
-    assert weighed.scores is None
 
 
 def test_unknown_keypoints_can_be_left_out() -> None:
@@ -405,9 +401,6 @@ def test_model_keypoints_without_ids_give_none() -> None:
             "photo.json: 4 keypoints without names, but the model has 3; "
             "give names, or as many keypoints as the model has, in its order",
         ),
-        ({}, {"sigma_from_scores": 1.0}, "photo.json: there are no scores to weigh by"),
-        ({}, {"sigma_from_scores": 0.0}, "sigma_from_scores: 0.0 is not positive"),
-        ({}, {"sigma_from_scores": np.nan}, "sigma_from_scores: nan is not positive"),
     ],
 )
 def test_keypoints_that_cannot_be_paired_are_refused(

@@ -1,4 +1,4 @@
-"""PASCAL3D+, ObjectNet3D, and detections in its photos: viewpoints, anchors, CAD models."""
+"""PASCAL3D+: viewpoints, anchors, CAD models."""
 
 from __future__ import annotations
 
@@ -103,14 +103,11 @@ def test_visible_anchors_belong_to_the_models(root):
     assert chair.model.model_id == "chair/02"
 
 
-def test_objectnet3d_has_the_same_layout_without_folders_of_categories(tmp_path):
-    write_cad(tmp_path / "CAD" / "mat" / "chair.mat")
-    write_record(tmp_path / "Annotations" / "n01.mat", annotated(), annotated(**{"class": "mug"}))
-    (photo,) = Pascal3D(tmp_path)
+def test_without_the_photo_its_size_is_the_annotations(root):
+    (root / "Images" / "chair_pascal" / "2008_000001.jpg").unlink()
+    (photo,) = Pascal3D(root)
     assert photo.image is None
     assert (photo.camera.width, photo.camera.height) == (200, 160)
-    assert [each.category for each in photo.objects] == ["chair", "mug"]
-    assert photo.objects[1].model is None
 
 
 def test_objects_without_a_continuous_viewpoint_have_no_pose(root):

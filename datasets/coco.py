@@ -46,9 +46,7 @@ class _Object(ForeignDocument):
     """One object of any form."""
 
     keypoints: list[Any] | _ByAxis | None = None
-    keypoint_scores: list[float | None] | None = None
     score: Any = None
-    bbox_score: Any = None
     confidence: Any = None
     image_id: _Id | None = None
     category_id: _Id | None = None
@@ -179,7 +177,7 @@ def _image_keypoints(entry: _Object, where: str, *, names: list[str] | None) -> 
         raise DataError(what, where=place)
     if third is not None and len(third) != len(points):
         raise DataError(f"{len(third)} scores of {len(points)} keypoints", where=place)
-    given = (_number(entry, name, where) for name in ("score", "bbox_score", "confidence"))
+    given = (_number(entry, name, where) for name in ("score", "confidence"))
     return ImageKeypoints(
         points_2d=points,
         scores=None if third is None else np.array(third, dtype=float),
@@ -200,24 +198,12 @@ def _points(entry: _Object, where: str) -> tuple[FloatArray, Any]:
         if len(value.x) != len(value.y):
             raise DataError(f"{len(value.y)} values, but x has {len(value.x)}", where=f"{where}.y")
         return np.column_stack([_floats(value.x), _floats(value.y)]), value.visible
-    if not value:
-        raise DataError("expected a list of numbers", where=where)
-    if any(isinstance(each, list) for each in value):
-        rows = convert(value, list[list[float | None] | None], where=where)
-        width = max(len(row or ()) for row in rows)
-        if width not in (2, 3) or any(len(row) != width for row in rows if row is not None):
-            raise DataError(f"{quote(rows)} are not x, y and score of each keypoint", where=where)
-        numbers = _floats([row or [None] * width for row in rows])
-    else:
-        flat = _floats(convert(value, list[float | None], where=where))
-        if len(flat) % 3:
-            what = f"{len(flat)} numbers are not x, y and visibility of keypoints"
-            raise DataError(what, where=where)
-        numbers = np.reshape(flat, (-1, 3))
-    third: Any = entry.keypoint_scores
-    if third is None and numbers.shape[1] == 3:
-        third = numbers[:, 2]
-    return np.ascontiguousarray(numbers[:, :2]), third
+    flat = _floats(convert(value, list[float | None], where=where))
+    if not len(flat) or len(flat) % 3:
+        what = f"{len(flat)} numbers are not x, y and visibility or score of keypoints"
+        raise DataError(what, where=where, fix=_FIX)
+    numbers = np.reshape(flat, (-1, 3))
+    return np.ascontiguousarray(numbers[:, :2]), numbers[:, 2]
 
 
 def _floats(values: Any) -> FloatArray:

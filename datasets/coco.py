@@ -8,10 +8,9 @@ from __future__ import annotations
 import logging
 import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -29,8 +28,6 @@ logger = logging.getLogger("cadalign")
 
 _FIX = "is it COCO's keypoint JSON, or a detector's? see cadalign's page on keypoints of detectors"
 _Id = int | str
-_Reader = tuple[str, Callable[[], ImageKeypoints | None]]
-"""The place of an object in its file, and what reads it."""
 _LARGEST = 2**31  # width or height of an image
 
 
@@ -101,13 +98,15 @@ def read_coco_keypoints(
 
     For ``problems`` see `cadalign.datasets.read_image_keypoints`.
     """
-    data = read_json(path, DETECTOR)
+    data, objects = read_json(path, DETECTOR), []
     with in_file(path):
-        readers = list(_readers(data))
-    objects = []
-    for where, read in readers:
+        file = _file_of(data)
+        images, categories = _by_id(file.images, "images"), _by_id(file.categories, "categories")
+    for row, entry in enumerate(file.annotations):
+        where = f"[{row}]" if isinstance(data, list) else f"annotations[{row}]"
         with leaving_out(f"{path}: {where}", problems), in_file(path):
-            if (found := read()) is not None:
+            found = _annotated(entry, where, images, categories)
+            if found is not None:
                 objects.append(replace(found, source=f"{path}: {where}"))
     if _are_flags([found.scores for found in objects if found.scores is not None]):
         objects = [_with_flags_read(found) for found in objects]
@@ -117,25 +116,16 @@ def read_coco_keypoints(
     return objects
 
 
-def _readers(data: Any) -> Iterable[_Reader]:
+def _file_of(data: Any) -> _File:
+    """The file's parts; results of detectors are annotations without images and categories."""
     if isinstance(data, list):
-        return ((f"[{row}]", partial(_bare, each, f"[{row}]")) for row, each in enumerate(data))
+        return _File(data)
     if not isinstance(data, dict):
         raise DataError(f"{quote(data)} is not an object or a list", fix=_FIX)
     if "annotations" not in data:
         raise DataError("missing", where="annotations", fix=_FIX)
-    return _from_annotations(convert(data, _File))
-
-
-def _bare(data: Any, where: str) -> ImageKeypoints:
-    return _image_keypoints(convert(data, _Object, where), where, names=None)
-
-
-def _from_annotations(data: _File) -> Iterator[_Reader]:
-    images, categories = _by_id(data.images, "images"), _by_id(data.categories, "categories")
-    for row, entry in enumerate(data.annotations):
-        where = f"annotations[{row}]"
-        yield where, partial(_annotated, entry, where, images, categories)
+    found: _File = convert(data, _File)
+    return found
 
 
 def _by_id(entries: Sequence[_Entry] | None, where: str) -> dict[_Id, _Entry]:

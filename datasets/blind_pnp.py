@@ -21,12 +21,11 @@ from cadalign.datasets.correspondences import (
 )
 from cadalign.datasets.unpickling import load_pickle
 from cadalign.errors import DataError, InputError
-from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.io.files import as_path
 
 # The virtual camera's focal length [px] where the files don't say one.
-_DEFAULT_FOCAL = 800.0
+_FOCAL = np.array([800.0])
 _LARGEST_IMAGE = 2**30
 # Pairs whose median distance under the true pose [normalised] is larger don't belong together.
 _PAIRED = 0.05
@@ -90,12 +89,15 @@ class BlindPnP(CorrespondenceSet):
 
     def read(self, position: int) -> Correspondences:
         """Read the sample of a number from 0."""
-        rotation = self._array("R", position, shape=(3, 3))
-        pose = rigid_pose(rotation, self._flat("t", position))
+        pose = rigid_pose(self._array("R", position, (3, 3)), self._numbers("t", position))
         rays, points_3d = self._matched(position)
         if not len(rays):
             raise InputError("there are no correspondences", where="matches")
-        distance = _distance(rays, points_3d, pose)
+        focal_lengths = self._numbers("focal", position) if "focal" in self._data else _FOCAL
+        camera = _virtual_camera(focal_lengths, rays)
+        pixels = camera.pixels_from_normalized(rays)
+        gaps = camera.project_where_ahead(pose.apply(points_3d)) - pixels
+        distance = np.median(np.linalg.norm(gaps / (camera.fx, camera.fy), axis=1))
         if not distance <= _PAIRED:
             raise InputError(
                 f"under the true pose the {len(rays)} pairs of points are {distance:.2g} apart, "
@@ -103,17 +105,15 @@ class BlindPnP(CorrespondenceSet):
                 where="true pose",
                 fix="is inlier_matches.pkl, which says what belongs together, missing?",
             )
-        camera = _virtual_camera(self._focal_lengths(position), rays)
-        pixels = camera.pixels_from_normalized(rays)
         return Correspondences(self.names[position], points_3d, pixels, camera, pose)
 
     def _matched(self, position: int) -> tuple[FloatArray, FloatArray]:
         """Image points (n, 2) and scene points (n, 3) that belong together."""
-        rows = self._array("matches", position, shape=(None, 5))
+        rows = self._array("matches", position, (None, 5))
         rays, points_3d = rows[:, :2], rows[:, 2:]
         if "inlier_matches" not in self._data:
             return rays, points_3d
-        numbers = self._array("inlier_matches", position, shape=(None, 2))
+        numbers = self._array("inlier_matches", position, (None, 2))
         bad = numbers[(numbers < 0) | (numbers >= len(rows))]
         if len(bad):
             what = f"names row {bad[0]:g} of {len(rows)} in matches"
@@ -121,26 +121,15 @@ class BlindPnP(CorrespondenceSet):
         scene_rows, image_rows = numbers.astype(np.int64).T
         return rays[image_rows], points_3d[scene_rows]
 
-    def _focal_lengths(self, position: int) -> FloatArray:
-        """One focal length [px], or those along x and y."""
-        if "focal" not in self._data:
-            return np.array([_DEFAULT_FOCAL])
-        focal = self._flat("focal", position)
-        if len(focal) > 2 or (focal <= 0).any():
-            raise InputError(f"{focal.tolist()} are no focal lengths", where="focal")
-        return focal
-
-    def _array(self, name: str, position: int, *, shape: tuple[int | None, ...]) -> FloatArray:
+    def _array(self, name: str, position: int, shape: tuple[int | None, ...]) -> FloatArray:
         return as_floats(self._data[name][position], name=name, shape=shape)
 
-    def _flat(self, name: str, position: int) -> FloatArray:
-        """A sample's few numbers, whatever shape they were stored in; (k,) float, k >= 1."""
+    def _numbers(self, name: str, position: int) -> FloatArray:
+        """A sample's few numbers, whatever shape they were stored in; (k,) float."""
         try:
             values = np.ravel(self._data[name][position])
         except ValueError:
             raise InputError("not an array of numbers", where=name) from None
-        if not len(values):
-            raise InputError("is empty", where=name)
         return as_floats(values, name=name, shape=(None,))
 
 
@@ -151,18 +140,13 @@ def _load_samples(file: Path) -> Any:
     return value
 
 
-def _distance(rays: FloatArray, points_3d: FloatArray, pose: Alignment) -> float:
-    """The median distance of pairs under a pose, in normalised coordinates."""
-    points_cam = pose.apply(points_3d)
-    in_front = points_cam[:, 2] > 0
-    gaps = np.full(len(rays), np.inf)
-    projected = points_cam[in_front, :2] / points_cam[in_front, 2:]
-    gaps[in_front] = np.linalg.norm(projected - rays[in_front], axis=1)
-    return float(np.median(gaps))
-
-
 def _virtual_camera(focal_lengths: FloatArray, rays: FloatArray) -> Camera:
-    """A camera that looks along its principal point and just has all rays in its image."""
+    """A camera that looks along its principal point and just has all rays in its image.
+
+    It has one focal length [px], or one along x and one along y.
+    """
+    if len(focal_lengths) not in (1, 2) or (focal_lengths <= 0).any():
+        raise InputError(f"{focal_lengths.tolist()} are no focal lengths", where="focal")
     fx, fy = float(focal_lengths[0]), float(focal_lengths[-1])
     with np.errstate(over="ignore"):
         reach = np.ceil(np.abs(rays).max(axis=0) * (fx, fy))

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points
+from cadalign.arrays import BoolArray, FloatArray, as_points
 from cadalign.datasets.records import RecordSet
 from cadalign.errors import CadalignError, DataError
 from cadalign.geometry.alignment import Alignment, Box
@@ -36,17 +36,11 @@ class PhotoKeypoints:
     """(k, 2), pixels; integers are pixel centres."""
     names: tuple[str, ...]
     """(k,), what each one is called: the model's keypoint of the same name is the same point."""
-    scores: FloatArray | None = None
-    """(k,), how sure a detector is of each."""
 
     def __post_init__(self) -> None:
         points = as_points(self.points_2d, name="keypoints", dimension=2)
-        count = len(points)
-        if len(self.names) != count:
-            raise DataError(f"{count} keypoints, {len(self.names)} names", where="keypoints")
-        if self.scores is not None:
-            scores = as_floats(self.scores, name="scores", shape=(count,))
-            object.__setattr__(self, "scores", scores)
+        if len(self.names) != len(points):
+            raise DataError(f"{len(points)} keypoints, {len(self.names)} names", where="keypoints")
         object.__setattr__(self, "points_2d", points)
 
     def __len__(self) -> int:

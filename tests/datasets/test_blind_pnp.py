@@ -139,7 +139,7 @@ def test_the_virtual_image_just_holds_the_points(tmp_path):
         ("R", 2 * np.eye(3), "not a rotation matrix"),
         ("R", np.diag([1.0, 1.0, -1.0]), "not a rotation matrix"),
         ("t", np.zeros(2), "translation: shape"),
-        ("t", [], "t: is empty"),
+        ("t", [], "translation: shape"),
         ("focal", -5.0, r"focal: \[-5.0\] are no focal lengths"),
         ("inlier_matches", np.array([[0, 10]]), "names row 10 of 10 in matches"),
     ],

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -179,12 +179,6 @@ class ModelKeypoints:
         data: dict[str, Any] = {"format": "cadalign model keypoints", "version": 1}
         if self.model is not None:
             data["model"] = written_path(self.model.resolve(), folder=folder)
-        data["keypoints"] = [_written(keypoint) for keypoint in self.keypoints]
+        written = map(asdict, self.keypoints)
+        data["keypoints"] = [{k: v for k, v in each.items() if v is not None} for each in written]
         return data
-
-
-def _written(keypoint: ModelKeypoint) -> dict[str, Any]:
-    data: dict[str, Any] = {"name": keypoint.name, "xyz": list(keypoint.xyz)}
-    if keypoint.semantic_id is not None:
-        data["semantic_id"] = keypoint.semantic_id
-    return data

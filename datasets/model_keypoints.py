@@ -172,13 +172,10 @@ class ModelKeypoints:
         DataError
             If it cannot be written.
         """
-        write_json(as_path(path), self.to_dict(folder=as_path(path).parent))
-
-    def to_dict(self, *, folder: Path | None) -> dict[str, Any]:
-        """Content of the file, the model's path relative to ``folder``."""
+        path = as_path(path)
         data: dict[str, Any] = {"format": "cadalign model keypoints", "version": 1}
         if self.model is not None:
-            data["model"] = written_path(self.model.resolve(), folder=folder)
+            data["model"] = written_path(self.model.resolve(), folder=path.parent)
         written = map(asdict, self.keypoints)
         data["keypoints"] = [{k: v for k, v in each.items() if v is not None} for each in written]
-        return data
+        write_json(path, data)

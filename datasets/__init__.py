@@ -5,9 +5,8 @@ from typing import TYPE_CHECKING
 from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
-    from cadalign.datasets.blind_pnp import BlindPnP
     from cadalign.datasets.colmap import Colmap
-    from cadalign.datasets.correspondences import Correspondences, CorrespondenceSet
+    from cadalign.datasets.correspondences import BlindPnP, Correspondences, CorrespondenceSet
 
     # `open` is not in __all__: a star import must not hide the built-in function.
     from cadalign.datasets.formats import open_correspondences, open_photos

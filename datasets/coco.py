@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, is_number
-from cadalign.datasets.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
+from cadalign.datasets.image_keypoints import ImageKeypoints
 from cadalign.datasets.records import leaving_out
 from cadalign.errors import DataError, InputError, quote
 from cadalign.io.documents import Count, Finite, ForeignDocument, Text, convert, in_file, read_json
@@ -210,7 +210,7 @@ def _are_flags(scores: Sequence[FloatArray]) -> bool:
 def _with_flags_read(found: ImageKeypoints) -> ImageKeypoints:
     if found.scores is None:
         return found
-    return replace(found, scores=np.choose(found.scores.astype(int), list(VISIBILITY_SCORES)))
+    return replace(found, scores=found.scores / 2)  # 0 not labelled, 1 hidden, 2 visible
 
 
 def _number(entry: _Object, name: str, where: str) -> float | None:

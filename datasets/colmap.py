@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -92,7 +93,12 @@ class Colmap(CorrespondenceSet):
         twice = self._point_ids[1:][self._point_ids[1:] == self._point_ids[:-1]]
         if len(twice):
             raise DataError(f"point {twice[0]} occurs twice", where=str(self._point_file))
-        super().__init__(image_file, [image.name for image in self._images])
+        names = [image.name for image in self._images]
+        for name, next_name in pairwise(names):
+            if name == next_name:
+                what = f"the image {name!r} occurs twice"
+                raise DataError(what, where=str(image_file), fix="remove one of them")
+        super().__init__(image_file, names)
 
     def read(self, position: int) -> Correspondences:
         """Read the image of a number from 0."""

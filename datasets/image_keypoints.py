@@ -18,8 +18,6 @@ from cadalign.io.images import photo_size, require_one_size
 from cadalign.io.kinds import PHOTO_ENDINGS
 from cadalign.io.observation import Observation, ObservationChanges
 
-VISIBILITY_SCORES = (0.0, 0.5, 1.0)
-"""Scores by COCO's visibility flag: not labelled, labelled but hidden, visible."""
 _COCO_DIGITS = 12
 
 

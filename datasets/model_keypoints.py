@@ -6,7 +6,6 @@ The file is described in docs/formats/model_keypoints.md.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -117,21 +116,10 @@ class ModelKeypoints:
         return np.array([keypoint.xyz for keypoint in self.keypoints], dtype=float).reshape(-1, 3)
 
     @classmethod
-    def of_model(
-        cls, model: AnnotatedModel, *, names: Mapping[int, str] | None = None
-    ) -> ModelKeypoints:
-        """The keypoints of an annotated model.
-
-        Parameters
-        ----------
-        model : AnnotatedModel
-            A model of KeypointNet or of the sample dataset.
-        names : mapping of int to str, optional
-            By semantic id; "keypoint 3" where there is none.
-        """
-        names, found = names or {}, model.keypoints
-        rows = zip(found.xyz.tolist(), found.ids.tolist(), strict=True)
-        keypoints = (ModelKeypoint(names.get(k, f"keypoint {k}"), tuple(xyz), k) for xyz, k in rows)
+    def of_model(cls, model: AnnotatedModel) -> ModelKeypoints:
+        """The keypoints of a model of KeypointNet, named by their ids, such as "keypoint 3"."""
+        rows = zip(model.keypoints.ids.tolist(), model.keypoints.xyz.tolist(), strict=True)
+        keypoints = (ModelKeypoint(f"keypoint {k}", tuple(xyz), k) for k, xyz in rows)
         return cls(tuple(keypoints), model.mesh_path)
 
     @classmethod

@@ -108,8 +108,10 @@ def read_coco_keypoints(
             found = _annotated(entry, where, images, categories)
             if found is not None:
                 objects.append(replace(found, source=f"{path}: {where}"))
-    if _are_flags([found.scores for found in objects if found.scores is not None]):
-        objects = [_with_flags_read(found) for found in objects]
+    third = np.concatenate([np.empty(0), *(o.scores for o in objects if o.scores is not None)])
+    if np.isin(third, (0, 1, 2)).all() and (third == 2).any():
+        # COCO's flags of a whole file: 0 not labelled, 1 labelled but hidden, 2 visible.
+        objects = [o if o.scores is None else replace(o, scores=o.scores / 2) for o in objects]
     if not objects:
         none = DataError("there are no keypoints", where=str(path))
         raise next(iter((problems or {}).values()), none)
@@ -199,18 +201,6 @@ def _points(entry: _Object, where: str) -> tuple[FloatArray, Any]:
 def _floats(values: Any) -> FloatArray:
     """Numbers as an array, NaN for None."""
     return np.array(values, dtype=float)
-
-
-def _are_flags(scores: Sequence[FloatArray]) -> bool:
-    """True where all the third numbers of a file are COCO's flags: 0, 1 or 2, and one is 2."""
-    values = np.concatenate([np.empty(0), *scores])
-    return bool(np.isin(values, (0, 1, 2)).all() and (values == 2).any())
-
-
-def _with_flags_read(found: ImageKeypoints) -> ImageKeypoints:
-    if found.scores is None:
-        return found
-    return replace(found, scores=found.scores / 2)  # 0 not labelled, 1 hidden, 2 visible
 
 
 def _number(entry: _Object, name: str, where: str) -> float | None:

@@ -38,7 +38,6 @@ from cadalign.io.documents import (
     ForeignDocument,
     Id,
     Point2,
-    Positive,
     Text,
     convert,
     in_file,
@@ -55,20 +54,11 @@ _FIRST_PIXEL = 1.0
 _VIEWPORT = 3000.0
 _VISIBLE = 1
 _CAD_FOLDERS = ("CAD", "cad")
-_IMAGES = (".jpg", ".JPEG")  # of PASCAL VOC and of ImageNet
+_IMAGES, _ENDINGS = "Images", (".jpg", ".JPEG")  # of PASCAL VOC and of ImageNet
 
 
 class _Record(ForeignDocument):
     objects: Any = None
-    size: dict[str, Positive] | None = None
-    imgsize: list[Positive] | None = None
-
-    @property
-    def written_size(self) -> tuple[int, int] | None:
-        """Width and height of the image, where they are known."""
-        size = self.size or dict(zip(("width", "height"), self.imgsize or (), strict=False))
-        known = {"width", "height"} <= size.keys()
-        return (int(size["width"]), int(size["height"])) if known else None
 
 
 class _Anchor(ForeignDocument):
@@ -134,11 +124,10 @@ class Pascal3D(PhotoDataset):
         with in_file(path):
             found: _Record = convert(read_structs(path, "record")[0], _Record)
         name = self.names[index]
-        image = first_existing(self.root / "Images" / f"{name}{end}" for end in _IMAGES)
-        size = found.written_size if image is None else photo_size(image)
-        if size is None:
-            raise DataError("the image is missing, and its size is unknown", where=str(path))
-        camera = Camera.without_focal(*size)
+        image = first_existing(self.root / _IMAGES / f"{name}{end}" for end in _ENDINGS)
+        if image is None:
+            raise DataError(f"its image is not in {_IMAGES}", where=str(path))
+        camera = Camera.without_focal(*photo_size(image))
 
         def read_object(number: int, each: Any) -> PhotoObject | None:
             shown: _Object = convert(each, _Object)

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     )
     from cadalign.datasets.keypoint_files import read_image_keypoints
     from cadalign.datasets.keypointnet import AnnotatedModel, KeypointNet
-    from cadalign.datasets.keypoints import Circle, Keypoints, RotationalSymmetry, Symmetries
     from cadalign.datasets.model_keypoints import ModelKeypoint, ModelKeypoints
     from cadalign.datasets.pascal3d import Pascal3D
     from cadalign.datasets.photo import (
@@ -40,13 +39,11 @@ __all__ = [
     "AnnotatedModel",
     "BlindPnP",
     "CadModel",
-    "Circle",
     "Colmap",
     "CorrespondenceSet",
     "Correspondences",
     "ImageKeypoints",
     "KeypointNet",
-    "Keypoints",
     "ModelKeypoint",
     "ModelKeypoints",
     "Pascal3D",
@@ -55,11 +52,9 @@ __all__ = [
     "PhotoKeypoints",
     "PhotoObject",
     "Pix3D",
-    "RotationalSymmetry",
     "Scan2CAD",
     "ShapeNet",
     "ShapeNetModel",
-    "Symmetries",
     "Truth",
     "check_solid",
     "choose_object",

@@ -91,9 +91,7 @@ class _File(ForeignDocument):
     categories: list[_Category] | None = None
 
 
-def read_coco_keypoints(
-    path: Path, problems: dict[str, DataError] | None = None
-) -> list[ImageKeypoints]:
+def read_coco_keypoints(path: Path, problems: dict[str, DataError] | None) -> list[ImageKeypoints]:
     """Read any of the forms, one entry for each object in each image.
 
     For ``problems`` see `cadalign.datasets.read_image_keypoints`.

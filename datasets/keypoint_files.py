@@ -50,17 +50,12 @@ def read_image_keypoints(
         If the file is missing, malformed or of no known kind; names file and field.
     """
     path = as_path(path)
-    read = read_csv_keypoints if path.suffix.lower() == ".csv" else read_coco_keypoints
+    read = _read_csv if path.suffix.lower() == ".csv" else read_coco_keypoints
     return read(path, problems)
 
 
-def read_csv_keypoints(
-    path: Path, problems: dict[str, DataError] | None = None
-) -> list[ImageKeypoints]:
-    """Read a CSV file, one object for each image.
-
-    For ``problems`` see `read_image_keypoints`.
-    """
+def _read_csv(path: Path, problems: dict[str, DataError] | None) -> list[ImageKeypoints]:
+    """Read a CSV file, one object for each image."""
     by_image: dict[str | None, list[tuple[str, list[str]]]] = {}
     try:
         lines = csv.reader(io.StringIO(read_text(path)), strict=True)

@@ -56,9 +56,6 @@ class Keypoints:
     def __len__(self) -> int:
         return len(self.xyz)
 
-    def __repr__(self) -> str:
-        return f"Keypoints(ids={self.ids.tolist()})"
-
     def on_mesh(self, mesh: Mesh) -> FloatArray:
         """The same points rebuilt from faces and barycentric coordinates, (k, 3) float.
 

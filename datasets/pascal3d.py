@@ -57,10 +57,6 @@ _CAD_FOLDERS = ("CAD", "cad")
 _IMAGES, _ENDINGS = "Images", (".jpg", ".JPEG")  # of PASCAL VOC and of ImageNet
 
 
-class _Record(ForeignDocument):
-    objects: Any = None
-
-
 class _Anchor(ForeignDocument):
     location: Point2 | None = None
     status: Finite | None = None
@@ -121,8 +117,7 @@ class Pascal3D(PhotoDataset):
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
         path = self._files[index]
-        with in_file(path):
-            found: _Record = convert(read_structs(path, "record")[0], _Record)
+        record = read_structs(path, "record")[0]
         name = self.names[index]
         image = first_existing(self.root / _IMAGES / f"{name}{end}" for end in _ENDINGS)
         if image is None:
@@ -134,7 +129,9 @@ class Pascal3D(PhotoDataset):
             is_of_folder = shown.category == path.parent.name.rpartition("_")[0]
             return _object(number, shown, camera, self.root) if is_of_folder else None
 
-        objects, problems = read_each(structs_of(found.objects), read_object, where=str(path))
+        objects, problems = read_each(
+            structs_of(record.get("objects")), read_object, where=str(path)
+        )
         return Photo(name, image, camera, objects, problems=problems)
 
 

@@ -11,13 +11,14 @@ from typing import TypeVar
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray, as_points
+from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points
 from cadalign.datasets.records import RecordSet
 from cadalign.errors import CadalignError, DataError
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry
+from cadalign.io.documents import in_file
 from cadalign.io.files import damaged, read_text
 from cadalign.io.images import ByteImage, open_photo, read_photo
 from cadalign.io.meshes.files import load_mesh
@@ -227,19 +228,13 @@ def read_matrix(path: Path, shape: tuple[int | None, int]) -> FloatArray:
 
     Raises DataError if it cannot be read, or is not a matrix of finite numbers of this shape.
     """
-    text = read_text(path)
-    rows = [line.split() for line in text.splitlines() if line.strip()]
+    rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
     try:
         matrix = np.array(rows, dtype=np.float64)
     except ValueError:
         raise damaged("not a table of numbers", path) from None
-    rows_wanted, columns = shape
-    if matrix.shape != (rows_wanted or len(matrix), columns):
-        wanted = f"{rows_wanted or 'some'} rows of {columns} numbers"
-        raise damaged(f"shape {matrix.shape}, expected {wanted}", path)
-    if not np.isfinite(matrix).all():
-        raise DataError("some of its numbers are not finite", where=str(path))
-    return matrix
+    with in_file(path):
+        return as_floats(matrix, name="matrix", shape=shape)
 
 
 def existing(path: Path) -> Path | None:

@@ -298,9 +298,8 @@ def _outline(v: SimpleNamespace, level: float) -> FloatArray:
     The level is -1 at the keel, 0 at the water line, 1 at the edge of the deck.
     """
     z = np.concatenate([np.linspace(0.5, -0.1, 13), np.linspace(-0.1, -0.5, 17)[1:]])
-    y = v.draft * min(level, 0) + (v.side + v.fore * np.clip((0.05 - z) / 0.55, 0, 1) ** 2) * max(
-        level, 0
-    )
+    sheer = np.clip((0.05 - z) / 0.55, 0, 1) ** 2
+    y = v.draft * min(level, 0) + (v.side + v.fore * sheer) * max(level, 0)
     flare = 0.35 + 0.65 * np.sqrt(min((level + 1) / 1.75, 1.0))
     entry, transom = v.entry * (1.125 - 0.125 * level), v.transom * (0.725 + 0.275 * level)
     narrow = (1 - np.clip((z + 0.5) / entry, 0, 1)) ** v.full

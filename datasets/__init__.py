@@ -5,9 +5,8 @@ from typing import TYPE_CHECKING
 from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
-    from cadalign.datasets.blind_pnp import BlindPnP
     from cadalign.datasets.colmap import Colmap
-    from cadalign.datasets.correspondences import Correspondences, CorrespondenceSet
+    from cadalign.datasets.correspondences import BlindPnP, Correspondences, CorrespondenceSet
 
     # `open` is not in __all__: a star import must not hide the built-in function.
     from cadalign.datasets.formats import open_correspondences, open_photos
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
     )
     from cadalign.datasets.keypoint_files import read_image_keypoints
     from cadalign.datasets.keypointnet import AnnotatedModel, KeypointNet
-    from cadalign.datasets.keypoints import Circle, Keypoints, RotationalSymmetry, Symmetries
     from cadalign.datasets.model_keypoints import ModelKeypoint, ModelKeypoints
     from cadalign.datasets.pascal3d import Pascal3D
     from cadalign.datasets.photo import (
@@ -41,13 +39,11 @@ __all__ = [
     "AnnotatedModel",
     "BlindPnP",
     "CadModel",
-    "Circle",
     "Colmap",
     "CorrespondenceSet",
     "Correspondences",
     "ImageKeypoints",
     "KeypointNet",
-    "Keypoints",
     "ModelKeypoint",
     "ModelKeypoints",
     "Pascal3D",
@@ -56,11 +52,9 @@ __all__ = [
     "PhotoKeypoints",
     "PhotoObject",
     "Pix3D",
-    "RotationalSymmetry",
     "Scan2CAD",
     "ShapeNet",
     "ShapeNetModel",
-    "Symmetries",
     "Truth",
     "check_solid",
     "choose_object",

@@ -8,10 +8,9 @@ from __future__ import annotations
 import logging
 import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, is_number
-from cadalign.datasets.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
+from cadalign.datasets.image_keypoints import ImageKeypoints
 from cadalign.datasets.records import leaving_out
 from cadalign.errors import DataError, InputError, quote
 from cadalign.io.documents import Count, Finite, ForeignDocument, Text, convert, in_file, read_json
@@ -29,8 +28,6 @@ logger = logging.getLogger("cadalign")
 
 _FIX = "is it COCO's keypoint JSON, or a detector's? see cadalign's page on keypoints of detectors"
 _Id = int | str
-_Reader = tuple[str, Callable[[], ImageKeypoints | None]]
-"""The place of an object in its file, and what reads it."""
 _LARGEST = 2**31  # width or height of an image
 
 
@@ -46,9 +43,7 @@ class _Object(ForeignDocument):
     """One object of any form."""
 
     keypoints: list[Any] | _ByAxis | None = None
-    keypoint_scores: list[float | None] | None = None
     score: Any = None
-    bbox_score: Any = None
     confidence: Any = None
     image_id: _Id | None = None
     category_id: _Id | None = None
@@ -96,48 +91,41 @@ class _File(ForeignDocument):
     categories: list[_Category] | None = None
 
 
-def read_coco_keypoints(
-    path: Path, problems: dict[str, DataError] | None = None
-) -> list[ImageKeypoints]:
+def read_coco_keypoints(path: Path, problems: dict[str, DataError] | None) -> list[ImageKeypoints]:
     """Read any of the forms, one entry for each object in each image.
 
     For ``problems`` see `cadalign.datasets.read_image_keypoints`.
     """
-    data = read_json(path, DETECTOR)
+    data, objects = read_json(path, DETECTOR), []
     with in_file(path):
-        readers = list(_readers(data))
-    objects = []
-    for where, read in readers:
+        file = _file_of(data)
+        images, categories = _by_id(file.images, "images"), _by_id(file.categories, "categories")
+    for row, entry in enumerate(file.annotations):
+        where = f"[{row}]" if isinstance(data, list) else f"annotations[{row}]"
         with leaving_out(f"{path}: {where}", problems), in_file(path):
-            if (found := read()) is not None:
+            found = _annotated(entry, where, images, categories)
+            if found is not None:
                 objects.append(replace(found, source=f"{path}: {where}"))
-    if _are_flags([found.scores for found in objects if found.scores is not None]):
-        objects = [_with_flags_read(found) for found in objects]
+    third = np.concatenate([np.empty(0), *(o.scores for o in objects if o.scores is not None)])
+    if np.isin(third, (0, 1, 2)).all() and (third == 2).any():
+        # COCO's flags of a whole file: 0 not labelled, 1 labelled but hidden, 2 visible.
+        objects = [o if o.scores is None else replace(o, scores=o.scores / 2) for o in objects]
     if not objects:
         none = DataError("there are no keypoints", where=str(path))
         raise next(iter((problems or {}).values()), none)
     return objects
 
 
-def _readers(data: Any) -> Iterable[_Reader]:
+def _file_of(data: Any) -> _File:
+    """The file's parts; results of detectors are annotations without images and categories."""
     if isinstance(data, list):
-        return ((f"[{row}]", partial(_bare, each, f"[{row}]")) for row, each in enumerate(data))
+        return _File(data)
     if not isinstance(data, dict):
         raise DataError(f"{quote(data)} is not an object or a list", fix=_FIX)
     if "annotations" not in data:
         raise DataError("missing", where="annotations", fix=_FIX)
-    return _from_annotations(convert(data, _File))
-
-
-def _bare(data: Any, where: str) -> ImageKeypoints:
-    return _image_keypoints(convert(data, _Object, where), where, names=None)
-
-
-def _from_annotations(data: _File) -> Iterator[_Reader]:
-    images, categories = _by_id(data.images, "images"), _by_id(data.categories, "categories")
-    for row, entry in enumerate(data.annotations):
-        where = f"annotations[{row}]"
-        yield where, partial(_annotated, entry, where, images, categories)
+    found: _File = convert(data, _File)
+    return found
 
 
 def _by_id(entries: Sequence[_Entry] | None, where: str) -> dict[_Id, _Entry]:
@@ -179,7 +167,7 @@ def _image_keypoints(entry: _Object, where: str, *, names: list[str] | None) -> 
         raise DataError(what, where=place)
     if third is not None and len(third) != len(points):
         raise DataError(f"{len(third)} scores of {len(points)} keypoints", where=place)
-    given = (_number(entry, name, where) for name in ("score", "bbox_score", "confidence"))
+    given = (_number(entry, name, where) for name in ("score", "confidence"))
     return ImageKeypoints(
         points_2d=points,
         scores=None if third is None else np.array(third, dtype=float),
@@ -200,41 +188,17 @@ def _points(entry: _Object, where: str) -> tuple[FloatArray, Any]:
         if len(value.x) != len(value.y):
             raise DataError(f"{len(value.y)} values, but x has {len(value.x)}", where=f"{where}.y")
         return np.column_stack([_floats(value.x), _floats(value.y)]), value.visible
-    if not value:
-        raise DataError("expected a list of numbers", where=where)
-    if any(isinstance(each, list) for each in value):
-        rows = convert(value, list[list[float | None] | None], where=where)
-        width = max(len(row or ()) for row in rows)
-        if width not in (2, 3) or any(len(row) != width for row in rows if row is not None):
-            raise DataError(f"{quote(rows)} are not x, y and score of each keypoint", where=where)
-        numbers = _floats([row or [None] * width for row in rows])
-    else:
-        flat = _floats(convert(value, list[float | None], where=where))
-        if len(flat) % 3:
-            what = f"{len(flat)} numbers are not x, y and visibility of keypoints"
-            raise DataError(what, where=where)
-        numbers = np.reshape(flat, (-1, 3))
-    third: Any = entry.keypoint_scores
-    if third is None and numbers.shape[1] == 3:
-        third = numbers[:, 2]
-    return np.ascontiguousarray(numbers[:, :2]), third
+    flat = _floats(convert(value, list[float | None], where=where))
+    if not len(flat) or len(flat) % 3:
+        what = f"{len(flat)} numbers are not x, y and visibility or score of keypoints"
+        raise DataError(what, where=where, fix=_FIX)
+    numbers = np.reshape(flat, (-1, 3))
+    return np.ascontiguousarray(numbers[:, :2]), numbers[:, 2]
 
 
 def _floats(values: Any) -> FloatArray:
     """Numbers as an array, NaN for None."""
     return np.array(values, dtype=float)
-
-
-def _are_flags(scores: Sequence[FloatArray]) -> bool:
-    """True where all the third numbers of a file are COCO's flags: 0, 1 or 2, and one is 2."""
-    values = np.concatenate([np.empty(0), *scores])
-    return bool(np.isin(values, (0, 1, 2)).all() and (values == 2).any())
-
-
-def _with_flags_read(found: ImageKeypoints) -> ImageKeypoints:
-    if found.scores is None:
-        return found
-    return replace(found, scores=np.choose(found.scores.astype(int), list(VISIBILITY_SCORES)))
 
 
 def _number(entry: _Object, name: str, where: str) -> float | None:

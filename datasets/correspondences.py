@@ -1,20 +1,35 @@
-"""Points of a scene, seen in an image with a known pose: what all correspondence loaders yield."""
+"""Points of a scene, seen in an image with a known pose: what all correspondence loaders yield.
+
+And the NYU-RGBD and MegaDepth correspondences that blind PnP was trained on: Liu, Campbell, Li,
+Zhou, Song and Yang, "Learning 2D-3D Correspondences To Solve The Blind Perspective-n-Point
+Problem", 2020 (github.com/Liumouliu/Deep_blind_PnP).
+"""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Sequence
+import os
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_floats, as_points, read_only
 from cadalign.datasets.records import RecordSet
+from cadalign.datasets.unpickling import load_pickle
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.io.files import as_path
+
+# The virtual camera's focal length [px] where the files don't say one.
+_FOCAL = np.array([800.0])
+_LARGEST_IMAGE = 2**30
+# Pairs whose median distance under the true pose [normalised] is larger don't belong together.
+_PAIRED = 0.05
+_REQUIRED, _OPTIONAL = ("matches", "R", "t"), ("inlier_matches", "focal")
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,36 +99,22 @@ class CorrespondenceSet(RecordSet[Correspondences]):
     """The images of a file, each with its correspondences, read one by one.
 
     ``images["00.jpg"]`` and ``images[0]`` give one image's `Correspondences`, and ``images.names``
-    names them in order; see `cadalign.datasets.records.RecordSet`. Raises DataError if a name
-    occurs twice.
+    names them in order; see `cadalign.datasets.records.RecordSet`.
     """
 
     noun = "image"
 
-    def __init__(self, root: Path, names: Sequence[str]) -> None:
-        super().__init__(root, names)
-        twice = [name for name, count in Counter(self.names).items() if count > 1]
-        if twice:
-            what = f"the image {twice[0]!r} occurs twice"
-            raise DataError(what, where=str(root), fix="remove one of them")
 
-
-def find_layout(
-    root: Path, layouts: Iterable[tuple[str, ...]], *, nothing: str, fix: str
-) -> tuple[Path, ...]:
-    """Find the files of the first of some layouts, names below a folder, that is whole.
-
-    Raises DataError if none is, which names what is missing of the one that has most of its files.
-    """
-    if not root.is_dir():
-        raise DataError("no such folder", where=str(root), fix=fix)
-    sets = [[root / name for name in layout] for layout in layouts]
-    found = [(files, [file for file in files if not file.is_file()]) for files in sets]
-    files, missing = min(found, key=lambda each: len(each[1]) / len(each[0]))
-    if not missing:
-        return tuple(files)
-    what = f"{', '.join(map(str, missing))} {'is' if len(missing) == 1 else 'are'} missing"
-    raise DataError(nothing if missing == files else what, where=str(root), fix=fix)
+def require_files(folder: Path, names: Iterable[str], *, fix: str) -> tuple[Path, ...]:
+    """Return the files of some names in a folder; raises DataError that names those missing."""
+    if not folder.is_dir():
+        raise DataError("no such folder", where=str(folder), fix=fix)
+    files = tuple(folder / name for name in names)
+    missing = [file.name for file in files if not file.is_file()]
+    if missing:
+        what = f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing"
+        raise DataError(what, where=str(folder), fix=fix)
+    return files
 
 
 def rigid_pose(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Alignment:
@@ -124,3 +125,127 @@ def rigid_pose(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Alignment
     matrix = as_floats(rotation, name="rotation", shape=(3, 3))
     shift = as_floats(np.reshape(translation, -1), name="translation", shape=(3,))
     return Alignment(matrix, shift, np.ones(3))
+
+
+class BlindPnP(CorrespondenceSet):
+    """Samples of one split, such as ``nyu_train`` or ``megaDepth_valid``, named "0", "1", ...
+
+    A split is a folder of pickles, each pickle a list with an entry per sample, those in brackets
+    optional::
+
+        matches.pkl  R.pkl  t.pkl  [inlier_matches.pkl  focal.pkl]
+
+    ``matches`` (n, 5) has an image point and a scene point in each row. Where there is
+    ``inlier_matches`` (m, 2), its rows say which belong together: (row of the scene point, row of
+    the image point).
+
+    Image points are stored with the calibration taken out. They are given in the pixels of a
+    virtual camera of the sample's focal length, by default 800 px, whose image is just large
+    enough for them.
+
+    No pickle can run code; see `cadalign.datasets.unpickling`.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The split's folder.
+
+    Raises
+    ------
+    DataError
+        If files are missing, no pickles, ask for code, or differ in their number of samples.
+        Asking for a sample raises it if its arrays are malformed, or if its points don't belong
+        together under the true pose.
+
+    Examples
+    --------
+    >>> samples = BlindPnP("nyu_train")  # doctest: +SKIP
+    >>> samples[0].cam_from_world.translation  # doctest: +SKIP
+    """
+
+    kind = "blind PnP"
+    marks = tuple(f"{name}.pkl" for name in _REQUIRED)
+    signature = "matches.pkl, R.pkl and t.pkl"
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        folder = as_path(path)
+        fix = "give a split's folder, which holds matches.pkl, R.pkl and t.pkl"
+        required = require_files(folder, self.marks, fix=fix)
+        optional = (folder / f"{name}.pkl" for name in _OPTIONAL)
+        files = [*required, *filter(Path.is_file, optional)]
+        self._data = {file.stem: _load_samples(file) for file in files}
+        count = len(self._data["t"])
+        for file in files:
+            if len(self._data[file.stem]) != count:
+                what = f"holds {len(self._data[file.stem])} samples, t.pkl {count}"
+                fix = "the files must be of one split; get them again"
+                raise DataError(what, where=str(file), fix=fix)
+        super().__init__(folder, [str(position) for position in range(count)])
+
+    def read(self, position: int) -> Correspondences:
+        """Read the sample of a number from 0."""
+        pose = rigid_pose(self._array("R", position, (3, 3)), self._numbers("t", position))
+        rays, points_3d = self._matched(position)
+        if not len(rays):
+            raise InputError("there are no correspondences", where="matches")
+        focal_lengths = self._numbers("focal", position) if "focal" in self._data else _FOCAL
+        camera = _virtual_camera(focal_lengths, rays)
+        pixels = camera.pixels_from_normalized(rays)
+        gaps = camera.project_where_ahead(pose.apply(points_3d)) - pixels
+        distance = np.median(np.linalg.norm(gaps / (camera.fx, camera.fy), axis=1))
+        if not distance <= _PAIRED:
+            raise InputError(
+                f"under the true pose the {len(rays)} pairs of points are {distance:.2g} apart, "
+                "in normalised coordinates and the median",
+                where="true pose",
+                fix="is inlier_matches.pkl, which says what belongs together, missing?",
+            )
+        return Correspondences(self.names[position], points_3d, pixels, camera, pose)
+
+    def _matched(self, position: int) -> tuple[FloatArray, FloatArray]:
+        """Image points (n, 2) and scene points (n, 3) that belong together."""
+        rows = self._array("matches", position, (None, 5))
+        rays, points_3d = rows[:, :2], rows[:, 2:]
+        if "inlier_matches" not in self._data:
+            return rays, points_3d
+        numbers = self._array("inlier_matches", position, (None, 2))
+        bad = numbers[(numbers < 0) | (numbers >= len(rows))]
+        if len(bad):
+            what = f"names row {bad[0]:g} of {len(rows)} in matches"
+            raise InputError(what, where="inlier_matches")
+        scene_rows, image_rows = numbers.astype(np.int64).T
+        return rays[image_rows], points_3d[scene_rows]
+
+    def _array(self, name: str, position: int, shape: tuple[int | None, ...]) -> FloatArray:
+        return as_floats(self._data[name][position], name=name, shape=shape)
+
+    def _numbers(self, name: str, position: int) -> FloatArray:
+        """A sample's few numbers, whatever shape they were stored in; (k,) float."""
+        try:
+            values = np.ravel(self._data[name][position])
+        except ValueError:
+            raise InputError("not an array of numbers", where=name) from None
+        return as_floats(values, name=name, shape=(None,))
+
+
+def _load_samples(file: Path) -> Any:
+    value = load_pickle(file)
+    if not isinstance(value, list | tuple) and not np.ndim(value):
+        raise DataError(f"holds {type(value).__name__}, not a list of samples", where=str(file))
+    return value
+
+
+def _virtual_camera(focal_lengths: FloatArray, rays: FloatArray) -> Camera:
+    """A camera that looks along its principal point and just has all rays in its image.
+
+    It has one focal length [px], or one along x and one along y.
+    """
+    if len(focal_lengths) not in (1, 2) or (focal_lengths <= 0).any():
+        raise InputError(f"{focal_lengths.tolist()} are no focal lengths", where="focal")
+    fx, fy = float(focal_lengths[0]), float(focal_lengths[-1])
+    with np.errstate(over="ignore"):
+        reach = np.ceil(np.abs(rays).max(axis=0) * (fx, fy))
+    if not (reach < _LARGEST_IMAGE).all():
+        raise InputError(f"image points reach {reach.max():g} px from the centre", where="points")
+    width, height = (2 * int(length) + 1 for length in reach)
+    return Camera(width, height, fx, fy, (width - 1) / 2, (height - 1) / 2)

@@ -6,9 +6,8 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
-from cadalign.datasets.blind_pnp import BlindPnP
 from cadalign.datasets.colmap import Colmap
-from cadalign.datasets.correspondences import CorrespondenceSet
+from cadalign.datasets.correspondences import BlindPnP, CorrespondenceSet
 from cadalign.datasets.pascal3d import Pascal3D
 from cadalign.datasets.photo import PhotoDataset
 from cadalign.datasets.pix3d import Pix3D

@@ -18,8 +18,6 @@ from cadalign.io.images import photo_size, require_one_size
 from cadalign.io.kinds import PHOTO_ENDINGS
 from cadalign.io.observation import Observation, ObservationChanges
 
-VISIBILITY_SCORES = (0.0, 0.5, 1.0)
-"""Scores by COCO's visibility flag: not labelled, labelled but hidden, visible."""
 _COCO_DIGITS = 12
 
 
@@ -181,7 +179,6 @@ def join_keypoints(
     image: Path | None = None,
     min_score: float = 0.0,
     ignore_unknown: bool = False,
-    sigma_from_scores: float | None = None,
 ) -> Observation:
     """Pair an image's keypoints with the model's.
 
@@ -200,10 +197,6 @@ def join_keypoints(
         Keypoints of a lower score are left out; those of score 0 always are.
     ignore_unknown : bool
         Leave out keypoints that the model does not have, instead of refusing them.
-    sigma_from_scores : float, optional
-        Take the scores as weights: the standard deviation of a keypoint is this [px] over its
-        score. Without it they become the observation's ``scores``, which a robust fit draws
-        its samples by.
 
     Returns
     -------
@@ -213,8 +206,6 @@ def join_keypoints(
     ------
     DataError
         If a keypoint is unknown, two are the same, none is left, or the camera is of another size.
-    InputError
-        If ``sigma_from_scores`` is not positive.
     """
     if found.size not in (None, (camera.width, camera.height)):
         what = "the image has {} x {} pixels".format(*found.size)
@@ -232,8 +223,6 @@ def join_keypoints(
         what = f"the model has no keypoint {labels[unknown[0]]!r}"
         fix = f"it has {some_of(model.names)}; ignore_unknown leaves out what it has not"
         raise DataError(what, where=found.source, fix=fix)
-    if sigma_from_scores is not None and not 0 < sigma_from_scores < np.inf:
-        raise InputError(f"{sigma_from_scores} is not positive", where="sigma_from_scores")
     pairs = [(row, place) for row in kept if (place := places[row]) is not None]
     first: dict[int, int] = {}
     for row, place in pairs:
@@ -245,20 +234,14 @@ def join_keypoints(
         raise DataError(what, where=found.source, fix=f"the model has {some_of(model.names)}")
     rows, columns = [row for row, _ in pairs], [place for _, place in pairs]
     ids = [model.ids[place] for place in columns]
-    scores = None if found.scores is None else found.scores[rows]
-    sigma = None if found.sigma is None else found.sigma[rows]
-    if sigma_from_scores is not None:
-        if scores is None:
-            raise DataError("there are no scores to weigh by", where=found.source)
-        sigma = sigma_from_scores / scores
     return Observation(
         points_3d=model.xyz[columns],
         points_2d=found.points_2d[rows],
         camera=camera,
-        sigma=sigma,
+        sigma=None if found.sigma is None else found.sigma[rows],
         ids=None if None in ids else np.array(ids, dtype=np.int64),
         names=tuple(model.names[place] for place in columns),
-        scores=scores if sigma_from_scores is None else None,
+        scores=None if found.scores is None else found.scores[rows],
         image=image,
         model=model.model,
         not_found=tuple(np.flatnonzero(~found.measured).tolist()),

@@ -50,41 +50,32 @@ def read_image_keypoints(
         If the file is missing, malformed or of no known kind; names file and field.
     """
     path = as_path(path)
-    read = read_csv_keypoints if path.suffix.lower() == ".csv" else read_coco_keypoints
+    read = _read_csv if path.suffix.lower() == ".csv" else read_coco_keypoints
     return read(path, problems)
 
 
-def read_csv_keypoints(
-    path: Path, problems: dict[str, DataError] | None = None
-) -> list[ImageKeypoints]:
-    """Read a CSV file, one object for each image.
-
-    For ``problems`` see `read_image_keypoints`.
-    """
-    by_image: dict[str | None, list[dict[str, Any]]] = {}
-    bad: dict[str | None, DataError] | None = None if problems is None else {}
+def _read_csv(path: Path, problems: dict[str, DataError] | None) -> list[ImageKeypoints]:
+    """Read a CSV file, one object for each image."""
+    by_image: dict[str | None, list[tuple[str, list[str]]]] = {}
     try:
         lines = csv.reader(io.StringIO(read_text(path)), strict=True)
         header = _header(next(lines, []), f"{path}, line 1")
         for line in lines:
             cells = {name: cell.strip() for name, cell in zip(header, line, strict=False)}
-            image = cells.get("image") or None
-            with leaving_out(image, bad):
-                row = _row(header, line, cells, f"{path}, line {lines.line_num}")
-                if row is not None:
-                    by_image.setdefault(image, []).append(row)
+            if any(cells.values()):
+                row = f"{path}, line {lines.line_num}", line
+                by_image.setdefault(cells.get("image") or None, []).append(row)
     except csv.Error as error:
         raise DataError(f"cannot be read ({brief(error)})", where=str(path)) from None
     objects = []
     for image, rows in by_image.items():
-        if image not in (bad or {}):
-            with leaving_out(image, bad):
-                objects.append(_object(path, image, rows))
+        source = str(path) if image is None else f"{path}, {image}"
+        with leaving_out(source, problems):
+            read = [_row(header, line, where) for where, line in rows]
+            objects.append(_object(read, image, source))
     if not objects:
         none = DataError("there are no keypoints", where=str(path))
-        raise next(iter((bad or {}).values()), none)
-    if problems is not None and bad is not None:
-        problems |= {_place(path, image): error for image, error in bad.items()}
+        raise next(iter((problems or {}).values()), none)
     return objects
 
 
@@ -103,14 +94,11 @@ def _header(cells: list[str], where: str) -> list[str]:
     return names
 
 
-def _row(
-    header: list[str], line: list[str], cells: dict[str, str], where: str
-) -> dict[str, Any] | None:
-    """One line, its pixel NaN where it has none; None for an empty line."""
-    if not any(cells.values()):
-        return None
+def _row(header: list[str], line: list[str], where: str) -> dict[str, Any]:
+    """One line, its pixel NaN where it has none."""
     if len(line) != len(header):
         raise DataError(f"{len(line)} values for {len(header)} columns", where=where)
+    cells = {name: cell.strip() for name, cell in zip(header, line, strict=True)}
     is_missing = all(cells[name].lower() in _MISSING for name in ("u", "v"))
     if is_missing:
         cells = cells | {name: text for name, text in _OF_MISSING.items() if name in cells}
@@ -132,11 +120,7 @@ def _number(name: str, cell: str) -> float:
     raise InputError(f"{quote(cell)} is not a finite number", where=name)
 
 
-def _place(path: Path, image: str | None) -> str:
-    return str(path) if image is None else f"{path}, {image}"
-
-
-def _object(path: Path, image: str | None, rows: list[dict[str, Any]]) -> ImageKeypoints:
+def _object(rows: list[dict[str, Any]], image: str | None, source: str) -> ImageKeypoints:
     columns = {name: [row[name] for row in rows] for name in rows[0]}
     scores = columns.get("score")
     names, ids, sigma = (columns.get(name) for name in ("name", "semantic_id", "sigma"))
@@ -147,5 +131,5 @@ def _object(path: Path, image: str | None, rows: list[dict[str, Any]]) -> ImageK
         ids=None if ids is None or names is not None else tuple(map(int, ids)),
         sigma=None if sigma is None else np.array(sigma),
         image=image,
-        source=_place(path, image),
+        source=source,
     )

@@ -25,7 +25,8 @@ from cadalign.datasets.keypoints import (
 )
 from cadalign.datasets.records import read_list
 from cadalign.datasets.shapenet import (
-    MeshLocator,
+    MESH_FILES,
+    ShapeNet,
     name_of_synset,
     require_category,
     synset_of_name,
@@ -41,6 +42,8 @@ logger = logging.getLogger("cadalign")
 ModelKey = tuple[str, str]
 """A category's name and a model's id."""
 
+# Folders of meshes below the root: KeypointNet's own, as PLY, and those in ShapeNet's layout.
+_PLY_FOLDER, _SHAPENET_FOLDERS = "ShapeNetCore.v2.ply", ("models", "ShapeNetCore.v2")
 # KeypointNet's file of all categories, beside those of each.
 _ALL = "all"
 # Real annotations match their meshes to 1e-6 of a model with the diagonal 1.
@@ -163,7 +166,14 @@ class KeypointNet:
         self.root = as_path(root, "root")
         if not self.root.is_dir():
             raise DataError("no such folder", where=str(self.root), fix="give KeypointNet's root")
-        self._locator = MeshLocator(self.root, shapenet_root)
+        given = [] if shapenet_root is None else [ShapeNet(shapenet_root).root]
+        below = (self.root / name for name in _SHAPENET_FOLDERS)
+        # Where a model's mesh may be, as what stands before and after <synset>/<model id>.
+        self._mesh_places = [
+            *((folder, f"/{file}") for folder in given for file in MESH_FILES),
+            (self.root / _PLY_FOLDER, ".ply"),
+            *((folder, f"/{file}") for folder in below for file in MESH_FILES),
+        ]
         self._allowed: frozenset[ModelKey] | None = None
         self._with_mesh = False
         folder = self.root / "annotations"
@@ -305,9 +315,16 @@ class KeypointNet:
     def _has(self, category: str, model_id: str) -> bool:
         if self._allowed is not None and (category, model_id) not in self._allowed:
             return False
+        if not self._with_mesh:
+            return True
         found = self._load(category).get(model_id)
-        synset = found.class_id if isinstance(found, AnnotatedModel) else synset_of_name(category)
-        return not self._with_mesh or self._locator.path(synset, model_id) is not None
+        if isinstance(found, AnnotatedModel):
+            return found.mesh_path is not None
+        return self._mesh_path(synset_of_name(category), model_id) is not None
+
+    def _mesh_path(self, synset: str, model_id: str) -> Path | None:
+        paths = (f"{folder}/{synset}/{model_id}{end}" for folder, end in self._mesh_places)
+        return next((Path(path) for path in paths if os.path.isfile(path)), None)
 
     def _load(self, category: str) -> _Models:
         """All models of a category, whose file is read once, also for subsets."""
@@ -322,7 +339,7 @@ class KeypointNet:
                     model_id = f"{model_id}#{position}"
                     raise DataError("the model occurs twice", where=where, fix="remove one entry")
                 annotation = parse_entry(entry, where=where)
-                mesh_path = self._locator.path(*annotation[:2])
+                mesh_path = self._mesh_path(*annotation[:2])
                 models[model_id] = AnnotatedModel(category, *annotation, mesh_path)
             except DataError as error:
                 logger.warning("left out: %s", error)

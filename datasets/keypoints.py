@@ -56,9 +56,6 @@ class Keypoints:
     def __len__(self) -> int:
         return len(self.xyz)
 
-    def __repr__(self) -> str:
-        return f"Keypoints(ids={self.ids.tolist()})"
-
     def on_mesh(self, mesh: Mesh) -> FloatArray:
         """The same points rebuilt from faces and barycentric coordinates, (k, 3) float.
 
@@ -131,12 +128,7 @@ class _Circle(ForeignDocument):
 
 
 class _Reflection(ForeignDocument):
-    kp_indexes: list[Count]  # rows of the keypoints
-
-    def __post_init__(self) -> None:
-        if len(self.kp_indexes) != 2:
-            what = f"{len(self.kp_indexes)} keypoints do not mirror each other, two do"
-            raise InputError(what, where="kp_indexes")
+    kp_indexes: tuple[Count, Count]  # rows of the keypoints
 
 
 class _Rotation(ForeignDocument):
@@ -211,8 +203,7 @@ def _symmetries(read: _Symmetries) -> Symmetries:
             normal = _frozen(normal / np.linalg.norm(normal))
             circle = Circle(_frozen(found.center), found.radius, normal)
         rotations.append(RotationalSymmetry(keypoints=tuple(item.kp_indexes), circle=circle))
-    mirrored = ((item.kp_indexes[0], item.kp_indexes[1]) for item in read.reflection)
-    return Symmetries(tuple(mirrored), tuple(rotations))
+    return Symmetries(tuple(item.kp_indexes for item in read.reflection), tuple(rotations))
 
 
 def _frozen(values: Any) -> Any:

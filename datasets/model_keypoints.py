@@ -6,8 +6,7 @@ The file is described in docs/formats/files.md.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -117,21 +116,10 @@ class ModelKeypoints:
         return np.array([keypoint.xyz for keypoint in self.keypoints], dtype=float).reshape(-1, 3)
 
     @classmethod
-    def of_model(
-        cls, model: AnnotatedModel, *, names: Mapping[int, str] | None = None
-    ) -> ModelKeypoints:
-        """The keypoints of an annotated model.
-
-        Parameters
-        ----------
-        model : AnnotatedModel
-            A model of KeypointNet or of the sample dataset.
-        names : mapping of int to str, optional
-            By semantic id; "keypoint 3" where there is none.
-        """
-        names, found = names or {}, model.keypoints
-        rows = zip(found.xyz.tolist(), found.ids.tolist(), strict=True)
-        keypoints = (ModelKeypoint(names.get(k, f"keypoint {k}"), tuple(xyz), k) for xyz, k in rows)
+    def of_model(cls, model: AnnotatedModel) -> ModelKeypoints:
+        """The keypoints of a model of KeypointNet, named by their ids, such as "keypoint 3"."""
+        rows = zip(model.keypoints.ids.tolist(), model.keypoints.xyz.tolist(), strict=True)
+        keypoints = (ModelKeypoint(f"keypoint {k}", tuple(xyz), k) for k, xyz in rows)
         return cls(tuple(keypoints), model.mesh_path)
 
     @classmethod
@@ -172,19 +160,10 @@ class ModelKeypoints:
         DataError
             If it cannot be written.
         """
-        write_json(as_path(path), self.to_dict(folder=as_path(path).parent))
-
-    def to_dict(self, *, folder: Path | None) -> dict[str, Any]:
-        """Content of the file, the model's path relative to ``folder``."""
+        path = as_path(path)
         data: dict[str, Any] = {"format": "cadalign model keypoints", "version": 1}
         if self.model is not None:
-            data["model"] = written_path(self.model.resolve(), folder=folder)
-        data["keypoints"] = [_written(keypoint) for keypoint in self.keypoints]
-        return data
-
-
-def _written(keypoint: ModelKeypoint) -> dict[str, Any]:
-    data: dict[str, Any] = {"name": keypoint.name, "xyz": list(keypoint.xyz)}
-    if keypoint.semantic_id is not None:
-        data["semantic_id"] = keypoint.semantic_id
-    return data
+            data["model"] = written_path(self.model.resolve(), folder=path.parent)
+        written = map(asdict, self.keypoints)
+        data["keypoints"] = [{k: v for k, v in each.items() if v is not None} for each in written]
+        write_json(path, data)

@@ -1,7 +1,6 @@
-"""PASCAL3D+ and ObjectNet3D: objects in photos with viewpoints, and CAD models with anchors.
+"""PASCAL3D+: objects in photos with viewpoints, and CAD models with anchors.
 
-Xiang et al., "Beyond PASCAL: A Benchmark for 3D Object Detection in the Wild", WACV 2014;
-Xiang et al., "ObjectNet3D: A Large Scale Database for 3D Object Recognition", ECCV 2016.
+Xiang et al., "Beyond PASCAL: A Benchmark for 3D Object Detection in the Wild", WACV 2014.
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ from cadalign.datasets.photo import (
     PhotoKeypoints,
     PhotoObject,
     Truth,
-    existing,
     first_existing,
     read_each,
 )
@@ -40,7 +38,6 @@ from cadalign.io.documents import (
     ForeignDocument,
     Id,
     Point2,
-    Positive,
     Text,
     convert,
     in_file,
@@ -49,29 +46,15 @@ from cadalign.io.files import as_path, listed, read_bytes
 from cadalign.io.images import photo_size
 
 ANNOTATIONS = "Annotations"
+_FILES = f"{ANNOTATIONS}/*/*.mat"
 _MOST_VERTICES = 2**31
 # MATLAB counts pixels from 1.
 _FIRST_PIXEL = 1.0
 # The focal length, in pixels, that annotations without one were made with.
 _VIEWPORT = 3000.0
 _VISIBLE = 1
-_CAD_FOLDERS = ("CAD", "CAD/mat", "cad")
-_CAD = "[Cc][Aa][Dd]/**/*.mat"  # files in any of these
-_IMAGE_FOLDERS = ("Images", "images")
-_IMAGES = (".jpg", ".JPEG", ".jpeg", ".png")
-
-
-class _Record(ForeignDocument):
-    objects: Any = None
-    size: dict[str, Positive] | None = None
-    imgsize: list[Positive] | None = None
-
-    @property
-    def written_size(self) -> tuple[int, int] | None:
-        """Width and height of the image, where they are known."""
-        size = self.size or dict(zip(("width", "height"), self.imgsize or (), strict=False))
-        known = {"width", "height"} <= size.keys()
-        return (int(size["width"]), int(size["height"])) if known else None
+_CAD_FOLDERS = ("CAD", "cad")
+_IMAGES, _ENDINGS = "Images", (".jpg", ".JPEG")  # of PASCAL VOC and of ImageNet
 
 
 class _Anchor(ForeignDocument):
@@ -99,80 +82,65 @@ class _Object(ForeignDocument):
 
 
 class Pascal3D(PhotoDataset):
-    """PASCAL3D+, or ObjectNet3D.
+    """PASCAL3D+.
 
     ::
 
-        Annotations/<category>_<source>/<image>.mat    Images/<category>_<source>/<image>.jpg
-        Annotations/<image>.mat                        Images/<image>.JPEG     (ObjectNet3D)
-        CAD/<category>.mat                             CAD/mat/<category>.mat  (ObjectNet3D)
+        Annotations/<category>_<source>/<image>.mat
+        Images/<category>_<source>/<image>.jpg         or .JPEG
+        CAD/<category>.mat
 
     The focal length of the photos is not known. Viewpoints were annotated under a conventional one
     (3000 px) and with the principal point at the object: `Truth.camera` is that camera, under
     which `Truth.cam_from_model` fits the photo. Its rotation counts; lengths have no unit. Objects
     without a continuous viewpoint (distance 0) have no pose. Anchors that are visible are the
-    keypoints. In PASCAL3D+ only the objects of the folder's category are taken.
+    keypoints. Only the objects of the folder's category are taken.
 
     Raises DataError if there are no annotations.
     """
 
     kind = "PASCAL3D+"
-    signature = f"PASCAL3D+ or ObjectNet3D: {ANNOTATIONS} with .mat files"
-    marks = (f"{ANNOTATIONS}/*.mat", f"{ANNOTATIONS}/*/*.mat")
-    patterns = (f"{ANNOTATIONS}/*.mat", f"{ANNOTATIONS}/*/*.mat", _CAD)
+    signature = f"PASCAL3D+: {_FILES}"
+    marks = (_FILES,)
+    patterns = (_FILES, *(f"{folder}/*.mat" for folder in _CAD_FOLDERS))
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
         folder = as_path(root, "root")
-        # Annotation files, and the category whose objects each annotates; None for all.
+        self._files = listed(folder, _FILES)
+        if not self._files:
+            fix = "give the folder of PASCAL3D+"
+            raise DataError(f"there are no {_FILES}", where=str(folder), fix=fix)
         place = folder / ANNOTATIONS
-        self._records: list[tuple[Path, str | None]] = [
-            *((path, None) for path in listed(place, "*.mat")),
-            *((p, p.parent.name.rpartition("_")[0] or None) for p in listed(place, "*/*.mat")),
-        ]
-        if not self._records:
-            what = f"there are no {ANNOTATIONS}/*.mat nor {ANNOTATIONS}/*/*.mat"
-            fix = "give the folder of PASCAL3D+ or ObjectNet3D"
-            raise DataError(what, where=str(folder), fix=fix)
-        names = (path.relative_to(place).with_suffix("").as_posix() for path, _ in self._records)
+        names = (path.relative_to(place).with_suffix("").as_posix() for path in self._files)
         super().__init__(folder, names)
 
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
-        path, taken = self._records[index]
-        with in_file(path):
-            found: _Record = convert(read_structs(path, "record")[0], _Record)
+        path = self._files[index]
+        record = read_structs(path, "record")[0]
         name = self.names[index]
-        image = find_image(self.root, name)
-        size = found.written_size if image is None else photo_size(image)
-        if size is None:
-            what = "the image is missing, and its size is unknown"
-            raise DataError(what, where=str(path))
-        camera = Camera.without_focal(*size)
+        image = first_existing(self.root / _IMAGES / f"{name}{end}" for end in _ENDINGS)
+        if image is None:
+            raise DataError(f"its image is not in {_IMAGES}", where=str(path))
+        camera = Camera.without_focal(*photo_size(image))
 
         def read_object(number: int, each: Any) -> PhotoObject | None:
             shown: _Object = convert(each, _Object)
-            if taken not in (None, shown.category):
-                return None
-            return _object(number, shown, camera, self.root)
+            is_of_folder = shown.category == path.parent.name.rpartition("_")[0]
+            return _object(number, shown, camera, self.root) if is_of_folder else None
 
-        objects, problems = read_each(structs_of(found.objects), read_object, where=str(path))
+        objects, problems = read_each(
+            structs_of(record.get("objects")), read_object, where=str(path)
+        )
         return Photo(name, image, camera, objects, problems=problems)
-
-
-def find_image(root: Path, name: str) -> Path | None:
-    """Find the image of an annotation, named without its ending; None where it is missing."""
-    return first_existing(
-        root / folder / f"{name}{end}" for folder in _IMAGE_FOLDERS for end in _IMAGES
-    )
 
 
 def cad_model(root: Path, category: str, index: int) -> CadModel | None:
     """The CAD model of a number from 1; None where the category has no file."""
-    folders = (root / name for name in _CAD_FOLDERS)
-    folder = next((folder for folder in folders if listed(folder, "*.mat")), None)
-    if folder is None or not existing(folder / f"{category}.mat"):
+    path = first_existing(root / folder / f"{category}.mat" for folder in _CAD_FOLDERS)
+    if path is None:
         return None
-    which = folder / f"{category}.mat", category, index
+    which = path, category, index
     name = f"{category}/{index:02d}"
     return CadModel(name, partial(_load_mesh, *which), partial(_load_keypoints, *which))
 

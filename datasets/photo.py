@@ -18,6 +18,7 @@ from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry
+from cadalign.io.documents import in_file
 from cadalign.io.files import damaged, read_text
 from cadalign.io.images import ByteImage, open_photo, read_photo
 from cadalign.io.meshes.files import load_mesh
@@ -36,17 +37,11 @@ class PhotoKeypoints:
     """(k, 2), pixels; integers are pixel centres."""
     names: tuple[str, ...]
     """(k,), what each one is called: the model's keypoint of the same name is the same point."""
-    scores: FloatArray | None = None
-    """(k,), how sure a detector is of each."""
 
     def __post_init__(self) -> None:
         points = as_points(self.points_2d, name="keypoints", dimension=2)
-        count = len(points)
-        if len(self.names) != count:
-            raise DataError(f"{count} keypoints, {len(self.names)} names", where="keypoints")
-        if self.scores is not None:
-            scores = as_floats(self.scores, name="scores", shape=(count,))
-            object.__setattr__(self, "scores", scores)
+        if len(self.names) != len(points):
+            raise DataError(f"{len(points)} keypoints, {len(self.names)} names", where="keypoints")
         object.__setattr__(self, "points_2d", points)
 
     def __len__(self) -> int:
@@ -233,19 +228,13 @@ def read_matrix(path: Path, shape: tuple[int | None, int]) -> FloatArray:
 
     Raises DataError if it cannot be read, or is not a matrix of finite numbers of this shape.
     """
-    text = read_text(path)
-    rows = [line.split() for line in text.splitlines() if line.strip()]
+    rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
     try:
         matrix = np.array(rows, dtype=np.float64)
     except ValueError:
         raise damaged("not a table of numbers", path) from None
-    rows_wanted, columns = shape
-    if matrix.shape != (rows_wanted or len(matrix), columns):
-        wanted = f"{rows_wanted or 'some'} rows of {columns} numbers"
-        raise damaged(f"shape {matrix.shape}, expected {wanted}", path)
-    if not np.isfinite(matrix).all():
-        raise DataError("some of its numbers are not finite", where=str(path))
-    return matrix
+    with in_file(path):
+        return as_floats(matrix, name="matrix", shape=shape)
 
 
 def existing(path: Path) -> Path | None:

@@ -57,14 +57,14 @@ class _Entry(ForeignDocument):
     img: PathText
     category: Text
     img_size: tuple[Positive, Positive]
-    model: PathText | None = None
-    mask: PathText | None = None
-    keypoints_2d: list[list[Point2]] | None = field(default=None, name="2d_keypoints")
-    keypoints_3d: PathText | None = field(default=None, name="3d_keypoints")
+    model: PathText
+    mask: PathText
+    focal_length: Positive
+    bbox: tuple[Finite, Finite, Finite, Finite]
     rot_mat: tuple[Point3, Point3, Point3] | None = None
     trans_mat: Point3 | None = None
-    focal_length: Positive | None = None
-    bbox: tuple[Finite, Finite, Finite, Finite] | None = None
+    keypoints_2d: list[list[Point2]] | None = field(default=None, name="2d_keypoints")
+    keypoints_3d: PathText | None = field(default=None, name="3d_keypoints")
 
 
 class Pix3D(PhotoDataset):
@@ -102,16 +102,13 @@ class Pix3D(PhotoDataset):
             truth=_truth(entry),
             keypoints=_keypoints(entry),
             model=self._model(entry),
-            mask_path=None if entry.mask is None else existing(self.root / entry.mask),
-            bbox=None if entry.bbox is None else np.array(entry.bbox) - PIXEL_CENTRE,
+            mask_path=existing(self.root / entry.mask),
+            bbox=np.array(entry.bbox) - PIXEL_CENTRE,
         )
         return Photo(self.names[index], existing(self.root / entry.img), camera, (shown,))
 
-    def _model(self, entry: _Entry) -> CadModel | None:
-        if entry.model is None:
-            return None
-        mesh = partial(_load, self.root / entry.model, load_mesh)
-        keypoints = None
+    def _model(self, entry: _Entry) -> CadModel:
+        mesh, keypoints = partial(_load, self.root / entry.model, load_mesh), None
         if entry.keypoints_3d is not None:
             keypoints = partial(_load, self.root / entry.keypoints_3d, _read_keypoints)
         return CadModel(entry.model, mesh, keypoints)
@@ -128,18 +125,16 @@ def _read_keypoints(path: Path) -> NamedPoints:
 
 
 @lru_cache(maxsize=64)
-def _camera(width: int, height: int, focal_length: float | None) -> Camera:
-    """The camera of an image of this size, and of a focal length [mm] where it is known."""
-    camera = Camera.without_focal(width, height)
-    return camera if focal_length is None else camera.with_focal(focal_length / _SENSOR * width)
+def _camera(width: int, height: int, focal_length: float) -> Camera:
+    """The camera of an image of this size, and of a focal length [mm]."""
+    return Camera.without_focal(width, height).with_focal(focal_length / _SENSOR * width)
 
 
 def _truth(entry: _Entry) -> Truth:
     if entry.rot_mat is None or entry.trans_mat is None:
         return Truth()
     rotation = _PIX3D_AXES[:, None] * nearest_rotation(np.array(entry.rot_mat))
-    shift = _PIX3D_AXES * entry.trans_mat
-    return Truth(Alignment(rotation, shift, np.ones(3), is_valid=True))
+    return Truth(Alignment(rotation, _PIX3D_AXES * entry.trans_mat, np.ones(3), is_valid=True))
 
 
 def _keypoints(entry: _Entry) -> PhotoKeypoints | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Hashable, Iterable, Iterator, MutableMapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -18,7 +18,6 @@ from cadalign.io.files import damaged
 logger = logging.getLogger("cadalign")
 
 T = TypeVar("T")
-K = TypeVar("K", bound=Hashable)
 # Warnings of one data set that are logged; `problems` has all.
 _LOGGED = 20
 
@@ -117,7 +116,7 @@ class RecordSet(ABC, Generic[T]):
 
 
 @contextmanager
-def leaving_out(name: K, problems: MutableMapping[K, DataError] | None) -> Iterator[None]:
+def leaving_out(name: str, problems: dict[str, DataError] | None) -> Iterator[None]:
     """Leave out a record that cannot be read, and keep the reason why in ``problems``.
 
     Without problems the reason is raised.

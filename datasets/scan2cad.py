@@ -80,9 +80,9 @@ class _Model(ForeignDocument):
     trs: _Trs
     id_cad: Id
     catid_cad: Id
+    bbox: tuple[Positive, Positive, Positive]  # half of the model's size
+    center: Point3
     sym: str = "__SYM_NONE"
-    bbox: tuple[Positive, Positive, Positive] | None = None
-    center: Point3 | None = None
     keypoints_cad: _Points | None = None
     keypoints_scan: _Points | None = None
 
@@ -181,7 +181,7 @@ def _object(
     """An object of the scan as a photo shows it; None where its box is not in the image."""
     world_from_model = found.trs.alignment()
     cam_from_model = _composed(cam_from_world, world_from_model)
-    center = np.array(found.center or (0.0, 0.0, 0.0))
+    center, half = np.array(found.center), np.array(found.bbox)
     distance = float(np.linalg.norm(cam_from_model.apply(center[None])))
     if distance > _FARTHEST:
         what = f"the object lies {distance:.3g} m from the camera, as with millimetres for metres"
@@ -190,14 +190,11 @@ def _object(
     if found.sym not in _FOLDS:
         known = ", ".join(_FOLDS)
         raise InputError(f"{quote(found.sym)} is no symmetry", where="sym", fix=f"known: {known}")
-    bounds = box = bbox = None
-    if found.bbox is not None:
-        half = np.array(found.bbox)
-        bounds = np.array([center - half, center + half])
-        box = Box.from_model(bounds, cam_from_model)
-        bbox = _rectangle(box, camera)
-        if bbox is None:
-            return None
+    bounds = np.array([center - half, center + half])
+    box = Box.from_model(bounds, cam_from_model)
+    bbox = _rectangle(box, camera)
+    if bbox is None:
+        return None
     mesh = first_existing(
         place / file
         for folder in folders

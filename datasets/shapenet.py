@@ -39,10 +39,6 @@ SYNSETS: dict[str, str] = {
 # Where a model's mesh lies in its folder: version 2, then version 1.
 MESH_FILES = (Path("models", "model_normalized.obj"), Path("model.obj"))
 _SYNSET_DIGITS = 8
-# KeypointNet's folder of ShapeNet's meshes as PLY.
-_PLY_FOLDER = "ShapeNetCore.v2.ply"
-# Folders in ShapeNet's layout that may lie below KeypointNet's root.
-_SHAPENET_FOLDERS = ("models", "ShapeNetCore.v2")
 _NAMES = {synset: name for name, synset in SYNSETS.items()}
 
 
@@ -156,34 +152,3 @@ class ShapeNet:
                 if (folder / model_id / file).is_file()
             }
         return self._models[name]
-
-
-class MeshLocator:
-    """Finds mesh files below KeypointNet's root or in ShapeNetCore, listing each folder once."""
-
-    def __init__(self, root: Path, shapenet_root: str | os.PathLike[str] | None) -> None:
-        self._ply_folder = root / _PLY_FOLDER
-        self._given = [] if shapenet_root is None else [ShapeNet(shapenet_root)]
-        below = [root / name for name in _SHAPENET_FOLDERS]
-        self._below = [ShapeNet(folder) for folder in below if folder.is_dir()]
-        self._files: dict[str, dict[str, Path]] = {}
-
-    def path(self, synset: str, model_id: str) -> Path | None:
-        """A model's mesh: of the given ShapeNetCore, else KeypointNet's, else of those below."""
-        if synset not in self._files:
-            folder = self._ply_folder / synset
-            files = folder.glob("*.ply") if os.path.isdir(folder) else ()  # not of too long a name
-            found: dict[str, Path] = {}
-            for shapenet in reversed(self._below):
-                found |= _list_models(shapenet, synset)
-            found |= {path.name.removesuffix(".ply"): path for path in files}
-            for shapenet in self._given:
-                found |= _list_models(shapenet, synset)
-            self._files[synset] = found
-        return self._files[synset].get(model_id)
-
-
-def _list_models(shapenet: ShapeNet, synset: str) -> dict[str, Path]:
-    name = name_of_synset(synset)
-    models = shapenet[name] if name in shapenet.categories else ()
-    return {model.model_id: model.mesh_path for model in models}

@@ -1,25 +1,23 @@
-"""Pickles of NumPy arrays and plain containers, read without running code.
+"""Pickles of NumPy arrays in lists and tuples, read without running code.
 
-A pickle is a program for a stack machine, which may import and call anything. The machine here
-builds values alone: what a program may name is a word that it knows, the arrays are made from their
-shapes, types and bytes, and whatever else is asked for is refused. Memory and time are bounded by
-the file's size.
+A pickle is a program for a stack machine, which may import and call anything. So its steps are
+looked through before Python's own reader takes them, and what it imports are stand-ins: they keep
+what they are called with, and the arrays are made from that in the end. Memory and time are bounded
+by the file's size.
 """
 
 from __future__ import annotations
 
-import codecs
 import io
 import math
 import os
+import pickle
 import pickletools
 import re
-from collections.abc import Iterator, ValuesView
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from cadalign.errors import DataError, quote
 from cadalign.io.documents import in_file
@@ -29,57 +27,35 @@ from cadalign.io.files import as_path, damaged, read_bytes
 _PLAIN_DTYPE = re.compile(r"b1|[iufc]\d{1,2}|[SU][1-9]\d{0,5}|O\d?")
 _MAX_DEPTH = 100
 _MOST_TIMES = 10  # as many values as the file has bytes
-_PARTS = (list, tuple, ValuesView)
-_FIX = (
-    "only NumPy arrays and plain containers are loaded, a pickle can run code; get a trusted file"
+_FIX = "only NumPy arrays, lists and tuples are loaded, a pickle can run code; get a trusted file"
+# No dictionaries and sets: a key's hash may take forever.
+_STEPS = re.compile(
+    r"PROTO|FRAME|STOP|MARK|MEMOIZE|(LONG_)?(BIN)?(PUT|GET)|(STACK_)?GLOBAL|REDUCE|BUILD"
+    r"|NONE|NEW(TRUE|FALSE)|(BIN)?INT[12]?|LONG[14]?|(BIN)?FLOAT"
+    r"|(SHORT_)?(BIN)?(STRING|UNICODE|BYTES)8?|BYTEARRAY8"
+    r"|(EMPTY_)?(LIST|TUPLE)|TUPLE[123]|APPENDS?"
 )
-_ARRAY, _DTYPE, _NDARRAY = "numpy._core.multiarray._reconstruct", "numpy.dtype", "numpy.ndarray"
-_SCALAR, _BUFFER = "numpy._core.multiarray.scalar", "numpy._core.numeric._frombuffer"
-_BYTES, _ENCODE = "builtins.bytes", "_codecs.encode"
-_KNOWN = {_ARRAY, _DTYPE, _NDARRAY, _SCALAR, _BUFFER, _BYTES, _ENCODE}
-_CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
-# Steps of containers, and how many values each takes; None for those from the last mark on.
-_COUNTS: dict[str, int | None] = {
-    **dict.fromkeys(("EMPTY_LIST", "EMPTY_TUPLE", "EMPTY_DICT"), 0),
-    "TUPLE1": 1,
-    "TUPLE2": 2,
-    "TUPLE3": 3,
-    "APPEND": 1,
-    "SETITEM": 2,
-    **dict.fromkeys(("LIST", "TUPLE", "DICT", "APPENDS", "SETITEMS")),
-}
-_STEPS = {step.code.encode("latin-1"): step for step in pickletools.opcodes}
-_LITERALS = {
-    step.name
-    for step in pickletools.opcodes
-    if step.arg and not step.stack_before and step.stack_after
-    and step.stack_after[0] is not pickletools.anyobject
-}  # fmt: skip
-"""Steps that push their argument, a number or a text."""
-
-
-@dataclass
-class _Named:
-    """A name that a pickle calls; an array or a type of arrays is made first, then filled."""
-
-    name: str
-    value: Any = None
 
 
 def load_pickle(path: str | os.PathLike[str]) -> Any:
-    """Load a pickle of NumPy arrays, numbers, texts, and lists, tuples and dictionaries of these.
+    """Load a pickle of NumPy arrays, numbers, texts, and lists and tuples of these.
 
-    Pickles of Python 2 and of old and new NumPy are understood. Text of Python 2 is taken as
-    Latin-1, the encoding that keeps its bytes. An array of objects becomes a list.
+    Pickles of old and new NumPy are understood, and those of Python 2 but for protocol 0. Text of
+    Python 2 is taken as Latin-1, the encoding that keeps its bytes. An array of objects becomes a
+    list.
 
     Raises DataError if the file cannot be read, is no whole pickle, or asks for anything else.
     """
     data = read_bytes(as_path(path))
     try:
         with in_file(str(path)):
-            value = _run(data)
-        _check_size(value, most=_MOST_TIMES * len(data))
-        return value
+            for step, argument, _ in pickletools.genops(data):
+                if not _STEPS.fullmatch(step.name):
+                    raise ValueError(f"{step.name} is no step of arrays, lists and tuples")
+                if "PUT" in step.name and int(argument or 0) > len(data):
+                    raise ValueError(f"it remembers no {argument} values")
+            value = _Reader(io.BytesIO(data), encoding="latin-1").load()
+            return _Builder(_MOST_TIMES * len(data)).built(value)
     except DataError:
         raise
     except Exception as error:  # any step of a damaged pickle may fail
@@ -87,153 +63,105 @@ def load_pickle(path: str | os.PathLike[str]) -> Any:
         raise damaged(f"not a whole pickle of arrays ({reason})", path) from None
 
 
-def _run(data: bytes) -> Any:
-    """Build the value that a pickle's program describes."""
-    stack: list[Any] = []
-    marks: list[int] = []
-    memory: dict[int, Any] = {}
-    copied = 0
+class _Dtype:
+    """Stands for a type of arrays."""
 
-    def popped(count: int | None = None) -> list[Any]:
-        """Take the last values, by default those from the last mark on."""
-        start = marks.pop() if count is None else len(stack) - count
-        values = [_value_of(each) for each in stack[start:]]
-        del stack[start:]
-        return values
-
-    for name, argument in _steps(data):
-        if name in _LITERALS:
-            stack.append(argument)
-        elif name in _CONSTANTS:
-            stack.append(_CONSTANTS[name])
-        elif name == "MARK":
-            marks.append(len(stack))
-        elif name in _COUNTS:
-            values = popped(_COUNTS[name])
-            if "TUPLE" in name:
-                stack.append(tuple(values))
-            elif "LIST" in name:
-                stack.append(values)
-            elif "APPEND" in name:
-                _of(list, stack[-1]).extend(values)
-            else:
-                if "DICT" in name:
-                    stack.append({})
-                keys = [_of(str | bytes | int | float, key) for key in values[::2]]
-                _of(dict, stack[-1]).update(zip(keys, values[1::2], strict=True))
-        elif name in ("MEMOIZE", "PUT", "BINPUT", "LONG_BINPUT"):
-            memory[len(memory) if name == "MEMOIZE" else int(argument)] = stack[-1]
-        elif name in ("GET", "BINGET", "LONG_BINGET"):
-            stack.append(memory[int(argument)])
-        elif name in ("GLOBAL", "STACK_GLOBAL"):
-            stack.append(_named(*(argument.split(" ") if argument else popped(2))))
-        elif name in ("REDUCE", "BUILD"):
-            (arguments,) = popped(1)
-            copied += sum(len(each) for each in _of(tuple, arguments) if isinstance(each, str))
-            if copied > _MOST_TIMES * len(data):
-                raise ValueError("it copies a text again and again")
-            called = _of(_Named, stack[-1])
-            if name == "BUILD":
-                _fill(called, *arguments)
-            else:
-                stack[-1] = _made(called.name, *arguments)
-        elif name not in ("PROTO", "FRAME"):
-            raise ValueError(f"{name} is no step of arrays and plain containers")
-    (value,) = popped(len(stack))
-    return value
-
-
-def _steps(data: bytes) -> Iterator[tuple[str, Any]]:
-    """A program's steps to its end, each with its argument."""
-    stream = io.BytesIO(data)
-    while (code := stream.read(1)) != b".":
-        step = _STEPS[code]
-        if step.name == "STRING":  # Python 2's, which need not be ASCII
-            text = pickletools.read_stringnl(stream, decode=False)
-            yield step.name, codecs.escape_decode(text)[0].decode("latin-1")
-        else:
-            yield step.name, step.arg.reader(stream) if step.arg else None
-
-
-def _of(kind: Any, value: Any) -> Any:
-    """The value, which must be of a kind."""
-    if not isinstance(value, kind):
-        raise TypeError(f"{quote(value)} stands in the place of another kind of value")
-    return value
-
-
-def _value_of(item: Any) -> Any:
-    """The value of an item of the stack: what was made by a name, where that is whole."""
-    return item.value if isinstance(item, _Named) and item.value is not None else item
-
-
-def _named(module: str, attribute: str) -> _Named:
-    # Python 2 and NumPy 1 call the same modules otherwise.
-    current = module.replace("__builtin__", "builtins").replace("numpy.core.", "numpy._core.")
-    if f"{current}.{attribute}" not in _KNOWN:
-        asked = quote(f"{module}.{attribute}")[1:-1]
-        raise DataError(f"the pickle asks for {asked}, which is refused", fix=_FIX)
-    return _Named(f"{current}.{attribute}")
-
-
-def _made(name: str, *arguments: Any) -> Any:
-    """Make what a name is called for: an array or its type is filled later."""
-    if name == _DTYPE:
-        code = arguments[0]
+    def __init__(self, code: str, *_flags: Any) -> None:
         if not _PLAIN_DTYPE.fullmatch(code):
             raise ValueError(f"the dtype {quote(code)} is not one of plain values")
-        return _Named(name, np.dtype(code))
-    if name == _ARRAY and arguments[0] == _Named(_NDARRAY):
-        return _Named(name)
-    if name == _SCALAR:
-        return _array((), *arguments)[()]
-    if name == _BUFFER:
-        buffer, dtype, shape, order, *axes = arguments
-        array = _array(shape, dtype, buffer, order="F" if order == "F" else "C")
-        return array.transpose(axes[0]) if order == "K" and axes else array
-    if name == _BYTES and not arguments:
-        return b""
-    if name == _ENCODE and arguments[1] == "latin1":  # bytes, as Python 3 writes them for Python 2
-        return arguments[0].encode("latin1")
-    raise ValueError(f"{name} of {quote(arguments)} is no plain value")
+        self.dtype = np.dtype(code)
+
+    def __setstate__(self, state: Any) -> None:
+        self.dtype = self.dtype.newbyteorder(state[1])  # the rest follows from the code
 
 
-def _fill(made: _Named, *state: Any) -> None:
-    if made.name == _DTYPE:  # (version, byte order, ...); the rest follows from the code
-        made.value = made.value.newbyteorder(state[1])
-        return
-    if made.name != _ARRAY:
-        raise ValueError(f"{made.name} cannot be changed")
-    _, shape, dtype, is_fortran, data = state
-    if dtype.hasobject:
-        made.value = _of(list, data)
-        if shape != (len(data),):
-            raise ValueError(f"an array of shape {quote(shape)} has {len(data)} objects")
-    else:
-        made.value = _array(shape, dtype, data, order="F" if is_fortran else "C")
+@dataclass(eq=False)
+class _Array:
+    """Stands for an array or a scalar; its data are bytes, their Latin-1 text, or objects."""
+
+    dtype: Any
+    data: Any
+    shape: Any = None  # of a scalar
+    order: Any = "C"
+    axes: Any = None  # that transpose it
+
+    def __setstate__(self, state: Any) -> None:
+        _, self.shape, self.dtype, is_fortran, self.data = state
+        self.order, self.axes = "F" if is_fortran else "C", None
 
 
-def _array(
-    shape: Any, dtype: np.dtype[Any], data: bytes | str, *, order: Literal["C", "F"] = "C"
-) -> npt.NDArray[Any]:
-    """An array that looks at its bytes: one and the same may belong to many."""
-    content = data.encode("latin1") if isinstance(data, str) else data
-    if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(content):
-        raise ValueError(f"an array of shape {quote(shape)} has other data than that")
-    return np.ndarray(shape, dtype, content, order=order)
+def _from_buffer(data: Any, dtype: Any, shape: Any, order: Any, axes: Any = None) -> _Array:
+    return _Array(dtype, data, shape, "F" if order == "F" else "C", axes if order == "K" else None)
 
 
-def _check_size(value: Any, *, most: int) -> None:
-    """Refuse deep nesting, containers in themselves, and more values than a file can have.
+def _bytes(text: str = "", encoding: str = "latin1") -> str:
+    """Bytes as Python 3 writes them for Python 2, which stay the text that they are written as."""
+    if encoding != "latin1":
+        raise ValueError(f"{quote(encoding)} is not Latin-1")
+    return text
 
-    Shared containers count as often as they are found: who walks through them finds all.
+
+_STAND_INS = {
+    "numpy._core.multiarray._reconstruct": _Array,  # of nothing that counts, filled afterwards
+    "numpy._core.multiarray.scalar": _Array,
+    "numpy._core.numeric._frombuffer": _from_buffer,
+    "numpy.dtype": _Dtype,
+    "numpy.ndarray": _Array,
+    "builtins.bytes": _bytes,
+    "_codecs.encode": _bytes,
+}
+
+
+class _Reader(pickle.Unpickler):
+    """Python's reader, which imports nothing but stand-ins."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """The stand-in for what a pickle imports; raises DataError where there is none."""
+        # Python 2 and NumPy 1 call the same modules otherwise.
+        current = module.replace("__builtin__", "builtins").replace("numpy.core.", "numpy._core.")
+        if f"{current}.{name}" not in _STAND_INS:
+            asked = quote(f"{module}.{name}")[1:-1]
+            raise DataError(f"the pickle asks for {asked}, which is refused", fix=_FIX)
+        return _STAND_INS[f"{current}.{name}"]
+
+
+class _Builder:
+    """Makes the arrays in the places of their stand-ins.
+
+    Shared lists count as often as they are found: who walks through them finds all.
     """
-    level, count = [value], 0
-    for _ in range(_MAX_DEPTH):
-        count += len(level)
-        if not level or count > most:
-            break
-        parts = [each.values() if isinstance(each, dict) else each for each in level]
-        level = [each for part in parts if isinstance(part, _PARTS) for each in part]
-    if level:
-        raise ValueError("its values are nested too deeply, or more than the file has bytes")
+
+    def __init__(self, most: int) -> None:
+        self._left = most
+        self._bytes: dict[str, bytes] = {}  # by their text, which may belong to many arrays
+
+    def built(self, value: Any, depth: int = 0) -> Any:
+        self._left -= 1
+        if self._left < 0 or depth > _MAX_DEPTH:
+            raise ValueError("its values are nested too deeply, or more than the file has bytes")
+        if isinstance(value, _Array):
+            if not value.dtype.dtype.hasobject:
+                return self._array(value)
+            if type(value.data) is not list or value.shape != (len(value.data),):
+                raise ValueError(f"an array of shape {quote(value.shape)} has other objects")
+            value = value.data
+        if isinstance(value, list | tuple):
+            return type(value)([self.built(each, depth + 1) for each in value])
+        if value is None or isinstance(value, int | float | str | bytes | bytearray):
+            return value
+        raise TypeError(f"{quote(type(value).__name__)} is no plain value")
+
+    def _array(self, made: _Array) -> Any:
+        """An array that looks at its bytes: one and the same may belong to many."""
+        content, dtype = made.data, made.dtype.dtype
+        if isinstance(content, str):
+            if content not in self._bytes:
+                self._bytes[content] = content.encode("latin-1")
+            content = self._bytes[content]
+        shape = () if made.shape is None else made.shape
+        if math.prod(shape) * dtype.itemsize != len(content):
+            raise ValueError(f"an array of shape {quote(shape)} has other data than that")
+        array = np.ndarray(shape, dtype, content, order=made.order)
+        if made.axes is not None:
+            array = array.transpose(made.axes)
+        return array[()] if made.shape is None else array

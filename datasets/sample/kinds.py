@@ -7,27 +7,19 @@ from types import SimpleNamespace
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.sample.parts import Draft, beam, box, lathe, loft, palette, stack, table
+from cadalign.datasets.sample.parts import (
+    Draft,
+    beam,
+    box,
+    chosen,
+    lathe,
+    loft,
+    read_designs,
+    stack,
+)
 
-# Base, back, and armrests or none.
-_STYLES = (
-    ("straight", "slats", False), ("swivel", "panel", True), ("splayed", "panel", False),
-    ("straight", "slats", True), ("tapered", "panel", True), ("splayed", "slats", False),
-    ("straight", "panel", True), ("tapered", "panel", False), ("swivel", "panel", False),
-    ("splayed", "slats", True), ("tapered", "slats", False), ("tapered", "slats", True),
-)  # fmt: skip
-# How far the feet stand out and the legs' tops lie inside [metres]; thickness of top and foot.
-_LEGS = {
-    "straight": (-0.023, 0.023, (1.0, 1.0)),
-    "tapered": (0.0, 0.03, (1.15, 0.7)),
-    "splayed": (0.03, 0.1, (1.1, 0.6)),
-}
-# Ranges of the seat's width, depth, height, thickness, of the back's length, tilt, of a leg's size.
-_LEAST, _MOST = (0.4, 0.4, 0.42, 0.028, 0.38, 5, 0.032), (0.52, 0.5, 0.5, 0.05, 0.58, 13, 0.046)
-_WOODS = palette("966236 ba8650 603c26 cea470 7a4628 462e22")
-_METALS = palette("a8acb2 34363a 787c82")
-_FABRICS = palette("ac342e 2c5484 46764e d4a03c 784a78 42464e c4baa8 28787e")
-(_BLACK,) = palette("26262a")
+_CHAIR, _BOTTLE, _CAR, _VESSEL = read_designs("chair", "bottle", "car", "vessel")
+_EDGE = 0.022  # radius of the rounded edge of a bottle's bottom
 
 
 def chair(rng: np.random.Generator, index: int) -> Draft:
@@ -38,15 +30,17 @@ def chair(rng: np.random.Generator, index: int) -> Draft:
     17 to 20 feet. Three more are this data set's own: 21, 22 the sides of the back and 23 the
     middle of its top.
     """
-    base, back, has_arms = _STYLES[index % len(_STYLES)]
-    width, depth, seat, thickness, tall, tilt, leg = rng.uniform(_LEAST, _MOST).tolist()
-    bars, is_cushioned, is_wooden = rng.integers(3, 6), rng.random() < 0.6, base != "swivel"
-    frame, fabric = rng.choice(_WOODS if is_wooden else _METALS), rng.choice(_FABRICS)
+    style = chosen(_CHAIR.kinds, index)
+    measures = rng.uniform(_CHAIR.least, _CHAIR.most).tolist()
+    width, depth, seat, thickness, tall, tilt, leg = measures
+    bars, is_cushioned, is_wooden = rng.integers(3, 6), rng.random() < 0.6, style.base != "swivel"
+    frame = rng.choice(_CHAIR.woods if is_wooden else _CHAIR.metals)
+    fabric = rng.choice(_CHAIR.fabrics)
     draft, half = Draft(), width / 2
     color = np.round(frame + 0.2 * (255 - frame)) if is_wooden else fabric
     middle, size = (0.0, seat - thickness / 2, 0.0), (width, thickness, depth)
     draft.add(box(middle, size, color, radius=0.4 * thickness))
-    if is_cushioned or back == "panel":
+    if is_cushioned or style.back == "panel":
         middle, size = (0.0, seat + 0.012, -0.01), (width - 0.03, 0.045, depth - 0.05)
         draft.add(box(middle, size, fabric, radius=0.02))
     draft.mark_pair(2, 3, (half, seat, 0.43 * depth))
@@ -58,7 +52,7 @@ def chair(rng: np.random.Generator, index: int) -> Draft:
         z = depth / 2 - 0.025 + along * np.sin(slope) + hollow
         return x, seat + along * np.cos(slope), z
 
-    if back == "panel":  # an upholstered board with rounded edges before two posts
+    if style.back == "panel":  # an upholstered board with rounded edges before two posts
         scales = [(0.92, 0.35), (0.97, 0.75), (1, 1), (1, 1), (0.97, 0.75), (0.92, 0.35)]
         path = [at(share, 0.0) for share in (0.28, 0.285, 0.31, 0.97, 0.995, 1.0)]
         draft.add(beam(path, (width - leg, 0.05), fabric, scales=scales, radius=0.02))
@@ -78,22 +72,22 @@ def chair(rng: np.random.Generator, index: int) -> Draft:
     draft.mark_pair(21, 22, at(0.84, half + 0.08))
     draft.places[23] = at(1.2, 0.0)
 
-    if has_arms:  # each on a post in front
+    if style.arms:  # each on a post in front
         (x, y, rear), front = at(0.22 / tall, half + 0.01), -0.32 * depth
         middle, size = (x, y - 0.012, (front + rear) / 2), (0.05, 0.024, rear - front)
         path = [(half - 0.012, seat - 0.6 * thickness, front + 0.04), (x, y - 0.01, front + 0.04)]
-        draft.add_pair(box(middle, size, frame if is_wooden else _BLACK, radius=0.01))
+        draft.add_pair(box(middle, size, frame if is_wooden else _CHAIR.black, radius=0.01))
         draft.add_pair(beam(path, (0.026, 0.034), frame))
         draft.mark_pair(6, 8, (x + 0.025, y, front))
         draft.mark_pair(7, 9, (x + 0.025, y, rear))
     if is_wooden:  # four legs, and bars between straight ones
-        out, inset, taper = _LEGS[base]
+        out, inset, taper = _CHAIR.legs[style.base]
         x, z, top = half + out, depth / 2 + out, seat - 0.4 * thickness
         for right, left, sign in ((17, 20, -1), (18, 19, 1)):
             path = [(half - inset, top, sign * (depth / 2 - inset)), (x, 0, sign * z)]
             draft.add_pair(beam(path, (leg, leg), frame, scales=taper))
             draft.mark_pair(right, left, (x + leg, 0.01, sign * (z + leg)))
-        if base == "straight":
+        if style.base == "straight":
             draft.add_pair(beam([(x, 0.16, -z), (x, 0.16, z)], (0.02, 0.028), frame))
             draft.add(beam([(-x, 0.16, 0), (x, 0.16, 0)], (0.02, 0.028), frame))
         return draft
@@ -107,44 +101,9 @@ def chair(rng: np.random.Generator, index: int) -> Draft:
         x, z = 0.58 * width * np.sin(angle), 0.58 * width * np.cos(angle)
         castor = (0.96 * x, 0.03, 0.96 * z)
         draft.add(beam([(0, 0.115, 0), (x, 0.075, z)], (0.05, 0.036), frame, scales=(1, 0.6)))
-        draft.add(box(castor, (0.05, 0.06, 0.05), _BLACK, radius=0.03))
+        draft.add(box(castor, (0.05, 0.06, 0.05), _CHAIR.black, radius=0.03))
         draft.places[number] = (x, 0.09, z)
     return draft
-
-
-_EDGE = 0.022  # radius of the rounded edge of the bottom
-# Shares of the height. The neck begins at ``neck``; ``curve`` shapes what is between it and the
-# body's end, the shoulder: less than 1 is full, more is slender. A label is from low to high.
-_BOTTLES = table("""
-    kind      radius shoulder neck neck_radius curve waist low high glass cap
-    Bordeaux  .125   .6       .72  .047        .55   0     .14 .46  green foil
-    water     .155   .68      .88  .058        .8    0     .38 .6   clear screw
-    Burgundy  .15    .42      .74  .048        1.35  0     .1  .34  green foil
-    beer      .134   .55      .78  .052        1.0   0     .16 .44  brown crown
-    spirit    .2     .56      .76  .062        .45   0     .14 .42  amber stopper
-    soda      .155   .66      .87  .056        .9    .16   .36 .54  paint screw
-    milk      .178   .5       .78  .1          1.2   0     .12 .36  milk  screw
-    medicine  .2     .7       .78  .13         .5    0     .16 .56  amber screw
-    champagne .165   .36      .74  .05         1.1   0     .1  .3   green foil
-""")
-_GLASS = {
-    "green": palette("284a2c 1c3828"),
-    "brown": palette("623616"),
-    "clear": palette("a8d0e2"),
-    "amber": palette("ba7024 c8883c"),
-    "milk": palette("eeece2 e2e8ec"),
-    "paint": palette("ce342c 2860a8 ecba34 408c54"),
-}
-# Radius, relative to the neck's, and height from the cap's lower end to the rim of its top.
-_CAPS = {
-    "foil": [(1.03, 0.82), (1.03, 0.93), (1.13, 0.934), (1.13, 0.962), (1.05, 0.97)],
-    "crown": [(1.28, 0.942), (1.2, 0.958), (1.02, 0.972)],
-    "stopper": [(0.8, 0.93), (0.8, 0.97), (1.24, 0.985), (1.32, 1.005), (1.24, 1.028), (1, 1.042)],
-    "screw": [(1.16, 0.905), (1.16, 0.977), (1.1, 0.985)],
-}
-_CAP_COLORS = palette("b02428 202228 ceaa54 245296 f0f0ec")
-_LABELS = palette("eee6ce f6f6f2 decea0 cedee8")
-_STRIPES = palette("981e26 224276 285c3c a88032 302c2e")
 
 
 def bottle(rng: np.random.Generator, index: int) -> Draft:
@@ -154,12 +113,12 @@ def bottle(rng: np.random.Generator, index: int) -> Draft:
     shoulder, 8 the middle of the top, 9 to 12 around the top's rim, 13 to 16 around the beginning
     of the neck.
     """
-    color, b = rng.choice(_CAP_COLORS), SimpleNamespace(**vars(_BOTTLES[index % len(_BOTTLES)]))
+    color, b = rng.choice(_BOTTLE.cap_colors), chosen(_BOTTLE.kinds, index)
     b.radius *= rng.uniform(0.9, 1.14)
     b.shoulder += rng.uniform(-0.03, 0.03)
     b.neck += rng.uniform(-0.02, 0.02)
     b.neck_radius *= rng.uniform(0.92, 1.1)
-    cap = np.array(_CAPS[b.cap]) * (b.neck_radius, 1)
+    cap = np.array(_BOTTLE.caps[b.cap]) * (b.neck_radius, 1)
     cap[:, 1] = np.maximum(cap[:, 1], b.neck + 0.025)
     knots = [_EDGE, b.shoulder, b.neck, max(cap[0, 1], b.neck + 0.06) + 0.01]
     heights = np.interp(np.arange(-4, 33), [0, 15, 29, 32], knots)
@@ -167,10 +126,10 @@ def bottle(rng: np.random.Generator, index: int) -> Draft:
     paper = np.linspace(b.low, min(b.high, b.shoulder - 0.04), 9)
     draft = Draft(round=True)
     draft.add(
-        lathe(_profile(b, heights), rng.choice(_GLASS[b.glass]), count=40),
+        lathe(_profile(b, heights), rng.choice(_BOTTLE.glass[b.glass]), count=40),
         lathe(cap, color, count=40),
-        lathe(_profile(b, paper) * (1.012, 1), rng.choice(_LABELS), count=40),
-        lathe(_profile(b, paper[5:8]) * (1.02, 1), rng.choice(_STRIPES), count=40),
+        lathe(_profile(b, paper) * (1.012, 1), rng.choice(_BOTTLE.labels), count=40),
+        lathe(_profile(b, paper[5:8]) * (1.02, 1), rng.choice(_BOTTLE.stripes), count=40),
     )
     rim, top = cap[-1]
     draft.places[8] = (0.0, top + 0.1, 0.0)
@@ -195,29 +154,6 @@ def _profile(b: SimpleNamespace, y: FloatArray) -> FloatArray:
     return np.stack([radius + (b.neck_radius - b.radius) * step, y], axis=1)
 
 
-# Metres, but for positions along the car: shares of its length, 0 at the nose. ``nose``, ``belt``
-# and ``tail`` are heights; the windscreen goes from ``cowl`` to ``roof``, the rear window from
-# ``rear`` to ``deck``; ``lean`` is that of the sides; ``posts`` stand between the windows.
-_CARS = table("""
-    kind      length width height nose belt tail cowl roof rear deck axle back wheel lean sill posts
-    sedan     4.6    1.8   1.45   .76  .92  .96  .27  .43  .69  .84  .18  .78  .32   .2   .2   3
-    hatchback 4.0    1.74  1.48   .76  .93  .9   .25  .43  .88  .975 .19  .82  .31   .2   .2   3
-    off-road  4.7    1.9   1.74   .95  1.08 1.06 .25  .38  .9   .965 .18  .79  .39   .15  .3   4
-    sports    4.4    1.86  1.24   .73  .85  .87  .37  .53  .66  .9   .18  .8   .315  .26  .2   3
-    estate    4.75   1.8   1.48   .76  .92  .94  .25  .4   .91  .975 .17  .77  .32   .2   .2   4
-    city      3.45   1.62  1.54   .8   .95  .94  .17  .38  .92  .985 .19  .81  .29   .16  .2   3
-    minibus   5.0    1.94  2.05   .98  1.18 1.12 .1   .24  .985 .995 .17  .78  .35   .1   .25  5
-""")
-_PAINTS = palette(
-    "ba1e24 224e96 d6d8dc ecb228 3a7852 6e747c 3c3e46 ce6024 5aa0be eeece4 702238 96a078"
-)
-_PANES, _DARK, _TRIM, _RIM, _LAMP, _RED = palette("1e2630 202023 3a3c40 c4c8ce faf6d6 d6161a")
-# Profiles of radius, in radii of the wheel, and distance outward [metres].
-_TYRE = ((0.92, -0.22), (1, -0.18), (1, -0.04), (0.94, 0.0), (0.7, 0.0), (0.68, -0.035))
-_DISC = ((0.71, -0.05), (0.71, 0.006), (0.64, 0.006), (0.55, -0.005), (0.24, -0.005), (0.15, 0.014))
-_ARCH = ((1.12, -0.2), (1.12, -0.008))
-
-
 def car(rng: np.random.Generator, index: int) -> Draft:
     """Draw and build a car.
 
@@ -225,11 +161,11 @@ def car(rng: np.random.Generator, index: int) -> Draft:
     of the front and rear wheels; 8, 9 head lamps; 10, 11 tail lamps; 12, 13 lower corners of the
     windscreen; 14 to 17 ends of the front and rear bumper; 18, 19 mirrors.
     """
-    c, shift = _CARS[index % len(_CARS)], rng.uniform(-0.012, 0.012)
+    c, shift = chosen(_CAR.kinds, index), rng.uniform(-0.012, 0.012)
     least, most = (0.92, 0.95, 0.96), (1.08, 1.05, 1.06)
     length, width, height = (c.length, c.width, c.height) * rng.uniform(least, most)
     shoulder, wheel = rng.uniform(0.12, 0.2), c.wheel * rng.uniform(0.97, 1.04)
-    paint = _PAINTS[(5 * index + rng.integers(3)) % len(_PAINTS)]
+    paint = _CAR.paints[(5 * index + rng.integers(3)) % len(_CAR.paints)]
     draft, half, end = Draft(), width / 2, length / 2
 
     def level(share: float, grow: float = 0.0) -> tuple[float, float, float, float]:
@@ -252,22 +188,22 @@ def car(rng: np.random.Generator, index: int) -> Draft:
     roof = [level(0.86, 0.012), level(0.93, 0.012), level(1.0, -0.03), ridge]
     draft.add(
         stack(body, paint, radius=0.18),
-        stack([level(-0.25, -0.07), level(0.0), level(0.92)], _PANES, radius=0.12),
+        stack([level(-0.25, -0.07), level(0.0), level(0.92)], _CAR.panes, radius=0.12),
         stack(roof, paint, radius=0.12),
-        box((0, c.nose - 0.16, -end), (0.78 * half, 0.15, 0.06), _DARK, radius=0.02),
+        box((0, c.nose - 0.16, -end), (0.78 * half, 0.15, 0.06), _CAR.dark, radius=0.02),
     )
     draft.mark_pair(0, 1, (wide / 2, y, front))
     draft.mark_pair(2, 3, (wide / 2, y, rear))
     y, wide, front, _ = level(0.06)
     draft.mark_pair(12, 13, (wide / 2, y, front))
     (y, wide, *feet), (top, narrow, *heads) = level(-0.1, -0.03), level(0.92, -0.03)
-    for foot, head in np.linspace((feet[0], heads[0]), (feet[1], heads[1]), int(c.posts)):
+    for foot, head in np.linspace((feet[0], heads[0]), (feet[1], heads[1]), c.posts):
         draft.add_pair(beam([(wide / 2, y, foot), (narrow / 2, top, head)], (0.08, 0.05), paint))
     lamp, tail = (0.72 * half, c.nose - 0.15, 0.04 - end), (0.76 * half, c.tail - 0.16, end - 0.03)
     mirror = (half + 0.08, c.belt + 0.07, level(0.0)[2] + 0.36)
     draft.add_pair(
-        box(lamp, (0.42 * half, 0.17, 0.2), _LAMP, radius=0.09),
-        box(tail, (0.3 * half, 0.18, 0.16), _RED, radius=0.03),
+        box(lamp, (0.42 * half, 0.17, 0.2), _CAR.lamp, radius=0.09),
+        box(tail, (0.3 * half, 0.18, 0.16), _CAR.red, radius=0.03),
         box(mirror, (0.2, 0.15, 0.12), paint, radius=0.06),
     )
     draft.mark_pair(8, 9, (0.78 * half, c.nose - 0.09, -end - 0.1))
@@ -275,43 +211,16 @@ def car(rng: np.random.Generator, index: int) -> Draft:
     draft.mark_pair(18, 19, (half + 0.16, *mirror[1:]))
     for first, share, sign in ((4, c.axle, -1), (6, c.back, 1)):
         z = (share - 0.5) * length
-        for profile, color, lift in ((_TYRE, _DARK, 1), (_DISC, _RIM, 1), (_ARCH, _DARK, 1.12)):
-            hub, turned = (half + 0.012, lift * wheel, z), np.multiply(profile, (wheel, 1))
-            draft.add_pair(lathe(turned, color, center=hub, sideways=True))
+        for ring in _CAR.wheel:
+            hub = (half + 0.012, ring["lift"] * wheel, z)
+            turned = np.multiply(ring["profile"], (wheel, 1))
+            draft.add_pair(lathe(turned, ring["color"], center=hub, sideways=True))
         long = 0.06 + min(0.36, end - abs(z) - 1.22 * wheel)
         middle, size = (0, 0.41, sign * (end + 0.065 - long / 2)), (1.97 * half, 0.2, long)
-        draft.add(box(middle, size, _TRIM, radius=0.07))
+        draft.add(box(middle, size, _CAR.trim, radius=0.07))
         draft.mark_pair(first, first + 1, (half + 0.05, wheel, z))
         draft.mark_pair(first + 10, first + 11, (0.89 * half, 0.42, sign * (end + 0.1)))
     return draft
-
-
-# The length is 1, the bow at z = -0.5 and the water line at y = 0. ``draft`` is the depth under
-# water, ``side`` the height amidships, which rises by ``fore`` at the bow; it hangs over by
-# ``bow``. The hull is as wide as ``beam`` from ``entry`` on, its bow a wedge for ``full`` 1 and
-# blunt for 3, its ``transom`` a share of the beam. A mast has a ``rise`` and stands ``before`` the
-# roof's rear end; a funnel has a place z and a radius.
-_VESSELS = table("""
-    kind  beam draft side fore bow  entry full transom rise before z    funnel
-    ship  .165 .04   .052 .03  .045 .2    2.2  .82     .075 .0325  .433 .027
-    sloop .275 .05   .072 .035 .11  .58   1.7  .6      .965 .29    0    0
-    yacht .25  .035  .082 .045 .12  .55   1.8  .88     .19  .08    0    0
-    tug   .325 .07   .072 .08  .05  .38   2.3  .72     .2   .04    .08  .06
-""")
-# Height, width relative to the beam, and z of front and rear, from the lowest up.
-_STOREYS = {
-    "ship": 4 * [(0.034, 0.84, 0.3, 0.415)] + [(0.03, 1.0, 0.3075, 0.3625)],
-    "sloop": [(0.065, 0.44, -0.11, 0.19)],
-    "yacht": [(0.1, 0.74, -0.12, 0.3), (0.085, 0.65, -0.01, 0.23), (0.07, 0.57, 0.1, 0.16)],
-    "tug": [(0.11, 0.62, -0.22, 0.12), (0.135, 0.484, -0.2, -0.04)],
-}
-# Of the lower and upper end of a storey's parts: height, width, and how far it juts out.
-_WALL, _WINDOWS = ((0.0, 1.0, 0.0), (0.35, 1.0, 0.0)), ((0.35, 0.98, 0.0), (0.88, 0.94, 0.0))
-_ROOF = ((0.88, 1.03, 0.2), (1.0, 1.0, 0.12))
-_WHITE, _SPAR, _CLOTH, _PLANKS = palette("f0f0ec ced0d4 f6f3e8 b48a60")
-_BOTTOMS = palette("8c2620 6e2222 28423c")
-_SIDES = palette("243e68 962824 225850 262c34 e2e2de 204a78")
-_ACCENTS = palette("cc2c26 eea824 205ca0 2e7c4e e86a20")
 
 
 def vessel(rng: np.random.Generator, index: int) -> Draft:
@@ -322,19 +231,20 @@ def vessel(rng: np.random.Generator, index: int) -> Draft:
     front and 10, 11 rear upper corners of the deck house; 12 the highest point; 13, 14 stern at the
     water line; 15 the funnel's top, where there is one.
     """
-    turn, number = divmod(index, len(_VESSELS))
-    v = SimpleNamespace(**vars(_VESSELS[number]))
+    turn, number = divmod(index, len(_VESSEL.kinds["kind"]))
+    v = chosen(_VESSEL.kinds, number)
     v.beam, v.side = (v.beam, v.side) * rng.uniform((0.92, 0.88), (1.08, 1.12))
     variant, tall = turn % 3, rng.uniform(0.92, 1.1)
-    bottom, accent, draft = rng.choice(_BOTTOMS), rng.choice(_ACCENTS), Draft()
-    color = _SIDES[(number + turn + rng.integers(2)) % len(_SIDES)]
+    draft, accents = Draft(), _VESSEL.accents
+    bottom, accent = rng.choice(_VESSEL.bottoms), rng.choice(accents)
+    color = _VESSEL.sides[(number + turn + rng.integers(2)) % len(_VESSEL.sides)]
     low, edge, water = v.side - 0.011, _outline(v, 1.0), _outline(v, 0.0)
     planks = edge * (0.92, 1, 0.98) - (0, 0.011, 0)
     draft.add(
         loft([_outline(v, level) for level in np.linspace(-1.0, 0.0, 6)], bottom),
-        loft([water, _outline(v, 0.12)], _WHITE),  # a stripe above the water line
+        loft([water, _outline(v, 0.12)], _VESSEL.white),  # a stripe above the water line
         loft([*(_outline(v, level) for level in np.linspace(0.12, 1.0, 5)), planks], color),
-        loft([planks - (0, 0.004, 0), planks + (0, 0.002, 0)], _PLANKS),
+        loft([planks - (0, 0.004, 0), planks + (0, 0.002, 0)], _VESSEL.planks),
     )
     draft.places |= {0: edge[29], 1: water[29]}
     for right, place in ((2, edge[1]), (4, edge[11]), (6, edge[19]), (13, water[1])):
@@ -345,23 +255,24 @@ def vessel(rng: np.random.Generator, index: int) -> Draft:
         for bay, row, layer in np.ndindex(7, 2, 4):
             if layer < (3 if bay == 0 else 4 - (bay + row + variant) % 2):
                 middle = np.add((row, layer, bay), 0.5) * size + (0, low, -0.36)
-                color = _ACCENTS[(5 * bay + 3 * row + (2 + bay) * layer) % len(_ACCENTS)]
+                color = accents[(5 * bay + 3 * row + (2 + bay) * layer) % len(accents)]
                 draft.add_pair(box(middle, size * (0.95, 0.95, 0.92), color))
     elif v.kind == "sloop":  # a fin, mainsail and foresail, one of them coloured
         fin = [(-v.draft - 0.13, 0.03, -0.02, 0.14), (0.02 - v.draft, 0.026, -0.1, 0.16)]
-        top, colors = low + 1.02 * tall, ((_CLOTH, accent), (accent, _CLOTH))[turn % 2]
+        top, sails = low + 1.02 * tall, [_VESSEL.cloth, accent][:: 1 - 2 * (turn % 2)]
         main = [(low + 0.112, 0.006, -0.088, 0.29), (top - 0.03, 0.006, -0.088, -0.076)]
         fore = [(low + 0.03, 0.006, -0.47, -0.12), (0.86 * top, 0.006, -0.13, -0.118)]
-        for levels, color in zip((fin, main, fore), (bottom, *colors), strict=True):
+        for levels, color in zip((fin, main, fore), (bottom, *sails), strict=True):
             draft.add(stack(levels, color, radius=0.0))
 
     roofs, low = [], low - 0.01
-    storeys = _STOREYS[v.kind][: (2, 3, 1)[variant] if v.kind == "yacht" else None]
+    storeys = _VESSEL.storeys[v.kind][: (2, 3, 1)[variant] if v.kind == "yacht" else None]
     for number, (rise, share, front, rear) in enumerate(storeys, 1):
         high, width = rise * tall, share * v.beam
-        roof = accent if v.funnel and number == len(storeys) else _WHITE
-        for storey, color in ((_WALL, _WHITE), (_WINDOWS, _PANES), (_ROOF, roof)):
-            y, x, out = np.transpose(storey)
+        for part in _VESSEL.parts:
+            is_top = number == len(storeys) and part is _VESSEL.parts[-1]
+            color = accent if v.funnel and is_top else part["color"]
+            y, x, out = np.transpose(part["ends"])
             ends = np.column_stack([front - out * high, rear + out * high])
             walls = np.column_stack([low + y * high, x * width, ends])
             draft.add(stack(walls, color, radius=0.35 * high))
@@ -371,11 +282,11 @@ def vessel(rng: np.random.Generator, index: int) -> Draft:
     draft.mark_pair(8, 9, (x, y, front))
     draft.mark_pair(10, 11, (x, y, rear))
     z, top = roofs[-1][3] - v.before, low + v.rise * tall
-    draft.add(lathe([(0.008, low - 0.01), (0.005, top)], _SPAR, center=(0, 0, z), count=12))
+    draft.add(lathe([(0.008, low - 0.01), (0.005, top)], _VESSEL.spar, center=(0, 0, z), count=12))
     draft.places[12] = (0.0, top, z)
     if v.funnel:
         rim = np.array([(1.0, low - 0.14), (0.95, low + 0.02), (0.95, low + 0.05 * tall)])
-        for two, color in ((rim[:2], accent), (rim[1:], _DARK)):
+        for two, color in ((rim[:2], accent), (rim[1:], _VESSEL.black)):
             draft.add(lathe(two * (v.funnel, 1), color, center=(0, 0, v.z)))
         draft.places[15] = (0.0, low + 0.05 * tall, v.z)
     return draft
@@ -387,9 +298,8 @@ def _outline(v: SimpleNamespace, level: float) -> FloatArray:
     The level is -1 at the keel, 0 at the water line, 1 at the edge of the deck.
     """
     z = np.concatenate([np.linspace(0.5, -0.1, 13), np.linspace(-0.1, -0.5, 17)[1:]])
-    y = v.draft * min(level, 0) + (v.side + v.fore * np.clip((0.05 - z) / 0.55, 0, 1) ** 2) * max(
-        level, 0
-    )
+    sheer = np.clip((0.05 - z) / 0.55, 0, 1) ** 2
+    y = v.draft * min(level, 0) + (v.side + v.fore * sheer) * max(level, 0)
     flare = 0.35 + 0.65 * np.sqrt(min((level + 1) / 1.75, 1.0))
     entry, transom = v.entry * (1.125 - 0.125 * level), v.transom * (0.725 + 0.275 * level)
     narrow = (1 - np.clip((z + 0.5) / entry, 0, 1)) ** v.full

@@ -6,8 +6,10 @@ plane x = 0 must be exactly mirror symmetric, also in its tessellation.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,16 +25,15 @@ Color = npt.ArrayLike
 Place = Sequence[float] | FloatArray
 
 
-def palette(text: str) -> npt.NDArray[np.int64]:
-    """Colours (n, 3) by their hexadecimal digits, such as ``"b02428 202228"``."""
-    return np.array([list(bytes.fromhex(digits)) for digits in text.split()])
+def read_designs(*categories: str) -> list[SimpleNamespace]:
+    """The measures and colours of categories, from designs.toml."""
+    designs = tomllib.loads(Path(__file__).with_name("designs.toml").read_text(encoding="utf-8"))
+    return [SimpleNamespace(**designs[category]) for category in categories]
 
 
-def table(text: str) -> list[SimpleNamespace]:
-    """Kinds of objects by the rows of a table, at whose head stand the names of their measures."""
-    names, *rows = (line.split() for line in text.strip().splitlines())
-    cells = ((float(cell) if cell[-1].isdigit() else cell for cell in row) for row in rows)
-    return [SimpleNamespace(**dict(zip(names, row, strict=True))) for row in cells]
+def chosen(kinds: dict[str, list[Any]], index: int) -> SimpleNamespace:
+    """The measures of one kind out of lists over all, which take turns."""
+    return SimpleNamespace(**{name: each[index % len(each)] for name, each in kinds.items()})
 
 
 def part(vertices: npt.ArrayLike, faces: npt.ArrayLike, color: Color) -> Mesh:

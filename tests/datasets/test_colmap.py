@@ -1,11 +1,10 @@
-"""COLMAP models: text and binary say the same, real ones reproject, bad images are named."""
+"""COLMAP models: what they say arrives, real ones reproject, bad images are named."""
 
 from __future__ import annotations
 
 import logging
 import os
 import pickle
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -21,21 +20,6 @@ from cadalign.geometry.camera import Camera
 DATA = os.environ.get("CADALIGN_DATA")
 needs_data = pytest.mark.skipif(DATA is None, reason="CADALIGN_DATA is unset")
 
-# COLMAP's numbers of its camera models.
-MODELS = {
-    "SIMPLE_PINHOLE": 0,
-    "PINHOLE": 1,
-    "SIMPLE_RADIAL": 2,
-    "RADIAL": 3,
-    "OPENCV": 4,
-    "OPENCV_FISHEYE": 5,
-    "FULL_OPENCV": 6,
-    "FOV": 7,
-    "SIMPLE_RADIAL_FISHEYE": 8,
-    "RADIAL_FISHEYE": 9,
-    "THIN_PRISM_FISHEYE": 10,
-    "RAD_TAN_THIN_PRISM_FISHEYE": 11,
-}
 PARAMS = {
     "SIMPLE_PINHOLE": [500, 320, 240],
     "PINHOLE": [500, 510, 321, 242],
@@ -76,7 +60,7 @@ class Model:
             name = f"{number}.jpg"
             self.images.append([9 - number, quat, translation, camera_id, name, observations])
 
-    def write_text(self, folder: Path) -> Path:
+    def write(self, folder: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         cameras = ["# Camera list"]
         for number, (model, width, height, params) in self.cameras.items():
@@ -90,31 +74,6 @@ class Model:
         for stem, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
             (folder / f"{stem}.txt").write_text("\n".join(lines) + "\n")
         return folder
-
-    def write_binary(self, folder: Path) -> Path:
-        folder.mkdir(parents=True, exist_ok=True)
-        data = struct.pack("<Q", len(self.cameras))
-        for number, (model, width, height, params) in self.cameras.items():
-            data += struct.pack("<IiQQ", number, MODELS[model], width, height)
-            data += struct.pack(f"<{len(params)}d", *params)
-        (folder / "cameras.bin").write_bytes(data)
-        data = struct.pack("<Q", len(self.images))
-        for number, quat, translation, camera_id, name, observations in self.images:
-            data += struct.pack("<I4d3dI", number, *quat, *translation, camera_id)
-            data += name.encode() + b"\0" + struct.pack("<Q", len(observations))
-            for observation in observations:
-                data += struct.pack("<ddq", *observation)
-        (folder / "images.bin").write_bytes(data)
-        data = struct.pack("<Q", len(self.points))
-        for number, xyz in self.points.items():
-            data += struct.pack("<Q3d3BdQ", number, *xyz, 1, 2, 3, 0.5, 2)
-            data += struct.pack("<IIII", 1, 2, 3, 4)
-        (folder / "points3D.bin").write_bytes(data)
-        return folder
-
-
-WRITERS = [Model.write_text, Model.write_binary]
-either = pytest.mark.parametrize("write", WRITERS, ids=["text", "binary"])
 
 
 def assert_same(one: Correspondences, other: Correspondences) -> None:
@@ -130,21 +89,10 @@ def assert_same(one: Correspondences, other: Correspondences) -> None:
 # --- what the files say
 
 
-def test_text_and_binary_load_the_same(tmp_path):
-    model = Model(["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"])
-    text = Colmap(model.write_text(tmp_path / "text"))
-    binary = Colmap(model.write_binary(tmp_path / "binary"))
-    assert text.names == binary.names == ("0.jpg", "1.jpg", "2.jpg", "3.jpg", "4.jpg", "5.jpg")
-    assert not text.problems
-    for one, other in zip(text, binary, strict=True):
-        assert_same(one, other)
-
-
-@either
-def test_what_was_written_arrives(tmp_path, write):
+def test_what_was_written_arrives(tmp_path):
     model = Model(["PINHOLE", "OPENCV"])
     _, _, translation, _, name, observations = model.images[1]
-    seen = Colmap(write(model, tmp_path))[name]
+    seen = Colmap(model.write(tmp_path))[name]
     kept = [entry for entry in observations if entry[2] != -1]
     np.testing.assert_array_equal(seen.points_3d, [model.points[i] for _, _, i in kept])
     # COLMAP's pixel centres are at (0.5, 0.5), for observations and principal point alike.
@@ -155,32 +103,24 @@ def test_what_was_written_arrives(tmp_path, write):
     assert seen.cam_from_world.scale.tolist() == [1, 1, 1]
 
 
-@either
-def test_quaternions_are_scalar_first_and_cam_from_world(tmp_path, write):
+def test_quaternions_are_scalar_first_and_cam_from_world(tmp_path):
     model = Model(["PINHOLE"])
     model.images[0][1] = np.array([1.0, 1.0, 0.0, 0.0])  # 90 degrees about x, not normalised
-    rotation = Colmap(write(model, tmp_path))[0].cam_from_world.rotation
+    rotation = Colmap(model.write(tmp_path))[0].cam_from_world.rotation
     np.testing.assert_allclose(rotation, [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-15)
 
 
-@pytest.mark.parametrize("folder", ["", "sparse/0", "sparse"])
+@pytest.mark.parametrize("folder", ["", "sparse/0"])
 def test_a_model_is_found_below_the_folder(tmp_path, folder):
-    Model(["PINHOLE"]).write_text(tmp_path / folder)
+    Model(["PINHOLE"]).write(tmp_path / folder)
     assert Colmap(tmp_path).names == ("0.jpg",)
 
 
-def test_binary_is_preferred_to_text(tmp_path):
-    Model(["PINHOLE"]).write_text(tmp_path)
-    Model(["PINHOLE", "PINHOLE"]).write_binary(tmp_path)
-    assert len(Colmap(tmp_path)) == 2
-
-
-@either
-def test_images_without_observations_are_empty(tmp_path, write):
+def test_images_without_observations_are_empty(tmp_path):
     model = Model(["PINHOLE", "PINHOLE", "PINHOLE"])
     for image in model.images[:2]:  # one of them is last in the text file
         image[5] = []
-    images = Colmap(write(model, tmp_path))
+    images = Colmap(model.write(tmp_path))
     assert not images.problems
     assert [len(image) for image in images] == [0, 0, 25]
 
@@ -188,7 +128,7 @@ def test_images_without_observations_are_empty(tmp_path, write):
 def test_names_with_spaces_and_crlf_lines_are_read(tmp_path):
     model = Model(["PINHOLE"])
     model.images[0][4] = "a folder/my photo.jpg"
-    file = model.write_text(tmp_path) / "images.txt"
+    file = model.write(tmp_path) / "images.txt"
     file.write_bytes(file.read_bytes().replace(b"\n", b"\r\n"))
     assert Colmap(tmp_path)["a folder/my photo.jpg"].points_2d.shape == (25, 2)
 
@@ -196,9 +136,8 @@ def test_names_with_spaces_and_crlf_lines_are_read(tmp_path):
 # --- the sequence
 
 
-@either
-def test_models_can_be_sent_to_worker_processes(tmp_path, write):
-    images = Colmap(write(Model(["PINHOLE", "RADIAL"]), tmp_path))
+def test_models_can_be_sent_to_worker_processes(tmp_path):
+    images = Colmap(Model(["PINHOLE", "RADIAL"]).write(tmp_path))
     for one, other in zip(images, pickle.loads(pickle.dumps(images)), strict=True):
         assert_same(one, other)
 
@@ -206,7 +145,7 @@ def test_models_can_be_sent_to_worker_processes(tmp_path, write):
 def test_one_bad_image_spoils_no_other(tmp_path, caplog):
     model = Model(["PINHOLE"] * 3)
     model.images[1][5][0] = (1.0, 2.0, 999)
-    images = Colmap(model.write_text(tmp_path))
+    images = Colmap(model.write(tmp_path))
     with caplog.at_level(logging.WARNING, logger="cadalign"):
         assert [image.id for image in images] == ["0.jpg", "2.jpg"]
         assert len(list(images)) == 2
@@ -218,12 +157,11 @@ def test_one_bad_image_spoils_no_other(tmp_path, caplog):
 # --- bad input: exact messages for what the format's own checks find
 
 
-@either
-def test_observing_points_that_do_not_exist_names_file_image_and_point(tmp_path, write):
+def test_observing_points_that_do_not_exist_names_file_image_and_point(tmp_path):
     model = Model(["PINHOLE"] * 2)
     model.images[1][5][0] = (1.0, 2.0, 999)
     model.images[1][5][1] = (1.0, 2.0, 8)
-    images = Colmap(write(model, tmp_path))
+    images = Colmap(model.write(tmp_path))
     with pytest.raises(DataError) as caught:
         images["1.jpg"]
     assert caught.value.where == f"{images.root}, 1.jpg"
@@ -232,10 +170,9 @@ def test_observing_points_that_do_not_exist_names_file_image_and_point(tmp_path,
     )
 
 
-@either
 @pytest.mark.parametrize("name", ["FOV", "RAD_TAN_THIN_PRISM_FISHEYE", "THIN_PRISM_FISHEYE"])
-def test_unknown_camera_model_concerns_its_images_only(tmp_path, write, name):
-    images = Colmap(write(Model([name, "PINHOLE"]), tmp_path))
+def test_unknown_camera_model_concerns_its_images_only(tmp_path, name):
+    images = Colmap(Model([name, "PINHOLE"]).write(tmp_path))
     assert len(images[1]) == 25
     with pytest.raises(
         DataError, match=rf"camera 10.*unknown model '{name}'.*for others undistort the images"
@@ -243,31 +180,8 @@ def test_unknown_camera_model_concerns_its_images_only(tmp_path, write, name):
         images[0]
 
 
-def test_unknown_binary_model_number_is_refused(tmp_path):
-    folder = Model(["PINHOLE"]).write_binary(tmp_path)
-    data = bytearray((folder / "cameras.bin").read_bytes())
-    struct.pack_into("<i", data, 12, 77)
-    (folder / "cameras.bin").write_bytes(data)
-    with pytest.raises(DataError, match=r"cameras.bin, offset 8: camera 10 .* model number 77"):
-        Colmap(folder)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_a_binary_file_cut_anywhere_names_itself_and_the_offset(tmp_path, name):
-    folder = Model(["PINHOLE", "RADIAL"], points=8).write_binary(tmp_path)
-    data = (folder / name).read_bytes()
-    for length in range(len(data)):
-        (folder / name).write_bytes(data[:length])
-        with pytest.raises(DataError, match=rf"{name}: .* at offset \d+ needs .* cut short"):
-            Colmap(folder)
-    (folder / name).write_bytes(data + b"\0")
-    with pytest.raises(DataError, match=f"1 bytes too many from offset {len(data)}"):
-        Colmap(folder)
-
-
 def test_a_text_file_cut_short_names_the_image(tmp_path):
-    file = Model(["PINHOLE"] * 2).write_text(tmp_path) / "images.txt"
+    file = Model(["PINHOLE"] * 2).write(tmp_path) / "images.txt"
     lines = file.read_text().splitlines()
     file.write_text("\n".join([*lines[:-1], lines[-1].rsplit(maxsplit=1)[0]]))
     images = Colmap(tmp_path)
@@ -292,7 +206,7 @@ def test_a_text_file_cut_short_names_the_image(tmp_path):
     ],
 )
 def test_malformed_text_names_the_line(tmp_path, name, line, message):
-    folder = Model(["PINHOLE"]).write_text(tmp_path)
+    folder = Model(["PINHOLE"]).write(tmp_path)
     with (folder / name).open("a") as file:
         file.write(line + "\n")
     with pytest.raises(DataError) as caught:
@@ -311,11 +225,10 @@ def test_malformed_text_names_the_line(tmp_path, name, line, message):
         (5, [(np.nan, 1.0, 7)], "NaN or infinite values in row 0"),
     ],
 )
-@either
-def test_bad_values_name_the_image(tmp_path, write, column, value, message):
+def test_bad_values_name_the_image(tmp_path, column, value, message):
     model = Model(["PINHOLE", "PINHOLE"])
     model.images[1][column] = value
-    images = Colmap(write(model, tmp_path))
+    images = Colmap(model.write(tmp_path))
     assert images[0].id == "0.jpg"
     with pytest.raises(DataError, match=message) as caught:
         images[1]
@@ -325,10 +238,11 @@ def test_bad_values_name_the_image(tmp_path, write, column, value, message):
 def test_missing_files_are_named(tmp_path):
     with pytest.raises(DataError, match="no such folder"):
         Colmap(tmp_path / "nowhere")
-    with pytest.raises(DataError, match="there is no COLMAP model"):
+    (tmp_path / "cameras.bin").touch()
+    with pytest.raises(DataError, match=r"images.txt, points3D.txt are missing; .*model_converter"):
         Colmap(tmp_path)
-    (Model(["PINHOLE"]).write_text(tmp_path / "sparse/0") / "points3D.txt").unlink()
-    with pytest.raises(DataError, match=r"sparse/0/points3D.txt is missing"):
+    (Model(["PINHOLE"]).write(tmp_path / "sparse/0") / "points3D.txt").unlink()
+    with pytest.raises(DataError, match=r"sparse/0: points3D.txt is missing"):
         Colmap(tmp_path)
 
 

@@ -88,14 +88,10 @@ X, Y = zip(*POINTS, strict=True)
     [
         # MMPose's and Detectron2's result files, ultralytics' predictions.json.
         ({"image_id": 7, "category_id": 1, "keypoints": flat(SCORES), "score": 0.75}, 0.75),
-        # MMPose's inferencer.
-        ({"keypoints": POINTS, "keypoint_scores": SCORES, "bbox_score": 0.75}, 0.75),
         # ultralytics' results.to_json().
         ({"confidence": 0.75, "keypoints": {"x": X, "y": Y, "visible": SCORES}}, 0.75),
-        # Pairs with scores beside them, nested.
-        ({"keypoints": [[*p, s] for p, s in zip(POINTS, SCORES, strict=True)]}, None),
     ],
-    ids=["results", "mmpose", "ultralytics", "rows"],
+    ids=["results", "ultralytics"],
 )
 def test_detectors_files_are_read(tmp_path: Path, entry: Any, score: float | None) -> None:
     (found,) = read(tmp_path, [entry])
@@ -138,10 +134,10 @@ AT = "annotations[0].keypoints"
         ),
         ([], "there are no keypoints"),
         ([{"bbox": [1, 2, 3, 4]}], "[0].keypoints: missing; is it COCO's keypoint JSON"),
-        (changed("annotations.0.keypoints", []), f"{AT}: expected a list of numbers"),
+        (changed("annotations.0.keypoints", []), f"{AT}: 0 numbers are not x, y and visib"),
         (
             changed("annotations.0.keypoints", [1, 2, 2, 3]),
-            f"{AT}: 4 numbers are not x, y and visibility of keypoints",
+            f"{AT}: 4 numbers are not x, y and visibility or score of keypoints",
         ),
         (
             changed("annotations.0.keypoints", [1, 2, 2]),
@@ -160,15 +156,12 @@ AT = "annotations[0].keypoints"
         ),
         (changed("images.1.id", 3), "images[1].id: 3 is the id of another entry, too; "),
         ([{"keypoints": {"x": [1, 2], "y": [1]}}], "[0].keypoints.y: 1 values, but x has 2"),
+        ([{"keypoints": [[1, 2, 3]]}], "[0].keypoints[0]: [1, 2, 3] is not a finite number"),
         (
-            [{"keypoints": [[1, 2, 3, 4]]}],
-            "[0].keypoints: [[1.0, 2.0, 3.0, 4.0]] are not x, y and score of each keypoint",
-        ),
-        (
-            [{"keypoints": [[1, 2]], "keypoint_scores": [1, 2]}],
+            [{"keypoints": {"x": [1], "y": [1], "visible": [1, 2]}}],
             "[0].keypoints: 2 scores of 1 keypoints",
         ),
-        ([{"keypoints": [[1, 2, -1]]}], "[0]: scores: keypoint 0 has the value -1, which is nega"),
+        ([{"keypoints": [1, 2, -1]}], "[0]: scores: keypoint 0 has the value -1, which is nega"),
     ],
 )
 def test_malformed_json_is_refused_by_file_and_field(tmp_path: Path, data: Any, text: str) -> None:
@@ -347,13 +340,9 @@ def test_ids_pair_where_there_are_no_names_and_order_where_there_is_neither() ->
     assert by_order.scores is None
 
 
-def test_scores_leave_out_or_weigh() -> None:
+def test_low_scores_leave_keypoints_out() -> None:
     found = ImageKeypoints(np.array(POINTS), scores=np.array([0.25, 0.8, 1.0]))
     assert len(join_keypoints(found, MODEL, CAMERA, min_score=0.5).points_2d) == 2
-    weighed = join_keypoints(found, MODEL, CAMERA, sigma_from_scores=2.0)
-    assert weighed.sigma is not None
-    assert weighed.sigma.tolist() == [8.0, 2.5, 2.0]
-    assert weighed.scores is None
 
 
 def test_unknown_keypoints_can_be_left_out() -> None:
@@ -405,9 +394,6 @@ def test_model_keypoints_without_ids_give_none() -> None:
             "photo.json: 4 keypoints without names, but the model has 3; "
             "give names, or as many keypoints as the model has, in its order",
         ),
-        ({}, {"sigma_from_scores": 1.0}, "photo.json: there are no scores to weigh by"),
-        ({}, {"sigma_from_scores": 0.0}, "sigma_from_scores: 0.0 is not positive"),
-        ({}, {"sigma_from_scores": np.nan}, "sigma_from_scores: nan is not positive"),
     ],
 )
 def test_keypoints_that_cannot_be_paired_are_refused(

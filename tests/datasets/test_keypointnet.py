@@ -217,7 +217,7 @@ def test_annotations_may_be_a_thousandth_of_the_diagonal_off(tmp_path, off, is_r
             [0, 4],
             "reflection[0].kp_indexes: 4 is not the row",
         ),
-        ("symmetries.reflection.0.kp_indexes", [0], "1 keypoints do not mirror"),
+        ("symmetries.reflection.0.kp_indexes", [0], "[0].kp_indexes: [0] is not a list of 2"),
         ("symmetries.rotation.0.circle", {}, "rotation[0].circle.center: missing"),
         ("symmetries.rotation.0.circle.normal", [0, 0, 0], "circle.normal: has no length"),
         ("class_id", "../../etc", "class_id: '../../etc' is not an id"),

@@ -51,10 +51,6 @@ def coco_results(pixels: list[list[Any]]) -> Any:
     return [{"image_id": 1, "category_id": 1, "keypoints": flat, "score": 0.9}]
 
 
-def mmpose(pixels: list[list[Any]]) -> Any:
-    return [{"keypoints": pixels, "keypoint_scores": SCORES}]
-
-
 def csv(pixels: list[list[Any]]) -> str:
     words = {None: "null"}
     rows = zip(NAMES, pixels, SCORES, strict=True)
@@ -69,7 +65,7 @@ def observation(pixels: list[list[Any]]) -> Any:
 
 
 @pytest.mark.parametrize("placeholder", NOT_FOUND, ids=str)
-@pytest.mark.parametrize("form", [ultralytics, coco_results, mmpose, csv, observation])
+@pytest.mark.parametrize("form", [ultralytics, coco_results, csv, observation])
 def test_what_was_not_found_is_left_out_and_counted(
     tmp_path: Path, form: Any, placeholder: tuple[Any, Any]
 ) -> None:

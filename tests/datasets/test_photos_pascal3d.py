@@ -1,4 +1,4 @@
-"""PASCAL3D+, ObjectNet3D, and detections in its photos: viewpoints, anchors, CAD models."""
+"""PASCAL3D+: viewpoints, anchors, CAD models."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def annotated(**changes):
 def write_record(path, *objects):
     path.parent.mkdir(parents=True, exist_ok=True)
     objects = np.array(list(objects), dtype=object)
-    record = {"filename": f"{path.stem}.jpg", "imgsize": [200.0, 160.0, 3.0], "objects": objects}
+    record = {"filename": f"{path.stem}.jpg", "objects": objects}
     savemat(path, {"record": record})
     return path
 
@@ -103,14 +103,10 @@ def test_visible_anchors_belong_to_the_models(root):
     assert chair.model.model_id == "chair/02"
 
 
-def test_objectnet3d_has_the_same_layout_without_folders_of_categories(tmp_path):
-    write_cad(tmp_path / "CAD" / "mat" / "chair.mat")
-    write_record(tmp_path / "Annotations" / "n01.mat", annotated(), annotated(**{"class": "mug"}))
-    (photo,) = Pascal3D(tmp_path)
-    assert photo.image is None
-    assert (photo.camera.width, photo.camera.height) == (200, 160)
-    assert [each.category for each in photo.objects] == ["chair", "mug"]
-    assert photo.objects[1].model is None
+def test_the_photo_must_be_there_as_its_size_is_the_cameras(root):
+    (root / "Images" / "chair_pascal" / "2008_000001.jpg").unlink()
+    with pytest.raises(DataError, match=r"2008_000001.mat: its image is not in Images"):
+        Pascal3D(root)[0]
 
 
 def test_objects_without_a_continuous_viewpoint_have_no_pose(root):
@@ -141,6 +137,7 @@ def test_bad_objects_and_files_do_not_stop_the_others(root):
         annotated(cad_index=np.inf),
         annotated(),
     )
+    write_photo(root / "Images" / "chair_pascal" / "e.jpg", 200, 160)
     dataset = Pascal3D(root)
     photos = {photo.name.split("/")[1]: photo for photo in dataset}
     assert sorted(photos) == ["2008_000001", "e"]

@@ -1,4 +1,4 @@
-"""Pickles of arrays and plain containers are loaded, and no pickle runs code."""
+"""Pickles of arrays, lists and tuples are loaded, and no pickle runs code."""
 
 from __future__ import annotations
 
@@ -34,25 +34,22 @@ VALUES = [
 
 
 class Python2Pickler(pickle._Pickler):
-    """Writes protocols 0 and 2 as Python 2 did: bytes and text as Python 2's str."""
+    """Writes protocol 2 as Python 2 did: bytes and text as Python 2's str."""
 
     dispatch: ClassVar = dict(pickle._Pickler.dispatch)
 
     def save_string(self, obj):
         data = obj if isinstance(obj, bytes) else obj.encode("latin1")
-        if self.proto == 0:
-            self.write(pickle.STRING + b"'" + b"".join(b"\\x%02x" % each for each in data) + b"'\n")
-        else:
-            self.write(pickle.BINSTRING + struct.pack("<i", len(data)) + data)
+        self.write(pickle.BINSTRING + struct.pack("<i", len(data)) + data)
         self.memoize(obj)
 
     dispatch[bytes] = save_string
     dispatch[str] = save_string
 
 
-def python2_bytes(value: Any, protocol: int) -> bytes:
+def python2_bytes(value: Any) -> bytes:
     buffer = io.BytesIO()
-    Python2Pickler(buffer, protocol=protocol, fix_imports=True).dump(value)
+    Python2Pickler(buffer, protocol=2, fix_imports=True).dump(value)
     # NumPy's modules had other names.
     return buffer.getvalue().replace(b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n")
 
@@ -75,28 +72,27 @@ def assert_same(found: Any, expected: Any) -> None:
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
 def test_arrays_scalars_and_containers_survive_all_protocols(tmp_path, protocol):
     objects = np.empty(2, dtype=object)
-    objects[:] = [np.arange(3.0), {"a": [1, "text", b"bytes", None, -(10**30)]}]
+    objects[:] = [np.arange(3.0), [1, "text", None, -(10**30)]]
     shared = [1.5, (True, ())]
-    values = [*VALUES, objects, shared, shared, {"b": {1: 2.5}}]
+    values = [*VALUES, objects, shared, shared]
     found = loaded(tmp_path, pickle.dumps(values, protocol=protocol))
     for each, value in zip(found, VALUES, strict=False):
         assert_same(each, value)
     assert found[len(VALUES)][0].tolist() == [0, 1, 2]
     assert found[len(VALUES)][1] == objects[1]
-    assert found[-3:] == values[-3:]
+    assert found[-2:] == values[-2:]
     assert all(type(each) is np.ndarray for each in found[:9])
 
 
-@pytest.mark.parametrize("protocol", [0, 2])
-def test_python_2_pickles_are_understood(tmp_path, protocol):
+def test_python_2_pickles_are_understood(tmp_path):
     values = [value for value in VALUES if value.dtype.kind != "U"]
-    data = python2_bytes([values, {"\xe9": b"\xff"}], protocol)
+    data = python2_bytes([values, ["\xe9", b"\xff"]])
     assert b"numpy._core" not in data
     assert b"_codecs" not in data
     found, texts = loaded(tmp_path, data)
     for each, value in zip(found, values, strict=True):
         assert_same(each, value)
-    assert texts == {"\xe9": "\xff"}
+    assert texts == ["\xe9", "\xff"]
 
 
 # --- what is refused
@@ -116,8 +112,8 @@ class Call:
 def test_a_pickle_that_would_run_a_command_is_refused_and_does_not(tmp_path, protocol):
     proof = tmp_path / "it ran"
     objects = np.empty(1, dtype=object)
-    objects[0] = {"x": (1, [Call(os.system, f"touch '{proof}'")])}
-    for value in (objects[0]["x"][1], objects, (np.zeros(2), [{"a": objects}])):
+    objects[0] = (1, [Call(os.system, f"touch '{proof}'")])
+    for value in (objects[0][1], objects, (np.zeros(2), [objects])):
         trap = pickle.dumps(value, protocol=protocol)
         with pytest.raises(DataError) as caught:
             loaded(tmp_path, trap)
@@ -182,7 +178,7 @@ def test_arrays_that_contradict_themselves_are_refused(tmp_path, arguments):
 
 
 def test_a_pickle_cut_anywhere_is_refused(tmp_path):
-    data = python2_bytes([np.arange(4.0), {"a": 1}], 2)
+    data = python2_bytes([np.arange(4.0), (1,)])
     for length in range(len(data)):
         with pytest.raises(DataError, match=r"a.pkl: not a whole pickle of arrays"):
             loaded(tmp_path, data[:length])
@@ -201,26 +197,28 @@ PICKLES = {
     "doubled": pickle.dumps(doubled(40), protocol=2),
     "tuples": b"\x80\x02" + b"(" * 1_000_000 + b"t" * 1_000_000 + b".",
     "key": b"\x80\x02})" + b"\x85" * 1_000_000 + b"K\x01s.",
-    "copies": (
-        b"\x80\x02(T\x40\x42\x0f\x00"
-        + b"a" * 1_000_000
-        + b"q\x00"
-        + b"c_codecs\nencode\nh\x00X\x06\x00\x00\x00latin1\x86R" * 3000
-        + b"t."
-    ),
     "integer": b"\x80\x02\x8b\xff\xff\xff\x7f.",
     "bytes": b"\x80\x04\x8e\xff\xff\xff\xff\xff\xff\xff\x0f.",
     "array": b"\x80\x05\x96\xff\xff\xff\xff\xff\xff\xff\x0f.",
     "stack": b"\x80\x02" + b"0" * 10 + b".",
     "build": b"cnumpy.core.multiarray\n_reconstruct\n(N(dS'__defaults__'\n(I1\ntstb.",
     "text": b"\x80\x02X\x01\x00\x00\x00a)b.",
+    "memory": b"\x80\x02Nr\xff\xff\xff\x7f.",
+    "set": b"\x80\x04\x8f(K\x01\x90.",
+    "dictionary": b"\x80\x02}K\x01K\x02s.",
     "nothing": b"",
 }
 
 
+# One text in 3,000 arrays, which are of 3 GB together if each copies it.
+TEXT = b"S'" + b"a" * 1_000_000 + b"'\n"
+SHARED = array_pickle(b"f8", PLAIN, b"I125000\n", TEXT + b"p0\n")[:-1]
+PICKLES["copies"] = b"(" + SHARED + 2999 * SHARED.replace(TEXT + b"p0", b"g0") + b"l."
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("name", PICKLES)
-def test_hostile_pickles_are_refused_quickly(tmp_path, name):
+def test_hostile_pickles_are_refused_quickly_or_read_without_copies(tmp_path, name):
     (tmp_path / "a.pkl").write_bytes(PICKLES[name])
     # In its own process, which may neither crash nor take more than 300 MB on top.
     code = (
@@ -235,4 +233,4 @@ def test_hostile_pickles_are_refused_quickly(tmp_path, name):
         "    sys.exit(7 if len(str(error)) < 500 + len(sys.argv[1]) else 8)\n"
     )
     done = subprocess.run([sys.executable, "-c", code, tmp_path / "a.pkl"], timeout=60, check=False)
-    assert done.returncode == 7
+    assert done.returncode == (0 if name == "copies" else 7)

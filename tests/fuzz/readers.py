@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-import struct
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -170,26 +169,12 @@ _IMAGES = "1 1 0 0 0 0 0 3 1 a.jpg\n10 10 1 20 20 2 5 5 -1\n2 .5 .5 .5 .5 0 0 3 
 _SCENE_POINTS = "1 0.1 0.2 0.3 255 0 0 0.5 1 0\n2 -.1 .2 .1 0 0 255 0.1 1 1 2 0\n"
 
 
-def _colmap_text(changed: str) -> Callable[[Path], Path]:
+def _colmap(changed: str) -> Callable[[Path], Path]:
     def write(folder: Path) -> Path:
         texts = ("cameras", _CAMERAS), ("images", _IMAGES), ("points3D", _SCENE_POINTS)
         for name, text in texts:
             (folder / f"{name}.txt").write_text(text)
         return folder / f"{changed}.txt"
-
-    return write
-
-
-def _colmap_binary(changed: str) -> Callable[[Path], Path]:
-    camera = struct.pack("<QIiQQ4d", 1, 1, 1, 64, 48, 60.0, 60.0, 32.0, 24.0)
-    image = struct.pack("<QI7dI", 1, 1, 1, 0, 0, 0, 0, 0, 3, 1) + b"a.jpg\0"
-    image += struct.pack("<Qddqddq", 2, 10, 10, 1, 5, 5, -1)
-    point = struct.pack("<QQ3d3BdQii", 1, 1, 0.1, 0.2, 0.3, 1, 2, 3, 0.5, 1, 1, 0)
-
-    def write(folder: Path) -> Path:
-        for name, data in (("cameras", camera), ("images", image), ("points3D", point)):
-            (folder / f"{name}.bin").write_bytes(data)
-        return folder / f"{changed}.bin"
 
     return write
 
@@ -254,8 +239,7 @@ FORMATS = {
         Format("keypointnet", _write_annotations, _read_annotations),
         Format("model keypoints", _json("m.keypoints.json", _MODEL_KEYPOINTS), ModelKeypoints.load),
         *(
-            Format(f"colmap {name} {kind}", write(name), lambda path: list(Colmap(path.parent)))
-            for kind, write in (("text", _colmap_text), ("binary", _colmap_binary))
+            Format(f"colmap {name}", _colmap(name), lambda path: list(Colmap(path.parent)))
             for name in ("cameras", "images", "points3D")
         ),
         Format("blind pnp", _write_blind_pnp, lambda path: list(BlindPnP(path.parent))),

@@ -138,7 +138,7 @@ def write_pascal3d(root: Path) -> Path:
 
 def _write_record(path: Path, found: dict[str, Any]) -> None:
     objects = np.array([found], dtype=object)
-    record = {"filename": "1.jpg", "imgsize": [320.0, 240.0, 3.0], "objects": objects}
+    record = {"filename": "1.jpg", "objects": objects}
     _write_mat(path, {"record": record})
 
 

@@ -65,8 +65,8 @@ EVIDENCE = (MASK, GRAVITY, IMAGE)
 class PhotosOptions(FunctionOptions):
     """Evaluate methods on photos of real objects, by the metrics of their data set.
 
-    The folder may hold Scan2CAD, PASCAL3D+, ObjectNet3D or Pix3D. Keypoints
-    are the annotated or detected ones. The model's width (x) is given,
+    The folder may hold Scan2CAD, PASCAL3D+ or Pix3D. Keypoints
+    are the annotated ones. The model's width (x) is given,
     as one image leaves size open; with a shape model in metres it is estimated. The
     run's folder gets results.parquet with a row per object and method, summary.csv, figures and
     report.html. A killed run continues when the same command is started again.

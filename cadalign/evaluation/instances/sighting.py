@@ -35,9 +35,8 @@ from cadalign.geometry.camera import Camera
 from cadalign.render.scene import Scene
 
 _KEPT = 16
-ANNOTATED, DETECTED = "annotated", "detected"
+ANNOTATED = "annotated"
 _LEAST_KEYPOINTS = 6
-_LEAST_SCORE = 0.4  # of a detected keypoint that methods are given
 _LEAST_PX = 0.5  # a standard deviation that keypoints are given at least
 _FOCAL_PRIOR = 0.2  # of the logs of scales, while the focal length is estimated
 
@@ -247,7 +246,7 @@ def sight(target: PhotoTarget, protocol: Protocol, *, sigma: float | None) -> Si
     sighting = Sighting(
         target=target,
         camera=camera,
-        source=ANNOTATED if marks.scores is None else DETECTED,
+        source=ANNOTATED,
         names=names,
         points_2d=pixels,
         sigma=_sigma(target, protocol) if sigma is None else sigma,
@@ -262,8 +261,6 @@ def sight(target: PhotoTarget, protocol: Protocol, *, sigma: float | None) -> Si
 def _marked(marks: PhotoKeypoints, model: NamedPoints) -> tuple[tuple[str, ...], FloatArray]:
     """The visible keypoints that the model has, and their pixels."""
     good = np.isin(marks.names, model.names)
-    if marks.scores is not None:
-        good &= marks.scores > _LEAST_SCORE
     return tuple(np.array(marks.names)[good].tolist()), marks.points_2d[good]
 
 

@@ -15,7 +15,7 @@ from cadalign import Alignment, Camera
 from cadalign.cli import main
 from cadalign.datasets import load_mesh
 from cadalign.geometry.rotations import angle_between, rotation_from_vector
-from cadalign.geometry.symmetry_group import FACING
+from cadalign.geometry.symmetry import FACING
 from cadalign.io.images import read_image, write_image
 from cadalign.io.observation import Observation
 from cadalign.render import Scene, cast_geometry

@@ -7,7 +7,7 @@ import pytest
 
 from cadalign import Alignment, Camera, Model, Result, Size, Symmetry, View, align
 from cadalign.geometry.rotations import angle_between, rotation_from_vector
-from cadalign.geometry.symmetry_group import FACING
+from cadalign.geometry.symmetry import FACING
 
 UP = np.array([0.0, 1.0, 0.0])
 CAMERA = Camera(640, 480, 900.0, 900.0, 319.5, 239.5)

@@ -61,26 +61,16 @@ class ShapeLearn:
 
 @dataclass(frozen=True)
 class ShapeShow:
-    """Describe a shape model; with --out, draw its mean with the keypoints' ids."""
+    """Describe a shape model."""
 
     shape: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SHAPE")]
     """File that `cadalign shape learn` wrote."""
-    out: Path | None = None
-    """Picture to write; by default none is written."""
 
     def run(self) -> int:
         """Open the model and describe it; returns the exit code."""
         from cadalign.shapes.model import ShapeModel
-        from cadalign.shapes.outputs import draw_shape
 
-        model = ShapeModel.open(self.shape)
-        if self.out is not None:
-            make_folder_of(self.out)
-            with keeping([self.shape]):
-                draw_shape(self.out, model)
-        answer(_text(model))
-        if self.out is not None:
-            say(f"Written: {self.out}")
+        answer(_text(ShapeModel.open(self.shape)))
         return 0
 
 

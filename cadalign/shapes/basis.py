@@ -31,27 +31,19 @@ def component_of_basis(
     *,
     box: npt.ArrayLike | None,
     residual_sigma: float,
-    size_sigma: npt.ArrayLike | None,
 ) -> ShapeComponent:
     """Make a component from a linear shape model; see `ShapeModel.from_basis`."""
     points = as_floats(mean, name="mean", shape=(None, 3))
     if not len(points):
         raise InputError("there are no keypoints", where="mean")
     directions = as_floats(modes, name="modes", shape=(None, len(points), 3))
-    sigmas = _not_negative(deviations, "deviations", len(directions))
+    sigmas = as_floats(deviations, name="deviations", shape=(len(directions),))
+    if (sigmas < 0).any():
+        raise InputError(f"{sigmas.min():g} is negative", where="deviations")
     rows = np.vstack([points, extent(points) if box is None else checked_box(box, "box")])
     scaled = sigmas[:, None, None] * directions
     extended = [np.vstack([mode, _corners(points, mode, rows[-BOX_ROWS:])]) for mode in scaled]
-    if size_sigma is not None:
-        extended += list(rows * np.diag(_not_negative(size_sigma, "size_sigma", 3))[:, None])
     return ShapeComponent(1.0, rows, orthogonal(np.array(extended), len(rows)), residual_sigma)
-
-
-def _not_negative(given: npt.ArrayLike, where: str, count: int) -> FloatArray:
-    sigmas = as_floats(given, name=where, shape=(count,))
-    if (sigmas < 0).any():
-        raise InputError(f"{sigmas.min():g} is negative", where=where)
-    return sigmas
 
 
 def component_of_covariance(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import permutations, product
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -29,20 +28,6 @@ logger = logging.getLogger("cadalign")
 LEAST_MODELS = 4
 _LEAST_TO_MEASURE = 4  # keypoints; fewer may be near each other
 _LARGEST_RATIO = 20.0  # of models' sizes in one unit; an inch is 25 mm
-_LEAST_TO_TURN = 5  # keypoints; the turn of fewer may be their own
-_TURNED_RATIO = 0.4  # of distances from the others' keypoints, turned over as it is
-_ALIKE = 0.1  # such a distance as it is, over the radius, of models that need no turn
-# All ways to exchange and reverse three axes, (48, 3, 3), the identity first.
-_AXES = np.array(
-    sorted(
-        (
-            np.eye(3)[list(rows)] * signs
-            for rows in permutations(range(3))
-            for signs in product((1, -1), repeat=3)
-        ),
-        key=lambda turn: -float(np.trace(turn)),
-    )
-)
 _FARTHEST = 0.1  # gap between all keypoints and the box, over its diagonal: thin parts, rounding
 
 
@@ -138,7 +123,6 @@ def tabulated(
         what = f"{len(examples)} models are too few to learn a shape from"
         raise InputError(what, where="models", fix=f"give at least {LEAST_MODELS}")
     _check_names(examples)
-    _check_shared(examples)
     _warn_of_units(examples)
     ids = tuple(sorted({label for each in examples for label in each.ids}))
     column = {label: row for row, label in enumerate(ids)}
@@ -150,7 +134,6 @@ def tabulated(
             row[-BOX_ROWS:] = extent(each.points_3d)
         elif each.bounds is not None:
             row[-BOX_ROWS:] = each.bounds
-    _warn_of_axes(examples, rows[:, :-BOX_ROWS])
     shapes = TrainingShapes(
         tuple(each.model_id for each in examples),
         rows[:, :-BOX_ROWS].astype(np.float32),
@@ -175,21 +158,6 @@ def _check_names(examples: Sequence[Example]) -> None:
         raise InputError("in every model all keypoints coincide", where="models")
 
 
-def _check_shared(examples: Sequence[Example]) -> None:
-    """Refuse groups of models without a keypoint in common: nothing relates their shapes."""
-    groups: list[tuple[Example, set[KeypointId]]] = []
-    for each in examples:
-        joined = [group for group in groups if not group[1].isdisjoint(each.ids)]
-        first = joined[0][0] if joined else each
-        groups = [group for group in groups if group[1].isdisjoint(each.ids)]
-        groups.append((first, set(each.ids).union(*(ids for _, ids in joined))))
-    if len(groups) > 1:
-        one, other = (quote(first.model_id) for first, _ in groups[:2])
-        what = f"{len(groups)} groups of them share no keypoint, such as those of {one} and {other}"
-        fix = "give the same keypoint the same id in all models"
-        raise InputError(what, where="models", fix=fix)
-
-
 def _warn_of_units(examples: Sequence[Example]) -> None:
     """Warn of models that are so much larger or smaller than the others as another unit makes."""
     whole = [each for each in examples if len(each.ids) >= _LEAST_TO_MEASURE]
@@ -198,43 +166,9 @@ def _warn_of_units(examples: Sequence[Example]) -> None:
     is_large, is_small = sizes > _LARGEST_RATIO * typical, sizes < typical / _LARGEST_RATIO
     rows = np.flatnonzero((sizes > 0) & (is_large | is_small))
     if typical and len(rows):
-        why = f"reach over {sizes[rows[0]]:.3g} instead of {typical:.3g}; give all in one unit"
-        _warn("of another size", len(rows), examples, whole[rows[0]], why)
-
-
-def _warn_of_axes(examples: Sequence[Example], rows: FloatArray) -> None:
-    """Warn of models whose keypoints (m, 3) are the others' once axes are exchanged or reversed."""
-    count = np.isfinite(rows[..., 0]).sum(axis=1)
-    some = np.flatnonzero(count >= _LEAST_TO_TURN)
-    if not len(some):
-        return
-    normal = np.array([_unit(each) for each in rows[some]])
-    is_seen = np.isfinite(normal[..., 0])
-    place = np.full(rows.shape[1:], np.nan)
-    place[is_seen.any(axis=0)] = np.nanmedian(normal[:, is_seen.any(axis=0)], axis=0)
-    turned: dict[int, FloatArray] = {}
-    for row, points, has in zip(some, normal, is_seen, strict=True):
-        own, others = points[has], _unit(place[has])
-        distances = np.sqrt(((own @ _AXES - others) ** 2).sum(axis=2).mean(axis=1))
-        best = int(distances.argmin())
-        if distances[0] > _ALIKE and distances[best] < _TURNED_RATIO * distances[0]:
-            turned[int(row)] = _AXES[best].T
-    if turned:
-        odd, turn = next(iter(turned.items()))
-        axes = [f"{'-' * int(row.sum() < 0)}{'xyz'[int(np.abs(row).argmax())]}" for row in turn]
-        why = f"fit with ({', '.join(axes)}) as (x, y, z)"
-        why += ", mirrored" if np.linalg.det(turn) < 0 else ""
-        why += "; give all the same axes"
-        _warn("with other axes", len(turned), examples, examples[odd], why)
-
-
-def _warn(what: str, count: int, examples: Sequence[Example], odd: Example, why: str) -> None:
-    said = "models %s than the others: %d of %d, such as %s, whose keypoints %s"
-    logger.warning(said, what, count, len(examples), quote(odd.model_id), why)
-
-
-def _unit(points: FloatArray) -> FloatArray:
-    """Points (n, 3), or NaN, about their mean, with a mean square distance of 1 from it."""
-    centred = points - np.nanmean(points, axis=0)
-    radius = np.sqrt(np.nanmean((centred**2).sum(axis=1)))
-    return np.asarray(centred / radius if radius > 0 else centred)
+        said = (
+            "models of another size than the others: %d of %d, such as %s, whose keypoints reach "
+            "over %.3g instead of %.3g; give all in one unit"
+        )
+        name, size = quote(whole[rows[0]].model_id), sizes[rows[0]]
+        logger.warning(said, len(rows), len(examples), name, size, typical)

@@ -58,7 +58,8 @@ class ShapeModel:
     >>> boxes = ShapeModel.learn(models, category="box")
     >>> boxes
     ShapeModel('box', 4 keypoints, 1 component, 50 models)
-    >>> boxes.nearest(models[7].points_3d, names).model_id
+    >>> order = [names.index(name) for name in boxes.ids]
+    >>> boxes.nearest(models[7].points_3d[order]).model_id
     'box 7'
     """
 
@@ -194,17 +195,12 @@ class ShapeModel:
         InputError
             If category or split is unknown, or the category has too few models.
         """
-        from cadalign.shapes.examples import LEAST_MODELS, examples_of
+        from cadalign.shapes.examples import examples_of  # an estimate learns nothing
 
         models = dataset.subset(categories=[category], split=split)[category]
-        if len(models) < LEAST_MODELS:
-            where = f"{category}, split {split}" if split else category
-            what = f"{len(models)} models are too few to learn a shape from"
-            raise InputError(what, where=where, fix=f"at least {LEAST_MODELS} are needed")
-        examples = examples_of(models, meshes=meshes)
         return cls.learn(
-            examples,
-            category=models[0].category,
+            examples_of(models, meshes=meshes),
+            category=models[0].category if models else category,
             up_axis="y",
             unit="diagonal",
             components=components,
@@ -220,7 +216,6 @@ class ShapeModel:
         ids: Sequence[KeypointId] | None = None,
         box: npt.ArrayLike | None = None,
         residual_sigma: float = 0.0,
-        size_sigma: npt.ArrayLike | None = None,
         reflection: Reflection | None = None,
         category: str = "object",
         up_axis: Literal["x", "y", "z"] | None = None,
@@ -233,7 +228,7 @@ class ShapeModel:
         mean : (m, 3) float
             The keypoints of the mean shape.
         modes : (K, m, 3) float
-            Directions of deformation.
+            Directions of deformation; the mean times an axis' unit vector is the size along it.
         deviations : (K,) float
             Standard deviations of their coefficients, 0 or more.
         ids : (m,) int or str, optional
@@ -244,9 +239,6 @@ class ShapeModel:
             default the box of an estimate is the extent of all its keypoints.
         residual_sigma : float
             Standard deviation per coordinate of what the modes leave [model units].
-        size_sigma : (3,) float, optional
-            Standard deviations of the logarithms of the sizes along x, y and z, where the modes are
-            of objects of one size: further modes, which scale mean and box about the origin.
         reflection : Reflection, optional
             The category's mirror symmetry. Mean and covariance are averaged with their mirror
             images, since a mean whose left and right differ a little turns the estimates.
@@ -263,13 +255,12 @@ class ShapeModel:
         --------
         >>> mean = [[0, 0, 0], [4, 0, 0], [4, 2, 0], [0, 2, 1]]
         >>> longer = [[0, 0, 0], [1, 0, 0], [1, 0, 0], [0, 0, 0]]
-        >>> cars = ShapeModel.from_basis(mean, [longer], [0.5], ids=["a", "b", "c", "d"],
-        ...                              size_sigma=[0.1, 0.1, 0.1], unit="m")
+        >>> cars = ShapeModel.from_basis(mean, [longer], [0.5], ids=["a", "b", "c", "d"], unit="m")
         >>> cars.components[0].modes.shape
-        (3, 6, 3)
+        (1, 6, 3)
         """
         component = component_of_basis(
-            mean, modes, deviations, box=box, residual_sigma=residual_sigma, size_sigma=size_sigma
+            mean, modes, deviations, box=box, residual_sigma=residual_sigma
         )
         count = len(component.mean) - BOX_ROWS
         labels = check_ids(range(count) if ids is None else list(ids), "ids")
@@ -339,31 +330,23 @@ class ShapeModel:
             )
         return np.array([row_of[label] for label in wanted], dtype=np.int64)
 
-    def nearest(
-        self, points_3d: npt.ArrayLike, ids: Iterable[KeypointId] | None = None
-    ) -> NearestShape:
+    def nearest(self, points_3d: npt.ArrayLike) -> NearestShape:
         """Find the training model whose keypoints are nearest to given ones.
 
         Parameters
         ----------
-        points_3d : (n, 3) float
-            Keypoints in the model's coordinates [model units].
-        ids : (n,) int or str, optional
-            Their ids; by default all of the model's, in its order.
+        points_3d : (m, 3) float
+            All keypoints in the order of ``ids``, in the model's coordinates [model units].
 
         Raises
         ------
         InputError
-            If there are no training models, a shape is wrong, a value is NaN or infinite, or an id
-            is unknown.
+            If there are no training models, a shape is wrong, or a value is NaN or infinite.
         """
         if self.training is None or not len(self.training):
             raise InputError("no training models are known", where=self.category)
-        rows = np.arange(len(self.ids)) if ids is None else self.rows(ids)
-        points = as_floats(points_3d, name="points_3d", shape=(len(rows), 3))
-        if not len(rows):
-            raise InputError("no keypoints", where="points_3d")
-        known = self.training.points_3d[:, rows]
+        points = as_floats(points_3d, name="points_3d", shape=(len(self.ids), 3))
+        known = self.training.points_3d
         squares = ((known.astype(np.float64) - points) ** 2).sum(axis=2)
         # Two objects of the category are this far apart in a keypoint on average.
         expected = 2 * np.nanvar(known, axis=0).sum(axis=1)

@@ -123,12 +123,11 @@ def _car_shape(folder: Path) -> cadalign.ShapeModel:
     box = _car_bounds(points)
     return cadalign.ShapeModel.from_basis(
         points,
-        modes,
-        np.full(len(modes), _MODE_DEVIATION),
+        [*modes, *(points * axis for axis in np.eye(3))],
+        [*[_MODE_DEVIATION] * len(modes), *_LENGTH_SIGMAS],
         ids=names,
         box=box,
         residual_sigma=_REST,
-        size_sigma=_LENGTH_SIGMAS,
         # The mean of annotated cars is a little skew: its left wheel stands before its right one.
         reflection=find_reflection(np.vstack([points, box])[None], names, axis=0),
         category="Car",

@@ -75,15 +75,12 @@ class ShapeShow:
 
 
 def _text(model: ShapeModel) -> str:
-    training, mirror = model.training, model.reflection
+    training = model.training
     models = "given" if training is None else f"learned from {len(training)} models"
     lines = [
         f"{model.category}: {len(model.ids)} keypoints, {models}; lengths in {model.unit}",
         f"  up axis      {model.up_axis or 'unknown'}",
     ]
-    if mirror is not None:
-        pairs = ", ".join(f"{first}-{second}" for first, second in mirror.pairs)
-        lines.append(f"  reflection   across {mirror.axis}, pairs {pairs or 'none'}")
     for number, each in enumerate(model.components, start=1):
         held = 100 * each.variance[:_MODES].sum() / max(np.trace(each.covariance), 1e-300)
         sigma = np.sqrt(np.diag(each.covariance).mean())

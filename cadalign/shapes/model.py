@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, is_number
-from cadalign.errors import InputError, quote, require_kind
-from cadalign.shapes.basis import component_of_basis, symmetric_component
+from cadalign.errors import InputError, quote
+from cadalign.shapes.basis import component_of_basis
 from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.outputs import read_shape, write_shape
 from cadalign.shapes.parts import (
@@ -21,8 +21,6 @@ from cadalign.shapes.parts import (
     BoxMargins,
     FewKeypoints,
     KeypointId,
-    NearestShape,
-    Reflection,
     ShapeComponent,
     TrainingShapes,
     check_axis,
@@ -59,8 +57,8 @@ class ShapeModel:
     >>> boxes
     ShapeModel('box', 4 keypoints, 1 component, 50 models)
     >>> order = [names.index(name) for name in boxes.ids]
-    >>> boxes.nearest(models[7].points_3d[order]).model_id
-    'box 7'
+    >>> boxes.nearest(models[7].points_3d[order])
+    7
     """
 
     category: str
@@ -74,8 +72,6 @@ class ShapeModel:
     extent of all its keypoints."""
     up_axis: Literal["x", "y", "z"] | None = None
     """The model axis that points up, None where it is not known."""
-    reflection: Reflection | None = None
-    """The mirror symmetry of the category."""
     training: TrainingShapes | None = None
     """The models that it was learned from."""
     unit: str = "model units"
@@ -108,9 +104,6 @@ class ShapeModel:
         if self.up_axis is not None:
             check_axis(self.up_axis, "up_axis")
             object.__setattr__(self, "up_axis", str(self.up_axis))
-        if self.reflection is not None:
-            require_kind(self.reflection, Reflection, "reflection")
-            self.reflection.partners(ids)
         if self.training is not None and self.training.points_3d.shape[1] != len(ids):
             what = f"{self.training.points_3d.shape[1]} keypoints for {len(ids)} ids"
             raise InputError(what, where="training")
@@ -216,7 +209,6 @@ class ShapeModel:
         ids: Sequence[KeypointId] | None = None,
         box: npt.ArrayLike | None = None,
         residual_sigma: float = 0.0,
-        reflection: Reflection | None = None,
         category: str = "object",
         up_axis: Literal["x", "y", "z"] | None = None,
         unit: str = "model units",
@@ -239,17 +231,14 @@ class ShapeModel:
             default the box of an estimate is the extent of all its keypoints.
         residual_sigma : float
             Standard deviation per coordinate of what the modes leave [model units].
-        reflection : Reflection, optional
-            The category's mirror symmetry. Mean and covariance are averaged with their mirror
-            images, since a mean whose left and right differ a little turns the estimates.
         category, up_axis, unit
             See `ShapeModel`.
 
         Raises
         ------
         InputError
-            If a shape is wrong, a value is NaN or infinite, a sigma is negative, an id occurs
-            twice, or the reflection names an unknown one.
+            If a shape is wrong, a value is NaN or infinite, a sigma is negative, or an id occurs
+            twice.
 
         Examples
         --------
@@ -266,16 +255,12 @@ class ShapeModel:
         labels = check_ids(range(count) if ids is None else list(ids), "ids")
         if len(labels) != count:
             raise InputError(f"{len(labels)} for {count} keypoints", where="ids")
-        if reflection is not None:
-            require_kind(reflection, Reflection, "reflection")
-            component = symmetric_component(component, labels, reflection)
         return cls(
             category=category,
             ids=labels,
             components=(component,),
             has_box=box is not None,
             up_axis=up_axis,
-            reflection=reflection,
             unit=unit,
         )
 
@@ -330,8 +315,8 @@ class ShapeModel:
             )
         return np.array([row_of[label] for label in wanted], dtype=np.int64)
 
-    def nearest(self, points_3d: npt.ArrayLike) -> NearestShape:
-        """Find the training model whose keypoints are nearest to given ones.
+    def nearest(self, points_3d: npt.ArrayLike) -> int:
+        """Find the row in ``training`` of the model whose keypoints are nearest to given ones.
 
         Parameters
         ----------
@@ -351,7 +336,4 @@ class ShapeModel:
         # Two objects of the category are this far apart in a keypoint on average.
         expected = 2 * np.nanvar(known, axis=0).sum(axis=1)
         distances = np.where(np.isnan(squares), expected, squares).mean(axis=1)
-        best = int(np.argmin(distances))
-        own = self.training.points_3d[best].astype(np.float64)
-        name, path = self.training.model_ids[best], self.training.mesh_paths[best]
-        return NearestShape(name, own, path, float(np.sqrt(distances[best])))
+        return int(np.argmin(distances))

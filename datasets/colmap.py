@@ -150,7 +150,10 @@ _MODELS = (
     *("FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
     "RAD_TAN_THIN_PRISM_FISHEYE",
 )
-_UNSUPPORTED_COUNTS = {"FOV": 5, "THIN_PRISM_FISHEYE": 12, "RAD_TAN_THIN_PRISM_FISHEYE": 16}
+_UNSUPPORTED_COUNTS = {
+    "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5,
+    "THIN_PRISM_FISHEYE": 12, "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+}
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")  # number, model, width, height; parameters follow
 _IMAGE = struct.Struct("<I7dI")  # number, wxyz, translation, camera; name and observations follow

@@ -331,12 +331,11 @@ def _closure(generators: list[FloatArray]) -> FloatArray:
 
 def _keeps_turns(axis: FloatArray, scale: FloatArray, tolerance: float) -> bool:
     """True if the stretch is the same in all directions across an axis, and along or across it."""
-    squares = scale**2
-    across = np.eye(3) - np.outer(axis, axis)
-    within = across @ np.diag(squares) @ across
-    mean = np.trace(within) / 2
-    gaps = np.abs(np.diag(squares) @ axis - (axis @ (squares * axis)) * axis).max()
-    return bool(max(np.abs(within - mean * across).max(), gaps) <= 2 * tolerance * squares.max())
+    squares = np.diag(scale**2)
+    along = float(axis @ squares @ axis)
+    across = (float(np.trace(squares)) - along) / 2
+    round_ones = across * np.eye(3) + (along - across) * np.outer(axis, axis)
+    return bool(np.abs(squares - round_ones).max() <= 2 * tolerance * squares.max())
 
 
 def _free_branches(scale: FloatArray, tolerance: float) -> list[_Branch]:

@@ -268,7 +268,7 @@ def test_points_behind_the_camera_are_refused() -> None:
     with pytest.raises(InputError) as caught:
         PLAIN.project([[0, 0, 1], [0, 0, -2], [0, 0, 0]])
     assert str(caught.value) == (
-        "points_cam: 2 of 3 points lie behind the camera, the first is point 1 with z = -2; "
+        "points_cam: 2 of 3 points lie behind the camera, the first is point 1; "
         "only points with z > 0 have a projection"
     )
 

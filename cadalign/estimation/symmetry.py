@@ -17,7 +17,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import require_kind
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.rotations import angle_between, by_rotation, vector_from_rotation
+from cadalign.geometry.rotations import angles_between, by_rotation, vector_from_rotation
 from cadalign.geometry.symmetry import Equal, Symmetry
 
 SAME_SQUARES = 9.0
@@ -69,7 +69,7 @@ def distinct_ones(
 
     def is_same(other: Alignment) -> bool:
         near = symmetry.nearest(other, best.rotation, tolerance=_SAME_SCALE).alignment
-        if angle_between(near.rotation, best.rotation) < _SAME_DEG:
+        if angles_between(near.rotation, best.rotation) < _SAME_DEG:
             return True
         step = vector_from_rotation(near.rotation @ best.rotation.T)
         return information is not None and bool(step @ information @ step <= SAME_SQUARES)

@@ -362,11 +362,7 @@ def _read_params(model: Any, params: Any, shift: float) -> dict[str, Any]:
 def camera_doubts(camera: Calibration, *, is_tested: bool = False) -> tuple[str, ...]:
     """Say what is implausible of a camera, a sentence each; nothing of most.
 
-    Parameters
-    ----------
-    camera : Camera
-    is_tested : bool
-        Keypoints that agree with a wide camera confirm its focal length.
+    A camera ``is_tested`` by keypoints that agree with it: they confirm a short focal length.
     """
     found, focal = [], np.array([camera.fx, camera.fy])
     own = np.array([camera.width, camera.height], dtype=float)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from cadalign.errors import InputError
 from cadalign.evaluation.metrics.photos import scan2cad_errors
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.rotations import angle_between, nearest_rotation, rotation_from_vector
+from cadalign.geometry.rotations import angles_between, nearest_rotation, rotation_from_vector
 from cadalign.geometry.symmetry import FACING, Symmetry
 from cadalign.metrics import rotation_error
 
@@ -72,7 +72,7 @@ def test_a_group_is_closed_and_has_inverses(group):
                 cosines = [about @ product.T @ each @ about for each in group.rotations]
                 assert max(cosines) == pytest.approx(1)
             else:
-                assert min(angle_between(product, each) for each in group.rotations) < 1e-6
+                assert min(angles_between(product, each) for each in group.rotations) < 1e-6
 
 
 @pytest.mark.long
@@ -88,10 +88,10 @@ def test_the_canonical_alignment_is_that_of_all_equal_ones(
     again = group.canonical(first, reference=reference).alignment
     near = FACING if reference is None else reference
     # The nearest to the reference; beyond that ties may remain for special rotations alone.
-    assert angle_between(first.rotation, near) == pytest.approx(
-        angle_between(second.rotation, near), abs=1e-3
+    assert angles_between(first.rotation, near) == pytest.approx(
+        angles_between(second.rotation, near), abs=1e-3
     )
-    assert angle_between(first.rotation, near) <= angle_between(equal.rotation, near) + 1e-3
+    assert angles_between(first.rotation, near) <= angles_between(equal.rotation, near) + 1e-3
     np.testing.assert_allclose(again.rotation, first.rotation, atol=1e-6)
     np.testing.assert_allclose(second.rotation, first.rotation, atol=2e-5)
     np.testing.assert_allclose(second.translation, first.translation, atol=2e-4)
@@ -141,7 +141,7 @@ def test_a_quarter_turn_exchanges_the_stretches_it_turns():
     # With x known, the turned one would be another size, and stays.
     kept = group.canonical(second, held=(True, False, False)).alignment
     np.testing.assert_allclose(kept.scale, wide)
-    assert angle_between(kept.rotation, second.rotation) in (0.0, pytest.approx(180))
+    assert angles_between(kept.rotation, second.rotation) in (0.0, pytest.approx(180))
     assert count_equal(group, first, (True, False, False)) == 2
 
 

@@ -31,7 +31,7 @@ from cadalign.geometry.alignment import Alignment, bounds_corners, model_rays
 from cadalign.geometry.camera import Camera, turned_alignment
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import RayCaster
-from cadalign.geometry.rotations import angle_between
+from cadalign.geometry.rotations import angles_between
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.focal import prior_of_camera
 
@@ -319,6 +319,6 @@ def distinct(
 
 
 def _differ(one: Alignment, other: Alignment) -> bool:
-    turn = angle_between(one.rotation, other.rotation)
+    turn = angles_between(one.rotation, other.rotation)
     stretch = np.abs(np.log(one.scale / other.scale)).max()
     return bool(turn > _DISTINCT_DEG or stretch > _DISTINCT_STRETCH)

@@ -122,11 +122,11 @@ class Symmetry:
         Raises
         ------
         InputError
-            If ``fold`` is no positive whole number, or the axis is none.
+            If ``fold`` is no whole number from 1 to 240, or the axis is none.
         """
-        if fold is not None and not (is_whole(fold) and fold > 0):
+        if fold is not None and not (is_whole(fold) and 0 < fold <= _MOST_ROTATIONS):
             what = f"{quote(str(fold))} is no number of rotations"
-            fix = "give 1, 2, 3 ..., or None (null in a file) for any angle"
+            fix = f"give 1 to {_MOST_ROTATIONS}, or None (null in a file) for any angle"
             raise InputError(what, where="symmetry.fold", fix=fix)
         axis = _direction(as_floats(direction, name="symmetry.axis", shape=(3,)), "symmetry.axis")
         center = as_floats(offset, name="symmetry.offset", shape=(3,))
@@ -166,7 +166,7 @@ class Symmetry:
             what = f"the fields {', '.join(sorted(map(str, names)))} are no symmetry's"
             raise InputError(what, where="symmetry", fix=_FORMS)
         center, rotations, axes = (data[name] for name in _FIELDS)
-        return cls(center, rotations, _NO_AXES if axes == [] else axes)
+        return cls(center, rotations, _NO_AXES if isinstance(axes, list) and not axes else axes)
 
     def to_dict(self) -> dict[str, Any]:
         """Write the symmetry as plain lists, for JSON."""

@@ -188,7 +188,7 @@ def test_rotations_by_equal_angles_are_a_group(fold):
     np.testing.assert_allclose(symmetry.rotations[:, 1], [UP] * fold, atol=1e-12)
 
 
-@pytest.mark.parametrize("fold", [0, -3, True, 2.5, "2"])
+@pytest.mark.parametrize("fold", [0, -3, True, 2.5, "2", 10**9])
 def test_what_is_no_number_of_rotations_is_refused(fold):
     with pytest.raises(InputError, match=rf"^symmetry.fold: '{fold}' is no number of rotations"):
         Symmetry.around((0, 1, 0), fold=fold)

@@ -80,7 +80,7 @@ def nearest_truth(*, est: Alignment, gt: Alignment, symmetry: Symmetry) -> Align
     >>> bool(np.allclose(found.rotation, turned.rotation))
     True
     """
-    return symmetry.nearest(gt, est.rotation, tolerance=_SAME_STRETCH).alignment
+    return symmetry.canonical(gt, reference=est.rotation, tolerance=_SAME_STRETCH).alignment
 
 
 def _truth(est: Alignment, gt: Alignment, symmetry: Symmetry | None) -> Alignment:

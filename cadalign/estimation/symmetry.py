@@ -23,7 +23,6 @@ from cadalign.geometry.symmetry import Equal, Symmetry
 SAME_SQUARES = 9.0
 """Squared distance of rotations, in the best one's deviations, of equal estimates."""
 _SAME_DEG = 0.01  # of rotations where there are no deviations, or they are tiny
-_SAME_SCALE = 1e-4
 
 
 def check_symmetry(symmetry: Symmetry) -> None:
@@ -68,7 +67,7 @@ def distinct_ones(
         information = np.linalg.pinv(covariance[:3, :3], hermitian=True)
 
     def is_same(other: Alignment) -> bool:
-        near = symmetry.nearest(other, best.rotation, tolerance=_SAME_SCALE).alignment
+        near = symmetry.canonical(other, reference=best.rotation).alignment
         if angles_between(near.rotation, best.rotation) < _SAME_DEG:
             return True
         step = vector_from_rotation(near.rotation @ best.rotation.T)

@@ -214,10 +214,6 @@ class Symmetry:
             result = Alignment(turned, alignment.translation + shift, scale)
         return Equal(result, motion, free, self.center)
 
-    def nearest(self, alignment: Alignment, rotation: FloatArray, *, tolerance: float) -> Equal:
-        """The one of all equal alignments whose rotation is nearest to a given one."""
-        return self.canonical(alignment, reference=rotation, tolerance=tolerance)
-
     def nearest_turned(self, alignment: Alignment, rotation: FloatArray) -> Alignment:
         """The alignment nearest to a rotation of all that the group makes of the placed object.
 

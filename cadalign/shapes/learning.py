@@ -212,11 +212,12 @@ class _CrossValidation:
         return found
 
 
-def learn_parts(examples: Sequence[Example], components: int | None) -> dict[str, Any]:
+def learn_parts(
+    examples: Sequence[Example], category: str, components: int | None
+) -> dict[str, Any]:
     """Learn the fields of a `cadalign.ShapeModel`, but for its names; see `ShapeModel.learn`."""
-    if components is not None:
-        require_counts(components=components)
-    ids, rows, training = tabulated(examples)
+    require_counts(components=1 if components is None else components)
+    ids, rows, training = tabulated(examples, category)
     if (components or 1) > len(rows):
         what = f"{components} are more than the {len(rows)} models"
         raise InputError(what, where="components")

@@ -113,8 +113,7 @@ class ShapeModel:
         if freedom is not None and (not is_number(freedom) or freedom <= 2):
             what = f"{freedom!r} is not a number above 2, nor None"
             raise InputError(what, where="degrees_of_freedom")
-        freedom = None if freedom is None else float(freedom)
-        object.__setattr__(self, "degrees_of_freedom", freedom)
+        object.__setattr__(self, "degrees_of_freedom", freedom and float(freedom))
         object.__setattr__(self, "inflation", float(self.inflation))
         for name in ("category", "unit"):
             object.__setattr__(self, name, check_text(getattr(self, name), name))
@@ -155,7 +154,7 @@ class ShapeModel:
         """
         from cadalign.shapes.learning import learn_parts  # an estimate learns nothing
 
-        learned = learn_parts(list(models), components)
+        learned = learn_parts(list(models), category, components)
         return cls(category=category, up_axis=up_axis, unit=unit, **learned)
 
     @classmethod

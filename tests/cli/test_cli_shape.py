@@ -37,7 +37,7 @@ def test_refusals(sample_root: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     line = refusal_line(capsys, "shape", "learn", sample_root, "--category", "zebra")
     assert "zebra" in line
     line = refusal_line(capsys, "shape", "learn", sample_root, "--category", "chair")
-    assert line == "models: 1 models are too few to learn a shape from; give at least 4"
+    assert line == "models of chair: 1 are too few to learn a shape from; give at least 4"
     line = refusal_line(
         capsys, "shape", "learn", sample_root, "--category", "chair", "--split", "none"
     )

@@ -328,7 +328,7 @@ def test_refusals(learned: ShapeModel) -> None:
     some = tables(4)
     named = Example("named", ["a", "b"], TABLE[:2])
     assert learn(*some[:3]) == (
-        "models: 3 models are too few to learn a shape from; give at least 4"
+        "models of object: 3 are too few to learn a shape from; give at least 4"
     )
     assert learn(*some, named) == (
         "model named: its keypoints have names as ids, those of model table 0 have numbers; "

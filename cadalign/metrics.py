@@ -18,7 +18,6 @@ from cadalign.errors import InputError, require_kind
 from cadalign.geometry.alignment import Alignment, Box, oriented_box
 from cadalign.geometry.rotations import angles_between, dots, lengths
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.geometry.symmetry_group import group_of
 
 __all__ = [
     "box_iou",
@@ -70,8 +69,8 @@ def nearest_truth(*, est: Alignment, gt: Alignment, symmetry: Symmetry) -> Align
     """The truth whose rotation is nearest to the estimate's, among those that are equal.
 
     The model's symmetries take it to itself, so that several alignments place the same object; see
-    `cadalign.geometry.symmetry_group` for what a stretch leaves of them. True scales that differ
-    by up to 1 % count as equal. Raises InputError if the symmetry's motions make no group.
+    `cadalign.geometry.symmetry` for what a stretch leaves of them. True scales that differ
+    by up to 1 % count as equal.
 
     Examples
     --------
@@ -81,7 +80,7 @@ def nearest_truth(*, est: Alignment, gt: Alignment, symmetry: Symmetry) -> Align
     >>> bool(np.allclose(found.rotation, turned.rotation))
     True
     """
-    return group_of(symmetry).nearest(gt, est.rotation, tolerance=_SAME_STRETCH).alignment
+    return symmetry.canonical(gt, reference=est.rotation, tolerance=_SAME_STRETCH).alignment
 
 
 def _truth(est: Alignment, gt: Alignment, symmetry: Symmetry | None) -> Alignment:

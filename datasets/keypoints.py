@@ -16,8 +16,7 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import rotation_from_vector
-from cadalign.geometry.symmetry import Symmetry, SymmetryAxis
-from cadalign.geometry.symmetry_group import SymmetryGroup
+from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.documents import (
     Count,
     ForeignDocument,
@@ -229,32 +228,19 @@ def annotated_symmetry(xyz: FloatArray, symmetries: Symmetries) -> Symmetry:
     A reflection alone is no rotation, and an alignment never mirrors a model, so no two alignments
     differ by one. Two reflections make a rotation, which the rule finds.
     """
-    group = symmetry_group(xyz, symmetries)
-    center, rotations, axis = group.center, group.rotations, group.axis
-    motions = np.tile(np.eye(4), (len(rotations) - 1, 1, 1))
-    motions[:, :3, :3] = rotations[1:]
-    motions[:, :3, 3] = center - rotations[1:] @ center
-    return Symmetry(motions, () if axis is None else (SymmetryAxis(axis, center),))
-
-
-def symmetry_group(xyz: FloatArray, symmetries: Symmetries) -> SymmetryGroup:
-    """The rotations of `annotated_symmetry`."""
-    trivial = SymmetryGroup(np.zeros(3), np.eye(3)[None])
     if not symmetries.reflections and not symmetries.rotations:
-        return trivial
+        return Symmetry.none()
     tolerance = _EQUIVALENT * float(np.linalg.norm(np.ptp(xyz, axis=0)))
     revolution = _axis_of_revolution(xyz, symmetries, tolerance)
     if revolution is not None:
         center, axis = revolution
-        return SymmetryGroup(center, np.eye(3)[None], axis)
+        return Symmetry.around(axis, fold=None, offset=center)
     equivalent = _equivalent(len(xyz), symmetries)
     if equivalent.sum() == len(xyz):  # each to itself alone, as with a single reflection
-        return trivial
+        return Symmetry.none()
     center, rotations = xyz.mean(axis=0), _candidates()
     kept = _onto_themselves(xyz - center, equivalent, rotations, tolerance)
-    if not kept.any():
-        return trivial
-    return SymmetryGroup(center, np.concatenate([np.eye(3)[None], rotations[kept]]))
+    return Symmetry(center, rotations[kept])
 
 
 def _onto_themselves(

@@ -14,7 +14,7 @@ from cadalign.annotate.problem import LiveEstimate
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.estimation.result import Result
-from cadalign.geometry.camera import predicted_covariances, projection_jacobian
+from cadalign.geometry.camera import projection_jacobian
 from cadalign.io.observation import Observation
 from cadalign.render.viewpoints import visible_keypoints
 
@@ -137,7 +137,7 @@ def suggest(
         places = camera.projected_covariances(pose.apply(xyz[seen]), of_points[own][seen])
     else:
         slopes = projection_jacobian(xyz[seen], camera, pose)[:, :, : len(result.covariance)]
-        places = predicted_covariances(slopes, result.covariance)
+        places = slopes @ result.covariance @ slopes.transpose(0, 2, 1)
     # Rounded, so that points that differ by rounding alone are chosen by their order.
     gain = np.round(np.linalg.slogdet(np.eye(2) + places / estimate.sigma**2)[1], 9)
     best = int(np.argmax(gain))

@@ -15,7 +15,7 @@ from PIL import Image
 
 from cadalign.arrays import BoolArray
 from cadalign.errors import DataError, InputError
-from cadalign.geometry.camera import Camera, require_perspective
+from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file
 from cadalign.io.files import listed, read_bytes, reading, require_utf8
 from cadalign.io.focal import FocalPrior
@@ -100,7 +100,12 @@ def camera_of(photo: PhotoFile, camera: Camera | None) -> Camera:
             fix="give the camera of this photo",
         )
     with in_file(photo.path):
-        require_perspective(camera, "the annotator")
+        if camera.is_wide:
+            what, fix = (
+                f"no {camera.lens} lens",
+                "undistort the photo, or crop it to a pinhole's view",
+            )
+            raise InputError(f"the annotator takes {what}", where="camera.lens", fix=fix)
     return camera
 
 

@@ -28,7 +28,7 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.simulation import simulate_problem
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera, predicted_covariances, projection_jacobian
+from cadalign.geometry.camera import Camera, projection_jacobian
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.evidence import Size
 from cadalign.io.focal import FocalPrior
@@ -301,7 +301,8 @@ def find_outliers(
         others = others[result.camera.sees(result.alignment.apply(points_3d[others]))]
         if len(others) and covariance is not None:
             jacobian = projection_jacobian(points_3d[others], result.camera, result.alignment)
-            expected[others] += predicted_covariances(jacobian, covariance)
+            jacobian = jacobian[:, :, : len(covariance)]
+            expected[others] += jacobian @ covariance @ jacobian.transpose(0, 2, 1)
         finite = np.nan_to_num(residuals, posinf=1e9)
         squares = np.einsum("na,nab,nb->n", finite, np.linalg.inv(expected), finite)
         # The quantile of an F distribution with 2 degrees of freedom has a closed form.

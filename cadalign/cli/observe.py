@@ -15,7 +15,7 @@ from cadalign.datasets import ModelKeypoints, choose_object, read_image_keypoint
 from cadalign.datasets.coco import decode_segmentation
 from cadalign.datasets.image_keypoints import ImageKeypoints, observed_in
 from cadalign.errors import DataError
-from cadalign.geometry.plausible_camera import camera_doubts
+from cadalign.geometry.calibration import camera_doubts
 from cadalign.io.documents import in_file
 from cadalign.io.evidence import ImageEvidence
 from cadalign.io.files import keeping

@@ -61,39 +61,26 @@ class ShapeLearn:
 
 @dataclass(frozen=True)
 class ShapeShow:
-    """Describe a shape model; with --out, draw its mean with the keypoints' ids."""
+    """Describe a shape model."""
 
     shape: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SHAPE")]
     """File that `cadalign shape learn` wrote."""
-    out: Path | None = None
-    """Picture to write; by default none is written."""
 
     def run(self) -> int:
         """Open the model and describe it; returns the exit code."""
         from cadalign.shapes.model import ShapeModel
-        from cadalign.shapes.outputs import draw_shape
 
-        model = ShapeModel.open(self.shape)
-        if self.out is not None:
-            make_folder_of(self.out)
-            with keeping([self.shape]):
-                draw_shape(self.out, model)
-        answer(_text(model))
-        if self.out is not None:
-            say(f"Written: {self.out}")
+        answer(_text(ShapeModel.open(self.shape)))
         return 0
 
 
 def _text(model: ShapeModel) -> str:
-    training, mirror = model.training, model.reflection
+    training = model.training
     models = "given" if training is None else f"learned from {len(training)} models"
     lines = [
         f"{model.category}: {len(model.ids)} keypoints, {models}; lengths in {model.unit}",
         f"  up axis      {model.up_axis or 'unknown'}",
     ]
-    if mirror is not None:
-        pairs = ", ".join(f"{first}-{second}" for first, second in mirror.pairs)
-        lines.append(f"  reflection   across {mirror.axis}, pairs {pairs or 'none'}")
     for number, each in enumerate(model.components, start=1):
         held = 100 * each.variance[:_MODES].sum() / max(np.trace(each.covariance), 1e-300)
         sigma = np.sqrt(np.diag(each.covariance).mean())

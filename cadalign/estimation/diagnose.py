@@ -36,9 +36,9 @@ from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.problems import pack_one
 from cadalign.estimation.result_parts import EstimateWarning, FittedKeypoints, listed
 from cadalign.estimation.view import View
+from cadalign.geometry.calibration import OTHER_SIZES
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import rescaled_pixels
-from cadalign.geometry.plausible_camera import OTHER_SIZES
 from cadalign.io.evidence import LENGTHS, Size
 
 if TYPE_CHECKING:

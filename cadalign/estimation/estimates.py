@@ -22,8 +22,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, turned_alignment, turned_covariance
 from cadalign.geometry.pixels import perspective
 from cadalign.geometry.rotations import by_rotation, vector_from_rotation
-from cadalign.geometry.symmetry import Symmetry
-from cadalign.geometry.symmetry_group import Equal
+from cadalign.geometry.symmetry import Equal, Symmetry
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
 from cadalign.solvers.marginal.equations import POSE_UNKNOWNS

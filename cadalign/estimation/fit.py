@@ -104,7 +104,7 @@ def fit(
         under it, the one nearest to upright, y up, with the model's z axis towards the camera, and
         no other is an alternative; ``points_3d`` are the keypoints as this one has them. A stretch
         that differs across an axis leaves half turns of its rotations; ``stretch="y"`` keeps round
-        what is round about y. See `cadalign.geometry.symmetry_group`.
+        what is round about y. See `cadalign.geometry.symmetry`.
 
     Returns
     -------

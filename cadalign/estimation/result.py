@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from cadalign.export.aligned_object import Frame
     from cadalign.geometry.mesh import Mesh
     from cadalign.shapes.model import ShapeModel
+    from cadalign.shapes.parts import TrainingShapes
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,8 +327,9 @@ class Result:
 
         model, source = self.model, cast(FloatArray | None, None)
         if isinstance(model, ShapeModel):
-            nearest = model.nearest(self.points_3d)
-            source, mesh = nearest.points_3d, nearest.mesh_path if mesh is None else mesh
+            row, training = model.nearest(self.points_3d), cast("TrainingShapes", model.training)
+            source = training.points_3d[row].astype(np.float64)
+            mesh = training.mesh_paths[row] if mesh is None else mesh
         elif model is not None:
             source = None if model.shape_sigma is None else cast(FloatArray, model.points_3d)
             mesh = model.mesh if mesh is None else mesh

@@ -1,7 +1,7 @@
 """Results in terms of a model's symmetry: one of all equal alignments, and its uncertainty.
 
 A model that a symmetry g takes to itself is placed by A g as by A. A result has the canonical one
-of all such alignments (`SymmetryGroup.canonical`), together with the keypoints as that one has
+of all such alignments (`Symmetry.canonical`), together with the keypoints as that one has
 them, g^-1 x: the result is that of keypoints labelled so. To first order, a step (w, dt, ds) of A's
 rotation vector in the camera frame, translation and log scales is one of A g by a linear map, which
 carries the covariance. How far the object is turned about an axis of the symmetry means nothing:
@@ -17,20 +17,17 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import require_kind
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.rotations import angle_between, by_rotation, vector_from_rotation
-from cadalign.geometry.symmetry import Symmetry
-from cadalign.geometry.symmetry_group import Equal, group_of
+from cadalign.geometry.rotations import angles_between, by_rotation, vector_from_rotation
+from cadalign.geometry.symmetry import Equal, Symmetry
 
 SAME_SQUARES = 9.0
 """Squared distance of rotations, in the best one's deviations, of equal estimates."""
 _SAME_DEG = 0.01  # of rotations where there are no deviations, or they are tiny
-_SAME_SCALE = 1e-4
 
 
 def check_symmetry(symmetry: Symmetry) -> None:
-    """Raise InputError for what is no symmetry, or whose motions make no group."""
+    """Raise InputError for what is no symmetry."""
     require_kind(symmetry, Symmetry, "symmetry", fix="see cadalign.Symmetry.from_dict")
-    group_of(symmetry)
 
 
 def held_axes(stretched: str) -> tuple[bool, bool, bool]:
@@ -63,16 +60,15 @@ def distinct_ones(
     held: tuple[bool, bool, bool],
 ) -> list[tuple[int, Equal]]:
     """Canonical alignments with their numbers, without those as near the first as errors."""
-    group = group_of(symmetry)
-    first, *others = enumerate(group.canonical(each, held=held) for each in poses)
+    first, *others = enumerate(symmetry.canonical(each, held=held) for each in poses)
     best = first[1].alignment
     information = None
     if covariance is not None:
         information = np.linalg.pinv(covariance[:3, :3], hermitian=True)
 
     def is_same(other: Alignment) -> bool:
-        near = group.nearest(other, best.rotation, tolerance=_SAME_SCALE).alignment
-        if angle_between(near.rotation, best.rotation) < _SAME_DEG:
+        near = symmetry.canonical(other, reference=best.rotation).alignment
+        if angles_between(near.rotation, best.rotation) < _SAME_DEG:
             return True
         step = vector_from_rotation(near.rotation @ best.rotation.T)
         return information is not None and bool(step @ information @ step <= SAME_SQUARES)

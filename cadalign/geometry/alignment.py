@@ -192,12 +192,10 @@ def describe_plane(points_3d: FloatArray) -> str | None:
         return "the points lie on one line"
     if spread[2] > 1e-6 * spread[0]:
         return None
-    normal = axes[2] * np.sign(axes[2][np.argmax(np.abs(axes[2]))])
-    axis = int(np.argmax(np.abs(normal)))
-    if normal[axis] > 1 - 1e-6:
+    axis = int(np.argmax(np.abs(axes[2])))
+    if abs(axes[2, axis]) > 1 - 1e-6:
         return f"the points lie in the plane {'xyz'[axis]} = {mean[axis]:.4g}"
-    words = ", ".join(f"{value:.3g}" for value in normal)
-    return f"the points lie in one plane, with the normal ({words})"
+    return "the points lie in one plane"
 
 
 def bounds_corners(low: FloatArray, high: FloatArray) -> FloatArray:
@@ -221,15 +219,8 @@ class Box:
     """Its axes are the columns (3, 3)."""
     extents: FloatArray
     """Its full side lengths along these axes (3,), not negative."""
-    _: KW_ONLY
-    is_valid: InitVar[bool] = False
-    """The arrays are known to be valid: take them over unchecked, and make them read-only."""
 
-    def __post_init__(self, is_valid: bool) -> None:
-        if is_valid:
-            for array in (self.center, self.rotation, self.extents):
-                array.flags.writeable = False
-            return
+    def __post_init__(self) -> None:
         center = as_floats(self.center, name="center", shape=(3,))
         rotation = nearest_rotation(as_floats(self.rotation, name="rotation", shape=(3, 3)))
         extents = as_floats(self.extents, name="extents", shape=(3,))
@@ -253,12 +244,7 @@ class Box:
         """
         bounds = as_floats(bounds, name="bounds", shape=(2, 3))
         pose = alignment.rotation, alignment.translation, alignment.scale
-        center, rotation, extents = oriented_box(bounds, *pose)
-        # Python's numbers: NumPy's reductions of three take longer than the rest of this.
-        valid = min(extents.tolist()) >= 0 and math.isfinite(
-            sum(extents.tolist() + center.tolist())
-        )
-        return cls(center, rotation, extents, is_valid=valid)
+        return cls(*oriented_box(bounds, *pose))
 
     @property
     def corners(self) -> FloatArray:

@@ -1,7 +1,8 @@
-"""The numbers of a calibrated camera, checked, and their form in JSON: COLMAP's, or a matrix."""
+"""The numbers of a calibrated camera, checked and questioned, and their form in JSON."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
@@ -12,6 +13,7 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray, as_floats, is_masked, is_number
 from cadalign.errors import InputError, quote
 from cadalign.geometry.pixels import (
+    PIXEL_CENTRE,
     LensKind,
     PixelOrigin,
     checked_coefficients,
@@ -28,8 +30,6 @@ COLMAP_PARAMS: dict[str, tuple[str, ...]] = {
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
-    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
 _C = TypeVar("_C", bound="Calibration")  # which completion in editors follows, unlike Self
@@ -39,11 +39,16 @@ _COEFFICIENTS: dict[LensKind, tuple[str, ...]] = {
 }
 _WRITTEN = {0: "PINHOLE", 4: "OPENCV"}  # models, by the number of coefficients
 _NO_SKEW = 1e-9  # relative to the focal length
-_FORMS = {
-    "params": ("model", "width", "height", "params"),
-    "matrix": ("matrix", "width", "height"),
-}
+_SIZE = ("width", "height")
+_FORMS = {"params": ("model", *_SIZE, "params"), "matrix": ("matrix", *_SIZE)}
 _MATRIX_FIELDS = (*_FORMS["matrix"], "pixel_origin", "distortion", "lens")
+
+OTHER_SIZES = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2.0, 3.0, 4.0)
+"""Usual sizes of other images of a photo, over that of its camera."""
+_FAR_FROM_MIDDLE = 0.3  # of an image's size, from its middle to a principal point
+_SAME_MIDDLE = 0.02  # of an image's size, from its middle to a principal point taken for it
+_OBLONG = 1.1  # ratio of a pixel's sides
+_WIDEST_DEG = 120.0  # angle of view of a camera without a lens model
 
 
 @dataclass(frozen=True)
@@ -63,18 +68,16 @@ class Calibration:
     """Rotation by rows from the frame that `turned` gave to the lens's own; empty for none."""
 
     def __post_init__(self) -> None:
-        for name in ("width", "height"):
+        for name in _SIZE:
             object.__setattr__(self, name, _whole_size(getattr(self, name), name))
         for name in ("fx", "fy", "cx", "cy"):
             value = getattr(self, name)
             if not is_number(value):
                 raise InputError(f"{quote(value)} is not a finite number", where=f"camera.{name}")
-            object.__setattr__(self, name, float(value))
-        for name in ("fx", "fy"):
-            if getattr(self, name) <= 0:
-                what = f"the focal length is {getattr(self, name):g}"
-                fix = "give the calibrated focal length in pixels"
+            if name.startswith("f") and value <= 0:
+                what, fix = f"the focal length is {value:g}", "give the calibrated one in pixels"
                 raise InputError(what, where=f"camera.{name}", fix=fix)
+            object.__setattr__(self, name, float(value))
         known: object = self.focal_known
         if not isinstance(known, bool | np.bool_):
             what = f"{quote(known)} is neither True nor False"
@@ -140,10 +143,8 @@ class Calibration:
         (fx, _, cx), (_, fy, cy), _ = values.tolist()
         expected = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
         if np.abs(values - expected).max() > _NO_SKEW * max(abs(fx), 1.0):
-            what = (
-                f"{quote(values.tolist())} is not of the form [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
-            )
-            fix = "give the matrix of a camera without skew, by rows"
+            what, form = quote(values.tolist()), "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+            what, fix = f"{what} is not of the form {form}", "give one without skew, by rows"
             raise InputError(what, where="matrix", fix=fix)
         return cls(width, height, fx, fy, cx - shift, cy - shift, distortion, lens=lens)
 
@@ -233,46 +234,34 @@ class Calibration:
         high = np.array([self.width, self.height]) - 0.5 - margin
         return np.asarray(((points_2d >= low) & (points_2d <= high)).all(axis=-1))
 
-    def to_dict(self, *, pixel_origin: PixelOrigin | None = None) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Write the camera as COLMAP does: ``{"model", "width", "height", "params"}``.
 
         COLMAP puts the centre of the top-left pixel at (0.5, 0.5), so the principal point there
         is larger by half a pixel than ``cx`` and ``cy`` here. An unknown focal length is None,
         ``null`` in JSON.
 
-        Parameters
-        ----------
-        pixel_origin : {"corner", "center"}, optional
-            Where (0, 0) lies for the written principal point: the top-left corner of the image,
-            or the centre of the top-left pixel; stated in ``pixel_origin``. By default COLMAP's
-            corner, not stated.
-
         Examples
         --------
         >>> from cadalign import Camera
-        >>> camera = Camera(640, 480, 500, 500, 319.5, 239.5)
-        >>> camera.to_dict()["params"]
+        >>> Camera(640, 480, 500, 500, 319.5, 239.5).to_dict()["params"]
         [500.0, 500.0, 320.0, 240.0]
-        >>> camera.to_dict(pixel_origin="center")["params"]
-        [500.0, 500.0, 319.5, 239.5]
         """
         if self.turn:
             what = "a camera in a turned frame has no form in files"
             raise InputError(what, where="camera", fix="write the camera that was turned")
         model = _WRITTEN.get(len(self.distortion), "FULL_OPENCV")
         model = "OPENCV_FISHEYE" if self.lens == "fisheye" else model
-        shift = shift_of(pixel_origin or "corner")
         names = _COEFFICIENTS[self.lens]
         values: dict[str, float | None] = dict(zip(names, self.distortion, strict=False))
-        values |= {"cx": self.cx + shift, "cy": self.cy + shift}
+        values |= {"cx": self.cx + PIXEL_CENTRE, "cy": self.cy + PIXEL_CENTRE}
         values |= {name: getattr(self, name) if self.focal_known else None for name in ("fx", "fy")}
-        form = {
+        return {
             "model": model,
             "width": self.width,
             "height": self.height,
             "params": [values.get(name, 0.0) for name in COLMAP_PARAMS[model]],
         }
-        return form if pixel_origin is None else form | {"pixel_origin": pixel_origin}
 
     @classmethod
     def from_dict(cls: type[_C], data: Mapping[str, Any]) -> _C:
@@ -281,9 +270,9 @@ class Calibration:
         Parameters
         ----------
         data : mapping
-            ``model`` (SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV,
-            SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE or OPENCV_FISHEYE), ``width``, ``height``, and
-            ``params`` in COLMAP's order and pixel convention. None in the place of the focal
+            ``model`` (SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV or
+            OPENCV_FISHEYE), ``width``, ``height``, and ``params`` in COLMAP's order and pixel
+            convention. None in the place of the focal
             lengths, or ``width`` and ``height`` alone, give a camera `without_focal`. Or ``matrix``
             (3, 3), ``width``, ``height`` and optionally ``distortion`` and ``lens``, as for
             `from_matrix`. ``pixel_origin`` states where (0, 0) lies: by default ``"corner"`` for
@@ -367,3 +356,42 @@ def _read_params(model: Any, params: Any, shift: float) -> dict[str, Any]:
         return fields | {"fx": values[focals[0]], "fy": values[focals[-1]], "lens": lens}
     require_perspective_lens(lens, where="camera.params")
     return fields
+
+
+@np.errstate(over="ignore")  # sizes of images are any numbers
+def camera_doubts(camera: Calibration, *, is_tested: bool = False) -> tuple[str, ...]:
+    """Say what is implausible of a camera, a sentence each; nothing of most.
+
+    A camera ``is_tested`` by keypoints that agree with it: they confirm a short focal length.
+    """
+    found, focal = [], np.array([camera.fx, camera.fy])
+    own = np.array([camera.width, camera.height], dtype=float)
+    size = f"{camera.width} x {camera.height} px"
+    point = f"the camera's principal point ({camera.cx:.4g}, {camera.cy:.4g}) is"
+    sizes, middle = np.outer(OTHER_SIZES, own), np.array([camera.cx, camera.cy]) + PIXEL_CENTRE
+    same = np.flatnonzero(np.abs(2 * middle / sizes - 1).max(axis=1) < _SAME_MIDDLE).tolist()
+    if same:
+        width, height = sizes[same[0]]
+        found.append(
+            f"{point} the middle of an image of {width:.0f} x {height:.0f} px, its own has "
+            f"{size}: if the photo was resized, give Camera.resized({camera.width}, "
+            f"{camera.height}) of its camera"
+        )
+    elif np.abs(middle / own - 0.5).max() >= _FAR_FROM_MIDDLE:
+        found.append(
+            f"{point} far from the middle of its image of {size}, which is right "
+            "only for a photo cut out of a larger one"
+        )
+    if not 1 / _OBLONG < camera.fx / camera.fy < _OBLONG:
+        found.append(
+            f"the camera's pixels are oblong (fx {camera.fx:.4g}, fy {camera.fy:.4g}): was the "
+            "photo squeezed?"
+        )
+    angle = 2 * math.degrees(math.atan(float((own / focal).max()) / 2))
+    is_pinhole = camera.lens == "perspective" and not any(camera.distortion)
+    if camera.focal_known and is_pinhole and angle > _WIDEST_DEG and not is_tested:
+        found.append(
+            f"the camera sees {angle:.0f} deg without a lens model: is the focal length, "
+            f"{focal.min():.4g}, in pixels?"
+        )
+    return tuple(found)

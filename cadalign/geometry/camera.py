@@ -120,18 +120,16 @@ class Camera(Calibration):
         """
         self.require_focal()
         points = as_points(points_cam, name="points_cam", dimension=3)
-        unseen = np.flatnonzero(~self.sees(points))
-        if len(unseen):
-            what, first = f"{len(unseen)} of {len(points)} points lie", unseen[0]
-            if self.is_wide:
-                limit = np.degrees(largest_angle(self.distortion))
-                what += f" outside the lens's field, the first is point {first}"
-                fix = f"less than {limit:.4g} degrees off the axis"
-            else:
-                z = points[first, 2]
-                what += f" behind the camera, the first is point {first} with z = {z:g}"
-                fix = "with z > 0"
-            raise InputError(what, where="points_cam", fix=f"only points {fix} have a projection")
+        what, which = "{} points lie behind the camera", "with z > 0"
+        if self.is_wide:
+            limit = np.degrees(largest_angle(self.distortion))
+            what, which = (
+                "{} points lie outside the lens's field",
+                f"less than {limit:.4g} degrees ",
+            )
+            which += "off the axis"
+        fix = f"only points {which} have a projection"
+        _refuse(~self.sees(points), what, fix, where="points_cam")
         return self.pixels_of_rays(points)
 
     def project_where_ahead(self, points_cam: FloatArray) -> FloatArray:
@@ -190,7 +188,7 @@ class Camera(Calibration):
         """
         self.require_focal()
         rays, valid = self.rays_where_valid(points_2d)
-        _check_undone(valid)
+        _refuse(~valid, *_NOT_UNDONE)
         return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
     def rays_where_valid(self, points_2d: npt.ArrayLike) -> tuple[FloatArray, BoolArray]:
@@ -223,13 +221,9 @@ class Camera(Calibration):
         """
         self.require_focal()
         rays, valid = self.rays_where_valid(points_2d)
-        _check_undone(valid)
-        behind = np.flatnonzero(rays[:, 2] <= 0)
-        if len(behind):
-            what = f"the rays of {len(behind)} of {len(rays)} pixels are 90 degrees or more off "
-            what += f"the z axis, the first is point {behind[0]}"
-            fix = "these have no normalised coordinates; use unproject"
-            raise InputError(what, where="points_2d", fix=fix)
+        _refuse(~valid, *_NOT_UNDONE)
+        what = "the rays of {} pixels are 90 degrees or more off the z axis"
+        _refuse(rays[:, 2] <= 0, what, "these have no normalised coordinates; use unproject")
         return perspective(rays)
 
     def normalize_where_valid(self, points_2d: npt.ArrayLike) -> tuple[FloatArray, BoolArray]:
@@ -265,26 +259,23 @@ def _homogeneous(normalized: FloatArray) -> FloatArray:
     return np.column_stack([normalized, np.ones(len(normalized))])
 
 
-def _check_undone(valid: BoolArray) -> None:
-    failed = np.flatnonzero(~valid)
-    if len(failed):
-        what = f"the lens distortion cannot be undone at {len(failed)} of {len(valid)} pixels, "
-        fix = "these lie outside the area in which the lens model is valid; drop them"
-        raise InputError(f"{what}the first is point {failed[0]}", where="points_2d", fix=fix)
+def _refuse(odd: BoolArray, what: str, fix: str, *, where: str = "points_2d") -> None:
+    """Refuse rows (n,), of which ``what`` is said; its place is for their number."""
+    rows = np.flatnonzero(odd)
+    if len(rows):
+        what = what.format(f"{len(rows)} of {len(odd)}")
+        raise InputError(f"{what}, the first is point {rows[0]}", where=where, fix=fix)
 
 
+_NOT_UNDONE = (
+    "the lens distortion cannot be undone at {} pixels",
+    "these lie outside the area in which the lens model is valid; drop them",
+)
 _REACH = 85.0  # of rays off the facing axis [degrees]
 _OF_OBJECT = 60.0  # half the angle under which an object is seen that stray keypoints go beyond
 _CANDIDATES = 200
 _ROUNDS = 64
 _OF_A_RESULT = 10  # unknowns of a result's covariance, focal length included
-
-
-def require_perspective(camera: Camera, what: str) -> None:
-    """Refuse a wide lens for ``what`` does without frames that face the keypoints."""
-    if camera.is_wide:
-        fix = "undistort the photo, or crop it to a pinhole's view"
-        raise InputError(f"{what} takes no {camera.lens} lens", where="camera.lens", fix=fix)
 
 
 def faced(camera: Camera, points_2d: FloatArray) -> Camera:
@@ -334,14 +325,12 @@ def rays_ahead(points_2d: FloatArray, camera: Camera, *, clips: bool = False) ->
     """
     rays = camera.unproject(points_2d)
     border = math.radians(_REACH)
-    beside = np.flatnonzero(rays[:, 2] < math.cos(border))
-    if len(beside) and not clips:
-        raise InputError(
-            f"the keypoints surround the camera: {len(beside)} of {len(rays)} lie more than "
-            f"{_REACH:g} degrees off the direction amid them, the first is point {beside[0]}",
-            where="points_2d",
-            fix="give keypoints on one side of the camera, or, if these are outliers, ransac",
-        )
+    beside = rays[:, 2] < math.cos(border)
+    if not clips:
+        what = "the keypoints surround the camera: {} lie more than "
+        what += f"{_REACH:g} degrees off the direction amid them"
+        fix = "give keypoints on one side of the camera, or, if these are outliers, ransac"
+        _refuse(beside, what, fix)
     across = rays[beside, :2] / np.linalg.norm(rays[beside, :2], axis=1, keepdims=True)
     rays[beside, :2], rays[beside, 2] = math.sin(border) * across, math.cos(border)
     return perspective(rays)
@@ -386,12 +375,3 @@ def projection_jacobian(points_3d: FloatArray, camera: Camera, alignment: Alignm
     jacobian[:, :, 6:9] = by_point @ (alignment.rotation * stretched[:, None])
     jacobian[:, :, 9] = camera.pixels_of_rays(in_camera) - (camera.cx, camera.cy)
     return jacobian
-
-
-def predicted_covariances(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Covariances (n, 2, 2) [px^2] of predicted projections, without a measurement's own noise.
-
-    By the `projection_jacobian` and the covariance of the unknowns (m, m), the first of its 10.
-    """
-    jacobian = jacobian[:, :, : len(covariance)]
-    return np.asarray(jacobian @ covariance @ jacobian.transpose(0, 2, 1))

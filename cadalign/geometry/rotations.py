@@ -75,17 +75,12 @@ def _quaternion(rotation: FloatArray) -> tuple[float, float, float, float]:
     return w, x, y, z
 
 
-def angle_between(first: FloatArray, second: FloatArray) -> float:
-    """Angle of the rotation that leads from one matrix (3, 3) to another [degrees], 0 to 180.
+def angles_between(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Angles (...) of rotations from matrices (..., 3, 3) to others [degrees], 0 to 180.
 
     From the chord, |first - second| = sqrt(8) sin(angle / 2), which is exact at small angles, where
     the usual arc cosine of the trace loses half the digits (and beyond 90 degrees from the trace).
     """
-    return float(angles_between(first, second))
-
-
-def angles_between(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Angles (...) between matrices (..., 3, 3) [degrees], as `angle_between`."""
     difference = first - second
     chord = lengths(difference.reshape(*difference.shape[:-2], 9)) / np.sqrt(8.0)
     cosine = np.sqrt(np.maximum(((first * second).sum(axis=(-2, -1)) + 1.0) / 4.0, 0.0))

@@ -291,7 +291,7 @@ def write_image_fields(image: ObservedImage, folder: Path | None) -> dict[str, A
     known = {name: np.asarray(each).tolist() for name, each in columns.items() if each is not None}
     rows = [dict(zip(known, row, strict=True)) for row in zip(*known.values(), strict=True)]
     data: dict[str, Any] = {
-        "camera": image.camera.to_dict(pixel_origin="corner"),
+        "camera": image.camera.to_dict() | {"pixel_origin": "corner"},
         "pixel_origin": "center",
         # An unknown depth is NaN.
         "keypoints": [

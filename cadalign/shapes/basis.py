@@ -1,9 +1,8 @@
-"""Shape components from given means, modes and covariances, and from a mirror symmetry."""
+"""Shape components from given means, modes and covariances, and the mirror of a category."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -11,17 +10,9 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import extent
-from cadalign.shapes.parts import (
-    AXES,
-    BOX_ROWS,
-    KeypointId,
-    Reflection,
-    ShapeComponent,
-    checked_box,
-)
+from cadalign.shapes.parts import BOX_ROWS, ShapeComponent, checked_box
 
 _ROUNDS = 10  # of pairing keypoints and moving the mirror; 3 suffice as a rule
-_LARGEST_GAP = 0.2  # of a keypoint from its mirror image, over the mean's diagonal
 
 
 def component_of_basis(
@@ -31,27 +22,19 @@ def component_of_basis(
     *,
     box: npt.ArrayLike | None,
     residual_sigma: float,
-    size_sigma: npt.ArrayLike | None,
 ) -> ShapeComponent:
     """Make a component from a linear shape model; see `ShapeModel.from_basis`."""
     points = as_floats(mean, name="mean", shape=(None, 3))
     if not len(points):
         raise InputError("there are no keypoints", where="mean")
     directions = as_floats(modes, name="modes", shape=(None, len(points), 3))
-    sigmas = _not_negative(deviations, "deviations", len(directions))
+    sigmas = as_floats(deviations, name="deviations", shape=(len(directions),))
+    if (sigmas < 0).any():
+        raise InputError(f"{sigmas.min():g} is negative", where="deviations")
     rows = np.vstack([points, extent(points) if box is None else checked_box(box, "box")])
     scaled = sigmas[:, None, None] * directions
     extended = [np.vstack([mode, _corners(points, mode, rows[-BOX_ROWS:])]) for mode in scaled]
-    if size_sigma is not None:
-        extended += list(rows * np.diag(_not_negative(size_sigma, "size_sigma", 3))[:, None])
-    return ShapeComponent(1.0, rows, orthogonal(np.array(extended), len(rows)), residual_sigma)
-
-
-def _not_negative(given: npt.ArrayLike, where: str, count: int) -> FloatArray:
-    sigmas = as_floats(given, name=where, shape=(count,))
-    if (sigmas < 0).any():
-        raise InputError(f"{sigmas.min():g} is negative", where=where)
-    return sigmas
+    return ShapeComponent(1.0, rows, _orthogonal(np.array(extended), len(rows)), residual_sigma)
 
 
 def component_of_covariance(
@@ -84,7 +67,7 @@ def _corners(points: FloatArray, mode: FloatArray, corners: FloatArray) -> Float
     return np.asarray(mode.mean(axis=0) + stretch * (corners - centre))
 
 
-def orthogonal(modes: FloatArray, count: int) -> FloatArray:
+def _orthogonal(modes: FloatArray, count: int) -> FloatArray:
     """Modes (K, count, 3) of the same covariance that are orthogonal, the longest first."""
     if not len(modes):
         return modes.reshape(0, count, 3)
@@ -93,7 +76,15 @@ def orthogonal(modes: FloatArray, count: int) -> FloatArray:
     return np.asarray((lengths[keep, None] * directions[keep]).reshape(-1, count, 3))
 
 
-def find_reflection(completed: FloatArray, ids: Sequence[KeypointId], axis: int) -> Reflection:
+class Mirror(NamedTuple):
+    """A mirror across an axis, as a category has one whose mirrored objects are as likely."""
+
+    axis: int
+    offset: float  # where it stands on that axis [model units]
+    partners: tuple[int, ...]  # the row of each keypoint's mirror image, its own for some
+
+
+def find_mirror(completed: FloatArray, axis: int) -> Mirror:
     """Find the pairs of keypoints that a mirror across an axis exchanges best.
 
     Keypoints are paired such that the squared distances between the mirrored keypoints and their
@@ -104,57 +95,27 @@ def find_reflection(completed: FloatArray, ids: Sequence[KeypointId], axis: int)
 
     points = completed[:, :-BOX_ROWS]
     offset = float(completed[:, -BOX_ROWS:, axis].mean())
-    partner = np.arange(len(ids))
+    own = partner = np.arange(points.shape[1])
     for _ in range(_ROUNDS):
         mirrored = points.copy()
         mirrored[..., axis] = 2 * offset - mirrored[..., axis]
         gaps = ((mirrored[:, :, None] - points[:, None, :]) ** 2).sum(axis=3).mean(axis=0)
         _, found = linear_sum_assignment(gaps + gaps.T)
         # A mirror undoes itself; a longer cycle of keypoints is none.
-        found = np.where(found[found] == np.arange(len(ids)), found, np.arange(len(ids)))
+        found = np.where(found[found] == own, found, own)
         midpoints = (points[..., axis] + points[:, found, axis]) / 2
         # The median, since keypoints without a partner may lie off the mirror.
         offset = float(np.median(midpoints.mean(axis=0)))
         if (found == partner).all():
             break
         partner = found
-    partners = enumerate(partner.tolist())
-    pairs = tuple((ids[row], ids[other]) for row, other in partners if row < other)
-    return Reflection(AXES[axis], offset, pairs)
+    return Mirror(axis, offset, tuple(partner.tolist()))
 
 
-def mirrored(
-    rows: FloatArray, ids: Sequence[KeypointId], reflection: Reflection, *, offset: float
-) -> FloatArray:
-    """Mirror models' keypoints and box corners, (N, m + 2, 3) float, NaN where missing.
-
-    The ``offset`` is the reflection's or, for displacements of keypoints and corners, 0.
-    """
-    axis = AXES.index(reflection.axis)
-    exchanged = rows[:, [*reflection.partners(ids), -BOX_ROWS, -1]]
-    exchanged[..., axis] = -exchanged[..., axis]
-    exchanged[:, [-BOX_ROWS, -1], axis] = exchanged[:, [-1, -BOX_ROWS], axis]
-    exchanged[..., axis] += 2 * offset
+def mirrored(rows: FloatArray, mirror: Mirror) -> FloatArray:
+    """Mirror models' keypoints and box corners, (N, m + 2, 3) float, NaN where missing."""
+    exchanged = rows[:, [*mirror.partners, -BOX_ROWS, -1]]
+    exchanged[..., mirror.axis] = -exchanged[..., mirror.axis]
+    exchanged[:, [-BOX_ROWS, -1], mirror.axis] = exchanged[:, [-1, -BOX_ROWS], mirror.axis]
+    exchanged[..., mirror.axis] += 2 * mirror.offset
     return exchanged
-
-
-def symmetric_component(
-    component: ShapeComponent, ids: Sequence[KeypointId], reflection: Reflection
-) -> ShapeComponent:
-    """Make a component symmetric: an object is as likely as its mirror image.
-
-    Mean and covariance are the average of the component's own and of the mirrored ones.
-    """
-    mean, modes = component.mean, component.modes
-    of_modes = mirrored(modes, ids, reflection, offset=0.0)
-    (of_mean,) = mirrored(mean[None], ids, reflection, offset=reflection.offset)
-    gaps = np.linalg.norm(of_mean - mean, axis=1)[:-BOX_ROWS]
-    worst = int(np.argmax(gaps))
-    if gaps[worst] > _LARGEST_GAP * np.linalg.norm(np.ptp(mean[:-BOX_ROWS], axis=0)):
-        what = f"keypoint {ids[worst]!r} of the mean is {gaps[worst]:.3g} from its mirror image"
-        raise InputError(what, where="reflection", fix="check axis, offset and pairs")
-    return replace(
-        component,
-        mean=(mean + of_mean) / 2,
-        modes=orthogonal(np.concatenate([modes, of_modes]) / np.sqrt(2), len(mean)),
-    )

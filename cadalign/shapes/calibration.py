@@ -20,7 +20,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.geometry.alignment import are_on_a_line
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
-from cadalign.shapes.gaussians import Gaussians
+from cadalign.shapes.gaussians import Gaussians, Vectors
 from cadalign.shapes.parts import (
     BOX_ROWS,
     FEW,
@@ -215,20 +215,11 @@ def _squares(view: _View, mixture: Gaussians, sigma: float) -> tuple[FloatArray,
 
 def excesses_of(rows: FloatArray, mixture: Gaussians) -> FloatArray:
     """Distances of linear boxes beyond the true faces of models that were held out, (N, 2, 3)."""
-    found = np.full((len(rows), BOX_ROWS, 3), np.nan)
-    first = rows[0].size - 3 * BOX_ROWS
-    for place, row in enumerate(rows):
-        entries = np.flatnonzero(np.isfinite(row.ravel()[:first]))
-        best = -np.inf
-        for weight, mean, covariance in zip(*mixture, strict=True):
-            gap = row.ravel()[entries] - mean[entries]
-            own = covariance[entries[:, None], entries]
-            solved = np.linalg.solve(own, gap)
-            score = 2 * np.log(weight) - gap @ solved - np.linalg.slogdet(own)[1]
-            if score > best:
-                best, linear = score, mean[first:] + covariance[first:, entries] @ solved
-        found[place] = OUTWARD * (linear.reshape(BOX_ROWS, 3) - row[-BOX_ROWS:])
-    return found
+    without = rows.copy()
+    without[:, -BOX_ROWS:] = np.nan
+    vectors = Vectors(without.reshape(len(rows), -1), np.ones(len(rows)))
+    linear = vectors.completed(mixture).reshape(rows.shape)
+    return np.asarray(OUTWARD * (linear - rows)[:, -BOX_ROWS:])
 
 
 def learn_margins(rows: FloatArray, excesses: FloatArray) -> BoxMargins | None:

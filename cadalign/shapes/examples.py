@@ -123,7 +123,7 @@ def examples_of(models: Sequence[Any], *, meshes: bool) -> list[Example]:
 
 
 def tabulated(
-    examples: Sequence[Example],
+    examples: Sequence[Example], category: str
 ) -> tuple[tuple[KeypointId, ...], FloatArray, TrainingShapes]:
     """Models as rows of one array: all ids that a model has, sorted, and the rows.
 
@@ -135,8 +135,8 @@ def tabulated(
         fix = "`cadalign shape learn` takes the folder of a data set"
         require_kind(each, Example, f"models[{number}]", fix=fix)
     if len(examples) < LEAST_MODELS:
-        what = f"{len(examples)} models are too few to learn a shape from"
-        raise InputError(what, where="models", fix=f"give at least {LEAST_MODELS}")
+        what, where = f"{len(examples)} are too few to learn a shape from", f"models of {category}"
+        raise InputError(what, where=where, fix=f"give at least {LEAST_MODELS}")
     _check_names(examples)
     _check_shared(examples)
     _warn_of_units(examples)

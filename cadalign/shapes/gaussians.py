@@ -89,9 +89,12 @@ class Vectors:
         return float(np.nanmean((self.values - self.mean) ** 2))
 
     def completed(self, model: Gaussians) -> FloatArray:
-        """The vectors with their expected missing entries under the first component, (N, d)."""
-        unweighted, given = np.zeros(len(self.values)), _conditionals(self, model)[0]
-        return _expect(self, unweighted, model.means[0], given)[0]
+        """The vectors with the missing entries that their likeliest component expects, (N, d)."""
+        given, unweighted = _conditionals(self, model), np.zeros(len(self.values))
+        likeliest = _log_densities(self, model, given).argmax(axis=1)
+        pairs = zip(model.means, given, strict=True)
+        every = np.array([_expect(self, unweighted, mean, each)[0] for mean, each in pairs])
+        return np.asarray(every[likeliest, np.arange(len(likeliest))])
 
 
 def log_likelihoods(vectors: Vectors, model: Gaussians) -> FloatArray:

@@ -17,7 +17,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, require_counts
 from cadalign.errors import InputError
-from cadalign.shapes.basis import component_of_covariance, find_reflection, mirrored
+from cadalign.shapes.basis import Mirror, component_of_covariance, find_mirror, mirrored
 from cadalign.shapes.calibration import ShapeCalibration, calibrate, excesses_of, learn_margins
 from cadalign.shapes.examples import Example, tabulated
 from cadalign.shapes.gaussians import (
@@ -27,7 +27,7 @@ from cadalign.shapes.gaussians import (
     learn_mixture,
     log_likelihoods,
 )
-from cadalign.shapes.parts import BoxMargins, KeypointId, Reflection
+from cadalign.shapes.parts import BoxMargins
 
 # Lengths relative to the models' median diagonal.
 _FLOOR = 1e-3
@@ -53,7 +53,7 @@ class _Recipe:
     """Choices that are made before the components are learned."""
 
     strength: float = _STRENGTHS[1]
-    reflection: Reflection | None = None
+    mirror: Mirror | None = None
     components: int = 1
 
 
@@ -61,19 +61,18 @@ class _Recipe:
 class _Models:
     """Models to learn from."""
 
-    ids: Sequence[KeypointId]  # (m,) int or str
     rows: FloatArray  # (N, m + 2, 3), keypoints and box corners, NaN where missing
     size: float  # their median diagonal
     _known: dict[_Recipe, tuple[Vectors, Gaussians]] = field(default_factory=dict)
 
     def some(self, chosen: BoolArray) -> _Models:
         """A part of the models."""
-        return _Models(self.ids, self.rows[chosen], self.size)
+        return _Models(self.rows[chosen], self.size)
 
     @cached_property
     def vectors(self) -> Vectors:
         """The models, without mirror images."""
-        return _vectors(self.rows, None, self.ids)
+        return _vectors(self.rows, None)
 
     def completed(self) -> FloatArray:
         """The models with their expected missing keypoints, (N, m + 2, 3) float."""
@@ -85,8 +84,8 @@ class _Models:
         single = replace(recipe, components=1)
         if single not in self._known:
             vectors = self.vectors
-            if recipe.reflection is not None:
-                vectors = _vectors(self.rows, recipe.reflection, self.ids)
+            if recipe.mirror is not None:
+                vectors = _vectors(self.rows, recipe.mirror)
             floor, strength = _FLOOR * self.size, recipe.strength
             gaussian = learn_gaussian(vectors, strength=strength, floor=floor, rounds=_ROUNDS)
             self._known[single] = vectors, gaussian
@@ -158,15 +157,15 @@ class _CrossValidation:
                 most = min(recipe.components, count - 1)
                 best = self._try(replace(recipe, components=most))
         else:
-            best = self._with_components(self._with_reflection(best), components)
+            best = self._with_components(self._with_mirror(best), components)
             recipe, modes = best.recipe, self._modes(best)
         figures = self._calibration(best, modes)._asdict()
         return recipe, modes, figures | {"box_margins": self._margins(best)}
 
-    def _with_reflection(self, best: _Trial) -> _Trial:
+    def _with_mirror(self, best: _Trial) -> _Trial:
         completed = self._models.completed()
-        mirrors = [find_reflection(completed, self._models.ids, axis) for axis in range(3)]
-        mirrored = self._best(replace(best.recipe, reflection=each) for each in mirrors)
+        mirrors = [find_mirror(completed, axis) for axis in range(3)]
+        mirrored = self._best(replace(best.recipe, mirror=each) for each in mirrors)
         # Twice as many models to learn from are worth a little.
         return mirrored if _is_enough(mirrored.scores, best.scores, _TOLERANCE) else best
 
@@ -213,16 +212,17 @@ class _CrossValidation:
         return found
 
 
-def learn_parts(examples: Sequence[Example], components: int | None) -> dict[str, Any]:
+def learn_parts(
+    examples: Sequence[Example], category: str, components: int | None
+) -> dict[str, Any]:
     """Learn the fields of a `cadalign.ShapeModel`, but for its names; see `ShapeModel.learn`."""
-    if components is not None:
-        require_counts(components=components)
-    ids, rows, training = tabulated(examples)
+    require_counts(components=1 if components is None else components)
+    ids, rows, training = tabulated(examples, category)
     if (components or 1) > len(rows):
         what = f"{components} are more than the {len(rows)} models"
         raise InputError(what, where="components")
     extents = np.nanmax(rows, axis=1) - np.nanmin(rows, axis=1)
-    models = _Models(ids, rows, float(np.median(np.linalg.norm(extents, axis=1))))
+    models = _Models(rows, float(np.median(np.linalg.norm(extents, axis=1))))
     recipe, modes, calibration = _CrossValidation(models).choose(components)
     parts = sorted(zip(*models.mixture(recipe), strict=True), key=lambda part: -part[0])
     total = sum(weight for weight, _, _ in parts)
@@ -235,18 +235,16 @@ def learn_parts(examples: Sequence[Example], components: int | None) -> dict[str
     return {
         "ids": ids,
         "components": tuple(learned),
-        "reflection": recipe.reflection,
         "training": training,
         **calibration,
     }
 
 
-def _vectors(rows: FloatArray, reflection: Reflection | None, ids: Sequence[KeypointId]) -> Vectors:
+def _vectors(rows: FloatArray, mirror: Mirror | None) -> Vectors:
     """Models as vectors, beside each its mirror image of the same weight."""
     weight = 1.0
-    if reflection is not None:
-        images = mirrored(rows, ids, reflection, offset=reflection.offset)
-        rows = np.concatenate([rows, images])
+    if mirror is not None:
+        rows = np.concatenate([rows, mirrored(rows, mirror)])
         weight = 0.5
     return Vectors(rows.reshape(len(rows), -1), np.full(len(rows), weight))
 

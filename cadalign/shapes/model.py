@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, is_number
-from cadalign.errors import InputError, quote, require_kind
-from cadalign.shapes.basis import component_of_basis, symmetric_component
+from cadalign.errors import InputError, quote
+from cadalign.shapes.basis import component_of_basis
 from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.outputs import read_shape, write_shape
 from cadalign.shapes.parts import (
@@ -21,8 +21,6 @@ from cadalign.shapes.parts import (
     BoxMargins,
     FewKeypoints,
     KeypointId,
-    NearestShape,
-    Reflection,
     ShapeComponent,
     TrainingShapes,
     check_axis,
@@ -58,8 +56,9 @@ class ShapeModel:
     >>> boxes = ShapeModel.learn(models, category="box")
     >>> boxes
     ShapeModel('box', 4 keypoints, 1 component, 50 models)
-    >>> boxes.nearest(models[7].points_3d, names).model_id
-    'box 7'
+    >>> order = [names.index(name) for name in boxes.ids]
+    >>> boxes.nearest(models[7].points_3d[order])
+    7
     """
 
     category: str
@@ -73,8 +72,6 @@ class ShapeModel:
     extent of all its keypoints."""
     up_axis: Literal["x", "y", "z"] | None = None
     """The model axis that points up, None where it is not known."""
-    reflection: Reflection | None = None
-    """The mirror symmetry of the category."""
     training: TrainingShapes | None = None
     """The models that it was learned from."""
     unit: str = "model units"
@@ -107,9 +104,6 @@ class ShapeModel:
         if self.up_axis is not None:
             check_axis(self.up_axis, "up_axis")
             object.__setattr__(self, "up_axis", str(self.up_axis))
-        if self.reflection is not None:
-            require_kind(self.reflection, Reflection, "reflection")
-            self.reflection.partners(ids)
         if self.training is not None and self.training.points_3d.shape[1] != len(ids):
             what = f"{self.training.points_3d.shape[1]} keypoints for {len(ids)} ids"
             raise InputError(what, where="training")
@@ -119,8 +113,7 @@ class ShapeModel:
         if freedom is not None and (not is_number(freedom) or freedom <= 2):
             what = f"{freedom!r} is not a number above 2, nor None"
             raise InputError(what, where="degrees_of_freedom")
-        freedom = None if freedom is None else float(freedom)
-        object.__setattr__(self, "degrees_of_freedom", freedom)
+        object.__setattr__(self, "degrees_of_freedom", freedom and float(freedom))
         object.__setattr__(self, "inflation", float(self.inflation))
         for name in ("category", "unit"):
             object.__setattr__(self, name, check_text(getattr(self, name), name))
@@ -161,7 +154,7 @@ class ShapeModel:
         """
         from cadalign.shapes.learning import learn_parts  # an estimate learns nothing
 
-        learned = learn_parts(list(models), components)
+        learned = learn_parts(list(models), category, components)
         return cls(category=category, up_axis=up_axis, unit=unit, **learned)
 
     @classmethod
@@ -194,17 +187,12 @@ class ShapeModel:
         InputError
             If category or split is unknown, or the category has too few models.
         """
-        from cadalign.shapes.examples import LEAST_MODELS, examples_of
+        from cadalign.shapes.examples import examples_of  # an estimate learns nothing
 
         models = dataset.subset(categories=[category], split=split)[category]
-        if len(models) < LEAST_MODELS:
-            where = f"{category}, split {split}" if split else category
-            what = f"{len(models)} models are too few to learn a shape from"
-            raise InputError(what, where=where, fix=f"at least {LEAST_MODELS} are needed")
-        examples = examples_of(models, meshes=meshes)
         return cls.learn(
-            examples,
-            category=models[0].category,
+            examples_of(models, meshes=meshes),
+            category=models[0].category if models else category,
             up_axis="y",
             unit="diagonal",
             components=components,
@@ -220,8 +208,6 @@ class ShapeModel:
         ids: Sequence[KeypointId] | None = None,
         box: npt.ArrayLike | None = None,
         residual_sigma: float = 0.0,
-        size_sigma: npt.ArrayLike | None = None,
-        reflection: Reflection | None = None,
         category: str = "object",
         up_axis: Literal["x", "y", "z"] | None = None,
         unit: str = "model units",
@@ -233,7 +219,7 @@ class ShapeModel:
         mean : (m, 3) float
             The keypoints of the mean shape.
         modes : (K, m, 3) float
-            Directions of deformation.
+            Directions of deformation; the mean times an axis' unit vector is the size along it.
         deviations : (K,) float
             Standard deviations of their coefficients, 0 or more.
         ids : (m,) int or str, optional
@@ -244,47 +230,36 @@ class ShapeModel:
             default the box of an estimate is the extent of all its keypoints.
         residual_sigma : float
             Standard deviation per coordinate of what the modes leave [model units].
-        size_sigma : (3,) float, optional
-            Standard deviations of the logarithms of the sizes along x, y and z, where the modes are
-            of objects of one size: further modes, which scale mean and box about the origin.
-        reflection : Reflection, optional
-            The category's mirror symmetry. Mean and covariance are averaged with their mirror
-            images, since a mean whose left and right differ a little turns the estimates.
         category, up_axis, unit
             See `ShapeModel`.
 
         Raises
         ------
         InputError
-            If a shape is wrong, a value is NaN or infinite, a sigma is negative, an id occurs
-            twice, or the reflection names an unknown one.
+            If a shape is wrong, a value is NaN or infinite, a sigma is negative, or an id occurs
+            twice.
 
         Examples
         --------
         >>> mean = [[0, 0, 0], [4, 0, 0], [4, 2, 0], [0, 2, 1]]
         >>> longer = [[0, 0, 0], [1, 0, 0], [1, 0, 0], [0, 0, 0]]
-        >>> cars = ShapeModel.from_basis(mean, [longer], [0.5], ids=["a", "b", "c", "d"],
-        ...                              size_sigma=[0.1, 0.1, 0.1], unit="m")
+        >>> cars = ShapeModel.from_basis(mean, [longer], [0.5], ids=["a", "b", "c", "d"], unit="m")
         >>> cars.components[0].modes.shape
-        (3, 6, 3)
+        (1, 6, 3)
         """
         component = component_of_basis(
-            mean, modes, deviations, box=box, residual_sigma=residual_sigma, size_sigma=size_sigma
+            mean, modes, deviations, box=box, residual_sigma=residual_sigma
         )
         count = len(component.mean) - BOX_ROWS
         labels = check_ids(range(count) if ids is None else list(ids), "ids")
         if len(labels) != count:
             raise InputError(f"{len(labels)} for {count} keypoints", where="ids")
-        if reflection is not None:
-            require_kind(reflection, Reflection, "reflection")
-            component = symmetric_component(component, labels, reflection)
         return cls(
             category=category,
             ids=labels,
             components=(component,),
             has_box=box is not None,
             up_axis=up_axis,
-            reflection=reflection,
             unit=unit,
         )
 
@@ -339,36 +314,25 @@ class ShapeModel:
             )
         return np.array([row_of[label] for label in wanted], dtype=np.int64)
 
-    def nearest(
-        self, points_3d: npt.ArrayLike, ids: Iterable[KeypointId] | None = None
-    ) -> NearestShape:
-        """Find the training model whose keypoints are nearest to given ones.
+    def nearest(self, points_3d: npt.ArrayLike) -> int:
+        """Find the row in ``training`` of the model whose keypoints are nearest to given ones.
 
         Parameters
         ----------
-        points_3d : (n, 3) float
-            Keypoints in the model's coordinates [model units].
-        ids : (n,) int or str, optional
-            Their ids; by default all of the model's, in its order.
+        points_3d : (m, 3) float
+            All keypoints in the order of ``ids``, in the model's coordinates [model units].
 
         Raises
         ------
         InputError
-            If there are no training models, a shape is wrong, a value is NaN or infinite, or an id
-            is unknown.
+            If there are no training models, a shape is wrong, or a value is NaN or infinite.
         """
         if self.training is None or not len(self.training):
             raise InputError("no training models are known", where=self.category)
-        rows = np.arange(len(self.ids)) if ids is None else self.rows(ids)
-        points = as_floats(points_3d, name="points_3d", shape=(len(rows), 3))
-        if not len(rows):
-            raise InputError("no keypoints", where="points_3d")
-        known = self.training.points_3d[:, rows]
+        points = as_floats(points_3d, name="points_3d", shape=(len(self.ids), 3))
+        known = self.training.points_3d
         squares = ((known.astype(np.float64) - points) ** 2).sum(axis=2)
         # Two objects of the category are this far apart in a keypoint on average.
         expected = 2 * np.nanvar(known, axis=0).sum(axis=1)
         distances = np.where(np.isnan(squares), expected, squares).mean(axis=1)
-        best = int(np.argmin(distances))
-        own = self.training.points_3d[best].astype(np.float64)
-        name, path = self.training.model_ids[best], self.training.mesh_paths[best]
-        return NearestShape(name, own, path, float(np.sqrt(distances[best])))
+        return int(np.argmin(distances))

@@ -1,4 +1,4 @@
-"""Parts of a shape model: components, reflection, training, box, and the tails of its errors."""
+"""Parts of a shape model: components, training, box, and the tails of its errors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from cadalign.errors import InputError, quote
 KeypointId = int | str
 """A keypoint's semantic id or name."""
 
-AXES = ("x", "y", "z")
 BOX_ROWS = 2  # the box's least and greatest corner, after the keypoints
 FEW = 6  # keypoints with which the inflation is least
 OUTWARD = np.array([[-1.0], [1.0]])
@@ -73,63 +72,6 @@ class ShapeComponent:
     def variance(self) -> FloatArray:
         """Sum of the rows' variances along each mode, (K,) float [model units squared]."""
         return np.asarray((self.modes**2).sum(axis=(1, 2)))
-
-
-@dataclass(frozen=True)
-class Reflection:
-    """A category's mirror symmetry: mirrored objects are as likely as the objects themselves."""
-
-    axis: str  # "x", "y" or "z": the axis across which the objects are mirrored
-    offset: float  # where the mirror stands on that axis [model units]
-    pairs: tuple[tuple[KeypointId, KeypointId], ...]
-    """The keypoints that exchange places; the others are their own mirror image."""
-
-    def __post_init__(self) -> None:
-        check_axis(self.axis, "axis")
-        if not is_number(self.offset):
-            raise InputError(f"{self.offset!r} is not a finite number", where="offset")
-        pairs = tuple(tuple(pair) for pair in self.pairs)
-        odd = next((pair for pair in pairs if len(pair) != 2), None)
-        if odd is not None:
-            raise InputError(f"{quote(odd)} are not two keypoints", where="pairs")
-        paired = [label for pair in pairs for label in pair]
-        if len(set(paired)) < len(paired):
-            raise InputError("a keypoint is mirrored twice", where="pairs")
-        labels = iter(check_ids(paired, "pairs") if paired else ())
-        object.__setattr__(self, "axis", str(self.axis))
-        object.__setattr__(self, "offset", float(self.offset))
-        object.__setattr__(self, "pairs", tuple(zip(labels, labels, strict=True)))
-
-    def partners(self, ids: Sequence[KeypointId]) -> npt.NDArray[np.int64]:
-        """The row that each keypoint's mirror image has, (m,) int.
-
-        Examples
-        --------
-        >>> Reflection("x", 0.0, (("left", "right"),)).partners(["left", "top", "right"])
-        array([2, 1, 0])
-        """
-        row_of = {label: row for row, label in enumerate(ids)}
-        partner = np.arange(len(ids))
-        for first, second in self.pairs:
-            if first not in row_of or second not in row_of:
-                missing = first if first not in row_of else second
-                raise InputError(f"unknown keypoint {missing!r}", where="reflection")
-            partner[[row_of[first], row_of[second]]] = row_of[second], row_of[first]
-        return partner
-
-
-@dataclass(frozen=True, eq=False)
-class NearestShape:
-    """The training model whose keypoints are nearest to given ones."""
-
-    model_id: str
-    points_3d: FloatArray
-    """(m, 3), its keypoints in the order of the shape model's ids [model units]; NaN where it lacks
-    one."""
-    mesh_path: Path | None
-    distance: float
-    """Root of the mean squared distance of the keypoints [model units]; for those that the model
-    lacks the distance expected in the category."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,7 +238,7 @@ def check_text(text: object, where: str) -> str:
 
 def check_axis(axis: object, where: str) -> None:
     """Refuse what is not the name of an axis."""
-    if not isinstance(axis, str) or axis not in AXES:
+    if not isinstance(axis, str) or axis not in ("x", "y", "z"):
         raise InputError(f"{quote(axis)} is no axis", where=where, fix="give x, y or z")
 
 

@@ -22,7 +22,7 @@ from cadalign.arrays import FloatArray
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.images import photo_size
 from cadalign.metrics import box_iou
-from cadalign.shapes.basis import find_reflection
+from cadalign.shapes.basis import find_mirror, mirrored
 
 _LEAST_KEYPOINTS, _SURE = 6, 0.4  # score of a keypoint
 _CELLS = 64  # of a network's heatmap along the longer side of a car's rectangle
@@ -118,17 +118,21 @@ def _car_shape(folder: Path) -> cadalign.ShapeModel:
     mean = np.loadtxt(folder / "meanShape_2.txt")
     metres, *_ = np.linalg.lstsq(mean - mean.mean(axis=0), points - points.mean(axis=0), rcond=None)
     modes = np.loadtxt(folder / "vectors2.txt").reshape(-1, *points.shape) @ metres
-    box = _car_bounds(points)
+    modes = np.concatenate([modes, [points * axis for axis in np.eye(3)]])
+    deviations = [*[_MODE_DEVIATION] * (len(modes) - 3), *_LENGTH_SIGMAS]
+    # The mean of annotated cars is a little skew: its left wheel stands before its right one.
+    rows = np.vstack([points, _car_bounds(points)])
+    mirror = find_mirror(rows[None], axis=0)
+    moved = mirrored(rows + np.pad(modes, ((0, 0), (0, 2), (0, 0))), mirror)
+    image = mirrored(rows[None], mirror)[0]
+    mean, images = (rows + image) / 2, (moved - image)[:, :-2]
     return cadalign.ShapeModel.from_basis(
-        points,
-        modes,
-        np.full(len(modes), _MODE_DEVIATION),
+        mean[:-2],
+        np.concatenate([modes, images]) / np.sqrt(2),
+        [*deviations, *deviations],
         ids=names,
-        box=box,
+        box=mean[-2:],
         residual_sigma=_REST,
-        size_sigma=_LENGTH_SIGMAS,
-        # The mean of annotated cars is a little skew: its left wheel stands before its right one.
-        reflection=find_reflection(np.vstack([points, box])[None], names, axis=0),
         category="Car",
         up_axis="z",
         unit="m",

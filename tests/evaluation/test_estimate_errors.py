@@ -16,10 +16,10 @@ from cadalign.evaluation.instances.record import box_alignment
 from cadalign.evaluation.metrics.errors import estimate_errors
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.rotations import rotation_from_vector
-from cadalign.geometry.symmetry_group import SymmetryGroup
+from cadalign.geometry.symmetry import Symmetry
 
-NO_SYMMETRY = SymmetryGroup(np.zeros(3), np.eye(3)[None])
-HALF_TURN = SymmetryGroup(np.zeros(3), np.array([np.eye(3), np.diag([-1.0, 1.0, -1.0])]))
+NO_SYMMETRY = Symmetry.none()
+HALF_TURN = Symmetry.around((0, 1, 0), fold=2)
 
 
 def alignment(rng: np.random.Generator) -> Alignment:

@@ -23,7 +23,7 @@ from cadalign.evaluation.metrics.errors import limit_estimate
 from cadalign.evaluation.simulation import simulate_problem
 from cadalign.geometry.alignment import Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.symmetry_group import SymmetryGroup
+from cadalign.geometry.symmetry import Symmetry
 from cadalign.metrics import rotation_error
 
 CUBE = np.array([[x, y, z] for x in (-1.0, 1) for y in (-1.0, 1) for z in (-1.0, 1)]) / 4
@@ -99,7 +99,7 @@ def task(model_id: str = "a", view: int = 0) -> KeypointTask:
         view=view,
         hull=KeypointHull(cloud()),
         ids=np.arange(14),
-        symmetry=SymmetryGroup(np.zeros(3), np.eye(3)[None]),
+        symmetry=Symmetry.none(),
         model=None,
     )
 

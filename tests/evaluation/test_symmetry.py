@@ -11,11 +11,11 @@ from cadalign.datasets.keypoints import (
     Circle,
     RotationalSymmetry,
     Symmetries,
-    symmetry_group,
+    annotated_symmetry,
 )
 from cadalign.evaluation.simulation import random_rotation
 from cadalign.geometry.rotations import rotation_from_vector
-from cadalign.geometry.symmetry_group import SymmetryGroup
+from cadalign.geometry.symmetry import Symmetry
 from cadalign.metrics import rotation_error, translation_error
 
 Y = np.array([0.0, 1.0, 0.0])
@@ -42,7 +42,7 @@ def table() -> tuple[FloatArray, Symmetries]:
     return xyz, Symmetries(reflections=ring + upper)
 
 
-def errors(group: SymmetryGroup, est: Alignment, gt: Alignment) -> tuple[float, float]:
+def errors(group: Symmetry, est: Alignment, gt: Alignment) -> tuple[float, float]:
     truth = group.nearest_turned(gt, est.rotation)
     return rotation_error(est=est, gt=truth), translation_error(est=est, gt=truth)
 
@@ -52,7 +52,7 @@ def some_truth(seed: int = 0) -> Alignment:
     return Alignment(random_rotation(rng), [0.3, -0.2, 4.0], [1.0, 0.6, 1.7])
 
 
-def turned(gt: Alignment, group: SymmetryGroup, rotation: FloatArray) -> Alignment:
+def turned(gt: Alignment, group: Symmetry, rotation: FloatArray) -> Alignment:
     """The alignment of the object turned about the group's centre."""
     shift = gt.rotation @ (group.center - rotation @ group.center)
     return Alignment(gt.rotation @ rotation, gt.translation + shift, gt.scale)
@@ -60,7 +60,7 @@ def turned(gt: Alignment, group: SymmetryGroup, rotation: FloatArray) -> Alignme
 
 @pytest.mark.parametrize("degrees", [0.0, 17.0, 90.0, 179.9, -120.0])
 def test_a_bottle_turned_about_its_axis_is_no_error(degrees: float) -> None:
-    group = symmetry_group(*bottle())
+    group = annotated_symmetry(*bottle())
     assert str(group) == "circle"
     gt = some_truth()
     est = turned(gt, group, rotation_from_vector(Y * np.radians(degrees)))
@@ -69,7 +69,7 @@ def test_a_bottle_turned_about_its_axis_is_no_error(degrees: float) -> None:
 
 
 def test_a_tilted_bottle_keeps_the_error_of_its_tilt() -> None:
-    group = symmetry_group(*bottle())
+    group = annotated_symmetry(*bottle())
     gt = some_truth()
     tilt = rotation_from_vector(np.array([np.radians(12.0), 0.0, 0.0]))
     est = turned(gt, group, tilt @ rotation_from_vector(Y * np.radians(75.0)))
@@ -78,7 +78,7 @@ def test_a_tilted_bottle_keeps_the_error_of_its_tilt() -> None:
 
 @pytest.mark.long
 def test_the_nearest_angle_is_the_best_of_all() -> None:
-    group = symmetry_group(*bottle())
+    group = annotated_symmetry(*bottle())
     for seed in range(20):
         gt = some_truth(seed)
         est = Alignment(random_rotation(np.random.default_rng(seed + 99)), [0, 0, 4], [1, 1, 1])
@@ -94,11 +94,11 @@ def test_the_nearest_angle_is_the_best_of_all() -> None:
 def test_a_handle_ends_the_circle() -> None:
     xyz, symmetries = bottle()
     with_handle = np.concatenate([xyz, [[0.3, 0.3, 0.0]]])
-    assert symmetry_group(with_handle, symmetries).is_trivial
+    assert annotated_symmetry(with_handle, symmetries).is_trivial
 
 
 def test_two_mirrors_make_a_half_turn() -> None:
-    group = symmetry_group(*table())
+    group = annotated_symmetry(*table())
     assert len(group.rotations) == 2
     gt = some_truth()
     assert errors(group, turned(gt, group, rotation_from_vector(Y * np.pi)), gt) == pytest.approx(
@@ -110,7 +110,7 @@ def test_two_mirrors_make_a_half_turn() -> None:
 
 def test_one_mirror_is_no_rotation() -> None:
     xyz = np.array([[0.3, 0, 0.1], [-0.3, 0, 0.1], [0.2, 0.5, 0], [-0.2, 0.5, 0]])
-    assert symmetry_group(xyz, Symmetries(reflections=((0, 1), (2, 3)))).is_trivial
+    assert annotated_symmetry(xyz, Symmetries(reflections=((0, 1), (2, 3)))).is_trivial
 
 
 def test_the_feet_of_an_office_chair_are_no_symmetry_of_the_chair() -> None:
@@ -118,6 +118,6 @@ def test_the_feet_of_an_office_chair_are_no_symmetry_of_the_chair() -> None:
     feet = 0.3 * np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=1)
     rotations = (RotationalSymmetry((0, 1, 2, 3, 4)),)
     with_hub = np.concatenate([feet, [[0.0, 0.2, 0.0]]])
-    assert len(symmetry_group(with_hub, Symmetries(rotations=rotations)).rotations) == 5
+    assert len(annotated_symmetry(with_hub, Symmetries(rotations=rotations)).rotations) == 5
     with_back = np.concatenate([with_hub, [[0.0, 0.8, -0.3]]])
-    assert symmetry_group(with_back, Symmetries(rotations=rotations)).is_trivial
+    assert annotated_symmetry(with_back, Symmetries(rotations=rotations)).is_trivial

@@ -260,7 +260,7 @@ class TestOptions:
         (few / "annotations").symlink_to(root / "annotations")
         (few / "splits" / "val.txt").write_text((root / "splits" / "val.txt").read_text())
         (few / "splits" / "train.txt").write_text(f"{SYNSET}-000\n{SYNSET}-001\n")
-        with pytest.raises(InputError, match="chair, split train: 2 models are too few"):
+        with pytest.raises(InputError, match="models of chair: 2 are too few"):
             run(UnseenOptions(few), folder, workers=0, dask=None)
 
 

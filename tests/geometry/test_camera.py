@@ -119,8 +119,6 @@ PARAMS = {
     "RADIAL": [500.0, 320.0, 240.0, 0.1, -0.05],
     "OPENCV": [500.0, 520.0, 320.0, 240.0, 0.1, -0.05, 0.01, -0.02],
     "FULL_OPENCV": [500.0, 520.0, 320.0, 240.0, 0.1, -0.05, 0.01, -0.02, 0.3, 0.4, -0.5, 0.6],
-    "SIMPLE_RADIAL_FISHEYE": [200.0, 320.0, 240.0, 0.1],
-    "RADIAL_FISHEYE": [200.0, 320.0, 240.0, 0.1, -0.05],
     "OPENCV_FISHEYE": [200.0, 210.0, 320.0, 240.0, 0.1, -0.05, 0.01, -0.02],
 }
 RADIAL, ALL = (0.1, -0.05, 0, 0), (0.1, -0.05, 0.01, -0.02)
@@ -132,16 +130,12 @@ EXPECTED: dict[str, tuple[float, float, tuple[float, ...], Any]] = {
     "RADIAL": (500, 500, RADIAL, "perspective"),
     "OPENCV": (500, 520, ALL, "perspective"),
     "FULL_OPENCV": (500, 520, (*ALL, 0.3, 0.4, -0.5, 0.6), "perspective"),
-    "SIMPLE_RADIAL_FISHEYE": (200, 200, (0.1, 0, 0, 0), "fisheye"),
-    "RADIAL_FISHEYE": (200, 200, RADIAL, "fisheye"),
     "OPENCV_FISHEYE": (200, 210, ALL, "fisheye"),
 }
 WRITTEN = {
     "SIMPLE_PINHOLE": "PINHOLE",
     "SIMPLE_RADIAL": "OPENCV",
     "RADIAL": "OPENCV",
-    "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE",
-    "RADIAL_FISHEYE": "OPENCV_FISHEYE",
 }
 
 
@@ -190,7 +184,7 @@ LENGTH_FIX = "give (k1, k2, p1, p2), optionally followed by k3 or k3, k4, k5, k6
     [
         (
             {"fx": 0},
-            "camera.fx: the focal length is 0; give the calibrated focal length in pixels",
+            "camera.fx: the focal length is 0; give the calibrated one in pixels",
         ),
         ({"fx": None}, "camera.fx: None is not a finite number"),
         ({"cx": np.inf}, "camera.cx: inf is not a finite number"),
@@ -243,8 +237,8 @@ COLMAP_DATA: dict[str, Any] = {
         (
             COLMAP_DATA | {"model": "FOV"},
             "camera.model: unknown model 'FOV'; known are SIMPLE_PINHOLE, PINHOLE, "
-            "SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, "
-            "OPENCV_FISHEYE; for others undistort the images",
+            "SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, OPENCV_FISHEYE; for others undistort the "
+            "images",
         ),
         (
             COLMAP_DATA | {"params": [500, 320, 240]},
@@ -256,7 +250,7 @@ COLMAP_DATA: dict[str, Any] = {
         ),
         (
             COLMAP_DATA | {"params": [0, 500, 320, 240]},
-            "camera.fx: the focal length is 0; give the calibrated focal length in pixels",
+            "camera.fx: the focal length is 0; give the calibrated one in pixels",
         ),
         (
             COLMAP_DATA | {"width": "640"},
@@ -274,7 +268,7 @@ def test_points_behind_the_camera_are_refused() -> None:
     with pytest.raises(InputError) as caught:
         PLAIN.project([[0, 0, 1], [0, 0, -2], [0, 0, 0]])
     assert str(caught.value) == (
-        "points_cam: 2 of 3 points lie behind the camera, the first is point 1 with z = -2; "
+        "points_cam: 2 of 3 points lie behind the camera, the first is point 1; "
         "only points with z > 0 have a projection"
     )
 

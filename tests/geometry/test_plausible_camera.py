@@ -7,7 +7,7 @@ import pytest
 
 from cadalign import Alignment, Camera, Model, View, align, fit
 from cadalign.evaluation.simulation import simulate_problem
-from cadalign.geometry.plausible_camera import camera_doubts
+from cadalign.geometry.calibration import camera_doubts
 from cadalign.geometry.rotations import rotation_from_vector
 
 RIGHT = Camera(640, 480, 935, 935, 319.5, 239.5)

@@ -141,7 +141,12 @@ def test_impossible_lenses_are_refused(given: dict[str, object], text: str) -> N
 
 
 def test_files_of_wide_lenses_want_a_focal_length() -> None:
-    data = {"model": "RADIAL_FISHEYE", "width": 9, "height": 9, "params": [None, 4, 4, 0, 0]}
+    data = {
+        "model": "OPENCV_FISHEYE",
+        "width": 9,
+        "height": 9,
+        "params": [None, None, 4, 4, *[0] * 4],
+    }
     with pytest.raises(InputError, match=r"camera.params: the focal length of a fisheye lens"):
         Camera.from_dict(data)
 

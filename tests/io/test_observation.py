@@ -148,7 +148,7 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
         (changed("image", 5), "{path}: image: 5 is not a path"),
         (
             changed("camera.params.0", 0),
-            "{path}: camera.fx: the focal length is 0; give the calibrated focal length in pixels",
+            "{path}: camera.fx: the focal length is 0; give the calibrated one in pixels",
         ),
         ('{\n"camera": ', "{path}, line 2: not valid JSON: Expecting value"),
         ("null", "{path}: None is not an object"),

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from cadalign.arrays import FloatArray
 from cadalign.evaluation.simulation import random_rotation
-from cadalign.geometry.rotations import angle_between, rotation_from_vector
+from cadalign.geometry.rotations import angles_between, rotation_from_vector
 from cadalign.solvers.alignment import Objective
 from cadalign.solvers.constants import LINEAR, ScalePrior
 from cadalign.solvers.evidence import KeypointEvidence
@@ -50,7 +50,7 @@ def test_the_true_pose_is_among_the_solutions(seed: int, distance: float) -> Non
     for found, shift in zip(rotations, translations, strict=True):
         np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-9)
         np.testing.assert_allclose(seen(points, found, shift), rays, atol=1e-4 / distance)
-    assert min(angle_between(found, rotation) for found in rotations) < 0.1
+    assert min(angles_between(found, rotation) for found in rotations) < 0.1
 
 
 @pytest.mark.parametrize("degrees", [0.0, 1.0, 30.0, 70.0])
@@ -60,7 +60,7 @@ def test_a_triangle_seen_along_its_axis_of_symmetry_is_solved(degrees: float) ->
     rays = seen(points, rotation, np.array([0.0, 0.0, 3.0]))
     for order in ([0, 1, 2], [2, 0, 1], [1, 2, 0]):
         rotations, _ = poses_of(points[order], rays[order])
-        assert min(angle_between(found, rotation) for found in rotations) < 0.2
+        assert min(angles_between(found, rotation) for found in rotations) < 0.2
 
 
 def test_points_in_a_line_and_at_one_place_have_no_pose() -> None:
@@ -122,7 +122,7 @@ def test_hypotheses_of_samples_are_their_rigid_optima() -> None:
     draws = np.array([[0, 1, 3, 4], [8, 7, 6, 4], [0, 1, 2, 5]])
     poses, scores = rigid_hypotheses(keypoints, draws, 9.0)
     for row in (0, 1):
-        assert angle_between(poses[row, :9].reshape(3, 3), rotation) < 1.0
+        assert angles_between(poses[row, :9].reshape(3, 3), rotation) < 1.0
         assert 2 * 9.0 <= scores[row] < 2 * 9.0 + 7 * 9.0
     assert scores[2] > scores[:2].max()
     nowhere = KeypointEvidence(np.ones((9, 3)), rays, keypoints.whitening, LINEAR, 1.0)

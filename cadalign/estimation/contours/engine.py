@@ -36,7 +36,7 @@ from cadalign.estimation.result_parts import EstimateWarning, OutlineNotes
 from cadalign.estimation.search import Minimum
 from cadalign.estimation.uncertainty.residuals import chi_square_quantile
 from cadalign.estimation.view import View
-from cadalign.geometry.rotations import angle_between, rotation_from_vector
+from cadalign.geometry.rotations import angles_between, rotation_from_vector
 from cadalign.io.images import ByteImage
 from cadalign.solvers.joint.covariance import information_of, scaled_information
 from cadalign.solvers.joint.evidence import State
@@ -236,7 +236,7 @@ def _distinct_candidates(candidates: list[Candidate]) -> list[Candidate]:
 def _are_alike(one: State, other: State) -> bool:
     turn, other_turn = (each.poses[0, :9].reshape(3, 3) for each in (one, other))
     stretch = np.abs(one.log_scales - other.log_scales).max()
-    return bool(angle_between(turn, other_turn) < _SAME_TURN_DEG and stretch < _SAME_STRETCH)
+    return bool(angles_between(turn, other_turn) < _SAME_TURN_DEG and stretch < _SAME_STRETCH)
 
 
 def _contradicting(best: list[Candidate], sources: Sequence[Source]) -> tuple[Source, str] | None:

@@ -31,9 +31,8 @@ from cadalign.geometry.alignment import Alignment, bounds_corners, model_rays
 from cadalign.geometry.camera import Camera, turned_alignment
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import RayCaster
-from cadalign.geometry.rotations import angle_between
+from cadalign.geometry.rotations import angles_between
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.geometry.symmetry_group import group_of
 from cadalign.io.focal import prior_of_camera
 
 _CELLS = 80  # rows and columns of a silhouette's or a mask's image
@@ -305,13 +304,12 @@ def distinct(
     found: list[tuple[Alignment, float]], count: int, symmetry: Symmetry | None
 ) -> list[tuple[Alignment, float]]:
     """The first ones whose alignments, apart from symmetry, are too far apart for one minimum."""
-    group = None if symmetry is None else group_of(symmetry)
     poses: list[Alignment] = []
     kept = []
     for each in found:
         pose = each[0]
-        if group is not None:
-            pose = group.canonical(pose, tolerance=_DISTINCT_STRETCH).alignment
+        if symmetry is not None:
+            pose = symmetry.canonical(pose, tolerance=_DISTINCT_STRETCH).alignment
         if all(_differ(pose, other) for other in poses):
             poses.append(pose)
             kept.append(each)
@@ -321,6 +319,6 @@ def distinct(
 
 
 def _differ(one: Alignment, other: Alignment) -> bool:
-    turn = angle_between(one.rotation, other.rotation)
+    turn = angles_between(one.rotation, other.rotation)
     stretch = np.abs(np.log(one.scale / other.scale)).max()
     return bool(turn > _DISTINCT_DEG or stretch > _DISTINCT_STRETCH)

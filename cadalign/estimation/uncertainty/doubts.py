@@ -13,9 +13,9 @@ from cadalign.estimation.options import USUAL_STRETCH, FitOptions, RansacOptions
 from cadalign.estimation.result_parts import Diagnosis, EstimateWarning, FittedKeypoints, Warnings
 from cadalign.estimation.uncertainty.residuals import chance_of
 from cadalign.geometry.alignment import Alignment, Uncertainty, uncertainty_of
+from cadalign.geometry.calibration import camera_doubts
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PIXEL_CENTRE
-from cadalign.geometry.plausible_camera import camera_doubts
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.io.focal import PriorOption, prior_of_camera
 from cadalign.shapes.parts import probability_within

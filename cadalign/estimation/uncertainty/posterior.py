@@ -68,11 +68,10 @@ def keypoint_covariance(fitted: FittedKeypoints) -> FloatArray | None:
         covariance = _posterior_covariance(fitted)
     if fitted.symmetry is None:
         return covariance
-    from cadalign.estimation.symmetry import held_axes, remove_free_turns
-    from cadalign.geometry.symmetry_group import group_of  # most models have none
+    from cadalign.estimation.symmetry import held_axes, remove_free_turns  # few have one
 
     held = held_axes(fitted.options.stretched_axes)
-    best = group_of(fitted.symmetry).canonical(fitted.alignment, held=held)
+    best = fitted.symmetry.canonical(fitted.alignment, held=held)
     return remove_free_turns(covariance, best)
 
 

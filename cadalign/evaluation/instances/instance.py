@@ -22,13 +22,13 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, instance_rng
 from cadalign.datasets import AnnotatedModel, KeypointNet, check_solid
-from cadalign.datasets.keypoints import symmetry_group
+from cadalign.datasets.keypoints import annotated_symmetry
 from cadalign.errors import CadalignError, TooFewVisibleError
 from cadalign.evaluation.runs.work import Row
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import perspective
-from cadalign.geometry.symmetry_group import SymmetryGroup
+from cadalign.geometry.symmetry import Symmetry
 
 if TYPE_CHECKING:
     # Workers that look at annotations only are not to carry the renderer's libraries.
@@ -187,7 +187,7 @@ def _framed_centers(corners: FloatArray, camera: Camera, *, fill: FloatArray) ->
 
 
 # Instances ----------------------------------------------------------------------------------------
-NO_SYMMETRY = SymmetryGroup(np.zeros(3), np.eye(3)[None])
+NO_SYMMETRY = Symmetry.none()
 NO_KEYPOINTS = KeypointHull(np.empty((0, 3)))
 
 
@@ -201,7 +201,7 @@ class KeypointTask:
     hull: KeypointHull = NO_KEYPOINTS
     """Keypoints (k, 3), and what views without a mesh need to know of them."""
     ids: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    symmetry: SymmetryGroup = NO_SYMMETRY
+    symmetry: Symmetry = NO_SYMMETRY
     model: AnnotatedModel | None = None
     """The model with its mesh; None where it is evaluated on its keypoints alone."""
     problem: str = ""  # reason why the model cannot be evaluated; empty otherwise
@@ -228,7 +228,7 @@ class KeypointTask:
             model_id,
             hull=KeypointHull(model.keypoints.xyz),
             ids=model.keypoints.ids,
-            symmetry=symmetry_group(model.keypoints.xyz, model.symmetries),
+            symmetry=annotated_symmetry(model.keypoints.xyz, model.symmetries),
             model=None if hull or model.mesh_path is None else model,
         )
 

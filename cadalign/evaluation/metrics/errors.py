@@ -14,7 +14,7 @@ from cadalign.evaluation.runs.work import Row
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera, projection_jacobian
 from cadalign.geometry.rotations import rotation_from_vector
-from cadalign.geometry.symmetry_group import SymmetryGroup
+from cadalign.geometry.symmetry import Symmetry
 from cadalign.metrics import (
     Alignments,
     Boxes,
@@ -75,7 +75,7 @@ def overlap_up_to_scale(*, est: Box, gt: Box) -> float | None:
 def estimate_errors(
     estimates: Sequence[Alignment],
     instances: Sequence[Instance],
-    symmetries: Sequence[SymmetryGroup],
+    symmetries: Sequence[Symmetry],
 ) -> list[Row | InputError]:
     """Errors of an estimate of each instance; the reason where one is not finite.
 

@@ -26,6 +26,7 @@ from cadalign.evaluation.metrics.errors import overlap_up_to_scale
 from cadalign.evaluation.runs.work import Columns, Row
 from cadalign.evaluation.summary import Group, known, medians
 from cadalign.geometry.alignment import Alignment, Box
+from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.metrics import box_iou, rotation_error, scale_error
 
@@ -159,9 +160,9 @@ def symmetric_box_iou(*, est: Box, gt: Box, symmetry: Symmetry) -> float:
     volume.
     """
     angles = 2 * np.pi * np.arange(_STEPS) / _STEPS
-    about = [axis.turned(angle) for axis in symmetry.axes for angle in angles] or [np.eye(4)]
-    turns = [turn @ motion for motion in (np.eye(4), *symmetry.motions) for turn in about]
-    boxes = (Box(est.center, est.rotation @ turn[:3, :3], est.extents) for turn in turns)
+    about = [rotation_from_vector(angle * axis) for axis in symmetry.axes for angle in angles]
+    turns = [turn @ each for each in symmetry.rotations for turn in (about or [np.eye(3)])]
+    boxes = (Box(est.center, est.rotation @ turn, est.extents) for turn in turns)
     return max(box_iou(est=box, gt=gt) for box in boxes)
 
 

@@ -10,7 +10,7 @@ from support.problems import problem_of
 from cadalign import Alignment, Camera, Model, Result, View, align, fit
 from cadalign.estimation.result_parts import Warnings
 from cadalign.estimation.uncertainty.doubts import another_pose
-from cadalign.geometry.rotations import angle_between, rotation_from_vector
+from cadalign.geometry.rotations import angles_between, rotation_from_vector
 
 CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 POSE = Alignment(np.eye(3), [0.0, 0.0, 4.0], np.ones(3))
@@ -78,7 +78,7 @@ def test_fit_names_another_pose_that_its_deviations_do_not_reach() -> None:
         problem = problem_of(seed, points=4, noise_px=0.0)
         result = fit(problem.points_3d, problem.points_2d, problem.camera, sigma=0.05)
         angles = [
-            angle_between(each.alignment.rotation, result.alignment.rotation)
+            angles_between(each.alignment.rotation, result.alignment.rotation)
             for each in result.alternatives
         ]
         assert result.std is not None

@@ -19,8 +19,8 @@ from cadalign import (
     fit_batch,
 )
 from cadalign.errors import DegenerateError
-from cadalign.geometry.rotations import angle_between, rotation_from_vector
-from cadalign.geometry.symmetry_group import FACING
+from cadalign.geometry.rotations import angles_between, rotation_from_vector
+from cadalign.geometry.symmetry import FACING
 
 UP = np.array([0.0, 1.0, 0.0])
 CAMERA = Camera(640, 480, 900.0, 900.0, 319.5, 239.5)
@@ -61,7 +61,7 @@ def test_permuted_labels_give_the_same_result(fold, step, angle):
     turn = 2 * np.pi * step / (fold or 12)
     first = fit(points, pixels, CAMERA, stretch="y", symmetry=symmetry)
     second = fit(labelled_after(points, turn), pixels, CAMERA, stretch="y", symmetry=symmetry)
-    assert angle_between(first.alignment.rotation, second.alignment.rotation) < 1e-3
+    assert angles_between(first.alignment.rotation, second.alignment.rotation) < 1e-3
     np.testing.assert_allclose(first.alignment.translation, second.alignment.translation, atol=1e-5)
     np.testing.assert_allclose(first.alignment.scale, second.alignment.scale, atol=1e-5)
     np.testing.assert_allclose(first.points_3d, second.points_3d, atol=1e-4)
@@ -86,7 +86,7 @@ def test_it_is_the_fit_of_keypoints_labelled_as_it_says(fold):
     if fold is not None:
         assert result.std.rotation_deg == pytest.approx(plain.std.rotation_deg, rel=0.02)
         # It looks at the camera within half a step.
-        assert angle_between(result.alignment.rotation, truth_of(0).rotation) <= 180 / fold + 1
+        assert angles_between(result.alignment.rotation, truth_of(0).rotation) <= 180 / fold + 1
 
 
 def test_rotations_about_the_axis_count_for_nothing():
@@ -118,7 +118,7 @@ def test_a_stretch_across_the_axis_leaves_half_turns():
     ]
     for result in results:
         np.testing.assert_allclose(result.alignment.scale, (1, 1.3, 1.6), rtol=0.02)
-        assert angle_between(result.alignment.rotation, truth_of(0.2).rotation) < 1
+        assert angles_between(result.alignment.rotation, truth_of(0.2).rotation) < 1
 
 
 def test_an_equal_minimum_is_no_alternative():
@@ -131,7 +131,7 @@ def test_an_equal_minimum_is_no_alternative():
     merged = fit(flat, pixels, CAMERA, stretch="none", symmetry=symmetry)
     for other in merged.alternatives:
         near = merged.alignment.rotation, other.alignment.rotation
-        assert angle_between(*near) > 0.01
+        assert angles_between(*near) > 0.01
     assert len(merged.alternatives) <= len(plain.alternatives)
 
 

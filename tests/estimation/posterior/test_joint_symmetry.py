@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from cadalign import Alignment, Camera, Model, Result, Size, Symmetry, View, align
-from cadalign.geometry.rotations import angle_between, rotation_from_vector
-from cadalign.geometry.symmetry_group import FACING
+from cadalign.geometry.rotations import angles_between, rotation_from_vector
+from cadalign.geometry.symmetry import FACING
 
 UP = np.array([0.0, 1.0, 0.0])
 CAMERA = Camera(640, 480, 900.0, 900.0, 319.5, 239.5)
@@ -39,7 +39,7 @@ def models(**options):
 
 
 def assert_same(first, second, *, tolerance):
-    assert angle_between(first.alignment.rotation, second.alignment.rotation) < 50 * tolerance
+    assert angles_between(first.alignment.rotation, second.alignment.rotation) < 50 * tolerance
     for name in ("points_3d", "bounds", "stretch"):
         np.testing.assert_allclose(getattr(first, name), getattr(second, name), atol=tolerance)
     np.testing.assert_allclose(
@@ -62,7 +62,7 @@ def test_labels_that_are_turned_give_the_same_result(options):
     view = View(CAMERA, pixels_of(truth), sigma=0.3)
     first, second = (align(model, view) for model in models(**options))
     assert_same(first, second, tolerance=2e-4)
-    assert angle_between(first.alignment.rotation, truth.rotation) < 1
+    assert angles_between(first.alignment.rotation, truth.rotation) < 1
     for result in (first, second):
         seen = CAMERA.project(result.alignment.apply(result.points_3d))
         np.testing.assert_allclose(seen - view.points_2d, result.residuals, atol=1e-6)

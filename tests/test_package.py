@@ -24,7 +24,6 @@ HEAVY = {
     "embreex",
     "matplotlib",
     "numba",
-    "open3d",
     "pandas",
     "pyarrow",
     "pyrender",

@@ -17,7 +17,6 @@ import cadalign
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = {
-    "OpenGL",
     "PIL",
     "cv2",
     "dask",
@@ -26,7 +25,6 @@ HEAVY = {
     "numba",
     "pandas",
     "pyarrow",
-    "pyrender",
     "rich",
     "scipy",
     "starlette",

@@ -22,7 +22,7 @@ from cadalign.cli.common import (
     waiting,
 )
 from cadalign.cli.options import CameraOptions, ManyCommand, named_as_flags
-from cadalign.errors import refuse_unused
+from cadalign.errors import DataError, refuse_unused
 from cadalign.estimation.options import Sigma
 from cadalign.io.documents import read_json
 from cadalign.io.files import keeping, refuse_input, require_utf8
@@ -166,7 +166,7 @@ class LibraryBuild:
     out: Path = Path("library.cadalign")
     """File to write."""
     categories: tuple[str, ...] | None = None
-    """Categories to include; all by default."""
+    """Categories of the data set to include; all by default."""
     split: str | None = None
     """Split of the data set to include, such as train; all models by default."""
     shapenet: Path | None = None
@@ -185,7 +185,8 @@ class LibraryBuild:
         dataset, total = None, len(own)
         if own:
             with named_as_flags(self):
-                refuse_unused(self, {"split", "shapenet"}, "on a folder of own models")
+                unused = {"categories", "split", "shapenet"}
+                refuse_unused(self, unused, "on a folder of own models")
         else:
             dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
             dataset = dataset.subset(categories=self.categories, split=self.split)
@@ -194,9 +195,11 @@ class LibraryBuild:
             refuse_input(self.out)
             make_folder_of(self.out)
             if dataset is None:
-                library = Library.from_folder(self.root, categories=self.categories)
+                library = Library.from_folder(self.root)
             else:
-                library = Library.from_dataset(dataset)
+                library = Library.from_models(dataset)
+            if not len(library):
+                raise DataError("the data set has no such models", where=str(self.root))
             library.save(self.out)
         megabytes = self.out.stat().st_size / 1e6
         say(f"{_describe(library)}\nWritten: {self.out} ({megabytes:.1f} MB)")

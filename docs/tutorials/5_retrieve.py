@@ -28,7 +28,7 @@ from cadalign.render import (
 
 root = write_sample_dataset(Path(tempfile.mkdtemp()), per_category=20, categories=("chair", "car"))
 dataset = KeypointNet(root)
-library = cadalign.Library.from_dataset(dataset)
+library = cadalign.Library.from_models(dataset)
 print(library)
 
 # %%

@@ -51,7 +51,7 @@ def _times(given: BenchmarkData) -> Tables:
     are cores, after warm-up. Ratios are those of processor time to `reference_seconds`. A run of
     `cadalign retrieve` has two processes.
     """
-    real = list(Library.from_dataset(KeypointNet(given.folder("keypointnet"))))
+    real = list(Library.from_models(KeypointNet(given.folder("keypointnet"))))
     mixed = [real[k] for k in np.random.default_rng(0).permutation(len(real)).tolist()]
     for size in (len(real), *given.sizes):
         with tempfile.TemporaryDirectory() as folder:

@@ -51,7 +51,7 @@ class Case:
 def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
     folder = tmp_path_factory.mktemp("retrieval")
     root = write_sample_dataset(folder / "sample", per_category=4, categories=["chair", "bottle"])
-    library = Library.from_dataset(KeypointNet(root))
+    library = Library.from_models(KeypointNet(root))
     library.save(folder / "lib.cadalign")
     model = library["chair", "sample_chair_002"]
     pose = look_at(azimuth=40.0, elevation=25.0, distance=2.6, scale=(1.0, 1.3, 0.8))

@@ -128,43 +128,14 @@ def _log_likelihoods(
 def deviation_of(table: ModelTable, category: str) -> tuple[float, float]:
     """Mean and standard deviation of log tau: from models of a category to their nearest ones."""
     _, points = table.keypoints_of(category)
-    asked = np.arange(0, len(points), -(-len(points) // _ASKED))
-    gaps = _distances(points, asked)
+    asked = points[:: -(-len(points) // _ASKED)]
+    gaps = np.array([distances(points, each, least=_LEAST_SHARED) for each in asked])
     gaps = np.where(gaps > SAME_SHAPE, gaps, np.inf).min(axis=1)
     nearest = np.minimum(gaps[np.isfinite(gaps)] / np.sqrt(3), _FARTHEST)
     if len(nearest) < 2:
         return _USUAL
     logs = np.log(nearest)
     return float(np.mean(logs)), max(float(np.std(logs)), LEAST_SPREAD)
-
-
-def _distances(points: FloatArray, rows: IntArray) -> FloatArray:
-    """Distances (r, m) of all models from some, as `shape_distance`.
-
-    Keypoints (m, k, 3) are NaN where a model lacks one. Means over those that two models share are
-    products of matrices.
-    """
-    has = ~np.isnan(points[:, :, 0])
-    points, known = np.nan_to_num(points), has.astype(np.float64)
-    of_rows = known[rows]
-    shared = of_rows @ known.T
-    counts = np.maximum(shared, 1.0)
-    square = np.zeros(shared.shape)
-    for axis in range(3):
-        every = known * points[:, :, axis]
-        wanted = of_rows * points[rows, :, axis]
-        mean, mean_wanted = of_rows @ every.T / counts, wanted @ known.T / counts
-        moved = np.maximum(of_rows @ (every**2).T / counts - mean**2, 0.0)
-        product = wanted @ every.T / counts - mean * mean_wanted
-        fixed = wanted**2 @ known.T / counts - mean_wanted**2
-        scale = np.maximum(product, 0.0) / np.where(moved > 0, moved, 1.0)
-        if axis == 0:
-            scale[:] = 1.0
-        square += scale * (scale * moved - 2.0 * product) + fixed
-    extents = [np.linalg.norm(np.ptp(points[row][has[row]], axis=0)) for row in rows.tolist()]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        gaps = np.sqrt(np.maximum(square, 0.0)) / np.array(extents)[:, None]
-    return np.asarray(np.where(shared >= _LEAST_SHARED, gaps, np.nan))
 
 
 def shape_distance(est: LibraryModel, gt: LibraryModel) -> float:
@@ -188,17 +159,25 @@ def shape_distance(est: LibraryModel, gt: LibraryModel) -> float:
     return float(distances(est.xyz[None, mine], gt.xyz[theirs])[0])
 
 
-def distances(est: FloatArray, gt: FloatArray) -> FloatArray:
-    """Compute the shape distance of models' keypoints (m, k, 3) from others (k, 3), (m,) float."""
-    if len(gt) < 2:
-        return np.full(len(est), np.nan)
-    moved = est - est.mean(axis=1, keepdims=True)
-    wanted = gt - gt.mean(axis=0)
-    squares = (moved**2).sum(axis=1)
-    products = (moved * wanted).sum(axis=1)
+def distances(est: FloatArray, gt: FloatArray, *, least: int = 2) -> FloatArray:
+    """Compute the shape distance of models' keypoints (m, k, 3) from others (k, 3), (m,) float.
+
+    Keypoints that a model lacks are NaN: those that two models share are compared. The distance is
+    NaN where these are fewer than ``least``.
+    """
+    # Keypoints, axes, models: sums over few numbers of many models are quick.
+    moved, wanted = np.ascontiguousarray(est.transpose(1, 2, 0)), gt[:, :, None]
+    known = ~np.isnan(moved[:, :1] + wanted[:, :1])
+    counts = known.sum(axis=(0, 1))
+    numbers = np.maximum(counts, 1)
+    moved, wanted = np.where(known, moved, 0.0), np.where(known, wanted, 0.0)
+    moved -= known * (sum(moved) / numbers)
+    wanted -= known * (sum(wanted) / numbers)
+    squares, products = sum(moved**2), sum(moved * wanted)
     # A mirrored or flat model cannot be stretched to the other.
     scale = np.maximum(products, 0.0) / np.where(squares > 0, squares, 1.0)
-    scale[:, 0] = 1.0
-    gaps = moved * scale[:, None] - wanted
-    extent = float(np.linalg.norm(np.ptp(gt, axis=0))) or np.nan
-    return np.asarray(np.sqrt((gaps**2).sum(axis=2).mean(axis=1)) / extent)
+    scale[0] = 1.0
+    gaps = ((moved * scale - wanted) ** 2).sum(axis=1)
+    extent = float(np.linalg.norm(np.ptp(gt[~np.isnan(gt[:, 0])], axis=0))) or np.nan
+    found = np.sqrt(np.ascontiguousarray(gaps.T).sum(axis=1) / numbers) / extent
+    return np.asarray(np.where(counts >= least, found, np.nan))

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from cadalign import Alignment, Camera, Library, Match
 from cadalign.retrieval import LibraryModel
-from cadalign.retrieval.absence import _distances, shape_distance
+from cadalign.retrieval.absence import distances, shape_distance
 
 CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 BOUNDS = np.array([[-0.3] * 3, [0.3] * 3])
@@ -85,10 +85,10 @@ def test_distances_of_a_category_are_those_of_its_pairs_of_models() -> None:
     library = Library.from_models(models)
     _, points = library.keypoints_of("box")
     rows = np.array([0, 4, 17])
-    found = _distances(points, rows)
     every = list(library)
-    for row, distances in zip(rows, found, strict=True):
-        for model, distance in zip(every, distances, strict=True):
+    for row in rows:
+        found = distances(points, points[row], least=4)
+        for model, distance in zip(every, found, strict=True):
             shared = np.intersect1d(model.ids, every[row].ids)
             if len(shared) < 4:
                 assert np.isnan(distance)

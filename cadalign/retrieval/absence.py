@@ -17,10 +17,11 @@ logarithm of tau is Gaussian; its mean and standard deviation are those of the d
 library's models to their nearest ones of another shape, in the category of k, the latter at least
 `LEAST_SPREAD`. So the odds of the second hypothesis are::
 
-    none_prior / (1 - none_prior) * sum over k of score_k E[B_k(tau)]
+    sum over k of score_k E[B_k(tau)]
 
-The sum is over the most likely models, which hold nearly all of it. Four keypoints, through which
-any model passes, decide nothing: the probability is then near ``none_prior``.
+if both are equally likely before an image is seen. The sum is over the most likely models, which
+hold nearly all of it. Four keypoints, through which any model passes, decide nothing: the
+probability is then near 1/2.
 """
 
 from __future__ import annotations
@@ -33,7 +34,6 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.estimation.problems import whitening_of
 from cadalign.retrieval.models import LibraryModel, ModelTable
-from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import CandidateSet, Observed, Ranking, bent, shared_keypoints
 from cadalign.solvers.projection import ray_derivatives
 
@@ -55,11 +55,8 @@ def none_probability(
     candidates: CandidateSet,
     observed: Observed,
     ranking: Ranking,
-    options: RetrievalOptions,
 ) -> float:
     """Compute the probability that the object is none of the models; see the module."""
-    if options.none_prior == 0:
-        return 0.0
     chosen = ranking.candidates[:_MOST_LIKELY].tolist()
     shared = [shared_keypoints(candidates, observed, candidate) for candidate in chosen]
     alike: dict[tuple[str, int], list[int]] = {}  # places of models that are computed together
@@ -78,8 +75,7 @@ def none_probability(
         logs = _log_likelihoods(poses, points, rows, observed, covariances)
         factors[places] = np.logaddexp.reduce(logs[1:] + shares, axis=0) - logs[0]
     relative = ranking.log_likelihoods[:_MOST_LIKELY] - ranking.log_likelihoods[0]
-    odds = np.log(options.none_prior) - np.log1p(-options.none_prior)
-    odds += np.logaddexp.reduce(relative + factors) - np.logaddexp.reduce(relative)
+    odds = np.logaddexp.reduce(relative + factors) - np.logaddexp.reduce(relative)
     return float(np.exp(-np.logaddexp(0.0, -odds)))
 
 

@@ -171,8 +171,7 @@ class Library(ModelTable):
             Number of threads; -1 for one per core.
         **options
             Fields of `cadalign.retrieval.options.RetrievalOptions`, which describes them: top,
-            category, sigma, shape_sigma, loss, loss_scale, stretch, stretch_sigma, missing_prob,
-            spurious, none_prior.
+            category, sigma, shape_sigma, loss, loss_scale, stretch.
 
         Returns
         -------
@@ -202,7 +201,7 @@ class Library(ModelTable):
             observed = observe(points_2d, ids, camera, chosen)
             candidates = gather_candidates(self, observed, chosen, exclude, workers)
             ranking = rank(candidates, observed, chosen, workers)
-            absent = none_probability(self, candidates, observed, ranking, chosen)
+            absent = none_probability(self, candidates, observed, ranking)
         else:
             category = category_to_rank(shape, chosen, self)
             # The deviation of shapes is no noise of the keypoints here.

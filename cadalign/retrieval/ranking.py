@@ -35,7 +35,12 @@ from cadalign.geometry.camera import Camera, faced, turned_alignment
 from cadalign.retrieval.kernels import LEAST_SHARED, Candidates, Query, bound_all, search_all
 from cadalign.retrieval.match import Match, posterior_by_shape, posterior_of_keypoints
 from cadalign.retrieval.models import ModelKey, ModelTable, check_semantic_ids, checked_key
-from cadalign.retrieval.options import RetrievalOptions
+from cadalign.retrieval.options import (
+    MISSING_PROB,
+    SPURIOUS,
+    STRETCH_SIGMA,
+    RetrievalOptions,
+)
 from cadalign.solvers.constants import CAUCHY, HUBER, POSE_SIZE
 
 _BOUNDED_AT_ONCE = 1024  # candidates that a thread bounds at a time
@@ -105,8 +110,8 @@ def observe(
     facing = faced(camera, pixels)
     rays = np.require(rays_of(pixels, facing), np.float64, ["C", "W"])
     fitting = options.fitting
-    density = np.log1p(-options.missing_prob) - np.log(2 * np.pi)
-    off = np.log(options.spurious / (camera.width * camera.height))
+    density = np.log1p(-MISSING_PROB) - np.log(2 * np.pi)
+    off = np.log(SPURIOUS / (camera.width * camera.height))
     query = Query(
         ids=ids,
         rays=rays,
@@ -188,9 +193,9 @@ def gather_candidates(
     # The losses are concave in the squares and 0 at 0, so that of their sum is at most their sum.
     bounds = bent(bounds, query.loss, query.loss_scale)
     counts = spans[:, 1] - spans[:, 0]
-    base = gains + observed.spurious + (counts - shared) * np.log(options.missing_prob)
+    base = gains + observed.spurious + (counts - shared) * np.log(MISSING_PROB)
     axes = len(options.fitting.stretched_axes)  # the prior's log density at no stretch:
-    base = base - axes * (0.5 * np.log(2 * np.pi) + np.log(options.stretch_sigma))
+    base = base - axes * (0.5 * np.log(2 * np.pi) + np.log(STRETCH_SIGMA))
     kept_keypoints = candidates._replace(spans=spans[kept])
     return CandidateSet(kept_keypoints, chosen[kept], base[kept], bounds[kept])
 

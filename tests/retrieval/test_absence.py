@@ -47,22 +47,10 @@ def test_objects_in_the_library_and_others_are_told_apart() -> None:
 
 
 @pytest.mark.slow
-def test_probability_is_that_of_all_matches_and_keeps_scores() -> None:
+def test_probability_is_that_of_all_matches() -> None:
     matches = retrieve(31)
     assert len({match.none_probability for match in matches}) == 1
     assert matches[0].to_dict()["none_probability"] == matches[0].none_probability
-    certain = retrieve(31, none_prior=0.0)
-    assert [match.score for match in certain] == [match.score for match in matches]
-    assert certain[0].none_probability == 0.0
-
-
-def test_probability_follows_the_prior_by_the_odds() -> None:
-    def odds(prior: float) -> float:
-        probability = retrieve(3, none_prior=prior)[0].none_probability
-        assert probability is not None
-        return probability / (1 - probability)
-
-    assert odds(0.9) == pytest.approx(9 * odds(0.5), rel=1e-9)
 
 
 def test_keypoints_that_fit_any_model_tell_nothing() -> None:

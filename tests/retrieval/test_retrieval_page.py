@@ -155,8 +155,8 @@ def test_matches_as_json_are_those_of_the_library(
 def test_refused_options_are_named_as_they_are_typed(
     case: Case, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert refusal_line(capsys, "retrieve", *case.arguments, "--missing-prob", "1") == (
-        "--missing-prob: must be between 0 and 1, both excluded, not 1.0"
+    assert refusal_line(capsys, "retrieve", *case.arguments, "--shape-sigma", "-1") == (
+        "--shape-sigma: must be >= 0, not -1.0"
     )
     assert refusal_line(capsys, "retrieve", *case.arguments, "--workers", "0") == (
         "--workers: must be >= 1, or -1 for all cores, not 0"

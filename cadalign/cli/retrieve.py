@@ -54,14 +54,14 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
     Each model is posed and stretched. The observation is a file as for `cadalign fit`; its
     keypoints need a semantic_id, or the name that the library has for it, and no xyz. A detector's
     file needs no --model. With --out, writes matches.json, an overlay of each
-    match, its observation and fit, and index.html, which shows them side by side.
+    match and its observation, and matches.png, which shows them side by side.
     Many observations are a run, as of `cadalign fit`: it writes results.parquet and results.csv
     with a row for each, and report.html.
     """
 
     out: Path | None = None
-    """Folder for matches.json, the matches' overlays and index.html; by default none is
-    written. For many observations the run's, by default beside them."""
+    """Folder for matches.json and the matches' pictures; by default none is written. For many
+    observations the run's, by default beside them."""
     workers: int | None = None
     """Threads for one observation, -1 (the default) for one per core. Processes for many, 0 for
     none; by default -1, for few observations 0."""
@@ -100,9 +100,8 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
 
     def _retrieve(self, query: Observation, path: Path, how: ObservationRetrieval) -> int:
         """Retrieve the models of one observation, read of a path; returns the exit code."""
-        from cadalign.retrieval.page import none_text, write_retrieval
+        from cadalign.retrieval.folder import none_text, write_retrieval
 
-        library, _ = how.opened()
         # The table needs no photo, which may have been moved.
         photo = None
         if self.out is not None and query.image is not None:
@@ -120,22 +119,14 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
         if self.out is not None:
             make_folder(self.out)
             with keeping([path, *query.files, self.library]):
-                page = write_retrieval(
-                    self.out,
-                    matches,
-                    query.camera,
-                    query=query,
-                    title=f"Models for {path.name}",
-                    library=f"{self.library.name} ({len(library):,} models)",
-                    image=photo,
-                )
-            say(f"Page: {page}")
+                sheet = write_retrieval(self.out, matches, query, image=photo)
+            say(f"Pictures: {sheet}")
         return 0
 
 
 def _print_table(matches: Sequence[Match]) -> None:
     from cadalign.evaluation.summary import ConsoleTable
-    from cadalign.retrieval.page import score_text
+    from cadalign.retrieval.folder import score_text
 
     labels = ("", "category", "model")
     heads = ("score", "log-lik.", "rms px", "kpts", "s_y", "s_z", "uncertain")

@@ -403,26 +403,6 @@ def likely(found: Ranking) -> list[int]:
     return found.candidates[found.scores > 1e-8].tolist()
 
 
-@pytest.mark.parametrize("noise_px", [1.0, 5.0])
-def test_candidates_that_cannot_count_are_searched_less(noise_px: float) -> None:
-    """The ceilings change no log-likelihood within 20 of the best."""
-    many = Library.from_models([make_model(number) for number in range(300)])
-    options = RetrievalOptions(sigma=noise_px, top=1)
-    pixels = view(MODELS[3], pose_of(3), noise_px=noise_px)
-    observed = observe(pixels, IDS, CAMERA, options)
-    candidates = gather_candidates(many, observed, options, (), 1)
-    everything = np.arange(len(candidates.models))
-    effort = 5, 4, 20
-    free = np.full(len(everything), np.inf)
-    _, costs = search_all(observed.query, candidates.keypoints, everything, free, *effort)
-    reached = candidates.base - costs / 2
-    ceilings = 2 * (candidates.base - reached.max() + 20)
-    _, found = search_all(observed.query, candidates.keypoints, everything, ceilings, *effort)
-    near = reached > reached.max() - 20
-    assert (found[near] == costs[near]).all()
-    assert (found > costs).any()
-
-
 @pytest.mark.long
 def test_nothing_depends_on_the_order_of_anything_or_on_the_workers() -> None:
     rng = np.random.default_rng(0)

@@ -6,8 +6,9 @@ from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
     from cadalign.render.overlay import draw_overlay, overlay_model
+    from cadalign.render.probe import Probe, make_renderer, probe_renderer
     from cadalign.render.raycast import RaycastRenderer, cast_geometry
-    from cadalign.render.scene import Frame, Geometry, Scene
+    from cadalign.render.scene import Frame, Geometry, Renderer, Scene
     from cadalign.render.surface import Studio
     from cadalign.render.viewpoints import (
         Angles,
@@ -23,7 +24,9 @@ __all__ = [
     "Angles",
     "Frame",
     "Geometry",
+    "Probe",
     "RaycastRenderer",
+    "Renderer",
     "Scene",
     "Studio",
     "Viewpoint",
@@ -31,8 +34,10 @@ __all__ = [
     "draw_overlay",
     "frame_object",
     "look_at",
+    "make_renderer",
     "overlay_model",
     "pose_in_view",
+    "probe_renderer",
     "sample_view",
     "visible_keypoints",
 ]

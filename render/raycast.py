@@ -26,7 +26,7 @@ _MAX_SAMPLES = 256
 
 
 class RaycastRenderer:
-    """Draws with embree on the processor: needs neither display nor graphics card.
+    """Draws with embree on the processor; the renderer that works everywhere.
 
     Parameters
     ----------
@@ -44,6 +44,8 @@ class RaycastRenderer:
     >>> float(frame.depth[24, 32]), int(frame.face_id[24, 32]), bool(frame.mask[0, 0])
     (4.0, 0, False)
     """
+
+    name = "raycast"
 
     def __init__(self, *, studio: Studio | None = None) -> None:
         self.studio = studio or Studio()
@@ -78,8 +80,7 @@ class RaycastRenderer:
         InputError
             If ``samples`` is not from 1 to 256.
         """
-        if not 1 <= samples <= _MAX_SAMPLES:
-            raise InputError(f"{samples} is not from 1 to {_MAX_SAMPLES}", where="samples")
+        check_samples(samples)
         check_image_size(camera)
         color: ByteImage = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
         posed = pose_scene(scene, camera, cam_from_model)
@@ -92,11 +93,11 @@ class RaycastRenderer:
 
         # Made now, before several threads ask for them at once.
         _ = scene.surface, scene.corner_normals
-        geometry = _geometry_of(camera, posed, shade)
+        geometry = geometry_of(camera, posed, shade)
         if posed is not None:
             if samples > 1:
                 self._antialias(color, posed, samples)
-            _darken(color, geometry, posed, self.studio)
+            darken_corners(color, geometry, posed, self.studio)
         return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
 
     def _antialias(self, color: ByteImage, posed: PosedScene, samples: int) -> None:
@@ -128,13 +129,19 @@ def cast_geometry(scene: Scene, camera: Camera, cam_from_model: Alignment) -> Ge
         If the image is too large.
     """
     check_image_size(camera)
-    return _geometry_of(camera, pose_scene(scene, camera, cam_from_model))
+    return geometry_of(camera, pose_scene(scene, camera, cam_from_model))
+
+
+def check_samples(samples: int) -> None:
+    """Refuse a number of rays per pixel that is out of range."""
+    if not 1 <= samples <= _MAX_SAMPLES:
+        raise InputError(f"{samples} is not from 1 to {_MAX_SAMPLES}", where="samples")
 
 
 _Shade = Callable[[PosedScene, Rectangle, FloatArray, FaceArray, FloatArray], None]
 
 
-def _geometry_of(camera: Camera, posed: PosedScene | None, shade: _Shade | None = None) -> Geometry:
+def geometry_of(camera: Camera, posed: PosedScene | None, shade: _Shade | None = None) -> Geometry:
     """Hits of one ray through each pixel's centre, which ``shade`` draws; none of an unseen scene.
 
     ``shade`` takes the scene, a part of its block, and the rays, triangles and depths of the pixels
@@ -212,7 +219,7 @@ _SPHERE = np.column_stack([_TURN.real, _TURN.imag, _HEIGHT]).reshape(_RAYS, -1, 
 _ENCODING = 1 / 2.2
 
 
-def _darken(color: ByteImage, geometry: Geometry, posed: PosedScene, studio: Studio) -> None:
+def darken_corners(color: ByteImage, geometry: Geometry, posed: PosedScene, studio: Studio) -> None:
     """Darken, in place, corners and places under other parts of the object."""
     if studio.occlusion <= 0:
         return

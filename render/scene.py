@@ -1,9 +1,10 @@
-"""Scenes, and the frames that are rendered of them."""
+"""Scenes, the frames that renderers make of them, and the interface of all renderers."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -153,6 +154,19 @@ class Frame(Geometry):
             If the background is neither a colour nor an image of the frame's size.
         """
         return composite(self.color, background)
+
+
+class Renderer(Protocol):
+    """Draws a scene as a camera sees it."""
+
+    @property
+    def name(self) -> str:
+        """The renderer's name on the command line."""
+
+    def render(
+        self, scene: Scene, camera: Camera, cam_from_model: Alignment, *, samples: int = 8
+    ) -> Frame:
+        """Draw one frame; see `RaycastRenderer.render`."""
 
 
 def check_image_size(camera: Camera) -> None:

@@ -38,6 +38,14 @@ class SurfaceColors:
                 if material.texture is not None
             }
 
+    @property
+    def opaque(self) -> bool:
+        """Nothing can be seen through the surface."""
+        color = self._face_color if self._corner_color is None else self._corner_color
+        return bool((color[..., 3] >= 1).all()) and all(
+            bool((texture[..., 3] >= 1).all()) for texture in self._textures.values()
+        )
+
     def color(self, face: FaceArray, weights: LinearArray) -> LinearArray:
         """Look up linear colour and opacity (n, 4), not premultiplied, at points of triangles (n,).
 

@@ -17,6 +17,7 @@ import cadalign
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = {
+    "OpenGL",
     "PIL",
     "cv2",
     "dask",
@@ -25,6 +26,7 @@ HEAVY = {
     "numba",
     "pandas",
     "pyarrow",
+    "pyrender",
     "rich",
     "scipy",
     "starlette",

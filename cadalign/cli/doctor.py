@@ -1,4 +1,4 @@
-"""`cadalign doctor`: describe this machine, and compile ahead for it."""
+"""`cadalign doctor`: check this machine, and compile ahead for it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,22 +20,36 @@ from cadalign.estimation.options import METHODS, RansacOptions
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.camera import Camera
 
+if TYPE_CHECKING:
+    from cadalign.render.probe import Probe
+
 
 @dataclass(frozen=True)
 class Doctor:
-    """Show versions, processor cores and the cache of compiled solvers.
+    """Check the renderers, and show how to enable missing ones.
 
-    With --compile, compiles the solvers ahead.
+    Also shows the processor cores and the cache of compiled solvers. With --compile, compiles the
+    solvers ahead.
     """
 
     compile: bool = False
     """Compile all solvers now, as for a Docker image, in place of when they are first called."""
 
     def run(self) -> int:
-        """Show or compile; returns the exit code."""
-        return self._compile() if self.compile else self._show()
+        """Run the checks; returns the exit code, 0 if ray casting works."""
+        return self._compile() if self.compile else self._check()
 
-    def _show(self) -> int:
+    def _check(self) -> int:
+        from cadalign.render.probe import REMEDIES, best_renderer
+
+        with waiting("trying the renderers, each in a process of its own ..."):
+            renderers = probed_renderers()
+        for each in renderers:
+            answer(f"{each.name:9} {'works' if each.works else 'fails'}: {each.detail}")
+        answer(f"--renderer auto takes: {best_renderer()}")
+        for each in renderers:
+            if not each.works:
+                answer(f"To enable {each.name}: {REMEDIES[each.name]}")
         versions = (f"{name} {version(name.lower())}" for name in ("NumPy", "Numba"))
         answer(f"Python {platform.python_version()}, {', '.join(versions)}")
         cores = os.cpu_count() or 1
@@ -42,7 +57,7 @@ class Doctor:
         usable = len(os.sched_getaffinity(0)) if has_affinity else cores
         answer(f"Cores: {cores}, of which this process may use {usable}")
         answer(f"Compiled solvers: {compiled_cache()}")
-        return 0
+        return 0 if renderers[-1].works else 1
 
     def _compile(self) -> int:
         from cadalign.compile.folder import kernel_folder
@@ -56,6 +71,13 @@ class Doctor:
             compile_ahead()
         answer(f"Compiled in {time.perf_counter() - began:.1f} s: {compiled_cache()}")
         return 0
+
+
+def probed_renderers() -> list[Probe]:
+    """Try every renderer in a process of its own, ray casting last; takes some seconds."""
+    from cadalign.render.probe import RENDERERS, probe_renderer
+
+    return [probe_renderer(name) for name in RENDERERS]
 
 
 def can_write(folder: Path) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -17,7 +17,7 @@ from cadalign.io.images import JPEG_ENDING
 if TYPE_CHECKING:
     from cadalign.arrays import FloatArray
     from cadalign.render.canvas import ByteImage
-    from cadalign.render.scene import Scene
+    from cadalign.render.scene import Renderer, Scene
     from cadalign.render.viewpoints import Angles
 
 _ENDINGS = (".png", JPEG_ENDING)
@@ -47,6 +47,8 @@ class Render:
     """Horizontal field of view in degrees."""
     samples: int = 16
     """Rays per pixel at edges; 1 turns antialiasing off."""
+    renderer: Literal["auto", "raycast", "pyrender"] = "auto"
+    """Renderer of the colour."""
 
     def run(self) -> int:
         """Draw and write; returns the exit code."""
@@ -54,16 +56,18 @@ class Render:
         from cadalign.io.images import write_image
         from cadalign.io.meshes.files import load_mesh
         from cadalign.render.layers import contact_sheet
+        from cadalign.render.probe import make_renderer
         from cadalign.render.scene import Scene
 
         with named_as_flags(self, elevation="--view"):
             camera, views = self._camera(), self._views()
-            scene = Scene(load_mesh(self.model))
+            scene, renderer = Scene(load_mesh(self.model)), make_renderer(self.renderer)
             keypoints = None
             if self.keypoints is not None:
                 keypoints = ModelKeypoints.load(self.keypoints).xyz
             pictures = {
-                name: self._draw(scene, camera, view, keypoints) for name, view in views.items()
+                name: self._draw(scene, renderer, camera, view, keypoints)
+                for name, view in views.items()
             }
             (picture, *further) = pictures.values()
             if further:
@@ -106,17 +110,17 @@ class Render:
     def _draw(
         self,
         scene: Scene,
+        renderer: Renderer,
         camera: Any,
         view: Angles,
         keypoints: FloatArray | None,
     ) -> ByteImage:
         """One picture, (h, w, 3) uint8."""
         from cadalign.render.layers import keypoint_picture
-        from cadalign.render.raycast import RaycastRenderer
         from cadalign.render.viewpoints import pose_in_view, visible_keypoints
 
         pose = pose_in_view(scene, camera, view, scale=self.scale)
-        image = RaycastRenderer().render(scene, camera, pose, samples=self.samples).composite()
+        image = renderer.render(scene, camera, pose, samples=self.samples).composite()
         if keypoints is None:
             return image
         visible = visible_keypoints(scene, keypoints, camera, pose)

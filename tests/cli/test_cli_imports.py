@@ -20,8 +20,8 @@ from cadalign.io.observation import Observation
 pytestmark = pytest.mark.long
 
 HEAVY = {
-    *("IPython", "PIL", "cv2", "dask", "embreex", "matplotlib"),
-    *("numba", "numpy", "pandas", "pyarrow", "pycocotools", "rich"),
+    *("IPython", "OpenGL", "PIL", "cv2", "dask", "embreex", "matplotlib"),
+    *("numba", "numpy", "pandas", "pyarrow", "pycocotools", "pyrender", "rich"),
     *("scipy.linalg", "scipy.optimize", "scipy.sparse", "scipy.spatial", "scipy.special"),
     *("starlette", "torch", "trimesh", "uvicorn"),
 }

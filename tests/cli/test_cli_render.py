@@ -17,6 +17,7 @@ from cadalign.cli.doctor import Doctor, compiled_cache
 from cadalign.cli.render import Render
 from cadalign.compile.folder import kernel_folder
 from cadalign.errors import DataError, InputError, RenderError
+from cadalign.render.probe import REMEDIES, Probe
 
 
 @pytest.fixture
@@ -27,9 +28,9 @@ def model(tmp_path) -> Path:
     return path
 
 
-def _run(model, *arguments):
+def _run(model, *arguments, renderer="raycast"):
     """Run the command as the command line does."""
-    command = tyro.cli(Render, args=[str(model), *map(str, arguments)])
+    command = tyro.cli(Render, args=[str(model), "--renderer", renderer, *map(str, arguments)])
     return command.run()
 
 
@@ -109,11 +110,15 @@ def test_a_file_that_cannot_be_written_is_named(model, tmp_path):
 # doctor
 
 
-def test_doctor_describes_the_machine(capsys):
-    assert Doctor().run() == 0
-    text = capsys.readouterr().out
-    assert "Numba " in text
-    assert "Cores: " in text
+def test_doctor_tells_what_works_and_how_to_enable_the_rest(monkeypatch, capsys):
+    good, bad = Probe("raycast", True, "processor"), Probe("pyrender", False, "no OpenGL")
+    for probed, code in (([bad, good], 0), ([Probe("raycast", False, "embreex is gone")], 1)):
+        monkeypatch.setattr("cadalign.cli.doctor.probed_renderers", lambda found=probed: found)
+        monkeypatch.setattr("cadalign.render.probe.best_renderer", lambda: "raycast")
+        assert Doctor().run() == code
+        text = capsys.readouterr().out
+    assert "raycast   fails: embreex is gone\n--renderer auto takes: raycast\n" in text
+    assert f"To enable raycast: {REMEDIES['raycast']}\n" in text
     assert "Compiled solvers: " in text
 
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from support.renderers import renderer_or_skip
 
 from cadalign import Alignment, Camera, Mesh, Model, View, align
 from cadalign.export.glb import photo_plane
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.render import Scene, cast_geometry
 from cadalign.render.overlay import draw_result, photo_of
+from cadalign.render.raycast import RaycastRenderer
 from cadalign.render.scene import LIGHT_GREY
 from cadalign.render.viewpoints import visible_keypoints
 
@@ -87,6 +89,14 @@ def test_the_picture_of_a_result_shows_model_box_and_regions() -> None:
     grey = np.array(LIGHT_GREY)
     changed = (np.abs(picture.astype(int) - grey).max(axis=2) > 8) & drawn
     assert changed.sum() > 0.9 * drawn.sum()
+
+
+def test_opengl_leaves_wide_lenses_to_rays() -> None:
+    opengl = renderer_or_skip("pyrender")
+    pose = placed(90)
+    expected = RaycastRenderer().render(BOX, FISHEYE, pose, samples=4)
+    drawn = opengl.render(BOX, FISHEYE, pose, samples=4)
+    np.testing.assert_array_equal(drawn.color, expected.color)
 
 
 def test_the_photo_of_a_wide_lens_is_exported_as_a_pinholes() -> None:

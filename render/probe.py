@@ -1,0 +1,189 @@
+"""Renderers by name: tried in a process of their own, and chosen."""
+
+from __future__ import annotations
+
+import json
+import logging
+import subprocess
+import sys
+from dataclasses import asdict, dataclass
+from functools import cache
+from importlib import import_module
+
+import numpy as np
+
+from cadalign.errors import CadalignError, RenderError, unknown
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Mesh
+from cadalign.render.scene import Renderer, Scene
+from cadalign.render.surface import Studio
+
+RENDERERS: dict[str, str] = {
+    "pyrender": "cadalign.render.opengl:PyrenderRenderer",
+    "raycast": "cadalign.render.raycast:RaycastRenderer",
+}
+"""Module and class of each renderer."""
+
+_TIMEOUT = 120
+REMEDIES = {
+    "pyrender": "pip install pyrender2; apt-get install libegl1 libgl1 libgl1-mesa-dri",
+    "raycast": "pip install --force-reinstall embreex trimesh",
+}
+"""Commands that install what a renderer needs, on Debian."""
+# The last line of the child's output begins so; libraries write what they like before it.
+_MARK = "cadalign-probe "
+_CHILD = (
+    "import sys, json; sys.path[:] = json.loads(sys.argv[1]); "
+    "from cadalign.render.probe import report; report(sys.argv[2])"
+)
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Result of trying a renderer."""
+
+    name: str
+    """The renderer."""
+    works: bool
+    detail: str
+    """Device that draws, or the reason of the failure."""
+
+
+@cache
+def probe_renderer(name: str) -> Probe:
+    """Try a renderer in a process of its own; the result is kept for the life of this one.
+
+    Parameters
+    ----------
+    name : str
+        One of `RENDERERS`.
+
+    Raises
+    ------
+    InputError
+        If there is no such renderer.
+    """
+    if name not in RENDERERS:
+        raise unknown("renderer", name, RENDERERS)
+    arguments = [json.dumps(sys.path), name]
+    try:
+        child = subprocess.run(
+            [sys.executable, "-c", _CHILD, *arguments],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=_TIMEOUT,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return Probe(name, False, f"no frame within {_TIMEOUT} seconds")
+    except OSError as error:
+        return Probe(name, False, f"no process to try it in ({error})")
+    for line in reversed(child.stdout.splitlines()):
+        if line.startswith(_MARK):
+            return Probe(**json.loads(line.removeprefix(_MARK)))
+    if child.returncode < 0:
+        reason = f"the process was killed by signal {-child.returncode}"
+    else:
+        reason = (child.stderr.strip().splitlines() or ["no message"])[-1]
+    return Probe(name, False, reason)
+
+
+def report(name: str) -> None:
+    """Try a renderer in this process and write the result to standard output, for the parent."""
+    try:
+        result = _try(name)
+    except Exception as error:  # whatever it is, the parent wants to know
+        reason = error.what if isinstance(error, CadalignError) else str(error)
+        result = Probe(name, False, reason or type(error).__name__)
+    sys.stdout.write(f"\n{_MARK}{json.dumps(asdict(result))}\n")
+    sys.stdout.flush()
+
+
+def load_renderer(name: str, studio: Studio | None) -> Renderer:
+    """Make a renderer in this process, even if that takes the process down."""
+    module, _, kind = RENDERERS[name].partition(":")
+    renderer: Renderer = getattr(import_module(module), kind)(studio=studio)
+    return renderer
+
+
+def _try(name: str) -> Probe:
+    renderer = load_renderer(name, None)
+    corners = np.array([[-1.0, 0, 0], [0, 1, 0], [1, 0, 0], [0, -2, 0]])
+    kite = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    camera = Camera.from_fov(64, 48, fov_x=50.0)
+    pose = Alignment(np.eye(3), np.array([0, 0, 4.5]), np.ones(3))
+    frame = renderer.render(Scene(kite), camera, pose)
+    seen = float((frame.color[:, :, 3] > 127).mean())
+    if not (frame.mask.any() and abs(seen - frame.mask.mean()) < 0.1):
+        return Probe(name, False, "it draws a kite wrongly")
+    return Probe(name, True, str(getattr(renderer, "device", "processor")))
+
+
+logger = logging.getLogger("cadalign")
+
+AUTO = "auto"
+
+# Of OpenGL's devices, programs that run on the processor.
+_IMITATIONS = ("llvmpipe", "softpipe", "swrast", "software rasterizer", "swiftshader")
+
+
+def make_renderer(name: str = AUTO, *, studio: Studio | None = None) -> Renderer:
+    """Make a renderer.
+
+    Renderers other than ``raycast`` are tried in a process of their own first, once in the life of
+    this one, since broken graphics libraries would take this process down.
+
+    Parameters
+    ----------
+    name : str
+        ``raycast`` works everywhere; ``pyrender`` draws the colour with OpenGL. ``auto`` takes
+        pyrender where it works on a graphics card, and raycast elsewhere: OpenGL imitated on the
+        processor takes as long and smooths edges less. It says which (logger "cadalign", level
+        info; the renderer's ``name``).
+    studio : Studio, optional
+        The lights.
+
+    Returns
+    -------
+    Renderer
+
+    Raises
+    ------
+    InputError
+        If there is no renderer of that name.
+    RenderError
+        If the one asked for does not work here.
+
+    Examples
+    --------
+    >>> make_renderer("raycast").name
+    'raycast'
+    """
+    if name == AUTO:
+        return load_renderer(best_renderer(), studio)
+    if name not in RENDERERS:
+        raise unknown("renderer", name, [AUTO, *RENDERERS])
+    if name != "raycast":
+        found = probe_renderer(name)
+        if not found.works:
+            raise RenderError(
+                f"the renderer does not work here: {found.detail}",
+                where=name,
+                fix="run `cadalign doctor` to see what is missing, or use the ray-cast renderer",
+            )
+    return load_renderer(name, studio)
+
+
+def best_renderer() -> str:
+    """The renderer that "auto" takes here, by name; ray casting needs no proof."""
+    found = probe_renderer("pyrender")
+    if not found.works:
+        name, reason = "raycast", f"pyrender does not work here: {found.detail}"
+    elif any(name in found.detail.lower() for name in _IMITATIONS):
+        name, reason = "raycast", f"OpenGL has no graphics card here but {found.detail}"
+    else:
+        name, reason = "pyrender", found.detail
+    logger.info("renderer: %s (%s)", name, reason)
+    return name

@@ -1,0 +1,32 @@
+"""Renderers, as far as they work on this machine."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from cadalign import Mesh
+from cadalign.render import Renderer, make_renderer
+from cadalign.render.probe import probe_renderer
+
+
+def skip_unless_works(name: str) -> None:
+    """Skip the test where a renderer does not work; ray casting needs no proof."""
+    if name == "raycast":
+        return
+    found = probe_renderer(name)
+    if not found.works:
+        pytest.skip(f"{name} does not work here: {found.detail}")
+
+
+def renderer_or_skip(name: str) -> Renderer:
+    """A renderer; the test is skipped where it does not work."""
+    skip_unless_works(name)
+    return make_renderer(name)
+
+
+def ball(subdivisions: int) -> Mesh:
+    """A ball of radius 1 with 20 * 4**subdivisions triangles."""
+    shape = trimesh.creation.icosphere(subdivisions=subdivisions)
+    return Mesh(np.array(shape.vertices), np.array(shape.faces))

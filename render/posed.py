@@ -17,7 +17,7 @@ from cadalign.geometry.alignment import Alignment, model_rays
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import barycentric_of
 from cadalign.geometry.pixels import perspective
-from cadalign.geometry.raycaster import FaceArray
+from cadalign.geometry.raycaster import FaceArray, RayCaster
 from cadalign.render.canvas import LinearArray
 from cadalign.render.scene import Scene
 from cadalign.render.surface import Studio
@@ -76,11 +76,17 @@ class PosedScene:
     """A scene placed before a camera, seen in a block of its pixels; made by `pose_scene`."""
 
     def __init__(
-        self, scene: Scene, camera: Camera, cam_from_model: Alignment, block: Rectangle
+        self,
+        scene: Scene,
+        camera: Camera,
+        cam_from_model: Alignment,
+        block: Rectangle,
+        caster: RayCaster,
     ) -> None:
         self.scene = scene
         self.camera = camera
         self.block = block
+        self._caster = caster
         self._alignment = cam_from_model
         self._origin, self._model_from_ray = model_rays(cam_from_model)
         first = scene.triangles[:, 0]
@@ -109,7 +115,7 @@ class PosedScene:
         A depth is the multiple of its ray that leads to the hit.
         """
         directions = self._directions(rays)
-        face, depth = self.scene.caster.first_hits(self._origin, directions, start=start)
+        face, depth = self._caster.first_hits(self._origin, directions, start=start)
         # Of coincident triangles those wound to the camera are shown.
         return np.where(face >= 0, self._shown[face], np.int32(-1)), depth
 
@@ -127,7 +133,7 @@ class PosedScene:
         model units.
         """
         columns = self._model_from_ray.T
-        return self.scene.caster.blocked(
+        return self._caster.blocked(
             (points_cam - self._alignment.translation) @ columns, directions @ columns, reach=reach
         )
 
@@ -192,12 +198,14 @@ class PosedScene:
         return np.asarray(rays @ self._model_from_ray.T)
 
 
-def pose_scene(scene: Scene, camera: Camera, cam_from_model: Alignment) -> PosedScene | None:
-    """Place a scene before a camera; None if it is unseen."""
+def pose_scene(
+    scene: Scene, camera: Camera, cam_from_model: Alignment, *, caster: RayCaster | None = None
+) -> PosedScene | None:
+    """Place a scene before a camera; None if it is unseen. The caster is by default its own."""
     block = _object_rectangle(scene, camera, cam_from_model)
     if block is None:
         return None
-    return PosedScene(scene, camera, cam_from_model, block)
+    return PosedScene(scene, camera, cam_from_model, block, caster or scene.caster)
 
 
 def _object_rectangle(scene: Scene, camera: Camera, cam_from_model: Alignment) -> Rectangle | None:

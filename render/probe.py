@@ -21,6 +21,7 @@ from cadalign.render.surface import Studio
 
 RENDERERS: dict[str, str] = {
     "pyrender": "cadalign.render.opengl:PyrenderRenderer",
+    "open3d": "cadalign.render.raycast:Open3DRenderer",
     "raycast": "cadalign.render.raycast:RaycastRenderer",
 }
 """Module and class of each renderer."""
@@ -28,6 +29,7 @@ RENDERERS: dict[str, str] = {
 _TIMEOUT = 120
 REMEDIES = {
     "pyrender": "pip install pyrender2; apt-get install libegl1 libgl1 libgl1-mesa-dri",
+    "open3d": "pip install 'cadalign[open3d]'; apt-get install libx11-6 libgl1 libgomp1",
     "raycast": "pip install --force-reinstall embreex trimesh",
 }
 """Commands that install what a renderer needs, on Debian."""
@@ -138,10 +140,11 @@ def make_renderer(name: str = AUTO, *, studio: Studio | None = None) -> Renderer
     Parameters
     ----------
     name : str
-        ``raycast`` works everywhere; ``pyrender`` draws the colour with OpenGL. ``auto`` takes
-        pyrender where it works on a graphics card, and raycast elsewhere: OpenGL imitated on the
-        processor takes as long and smooths edges less. It says which (logger "cadalign", level
-        info; the renderer's ``name``).
+        ``raycast`` works everywhere; ``pyrender`` draws the colour with OpenGL; ``open3d`` casts
+        rays with Open3D. ``auto`` takes pyrender where it works on a graphics card, and raycast
+        elsewhere: OpenGL imitated on the processor takes as long and smooths edges less, and
+        Open3D casts no faster. It says which (logger "cadalign", level info; the renderer's
+        ``name``).
     studio : Studio, optional
         The lights.
 

@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.errors import InputError
+from cadalign.errors import InputError, RenderError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.raycaster import FaceArray
+from cadalign.geometry.raycaster import FaceArray, RayCaster
 from cadalign.render.canvas import ByteImage, LinearArray, bytes_from_linear
 from cadalign.render.posed import PosedScene, Rectangle, in_threads, pose_scene
 from cadalign.render.scene import Frame, Geometry, Scene, check_image_size
@@ -83,7 +83,7 @@ class RaycastRenderer:
         check_samples(samples)
         check_image_size(camera)
         color: ByteImage = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
-        posed = pose_scene(scene, camera, cam_from_model)
+        posed = pose_scene(scene, camera, cam_from_model, caster=self._caster(scene))
 
         def shade(
             posed: PosedScene, band: Rectangle, rays: FloatArray, face: FaceArray, depth: FloatArray
@@ -100,6 +100,9 @@ class RaycastRenderer:
             darken_corners(color, geometry, posed, self.studio)
         return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
 
+    def _caster(self, scene: Scene) -> RayCaster:
+        return scene.caster
+
     def _antialias(self, color: ByteImage, posed: PosedScene, samples: int) -> None:
         """Cast more rays through pixels that differ from their neighbours."""
         rows, columns = np.nonzero(_unlike_neighbours(color[posed.block.slices]))
@@ -113,6 +116,26 @@ class RaycastRenderer:
             color[part[:, 1], part[:, 0]] = _encode(light.mean(axis=1))
 
         in_threads(draw, [pixels[begin : begin + step] for begin in range(0, len(pixels), step)])
+
+
+class Open3DRenderer(RaycastRenderer):
+    """Draws as `RaycastRenderer` does; Open3D finds the hits."""
+
+    name = "open3d"
+
+    def __init__(self, *, studio: Studio | None) -> None:
+        try:
+            import open3d  # noqa: F401
+        except (ImportError, OSError) as error:  # OSError: a library of the system is missing
+            raise RenderError(
+                f"Open3D cannot be imported ({error})",
+                where="open3d",
+                fix="run `cadalign doctor` to see what is missing, or use the ray-cast renderer",
+            ) from None
+        super().__init__(studio=studio)
+
+    def _caster(self, scene: Scene) -> RayCaster:
+        return scene.open3d_caster
 
 
 def cast_geometry(scene: Scene, camera: Camera, cam_from_model: Alignment) -> Geometry:

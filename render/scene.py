@@ -14,7 +14,7 @@ from cadalign.errors import RenderError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh, face_normals
-from cadalign.geometry.raycaster import RayCaster
+from cadalign.geometry.raycaster import Open3DEngine, RayCaster
 from cadalign.render.canvas import ByteImage, composite
 from cadalign.render.surface import SurfaceColors, coincident_faces, corner_normals
 
@@ -65,6 +65,11 @@ class Scene:
     def caster(self) -> RayCaster:
         """The ray hierarchy."""
         return RayCaster(self.mesh, self.face_normals)
+
+    @cached_property
+    def open3d_caster(self) -> RayCaster:
+        """The same built by Open3D, which must be importable."""
+        return RayCaster(self.mesh, self.face_normals, engine=Open3DEngine)
 
     @cached_property
     def used_vertices(self) -> FloatArray:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "cadalign"
-OPTIONAL = {"dask", "distributed"}
+OPTIONAL = {"open3d", "dask", "distributed"}
 
 
 def modules_with_examples() -> list[str]:

@@ -24,6 +24,7 @@ HEAVY = {
     "embreex",
     "matplotlib",
     "numba",
+    "open3d",
     "pandas",
     "pyarrow",
     "pyrender",

@@ -47,7 +47,7 @@ class Render:
     """Horizontal field of view in degrees."""
     samples: int = 16
     """Rays per pixel at edges; 1 turns antialiasing off."""
-    renderer: Literal["auto", "raycast", "pyrender"] = "auto"
+    renderer: Literal["auto", "raycast", "pyrender", "open3d"] = "auto"
     """Renderer of the colour."""
 
     def run(self) -> int:

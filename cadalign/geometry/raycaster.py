@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 from embreex.mesh_construction import TriangleMesh
@@ -46,13 +48,51 @@ class EmbreeEngine:
         return np.asarray(self._scene.run(origins, directions, far, query="OCCLUDED") >= 0)
 
 
+class Open3DEngine:
+    """Embree by way of Open3D, which casts with all cores by itself; see `EmbreeEngine`."""
+
+    def __init__(self, vertices: SingleArray, faces: FaceArray) -> None:
+        import open3d
+
+        self._tensor = open3d.core.Tensor
+        self._no_hit = np.uint32(open3d.t.geometry.RaycastingScene.INVALID_ID)
+        self._scene = open3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(
+            self._tensor(np.ascontiguousarray(vertices)),
+            self._tensor(np.ascontiguousarray(faces.astype(np.uint32))),
+        )
+        # The hierarchy is built on the first query; let no two threads make that one at once.
+        self.first_faces(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+
+    def first_faces(self, origins: SingleArray, directions: SingleArray) -> FaceArray:
+        """See `EmbreeEngine`."""
+        found = self._scene.cast_rays(self._rays(origins, directions))["primitive_ids"].numpy()
+        return np.asarray(np.where(found == self._no_hit, -1, found.astype(np.int32)), np.int32)
+
+    def blocked(
+        self, origins: SingleArray, directions: SingleArray, reach: float
+    ) -> npt.NDArray[np.bool_]:
+        """See `EmbreeEngine`."""
+        rays = self._rays(origins, directions)
+        return np.asarray(self._scene.test_occlusions(rays, tnear=0.0, tfar=reach).numpy(), bool)
+
+    def _rays(self, origins: SingleArray, directions: SingleArray) -> Any:
+        return self._tensor(np.concatenate([origins, directions], axis=1))
+
+
 class RayCaster:
     """A bounding volume hierarchy over a mesh, then only read; safe in several threads.
 
     ``normals`` (m, 3) are the unit normals of its faces, where they are known already.
     """
 
-    def __init__(self, mesh: Mesh, normals: FloatArray | None = None) -> None:
+    def __init__(
+        self,
+        mesh: Mesh,
+        normals: FloatArray | None = None,
+        *,
+        engine: type[EmbreeEngine | Open3DEngine] = EmbreeEngine,
+    ) -> None:
         low, high = self.bounds = mesh.bounds
         self._center = (low + high) / 2
         # A mesh of a single point has no size; any radius serves.
@@ -60,7 +100,7 @@ class RayCaster:
         self._triangles = mesh.triangles
         self._normals = face_normals(self._triangles) if normals is None else normals
         unit = (mesh.vertices - self._center) / self._radius
-        self._engine = EmbreeEngine(unit.astype(np.float32), mesh.faces.astype(np.int32))
+        self._engine = engine(unit.astype(np.float32), mesh.faces.astype(np.int32))
 
     def first_hits(
         self, origin: FloatArray, directions: FloatArray, *, start: FloatArray | None = None

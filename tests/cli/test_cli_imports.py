@@ -21,7 +21,7 @@ pytestmark = pytest.mark.long
 
 HEAVY = {
     *("IPython", "OpenGL", "PIL", "cv2", "dask", "embreex", "matplotlib"),
-    *("numba", "numpy", "pandas", "pyarrow", "pycocotools", "pyrender", "rich"),
+    *("numba", "numpy", "open3d", "pandas", "pyarrow", "pycocotools", "pyrender", "rich"),
     *("scipy.linalg", "scipy.optimize", "scipy.sparse", "scipy.spatial", "scipy.special"),
     *("starlette", "torch", "trimesh", "uvicorn"),
 }

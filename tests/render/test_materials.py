@@ -19,7 +19,7 @@ from cadalign.render import Scene, frame_object, look_at, make_renderer
 CAMERA = Camera.from_fov(320, 240, fov_x=45)
 
 
-@pytest.fixture(params=["raycast", "pyrender"])
+@pytest.fixture(params=["raycast", "open3d", "pyrender"])
 def renderer(request):
     return renderer_or_skip(request.param)
 

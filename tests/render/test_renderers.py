@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from support.renderers import renderer_or_skip
+from support.renderers import ball, renderer_or_skip
 
 from cadalign import Alignment, Camera, Material, Mesh
 from cadalign.errors import InputError, RenderError
@@ -22,6 +22,7 @@ from cadalign.render import (
     RaycastRenderer,
     Scene,
     Studio,
+    cast_geometry,
     frame_object,
     look_at,
     make_renderer,
@@ -32,7 +33,7 @@ from cadalign.render.probe import Probe
 CAMERA = Camera(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 SKEWED = Camera(width=160, height=120, fx=170.0, fy=140.0, cx=60.25, cy=71.75)
 BENT = Camera(160, 120, 170.0, 140.0, 66.0, 63.0, (-0.25, 0.06, 0.004, -0.003))
-NAMES = ("raycast", "pyrender")
+NAMES = ("raycast", "open3d", "pyrender")
 
 
 @pytest.fixture(params=NAMES)
@@ -64,6 +65,25 @@ def _textured(texture) -> Mesh:
 def _view(scene, camera, **angles):
     rotation = look_at(azimuth=35, elevation=25, distance=3, **angles).rotation
     return frame_object(scene.bounds, camera, rotation=rotation, fill=0.9)
+
+
+@pytest.mark.long
+def test_open3d_agrees_with_embreex_on_depth_and_faces():
+    renderer_or_skip("open3d")
+    camera = Camera.from_fov(640, 480, fov_x=50)
+    differing, total = 0, 0
+    for mesh in (_knot(), ball(5)):
+        scene = Scene(mesh)
+        pose = _view(scene, camera)
+        one = cast_geometry(scene, camera, pose)
+        other = make_renderer("open3d").render(scene, camera, pose, samples=1)
+        same = one.face_id == other.face_id
+        differing += (~same).sum()
+        total += same.size
+        np.testing.assert_array_equal(one.depth[same], other.depth[same])
+        near = np.abs(one.depth - other.depth) <= 1e-6 * one.depth.max()
+        assert near.mean() > 0.9999
+    assert differing < 1e-4 * total
 
 
 @pytest.mark.slow
@@ -260,8 +280,9 @@ def test_a_renderer_that_does_not_work_is_refused(monkeypatch):
     monkeypatch.setattr(
         "cadalign.render.probe.probe_renderer", lambda name: Probe(name, False, "no EGL")
     )
-    with pytest.raises(RenderError, match="pyrender: the renderer does not work here: no EGL"):
-        make_renderer("pyrender")
+    for name in ("pyrender", "open3d"):
+        with pytest.raises(RenderError, match=f"{name}: the renderer does not work here: no EGL"):
+            make_renderer(name)
     assert make_renderer("raycast").name == "raycast"
 
 
@@ -302,7 +323,7 @@ def test_a_missing_egl_device_is_told(monkeypatch):
 def test_importing_the_package_loads_no_graphics():
     code = (
         "import sys, json, cadalign.render; "
-        "print(json.dumps([m for m in ('pyrender', 'OpenGL') if m in sys.modules]))"
+        "print(json.dumps([m for m in ('pyrender', 'open3d', 'OpenGL') if m in sys.modules]))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert json.loads(done.stdout) == []

@@ -38,6 +38,7 @@ from cadalign.render.surface import DARKEST, Studio, linear_colors
 os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
 os.environ.setdefault("PYGLET_HEADLESS", "True")
 import pyrender
+from OpenGL import GL
 
 _ROUGHNESS = 0.55
 # OpenGL's own number; pyrender exports no name for it.
@@ -74,7 +75,7 @@ class PyrenderRenderer:
     @property
     def device(self) -> str:
         """Name of the graphics card, or llvmpipe for Mesa on the processor."""
-        return self._context.description()
+        return self._context.device
 
     def __reduce__(self) -> tuple[object, ...]:
         # OpenGL's objects belong to this process; another one makes its own.
@@ -119,13 +120,15 @@ class GlContext:
 
     def __init__(self) -> None:
         try:
-            self._renderer = pyrender.OffscreenRenderer(64, 64)
+            self._renderer = pyrender.OffscreenRenderer(64, 64)  # its context is the current one
+            name = GL.glGetString(GL.GL_RENDERER)
         except Exception as error:  # PyOpenGL and ctypes raise what they like
             raise RenderError(
                 f"OpenGL does not start ({type(error).__name__}: {_beginning(error)})",
                 where="pyrender",
                 fix="run `cadalign doctor` to see what is missing, or use the ray-cast renderer",
             ) from None
+        self.device = name.decode(errors="replace") if name else "unknown"
         self._flags = pyrender.RenderFlags.RGBA
         self._lock = threading.Lock()
         self._process = os.getpid()
@@ -161,17 +164,6 @@ class GlContext:
                     fix="use the ray-cast renderer",
                 ) from None
         return np.asarray(color, dtype=np.uint8)
-
-    def description(self) -> str:
-        """Name of the graphics card, or of the software that imitates one."""
-        from OpenGL import GL
-
-        platform = self._renderer._platform
-        with self._lock:
-            platform.make_current()
-            name = GL.glGetString(GL.GL_RENDERER)
-            platform.make_uncurrent()
-        return name.decode(errors="replace") if name else "unknown"
 
 
 @cache

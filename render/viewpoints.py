@@ -300,6 +300,7 @@ def pose_in_view(
     return frame_object(scene.bounds, camera, rotation=rotation, fill=_STILL_FILL, scale=scale)
 
 
+_BENEATH = 2e-3  # how deep beneath the surface a point still lies on it [diagonals]
 # The centre, then four around it: keypoints like to sit on corners and edges, where a ray to the
 # point itself may just graze the surface beside it.
 _RAY_OFFSETS = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], dtype=float)
@@ -310,13 +311,12 @@ def visible_keypoints(
     points_3d: npt.ArrayLike,
     camera: Camera,
     cam_from_model: Alignment,
-    *,
-    tolerance: float = 2e-3,
 ) -> npt.NDArray[np.bool_]:
     """Say which keypoints are inside the image, before the camera, and not hidden by the object.
 
-    Five rays go to each keypoint: to the point itself and to four places beside it, as far off as
-    the tolerance. The keypoint is hidden if all of them meet the surface before they get there.
+    Five rays go to each keypoint: to the point itself and to four places beside it, a fifth of a
+    percent of the (stretched) model's diagonal off. The keypoint is hidden if all of them meet the
+    surface farther than that before they get there: it may lie so deep beneath the surface.
 
     Parameters
     ----------
@@ -326,10 +326,6 @@ def visible_keypoints(
         Keypoints in model coordinates, on the surface or near it.
     camera : Camera
     cam_from_model : Alignment
-    tolerance : float
-        How far beneath the surface a keypoint may lie, along the ray, to count as lying on it; in
-        diagonals of the (stretched) model's bounding box. Parts thinner than this hide nothing
-        that lies on their back.
 
     Returns
     -------
@@ -338,7 +334,7 @@ def visible_keypoints(
     Raises
     ------
     InputError
-        If the points are not (k, 3) finite numbers or the tolerance is not positive.
+        If the points are not (k, 3) finite numbers.
 
     Examples
     --------
@@ -350,14 +346,12 @@ def visible_keypoints(
     [True, False, False]
     """
     points = as_points(points_3d, name="points_3d", dimension=3)
-    if not (np.isfinite(tolerance) and tolerance > 0):
-        raise InputError(f"{tolerance!r} is not positive", where="tolerance")
     in_camera = cam_from_model.apply(points)
     visible = seen_in_image(camera, in_camera)
     chosen = np.flatnonzero(visible)
     if not len(chosen):
         return visible
-    slack = tolerance * scene.stretched_diagonal(cam_from_model)
+    slack = _BENEATH * scene.stretched_diagonal(cam_from_model)
     targets = in_camera[chosen, None] + slack * _beside(in_camera[chosen])
     # In the camera frame a ray ends at its target; in the model frame its parameter is the same.
     origin, model_from_ray = model_rays(cam_from_model)

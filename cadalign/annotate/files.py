@@ -51,9 +51,6 @@ class SessionOptions:
     shape: Path | None = None
     """File of `cadalign shape learn`: estimate the object's own shape, of that category, from
     keypoints that it knows by semantic id or name."""
-    shape_sigma: float | None = None
-    """Estimate the object's own shape from the model's: standard deviation of the keypoints'
-    positions on the object about those on the stretched model [model units]."""
 
 
 @contextmanager

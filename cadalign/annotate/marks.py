@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from cadalign.annotate.files import SessionOptions
 from cadalign.annotate.photos import MarkedMask
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.model_keypoints import ModelKeypoint
@@ -260,35 +259,19 @@ class KeypointRegistry:
 
 @dataclass(frozen=True, eq=False)
 class ObjectShape:
-    """Objects' shape: a category's learned one with its file, a similar model's, or the model's.
-
-    ``sigma`` is the ``shape_sigma`` of `cadalign.Model`, for a similar one.
-    """
+    """Objects' shape: a category's learned one with its file, or that of the stretched model."""
 
     learned: ShapeModel | None = None
     path: Path | None = None
-    sigma: float | None = None
 
     @classmethod
-    def open(cls, options: SessionOptions) -> ObjectShape:
-        """Read the shape that the options name. Raises a CadalignError."""
-        path, sigma = options.shape, options.shape_sigma
-        if path is not None and sigma is not None:
-            what = "--shape has learned how far objects of the category differ"
-            raise InputError(what, where="--shape-sigma", fix="give one of the two options")
-        if sigma is not None and not 0 < sigma < np.inf:
-            what = f"{sigma:g} is not a standard deviation"
-            raise InputError(what, where="--shape-sigma", fix="give a positive number")
-        return cls(None if path is None else ShapeModel.open(path), path, sigma)
-
-    @property
-    def is_estimated(self) -> bool:
-        """True if objects have a shape of their own, not that of the stretched model."""
-        return self.learned is not None or self.sigma is not None
+    def open(cls, path: Path | None) -> ObjectShape:
+        """Read the learned shape of a file, if there is one. Raises a CadalignError."""
+        return cls(None if path is None else ShapeModel.open(path), path)
 
     @property
     def ids(self) -> tuple[KeypointId, ...]:
-        """Ids or names of the learned keypoints; empty for a similar model."""
+        """Ids or names of the learned keypoints."""
         return () if self.learned is None else self.learned.ids
 
     @property

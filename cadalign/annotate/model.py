@@ -70,19 +70,10 @@ class Wireframe:
         """The lines that always show, (k, 2, 3) float [model units]."""
         return self._mesh.vertices[self._creases]
 
-    def warped(
-        self, source: FloatArray, target: FloatArray, bounds: FloatArray, *, carried: FloatArray
-    ) -> tuple[Wireframe, FloatArray]:
-        """Warp the lines, and points on the surface (k, 3); see `cadalign.shapes.warp.warp_mesh`.
-
-        The simplified mesh hides the lines.
-        """
-        mesh = self._mesh
-        together = Mesh(np.concatenate([mesh.vertices, carried]), mesh.faces)
-        moved = warp_mesh(together, source, target, bounds=bounds).vertices
-        vertices, points = np.split(moved, [len(mesh.vertices)])
-        warped = Mesh(vertices, mesh.faces)
-        return replace(self, scene=Scene(warped), _mesh=warped), points
+    def warped(self, source: FloatArray, target: FloatArray, bounds: FloatArray) -> Wireframe:
+        """The lines, warped by `cadalign.shapes.warp.warp_mesh`; the simplified mesh hides them."""
+        warped = warp_mesh(self._mesh, source, target, bounds=bounds)
+        return replace(self, scene=Scene(warped), _mesh=warped)
 
     def seen_in(self, camera: Camera, alignment: Alignment) -> FloatArray:
         """Project the lines of the stretched model that a camera sees, (k, 2, 2) float [px]."""

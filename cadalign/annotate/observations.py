@@ -122,7 +122,7 @@ class ObservationFile:
     @property
     def stretch_sigma(self) -> float | None:
         """Prior on the stretch; None for a shape, which has its own."""
-        if self.shape.is_estimated:
+        if self.shape.learned is not None:
             return None
         return self.stored.fit_options.get("stretch_sigma") or LIKELY_STRETCH
 
@@ -134,7 +134,7 @@ class ObservationFile:
         pairs = marks.complete_pairs
         known = self.shape.known(self.model.points_of(pairs))
         counting = tuple(pair for pair, counts in zip(pairs, known, strict=True) if counts)
-        by_mask = marks.mask is not None and marks.start is None and not self.shape.is_estimated
+        by_mask = marks.mask is not None and marks.start is None and self.shape.learned is None
         return () if by_mask and len(counting) < LEAST_JOINT_PAIRS else counting
 
     def observation_of(
@@ -149,8 +149,6 @@ class ObservationFile:
         options = {**(sigma or {})}
         if self.stretch_sigma is not None:
             options["stretch_sigma"] = self.stretch_sigma
-        if self.shape.sigma is not None:
-            options["shape_sigma"] = self.shape.sigma
         if marks.photo:
             options["image"] = True
         prior = self.focal_prior
@@ -219,8 +217,6 @@ class ObservationFile:
     def _warn_of_options(self, stored: Observation) -> None:
         """Warn of stored options of the fit that the page does not use."""
         options = dict(stored.fit_options)
-        if options.get("shape_sigma") == self.shape.sigma:
-            options.pop("shape_sigma", None)
         if "stretch_sigma" in options or options.get("sigma") is None:
             options.pop("sigma", None)  # found by the annotator, or not stated
         others = [name for name in options if name not in _OWN_OPTIONS]

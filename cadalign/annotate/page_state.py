@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 
 from cadalign.annotate.actions import ActionOutcome
-from cadalign.annotate.live import LiveAlignment, short
 from cadalign.annotate.marks import ObjectShape
 from cadalign.annotate.model import box_lines
-from cadalign.annotate.session import Annotation, Session
+from cadalign.annotate.session import Annotation, LiveAlignment, Session
 from cadalign.arrays import FloatArray
 from cadalign.estimation.result import Result
 from cadalign.geometry.alignment import (
@@ -35,7 +34,7 @@ def page_state(
     with session.lock:
         state = session.annotation(number)
         live, marks, photo = session.live(state), state.marks, state.photo
-        registry, cad, suggestion = state.model.registry, state.model.cad, live.suggestion
+        registry, cad = state.model.registry, state.model.cad
         likely, focal = photo.likely_focal, marks.camera.fx
         return {
             "image": {
@@ -73,14 +72,6 @@ def page_state(
             ],
             "shape": _shape(state),
             "alignment": _alignment(state, live, is_ready=session.ready),
-            "suggestion": None
-            if suggestion is None
-            else {
-                "keypoint": suggestion.point.semantic_id,
-                "xyz": cad.to_display(suggestion.point.xyz).tolist(),
-                "uv": suggestion.uv,
-                "text": suggestion.text,
-            },
         }
 
 
@@ -96,18 +87,19 @@ def photos_state(session: Session) -> list[dict[str, Any]]:
 def _shape(state: Annotation) -> dict[str, Any] | None:
     """The shape's category, and the keypoints of it that the model lacks."""
     shape = state.shape
-    if not shape.is_estimated:
+    if shape.learned is None:
         return None
     known = {shape.id_of(point) for _, point in state.model.registry}
     return {
-        "category": None if shape.learned is None else shape.learned.category,
+        "category": shape.learned.category,
         "missing": [label for label in shape.ids if label not in known],
     }
 
 
 def _pairs(state: Annotation, live: LiveAlignment) -> list[dict[str, Any]]:
     """The pairs with their residuals; those that contradict the others are ``off`` [px]."""
-    pairs, row = [], 0
+    counting, row = iter(live.counts), 0
+    pairs = []
     for pair in state.marks.pairs:
         entry: dict[str, Any] = {
             "pair": pair.number,
@@ -121,10 +113,10 @@ def _pairs(state: Annotation, live: LiveAlignment) -> list[dict[str, Any]]:
             point = state.model.registry[pair.keypoint]
             entry["name"], entry["xyz"] = point.name, state.model.cad.to_display(point.xyz).tolist()
             entry["counts"] = state.shape.id_of(point) is not None
-        if pair.complete and live.result is not None:
-            residual = live.residuals[row]
+        if pair.complete and live.estimate is not None and next(counting):
+            residual = live.estimate.result.residuals[row]
             entry["residual"] = residual.tolist() if np.isfinite(residual).all() else None
-            entry["off"] = live.outliers.get(row)
+            entry["off"] = live.estimate.outliers.get(row)
             row += 1
         pairs.append(entry)
     return pairs
@@ -157,7 +149,7 @@ def _drawing(state: Annotation, live: LiveAlignment) -> dict[str, Any]:
     lines = live.wireframe.seen_in(camera, alignment), box_lines(result.bounds, camera, alignment)
     edges, box = (_rounded(each[(np.abs(each) < 1e6).all(axis=(1, 2))]) for each in lines)
     unmarked, regions = [], []
-    if shape.is_estimated:
+    if shape.learned is not None:
         registry, used = state.model.registry, state.marks.keypoints
         free = {shape.id_of(point) for number, point in registry if number not in used}
         in_camera = alignment.apply(result.points_3d)
@@ -204,7 +196,7 @@ def facts_of(
     """
     assert live.estimate is not None
     result = live.estimate.result
-    in_lengths = shape.is_estimated or "x" in result.stretched_axes
+    in_lengths = shape.learned is not None or "x" in result.stretched_axes
     axes = "xyz" if in_lengths else result.stretched_axes
     facts = {}
     for axis in axes:
@@ -237,12 +229,12 @@ def notes_of(state: Annotation, live: LiveAlignment) -> list[str]:
         notes.append(f"{subject}: {reason}.")
     others = len(result.alternatives)
     if others and live.counts.any():
-        how = "nearly as well" if shape.is_estimated else "as well"
+        how = "as well" if shape.learned is None else "nearly as well"
         notes.append(
             f"{others} other alignment{'s explain' if others > 1 else ' explains'} these pairs "
             f"{how}: one more pair tells them apart."
         )
-    told = {"outlier"} if live.outliers else set()  # beside the pairs
+    told = {"outlier"} if live.estimate.outliers else set()  # beside the pairs
     warnings = (each.text for each in result.warnings if each.kind not in told)
     return notes + [text.replace("+-", "± ") for text in warnings]
 
@@ -287,3 +279,8 @@ def _focal(result: Result, *, is_assumed: bool) -> tuple[str, str]:
     if relative > NOT_DETERMINED:
         return _UNDETERMINED
     return f"{focal:.0f} ± {short(focal * relative)} px", "estimated"
+
+
+def short(value: float) -> str:
+    """Two digits, without an exponent."""
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"

@@ -7,7 +7,7 @@ is only similar is not stretched to fit clicks.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, cast
@@ -15,11 +15,10 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.annotate.marks import ObjectShape, positions_of
+from cadalign.annotate.marks import ObjectShape
 from cadalign.annotate.observations import LIKELY_STRETCH
 from cadalign.arrays import FloatArray
 from cadalign.batch.observation_fit import model_of, views_of
-from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.estimation.align import align
 from cadalign.estimation.model import Model
@@ -65,36 +64,21 @@ FitRows = Callable[[Rows, bool], Result]
 class Known:
     """Knowledge of an object beside its observation.
 
-    ``points`` are the model's keypoints that the shape knows, ``focal`` is the likely focal length,
-    at which an unknown one is assumed, and ``focal_prior`` the prior on it.
+    ``focal`` is the likely focal length, at which an unknown one is assumed, and ``focal_prior``
+    the prior on it.
     """
 
     shape: ObjectShape
     mesh: Mesh
-    points: Sequence[ModelKeypoint] = ()
     focal: float = 0.0
     focal_prior: FocalPrior | None = None
 
     def model_for(self, observation: Observation) -> Model | ShapeModel:
-        """The model that `cadalign fit` aligns to the observation.
-
-        A similar one has keypoints that no pair shows, too, where they do not change the estimate:
-        without mask and photo, to which every keypoint warps the mesh.
-        """
-        shape, evidence = self.shape, observation.evidence
-        if shape.learned is not None:
-            return shape.learned
-        has_photo = bool(observation.fit_options.get("image"))
-        if shape.sigma is not None and not has_photo and evidence.mask is None:
-            return Model(
-                points_3d=positions_of(self.points),
-                ids=[point.semantic_id for point in self.points],
-                mesh=self.mesh,
-                shape_sigma=shape.sigma,
-                up_axis=observation.up_axis,
-            )
+        """The model that `cadalign fit` aligns to the observation."""
+        if self.shape.learned is not None:
+            return self.shape.learned
         options = FitOptions(stretch_sigma=observation.fit_options.get("stretch_sigma"))
-        return model_of(observation, options=options, shape_sigma=shape.sigma, mesh=self.mesh)
+        return model_of(observation, options=options, mesh=self.mesh)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,15 +118,9 @@ class LiveProblem:
             observation = replace(observation, camera=observation.camera.with_focal(known.focal))
         (view,) = views_of(observation, model, with_photos=has_photo)
         states_noise = observation.sigma is not None and not observation.is_plain
-        settles = not (known.shape.is_estimated or states_noise) and bool(len(view.keypoint_ids))
+        settles = not (known.shape.learned or states_noise) and bool(len(view.keypoint_ids))
         focal = estimates_focal, known.focal_prior
         return cls(model, view, observation.size, settles, *focal, observation.init)
-
-    @property
-    def exact(self) -> Model | None:
-        """The model, if nothing but its stretch is estimated."""
-        model = self.model
-        return model if isinstance(model, Model) and model.shape_sigma is None else None
 
     def estimate(self) -> LiveEstimate:
         """Align with as few assumptions as the marks need; raises a CadalignError without."""
@@ -153,7 +131,8 @@ class LiveProblem:
             except DegenerateError as error:
                 reason = error
                 continue
-            judged = attempt if attempt.exact else attempt.at_focal(result.camera)
+            has_shape = isinstance(self.model, ShapeModel)
+            judged = attempt.at_focal(result.camera) if has_shape else attempt
             outliers = judged.contradicting()
             return LiveEstimate(result, message, sigma, {} if message else options, outliers)
         assert reason is not None
@@ -166,8 +145,8 @@ class LiveProblem:
         problem = self.at_focal(self.view.camera)
         if self.estimates_focal:
             yield problem, _FOCAL_ASSUMED
-        if self.exact is not None:
-            rigid = replace(self.exact, stretch_sigma=None, stretch="none")
+        if isinstance(self.model, Model):
+            rigid = replace(self.model, stretch_sigma=None, stretch="none")
             yield replace(problem, model=rigid), _UNSTRETCHED
 
     def at_focal(self, camera: Camera) -> LiveProblem:
@@ -197,10 +176,10 @@ class LiveProblem:
 
     def contradicting(self) -> dict[int, float]:
         """Distances [px] of the pairs that contradict the others, by their rows."""
-        view, model = self.view, self.exact
+        view, model = self.view, self.model
         alone = View(view.camera, view.points_2d, ids=view.ids, sigma=view.sigma)
         pairs = replace(self, view=alone, size=None, init=None)
-        if model is None:
+        if isinstance(model, ShapeModel):
             return pairs._left_out()
         rows = {each: row for row, each in enumerate(model.ids or ())}
         points = np.asarray(model.points_3d)[[rows[each] for each in view.keypoint_ids]]

@@ -33,7 +33,6 @@ from cadalign.web import asset
 
 LOOPBACK = "127.0.0.1"
 """Address that only this machine reaches."""
-TOKEN_HEADER = "x-cadalign-token"
 _NAMES = [LOOPBACK, "localhost"]
 _MOST_CONNECTIONS = 256
 _POLICY = (
@@ -74,7 +73,7 @@ class Access:
             return "requests from another origin are refused"
         if request.headers.get("sec-fetch-site") in ("cross-site", "same-site"):
             return "requests from another site are refused"
-        given = [request.headers.get(TOKEN_HEADER), request.cookies.get(self.cookie)]
+        given = [request.cookies.get(self.cookie)]
         if request.url.path == "/":
             given.append(request.query_params.get("token"))
         wanted = self.token.encode()

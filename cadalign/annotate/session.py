@@ -17,17 +17,54 @@ from cadalign.annotate.files import (
     observation_file,
     refuse_collisions,
 )
-from cadalign.annotate.live import LiveAlignment, live_alignment, missing_text
-from cadalign.annotate.marks import History, Marks, ObjectShape, Pixel
-from cadalign.annotate.model import OpenedModel, open_model
-from cadalign.annotate.observations import ObservationFile
+from cadalign.annotate.marks import History, Marks, ObjectShape, Pixel, positions_of
+from cadalign.annotate.model import OpenedModel, Wireframe, open_model
+from cadalign.annotate.observations import LEAST_JOINT_PAIRS, ObservationFile
 from cadalign.annotate.photos import PhotoFile, camera_of, find_photos
 from cadalign.annotate.problem import Known, LiveEstimate, LiveProblem, warm_up
 from cadalign.arrays import BoolArray
+from cadalign.datasets.model_keypoints import ModelKeypoint
 from cadalign.errors import CadalignError, DataError, DegenerateError, InputError
+from cadalign.estimation.result import Result
 from cadalign.io.observation import Observation, read_camera
 
 logger = logging.getLogger("cadalign")
+
+_LEAST_PAIRS = 4  # of an alignment without evidence beside them
+
+
+@dataclass(frozen=True, eq=False)
+class LiveAlignment:
+    """Alignment of what is marked so far; without one a message says why."""
+
+    estimate: LiveEstimate | None = None
+    message: str = ""
+    counts: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))
+    """(n,), the complete pairs that count."""
+    wireframe: Wireframe | None = None
+    """Lines of the model, warped to an own shape, in its frame before the stretch."""
+
+    @property
+    def result(self) -> Result | None:
+        """The result of the estimate, whose keypoints are the pairs that count."""
+        return None if self.estimate is None else self.estimate.result
+
+
+def missing_text(counts: BoolArray, shape: ObjectShape, observation: Observation) -> str:
+    """Say how many more pairs the first alignment needs; empty if none.
+
+    ``counts`` (n,) are the complete pairs that count.
+    """
+    if shape.learned is None and (observation.evidence.mask or observation.init):
+        return ""
+    is_plain = observation.is_plain and shape.learned is None
+    missing = (_LEAST_PAIRS if is_plain else LEAST_JOINT_PAIRS) - int(counts.sum())
+    if missing <= 0:
+        return ""
+    text = f"{missing} more pair{'s' if missing > 1 else ''} to the first alignment"
+    if not counts.all() and shape.learned is not None:
+        text += f": keypoints that {shape.learned.category} has, the white points on the model"
+    return text
 
 
 @dataclass(eq=False)
@@ -94,30 +131,26 @@ class Annotation:
 
     def _align(self) -> LiveAlignment:
         file, marks, shape = self.file, self.marks, self.shape
-        observation, pairs = file.observation_of(marks), marks.complete_pairs
-        counting, points = file.counting(marks), self.model.points_of(pairs)
-        counts = np.array([pair in counting for pair in pairs], dtype=bool)
+        observation, counting = file.observation_of(marks), file.counting(marks)
+        counts = np.array([pair in counting for pair in marks.complete_pairs], dtype=bool)
         if missing := missing_text(counts, shape, observation):
             return LiveAlignment(message=missing)
-        uv = np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2)
-        return live_alignment(
-            self._estimate(observation),
-            shape,
-            self.model.registry,
-            self.model.cad.wireframe,
-            (points, uv, counts),
-            marks.keypoints,
-        )
+        estimate, lines = self._estimate(observation), self.model.cad.wireframe
+        if shape.learned is not None:  # warped such that known keypoints come to the estimated ones
+            result = estimate.result
+            registry = self.model.registry
+            own: dict[Any, ModelKeypoint] = {shape.id_of(point): point for _, point in registry}
+            rows = [row for row, label in enumerate(result.ids) if label in own]
+            source = positions_of(own[result.ids[row]] for row in rows)
+            lines = lines.warped(source, result.points_3d[rows], result.bounds)
+        return LiveAlignment(estimate, "", counts, lines)
 
     def _estimate(self, observation: Observation) -> LiveEstimate:
-        registry, file = self.model.registry, self.file
-        points = [point for _, point in registry if self.shape.id_of(point) is not None]
         depends = replace(observation, unfinished=None).to_dict()
-        # A drawn mask's file is written anew, and a similar model has all keypoints.
-        key = json.dumps([depends, hash(self.marks.mask), [point.xyz for point in points]])
+        key = json.dumps([depends, hash(self.marks.mask)])  # whose file is written anew
         if self._estimated is None or self._estimated[0] != key:
             mesh, likely = self.model.cad.scene.mesh, self.photo.likely_focal.focal
-            known = Known(self.shape, mesh, points, likely, file.focal_prior)
+            known = Known(self.shape, mesh, likely, self.file.focal_prior)
             self._estimated = key, LiveProblem.of(known, observation).estimate()
         return self._estimated[1]
 
@@ -138,7 +171,7 @@ class Session:
     def warm_up(self) -> None:
         """Compile or load the solvers, and prepare the model, until the session has ``ended``."""
         try:
-            joint = self.shape.is_estimated or any(
+            joint = self.shape.learned is not None or any(
                 not each.file.observation_of(each.marks).is_plain
                 for each in self.photos
                 if each.marks.complete_pairs
@@ -230,7 +263,7 @@ def find_session_files(options: SessionOptions) -> SessionFiles:
 def open_session(options: SessionOptions, files: SessionFiles | None = None) -> Session:
     """Open an annotation session: read photos, model, camera and earlier annotations."""
     files = files or find_session_files(options)
-    shape, (first, path) = ObjectShape.open(options), files[0]
+    shape, (first, path) = ObjectShape.open(options.shape), files[0]
     model = open_model(options.model, path.parent, keypoints=options.keypoints, shape=shape)
     size = first.width, first.height
     given = None if options.camera is None else read_camera(options.camera, size=size)

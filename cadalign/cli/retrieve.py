@@ -22,7 +22,7 @@ from cadalign.cli.common import (
     waiting,
 )
 from cadalign.cli.options import CameraOptions, ManyCommand, named_as_flags
-from cadalign.errors import refuse_unused
+from cadalign.errors import DataError, refuse_unused
 from cadalign.estimation.options import Sigma
 from cadalign.io.documents import read_json
 from cadalign.io.files import keeping, refuse_input, require_utf8
@@ -54,14 +54,14 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
     Each model is posed and stretched. The observation is a file as for `cadalign fit`; its
     keypoints need a semantic_id, or the name that the library has for it, and no xyz. A detector's
     file needs no --model. With --out, writes matches.json, an overlay of each
-    match, its observation and fit, and index.html, which shows them side by side.
+    match and its observation, and matches.png, which shows them side by side.
     Many observations are a run, as of `cadalign fit`: it writes results.parquet and results.csv
     with a row for each, and report.html.
     """
 
     out: Path | None = None
-    """Folder for matches.json, the matches' overlays and index.html; by default none is
-    written. For many observations the run's, by default beside them."""
+    """Folder for matches.json and the matches' pictures; by default none is written. For many
+    observations the run's, by default beside them."""
     workers: int | None = None
     """Threads for one observation, -1 (the default) for one per core. Processes for many, 0 for
     none; by default -1, for few observations 0."""
@@ -100,9 +100,8 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
 
     def _retrieve(self, query: Observation, path: Path, how: ObservationRetrieval) -> int:
         """Retrieve the models of one observation, read of a path; returns the exit code."""
-        from cadalign.retrieval.page import none_text, write_retrieval
+        from cadalign.retrieval.folder import none_text, write_retrieval
 
-        library, _ = how.opened()
         # The table needs no photo, which may have been moved.
         photo = None
         if self.out is not None and query.image is not None:
@@ -120,22 +119,14 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
         if self.out is not None:
             make_folder(self.out)
             with keeping([path, *query.files, self.library]):
-                page = write_retrieval(
-                    self.out,
-                    matches,
-                    query.camera,
-                    query=query,
-                    title=f"Models for {path.name}",
-                    library=f"{self.library.name} ({len(library):,} models)",
-                    image=photo,
-                )
-            say(f"Page: {page}")
+                sheet = write_retrieval(self.out, matches, query, image=photo)
+            say(f"Pictures: {sheet}")
         return 0
 
 
 def _print_table(matches: Sequence[Match]) -> None:
     from cadalign.evaluation.summary import ConsoleTable
-    from cadalign.retrieval.page import score_text
+    from cadalign.retrieval.folder import score_text
 
     labels = ("", "category", "model")
     heads = ("score", "log-lik.", "rms px", "kpts", "s_y", "s_z", "uncertain")
@@ -166,7 +157,7 @@ class LibraryBuild:
     out: Path = Path("library.cadalign")
     """File to write."""
     categories: tuple[str, ...] | None = None
-    """Categories to include; all by default."""
+    """Categories of the data set to include; all by default."""
     split: str | None = None
     """Split of the data set to include, such as train; all models by default."""
     shapenet: Path | None = None
@@ -185,7 +176,8 @@ class LibraryBuild:
         dataset, total = None, len(own)
         if own:
             with named_as_flags(self):
-                refuse_unused(self, {"split", "shapenet"}, "on a folder of own models")
+                unused = {"categories", "split", "shapenet"}
+                refuse_unused(self, unused, "on a folder of own models")
         else:
             dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
             dataset = dataset.subset(categories=self.categories, split=self.split)
@@ -194,9 +186,11 @@ class LibraryBuild:
             refuse_input(self.out)
             make_folder_of(self.out)
             if dataset is None:
-                library = Library.from_folder(self.root, categories=self.categories)
+                library = Library.from_folder(self.root)
             else:
-                library = Library.from_dataset(dataset)
+                library = Library.from_models(dataset)
+            if not len(library):
+                raise DataError("the data set has no such models", where=str(self.root))
             library.save(self.out)
         megabytes = self.out.stat().st_size / 1e6
         say(f"{_describe(library)}\nWritten: {self.out} ({megabytes:.1f} MB)")

@@ -17,10 +17,11 @@ logarithm of tau is Gaussian; its mean and standard deviation are those of the d
 library's models to their nearest ones of another shape, in the category of k, the latter at least
 `LEAST_SPREAD`. So the odds of the second hypothesis are::
 
-    none_prior / (1 - none_prior) * sum over k of score_k E[B_k(tau)]
+    sum over k of score_k E[B_k(tau)]
 
-The sum is over the most likely models, which hold nearly all of it. Four keypoints, through which
-any model passes, decide nothing: the probability is then near ``none_prior``.
+if both are equally likely before an image is seen. The sum is over the most likely models, which
+hold nearly all of it. Four keypoints, through which any model passes, decide nothing: the
+probability is then near 1/2.
 """
 
 from __future__ import annotations
@@ -33,7 +34,6 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.estimation.problems import whitening_of
 from cadalign.retrieval.models import LibraryModel, ModelTable
-from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import CandidateSet, Observed, Ranking, bent, shared_keypoints
 from cadalign.solvers.projection import ray_derivatives
 
@@ -55,11 +55,8 @@ def none_probability(
     candidates: CandidateSet,
     observed: Observed,
     ranking: Ranking,
-    options: RetrievalOptions,
 ) -> float:
     """Compute the probability that the object is none of the models; see the module."""
-    if options.none_prior == 0:
-        return 0.0
     chosen = ranking.candidates[:_MOST_LIKELY].tolist()
     shared = [shared_keypoints(candidates, observed, candidate) for candidate in chosen]
     alike: dict[tuple[str, int], list[int]] = {}  # places of models that are computed together
@@ -78,8 +75,7 @@ def none_probability(
         logs = _log_likelihoods(poses, points, rows, observed, covariances)
         factors[places] = np.logaddexp.reduce(logs[1:] + shares, axis=0) - logs[0]
     relative = ranking.log_likelihoods[:_MOST_LIKELY] - ranking.log_likelihoods[0]
-    odds = np.log(options.none_prior) - np.log1p(-options.none_prior)
-    odds += np.logaddexp.reduce(relative + factors) - np.logaddexp.reduce(relative)
+    odds = np.logaddexp.reduce(relative + factors) - np.logaddexp.reduce(relative)
     return float(np.exp(-np.logaddexp(0.0, -odds)))
 
 
@@ -128,43 +124,14 @@ def _log_likelihoods(
 def deviation_of(table: ModelTable, category: str) -> tuple[float, float]:
     """Mean and standard deviation of log tau: from models of a category to their nearest ones."""
     _, points = table.keypoints_of(category)
-    asked = np.arange(0, len(points), -(-len(points) // _ASKED))
-    gaps = _distances(points, asked)
+    asked = points[:: -(-len(points) // _ASKED)]
+    gaps = np.array([distances(points, each, least=_LEAST_SHARED) for each in asked])
     gaps = np.where(gaps > SAME_SHAPE, gaps, np.inf).min(axis=1)
     nearest = np.minimum(gaps[np.isfinite(gaps)] / np.sqrt(3), _FARTHEST)
     if len(nearest) < 2:
         return _USUAL
     logs = np.log(nearest)
     return float(np.mean(logs)), max(float(np.std(logs)), LEAST_SPREAD)
-
-
-def _distances(points: FloatArray, rows: IntArray) -> FloatArray:
-    """Distances (r, m) of all models from some, as `shape_distance`.
-
-    Keypoints (m, k, 3) are NaN where a model lacks one. Means over those that two models share are
-    products of matrices.
-    """
-    has = ~np.isnan(points[:, :, 0])
-    points, known = np.nan_to_num(points), has.astype(np.float64)
-    of_rows = known[rows]
-    shared = of_rows @ known.T
-    counts = np.maximum(shared, 1.0)
-    square = np.zeros(shared.shape)
-    for axis in range(3):
-        every = known * points[:, :, axis]
-        wanted = of_rows * points[rows, :, axis]
-        mean, mean_wanted = of_rows @ every.T / counts, wanted @ known.T / counts
-        moved = np.maximum(of_rows @ (every**2).T / counts - mean**2, 0.0)
-        product = wanted @ every.T / counts - mean * mean_wanted
-        fixed = wanted**2 @ known.T / counts - mean_wanted**2
-        scale = np.maximum(product, 0.0) / np.where(moved > 0, moved, 1.0)
-        if axis == 0:
-            scale[:] = 1.0
-        square += scale * (scale * moved - 2.0 * product) + fixed
-    extents = [np.linalg.norm(np.ptp(points[row][has[row]], axis=0)) for row in rows.tolist()]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        gaps = np.sqrt(np.maximum(square, 0.0)) / np.array(extents)[:, None]
-    return np.asarray(np.where(shared >= _LEAST_SHARED, gaps, np.nan))
 
 
 def shape_distance(est: LibraryModel, gt: LibraryModel) -> float:
@@ -188,17 +155,25 @@ def shape_distance(est: LibraryModel, gt: LibraryModel) -> float:
     return float(distances(est.xyz[None, mine], gt.xyz[theirs])[0])
 
 
-def distances(est: FloatArray, gt: FloatArray) -> FloatArray:
-    """Compute the shape distance of models' keypoints (m, k, 3) from others (k, 3), (m,) float."""
-    if len(gt) < 2:
-        return np.full(len(est), np.nan)
-    moved = est - est.mean(axis=1, keepdims=True)
-    wanted = gt - gt.mean(axis=0)
-    squares = (moved**2).sum(axis=1)
-    products = (moved * wanted).sum(axis=1)
+def distances(est: FloatArray, gt: FloatArray, *, least: int = 2) -> FloatArray:
+    """Compute the shape distance of models' keypoints (m, k, 3) from others (k, 3), (m,) float.
+
+    Keypoints that a model lacks are NaN: those that two models share are compared. The distance is
+    NaN where these are fewer than ``least``.
+    """
+    # Keypoints, axes, models: sums over few numbers of many models are quick.
+    moved, wanted = np.ascontiguousarray(est.transpose(1, 2, 0)), gt[:, :, None]
+    known = ~np.isnan(moved[:, :1] + wanted[:, :1])
+    counts = known.sum(axis=(0, 1))
+    numbers = np.maximum(counts, 1)
+    moved, wanted = np.where(known, moved, 0.0), np.where(known, wanted, 0.0)
+    moved -= known * (sum(moved) / numbers)
+    wanted -= known * (sum(wanted) / numbers)
+    squares, products = sum(moved**2), sum(moved * wanted)
     # A mirrored or flat model cannot be stretched to the other.
     scale = np.maximum(products, 0.0) / np.where(squares > 0, squares, 1.0)
-    scale[:, 0] = 1.0
-    gaps = moved * scale[:, None] - wanted
-    extent = float(np.linalg.norm(np.ptp(gt, axis=0))) or np.nan
-    return np.asarray(np.sqrt((gaps**2).sum(axis=2).mean(axis=1)) / extent)
+    scale[0] = 1.0
+    gaps = ((moved * scale - wanted) ** 2).sum(axis=1)
+    extent = float(np.linalg.norm(np.ptp(gt[~np.isnan(gt[:, 0])], axis=0))) or np.nan
+    found = np.sqrt(np.ascontiguousarray(gaps.T).sum(axis=1) / numbers) / extent
+    return np.asarray(np.where(counts >= least, found, np.nan))

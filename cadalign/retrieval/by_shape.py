@@ -8,8 +8,8 @@ object that it stands for:
 - its size and place, which one image does not determine;
 - a deviation of each coordinate: ``shape_sigma`` times the extent of the mean shape or, where that
   is 0, the distance of the library's models from their nearest ones;
-- each keypoint of the image that the model lacks, by the probability ``spurious``, and each of the
-  model's that the image lacks, by ``missing_prob``.
+- each keypoint of the image that the model lacks, by the probability `SPURIOUS`, and each of the
+  model's that the image lacks, by `MISSING_PROB`.
 
 Keypoints that a model lacks are filled in with those that the category leads to expect. All models
 are ranked, but those that would reach behind the camera; none is searched for a pose.
@@ -27,7 +27,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets.shapenet import require_category
-from cadalign.errors import DegenerateError, InputError, refuse_unused, require_kind
+from cadalign.errors import DegenerateError, InputError, require_kind
 from cadalign.estimation.align import align
 from cadalign.estimation.estimates import linearise
 from cadalign.estimation.options import FitOptions
@@ -39,7 +39,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import faced, turned_alignment
 from cadalign.retrieval.kernels import MOST_STRETCH
 from cadalign.retrieval.models import ModelTable
-from cadalign.retrieval.options import RetrievalOptions
+from cadalign.retrieval.options import MISSING_PROB, SPURIOUS, RetrievalOptions
 from cadalign.retrieval.ranking import CandidateSet, Observed, Ranking
 from cadalign.shapes.gaussians import Gaussians, Vectors, log_likelihoods
 from cadalign.shapes.model import ShapeModel
@@ -74,10 +74,8 @@ def category_to_rank(shape: ShapeModel, options: RetrievalOptions, table: ModelT
     Raises
     ------
     InputError
-        If it is not in the library, the shape model has no semantic ids, or an option has no
-        effect.
+        If it is not in the library, or the shape model has no semantic ids.
     """
-    refuse_unused(options, ("stretch_sigma", "none_prior"), "in a ranking by shape")
     require_kind(shape, ShapeModel, "shape")
     if any(isinstance(label, str) for label in shape.ids):
         what, fix = "its keypoints have names", "learn it from models with semantic ids"
@@ -159,9 +157,9 @@ def _rank_models(
     logs = log_likelihoods(vectors, _widened(likely, estimate, deviation))
     seen = np.array([label in result.views[0].ids for label in result.ids])
     has = known.has[models]
-    logs = logs + (~has[:, seen]).sum(axis=1) * np.log(options.spurious)
-    logs += has[:, ~seen].sum(axis=1) * np.log(options.missing_prob)
-    logs += has[:, seen].sum(axis=1) * np.log1p(-options.missing_prob)
+    logs = logs + (~has[:, seen]).sum(axis=1) * np.log(SPURIOUS)
+    logs += has[:, ~seen].sum(axis=1) * np.log(MISSING_PROB)
+    logs += has[:, seen].sum(axis=1) * np.log1p(-MISSING_PROB)
     axes, centres = options.fitting.stretched_axes, known.centres[models]
     scales = _scales(squares, products, axes)
     pose = turned_alignment(result.alignment, turn)

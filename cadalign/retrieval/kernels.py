@@ -11,14 +11,8 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import inlined, kernel
-from cadalign.solvers.alignment import (
-    Objective,
-    evaluate_alignment,
-    evaluate_cost,
-    room_for,
-    solve_damped,
-)
-from cadalign.solvers.constants import OK, POSE_SIZE, UNKNOWNS, ScalePrior
+from cadalign.solvers.alignment import Objective, evaluate_cost
+from cadalign.solvers.constants import OK, POSE_SIZE, ScalePrior
 from cadalign.solvers.evidence import KeypointEvidence, take_keypoints
 from cadalign.solvers.linalg import cholesky, mirror_upper
 from cadalign.solvers.linear import aepnp_kernel
@@ -39,11 +33,6 @@ _GRID_ROTATIONS = 48
 _HOPELESS = 2.0
 _HOPELESS_EXCESS = 20.0
 _SAME_CHORD = 1e-3
-# A start is also given up if its linearised cost, from which the quadratic model's decrease is
-# subtracted so many times, exceeds the ceiling by this factor. What candidates below the ceiling
-# lose by that is 2e-7 of the best likelihood at most.
-_OPTIMISM = 2.0
-_OUT_OF_REACH = 5.0
 
 
 class Query(NamedTuple):
@@ -93,7 +82,6 @@ def search_all(
     query: Query,
     candidates: Candidates,
     chosen: IntArray,
-    ceilings: FloatArray,
     subsets: int,
     refined: int,
     iterations: int,
@@ -102,8 +90,7 @@ def search_all(
 
     The linear solver proposes one pose, the minimal solver several for each of ``subsets``
     4-subsets of the keypoints; the best ``refined`` poses are refined in at most ``iterations``
-    steps. Costs above a candidate's ceiling (m,) are of no interest: poses from which it is out
-    of reach after the first steps are given up. The cost is infinite if no pose was found.
+    steps. The cost is infinite if no pose was found.
     """
     poses = np.zeros((chosen.shape[0], POSE_SIZE))
     costs = np.full(chosen.shape[0], np.inf)
@@ -123,7 +110,7 @@ def search_all(
             shared.points[i] -= mean
         objective = Objective(query.free, shared, ScalePrior(query.prior_weight, 0.0))
         effort = subsets, refined, iterations
-        costs[m] = _search(objective, ceilings[m], effort, poses[m])
+        costs[m] = _search(objective, effort, poses[m])
         uncenter(poses[m], mean, 1.0)
     return poses, costs
 
@@ -153,12 +140,7 @@ def _gather(
 
 
 @kernel
-def _search(
-    objective: Objective,
-    ceiling: float,
-    effort: tuple[int, int, int],
-    pose: FloatArray,
-) -> float:
+def _search(objective: Objective, effort: tuple[int, int, int], pose: FloatArray) -> float:
     """Write the best pose found; returns its cost, or infinity."""
     subsets, refined, iterations = effort
     starts = np.empty((subsets * MAX_SOLUTIONS + 1 + _GRID_ROTATIONS, POSE_SIZE))
@@ -175,11 +157,7 @@ def _search(
         best = np.argmin(costs)
         if not costs[best] < min(np.inf, _HOPELESS * least + _HOPELESS_EXCESS):
             break
-        expected = _linearised_cost(objective, probed[best], costs[best])
-        out_of_reach = expected > _OUT_OF_REACH * ceiling
         costs[best] = np.inf
-        if out_of_reach:
-            continue
         square = ((pose[:9] - probed[best, :9]) ** 2).sum()
         if least < np.inf and square < _SAME_CHORD * _SAME_CHORD:
             continue
@@ -189,18 +167,6 @@ def _search(
             least = cost
             pose[:] = probed[best]
     return least
-
-
-@kernel
-def _linearised_cost(objective: Objective, pose: FloatArray, cost: float) -> float:
-    """Estimate the least cost that a refinement of the pose comes to, from below.
-
-    The decrease of the cost on its quadratic model counts `_OPTIMISM` times.
-    """
-    equations = room_for(UNKNOWNS)
-    evaluate_alignment(objective, pose, equations)
-    decrease = solve_damped(equations, UNKNOWNS, 0.0, np.empty(UNKNOWNS))
-    return cost - _OPTIMISM * decrease if decrease == decrease else 0.0
 
 
 @kernel

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from bisect import bisect_left
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,25 +14,16 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import IntArray
-from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.datasets.image_keypoints import plain_name, some_of
 from cadalign.datasets.model_keypoints import SUFFIX, ModelKeypoint, ModelKeypoints
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
-from cadalign.io.files import as_path, checksum, listed
+from cadalign.io.files import as_path, listed
 from cadalign.io.kinds import MESH_ENDINGS
 from cadalign.retrieval.absence import none_probability
 from cadalign.retrieval.by_shape import category_to_rank, rank_by_shape
 from cadalign.retrieval.match import Match
-from cadalign.retrieval.models import (
-    SEAL,
-    LibraryModel,
-    ModelKey,
-    ModelTable,
-    checked_key,
-    read_library,
-    table_of,
-)
+from cadalign.retrieval.models import LibraryModel, ModelKey, ModelTable, checked_key
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import gather_candidates, make_matches, observe, rank
 from cadalign.shapes.model import ShapeModel
@@ -45,13 +36,8 @@ class Library(ModelTable):
     """Annotated CAD models to retrieve from: keypoints, bounds and mesh paths.
 
     The models are sorted by category and id, so that results do not depend on their order.
-    `Library.from_dataset` and `Library.from_models` make a library, `Library.open` maps a saved one
-    into memory.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-        The models.
+    `Library.from_models` and `Library.from_folder` make a library, `Library.open` reads a saved
+    one.
 
     Examples
     --------
@@ -73,51 +59,7 @@ class Library(ModelTable):
     """
 
     @classmethod
-    def from_models(cls, models: Iterable[LibraryModel | AnnotatedModel]) -> Library:
-        """Make a library; raises InputError if two models have the same category and id.
-
-        Models of a data set are read, with the bounds of their meshes.
-        """
-        return cls(table_of(models))
-
-    @classmethod
-    def from_dataset(
-        cls,
-        dataset: KeypointNet,
-        *,
-        categories: Iterable[str] | None = None,
-    ) -> Library:
-        """Make a library of a data set's annotated models.
-
-        Meshes are read for their bounds. If a mesh is missing or cannot be read, the keypoints'
-        bounds are used, with a warning (logger "cadalign"). Malformed models are left out, as by
-        the data set itself.
-
-        Parameters
-        ----------
-        dataset : KeypointNet
-        categories : iterable of str, optional
-            Names or synset ids; by default all.
-
-        Raises
-        ------
-        InputError
-            If a category is unknown.
-        DataError
-            If there are no models.
-        """
-        models = list(map(LibraryModel.of_annotated, dataset.subset(categories=categories)))
-        if not models:
-            raise DataError("the data set has no such models", where=str(dataset.root))
-        return cls.from_models(models)
-
-    @classmethod
-    def from_folder(
-        cls,
-        folder: str | os.PathLike[str],
-        *,
-        categories: Iterable[str] | None = None,
-    ) -> Library:
+    def from_folder(cls, folder: str | os.PathLike[str]) -> Library:
         """Make a library of own models: a folder of files ``NAME.keypoints.json`` and meshes.
 
         The folder that a file lies in is its category, NAME the model's id. The mesh is the one
@@ -128,8 +70,6 @@ class Library(ModelTable):
         ----------
         folder : str or path-like
             It, and those below it, are looked through.
-        categories : iterable of str, optional
-            By default all.
 
         Raises
         ------
@@ -142,23 +82,8 @@ class Library(ModelTable):
         >>> library = Library.from_folder("chairs")  # doctest: +SKIP
         >>> library.retrieve(points_2d, ["seat", "back"], camera)  # doctest: +SKIP
         """
-        own = _read_own_models(as_path(folder), categories)
-        return cls(table_of(*own))
-
-    @classmethod
-    def open(cls, path: str | os.PathLike[str]) -> Library:
-        """Map a saved library into memory.
-
-        Raises
-        ------
-        DataError
-            If the file is missing, truncated, damaged, of another version, or of another format.
-        """
-        return cls(read_library(path))
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the library to a file atomically; raises DataError on failure."""
-        SEAL.write(as_path(path), self.payload())
+        models, names = _read_own_models(as_path(folder))
+        return cls.from_models(models, names=names)
 
     def __iter__(self) -> Iterator[LibraryModel]:
         return map(self.model, range(len(self)))
@@ -205,12 +130,7 @@ class Library(ModelTable):
     @property
     def with_mesh(self) -> int:
         """Number of models that have a mesh."""
-        return len(self) - int(self.table["mesh"].null_count)
-
-    @property
-    def fingerprint(self) -> str:
-        """Hash of the library's content, as text."""
-        return checksum(self.payload()).hex()
+        return len(self) - self.meshes.count(None)
 
     def retrieve(
         self,
@@ -251,8 +171,7 @@ class Library(ModelTable):
             Number of threads; -1 for one per core.
         **options
             Fields of `cadalign.retrieval.options.RetrievalOptions`, which describes them: top,
-            category, sigma, shape_sigma, loss, loss_scale, stretch, stretch_sigma, missing_prob,
-            spurious, none_prior.
+            category, sigma, shape_sigma, loss, loss_scale, stretch.
 
         Returns
         -------
@@ -282,7 +201,7 @@ class Library(ModelTable):
             observed = observe(points_2d, ids, camera, chosen)
             candidates = gather_candidates(self, observed, chosen, exclude, workers)
             ranking = rank(candidates, observed, chosen, workers)
-            absent = none_probability(self, candidates, observed, ranking, chosen)
+            absent = none_probability(self, candidates, observed, ranking)
         else:
             category = category_to_rank(shape, chosen, self)
             # The deviation of shapes is no noise of the keypoints here.
@@ -298,23 +217,18 @@ def keypoint_files(folder: Path) -> list[Path]:
     return listed(folder, f"**/*{SUFFIX}")
 
 
-def _read_own_models(
-    folder: Path, categories: Iterable[str] | None
-) -> tuple[list[LibraryModel], dict[str, int]]:
+def _read_own_models(folder: Path) -> tuple[list[LibraryModel], dict[str, int]]:
     """A folder's models, and semantic ids by name; raises as `Library.from_folder`."""
-    chosen = None if categories is None else set(categories)
     files = keypoint_files(folder)
-    files = [path for path in files if chosen is None or path.absolute().parent.name in chosen]
     if not files:
-        what = "no model with keypoints" + ("" if chosen is None else " of these categories")
-        raise DataError(what, where=str(folder), fix=_FIX)
+        raise DataError("no model with keypoints", where=str(folder), fix=_FIX)
     read = [(path, ModelKeypoints.load(path)) for path in files]
     names = _numbers(read)
     models = [_model(path, found, names) for path, found in read]
     meshes = [path for path in listed(folder, "**/*") if path.suffix.lower() in MESH_ENDINGS]
     used = {model.mesh_path for model in models}
     unused = [path for path in meshes if path.absolute() not in used]
-    if unused and chosen is None:
+    if unused:
         said = "%d meshes have no keypoints and are left out, the first is %s; %s"
         logger.warning(said, len(unused), unused[0], _FIX)
     return models, names

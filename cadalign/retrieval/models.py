@@ -1,8 +1,7 @@
 """Models of a library: `LibraryModel`, the `ModelTable` of all, and its file.
 
-The file is sealed (see `cadalign.io.files`) about an Arrow IPC file of the columns of `SCHEMA`.
-Opening maps it into memory and compares the checksum, which reads the file once: 50,000 models of
-10 keypoints are 30 MB and take some 0.1 s. Processes that open the same file share its memory.
+The file is a sealed MessagePack document (see `cadalign.io.files`) of the table's fields, arrays
+as little-endian numbers: 50,000 models of 10 keypoints are 30 MB and open in some 0.1 s.
 """
 
 from __future__ import annotations
@@ -11,47 +10,33 @@ import logging
 import os
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from itertools import pairwise
-from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
-import pyarrow as pa
-import pyarrow.compute as pc
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_only
 from cadalign.datasets import AnnotatedModel, load_mesh
 from cadalign.errors import CadalignError, InputError, quote
 from cadalign.geometry.alignment import extent
-from cadalign.io.files import Seal, as_path, open_input
+from cadalign.io.documents import Document
+from cadalign.io.files import Seal, as_path, checksum, read_bytes
 
 logger = logging.getLogger("cadalign")
 ModelKey = tuple[str, str]
 """Category name and model id."""
 
 _LARGEST = 1e50  # coordinate
-_NAMES = b"names"  # of the schema's metadata
-_MOST_BYTES = 1 << 40  # mapped, not read; a million models are 0.8 GB
+_MOST_BYTES = 1 << 33  # of ten million models
 SEAL = Seal(
     magic=b"cadalign library",
-    version=1,
+    version=2,
     noun="library file",
     fix="build it with: cadalign library build",
-)
-SCHEMA = pa.schema(
-    [
-        ("category", pa.string()),
-        ("model_id", pa.string()),
-        ("mesh", pa.string()),
-        ("bounds", pa.list_(pa.float64(), 6)),
-        ("keypoints", pa.list_(pa.list_(pa.float64(), 3))),
-        ("semantic_ids", pa.list_(pa.int64())),
-    ]
 )
 
 
@@ -137,88 +122,142 @@ def checked_key(key: object, where: str) -> ModelKey:
     raise InputError(what, where=where, fix='give pairs, as ("chair", model_id)')
 
 
-def table_of(
-    models: Iterable[LibraryModel | AnnotatedModel], names: Mapping[str, int] | None = None
-) -> pa.Table:
-    """Make the table of models, sorted; ``names`` are semantic ids by the keypoints' names.
+class _Stored(Document):
+    """The content of a library's file."""
 
-    Raises InputError if two models have the same category and id.
-    """
-    key_of = itemgetter("category", "model_id")
-    rows = sorted(map(_row_of, models), key=key_of)
-    for first, second in pairwise(rows):
-        if key_of(first) == key_of(second):
-            what = f"the model {first['model_id']!r} of {first['category']!r} occurs twice"
-            fix = "give every model of a category its own id"
-            raise InputError(what, where="library", fix=fix)
-    table = pa.Table.from_pylist(rows, schema=SCHEMA)
-    stored = msgspec.json.encode(names, order="deterministic")
-    return table if names is None else table.replace_schema_metadata({_NAMES: stored})
+    keys: list[ModelKey]
+    meshes: list[str | None]
+    names: dict[str, int]
+    offsets: bytes
+    ids: bytes
+    xyz: bytes
+    bounds: bytes
 
 
-def _row_of(model: object) -> dict[str, Any]:
-    """Convert a model to a row of the table, its keypoints in the order of their ids."""
-    if isinstance(model, AnnotatedModel):
-        model = LibraryModel.of_annotated(model)
-    if not isinstance(model, LibraryModel):
-        what = f"expected a LibraryModel or a data set's model, got {type(model).__name__}"
-        raise InputError(what, where="models", fix="give the models of `cadalign.datasets`")
-    order = np.argsort(model.ids)
-    return {
-        "category": model.category,
-        "model_id": model.model_id,
-        "mesh": None if model.mesh_path is None else str(model.mesh_path),
-        "bounds": model.bounds.ravel().tolist(),
-        "keypoints": model.xyz[order].tolist(),
-        "semantic_ids": model.ids[order].tolist(),
-    }
-
-
+@dataclass(frozen=True, eq=False)
 class ModelTable:
-    """All models of a library, sorted by category and id: arrays on an Arrow table of `SCHEMA`."""
+    """All models of a library, sorted by category and id, in arrays."""
 
-    def __init__(self, table: pa.Table) -> None:
-        self.table = table.combine_chunks()
+    keys: tuple[ModelKey, ...]
+    """Category and model id of every model."""
+    meshes: tuple[str | None, ...]
+    """Paths of the meshes, None where there is none."""
+    names: Mapping[str, int]
+    """Semantic ids by the keypoints' names; empty where they have none."""
+    offsets: IntArray
+    """Start of each model's keypoints, and the end of the last, (n + 1,) int."""
+    ids: IntArray
+    """Semantic ids of `xyz`, (k,) int."""
+    xyz: FloatArray
+    """Keypoints of all models, each model's in the order of their ids, (k, 3) float."""
+    bounds: FloatArray
+    """Lowest and highest coordinates of every model, (n, 2, 3) float."""
+
+    def __post_init__(self) -> None:
+        for array in (self.offsets, self.ids, self.xyz, self.bounds):
+            array.flags.writeable = False
+
+    @classmethod
+    def from_models(
+        cls,
+        models: Iterable[LibraryModel | AnnotatedModel],
+        *,
+        names: Mapping[str, int] | None = None,
+    ) -> Self:
+        """Make a library of models, or of a data set, of which meshes are read for their bounds.
+
+        If a mesh cannot be read, the keypoints' bounds are used, with a warning (logger
+        "cadalign").
+
+        Parameters
+        ----------
+        models : iterable of LibraryModel or AnnotatedModel
+        names : mapping of str to int, optional
+            Semantic ids by the keypoints' names.
+
+        Raises
+        ------
+        InputError
+            If two models have the same category and id.
+        """
+        every = sorted(map(_library_model, models), key=lambda model: model.key)
+        for first, second in pairwise(every):
+            if first.key == second.key:
+                what = f"the model {first.model_id!r} of {first.category!r} occurs twice"
+                fix = "give every model of a category its own id"
+                raise InputError(what, where="library", fix=fix)
+        orders = [np.argsort(model.ids) for model in every]
+        pairs = list(zip(every, orders, strict=True))
+        return cls(
+            tuple(model.key for model in every),
+            tuple(None if each.mesh_path is None else str(each.mesh_path) for each in every),
+            dict(names or {}),
+            np.cumsum([0, *map(len, orders)], dtype=np.int64),
+            np.concatenate([np.empty(0, np.int64), *(m.ids[order] for m, order in pairs)]),
+            np.concatenate([np.empty((0, 3)), *(m.xyz[order] for m, order in pairs)]),
+            np.array([model.bounds for model in every]).reshape(-1, 2, 3),
+        )
+
+    @classmethod
+    def open(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a saved library.
+
+        Raises
+        ------
+        DataError
+            If the file is missing, truncated, damaged, of another version, or of another format.
+        """
+        content = read_bytes(as_path(path), most=_MOST_BYTES)
+        try:
+            stored = msgspec.msgpack.decode(SEAL.unwrap(content, str(path)), type=_Stored)
+            table = cls(
+                tuple(stored.keys),
+                tuple(stored.meshes),
+                stored.names,
+                np.frombuffer(stored.offsets, dtype="<i8"),
+                np.frombuffer(stored.ids, dtype="<i8"),
+                np.frombuffer(stored.xyz, dtype="<f8").reshape(-1, 3),
+                np.frombuffer(stored.bounds, dtype="<f8").reshape(-1, 2, 3),
+            )
+            table._check()
+        except (ValueError, msgspec.MsgspecError) as error:
+            raise SEAL.error(f"is invalid: {str(error)[:200]}", str(path)) from None
+        return table
+
+    def _check(self) -> None:
+        """Refuse arrays whose indices could lead out of them, whatever the file's checksum."""
+        count, starts = len(self.keys), self.offsets
+        if not len(self.meshes) == len(self.bounds) == len(starts) - 1 == count:
+            raise ValueError("its models have too few or too many values")
+        is_ascending = starts[0] == 0 and bool((np.diff(starts) >= 0).all())
+        if not (is_ascending and starts[-1] == len(self.ids) == len(self.xyz)):
+            raise ValueError("keypoints and semantic ids differ in number")
+        if not all((np.abs(each) < _LARGEST).all() for each in (self.xyz, self.bounds)):
+            raise ValueError("a coordinate is NaN, infinite or so large that its powers are")
+        if list(self.keys) != sorted(set(self.keys)):
+            raise ValueError("models are not sorted by category and id")
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the library to a file atomically; raises DataError on failure."""
+        SEAL.write(as_path(path), self._payload)
+
+    @property
+    def fingerprint(self) -> str:
+        """Hash of the library's content, as text."""
+        return checksum(self._payload).hex()
+
+    @property
+    def _payload(self) -> bytes:
+        content = {field.name: getattr(self, field.name) for field in fields(self)}
+        return msgspec.msgpack.encode(content, enc_hook=_little_endian, order="deterministic")
 
     def __len__(self) -> int:
-        return len(self.table)
-
-    @cached_property
-    def keys(self) -> tuple[ModelKey, ...]:
-        """Category and model id of every model, sorted."""
-        columns = (self.table[name].to_pylist() for name in ("category", "model_id"))
-        return tuple(zip(*columns, strict=True))
+        return len(self.keys)
 
     @cached_property
     def categories(self) -> tuple[str, ...]:
         """Names of the categories, sorted."""
-        return tuple(sorted(self.table["category"].unique().to_pylist()))
-
-    @cached_property
-    def offsets(self) -> IntArray:
-        """Start of each model's keypoints, and the end of the last, (n + 1,) int."""
-        return _offsets(self._column("semantic_ids"))
-
-    @cached_property
-    def xyz(self) -> FloatArray:
-        """Keypoints of all models, each model's in the order of their ids, (k, 3) float."""
-        return _numbers(self._column("keypoints").flatten().flatten()).reshape(-1, 3)
-
-    @cached_property
-    def ids(self) -> IntArray:
-        """Semantic ids of `xyz`, (k,) int."""
-        return _numbers(self._column("semantic_ids").flatten())
-
-    @cached_property
-    def bounds(self) -> FloatArray:
-        """Lowest and highest coordinates of every model, (n, 2, 3) float."""
-        return _numbers(self._column("bounds").flatten()).reshape(-1, 2, 3)
-
-    @cached_property
-    def names(self) -> dict[str, int]:
-        """Semantic ids by the keypoints' names; empty where they have none."""
-        stored = (self.table.schema.metadata or {}).get(_NAMES, b"{}")
-        return msgspec.json.decode(stored, type=dict[str, int])
+        return tuple(sorted({category for category, _ in self.keys}))
 
     def known_ids(self, category: str | None = None) -> IntArray:
         """Semantic ids of a category's models, or of all, ascending."""
@@ -246,65 +285,20 @@ class ModelTable:
     def model(self, row: int) -> LibraryModel:
         """Make the model of a row."""
         own = slice(int(self.offsets[row]), int(self.offsets[row + 1]))
-        path = self.table["mesh"][row].as_py()
-        category, model_id = self.keys[row]
-        xyz, ids, bounds = self.xyz[own], self.ids[own], self.bounds[row]
-        return LibraryModel(category, model_id, xyz, ids, bounds, path and Path(path))
-
-    def payload(self) -> pa.Buffer:
-        """All content, as the file of a library has it."""
-        sink = pa.BufferOutputStream()
-        with pa.ipc.new_file(sink, self.table.schema) as writer:
-            writer.write_table(self.table)
-        return sink.getvalue()
-
-    def _column(self, name: str) -> Any:
-        column = self.table[name]
-        return column.chunk(0) if column.num_chunks else pa.array([], type=column.type)
+        mesh, xyz, ids = self.meshes[row], self.xyz[own], self.ids[own]
+        path = None if mesh is None else Path(mesh)
+        return LibraryModel(*self.keys[row], xyz, ids, self.bounds[row], path)
 
 
-def _numbers(array: Any) -> npt.NDArray[Any]:
-    """View an Arrow array as a read-only NumPy array, without a copy."""
-    numbers = array.to_numpy(zero_copy_only=True)
-    numbers.flags.writeable = False
-    return np.asarray(numbers)
+def _library_model(model: object) -> LibraryModel:
+    if isinstance(model, AnnotatedModel):
+        return LibraryModel.of_annotated(model)
+    if not isinstance(model, LibraryModel):
+        what = f"expected a LibraryModel or a data set's model, got {type(model).__name__}"
+        raise InputError(what, where="models", fix="give the models of `cadalign.datasets`")
+    return model
 
 
-def _offsets(array: Any) -> IntArray:
-    offsets = array.offsets.to_numpy().astype(np.int64)
-    offsets -= offsets[0] if len(offsets) else 0
-    offsets.flags.writeable = False
-    return np.asarray(offsets)
-
-
-def read_library(path: str | os.PathLike[str]) -> pa.Table:
-    """Map a library's file into memory and check it."""
-    file, where = as_path(path), str(path)
-    with open_input(file, most=_MOST_BYTES), pa.memory_map(where) as source:
-        content = source.read_buffer()
-    payload = SEAL.unwrap(content, where)
-    try:
-        with pa.ipc.open_file(pa.BufferReader(pa.py_buffer(payload))) as reader:
-            table = reader.read_all()
-        _check_table(table)
-        _ = ModelTable(table).names
-    except (pa.ArrowException, OSError, ValueError, msgspec.MsgspecError) as error:
-        raise SEAL.error(f"is invalid: {str(error)[:200]}", where) from None
-    return table
-
-
-def _check_table(table: pa.Table) -> None:
-    """Refuse a table whose indices could lead out of its memory, whatever its checksum."""
-    if not table.schema.equals(SCHEMA):
-        raise ValueError("it has other columns")
-    table.validate(full=True)
-    if any(table[name].null_count for name in table.column_names if name != "mesh"):
-        raise ValueError("a value is missing")
-    found = ModelTable(table)  # of which a missing number cannot be viewed
-    points, ids = (pc.list_value_length(table[name]) for name in ("keypoints", "semantic_ids"))
-    if len(found.xyz) != len(found.ids) or not points.equals(ids):
-        raise ValueError("keypoints and semantic_ids differ in length")
-    if not all((np.abs(each) < _LARGEST).all() for each in (found.xyz, found.bounds)):
-        raise ValueError("a coordinate is NaN, infinite or so large that its powers are")
-    if list(found.keys) != sorted(set(found.keys)):
-        raise ValueError("models are not sorted by category and id")
+def _little_endian(array: Any) -> bytes:
+    data: bytes = array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()
+    return data

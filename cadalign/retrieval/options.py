@@ -3,23 +3,21 @@
 A model of the library is scored by the likelihood of everything in the image, under these
 assumptions:
 
-- A keypoint of the object is marked in the image with the probability ``1 - missing_prob``,
-  independently of the others; it may be hidden, or overlooked.
+- A keypoint of the object is marked in the image with the probability 1/2, independently of the
+  others; it may be hidden, or overlooked.
 - A marked keypoint lies at the projection of the model's keypoint, with Gaussian noise of the
   standard deviation ``sigma``, to which ``shape_sigma`` adds the differences of shape. A robust
   loss takes the place of the squared error.
-- An image shows ``spurious`` keypoints, on average, that the object does not have, anywhere in the
-  image with equal density: each costs ``log(spurious / area)``.
+- An image shows .01 keypoints, on average, that the object does not have, anywhere in the image
+  with equal density.
 - The logarithms of the stretches along y and z are Gaussian about zero, with the standard deviation
-  ``stretch_sigma``, within 1/4 and 4.
+  .4, within 1/4 and 4.
 
 So with N the number of shared keypoints, their errors r_i whitened by their covariances C_i, m the
 number of the model's keypoints that the image lacks and e of the image's that the model lacks::
 
-    log-likelihood = sum over the shared [log(1 - missing_prob) - log(2 pi) - log det(C_i) / 2
-                                          - |r_i|^2 / 2]
-                     + m log(missing_prob) + e log(spurious / area)
-                     + log density of the stretches
+    log-likelihood = sum over the shared [log(1/2) - log(2 pi) - log det(C_i) / 2 - |r_i|^2 / 2]
+                     + m log(1/2) + e log(.01 / area) + log density of the stretches
 
 at the pose and stretch that maximise it. A model that lacks keypoints of the image has fewer errors
 to explain, but each of them costs some 15 units; each keypoint of a model that the image does not
@@ -33,6 +31,13 @@ from dataclasses import dataclass
 
 from cadalign.errors import InputError
 from cadalign.estimation.options import FitOptions, Sigma
+
+MISSING_PROB = 0.5
+"""Probability that a keypoint of the object is not marked in the image."""
+SPURIOUS = 0.01
+"""Average number of keypoints in an image that the object does not have."""
+STRETCH_SIGMA = 0.4
+"""Standard deviation of a Gaussian prior on the logarithm of each stretch."""
 
 
 @dataclass(frozen=True)
@@ -57,14 +62,6 @@ class RetrievalOptions:
     shape_sigma: float = 0.0
     """Distance of a model's keypoints from the object's, as a share of the extent of the keypoints
     in the image: above 0, say 0.03, for libraries with only similar models."""
-    stretch_sigma: float = 0.4
-    """Standard deviation of a Gaussian prior on the logarithm of each stretch."""
-    missing_prob: float = 0.5
-    """Probability that a keypoint of the object is not marked in the image."""
-    spurious: float = 0.01
-    """Average number of keypoints in an image that the object does not have."""
-    none_prior: float = 0.5
-    """Probability, before an image is seen, that the object is none of the library's models."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.top, int) or self.top < 1:
@@ -72,15 +69,8 @@ class RetrievalOptions:
         if self.sigma is None:
             fix = "give pixels, and shape_sigma where shapes differ"
             raise InputError("the noise must be known to compare models", where="sigma", fix=fix)
-        is_share = 1e-9 <= self.missing_prob <= 1 - 1e-9
-        for name, is_valid, rule in (
-            ("shape_sigma", 0 <= self.shape_sigma < math.inf, ">= 0"),
-            ("missing_prob", is_share, "between 0 and 1, both excluded"),
-            ("spurious", 1e-9 <= self.spurious < math.inf, "> 0"),
-            ("none_prior", 0 <= self.none_prior < 1, "between 0 and 1, the latter excluded"),
-        ):
-            if not is_valid:
-                raise InputError(f"must be {rule}, not {getattr(self, name)}", where=name)
+        if not 0 <= self.shape_sigma < math.inf:
+            raise InputError(f"must be >= 0, not {self.shape_sigma}", where="shape_sigma")
         _ = self.fitting  # checks the options that it shares with a fit
 
     @property
@@ -90,5 +80,5 @@ class RetrievalOptions:
             loss=self.loss,
             loss_scale=self.loss_scale,
             stretch=self.stretch,
-            stretch_sigma=self.stretch_sigma,
+            stretch_sigma=STRETCH_SIGMA,
         )

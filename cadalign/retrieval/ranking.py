@@ -5,8 +5,7 @@ A candidate is a model that shares enough keypoints with the image. The lower bo
 batches, in the order of their bounds, until the bounds of all others lie 20 below the best
 log-likelihood found. So every match with a score above 1e-8 has the rank of an exhaustive search.
 If these do not fill the top list, up to 768 more candidates are searched, so that in a library of
-that size the whole list is exact. A candidate's search ends early once its pose is out of reach of
-a log-likelihood that would count.
+that size the whole list is exact.
 
 Candidates are searched independently: the result does not depend on the order of the library or on
 the number of threads.
@@ -35,7 +34,12 @@ from cadalign.geometry.camera import Camera, faced, turned_alignment
 from cadalign.retrieval.kernels import LEAST_SHARED, Candidates, Query, bound_all, search_all
 from cadalign.retrieval.match import Match, posterior_by_shape, posterior_of_keypoints
 from cadalign.retrieval.models import ModelKey, ModelTable, check_semantic_ids, checked_key
-from cadalign.retrieval.options import RetrievalOptions
+from cadalign.retrieval.options import (
+    MISSING_PROB,
+    SPURIOUS,
+    STRETCH_SIGMA,
+    RetrievalOptions,
+)
 from cadalign.solvers.constants import CAUCHY, HUBER, POSE_SIZE
 
 _BOUNDED_AT_ONCE = 1024  # candidates that a thread bounds at a time
@@ -105,8 +109,8 @@ def observe(
     facing = faced(camera, pixels)
     rays = np.require(rays_of(pixels, facing), np.float64, ["C", "W"])
     fitting = options.fitting
-    density = np.log1p(-options.missing_prob) - np.log(2 * np.pi)
-    off = np.log(options.spurious / (camera.width * camera.height))
+    density = np.log1p(-MISSING_PROB) - np.log(2 * np.pi)
+    off = np.log(SPURIOUS / (camera.width * camera.height))
     query = Query(
         ids=ids,
         rays=rays,
@@ -188,9 +192,9 @@ def gather_candidates(
     # The losses are concave in the squares and 0 at 0, so that of their sum is at most their sum.
     bounds = bent(bounds, query.loss, query.loss_scale)
     counts = spans[:, 1] - spans[:, 0]
-    base = gains + observed.spurious + (counts - shared) * np.log(options.missing_prob)
+    base = gains + observed.spurious + (counts - shared) * np.log(MISSING_PROB)
     axes = len(options.fitting.stretched_axes)  # the prior's log density at no stretch:
-    base = base - axes * (0.5 * np.log(2 * np.pi) + np.log(options.stretch_sigma))
+    base = base - axes * (0.5 * np.log(2 * np.pi) + np.log(STRETCH_SIGMA))
     kept_keypoints = candidates._replace(spans=spans[kept])
     return CandidateSet(kept_keypoints, chosen[kept], base[kept], bounds[kept])
 
@@ -204,7 +208,7 @@ def rank(
         found = _SearchState(candidates, observed, pool)
         found.search_in_order(effort, options.top)
         last = found.ranking().candidates[: 2 * options.top]
-        found.search(last, _FINAL_EFFORT, floor=-np.inf)
+        found.search(last, _FINAL_EFFORT)
     return found.ranking()
 
 
@@ -219,16 +223,14 @@ class _SearchState:
         self._poses = np.empty((len(candidates.base), POSE_SIZE))
         self._reached = np.full(len(candidates.base), -np.inf)
 
-    def search(self, chosen: IntArray, effort: tuple[int, int, int], *, floor: float) -> None:
-        """Search candidates for poses above a log-likelihood; a known better pose is kept."""
+    def search(self, chosen: IntArray, effort: tuple[int, int, int]) -> None:
+        """Search candidates for poses; a known better pose is kept."""
         if not len(chosen):
             return
-        ceilings = 2.0 * (self._candidates.base[chosen] - floor)
 
         def piece(start: int) -> tuple[FloatArray, FloatArray]:
             own = slice(start, start + _SEARCHED_AT_ONCE)
-            known = self._query, self._candidates.keypoints
-            return search_all(*known, chosen[own], ceilings[own], *effort)
+            return search_all(self._query, self._candidates.keypoints, chosen[own], *effort)
 
         parts = list(self._pool.map(piece, range(0, len(chosen), _SEARCHED_AT_ONCE)))
         poses, costs = map(np.concatenate, zip(*parts, strict=True))
@@ -249,15 +251,14 @@ class _SearchState:
             batch = batch[limits[batch] >= self._best - _NEGLIGIBLE]
             if not len(batch):
                 break
-            self.search(batch, effort, floor=min(self._best - _NEGLIGIBLE, self._last_of(top)))
+            self.search(batch, effort)
             done += len(batch)
             size = min(2 * size, _LARGEST_BATCH)
         rest = order[done:]
         rest = rest[np.argsort(-guesses[rest], kind="stable")]
         for start in range(0, min(_TO_FILL, len(rest)), _FILL_BATCH):
             batch = rest[start : start + _FILL_BATCH]
-            last = self._last_of(top)
-            self.search(batch[limits[batch] >= last], effort, floor=last)
+            self.search(batch[limits[batch] >= self._last_of(top)], effort)
 
     def _last_of(self, top: int) -> float:
         """Log-likelihood of the last model of the top list; minus infinity if it is not full."""

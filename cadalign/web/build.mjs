@@ -14,7 +14,6 @@ await mkdir(out, { recursive: true });
 for (const [page, entry] of [
   ["report", "main.js"],
   ["annotate", "main.js"],
-  ["retrieval", "main.css"],
 ]) {
   for (const name of await readdir(path.join(here, page))) {
     if (name.endsWith(".html")) await copyFile(path.join(here, page, name), path.join(out, name));

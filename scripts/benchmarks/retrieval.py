@@ -47,7 +47,7 @@ def _times(given: BenchmarkData) -> Tables:
     of all categories are compared. Times are the least of three calls with as many threads as there
     are cores, after warm-up.
     """
-    real = list(Library.from_dataset(KeypointNet(given.folder("keypointnet"))))
+    real = list(Library.from_models(KeypointNet(given.folder("keypointnet"))))
     mixed = [real[k] for k in np.random.default_rng(0).permutation(len(real)).tolist()]
     for size in (len(real), *given.sizes):
         with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""The live alignment: its values, outliers among the pairs, and the next keypoint."""
+"""The live alignment: its values, and outliers among the pairs."""
 
 from __future__ import annotations
 
@@ -7,24 +7,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
 from support.problems import problem_of
 
 from cadalign import Camera, fit
-from cadalign.annotate.live import LiveAlignment, live_alignment, missing_text, suggest
-from cadalign.annotate.marks import KeypointRegistry, ObjectShape
-from cadalign.annotate.model import Wireframe
+from cadalign.annotate.marks import ObjectShape
 from cadalign.annotate.observations import LIKELY_STRETCH
 from cadalign.annotate.page_state import facts_of
 from cadalign.annotate.problem import Known, LiveEstimate, LiveProblem
-from cadalign.datasets import ModelKeypoint
+from cadalign.annotate.session import LiveAlignment, missing_text
 from cadalign.evaluation.simulation import SimulatedProblem
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.evidence import ImageEvidence
 from cadalign.io.observation import Observation
-from cadalign.render import visible_keypoints
-from cadalign.render.scene import Scene
 
 STRETCHED = ObjectShape()
 BOX = Mesh(
@@ -55,16 +49,8 @@ def estimate_of(
 
 def live_of(problem: SimulatedProblem, **options: Any) -> LiveAlignment:
     """The same as the page shows it."""
-    points = [
-        ModelKeypoint(f"point {row}", tuple(xyz), row)
-        for row, xyz in enumerate(problem.points_3d.tolist())
-    ]
-    lines, counts = Wireframe.of_scene(Scene(BOX)), np.ones(len(points), dtype=bool)
-    registry = KeypointRegistry()
-    registry.merge(points)
-    pairs = points, problem.points_2d, counts
-    estimate = estimate_of(problem, **options)
-    return live_alignment(estimate, STRETCHED, registry, lines, pairs, range(len(points)))
+    counts = np.ones(len(problem.points_3d), dtype=bool)
+    return LiveAlignment(estimate_of(problem, **options), counts=counts)
 
 
 # --- the alignment ---------------------------------------------------------------------------
@@ -149,60 +135,6 @@ def test_too_few_pairs_accuse_nobody() -> None:
     problem = problem_of(0, points=5, noise_px=1.0)
     points_2d = problem.points_2d + [[90, 0], *[[0, 0]] * 4]
     assert estimate_of(problem, points_2d=points_2d).outliers == {}
-
-
-# --- the next keypoint -----------------------------------------------------------------------
-
-
-def refitted(
-    problem: SimulatedProblem, result: Any, candidate: np.ndarray, focal: str
-) -> np.ndarray:
-    """The covariance of a fit to which the candidate was added, measured where it is predicted."""
-    pixel = result.camera.project(result.alignment.apply(candidate[None]))
-    again = fit(
-        np.vstack([problem.points_3d, candidate]),
-        np.vstack([problem.points_2d, pixel]),
-        problem.camera,
-        focal=focal,
-    )
-    assert again.fisher_covariance is not None
-    return again.fisher_covariance
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("camera", [None, UNKNOWN])
-@given(st.integers(0, 10_000))
-@settings(max_examples=8)
-def test_the_suggestion_is_that_of_brute_force_refitting(camera: Camera | None, seed: int) -> None:
-    problem = problem_of(seed, points=9, noise_px=0.5)
-    live, focal = estimate_of(problem, camera=camera), "known" if camera is None else "estimate"
-    result = live.result
-    assume(not live.message)
-    # The prediction is of first order: a focal length that is open by more than its own size, at
-    # the end of its range, is beyond it.
-    assume(result.std is not None and result.std.focal < 1)
-    lines, rng = Wireframe.of_scene(Scene(BOX)), np.random.default_rng(seed + 1)
-    points = [
-        ModelKeypoint(f"corner {k}", tuple(xyz), k)
-        for k, xyz in enumerate(rng.permutation(BOX.vertices).tolist())
-    ]
-    scene = lines.scene
-    xyz = np.array([point.xyz for point in points])
-    seen = visible_keypoints(scene, xyz, result.camera, result.alignment)
-    assume(np.count_nonzero(seen) > 1)
-    found = suggest(live, lines, points, STRETCHED)
-    assert found is not None
-    left = {
-        point.name: np.linalg.slogdet(refitted(problem, result, np.array(point.xyz), focal))[1]
-        for point in np.array(points, dtype=object)[seen]
-    }
-    assert left[found.point.name] <= min(left.values()) + 0.02
-
-
-def test_without_visible_keypoints_none_is_suggested() -> None:
-    found = estimate_of(problem_of(7, points=10, noise_px=0.5))
-    hidden = [ModelKeypoint("inside", (0.0, 0.0, 0.0), 3)]
-    assert suggest(found, Wireframe.of_scene(Scene(BOX)), hidden, STRETCHED) is None
 
 
 # --- text -----------------------------------------------------------------------------------

@@ -37,7 +37,8 @@ class Annotator:
 
     def act(self, action: dict[str, Any]) -> dict[str, Any]:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
-        headers = {"X-Cadalign-Token": self.token, "Content-Type": "application/json"}
+        cookie = f"cadalign-{self.port}={self.token}"
+        headers = {"Cookie": cookie, "Content-Type": "application/json"}
         connection.request("POST", "/act/0", body=json.dumps(action), headers=headers)
         answer: dict[str, Any] = json.loads(connection.getresponse().read())
         connection.close()

@@ -93,17 +93,3 @@ def test_priors_of_a_file_count_and_are_kept(
     perform(session, 0, {"do": "delete", "pair": 1})
     assert Observation.load(case.observation).fit_options.items() >= options.items()
     agree_with_fit(session, case, capsys)
-
-
-@pytest.mark.parametrize("evidence", ["mask", "photo"])
-def test_fit_finds_what_the_page_does_of_a_similar_model_with_its_outline(
-    case: Case, capsys: pytest.CaptureFixture[str], evidence: str
-) -> None:
-    """Every keypoint of the model warps its mesh: those that no pair shows are not in the file."""
-    session = case.open(shape_sigma=0.02)
-    place_all(session, case, count=5)
-    if evidence == "mask":
-        perform(session, 0, {"do": "mask_cut", "corners": [[90, 10], [470, 460]]})
-    else:
-        perform(session, 0, {"do": "use_photo", "on": True})
-    agree_with_fit(session, case, capsys)

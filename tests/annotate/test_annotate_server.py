@@ -34,7 +34,7 @@ def ask(
     """Send a request as it is written, with the session's token unless another is given."""
     sent = {name.replace("_", "-"): value for name, value in headers.items()}
     if token is not None:
-        sent["X-Cadalign-Token"] = access.token if token == "right" else token
+        sent["Cookie"] = f"{access.cookie}={access.token if token == 'right' else token}"
     connection = http.client.HTTPConnection("127.0.0.1", access.port, timeout=20)
     try:
         connection.request(method, path, body=body, headers=sent)

@@ -1,4 +1,4 @@
-"""The annotator with the object's own shape: a category's, or that of a similar model."""
+"""The annotator with the object's own shape, of a learned category."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from support.annotating import Case, agree_with_fit, place_all
 
 from cadalign import CadalignError, ShapeModel
 from cadalign.annotate.actions import perform
-from cadalign.annotate.live import LiveAlignment
 from cadalign.annotate.page_state import page_state
-from cadalign.annotate.session import Session
+from cadalign.annotate.session import LiveAlignment, Session
 from cadalign.datasets import KeypointNet, ModelKeypoints
 from cadalign.io.observation import Observation
 from cadalign.shapes.examples import Example
@@ -50,17 +49,11 @@ def live_shape(session: Session) -> LiveAlignment:
     return live
 
 
-def options_of(kind: str, shape_file: Path) -> dict[str, Any]:
-    return {"shape": shape_file} if kind == "learned" else {"shape_sigma": 0.02}
-
-
-@pytest.mark.parametrize("kind", ["learned", "similar"])
 @pytest.mark.parametrize(("weighted", "count"), [(False, None), (True, 6)])
 def test_fit_of_the_observation_gives_the_pages_numbers(
     case: Case,
     capsys: pytest.CaptureFixture[str],
     shape_file: Path,
-    kind: str,
     count: int | None,
     *,
     weighted: bool,
@@ -75,7 +68,7 @@ def test_fit_of_the_observation_gives_the_pages_numbers(
     points = np.array([of_model[number] for number in ids.tolist()])
     given = Observation(points, instance.points_2d[keep], instance.camera, sigma, ids)
     given.save(case.observation)
-    session = case.open(**options_of(kind, shape_file))
+    session = case.open(shape=shape_file)
     perform(session, 0, {"do": "move", "pair": 2, "uv": instance.points_2d[1].tolist()})
     agree_with_fit(session, case, capsys)
 
@@ -95,16 +88,15 @@ def test_page_shows_box_lines_keypoints_and_regions(case: Case, shape_file: Path
     assert labels[:5] == [*(f"Length {axis}" for axis in "xyz"), "Rotation", "Distance"]
 
 
-def test_warp_carries_points_that_the_shape_lacks(case: Case, shape_file: Path) -> None:
-    """They don't count, are shown with where the warp puts them, and are not lost."""
+def test_points_that_the_shape_lacks_do_not_count(case: Case, shape_file: Path) -> None:
+    """They are not lost."""
     session = case.open(shape=shape_file)
     state = place_all(session, case)
     lacking = [pair for pair in state["pairs"] if not pair["counts"]]
     known = set(ShapeModel.open(shape_file).ids)
     assert {pair["keypoint"] for pair in lacking} == {n for n, _ in case.clicks} - known
     assert lacking
-    for pair in lacking:
-        assert np.linalg.norm(pair["residual"]) < 15
+    assert all(pair["residual"] is None for pair in lacking)
     assert f"{len(lacking)} pair" in " ".join(state["alignment"]["notes"])
     observation = Observation.load(case.observation)
     assert observation.shape is not None
@@ -139,11 +131,10 @@ def test_points_of_the_model_can_be_identified(
     assert not page_state(session, 0)["pairs"][0]["counts"]
 
 
-@pytest.mark.parametrize("kind", ["learned", "similar"])
 def test_unknown_focal_length_is_estimated_with_the_shape(
-    case: Case, capsys: pytest.CaptureFixture[str], shape_file: Path, kind: str
+    case: Case, capsys: pytest.CaptureFixture[str], shape_file: Path
 ) -> None:
-    session = case.open(**options_of(kind, shape_file), camera=None)
+    session = case.open(shape=shape_file, camera=None)
     shown = place_all(session, case)["alignment"]
     (fact,) = (fact for fact in shown["facts"] if fact["label"] == "Focal length")
     found = live_shape(session).result
@@ -180,12 +171,8 @@ def test_contradicting_pair_is_named(case: Case, shape_file: Path) -> None:
 def test_a_stored_shape_is_named_where_it_is_not_used(
     case: Case, shape_file: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    for options in ({"shape": shape_file}, {"shape_sigma": 0.02}):
-        place_all(case.open(**options), case)
-        case.open(**options)
-        assert caplog.text == ""
-        case.open()
-        assert "fits without the stored shape" in caplog.text
-        caplog.clear()
-        for file in case.folder.glob("photo*.json"):
-            file.unlink()
+    place_all(case.open(shape=shape_file), case)
+    case.open(shape=shape_file)
+    assert caplog.text == ""
+    case.open()
+    assert "fits without the stored shape" in caplog.text

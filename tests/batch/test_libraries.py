@@ -43,7 +43,7 @@ def test_a_library_that_is_written_can_be_opened(root: Path, tmp_path: Path) -> 
     mesh = KeypointNet(root)["bottle"][0].mesh_path
     assert mesh is not None
     mesh.write_text(PLY)
-    Library.from_dataset(KeypointNet(root)).save(tmp_path / "lib")
+    Library.from_models(KeypointNet(root)).save(tmp_path / "lib")
     assert len(Library.open(tmp_path / "lib")) == 7
     with pytest.raises(InputError, match=r"^chair, model a: a coordinate exceeds 1e\+50"):
         LibraryModel("chair", "a", [[1e60, 0, 0]], [0], [[0, 0, 0], [1, 1, 1]])

@@ -44,7 +44,7 @@ class Case:
 def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
     folder = tmp_path_factory.mktemp("queries")
     root = write_sample_dataset(folder / "sample", per_category=3, categories=["chair", "bottle"])
-    library = Library.from_dataset(KeypointNet(root))
+    library = Library.from_models(KeypointNet(root))
     library.save(folder / "lib.cadalign")
     rng, texts, keys = np.random.default_rng(0), [], []
     for model in (list(library) * 4)[:20]:

@@ -178,7 +178,6 @@ FEW = replace(NAMED, ids=tuple(range(100, 110)), category="table")
         ({"shape": "chair.shape"}, "shape: expected a cadalign.ShapeModel, got str"),
         ({"shape": replace(SHAPE, category="mug")}, "shape: unknown category 'mug'; known are tab"),
         ({"shape": NAMED}, "shape: its keypoints have names; learn it from models with semantic"),
-        ({"none_prior": 0.1}, "none_prior: has no effect in a ranking by shape; leave it out"),
         ({"shape": FEW}, "ids: the shape model has less than 3 of the keypoints; check them, or"),
     ],
 )

@@ -365,7 +365,7 @@ def plan(options: RetrievalRunOptions, folder: RunFolder) -> Plan[RetrievalTask]
         library = Library.open(options.root)
     else:
         dataset = KeypointNet(options.root, shapenet_root=options.shapenet)
-        library = Library.from_dataset(dataset, categories=options.categories)
+        library = Library.from_models(dataset.subset(categories=options.categories))
     tasks = retrieval_tasks(library, options)
     folder.make()
     file = folder.path / "library.cadalign"

@@ -5,7 +5,6 @@ const KINDS = {
   selected: { fill: "#0b2e66", ring: "#ffd23f", radius: 13 },
   wrong: { fill: "#b3261e", ring: "#ffffff", radius: 11 },
   free: { fill: "#ffffff", ring: "#3a4048", radius: 5 },
-  suggested: { fill: "transparent", ring: "#ffd23f", radius: 12 },
   axis: { fill: "#3a4048", ring: "#a4abb5", radius: 9 },
 };
 
@@ -31,9 +30,7 @@ export function drawBadge(context, kind, label, x, y) {
   context.arc(x, y, radius, 0, 2 * Math.PI);
   context.fillStyle = fill;
   context.fill();
-  context.setLineDash(kind === "suggested" ? [4, 3] : []);
   strokeTwice(context, ring, 2);
-  context.setLineDash([]);
   context.fillStyle = "#ffffff";
   context.font = "600 12px system-ui, sans-serif";
   context.textAlign = "center";

@@ -3,7 +3,7 @@ import { button, h } from "../common/dom.js";
 import { HELP } from "./keys.js";
 
 export class Layout {
-  /** @param {object} handlers - act(action), go(by), goTo(number), boxing(), asPhoto(), suggested(), photo and model: zoom(factor), fit() */
+  /** @param {object} handlers - act(action), go(by), goTo(number), boxing(), asPhoto(), photo and model: zoom(factor), fit() */
   constructor(handlers, panel) {
     const { act, go, goTo } = handlers;
     this.title = h("h1");
@@ -19,7 +19,6 @@ export class Layout {
     this.model = h("div", { class: "host" });
     this.box = button("Mask by a box", handlers.boxing, { title: "Drag a box around the object (X)", "aria-pressed": "false" });
     this.asPhoto = button("As photo", handlers.asPhoto, { title: "Look from where the photo was taken (V)" });
-    this.suggestion = button("", handlers.suggested, { class: "suggestion", title: "Use this point of the model (N)" });
     this.help = makeHelp();
     document.body.classList.add("waiting"); // for the first state, which says what there is
     document.body.append(
@@ -37,7 +36,7 @@ export class Layout {
         "main",
         {},
         view("Photo", this.photo, handlers.photo, this.box),
-        view("Model", this.model, handlers.model, [this.suggestion, this.asPhoto]),
+        view("Model", this.model, handlers.model, this.asPhoto),
         this.status,
         panel,
       ),
@@ -46,7 +45,7 @@ export class Layout {
   }
 
   show(state) {
-    const { image, saved, alignment, suggestion } = state;
+    const { image, saved, alignment } = state;
     document.body.classList.remove("waiting");
     document.title = `${image.name} · cadalign annotate`;
     this.title.textContent = image.name;
@@ -58,8 +57,6 @@ export class Layout {
     this.redo.disabled = !state.can_redo;
     this.asPhoto.disabled = alignment.status !== "done";
     this.box.hidden = !state.evidence.outline;
-    this.suggestion.hidden = !suggestion;
-    this.suggestion.textContent = suggestion ? `Next: ${suggestion.text}` : "";
     this.saved.classList.toggle("wrong", Boolean(saved.trouble));
     this.saved.textContent = saved.trouble ? `Not saved: ${saved.trouble}` : `Every change is saved in ${saved.path}`;
     if (state.message) this.say(state.message);

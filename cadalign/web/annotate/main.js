@@ -33,7 +33,6 @@ class App {
         goTo: (number) => this.goTo(number),
         boxing: () => this.boxing(!this.photo.isBoxing),
         asPhoto: () => this.model.frameAsPhoto(),
-        suggested: () => this.suggested(),
         photo: { zoom: (factor) => this.photo.zoom(factor), fit: () => this.photo.fit() },
         model: { zoom: (factor) => this.model.zoom(factor), fit: () => this.model.frame() },
       },
@@ -52,7 +51,6 @@ class App {
     this.model = new ModelView(this.layout.model, {
       onPick: (aim) => act({ do: "pick", ...aim, pair: this.selected }),
       onSelect: select,
-      onSuggested: () => this.suggested(),
     });
     listen(this);
     window.addEventListener("hashchange", () => this.open());
@@ -181,11 +179,6 @@ class App {
   hide(hidden) {
     this.photo.hidden = hidden;
     this.photo.invalidate();
-  }
-
-  suggested() {
-    const { suggestion } = this.state;
-    if (suggestion) this.act({ do: "place_keypoint", keypoint: suggestion.keypoint, pair: this.selected });
   }
 
   /** Go to the photo some places on. */

@@ -29,7 +29,7 @@ const STANDING = { x: (x, y, z) => [y, z, x], y: (x, y, z) => [x, y, z], z: (x, 
 export class ModelView {
   /**
    * @param {HTMLElement} host - the element to fill
-   * @param {object} handlers - onPick({ origin, direction, near }), onSelect(pair), onSuggested()
+   * @param {object} handlers - onPick({ origin, direction, near }), onSelect(pair)
    */
   constructor(host, handlers) {
     this.handlers = handlers;
@@ -106,15 +106,14 @@ export class ModelView {
       this.upAxis = state.image.up_axis;
       this.frame();
     }
-    const { keypoints, pairs, suggestion } = state;
+    const { keypoints, pairs } = state;
     const end = (label) => new Vector3().setComponent("xyz".indexOf(label), this.ends[label]).toArray();
     const axes = this.mesh ? [..."xyz"].map((label) => ({ kind: "axis", label, xyz: end(label), fixed: true })) : [];
     const free = keypoints.filter(({ used }) => !used).map((point) => ({ kind: "free", label: "", ...point }));
     const placed = pairs.filter(({ xyz }) => xyz).map((pair) => ({
       kind: kindOf(pair, selected), label: String(pair.pair), xyz: pair.xyz, pair: pair.pair, name: pair.name,
     }));
-    const next = suggestion ? [{ kind: "suggested", label: "", xyz: suggestion.xyz, suggested: true, name: "suggested next" }] : [];
-    if (!this.markers.show([...axes, ...free, ...placed, ...next])) return;
+    if (!this.markers.show([...axes, ...free, ...placed])) return;
     // Not in the same frame as the photo, which is what one looks at.
     requestAnimationFrame(() => requestAnimationFrame(() => this.stage.invalidate()));
   }
@@ -149,7 +148,6 @@ export class ModelView {
   pick(place) {
     const marker = this.markerAt(place);
     if (marker?.pair !== undefined) return this.handlers.onSelect(marker.pair);
-    if (marker?.suggested) return this.handlers.onSuggested();
     const { origin, direction } = this.aim(place);
     const near = marker?.keypoint ?? null;
     return this.handlers.onPick({ origin: origin.toArray(), direction: direction.toArray(), near });

@@ -270,10 +270,6 @@ export class PhotoView {
       const [[u1, v1], [u2, v2]] = this.box;
       this.stroke([[u1, v1, u2, v1, u2, v2, u1, v2, u1, v1]], MASK, 2);
     }
-    if (state.suggestion) {
-      const { x, y } = this.toView(state.suggestion.uv);
-      drawBadge(context, "suggested", "", x, y);
-    }
     for (const pair of state.pairs) if (pair.uv) this.drawPair(pair);
   }
 

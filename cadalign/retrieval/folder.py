@@ -1,0 +1,85 @@
+"""Folder of a retrieval: matches as JSON, their observations, overlays, and a sheet of these."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+from cadalign.errors import CadalignError
+from cadalign.geometry.camera import Camera
+from cadalign.io.files import refuse_input, write_json
+from cadalign.io.images import write_image
+from cadalign.io.observation import Observation
+from cadalign.render import Geometry, Scene, cast_geometry, draw_overlay
+from cadalign.render.canvas import ByteImage
+from cadalign.render.layers import contact_sheet
+from cadalign.render.overlay import photo_of
+from cadalign.retrieval.match import Match
+
+logger = logging.getLogger("cadalign")
+
+
+def write_retrieval(
+    folder: Path, matches: Sequence[Match], query: Observation, *, image: ByteImage | None
+) -> Path:
+    """Write the matches of a query's keypoints to a folder; returns the sheet of their overlays.
+
+    They are ``matches.json``, an overlay of each (``overlay_01.png``), all of them side by side
+    (``matches.png``), and the observation of each match's model (``match_01.json``), which
+    `cadalign fit` refines. Without a photo the overlays are drawn on grey.
+    """
+    photo = photo_of(image, query.camera)
+    for rank in range(1, len(matches) + 1):
+        for path in _files(folder, rank):
+            refuse_input(path)
+    write_json(folder / "matches.json", [match.to_dict() for match in matches])
+    overlays = {}
+    for rank, match in enumerate(matches, start=1):
+        overlay, observation = _files(folder, rank)
+        drawn = draw_match(photo, query.camera, match)
+        overlays[f"{rank}. {match.category} {match.model_id}: {score_text(match.score)}"] = drawn
+        write_image(overlay, drawn)
+        match.observation(query).save(observation)
+    sheet = folder / "matches.png"
+    write_image(sheet, contact_sheet(overlays))
+    return sheet
+
+
+def _files(folder: Path, rank: int) -> tuple[Path, Path]:
+    """A match's overlay and observation; ranks count from 1."""
+    return folder / f"overlay_{rank:02d}.png", folder / f"match_{rank:02d}.json"
+
+
+def draw_match(image: ByteImage, camera: Camera, match: Match) -> ByteImage:
+    """Draw a match over its photo: box, keypoints and, where there is a mesh, the model."""
+    (seen,) = match.result.views
+    return draw_overlay(
+        image,
+        camera,
+        est_box=match.box,
+        est_frame=_cast(match, camera),  # without a mesh, keypoints and box are drawn
+        observed=seen.points_2d,
+        reprojected=seen.points_2d + seen.residuals,
+    )
+
+
+def none_text(matches: Sequence[Match]) -> str | None:
+    """Sentence on the probability that the object is none of the models."""
+    probability = matches[0].none_probability if matches else None
+    return None if probability is None else f"None of these: {score_text(probability)}"
+
+
+def score_text(score: float) -> str:
+    """Format a probability in percent."""
+    return f"{100 * score:.1f} %" if score >= 0.0005 else "< 0.1 %"
+
+
+def _cast(match: Match, camera: Camera) -> Geometry | None:
+    """Cast rays at a match's mesh; None if there is none or, with a warning, it is unreadable."""
+    try:
+        mesh = match.mesh()
+        return None if mesh is None else cast_geometry(Scene(mesh), camera, match.alignment)
+    except CadalignError as error:
+        logger.warning("no silhouette: %s", error)
+        return None

@@ -16,12 +16,12 @@ import numpy as np
 
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions, Sigma
-from cadalign.io.documents import in_file, within
+from cadalign.io.documents import convert, in_file, within
 from cadalign.io.evidence import ObservedImage
 from cadalign.io.files import once_per_file
 from cadalign.io.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
 from cadalign.io.images import photo_size, require_one_size
-from cadalign.io.observation import Observation, ObservationChanges
+from cadalign.io.observation import FitFields, Observation, ObservationChanges
 
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
@@ -80,6 +80,10 @@ class ObservationFit:
 
     def check(self) -> None:
         """Raise an InputError if an option is invalid by itself."""
+        try:
+            convert(self.given, FitFields)
+        except DataError as error:
+            raise InputError(error.what, where=error.where, fix=error.fix) from None
         checked = ("method", "loss", "stretch")
         FitOptions(**{name: each for name, each in self.given.items() if name in checked})
 

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import os
-import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import lru_cache
-from itertools import chain, starmap
 from pathlib import Path
-from typing import Any, ClassVar, get_args, get_type_hints
+from typing import Any, ClassVar
 
-from cadalign.arrays import is_number, worker_count
+from cadalign.arrays import worker_count
 from cadalign.batch.observation_fit import ObservationFit, opened_shape, photo_doubt
 from cadalign.batch.outputs import (
     COLUMNS,
@@ -27,7 +24,7 @@ from cadalign.batch.outputs import (
 from cadalign.batch.sources import ObservationTask, ObservationTasks
 from cadalign.datasets.image_keypoints import ImageKeypoints, observed_in, photo_in
 from cadalign.datasets.model_keypoints import ModelKeypoint, ModelKeypoints
-from cadalign.errors import CadalignError, DataError, InputError, require_kind, unknown
+from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.estimation.result import Result
 from cadalign.estimation.results import Results
 from cadalign.evaluation.options import ExperimentOptions, absolute_paths
@@ -35,7 +32,7 @@ from cadalign.evaluation.runs.engine import OnProgress, execute, workers_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import Columns, Plan, Row, fingerprint
 from cadalign.export.results import failed_row
-from cadalign.io.documents import Positive, convert, in_file, parse_json
+from cadalign.io.documents import in_file, parse_json
 from cadalign.io.files import as_path, read_bytes
 from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
 
@@ -44,7 +41,7 @@ LARGEST_CHUNK = 256
 _LEAST_CHUNKS = 64  # of a run, such that workers share the last ones evenly
 _FEW = 200  # observations, which are aligned sooner than processes start
 
-Observed = str | os.PathLike[str] | Iterable[str | os.PathLike[str]] | Iterable[Observation]
+Observed = str | os.PathLike[str] | Observation
 Estimated = tuple[Observation, Result, Row]
 """What is aligned, its result, and further cells of the tables."""
 
@@ -101,6 +98,9 @@ class FitRunOptions(ExperimentOptions):
         """Estimate the object of an observation; raises CadalignError if it cannot be."""
         seen = self.estimate.changed(seen)
         return seen, self.estimate.fit(seen, where), {}
+
+
+_DEFAULTS = FitRunOptions()
 
 
 @dataclass(frozen=True)
@@ -234,41 +234,43 @@ def run_many(
 
 
 def fit_many(
-    observations: Observed,
+    observations: Observed | Iterable[Observed],
+    out: str | os.PathLike[str],
     *,
-    out: str | os.PathLike[str] | None = None,
+    estimate: ObservationFit = _DEFAULTS.estimate,
+    changes: ObservationChanges = _DEFAULTS.changes,
+    detector: DetectorOptions = _DEFAULTS.detector,
+    pictures: int = 0,
     workers: int | None = None,
     dask: str | None = None,
-    pictures: int = 0,
     on_progress: OnProgress = lambda progress: None,
-    **options: Any,
 ) -> Results:
     """Align many observations, as a run that goes on where it was killed.
 
     Parameters
     ----------
-    observations : path, or iterable of path or of Observation
+    observations : path or Observation, or iterable of them
         Observation files, folders of such, JSON lines, and detectors' files (COCO's JSON or CSV);
         or observations, for example of a generator, all of which memory holds as JSON.
-    out : path-like, optional
+    out : path-like
         The run's folder: ``results.parquet`` and ``results.csv``, and what `Results.open` needs.
         Started again with the same arguments, a run that was killed goes on, and a finished one is
-        read. Without it nothing is kept.
+        read.
+    estimate : ObservationFit
+        Options of each alignment.
+    changes : ObservationChanges
+        A camera, or its focal length, for all observations.
+    detector : DetectorOptions
+        What goes with a detector's file: the model, the folder of the photos.
+    pictures : int
+        Number of observations whose photos are kept for `cadalign.report.write_report`, the first
+        ones.
     workers : int, optional
         Processes; -1 for one for each core, 0 for none. By default -1, for few observations 0.
     dask : str, optional
         Address of a Dask scheduler, whose workers are used instead.
-    pictures : int
-        Number of observations whose photos are kept for `cadalign.report.write_report`, the first
-        ones.
     on_progress : callable
         Is told of every chunk that is done.
-    **options
-        Fields of `cadalign.batch.observation_fit.ObservationFit`, such as ``method``, ``similar``,
-        ``robust``, ``shape``; of `cadalign.batch.DetectorOptions`, such as ``model``, ``images``;
-        and ``camera``, the file of a camera for all. A number as ``focal`` is the focal length [px]
-        of all images. What an observation stores holds where an option is None: unlike those of
-        `cadalign.fit`, ``sigma=None`` means the observation's, or 1; ``sigma="none"`` estimates it.
 
     Returns
     -------
@@ -278,12 +280,13 @@ def fit_many(
     Raises
     ------
     InputError
-        If an option is invalid or not known.
+        If an option is invalid.
     DataError
         If an input cannot be read, or the folder holds another run or cannot be written to.
 
     Examples
     --------
+    >>> from tempfile import mkdtemp
     >>> import numpy as np
     >>> from cadalign import Camera, Observation
     >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
@@ -292,82 +295,28 @@ def fit_many(
     ...     Observation(corners, camera.project(corners + [0.1, 0.2, depth]), camera)
     ...     for depth in (5.0, 6.0)
     ... )
-    >>> results = fit_many(seen, method="aepnp")
+    >>> results = fit_many(seen, mkdtemp(), estimate=ObservationFit(method="aepnp"))
     >>> results.translation[:, 2].round(3).tolist()
     [5.0, 6.0]
     """
-    with ExitStack() as stack:
-        is_kept = out is not None
-        if out is None:
-            out = stack.enter_context(tempfile.TemporaryDirectory(prefix="cadalign-"))
-        folder = RunFolder(as_path(out, "out"))
-        parts = _parts_of({"pictures": pictures, **options})
-        inputs, given = _inputs(observations)
-        chosen = FitRunOptions(inputs=inputs, **parts)
-        run_many(chosen, folder, given=given, workers=workers, dask=dask, on_progress=on_progress)
-        results = Results.open(folder.path)
-        if not is_kept:
-            list(results)  # reads each, before the folder goes away
-        return results
-
-
-_PARTS: dict[str, Any] = {
-    "changes": ObservationChanges,
-    "detector": DetectorOptions,
-    "estimate": ObservationFit,
-}
-"""Dataclasses of a run's options; of a name that two have, the last one's is meant."""
-
-
-def _parts_of(given: dict[str, Any]) -> dict[str, Any]:
-    """Fields of `FitRunOptions` by options of any of their dataclasses; see `fit_many`.
-
-    Paths may be texts. Raises InputError if an option is not known, or of another type.
-    """
-    known = {
-        name: (part, kind)
-        for part, owner in _PARTS.items()
-        for name, kind in get_type_hints(owner, include_extras=True).items()
-    }
-    found: dict[str, dict[str, Any]] = {part: {} for part in _PARTS}
-    pictures = _converted(given.pop("pictures"), int, "pictures")
-    for name, value in given.items():
-        if name not in known:
-            raise unknown("option", name, known, where=name)
-        part, kind = known[name]
-        if name == "focal" and is_number(value):
-            part, kind = "changes", Positive
-        if value is not None:
-            found[part][name] = _converted(value, kind, name)
-    return {"pictures": pictures} | {part: owner(**found[part]) for part, owner in _PARTS.items()}
-
-
-def _converted(value: Any, kind: Any, name: str) -> Any:
-    if Path in get_args(kind):
-        return as_path(value, name)
-    try:
-        return convert(value, kind, name)
-    except DataError as error:
-        raise InputError(error.what, where=error.where, fix=error.fix) from None
-
-
-def _inputs(observations: Observed) -> tuple[tuple[Path, ...], list[bytes]]:
-    """The paths of observations, or observations as lines."""
-    if isinstance(observations, str | os.PathLike):
-        return (as_path(observations, "observations"),), []
-    try:
-        source = iter(observations)
-    except TypeError:
-        what = f"expected paths or Observations, got {type(observations).__name__}"
-        raise InputError(what, where="observations", fix="give a list of them") from None
-    first = next(source, None)
-    if first is None:
-        raise InputError("there are none", where="observations")
-    if isinstance(first, Observation):
-        return (), list(starmap(_line, enumerate(chain([first], source))))
-    return tuple(as_path(each, "observations") for each in (first, *source)), []
-
-
-def _line(number: int, observation: Any) -> bytes:
-    require_kind(observation, Observation, f"observations[{number}]")
-    return json_of(observation.to_dict())
+    if isinstance(observations, str | os.PathLike | Observation):
+        observations = [observations]
+    paths, lines = [], []
+    for number, each in enumerate(observations):
+        if isinstance(each, Observation):
+            lines.append(json_of(each.to_dict()))
+        else:
+            paths.append(as_path(each, f"observations[{number}]"))
+    if bool(paths) == bool(lines):
+        what = "paths and Observations" if paths else "there are none"
+        raise InputError(what, where="observations", fix="give paths alone, or Observations alone")
+    folder = RunFolder(as_path(out, "out"))
+    options = FitRunOptions(
+        inputs=tuple(paths),
+        estimate=estimate,
+        changes=changes,
+        detector=detector,
+        pictures=pictures,
+    )
+    run_many(options, folder, given=lines, workers=workers, dask=dask, on_progress=on_progress)
+    return Results.open(folder.path)

@@ -127,7 +127,7 @@ def run_command(command: ManyCommand, options: FitRunOptions, *, done: str) -> i
     """
     import pyarrow.parquet as pq
 
-    from cadalign.batch.outputs import WARNED, warnings_text, without_lists
+    from cadalign.batch.outputs import WARNED, warnings_text
     from cadalign.batch.runs import run_many
 
     folder = run_folder(command, options)
@@ -140,7 +140,7 @@ def run_command(command: ManyCommand, options: FitRunOptions, *, done: str) -> i
             on_progress=on_progress,
         )
     if command.json:
-        print_json(without_lists(pq.read_table(folder.results)).to_pylist())
+        print_json(pq.read_table(folder.results).to_pylist())
     total, reasons = _reasons(folder)
     failed = sum(count for _, count in reasons)
     _say_reasons([(_as_typed(reason, command), count) for reason, count in reasons])

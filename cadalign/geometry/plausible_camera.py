@@ -6,6 +6,7 @@ Whoever reads, takes or shows a camera asks this one function.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -20,6 +21,7 @@ _OBLONG = 1.1  # ratio of a pixel's sides
 _WIDEST_DEG = 120.0  # angle of view of a camera without a lens model
 
 
+@lru_cache(maxsize=64)  # most estimates have the camera of others
 @np.errstate(over="ignore")  # sizes of images are any numbers
 def camera_doubts(camera: Calibration, *, is_tested: bool = False) -> tuple[str, ...]:
     """Say what is implausible of a camera, a sentence each; nothing of most.

@@ -5,8 +5,10 @@ The format is described in docs/formats/observation.md.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -83,8 +85,8 @@ class ImageEvidence(Document, kw_only=True, eq=False):
     @property
     def given(self) -> dict[str, Any]:
         """The fields that are known, by name."""
-        values = {name: getattr(self, name) for name in ImageEvidence.__struct_fields__}
-        return {name: value for name, value in values.items() if value is not None}
+        names = ImageEvidence.__struct_fields__
+        return {name: value for name in names if (value := getattr(self, name)) is not None}
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -265,7 +267,7 @@ def read_image_fields(read: ViewFields, *, needs_xyz: bool = True) -> ObservedIm
     """
     for name in ("name", "semantic_id"):
         require_unique(read.keypoints, name)
-    camera, points_2d = Camera.from_dict(read.camera), _pixels(read.keypoints)
+    camera, points_2d = _camera(read.camera), _pixels(read.keypoints)
     kept = np.flatnonzero(~unmeasured(points_2d)).tolist()
     keypoints = {row: read.keypoints[row] for row in kept}
     points_2d = points_2d[kept]
@@ -291,9 +293,24 @@ def read_image_fields(read: ViewFields, *, needs_xyz: bool = True) -> ObservedIm
     )
 
 
+def _camera(form: Any) -> Camera:
+    """The camera of a form in a file, which most images of a run share."""
+    try:
+        return _camera_of(json.dumps(form))
+    except (TypeError, ValueError, RecursionError):  # of NumPy's arrays
+        return Camera.from_dict(form)
+
+
+@lru_cache(maxsize=64)
+def _camera_of(text: str) -> Camera:
+    return Camera.from_dict(json.loads(text))
+
+
 def _pixels(keypoints: Sequence[KeypointFields]) -> FloatArray:
     """Pixels (n, 2) of keypoints; NaN where they were not found."""
     pixels = np.array([each.uv or (None, None) for each in keypoints], dtype=float).reshape(-1, 2)
+    if np.isfinite(pixels).all():
+        return pixels
     half = np.isnan(pixels) & ~np.isnan(pixels[:, ::-1])
     for row, column in np.argwhere(np.isinf(pixels) | half).tolist():
         value = (keypoints[row].uv or ())[column]
@@ -304,8 +321,8 @@ def _pixels(keypoints: Sequence[KeypointFields]) -> FloatArray:
 
 def _column(keypoints: Mapping[int, KeypointFields], name: str) -> Any:
     """One optional field of all keypoints, by rows, as a list; None where none has it."""
-    values = {row: getattr(keypoint, name) for row, keypoint in keypoints.items()}
-    missing = [row for row, value in values.items() if value is None]
+    values = [getattr(keypoint, name) for keypoint in keypoints.values()]
+    missing = [row for row, value in zip(keypoints, values, strict=True) if value is None]
     if len(missing) == len(values):
         return None
     if missing:
@@ -314,7 +331,7 @@ def _column(keypoints: Mapping[int, KeypointFields], name: str) -> Any:
             where=f"keypoints[{missing[0]}].{name}",
             fix="give it for all keypoints or for none",
         )
-    return list(values.values())
+    return values
 
 
 def write_image_fields(image: ObservedImage, folder: Path | None) -> dict[str, Any]:

@@ -294,9 +294,7 @@ def find_rims(sight: Sight, contour: Contour, reach: float) -> Rims:
     return Rims(found, offset, surface, faces)
 
 
-def _rim_intervals(
-    sight: Sight, contour: Contour, steps: FloatArray
-) -> tuple[IntArray, BoolArray]:
+def _rim_intervals(sight: Sight, contour: Contour, steps: FloatArray) -> tuple[IntArray, BoolArray]:
     """`_nearest_exits` of the object at steps along normals; most rims are beside the contour."""
     middle = len(steps) // 2
     near = slice(middle - 1, middle + 2)

@@ -1,7 +1,4 @@
-"""`cadalign evaluate`, `simulate` and `demo`: runs that can be killed and started again; `report`.
-
-A report is the result of runs as one page, or as a table for papers and pull requests.
-"""
+"""`cadalign evaluate`, `simulate` and `demo`: runs that go on where they were killed; `report`."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ from contextlib import redirect_stdout
 from dataclasses import dataclass, fields, make_dataclass
 from inspect import getdoc
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 import tyro
@@ -23,7 +20,6 @@ from cadalign.evaluation.experiments.simulation import SweepOptions
 from cadalign.evaluation.options import ExperimentOptions, RunOptions
 from cadalign.evaluation.registry import Spec, known_options, spec_named
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.io.files import keeping, write_text
 
 if TYPE_CHECKING:
     from cadalign.evaluation.runs.tables import Run
@@ -142,25 +138,14 @@ class ReportCommand:
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """Folders of runs, as `cadalign demo`, `evaluate` and `simulate` write them."""
     out: Path | None = None
-    """File to write. By default report.html, in the run's folder if it is one run; a table goes to
-    standard output."""
-    format: Literal["html", "md", "csv"] = "html"
-    """The page, or the headline table alone."""
+    """File to write; by default report.html, in the run's folder if it is one run."""
 
     def run(self) -> int:
         """Write the report; returns the exit code."""
-        from cadalign.report import headline_text, write_report
+        from cadalign.report import write_report
 
-        if self.format == "html":
-            page = self.runs[0] / "report.html" if len(self.runs) == 1 else Path("report.html")
-            say(f"Report: {write_report(self.runs, self.out or page)}")
-            return 0
-        text = headline_text(self.runs, format=self.format)
-        if self.out is None:
-            sys.stdout.write(text)
-        else:
-            with keeping(path for run in self.runs for path in RunFolder(run).sources):
-                write_text(self.out, text)
+        page = self.runs[0] / "report.html" if len(self.runs) == 1 else Path("report.html")
+        say(f"Report: {write_report(self.runs, self.out or page)}")
         return 0
 
 

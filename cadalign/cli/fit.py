@@ -16,7 +16,7 @@ from cadalign.batch.observation_fit import ObservationFit
 from cadalign.cli.common import answer, beside, make_folder, say, waiting
 from cadalign.cli.options import CameraOptions, ManyCommand, named_as_flags
 from cadalign.errors import DataError, InputError, refuse_unused
-from cadalign.export.aligned_object import FORMATS, AlignedObject, export_object, format_of
+from cadalign.export.aligned_object import AlignedObject, export_object, format_of
 from cadalign.io.documents import in_file, read_json
 from cadalign.io.files import keeping, write_text
 from cadalign.io.kinds import FIT, OBSERVATION, is_of_many
@@ -179,22 +179,15 @@ class Export:
     fit: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FIT.JSON")]
     """Result of `cadalign fit`, or its folder."""
     to: Path
-    """File to write."""
-    format: str | None = None
-    """Format, by default what the name's ending tells: glb, obj, ply."""
-    metres: float = 1.0
-    """Length of one unit of the model [m]. Written are metres."""
-    frame: Literal["camera", "rig", "model"] = "camera"
-    """Frame of the exported coordinates: the first photo's camera, the frame that cameras of known
-    motion share, or the stretched model's own."""
+    """File to write, whose ending tells the format: .glb, .obj, .ply."""
 
     def run(self) -> int:
         """Write the file; returns the exit code."""
         fit = self.fit / "fit.json" if self.fit.is_dir() else self.fit
         with named_as_flags(self):
-            name = self.format or format_of(self.to)
-            path = export_object(self.to, self._object(fit), format=name, frame=self.frame)
-        say(f"{path}: {FORMATS[name].about}")
+            about = format_of(self.to).about
+            path = export_object(self.to, self._object(fit))
+        say(f"{path}: {about}")
         return 0
 
     def _object(self, fit: Path) -> AlignedObject:
@@ -221,8 +214,7 @@ class Export:
             exported = object_of(
                 result,
                 mesh=mesh_of(seen, result),
-                images=[view.image for view in seen.views],
+                photos=[view.image for view in seen.views],
                 name="model" if seen.model is None else seen.model.stem,
-                metres=self.metres,
             )
         return replace(exported, sources=(fit, *seen.files))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 import tyro
 
-from cadalign.cli.common import NOTHING_WORKED, SUCCESS, JsonOption, group_of, make_folder, say
+from cadalign.cli.common import NOTHING_WORKED, SUCCESS, JsonOption, group_of, say
 from cadalign.cli.options import named_as_flags
 from cadalign.cli.runs import conclude, run_progress, write_run_report
 from cadalign.evaluation.experiments.keypointnet import DemoOptions
@@ -114,11 +114,8 @@ class _DemoCommand(RunCommand):
         from cadalign.report import write_report
 
         spec, run = self.do_run()
-        for row in run.results.to_pylist():
-            if row["reason"]:
-                say(f"{row['category']} {row['model_id']}: {row['reason']}")
         code = conclude(spec, run, json=self.json)
-        write_report([self.out], self.out / "index.html", title="cadalign demo")
+        write_report([self.out], self.out / "index.html")
         say(f"Pictures: {self.out / 'index.html'}")
         return NOTHING_WORKED if code == NOTHING_WORKED else SUCCESS
 
@@ -180,12 +177,12 @@ def write_example(folder: Path) -> None:
     from cadalign.geometry.camera import Camera
     from cadalign.geometry.mesh import Mesh
     from cadalign.geometry.rotations import rotation_from_vector
-    from cadalign.io.files import write_json
+    from cadalign.io.files import made_folder, write_json
     from cadalign.io.images import write_image
     from cadalign.io.meshes.files import write_obj_mesh
     from cadalign.render import RaycastRenderer, Scene
 
-    make_folder(folder)
+    made_folder(folder)
     mesh = Mesh(np.array(KEYPOINTS + _FEET), np.array(_FACES))
     write_obj_mesh(folder / "chair.obj", mesh)
     named = tuple(map(ModelKeypoint, NAMES, KEYPOINTS))

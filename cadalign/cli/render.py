@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -41,14 +41,8 @@ class Render:
     """Width and height in pixels; of a contact sheet, each picture's."""
     keypoints: Path | None = None
     """Keypoints to draw: the model's NAME.keypoints.json."""
-    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Stretch along the model's axes."""
     fov: float = 35.0
     """Horizontal field of view in degrees."""
-    samples: int = 16
-    """Rays per pixel at edges; 1 turns antialiasing off."""
-    renderer: Literal["auto", "raycast", "pyrender", "open3d"] = "auto"
-    """Renderer of the colour."""
 
     def run(self) -> int:
         """Draw and write; returns the exit code."""
@@ -56,12 +50,12 @@ class Render:
         from cadalign.io.images import write_image
         from cadalign.io.meshes.files import load_mesh
         from cadalign.render.layers import contact_sheet
-        from cadalign.render.probe import make_renderer
+        from cadalign.render.raycast import RaycastRenderer
         from cadalign.render.scene import Scene
 
         with named_as_flags(self, elevation="--view"):
             camera, views = self._camera(), self._views()
-            scene, renderer = Scene(load_mesh(self.model)), make_renderer(self.renderer)
+            scene, renderer = Scene(load_mesh(self.model)), RaycastRenderer()
             keypoints = None
             if self.keypoints is not None:
                 keypoints = ModelKeypoints.load(self.keypoints).xyz
@@ -92,8 +86,6 @@ class Render:
             what = f"{self.out.name} is neither a PNG nor a JPEG file"
             fix = f"give a name that ends in {' or '.join(_ENDINGS)}"
             raise InputError(what, where="--out", fix=fix)
-        if not all(0 < each < float("inf") for each in self.scale):
-            raise InputError(f"{self.scale} is not positive", where="--scale")
         return camera
 
     def _views(self) -> dict[str, Angles]:
@@ -119,8 +111,8 @@ class Render:
         from cadalign.render.layers import keypoint_picture
         from cadalign.render.viewpoints import pose_in_view, visible_keypoints
 
-        pose = pose_in_view(scene, camera, view, scale=self.scale)
-        image = renderer.render(scene, camera, pose, samples=self.samples).composite()
+        pose = pose_in_view(scene, camera, view)
+        image = renderer.render(scene, camera, pose).composite()
         if keypoints is None:
             return image
         visible = visible_keypoints(scene, keypoints, camera, pose)

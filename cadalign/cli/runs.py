@@ -83,10 +83,10 @@ def write_run_report(folder: RunFolder) -> None:
 
 
 @contextmanager
-def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
-    """Show a progress bar with the time left; yields what takes how many of all are done."""
+def run_progress(label: str) -> Iterator[Callable[[RunProgress], None]]:
+    """Show a progress bar with the time left; yields what takes a run's progress."""
     if not sys.stderr.isatty():  # rich would end in an empty line; before 14.3 also if disabled
-        yield lambda done, total: None
+        yield lambda state: None
         return
     with Progress(
         TextColumn("{task.description}"),
@@ -99,14 +99,7 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
         transient=True,
     ) as progress:
         bar = progress.add_task(label, total=None)
-        yield lambda done, total: progress.update(bar, total=total, completed=done)
-
-
-@contextmanager
-def run_progress(label: str) -> Iterator[Callable[[RunProgress], None]]:
-    """Show a progress bar; yields what takes a run's progress."""
-    with progress_bar(label) as show:
-        yield lambda state: show(state.done, state.total)
+        yield lambda state: progress.update(bar, total=state.total, completed=state.done)
 
 
 def inputs_of(command: Any) -> dict[str, Any]:
@@ -196,7 +189,7 @@ def run_folder(command: ManyCommand, options: FitRunOptions) -> RunFolder:
     """The run's folder, by default beside the first input."""
     from cadalign.evaluation.runs.folder import RunFolder
 
-    kind, first = options.experiment, command.observations[0]
+    kind, first = options.experiment, command.first
     if command.out is not None:
         return RunFolder(command.out)
     if len(command.observations) > 1 or not os.path.exists(first):

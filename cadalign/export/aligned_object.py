@@ -16,7 +16,6 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.files import as_path, keeping, made_folder, printable, refuse_input, refuse_nul
-from cadalign.io.images import ByteImage, read_image
 from cadalign.io.meshes.files import write_obj_mesh, write_ply_mesh
 
 _SAME = 1e-6
@@ -41,16 +40,6 @@ class ExportView:
 
     def __post_init__(self) -> None:
         self.camera.require_focal()
-
-    def read_image(self) -> ByteImage | None:
-        """The photo's pixels, None where there is none.
-
-        Raises
-        ------
-        DataError
-            If it cannot be read, or has another size than the camera.
-        """
-        return None if self.image is None else read_image(self.image, self.camera)
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,7 +33,7 @@ from cadalign.geometry.alignment import OPENGL_AXES, OPENGL_FLIP, bounds_corners
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Material, Mesh
 from cadalign.io.files import write_whole
-from cadalign.io.images import ByteImage
+from cadalign.io.images import ByteImage, read_image
 
 _gltf: Any = trimesh.exchange.gltf  # which has no types
 _visual: Any = trimesh.visual
@@ -213,10 +213,11 @@ def _add_cameras(tree: dict[str, Any], photos: Sequence[PlacedPhoto]) -> None:
 def _placed_photo(exported: AlignedObject, number: int) -> PlacedPhoto:
     """A view's photo, behind the object's farthest corner."""
     view = exported.views[number]
+    image = None if view.image is None else read_image(view.image, view.camera)
     pose = OPENGL_FLIP @ exported.first_from_cam(number) @ OPENGL_FLIP
     corners = view.cam_from_model.apply(bounds_corners(*exported.mesh.bounds))
     depth = _BEHIND * float(np.abs(corners[:, 2]).max())
-    return PlacedPhoto(*photo_plane(view.camera, view.read_image()), depth, pose)
+    return PlacedPhoto(*photo_plane(view.camera, image), depth, pose)
 
 
 def photo_plane(

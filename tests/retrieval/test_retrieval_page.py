@@ -158,8 +158,8 @@ def test_refused_options_are_named_as_they_are_typed(
     assert refusal_line(capsys, "retrieve", *case.arguments, "--missing-prob", "1") == (
         "--missing-prob: must be between 0 and 1, both excluded, not 1.0"
     )
-    assert refusal_line(capsys, "retrieve", *case.arguments, "--workers", "0") == (
-        "--workers: must be >= 1, or -1 for all cores, not 0"
+    assert refusal_line(capsys, "retrieve", *case.arguments, "--workers", "2") == (
+        "--workers: has no effect on one observation; leave it out"
     )
     assert refusal_line(capsys, "retrieve", *case.arguments, "--category", "tabel").startswith(
         "--category: unknown category 'tabel'; known are "

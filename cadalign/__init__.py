@@ -6,7 +6,6 @@ from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
     from cadalign import datasets, errors, geometry, metrics, render, retrieval, shapes, solvers
-    from cadalign.batch.runs import fit_many
     from cadalign.errors import CadalignError
     from cadalign.estimation.align import align, align_batch
     from cadalign.estimation.fit import fit, fit_batch
@@ -60,7 +59,6 @@ __all__ = [
     "evaluate",
     "fit",
     "fit_batch",
-    "fit_many",
     "geometry",
     "load_mesh",
     "metrics",

@@ -7,7 +7,7 @@ from cadalign.names import lazy_names
 if TYPE_CHECKING:
     from cadalign.batch.observation_fit import ObservationFit
     from cadalign.batch.retrievals import RetrieveRunOptions
-    from cadalign.batch.runs import FitRunOptions, fit_many, run_many
+    from cadalign.batch.runs import FitRunOptions, run_many
     from cadalign.io.observation import DetectorOptions, ObservationChanges
 
 __all__ = [
@@ -16,7 +16,6 @@ __all__ = [
     "ObservationChanges",
     "ObservationFit",
     "RetrieveRunOptions",
-    "fit_many",
     "run_many",
 ]
 

@@ -1,10 +1,10 @@
-"""Runs over many observations: options, their tasks and rows, `fit_many`."""
+"""Runs over many observations: options, their tasks and rows, `run_many`."""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -26,7 +26,6 @@ from cadalign.datasets.image_keypoints import ImageKeypoints, observed_in, photo
 from cadalign.datasets.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.estimation.result import Result
-from cadalign.estimation.results import Results
 from cadalign.evaluation.options import ExperimentOptions, absolute_paths
 from cadalign.evaluation.runs.engine import OnProgress, execute, workers_of
 from cadalign.evaluation.runs.folder import RunFolder
@@ -41,7 +40,6 @@ LARGEST_CHUNK = 256
 _LEAST_CHUNKS = 64  # of a run, such that workers share the last ones evenly
 _FEW = 200  # observations, which are aligned sooner than processes start
 
-Observed = str | os.PathLike[str] | Observation
 Estimated = tuple[Observation, Result, Row]
 """What is aligned, its result, and further cells of the tables."""
 
@@ -98,9 +96,6 @@ class FitRunOptions(ExperimentOptions):
         """Estimate the object of an observation; raises CadalignError if it cannot be."""
         seen = self.estimate.changed(seen)
         return seen, self.estimate.fit(seen, where), {}
-
-
-_DEFAULTS = FitRunOptions()
 
 
 @dataclass(frozen=True)
@@ -185,17 +180,15 @@ def _doubts(seen: Observation) -> Iterator[tuple[str, str]]:
             yield "camera", doubt
 
 
-def plan_run(
-    options: FitRunOptions, folder: RunFolder, given: Iterable[bytes] = ()
-) -> Plan[ObservationTask]:
-    """Plan the estimates of the observations of all inputs, and of ``given`` lines.
+def plan_run(options: FitRunOptions, folder: RunFolder) -> Plan[ObservationTask]:
+    """Plan the estimates of the observations of all inputs.
 
     Raises CadalignError if an option is invalid, an input or the camera cannot be read, or what a
     detector's file needs is missing.
     """
     options.changes.read_camera((1, 1))  # whatever the size: else every row would say its error
     model, photos = options.keypoints(), options.detector.images
-    tasks = ObservationTasks(options.inputs, given)
+    tasks = ObservationTasks(options.inputs)
     if photos is not None and not photos.is_dir():
         what = f"{photos} is not a folder of photos"
         raise InputError(what, where="images", fix="give the photos' folder, or leave it out")
@@ -214,68 +207,28 @@ def plan_run(
 
 def run_many(
     options: FitRunOptions,
-    folder: RunFolder,
-    *,
-    given: Iterable[bytes] = (),
-    workers: int | None,
-    dask: str | None,
-    on_progress: OnProgress = lambda progress: None,
-) -> None:
-    """Do the run that the options describe, or what is left of it; see `fit_many`.
-
-    By default processes do it, but few observations.
-    """
-    plan = plan_run(options, folder, given)
-    if workers is None:
-        workers = 0 if len(plan.tasks) < _FEW else -1
-    pool = workers_of(workers, dask, threads=worker_count(options.threads))
-    execute(plan, folder, workers=pool, on_progress=on_progress)
-    write_csv(folder)
-
-
-def fit_many(
-    observations: Observed | Iterable[Observed],
     out: str | os.PathLike[str],
     *,
-    estimate: ObservationFit = _DEFAULTS.estimate,
-    changes: ObservationChanges = _DEFAULTS.changes,
-    detector: DetectorOptions = _DEFAULTS.detector,
-    pictures: int = 0,
     workers: int | None = None,
     dask: str | None = None,
     on_progress: OnProgress = lambda progress: None,
-) -> Results:
-    """Align many observations, as a run that goes on where it was killed.
+) -> None:
+    """Align many observations, or retrieve their models, as a run that goes on where it was killed.
 
     Parameters
     ----------
-    observations : path or Observation, or iterable of them
-        Observation files, folders of such, JSON lines, and detectors' files (COCO's JSON or CSV);
-        or observations, for example of a generator, all of which memory holds as JSON.
+    options : FitRunOptions or RetrieveRunOptions
+        The inputs, and options of each estimate.
     out : path-like
-        The run's folder: ``results.parquet`` and ``results.csv``, and what `Results.open` needs.
-        Started again with the same arguments, a run that was killed goes on, and a finished one is
-        read.
-    estimate : ObservationFit
-        Options of each alignment.
-    changes : ObservationChanges
-        A camera, or its focal length, for all observations.
-    detector : DetectorOptions
-        What goes with a detector's file: the model, the folder of the photos.
-    pictures : int
-        Number of observations whose photos are kept for `cadalign.report.write_report`, the first
-        ones.
+        The run's folder: ``results.parquet`` and ``results.csv``, and what `cadalign.Results.open`
+        needs. Started again with the same options, a run that was killed goes on, and a finished
+        one stays as it is.
     workers : int, optional
         Processes; -1 for one for each core, 0 for none. By default -1, for few observations 0.
     dask : str, optional
         Address of a Dask scheduler, whose workers are used instead.
     on_progress : callable
         Is told of every chunk that is done.
-
-    Returns
-    -------
-    Results
-        In the order of the observations; the error takes the place of a result that there is not.
 
     Raises
     ------
@@ -286,37 +239,15 @@ def fit_many(
 
     Examples
     --------
-    >>> from tempfile import mkdtemp
-    >>> import numpy as np
-    >>> from cadalign import Camera, Observation
-    >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
-    >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
-    >>> seen = (
-    ...     Observation(corners, camera.project(corners + [0.1, 0.2, depth]), camera)
-    ...     for depth in (5.0, 6.0)
-    ... )
-    >>> results = fit_many(seen, mkdtemp(), estimate=ObservationFit(method="aepnp"))
-    >>> results.translation[:, 2].round(3).tolist()
-    [5.0, 6.0]
+    >>> linear = ObservationFit(method="aepnp")
+    >>> options = FitRunOptions(inputs=(Path("seen.jsonl"),), estimate=linear)
+    >>> run_many(options, "runs/boxes")  # doctest: +SKIP
+    >>> results = cadalign.Results.open("runs/boxes")  # doctest: +SKIP
     """
-    if isinstance(observations, str | os.PathLike | Observation):
-        observations = [observations]
-    paths, lines = [], []
-    for number, each in enumerate(observations):
-        if isinstance(each, Observation):
-            lines.append(json_of(each.to_dict()))
-        else:
-            paths.append(as_path(each, f"observations[{number}]"))
-    if bool(paths) == bool(lines):
-        what = "paths and Observations" if paths else "there are none"
-        raise InputError(what, where="observations", fix="give paths alone, or Observations alone")
     folder = RunFolder(as_path(out, "out"))
-    options = FitRunOptions(
-        inputs=tuple(paths),
-        estimate=estimate,
-        changes=changes,
-        detector=detector,
-        pictures=pictures,
-    )
-    run_many(options, folder, given=lines, workers=workers, dask=dask, on_progress=on_progress)
-    return Results.open(folder.path)
+    plan = plan_run(options, folder)
+    if workers is None:
+        workers = 0 if len(plan.tasks) < _FEW else -1
+    pool = workers_of(workers, dask, threads=worker_count(options.threads))
+    execute(plan, folder, workers=pool, on_progress=on_progress)
+    write_csv(folder)

@@ -23,7 +23,6 @@ from cadalign.io.documents import read_json
 from cadalign.io.files import listed, open_input, read_bytes, read_text
 from cadalign.io.kinds import DETECTOR, LINES, OBSERVATION, TABLE, kind_of, refuse_other_file
 
-_DAMAGED = "damaged"  # a file whose row says what is wrong with it
 _CELLS = 3  # of a task: the number of its source, its own in it, and the byte where it begins
 
 
@@ -43,20 +42,15 @@ class ObservationTask(NamedTuple):
 class ObservationTasks(Sequence[ObservationTask]):
     """The observations of all inputs; of a file of lines it keeps where each begins.
 
-    ``given`` are lines of observations that come from no file. Raises DataError if a file cannot be
-    read, or an input holds no observation.
+    Raises DataError if a file cannot be read, or an input holds no observation.
     """
 
-    def __init__(self, inputs: Iterable[Path], given: Iterable[bytes] = ()) -> None:
+    def __init__(self, inputs: Iterable[Path]) -> None:
         self._digest = hashlib.sha256()
         self._sources: list[Path] = []
         self._cells = array("q")
-        self._objects: dict[int, list[tuple[str, bytes | ImageKeypoints | DataError]]] = {}
+        self._objects: dict[int, list[tuple[str, Any]]] = {}  # of a detector's file
         self.has_detections = False
-        lines = [(f"observations[{number}]", line) for number, line in enumerate(given)]
-        if lines:
-            self._digest.update(b"\n".join(line for _, line in lines))
-            self._add_objects(Path("observations"), lines)
         for path in inputs:
             for file, kind in _files_of(path):
                 self._add(file, kind)
@@ -106,16 +100,14 @@ class ObservationTasks(Sequence[ObservationTask]):
             # Which memory holds whole; objects that cannot be read come last.
             bad: dict[str, DataError] = {}
             good = read_image_keypoints(path, problems=bad)
-            self._add_objects(path, [*((each.source, each) for each in good), *bad.items()])
+            objects = [*((each.source, each) for each in good), *bad.items()]
+            self._objects[len(self._sources)] = objects
+            self._cells.extend(
+                cell for own in range(len(objects)) for cell in (len(self._sources), own, 0)
+            )
             self.has_detections = True
         else:
             self._cells.extend((len(self._sources), 0, 0))
-            self._sources.append(path)
-
-    def _add_objects(self, path: Path, objects: list[tuple[str, Any]]) -> None:
-        for own in range(len(objects)):
-            self._cells.extend((len(self._sources), own, 0))
-        self._objects[len(self._sources)] = objects
         self._sources.append(path)
 
     def _add_lines(self, path: Path) -> None:
@@ -145,7 +137,7 @@ def _files_of(path: Path) -> Iterator[tuple[Path, str | None]]:
     for each in listed(path):
         if each.suffix.lower() in (".json", *LINES) and each.is_file():
             kind = _kind_of(each)
-            if kind in (OBSERVATION, _DAMAGED):
+            if kind == OBSERVATION:
                 is_empty = False
                 yield each, kind
     if is_empty:
@@ -159,5 +151,5 @@ def _kind_of(path: Path) -> str | None:
         return DETECTOR if suffix == TABLE else OBSERVATION
     try:
         return kind_of(read_json(path))
-    except DataError:
-        return _DAMAGED
+    except DataError:  # which its row says
+        return OBSERVATION

@@ -127,7 +127,7 @@ def run_command(command: ManyCommand, options: FitRunOptions, *, done: str) -> i
     with run_progress(options.experiment) as on_progress:
         run_many(
             options,
-            folder,
+            folder.path,
             workers=command.workers,
             dask=command.dask,
             on_progress=on_progress,

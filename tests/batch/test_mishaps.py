@@ -15,9 +15,8 @@ import pytest
 from PIL import Image
 from support.forked import MAIN, Program
 
-import cadalign
 from cadalign import Camera, Observation
-from cadalign.batch import ObservationFit
+from cadalign.batch import FitRunOptions, ObservationFit, run_many
 from cadalign.cli import main
 from cadalign.datasets import ModelKeypoint, ModelKeypoints
 from cadalign.evaluation.runs.engine import Progress
@@ -63,8 +62,8 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on(
     done = len(list(run.parts.glob("???????.parquet")))
     assert done == 64
     seen: list[Progress] = []
-    linear = ObservationFit(method="aepnp")
-    cadalign.fit_many(source, run.path, workers=0, estimate=linear, on_progress=seen.append)
+    options = FitRunOptions(inputs=(source,), estimate=ObservationFit(method="aepnp"))
+    run_many(options, run.path, workers=0, on_progress=seen.append)
     assert seen[0].done == 640
     assert {row["status"] for row in rows_of(run.path)} == {"ok"}
 
@@ -224,7 +223,8 @@ def test_photo_of_another_size_than_its_camera_is_warned_of(tmp_path: Path) -> N
     photo = tmp_path / "photo.png"
     write_image(photo, np.zeros((960, 1280, 3), dtype=np.uint8))
     seen = Observation(problem.points_3d, problem.points_2d, problem.camera, image=photo)
-    cadalign.fit_many(seen, tmp_path / "run")
+    seen.save(tmp_path / "seen.json")
+    run_many(FitRunOptions(inputs=(tmp_path / "seen.json",)), tmp_path / "run")
     (row,) = rows_of(tmp_path / "run")
     assert row["warning_kinds"].split("; ")[-1] == "camera"
     assert "photo.png: the image has 1280 x 960 pixels, that of its camera 640 x" in row["warnings"]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -20,7 +20,6 @@ from cadalign.io.documents import convert, in_file, within
 from cadalign.io.evidence import ObservedImage
 from cadalign.io.files import once_per_file
 from cadalign.io.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
-from cadalign.io.images import photo_size, require_one_size
 from cadalign.io.observation import FitFields, Observation, ObservationChanges
 
 if TYPE_CHECKING:
@@ -139,8 +138,10 @@ class ObservationFit:
         ``note`` is called with what is left out, and the source of a focal length. Raises
         CadalignError if options or observation are invalid, or there is no alignment.
         """
-        notes = [text for view in seen.views if (text := view.text_of_not_found)]
-        options = self._options(seen, where, notes.append)
+        for view in seen.views:
+            if view.text_of_not_found:
+                note(view.text_of_not_found)
+        options = self._options(seen, where, note)
         if seen.model is not None and seen.shape is None:
             from cadalign.io.meshes.files import check_keypoints
 
@@ -148,12 +149,8 @@ class ObservationFit:
                 for view in seen.views:
                     check_keypoints(view.points_3d, seen.model, where="keypoints.xyz")
         if _is_plain(seen):
-            result = self._fit_keypoints(seen, options)
-        else:
-            result = self._align(seen, where, options)
-        for text in notes:
-            note(text)
-        return result
+            return self._fit_keypoints(seen, options)
+        return self._align(seen, where, options)
 
     def _options(self, seen: Observation, where: str, note: Note) -> FitOptions:
         """Options of the fit, with the standard deviation and focal length that are known."""
@@ -315,20 +312,6 @@ def views_of(
             )
             views.append(view)
     return tuple(views)
-
-
-def photo_doubt(image: ObservedImage) -> str:
-    """Doubt about the size of an image's photo; empty where there is none to be read."""
-    if image.image is None:
-        return ""
-    with suppress(DataError):
-        size = photo_size(image.image)
-        known = {"its camera": (image.camera.width, image.camera.height), image.image.name: size}
-        try:
-            require_one_size(known, image.image)
-        except DataError as error:
-            return f"{error} (`Camera.resized`, `Camera.cropped`)"
-    return ""
 
 
 def shape_ids(image: ObservedImage, shape: ShapeModel) -> tuple[KeypointId, ...]:

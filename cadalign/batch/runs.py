@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from cadalign.arrays import worker_count
-from cadalign.batch.observation_fit import ObservationFit, opened_shape, photo_doubt
+from cadalign.batch.observation_fit import ObservationFit, opened_shape
 from cadalign.batch.outputs import (
     COLUMNS,
     RECORD_COLUMNS,
@@ -33,6 +33,7 @@ from cadalign.evaluation.runs.work import Columns, Plan, Row, fingerprint
 from cadalign.export.results import failed_row
 from cadalign.io.documents import in_file, parse_json
 from cadalign.io.files import as_path, read_bytes
+from cadalign.io.images import photo_size, require_one_size
 from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
 
 LARGEST_CHUNK = 256
@@ -176,8 +177,17 @@ def _doubts(seen: Observation) -> Iterator[tuple[str, str]]:
     for view in seen.views:
         if view.text_of_not_found:
             yield "left-out", view.text_of_not_found
-        if doubt := photo_doubt(view):
-            yield "camera", doubt
+        if view.image is None:
+            continue
+        known = {"its camera": (view.camera.width, view.camera.height)}
+        try:
+            known[view.image.name] = photo_size(view.image)
+        except DataError:
+            continue
+        try:
+            require_one_size(known, view.image)
+        except DataError as error:
+            yield "camera", f"{error} (`Camera.resized`, `Camera.cropped`)"
 
 
 def plan_run(options: FitRunOptions, folder: RunFolder) -> Plan[ObservationTask]:

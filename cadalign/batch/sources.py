@@ -14,7 +14,7 @@ from codecs import BOM_UTF8
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, cast
 
 from cadalign.datasets.image_keypoints import ImageKeypoints
 from cadalign.datasets.keypoint_files import read_image_keypoints
@@ -47,13 +47,15 @@ class ObservationTasks(Sequence[ObservationTask]):
 
     def __init__(self, inputs: Iterable[Path]) -> None:
         self._digest = hashlib.sha256()
-        self._sources: list[Path] = []
+        self._sources: list[tuple[Path, str]] = []  # with the folder that each lies in
         self._cells = array("q")
         self._objects: dict[int, list[tuple[str, Any]]] = {}  # of a detector's file
         self.has_detections = False
         for path in inputs:
             for file, kind in _files_of(path):
                 self._add(file, kind)
+                folder = os.path.dirname(os.path.abspath(file))
+                self._sources.append((file, folder))
 
     @property
     def fingerprint(self) -> str:
@@ -73,12 +75,11 @@ class ObservationTasks(Sequence[ObservationTask]):
 
     def _task(self, row: int, files: dict[int, BinaryIO], opened: ExitStack) -> ObservationTask:
         source, own, start = self._cells[_CELLS * row : _CELLS * (row + 1)]
-        path = self._sources[source]
-        name = os.fspath(path)
-        content: str | bytes | ImageKeypoints | DataError
+        path, folder = self._sources[source]
+        name, content = os.fspath(path), cast(Any, None)
         if source in self._objects:
             name, content = self._objects[source][own]
-        elif path.suffix.lower() in LINES:
+        elif own:  # a line
             if source not in files:
                 files[source] = opened.enter_context(open_input(path))
             files[source].seek(start)
@@ -88,7 +89,7 @@ class ObservationTasks(Sequence[ObservationTask]):
                 content = read_text(path)
             except DataError as error:
                 content = error
-        return ObservationTask(row, name, content, os.path.dirname(os.path.abspath(path)))
+        return ObservationTask(row, name, content, folder)
 
     def _add(self, path: Path, kind: str | None) -> None:
         if path.suffix.lower() in LINES:
@@ -108,7 +109,6 @@ class ObservationTasks(Sequence[ObservationTask]):
             self.has_detections = True
         else:
             self._cells.extend((len(self._sources), 0, 0))
-        self._sources.append(path)
 
     def _add_lines(self, path: Path) -> None:
         """Find where the lines of a file begin; empty ones are passed over."""
@@ -122,7 +122,6 @@ class ObservationTasks(Sequence[ObservationTask]):
                 self._digest.update(line)
         if len(self._cells) == before:
             raise DataError("the file holds no observation", where=str(path))
-        self._sources.append(path)
 
 
 def _files_of(path: Path) -> Iterator[tuple[Path, str | None]]:

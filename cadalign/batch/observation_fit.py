@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,6 +16,7 @@ import numpy as np
 
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions, Sigma
+from cadalign.estimation.result_parts import quickly
 from cadalign.io.documents import convert, in_file, within
 from cadalign.io.evidence import ObservedImage
 from cadalign.io.files import once_per_file
@@ -113,7 +114,9 @@ class ObservationFit:
             shape = self.shape
             stored.pop("shape_sigma", None)
         options = stored | given
-        changed = replace(seen, shape=shape and shape.absolute(), fit_options=options)
+        # Nothing is checked anew: in runs that takes as long as a linear solver.
+        fields = {"shape": shape and shape.absolute(), "fit_options": options}
+        changed = quickly(Observation, vars(seen) | fields)
         if not _is_plain(changed):
             self._refuse_without_effect(changed)
         has_prior = options.get("method", "optimal") == "optimal"

@@ -36,7 +36,7 @@ from cadalign.io.files import as_path, read_bytes
 from cadalign.io.images import photo_size, require_one_size
 from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
 
-LARGEST_CHUNK = 256
+LARGEST_CHUNK = 512
 """Most observations that a worker gets at a time, as of every long run."""
 _LEAST_CHUNKS = 64  # of a run, such that workers share the last ones evenly
 _FEW = 200  # observations, which are aligned sooner than processes start

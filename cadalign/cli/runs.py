@@ -9,14 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import MofNCompleteColumn, Progress
 
 from cadalign.cli.common import beside, exit_code, new_console, print_json, print_table, say
 from cadalign.cli.options import flags_of, with_flags
@@ -88,16 +81,8 @@ def run_progress(label: str) -> Iterator[Callable[[RunProgress], None]]:
     if not sys.stderr.isatty():  # rich would end in an empty line; before 14.3 also if disabled
         yield lambda state: None
         return
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        console=new_console(),
-        transient=True,
-    ) as progress:
+    columns = *Progress.get_default_columns(), MofNCompleteColumn()
+    with Progress(*columns, console=new_console(), transient=True) as progress:
         bar = progress.add_task(label, total=None)
         yield lambda state: progress.update(bar, total=state.total, completed=state.done)
 
@@ -125,13 +110,8 @@ def run_command(command: ManyCommand, options: FitRunOptions, *, done: str) -> i
 
     folder = run_folder(command, options)
     with run_progress(options.experiment) as on_progress:
-        run_many(
-            options,
-            folder.path,
-            workers=command.workers,
-            dask=command.dask,
-            on_progress=on_progress,
-        )
+        workers, dask = command.workers, command.dask
+        run_many(options, folder.path, workers=workers, dask=dask, on_progress=on_progress)
     if command.json:
         print_json(pq.read_table(folder.results).to_pylist())
     total, reasons = _reasons(folder)

@@ -170,6 +170,8 @@ class Result:
     @property
     def rms(self) -> float:
         """Root mean square length of the inliers' residuals [px]."""
+        if len(self.views) == 1:
+            return self.views[0].rms
         return rms_of(self.residuals, self.inliers)
 
     @property

@@ -99,13 +99,14 @@ def row_of(result: Any) -> dict[str, Any]:
     sigma: Any = result.sigma
     if sigma is None and result.options is not None:
         sigma = result.options.sigma
+    inliers = result.inliers
     row: dict[str, Any] = {
         "status": "ok",
         "reason": "",
         "method": result.method,
         "views": len(result.views),
-        "keypoints": len(result.inliers),
-        "inliers": int(result.inliers.sum()),
+        "keypoints": len(inliers),
+        "inliers": int(inliers.sum()),
         "focal_length": result.camera.fx,
         "sigma": None if sigma is None or np.ndim(sigma) else float(sigma),
         "rms_px": result.rms,

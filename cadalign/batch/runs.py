@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from cadalign.arrays import worker_count
 from cadalign.batch.observation_fit import ObservationFit, opened_shape
@@ -89,10 +89,6 @@ class FitRunOptions(ExperimentOptions):
             tuple(ModelKeypoint(str(k), tuple(xyz), None if named else int(k)) for k, xyz in pairs)
         )
 
-    def read(self, data: Any, where: str, *, folder: Path) -> Observation:
-        """Read the parsed form of an observation, which messages call ``where``."""
-        return self.estimate.read(data, where, folder=folder, changes=self.changes)
-
     def estimate_of(self, seen: Observation, where: str) -> Estimated:
         """Estimate the object of an observation; raises CadalignError if it cannot be."""
         seen = self.estimate.changed(seen)
@@ -151,7 +147,8 @@ class ManyEstimates:
         if isinstance(content, DataError):
             raise content
         if not isinstance(content, ImageKeypoints):
-            return options.read(parse_json(content, task.name), task.name, folder=folder)
+            data, changes = parse_json(content, task.name), options.changes
+            return options.estimate.read(data, task.name, folder=folder, changes=changes)
         detector = options.detector
         assert self.model is not None
         photos, named = detector.images or folder, content.image

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
-    from cadalign import datasets, errors, geometry, metrics, render, retrieval, shapes, solvers
+    from cadalign import datasets, errors, metrics, render
     from cadalign.batch.runs import fit_many
     from cadalign.errors import CadalignError
     from cadalign.estimation.align import align, align_batch
@@ -13,20 +13,18 @@ if TYPE_CHECKING:
     from cadalign.estimation.model import Model
     from cadalign.estimation.options import RansacOptions
     from cadalign.estimation.result import Result
-    from cadalign.estimation.result_parts import EvidenceSummary
     from cadalign.estimation.results import Results
     from cadalign.estimation.view import View
     from cadalign.evaluation.api import evaluate, simulate
     from cadalign.geometry.alignment import Alignment, Box
     from cadalign.geometry.camera import Camera
-    from cadalign.geometry.mesh import Material, Mesh
+    from cadalign.geometry.mesh import Mesh
     from cadalign.geometry.symmetry import Symmetry
     from cadalign.io.evidence import Size
     from cadalign.io.focal import FocalPrior
     from cadalign.io.meshes.files import load_mesh
     from cadalign.io.observation import Observation
     from cadalign.retrieval.library import Library
-    from cadalign.retrieval.match import Match
     from cadalign.shapes.examples import Example
     from cadalign.shapes.model import ShapeModel
 
@@ -37,12 +35,9 @@ __all__ = [
     "Box",
     "CadalignError",
     "Camera",
-    "EvidenceSummary",
     "Example",
     "FocalPrior",
     "Library",
-    "Match",
-    "Material",
     "Mesh",
     "Model",
     "Observation",
@@ -61,14 +56,10 @@ __all__ = [
     "fit",
     "fit_batch",
     "fit_many",
-    "geometry",
     "load_mesh",
     "metrics",
     "render",
-    "retrieval",
-    "shapes",
     "simulate",
-    "solvers",
 ]
 
 __getattr__ = lazy_names(__name__)

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, replace
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,12 +16,12 @@ import numpy as np
 
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions, Sigma
-from cadalign.io.documents import in_file, within
+from cadalign.estimation.result_parts import quickly
+from cadalign.io.documents import convert, in_file, within
 from cadalign.io.evidence import ObservedImage
 from cadalign.io.files import once_per_file
 from cadalign.io.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
-from cadalign.io.images import photo_size, require_one_size
-from cadalign.io.observation import Observation, ObservationChanges
+from cadalign.io.observation import FitFields, Observation, ObservationChanges
 
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
@@ -80,6 +80,10 @@ class ObservationFit:
 
     def check(self) -> None:
         """Raise an InputError if an option is invalid by itself."""
+        try:
+            convert(self.given, FitFields)
+        except DataError as error:
+            raise InputError(error.what, where=error.where, fix=error.fix) from None
         checked = ("method", "loss", "stretch")
         FitOptions(**{name: each for name, each in self.given.items() if name in checked})
 
@@ -108,7 +112,9 @@ class ObservationFit:
             shape = self.shape
             stored.pop("shape_sigma", None)
         options = stored | given
-        changed = replace(seen, shape=shape and shape.absolute(), fit_options=options)
+        # Nothing is checked anew: in runs that takes as long as a linear solver.
+        fields = {"shape": shape and shape.absolute(), "fit_options": options}
+        changed = quickly(Observation, vars(seen) | fields)
         if not _is_plain(changed):
             self._refuse_without_effect(changed)
         has_prior = options.get("method", "optimal") == "optimal"
@@ -133,8 +139,10 @@ class ObservationFit:
         ``note`` is called with what is left out, and the source of a focal length. Raises
         CadalignError if options or observation are invalid, or there is no alignment.
         """
-        notes = [text for view in seen.views if (text := view.text_of_not_found)]
-        options = self._options(seen, where, notes.append)
+        for view in seen.views:
+            if view.text_of_not_found:
+                note(view.text_of_not_found)
+        options = self._options(seen, where, note)
         if seen.model is not None and seen.shape is None:
             from cadalign.io.meshes.files import check_keypoints
 
@@ -142,12 +150,8 @@ class ObservationFit:
                 for view in seen.views:
                     check_keypoints(view.points_3d, seen.model, where="keypoints.xyz")
         if _is_plain(seen):
-            result = self._fit_keypoints(seen, options)
-        else:
-            result = self._align(seen, where, options)
-        for text in notes:
-            note(text)
-        return result
+            return self._fit_keypoints(seen, options)
+        return self._align(seen, where, options)
 
     def _options(self, seen: Observation, where: str, note: Note) -> FitOptions:
         """Options of the fit, with the standard deviation and focal length that are known."""
@@ -309,20 +313,6 @@ def views_of(
             )
             views.append(view)
     return tuple(views)
-
-
-def photo_doubt(image: ObservedImage) -> str:
-    """Doubt about the size of an image's photo; empty where there is none to be read."""
-    if image.image is None:
-        return ""
-    with suppress(DataError):
-        size = photo_size(image.image)
-        known = {"its camera": (image.camera.width, image.camera.height), image.image.name: size}
-        try:
-            require_one_size(known, image.image)
-        except DataError as error:
-            return f"{error} (`Camera.resized`, `Camera.cropped`)"
-    return ""
 
 
 def shape_ids(image: ObservedImage, shape: ShapeModel) -> tuple[KeypointId, ...]:

@@ -1,7 +1,7 @@
 """Outputs of runs over many observations: their tables, and pictures for the page.
 
-The table is ``results.parquet``, and ``results.csv`` without the columns that are lists;
-docs/how_to/many_photos.md describes the columns. Rows are in the order of the observations. Pose
+The table is ``results.parquet``, and the same as ``results.csv``; docs/how_to/many_photos.md
+describes the columns. Rows are in the order of the observations. Pose
 and camera of several views are the first's.
 """
 
@@ -36,7 +36,6 @@ from cadalign.render.overlay import mesh_of
 COLUMNS: Columns = (
     *(("row", int), ("source", str), ("image", str), ("object", str), ("model", str)),
     *RESULT_COLUMNS,
-    *(("covariance", list[float]), ("residuals", list[float]), ("is_inlier", list[bool])),
 )
 RECORD_COLUMNS: Columns = (("row", int), ("observation", str), ("result", str))
 """As JSON the result, for pages and `cadalign.Results.open`, or the observation that has none."""
@@ -63,27 +62,19 @@ def naming_row(row: int, source: str, observation: Observation | None) -> Row:
 
 
 def result_row(result: Result) -> Row:
-    """The cells of a result, those that are lists, too, and its record.
-
-    The record is without its time, on which no two runs agree.
-    """
-    row = row_of(result)
-    row |= {"residuals": result.residuals.ravel().tolist(), "is_inlier": result.inliers.tolist()}
-    if result.covariance is not None:
-        row["covariance"] = result.covariance.ravel().tolist()
+    """The cells of a result, and its record without its time, on which no two runs agree."""
     data = result.to_dict()
     data["stats"]["seconds"] = 0.0
-    return row | {"observation": "", "result": json_of(data).decode()}
+    return row_of(result) | {"observation": "", "result": json_of(data).decode()}
 
 
 def write_csv(folder: RunFolder) -> None:
     """Write ``results.csv`` of a finished run, holding few rows at a time."""
-    schema = without_lists(pq.read_schema(folder.results).empty_table()).schema
 
     def write(unfinished: Any) -> None:
-        with pa_csv.CSVWriter(unfinished, schema) as writer:
+        with pa_csv.CSVWriter(unfinished, pq.read_schema(folder.results)) as writer:
             for table in read_groups(folder.results, fix=DONE_ANEW):
-                writer.write_table(without_lists(table))
+                writer.write_table(table)
 
     write_whole(folder.path / "results.csv", write)
 
@@ -98,11 +89,6 @@ def warnings_text(table: pa.Table) -> str:
             listed = ", ".join(f"{name} {count:,}" for name, count in of_each)
             said.append(f"{len(rows):,} {label}: {listed}")
     return "; ".join(said)
-
-
-def without_lists(table: pa.Table) -> pa.Table:
-    """A table without the columns that hold several values in a cell."""
-    return table.select([each.name for each in table.schema if not pa.types.is_list(each.type)])
 
 
 NAMING = ("row", "source", "image", "object", "model", "match_category", "match_id")

@@ -26,8 +26,7 @@ class RetrieveRunOptions(FitRunOptions):
     columns: ClassVar[Columns] = (
         *(("match_category", str), ("match_id", str), ("match_score", float)),
         *(("match_log_likelihood", float), ("none_probability", float)),
-        ("missing", int),
-        *(("top_categories", list[str]), ("top_ids", list[str]), ("top_scores", list[float])),
+        *(("missing", int), ("matches", str)),
     )
     threads: ClassVar[int] = -1  # the search lets go of the interpreter lock
 
@@ -52,9 +51,7 @@ class RetrieveRunOptions(FitRunOptions):
             "match_log_likelihood": best.log_likelihood,
             "none_probability": best.none_probability,
             "missing": len(best.missing_ids),
-            "top_categories": [match.category for match in matches],
-            "top_ids": [match.model_id for match in matches],
-            "top_scores": [match.score for match in matches],
+            "matches": "; ".join(f"{m.category} {m.model_id} {m.score:.4g}" for m in matches),
         }
         return best.observation(seen), best.result, cells
 

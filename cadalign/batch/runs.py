@@ -1,20 +1,18 @@
-"""Runs over many observations: options, their tasks and rows, `fit_many`."""
+"""Runs over many observations: options, their tasks and rows, `run_many` and `fit_many`."""
 
 from __future__ import annotations
 
 import os
-import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import lru_cache
-from itertools import chain, starmap
 from pathlib import Path
-from typing import Any, ClassVar, get_args, get_type_hints
+from tempfile import TemporaryDirectory
+from typing import Any, ClassVar
 
-from cadalign.arrays import is_number, worker_count
-from cadalign.batch.observation_fit import ObservationFit, opened_shape, photo_doubt
+from cadalign.arrays import worker_count
+from cadalign.batch.observation_fit import ObservationFit, opened_shape
 from cadalign.batch.outputs import (
     COLUMNS,
     RECORD_COLUMNS,
@@ -27,7 +25,7 @@ from cadalign.batch.outputs import (
 from cadalign.batch.sources import ObservationTask, ObservationTasks
 from cadalign.datasets.image_keypoints import ImageKeypoints, observed_in, photo_in
 from cadalign.datasets.model_keypoints import ModelKeypoint, ModelKeypoints
-from cadalign.errors import CadalignError, DataError, InputError, require_kind, unknown
+from cadalign.errors import CadalignError, DataError, InputError, quote, require_kind
 from cadalign.estimation.result import Result
 from cadalign.estimation.results import Results
 from cadalign.evaluation.options import ExperimentOptions, absolute_paths
@@ -35,16 +33,16 @@ from cadalign.evaluation.runs.engine import OnProgress, execute, workers_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import Columns, Plan, Row, fingerprint
 from cadalign.export.results import failed_row
-from cadalign.io.documents import Positive, convert, in_file, parse_json
-from cadalign.io.files import as_path, read_bytes
+from cadalign.io.documents import in_file, parse_json
+from cadalign.io.files import as_path, made_folder, read_bytes, write_text
+from cadalign.io.images import photo_size, require_one_size
 from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
 
-LARGEST_CHUNK = 256
+LARGEST_CHUNK = 512
 """Most observations that a worker gets at a time, as of every long run."""
 _LEAST_CHUNKS = 64  # of a run, such that workers share the last ones evenly
 _FEW = 200  # observations, which are aligned sooner than processes start
 
-Observed = str | os.PathLike[str] | Iterable[str | os.PathLike[str]] | Iterable[Observation]
 Estimated = tuple[Observation, Result, Row]
 """What is aligned, its result, and further cells of the tables."""
 
@@ -92,10 +90,6 @@ class FitRunOptions(ExperimentOptions):
         return ModelKeypoints(
             tuple(ModelKeypoint(str(k), tuple(xyz), None if named else int(k)) for k, xyz in pairs)
         )
-
-    def read(self, data: Any, where: str, *, folder: Path) -> Observation:
-        """Read the parsed form of an observation, which messages call ``where``."""
-        return self.estimate.read(data, where, folder=folder, changes=self.changes)
 
     def estimate_of(self, seen: Observation, where: str) -> Estimated:
         """Estimate the object of an observation; raises CadalignError if it cannot be."""
@@ -155,7 +149,8 @@ class ManyEstimates:
         if isinstance(content, DataError):
             raise content
         if not isinstance(content, ImageKeypoints):
-            return options.read(parse_json(content, task.name), task.name, folder=folder)
+            data, changes = parse_json(content, task.name), options.changes
+            return options.estimate.read(data, task.name, folder=folder, changes=changes)
         detector = options.detector
         assert self.model is not None
         photos, named = detector.images or folder, content.image
@@ -181,21 +176,28 @@ def _doubts(seen: Observation) -> Iterator[tuple[str, str]]:
     for view in seen.views:
         if view.text_of_not_found:
             yield "left-out", view.text_of_not_found
-        if doubt := photo_doubt(view):
-            yield "camera", doubt
+        if view.image is None:
+            continue
+        known = {"its camera": (view.camera.width, view.camera.height)}
+        try:
+            known[view.image.name] = photo_size(view.image)
+        except DataError:
+            continue
+        try:
+            require_one_size(known, view.image)
+        except DataError as error:
+            yield "camera", f"{error} (`Camera.resized`, `Camera.cropped`)"
 
 
-def plan_run(
-    options: FitRunOptions, folder: RunFolder, given: Iterable[bytes] = ()
-) -> Plan[ObservationTask]:
-    """Plan the estimates of the observations of all inputs, and of ``given`` lines.
+def plan_run(options: FitRunOptions, folder: RunFolder) -> Plan[ObservationTask]:
+    """Plan the estimates of the observations of all inputs.
 
     Raises CadalignError if an option is invalid, an input or the camera cannot be read, or what a
     detector's file needs is missing.
     """
     options.changes.read_camera((1, 1))  # whatever the size: else every row would say its error
     model, photos = options.keypoints(), options.detector.images
-    tasks = ObservationTasks(options.inputs, given)
+    tasks = ObservationTasks(options.inputs)
     if photos is not None and not photos.is_dir():
         what = f"{photos} is not a folder of photos"
         raise InputError(what, where="images", fix="give the photos' folder, or leave it out")
@@ -214,18 +216,45 @@ def plan_run(
 
 def run_many(
     options: FitRunOptions,
-    folder: RunFolder,
+    out: str | os.PathLike[str],
     *,
-    given: Iterable[bytes] = (),
-    workers: int | None,
-    dask: str | None,
+    workers: int | None = None,
+    dask: str | None = None,
     on_progress: OnProgress = lambda progress: None,
 ) -> None:
-    """Do the run that the options describe, or what is left of it; see `fit_many`.
+    """Align many observations, or retrieve their models, as a run that goes on where it was killed.
 
-    By default processes do it, but few observations.
+    Parameters
+    ----------
+    options : FitRunOptions or RetrieveRunOptions
+        The inputs, and options of each estimate.
+    out : path-like
+        The run's folder: ``results.parquet`` and ``results.csv``, and what `cadalign.Results.open`
+        needs. Started again with the same options, a run that was killed goes on, and a finished
+        one stays as it is.
+    workers : int, optional
+        Processes; -1 for one for each core, 0 for none. By default -1, for few observations 0.
+    dask : str, optional
+        Address of a Dask scheduler, whose workers are used instead.
+    on_progress : callable
+        Is told of every chunk that is done.
+
+    Raises
+    ------
+    InputError
+        If an option is invalid.
+    DataError
+        If an input cannot be read, or the folder holds another run or cannot be written to.
+
+    Examples
+    --------
+    >>> linear = ObservationFit(method="aepnp")
+    >>> options = FitRunOptions(inputs=(Path("seen.jsonl"),), estimate=linear)
+    >>> run_many(options, "runs/boxes")  # doctest: +SKIP
+    >>> results = cadalign.Results.open("runs/boxes")  # doctest: +SKIP
     """
-    plan = plan_run(options, folder, given)
+    folder = RunFolder(as_path(out, "out"))
+    plan = plan_run(options, folder)
     if workers is None:
         workers = 0 if len(plan.tasks) < _FEW else -1
     pool = workers_of(workers, dask, threads=worker_count(options.threads))
@@ -234,41 +263,38 @@ def run_many(
 
 
 def fit_many(
-    observations: Observed,
+    observations: str | os.PathLike[str] | Iterable[Any],
     *,
     out: str | os.PathLike[str] | None = None,
     workers: int | None = None,
     dask: str | None = None,
     pictures: int = 0,
-    on_progress: OnProgress = lambda progress: None,
+    changes: ObservationChanges | None = None,
+    detector: DetectorOptions | None = None,
     **options: Any,
 ) -> Results:
-    """Align many observations, as a run that goes on where it was killed.
+    """Align many observations, as `cadalign fit` does, and return their results.
 
     Parameters
     ----------
     observations : path, or iterable of path or of Observation
-        Observation files, folders of such, JSON lines, and detectors' files (COCO's JSON or CSV);
-        or observations, for example of a generator, all of which memory holds as JSON.
+        Observation files, folders of such, JSON lines, and detectors' files; or observations of a
+        program, which are written as JSON lines.
     out : path-like, optional
-        The run's folder: ``results.parquet`` and ``results.csv``, and what `Results.open` needs.
-        Started again with the same arguments, a run that was killed goes on, and a finished one is
-        read. Without it nothing is kept.
-    workers : int, optional
-        Processes; -1 for one for each core, 0 for none. By default -1, for few observations 0.
-    dask : str, optional
-        Address of a Dask scheduler, whose workers are used instead.
+        The run's folder, see `run_many`; observations of a program are kept beside it, as
+        ``<out>.jsonl``. Without it nothing is kept.
+    workers, dask
+        See `run_many`.
     pictures : int
-        Number of observations whose photos are kept for `cadalign.report.write_report`, the first
-        ones.
-    on_progress : callable
-        Is told of every chunk that is done.
+        Number of observations whose photos the page shows, the first ones.
+    changes : ObservationChanges, optional
+        Takes the place of the observations' own, such as a camera for all.
+    detector : DetectorOptions, optional
+        Model and photos of a detector's file.
     **options
-        Fields of `cadalign.batch.observation_fit.ObservationFit`, such as ``method``, ``similar``,
-        ``robust``, ``shape``; of `cadalign.batch.DetectorOptions`, such as ``model``, ``images``;
-        and ``camera``, the file of a camera for all. A number as ``focal`` is the focal length [px]
-        of all images. What an observation stores holds where an option is None: unlike those of
-        `cadalign.fit`, ``sigma=None`` means the observation's, or 1; ``sigma="none"`` estimates it.
+        Fields of `cadalign.batch.ObservationFit`, such as ``method``, ``similar``, ``robust``,
+        ``loss``, ``shape``. Those that are not given are the observations' own; ``sigma="none"``
+        estimates it.
 
     Returns
     -------
@@ -278,7 +304,7 @@ def fit_many(
     Raises
     ------
     InputError
-        If an option is invalid or not known.
+        If an option is invalid or not known, or there are no observations.
     DataError
         If an input cannot be read, or the folder holds another run or cannot be written to.
 
@@ -292,82 +318,51 @@ def fit_many(
     ...     Observation(corners, camera.project(corners + [0.1, 0.2, depth]), camera)
     ...     for depth in (5.0, 6.0)
     ... )
-    >>> results = fit_many(seen, method="aepnp")
-    >>> results.translation[:, 2].round(3).tolist()
+    >>> fit_many(seen, method="aepnp").translation[:, 2].round(3).tolist()
     [5.0, 6.0]
     """
-    with ExitStack() as stack:
-        is_kept = out is not None
+    known = [each.name for each in fields(ObservationFit)]
+    if unknown := set(options) - set(known):
+        what = f"not an option: {', '.join(map(quote, sorted(unknown)))}"
+        raise InputError(what, where="options", fix=f"known are {', '.join(known)}")
+    if options.get("shape") is not None:
+        options["shape"] = as_path(options["shape"], "shape")
+    with TemporaryDirectory(prefix="cadalign-") as scratch:
+        folder = Path(scratch) / "run" if out is None else as_path(out, "out")
+        chosen = FitRunOptions(
+            inputs=_inputs(observations, folder.with_name(f"{folder.name}.jsonl")),
+            changes=changes or ObservationChanges(),
+            detector=detector or DetectorOptions(),
+            pictures=pictures,
+            estimate=ObservationFit(**options),
+        )
+        run_many(chosen, folder, workers=workers, dask=dask)
+        results = Results.open(folder)
         if out is None:
-            out = stack.enter_context(tempfile.TemporaryDirectory(prefix="cadalign-"))
-        folder = RunFolder(as_path(out, "out"))
-        parts = _parts_of({"pictures": pictures, **options})
-        inputs, given = _inputs(observations)
-        chosen = FitRunOptions(inputs=inputs, **parts)
-        run_many(chosen, folder, given=given, workers=workers, dask=dask, on_progress=on_progress)
-        results = Results.open(folder.path)
-        if not is_kept:
             list(results)  # reads each, before the folder goes away
         return results
 
 
-_PARTS: dict[str, Any] = {
-    "changes": ObservationChanges,
-    "detector": DetectorOptions,
-    "estimate": ObservationFit,
-}
-"""Dataclasses of a run's options; of a name that two have, the last one's is meant."""
-
-
-def _parts_of(given: dict[str, Any]) -> dict[str, Any]:
-    """Fields of `FitRunOptions` by options of any of their dataclasses; see `fit_many`.
-
-    Paths may be texts. Raises InputError if an option is not known, or of another type.
-    """
-    known = {
-        name: (part, kind)
-        for part, owner in _PARTS.items()
-        for name, kind in get_type_hints(owner, include_extras=True).items()
-    }
-    found: dict[str, dict[str, Any]] = {part: {} for part in _PARTS}
-    pictures = _converted(given.pop("pictures"), int, "pictures")
-    for name, value in given.items():
-        if name not in known:
-            raise unknown("option", name, known, where=name)
-        part, kind = known[name]
-        if name == "focal" and is_number(value):
-            part, kind = "changes", Positive
-        if value is not None:
-            found[part][name] = _converted(value, kind, name)
-    return {"pictures": pictures} | {part: owner(**found[part]) for part, owner in _PARTS.items()}
-
-
-def _converted(value: Any, kind: Any, name: str) -> Any:
-    if Path in get_args(kind):
-        return as_path(value, name)
-    try:
-        return convert(value, kind, name)
-    except DataError as error:
-        raise InputError(error.what, where=error.where, fix=error.fix) from None
-
-
-def _inputs(observations: Observed) -> tuple[tuple[Path, ...], list[bytes]]:
-    """The paths of observations, or observations as lines."""
+def _inputs(observations: Any, beside: Path) -> tuple[Path, ...]:
+    """Paths of inputs; observations are written as JSON lines, to the file ``beside`` the run."""
     if isinstance(observations, str | os.PathLike):
-        return (as_path(observations, "observations"),), []
+        observations = [observations]
     try:
-        source = iter(observations)
+        given = list(observations)
     except TypeError:
-        what = f"expected paths or Observations, got {type(observations).__name__}"
-        raise InputError(what, where="observations", fix="give a list of them") from None
-    first = next(source, None)
-    if first is None:
-        raise InputError("there are none", where="observations")
-    if isinstance(first, Observation):
-        return (), list(starmap(_line, enumerate(chain([first], source))))
-    return tuple(as_path(each, "observations") for each in (first, *source)), []
-
-
-def _line(number: int, observation: Any) -> bytes:
-    require_kind(observation, Observation, f"observations[{number}]")
-    return json_of(observation.to_dict())
+        what = f"expected a path or a sequence, got {type(observations).__name__}"
+        raise InputError(what, where="observations", fix="give a list") from None
+    if not given:
+        raise InputError("none are given", where="observations")
+    if isinstance(given[0], str | os.PathLike):
+        return tuple(as_path(each, f"observations[{k}]") for k, each in enumerate(given))
+    for number, each in enumerate(given):
+        require_kind(each, Observation, f"observations[{number}]")
+    made_folder(beside.parent)
+    lines = [json_of(each.to_dict(folder=beside.absolute().parent)).decode() for each in given]
+    text = "".join(f"{line}\n" for line in lines)
+    if beside.exists() and read_bytes(beside) != text.encode():
+        what, fix = "holds the observations of another run", "give another folder as out"
+        raise DataError(what, where=str(beside), fix=fix)
+    write_text(beside, text)
+    return (beside,)

@@ -14,7 +14,7 @@ from codecs import BOM_UTF8
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, cast
 
 from cadalign.datasets.image_keypoints import ImageKeypoints
 from cadalign.datasets.keypoint_files import read_image_keypoints
@@ -23,7 +23,6 @@ from cadalign.io.documents import read_json
 from cadalign.io.files import listed, open_input, read_bytes, read_text
 from cadalign.io.kinds import DETECTOR, LINES, OBSERVATION, TABLE, kind_of, refuse_other_file
 
-_DAMAGED = "damaged"  # a file whose row says what is wrong with it
 _CELLS = 3  # of a task: the number of its source, its own in it, and the byte where it begins
 
 
@@ -43,23 +42,20 @@ class ObservationTask(NamedTuple):
 class ObservationTasks(Sequence[ObservationTask]):
     """The observations of all inputs; of a file of lines it keeps where each begins.
 
-    ``given`` are lines of observations that come from no file. Raises DataError if a file cannot be
-    read, or an input holds no observation.
+    Raises DataError if a file cannot be read, or an input holds no observation.
     """
 
-    def __init__(self, inputs: Iterable[Path], given: Iterable[bytes] = ()) -> None:
+    def __init__(self, inputs: Iterable[Path]) -> None:
         self._digest = hashlib.sha256()
-        self._sources: list[Path] = []
+        self._sources: list[tuple[Path, str]] = []  # with the folder that each lies in
         self._cells = array("q")
-        self._objects: dict[int, list[tuple[str, bytes | ImageKeypoints | DataError]]] = {}
+        self._objects: dict[int, list[tuple[str, Any]]] = {}  # of a detector's file
         self.has_detections = False
-        lines = [(f"observations[{number}]", line) for number, line in enumerate(given)]
-        if lines:
-            self._digest.update(b"\n".join(line for _, line in lines))
-            self._add_objects(Path("observations"), lines)
         for path in inputs:
             for file, kind in _files_of(path):
                 self._add(file, kind)
+                folder = os.path.dirname(os.path.abspath(file))
+                self._sources.append((file, folder))
 
     @property
     def fingerprint(self) -> str:
@@ -79,12 +75,11 @@ class ObservationTasks(Sequence[ObservationTask]):
 
     def _task(self, row: int, files: dict[int, BinaryIO], opened: ExitStack) -> ObservationTask:
         source, own, start = self._cells[_CELLS * row : _CELLS * (row + 1)]
-        path = self._sources[source]
-        name = os.fspath(path)
-        content: str | bytes | ImageKeypoints | DataError
+        path, folder = self._sources[source]
+        name, content = os.fspath(path), cast(Any, None)
         if source in self._objects:
             name, content = self._objects[source][own]
-        elif path.suffix.lower() in LINES:
+        elif own:  # a line
             if source not in files:
                 files[source] = opened.enter_context(open_input(path))
             files[source].seek(start)
@@ -94,7 +89,7 @@ class ObservationTasks(Sequence[ObservationTask]):
                 content = read_text(path)
             except DataError as error:
                 content = error
-        return ObservationTask(row, name, content, os.path.dirname(os.path.abspath(path)))
+        return ObservationTask(row, name, content, folder)
 
     def _add(self, path: Path, kind: str | None) -> None:
         if path.suffix.lower() in LINES:
@@ -106,17 +101,14 @@ class ObservationTasks(Sequence[ObservationTask]):
             # Which memory holds whole; objects that cannot be read come last.
             bad: dict[str, DataError] = {}
             good = read_image_keypoints(path, problems=bad)
-            self._add_objects(path, [*((each.source, each) for each in good), *bad.items()])
+            objects = [*((each.source, each) for each in good), *bad.items()]
+            self._objects[len(self._sources)] = objects
+            self._cells.extend(
+                cell for own in range(len(objects)) for cell in (len(self._sources), own, 0)
+            )
             self.has_detections = True
         else:
             self._cells.extend((len(self._sources), 0, 0))
-            self._sources.append(path)
-
-    def _add_objects(self, path: Path, objects: list[tuple[str, Any]]) -> None:
-        for own in range(len(objects)):
-            self._cells.extend((len(self._sources), own, 0))
-        self._objects[len(self._sources)] = objects
-        self._sources.append(path)
 
     def _add_lines(self, path: Path) -> None:
         """Find where the lines of a file begin; empty ones are passed over."""
@@ -130,7 +122,6 @@ class ObservationTasks(Sequence[ObservationTask]):
                 self._digest.update(line)
         if len(self._cells) == before:
             raise DataError("the file holds no observation", where=str(path))
-        self._sources.append(path)
 
 
 def _files_of(path: Path) -> Iterator[tuple[Path, str | None]]:
@@ -145,7 +136,7 @@ def _files_of(path: Path) -> Iterator[tuple[Path, str | None]]:
     for each in listed(path):
         if each.suffix.lower() in (".json", *LINES) and each.is_file():
             kind = _kind_of(each)
-            if kind in (OBSERVATION, _DAMAGED):
+            if kind == OBSERVATION:
                 is_empty = False
                 yield each, kind
     if is_empty:
@@ -159,5 +150,5 @@ def _kind_of(path: Path) -> str | None:
         return DETECTOR if suffix == TABLE else OBSERVATION
     try:
         return kind_of(read_json(path))
-    except DataError:
-        return _DAMAGED
+    except DataError:  # which its row says
+        return OBSERVATION

@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 
 from cadalign.batch.outputs import COLUMNS as TABLE_COLUMNS
-from cadalign.batch.outputs import NAMING, RECORD_COLUMNS, page_names, warnings_text, without_lists
+from cadalign.batch.outputs import NAMING, RECORD_COLUMNS, page_names, warnings_text
 from cadalign.batch.runs import FitRunOptions, plan_run
 from cadalign.errors import DataError
 from cadalign.estimation.result import Result
@@ -66,13 +66,12 @@ class FitRun(Run):
 
 def _as_instances(table: pa.Table) -> pa.Table:
     """The table of results with the names of instances, the estimates of all by one name."""
-    shown = without_lists(table)
-    naming = [name for name in NAMING if name in shown.column_names]
-    names = [page_names(row) for row in shown.select(naming).to_pylist()]
+    naming = [name for name in NAMING if name in table.column_names]
+    names = [page_names(row) for row in table.select(naming).to_pylist()]
     for name in ("category", "model_id", "view"):
-        shown = shown.append_column(name, pa.array([each[name] for each in names]))
-    place = shown.schema.get_field_index("method")
-    return shown.set_column(place, "method", pa.array([METHOD] * len(shown), pa.string()))
+        table = table.append_column(name, pa.array([each[name] for each in names]))
+    place = table.schema.get_field_index("method")
+    return table.set_column(place, "method", pa.array([METHOD] * len(table), pa.string()))
 
 
 def _record(stored: Row, names: Row) -> Row:

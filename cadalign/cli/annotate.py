@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from cadalign.annotate.files import SessionOptions, only_annotator
-from cadalign.cli.common import UsageError, answer, make_folder, say, waiting
-from cadalign.io.files import writing
+from cadalign.cli.common import UsageError, answer, say, waiting
+from cadalign.io.files import made_folder, writing
 from cadalign.io.kinds import MESH, PHOTO, kind_of_file
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class Annotate(SessionOptions):
         with ExitStack() as opened:
             opened.enter_context(listener)
             if self.out is not None:
-                make_folder(self.out)
+                made_folder(self.out)
             if self.observation is not None:
                 with writing(self.observation):
                     self.observation.parent.mkdir(parents=True, exist_ok=True)

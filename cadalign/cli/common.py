@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import tyro
 
-from cadalign.errors import CadalignError, DataError
-from cadalign.io.files import finite, printable, refuse_folder, refuse_nul
+from cadalign.errors import CadalignError
+from cadalign.io.files import finite, made_folder, refuse_folder
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -138,7 +138,7 @@ def print_table(table: ConsoleTable) -> None:
 def make_folder_of(file: Path) -> None:
     """Create the folder of an output file; raises DataError on failure, or if it is a folder."""
     refuse_folder(file)
-    make_folder(file.absolute().parent)
+    made_folder(file.absolute().parent)
 
 
 def beside(given: Path, ending: str) -> Path:
@@ -147,16 +147,3 @@ def beside(given: Path, ending: str) -> Path:
         given = given.resolve()
         return given.with_name(given.name + ending)
     return given.with_name(given.stem + ending)
-
-
-def make_folder(path: Path) -> None:
-    """Create an output folder; raises DataError on failure."""
-    refuse_nul(path)
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(
-            f"the folder cannot be created ({error.strerror or error})",
-            where=printable(path),
-            fix="choose another --out",
-        ) from None

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import platform
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,8 +26,7 @@ if TYPE_CHECKING:
 class Doctor:
     """Check the renderers, and show how to enable missing ones.
 
-    Also shows the processor cores and the cache of compiled solvers. With --compile, compiles the
-    solvers ahead.
+    Also shows the cache of compiled solvers. With --compile, compiles the solvers ahead.
     """
 
     compile: bool = False
@@ -50,12 +47,6 @@ class Doctor:
         for each in renderers:
             if not each.works:
                 answer(f"To enable {each.name}: {REMEDIES[each.name]}")
-        versions = (f"{name} {version(name.lower())}" for name in ("NumPy", "Numba"))
-        answer(f"Python {platform.python_version()}, {', '.join(versions)}")
-        cores = os.cpu_count() or 1
-        has_affinity = hasattr(os, "sched_getaffinity")  # not on macOS
-        usable = len(os.sched_getaffinity(0)) if has_affinity else cores
-        answer(f"Cores: {cores}, of which this process may use {usable}")
         answer(f"Compiled solvers: {compiled_cache()}")
         return 0 if renderers[-1].works else 1
 

@@ -1,7 +1,4 @@
-"""`cadalign evaluate`, `simulate` and `demo`: runs that can be killed and started again; `report`.
-
-A report is the result of runs as one page, or as a table for papers and pull requests.
-"""
+"""`cadalign evaluate`, `simulate` and `demo`: runs that go on where they were killed; `report`."""
 
 from __future__ import annotations
 
@@ -10,12 +7,12 @@ from contextlib import redirect_stdout
 from dataclasses import dataclass, fields, make_dataclass
 from inspect import getdoc
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 import tyro
 
-from cadalign.cli.common import NOTHING_WORKED, SUCCESS, JsonOption, group_of, make_folder, say
+from cadalign.cli.common import NOTHING_WORKED, SUCCESS, JsonOption, group_of, say
 from cadalign.cli.options import named_as_flags
 from cadalign.cli.runs import conclude, run_progress, write_run_report
 from cadalign.evaluation.experiments.keypointnet import DemoOptions
@@ -23,7 +20,6 @@ from cadalign.evaluation.experiments.simulation import SweepOptions
 from cadalign.evaluation.options import ExperimentOptions, RunOptions
 from cadalign.evaluation.registry import Spec, known_options, spec_named
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.io.files import keeping, write_text
 
 if TYPE_CHECKING:
     from cadalign.evaluation.runs.tables import Run
@@ -118,11 +114,8 @@ class _DemoCommand(RunCommand):
         from cadalign.report import write_report
 
         spec, run = self.do_run()
-        for row in run.results.to_pylist():
-            if row["reason"]:
-                say(f"{row['category']} {row['model_id']}: {row['reason']}")
         code = conclude(spec, run, json=self.json)
-        write_report([self.out], self.out / "index.html", title="cadalign demo")
+        write_report([self.out], self.out / "index.html")
         say(f"Pictures: {self.out / 'index.html'}")
         return NOTHING_WORKED if code == NOTHING_WORKED else SUCCESS
 
@@ -142,25 +135,14 @@ class ReportCommand:
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """Folders of runs, as `cadalign demo`, `evaluate` and `simulate` write them."""
     out: Path | None = None
-    """File to write. By default report.html, in the run's folder if it is one run; a table goes to
-    standard output."""
-    format: Literal["html", "md", "csv"] = "html"
-    """The page, or the headline table alone."""
+    """File to write; by default report.html, in the run's folder if it is one run."""
 
     def run(self) -> int:
         """Write the report; returns the exit code."""
-        from cadalign.report import headline_text, write_report
+        from cadalign.report import write_report
 
-        if self.format == "html":
-            page = self.runs[0] / "report.html" if len(self.runs) == 1 else Path("report.html")
-            say(f"Report: {write_report(self.runs, self.out or page)}")
-            return 0
-        text = headline_text(self.runs, format=self.format)
-        if self.out is None:
-            sys.stdout.write(text)
-        else:
-            with keeping(path for run in self.runs for path in RunFolder(run).sources):
-                write_text(self.out, text)
+        page = self.runs[0] / "report.html" if len(self.runs) == 1 else Path("report.html")
+        say(f"Report: {write_report(self.runs, self.out or page)}")
         return 0
 
 
@@ -195,12 +177,12 @@ def write_example(folder: Path) -> None:
     from cadalign.geometry.camera import Camera
     from cadalign.geometry.mesh import Mesh
     from cadalign.geometry.rotations import rotation_from_vector
-    from cadalign.io.files import write_json
+    from cadalign.io.files import made_folder, write_json
     from cadalign.io.images import write_image
     from cadalign.io.meshes.files import write_mesh
     from cadalign.render import RaycastRenderer, Scene
 
-    make_folder(folder)
+    made_folder(folder)
     mesh = Mesh(np.array(KEYPOINTS + _FEET), np.array(_FACES))
     write_mesh(folder / "chair.obj", mesh, kind="obj")
     named = tuple(map(ModelKeypoint, NAMES, KEYPOINTS))

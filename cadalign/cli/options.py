@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from cadalign.cli.common import JsonOption, UsageError
 from cadalign.errors import DataError, InputError, refuse_unused
+from cadalign.io.documents import read_json
+from cadalign.io.kinds import OBSERVATION, is_of_many
 from cadalign.io.observation import DetectorOptions, ObservationChanges
 
 if TYPE_CHECKING:
@@ -79,17 +82,28 @@ class ManyCommand(JsonOption, DetectorOptions):
     dask: str | None = None
     """Address of a Dask scheduler, whose workers are used instead."""
 
-    def refuse_of_many(self, *used: str) -> None:
-        """Refuse what is for many observations alone, but for ``used``; see `refuse_unused`."""
-        names = {"workers", "dask", *DetectorOptions.__dataclass_fields__}
-        refuse_unused(self, names.difference(used), "on one observation")
-
+    @property
     def first(self) -> Path:
         """The first observation; raises UsageError if none is given."""
         if not self.observations:
             fix = "give a JSON file with camera and keypoints, or a folder of such files"
             raise UsageError("no observation is given", where="OBSERVATION", fix=fix)
         return self.observations[0]
+
+    def only(self) -> Any:
+        """The parsed form of the only observation; None where there may be many.
+
+        What is for many observations alone is refused beside one.
+        """
+        path, data = self.first, None
+        if path.suffix.lower() == ".json" and os.path.isfile(path):
+            data = read_json(path)
+        if len(self.observations) > 1 or is_of_many(path, data):
+            return None
+        data = read_json(path, OBSERVATION) if data is None else data
+        names = "workers", "dask", *DetectorOptions.__dataclass_fields__
+        refuse_unused(self, names, "on one observation")
+        return data
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -15,9 +15,6 @@ from cadalign.errors import InputError
 from cadalign.io.images import JPEG_ENDING
 
 if TYPE_CHECKING:
-    from cadalign.arrays import FloatArray
-    from cadalign.render.canvas import ByteImage
-    from cadalign.render.scene import Renderer, Scene
     from cadalign.render.viewpoints import Angles
 
 _ENDINGS = (".png", JPEG_ENDING)
@@ -41,39 +38,32 @@ class Render:
     """Width and height in pixels; of a contact sheet, each picture's."""
     keypoints: Path | None = None
     """Keypoints to draw: the model's NAME.keypoints.json."""
-    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Stretch along the model's axes."""
     fov: float = 35.0
     """Horizontal field of view in degrees."""
-    samples: int = 16
-    """Rays per pixel at edges; 1 turns antialiasing off."""
-    renderer: Literal["auto", "raycast", "pyrender", "open3d"] = "auto"
-    """Renderer of the colour."""
 
     def run(self) -> int:
         """Draw and write; returns the exit code."""
         from cadalign.datasets.model_keypoints import ModelKeypoints
         from cadalign.io.images import write_image
         from cadalign.io.meshes.files import load_mesh
-        from cadalign.render.layers import contact_sheet
-        from cadalign.render.probe import make_renderer
+        from cadalign.render.layers import contact_sheet, keypoint_picture
+        from cadalign.render.raycast import RaycastRenderer
         from cadalign.render.scene import Scene
+        from cadalign.render.viewpoints import pose_in_view, visible_keypoints
 
         with named_as_flags(self, elevation="--view"):
             camera, views = self._camera(), self._views()
-            scene, renderer = Scene(load_mesh(self.model)), make_renderer(self.renderer)
-            keypoints = None
-            if self.keypoints is not None:
-                keypoints = ModelKeypoints.load(self.keypoints).xyz
-            pictures = {
-                name: self._draw(scene, renderer, camera, view, keypoints)
-                for name, view in views.items()
-            }
-            (picture, *further) = pictures.values()
-            if further:
-                picture = contact_sheet(pictures)
+            scene, pictures = Scene(load_mesh(self.model)), {}
+            xyz = None if self.keypoints is None else ModelKeypoints.load(self.keypoints).xyz
+            for name, view in views.items():
+                pose = pose_in_view(scene, camera, view)
+                picture = RaycastRenderer().render(scene, camera, pose).composite()
+                if xyz is not None:
+                    visible = visible_keypoints(scene, xyz, camera, pose)
+                    picture = keypoint_picture(picture, camera, xyz, pose, visible)
+                pictures[name] = picture
             make_folder_of(self.out)
-            write_image(self.out, picture)
+            write_image(self.out, contact_sheet(pictures) if len(pictures) > 1 else picture)
         say(f"Written: {self.out}")
         return 0
 
@@ -92,8 +82,6 @@ class Render:
             what = f"{self.out.name} is neither a PNG nor a JPEG file"
             fix = f"give a name that ends in {' or '.join(_ENDINGS)}"
             raise InputError(what, where="--out", fix=fix)
-        if not all(0 < each < float("inf") for each in self.scale):
-            raise InputError(f"{self.scale} is not positive", where="--scale")
         return camera
 
     def _views(self) -> dict[str, Angles]:
@@ -106,22 +94,3 @@ class Render:
         if not views:
             raise InputError("no view is given", where="--view", fix="give one or more")
         return views
-
-    def _draw(
-        self,
-        scene: Scene,
-        renderer: Renderer,
-        camera: Any,
-        view: Angles,
-        keypoints: FloatArray | None,
-    ) -> ByteImage:
-        """One picture, (h, w, 3) uint8."""
-        from cadalign.render.layers import keypoint_picture
-        from cadalign.render.viewpoints import pose_in_view, visible_keypoints
-
-        pose = pose_in_view(scene, camera, view, scale=self.scale)
-        image = renderer.render(scene, camera, pose, samples=self.samples).composite()
-        if keypoints is None:
-            return image
-        visible = visible_keypoints(scene, keypoints, camera, pose)
-        return keypoint_picture(image, camera, keypoints, pose, visible)

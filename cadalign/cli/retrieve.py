@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -14,7 +13,6 @@ import tyro
 from cadalign.cli.common import (
     answer,
     group_of,
-    make_folder,
     make_folder_of,
     print_json,
     print_table,
@@ -24,10 +22,8 @@ from cadalign.cli.common import (
 from cadalign.cli.options import CameraOptions, ManyCommand, named_as_flags
 from cadalign.errors import DataError, refuse_unused
 from cadalign.estimation.options import Sigma
-from cadalign.io.documents import read_json
-from cadalign.io.files import keeping, refuse_input, require_utf8
+from cadalign.io.files import keeping, made_folder, refuse_input, require_utf8
 from cadalign.io.images import read_image
-from cadalign.io.kinds import OBSERVATION, is_of_many
 from cadalign.io.observation import Observation
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.query import ObservationRetrieval
@@ -62,9 +58,6 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
     out: Path | None = None
     """Folder for matches.json and the matches' pictures; by default none is written. For many
     observations the run's, by default beside them."""
-    workers: int | None = None
-    """Threads for one observation, -1 (the default) for one per core. Processes for many, 0 for
-    none; by default -1, for few observations 0."""
     picture: bool = True
     """Write a page of many observations."""
     ranking: Annotated[
@@ -73,9 +66,7 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
 
     def run(self) -> int:
         """Run the retrieval, or the retrievals; returns the exit code."""
-        path = self.first()
-        is_file = path.suffix.lower() == ".json" and os.path.isfile(path)
-        data = read_json(path) if is_file else None
+        path = self.first
         with named_as_flags(self, self.ranking):
             how = ObservationRetrieval(
                 library=self.library,
@@ -83,20 +74,15 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
                 sigma=self.sigma,
                 ranking=RetrievalOptions(**vars(self.ranking)),
             )
-            if len(self.observations) > 1 or is_of_many(path, data):
-                return self._retrieve_many(how)
-            self.refuse_of_many("workers")
-            data = read_json(path, OBSERVATION) if data is None else data
+            data = self.only()
+            if data is None:
+                from cadalign.batch.retrievals import RetrieveRunOptions  # takes time to import
+                from cadalign.cli.runs import inputs_of, run_command
+
+                options = RetrieveRunOptions(estimate=how, **inputs_of(self))
+                return run_command(self, options, done="retrieved")
             query = how.read(data, str(path), folder=path.parent, changes=self.changes)
             return self._retrieve(how.with_ids(query, str(path)), path, how)
-
-    def _retrieve_many(self, how: ObservationRetrieval) -> int:
-        """Retrieve the models of all observations; returns the exit code."""
-        from cadalign.batch.retrievals import RetrieveRunOptions
-        from cadalign.cli.runs import inputs_of, run_command
-
-        options = RetrieveRunOptions(estimate=how, **inputs_of(self))
-        return run_command(self, options, done="retrieved")
 
     def _retrieve(self, query: Observation, path: Path, how: ObservationRetrieval) -> int:
         """Retrieve the models of one observation, read of a path; returns the exit code."""
@@ -107,8 +93,7 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
         if self.out is not None and query.image is not None:
             photo = read_image(query.image, query.camera)
         with waiting("retrieving (the first time after an installation takes a minute)"):
-            workers = -1 if self.workers is None else self.workers
-            matches = how.retrieve(query, str(path), workers=workers)
+            matches = how.retrieve(query, str(path))
         if self.json:
             print_json([match.to_dict() for match in matches])
         else:
@@ -117,7 +102,7 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
             if absent is not None:
                 say(absent)
         if self.out is not None:
-            make_folder(self.out)
+            made_folder(self.out)
             with keeping([path, *query.files, self.library]):
                 sheet = write_retrieval(self.out, matches, query, image=photo)
             say(f"Pictures: {sheet}")

@@ -9,14 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import MofNCompleteColumn, Progress
 
 from cadalign.cli.common import beside, exit_code, new_console, print_json, print_table, say
 from cadalign.cli.options import flags_of, with_flags
@@ -83,30 +76,15 @@ def write_run_report(folder: RunFolder) -> None:
 
 
 @contextmanager
-def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
-    """Show a progress bar with the time left; yields what takes how many of all are done."""
-    if not sys.stderr.isatty():  # rich would end in an empty line; before 14.3 also if disabled
-        yield lambda done, total: None
-        return
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        console=new_console(),
-        transient=True,
-    ) as progress:
-        bar = progress.add_task(label, total=None)
-        yield lambda done, total: progress.update(bar, total=total, completed=done)
-
-
-@contextmanager
 def run_progress(label: str) -> Iterator[Callable[[RunProgress], None]]:
-    """Show a progress bar; yields what takes a run's progress."""
-    with progress_bar(label) as show:
-        yield lambda state: show(state.done, state.total)
+    """Show a progress bar with the time left; yields what takes a run's progress."""
+    if not sys.stderr.isatty():  # rich would end in an empty line; before 14.3 also if disabled
+        yield lambda state: None
+        return
+    columns = *Progress.get_default_columns(), MofNCompleteColumn()
+    with Progress(*columns, console=new_console(), transient=True) as progress:
+        bar = progress.add_task(label, total=None)
+        yield lambda state: progress.update(bar, total=state.total, completed=state.done)
 
 
 def inputs_of(command: Any) -> dict[str, Any]:
@@ -127,20 +105,15 @@ def run_command(command: ManyCommand, options: FitRunOptions, *, done: str) -> i
     """
     import pyarrow.parquet as pq
 
-    from cadalign.batch.outputs import WARNED, warnings_text, without_lists
+    from cadalign.batch.outputs import WARNED, warnings_text
     from cadalign.batch.runs import run_many
 
     folder = run_folder(command, options)
     with run_progress(options.experiment) as on_progress:
-        run_many(
-            options,
-            folder,
-            workers=command.workers,
-            dask=command.dask,
-            on_progress=on_progress,
-        )
+        workers, dask = command.workers, command.dask
+        run_many(options, folder.path, workers=workers, dask=dask, on_progress=on_progress)
     if command.json:
-        print_json(without_lists(pq.read_table(folder.results)).to_pylist())
+        print_json(pq.read_table(folder.results).to_pylist())
     total, reasons = _reasons(folder)
     failed = sum(count for _, count in reasons)
     _say_reasons([(_as_typed(reason, command), count) for reason, count in reasons])
@@ -196,7 +169,7 @@ def run_folder(command: ManyCommand, options: FitRunOptions) -> RunFolder:
     """The run's folder, by default beside the first input."""
     from cadalign.evaluation.runs.folder import RunFolder
 
-    kind, first = options.experiment, command.observations[0]
+    kind, first = options.experiment, command.first
     if command.out is not None:
         return RunFolder(command.out)
     if len(command.observations) > 1 or not os.path.exists(first):

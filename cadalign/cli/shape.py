@@ -89,12 +89,6 @@ def _text(model: ShapeModel) -> str:
             f"the first {_MODES} hold {held:.0f} % of the variance; standard deviation of a "
             f"coordinate {sigma:.3g}, {each.residual_sigma:.2g} besides the modes"
         )
-    if training is not None:
-        counts = np.isfinite(training.points_3d[..., 0]).sum(axis=0).tolist()
-        pairs_of = zip(model.ids, counts, strict=True)
-        rare = [f"{name} ({count})" for name, count in pairs_of if count < len(training) / 4]
-        if rare:
-            lines.append(f"  rare keypoints (models that have it): {', '.join(rare)}")
     return "\n".join(lines)
 
 

@@ -42,8 +42,8 @@ from cadalign.io.focal import FocalPrior
 
 Matrix = list[list[Finite]]
 Matrix3 = tuple[Point3, Point3, Point3]
-_REPEATED = ("alignment", "camera", "rms", "std", "covariance")
-"""Properties of a result that a file holds for other readers."""
+_REPEATED = ("rms", "std", "covariance")
+"""Properties of a result that a file holds for other readers, beside the first view's."""
 _OF_POINTS = ("points_covariance", "points_cam_covariance")
 _OF_POSTERIOR = (*("fisher_covariance", *_OF_POINTS, "degrees_of_freedom", "warnings", "evidence"),)
 
@@ -135,8 +135,9 @@ def write_result(result: Any) -> dict[str, Any]:
     """A result as plain lists and numbers; its model is not part of it."""
     posterior = {name: getattr(result.posterior, name) for name in _OF_POSTERIOR}
     others = {"version": 1, **posterior, "own_stretch": result.stretch}
-    repeated = {name: _plain(getattr(result, name)) for name in _REPEATED}
-    return _fields(result, _Result, others) | repeated
+    written = _fields(result, _Result, others)
+    first = {name: dict(written["views"][0][name]) for name in ("alignment", "camera")}
+    return written | first | {name: _plain(getattr(result, name)) for name in _REPEATED}
 
 
 def _fields(value: Any, form: type[ForeignDocument], others: Mapping[str, Any]) -> dict[str, Any]:
@@ -148,20 +149,23 @@ def _fields(value: Any, form: type[ForeignDocument], others: Mapping[str, Any]) 
     }
 
 
+_SCALARS = {int, str, bool, type(None)}
+
+
 def _plain(value: Any) -> Any:
     """A value as lists, mappings and numbers; null for a number or a row that is not finite."""
     kind = type(value)
-    if value is None or kind in (int, str, bool):
+    if kind in _SCALARS:
         return value
     if kind is np.ndarray:
         rows = value.tolist()
-        if np.isfinite(value.sum()):
+        if math.isfinite(value.sum()):
             return rows
         return [row if np.isfinite(row).all() else None for row in rows]
     if kind is float:
         return value if math.isfinite(value) else None
     if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
+        return [each if type(each) in _SCALARS else _plain(each) for each in value]
     if isinstance(value, Alignment | Camera | Symmetry):
         return value.to_dict()
     if kind in _FORMS:

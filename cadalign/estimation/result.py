@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 
     from cadalign.estimation.model import Model
     from cadalign.estimation.result_parts import EstimateWarning, EvidenceSummary
-    from cadalign.export.aligned_object import Frame
     from cadalign.geometry.mesh import Mesh
     from cadalign.shapes.model import ShapeModel
     from cadalign.shapes.parts import TrainingShapes
@@ -172,6 +171,8 @@ class Result:
     @property
     def rms(self) -> float:
         """Root mean square length of the inliers' residuals [px]."""
+        if len(self.views) == 1:
+            return self.views[0].rms
         return rms_of(self.residuals, self.inliers)
 
     @property
@@ -391,9 +392,6 @@ class Result:
     def export(
         self,
         path: str | os.PathLike[str],
-        *,
-        format: str | None = None,
-        frame: Frame = "camera",
         **of_the_object: Any,
     ) -> Path:
         """Write the aligned object for another tool; see `cadalign.export.export_object`.
@@ -402,20 +400,16 @@ class Result:
         ----------
         path : path-like
             Its ending chooses the format: ``.glb``, ``.obj`` or ``.ply``.
-        format, frame
-            As for `cadalign.export.export_object`.
         **of_the_object
-            ``mesh``, ``image`` or ``images``, ``name`` and ``metres`` of
-            `cadalign.export.object_of`.
+            ``mesh``, ``photos`` and ``name`` of `cadalign.export.object_of`.
 
         Examples
         --------
-        >>> result.export("chair.glb", mesh=mesh, image="chair.jpg")  # doctest: +SKIP
+        >>> result.export("chair.glb", mesh=mesh, photos=["chair.jpg"])  # doctest: +SKIP
         """
         from cadalign.export import export_object, object_of
 
-        exported = object_of(self, **of_the_object)
-        return export_object(path, exported, format=format, frame=frame)
+        return export_object(path, object_of(self, **of_the_object))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result as JSON, as `cadalign fit` does.

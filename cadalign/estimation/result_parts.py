@@ -7,6 +7,7 @@ logarithms of the lengths along x, y, z, and, where it was estimated, of the foc
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
@@ -209,7 +210,9 @@ class FittedKeypoints:
     @property
     def is_counted(self) -> BoolArray:
         """Rows (n,) that are not left out."""
-        return ~np.isin(np.arange(len(self.points_3d)), [row for row, _ in self.repeats])
+        counted = np.ones(len(self.points_3d), dtype=bool)
+        counted[[row for row, _ in self.repeats]] = False
+        return counted
 
     @property
     def observed(self) -> FloatArray:
@@ -276,10 +279,10 @@ def keypoint_summary(
     """The summary of a view's inliers (n,), with residuals (n, 2) [px] of a standard deviation."""
     kept, unit = residuals[inliers], 1.0 if sigma is None else sigma
     count = max(len(kept), 1)
-    rms = float(np.sqrt((kept * kept).sum() / count))
+    rms = math.sqrt((kept * kept).sum() / count)
     if np.ndim(unit) == 0:
-        with np.errstate(over="ignore"):  # of the least positive number
-            in_sigmas = float(np.nan_to_num(np.divide(rms / np.sqrt(2.0), float(unit))))
+        # The least positive number is a sigma, too.
+        in_sigmas = min(rms / math.sqrt(2.0) / float(unit), sys.float_info.max)
     else:
         information = pixel_information(unit, len(residuals))[inliers]
         squares = np.einsum("ni,nij,nj->", kept, information, kept)
@@ -396,4 +399,4 @@ class ViewResult:
 def rms_of(residuals: FloatArray, inliers: BoolArray) -> float:
     """Root mean square length of residuals (n, 2), of the inliers (n,) alone."""
     kept = residuals[inliers]
-    return float(np.sqrt((kept * kept).sum() / max(len(kept), 1)))
+    return math.sqrt((kept * kept).sum() / max(len(kept), 1))

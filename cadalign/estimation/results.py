@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 COLUMNS = POSE_SIZE + 2
 """Columns of a table of results: a packed alignment, rms and focal length."""
 _TABLE, _RECORDS = "results.parquet", "records.parquet"  # of a run, see `cadalign.batch.outputs`
-_FIX = "give a folder that `cadalign fit` or `cadalign.fit_many` has written"
+_FIX = "give a folder that `cadalign fit` or `cadalign.batch.run_many` has written"
 
 Entry = Result | CadalignError | Callable[[], Result]
 
@@ -152,7 +152,7 @@ class Results(Sequence[Result | CadalignError]):
 
     @classmethod
     def open(cls, folder: str | os.PathLike[str]) -> Results:
-        """Read the results of a run of `cadalign fit` or `cadalign.fit_many`.
+        """Read the results of a run of `cadalign fit` or `cadalign.batch.run_many`.
 
         Parameters
         ----------

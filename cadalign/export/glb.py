@@ -1,7 +1,6 @@
 """GLB (binary glTF 2.0): the textured model, the cameras, and behind it the photos.
 
-The scene's axes are those of the chosen frame; the first camera's are turned to glTF's, so that it
-stands in the origin, looks along -z and has y up. Lengths are metres, by `AlignedObject.metres`.
+The first camera stands in the origin, looks along -z and has y up. Lengths are the model's.
 The model is a node whose transform holds pose and stretch. Every view is a camera node and a
 rectangle with the photo behind the object, seen from its camera's side only and unlit
 (KHR_materials_unlit).
@@ -29,12 +28,12 @@ from PIL import Image
 from trimesh.visual.color import srgb_to_linear
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.export.aligned_object import AlignedObject, Frame
+from cadalign.export.aligned_object import AlignedObject
 from cadalign.geometry.alignment import OPENGL_AXES, OPENGL_FLIP, bounds_corners
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Material, Mesh
 from cadalign.io.files import write_whole
-from cadalign.io.images import ByteImage
+from cadalign.io.images import ByteImage, read_image
 
 _gltf: Any = trimesh.exchange.gltf  # which has no types
 _visual: Any = trimesh.visual
@@ -65,9 +64,9 @@ class PlacedPhoto(NamedTuple):
     high: FloatArray
     """Its bottom right corner (2,)."""
     depth: float
-    """Depth at which it stands [m]."""
+    """Depth at which it stands."""
     pose: FloatArray
-    """Pose (4, 4) of its camera, which has glTF's axes [m]."""
+    """Pose (4, 4) of its camera, which has glTF's axes."""
 
     @property
     def look(self) -> dict[str, float]:
@@ -84,19 +83,10 @@ class PlacedPhoto(NamedTuple):
         return np.asarray(np.array(rows) * self.depth * OPENGL_AXES)
 
 
-def write_glb(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -> None:
-    """Write an aligned object with its cameras and photos as GLB.
-
-    Raises
-    ------
-    InputError
-        If the frame is not known.
-    DataError
-        If a photo cannot be read.
-    """
-    placing = _root(frame) @ exported.frame_from_model(frame).cam_from_model
-    placing[:3] *= exported.metres
-    photos = [_placed_photo(exported, frame, number) for number in range(len(exported.views))]
+def write_glb(path: Path, exported: AlignedObject) -> None:
+    """Write an aligned object with its cameras and photos; DataError if a photo is unreadable."""
+    placing = OPENGL_FLIP @ exported.views[0].cam_from_model.cam_from_model
+    photos = [_placed_photo(exported, number) for number in range(len(exported.views))]
     nodes = [
         (f"{exported.name}_{number}", surface, material, placing)
         for number, (surface, material) in enumerate(_parts(exported.mesh))
@@ -220,19 +210,14 @@ def _add_cameras(tree: dict[str, Any], photos: Sequence[PlacedPhoto]) -> None:
         tree["nodes"].append({"name": name, "camera": number, "matrix": matrix})
 
 
-def _root(frame: Frame) -> FloatArray:
-    """The scene's axes from those of a frame: the first camera's are turned to glTF's."""
-    return OPENGL_FLIP if frame == "camera" else np.eye(4)
-
-
-def _placed_photo(exported: AlignedObject, frame: Frame, number: int) -> PlacedPhoto:
+def _placed_photo(exported: AlignedObject, number: int) -> PlacedPhoto:
     """A view's photo, behind the object's farthest corner."""
     view = exported.views[number]
-    pose = _root(frame) @ exported.frame_from_cam(frame, number) @ OPENGL_FLIP
-    pose[:3, 3] *= exported.metres
+    image = None if view.image is None else read_image(view.image, view.camera)
+    pose = OPENGL_FLIP @ exported.first_from_cam(number) @ OPENGL_FLIP
     corners = view.cam_from_model.apply(bounds_corners(*exported.mesh.bounds))
-    depth = _BEHIND * float(np.abs(corners[:, 2]).max()) * exported.metres
-    return PlacedPhoto(*photo_plane(view.camera, view.read_image()), depth, pose)
+    depth = _BEHIND * float(np.abs(corners[:, 2]).max())
+    return PlacedPhoto(*photo_plane(view.camera, image), depth, pose)
 
 
 def photo_plane(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,12 +20,10 @@ from cadalign.geometry.alignment import (
 )
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import quat_wxyz_from_rotation
-from cadalign.io.images import ByteImage
+from cadalign.io.files import as_path
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-Photo = Path | str | ByteImage | None
 
 
 def result_text(result: Any) -> str:
@@ -102,13 +99,14 @@ def row_of(result: Any) -> dict[str, Any]:
     sigma: Any = result.sigma
     if sigma is None and result.options is not None:
         sigma = result.options.sigma
+    inliers = result.inliers
     row: dict[str, Any] = {
         "status": "ok",
         "reason": "",
         "method": result.method,
         "views": len(result.views),
-        "keypoints": len(result.inliers),
-        "inliers": int(result.inliers.sum()),
+        "keypoints": len(inliers),
+        "inliers": int(inliers.sum()),
         "focal_length": result.camera.fx,
         "sigma": None if sigma is None or np.ndim(sigma) else float(sigma),
         "rms_px": result.rms,
@@ -165,10 +163,8 @@ def object_of(
     result: Any,
     *,
     mesh: Mesh | str | os.PathLike[str] | None = None,
-    image: Photo = None,
-    images: Sequence[Photo] = (),
+    photos: Sequence[str | os.PathLike[str] | None] = (),
     name: str = "model",
-    metres: float = 1.0,
 ) -> AlignedObject:
     """The object of a result.
 
@@ -177,33 +173,28 @@ def object_of(
     result : cadalign.Result
     mesh : Mesh or path, optional
         The model's as given; it is warped where the result knows its model, see `Result.mesh`.
-    image : path or (h, w, 3) uint8, optional
-        The photo of the only view.
-    images : sequence
-        The photos of several views, in the place of ``image``.
-    name, metres
+    photos : sequence of path or None
+        The photo of every view; by default none.
+    name
         As for `AlignedObject`.
 
     Raises
     ------
     InputError
-        If there are more or fewer images than the result has views, or no mesh is known.
+        If there are more or fewer photos than the result has views, or no mesh is known.
     """
-    photos: list[Photo] = list(images) or [image] + [None] * (len(result.views) - 1)
-    if len(photos) != len(result.views):
-        what = f"{len(photos)}, but the result has {len(result.views)} views"
-        raise InputError(what, where="images", fix="give one or None for each")
+    paths = [None if each is None else as_path(each, "photos") for each in photos]
+    paths = paths or [None] * len(result.views)
+    if len(paths) != len(result.views):
+        what = f"{len(paths)}, but the result has {len(result.views)} views"
+        raise InputError(what, where="photos", fix="give one or None for each")
     from cadalign.render.overlay import drawable_mesh  # takes time to import
 
     known = drawable_mesh(result, mesh)
     if known is None:
         what = "there is no mesh of the model to write"
         raise InputError(what, where="mesh", fix="give one, or an observation with a `model`")
-    views = zip(result.views, photos, strict=True)
+    views = zip(result.views, paths, strict=True)
     return AlignedObject(
-        tuple(ExportView(view.camera, view.alignment, photo) for view, photo in views),
-        known,
-        result.rig_from_model,
-        name,
-        metres,
+        tuple(ExportView(view.camera, view.alignment, photo) for view, photo in views), known, name
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -358,6 +359,7 @@ def _read_params(model: Any, params: Any, shift: float) -> dict[str, Any]:
     return fields
 
 
+@lru_cache(maxsize=64)  # most estimates have the camera of others
 @np.errstate(over="ignore")  # sizes of images are any numbers
 def camera_doubts(camera: Calibration, *, is_tested: bool = False) -> tuple[str, ...]:
     """Say what is implausible of a camera, a sentence each; nothing of most.

@@ -134,8 +134,10 @@ class Camera(Calibration):
 
     def project_where_ahead(self, points_cam: FloatArray) -> FloatArray:
         """Project points (n, 3) of the camera frame; infinite pixels (n, 2) where not seen."""
-        pixels = np.full((len(points_cam), 2), np.inf)
         ahead = self.sees(points_cam)
+        if ahead.all():
+            return self.pixels_of_rays(points_cam)
+        pixels = np.full((len(points_cam), 2), np.inf)
         pixels[ahead] = self.pixels_of_rays(points_cam[ahead])
         return pixels
 

@@ -63,8 +63,9 @@ def unmeasured(points_2d: FloatArray, *, least: int = _SEVERAL) -> BoolArray:
     for _, here in _placeholders(points_2d, least):
         bad |= here
     known = points_2d[~bad]
-    if len(known) >= _CROWD and np.ptp(known, axis=0).max() >= _CROWDED_SPAN:
-        rows = list(map(tuple, known.tolist()))
+    rows = list(map(tuple, known.tolist()))
+    is_repeated = len(rows) - len(set(rows)) >= _CROWD - 1
+    if is_repeated and np.ptp(known, axis=0).max() >= _CROWDED_SPAN:
         times = Counter(rows)
         bad[~bad] = [times[row] >= _CROWD for row in rows]
     return np.asarray(bad)
@@ -84,8 +85,7 @@ def check_pixels(points_2d: FloatArray, width: int, height: int, *, where: str) 
     """
     if not len(points_2d):
         return
-    if not points_2d.min() > 0:  # else none is a placeholder, which is quickly told
-        _refuse_placeholders(points_2d, where)
+    _refuse_placeholders(points_2d, where)
     if abs(points_2d.item(0)) > _NORMALISED:
         return
     if min(width, height) < _LEAST_SIZE or not np.ptp(points_2d, axis=0).any():
@@ -107,6 +107,8 @@ def _refuse_placeholders(points_2d: FloatArray, where: str) -> None:
 
 def _placeholders(points_2d: FloatArray, least: int) -> Iterator[tuple[float, BoolArray]]:
     """Values of both coordinates that are written ``least`` times, and the rows (n,) of each."""
+    if len(points_2d) and points_2d.min() > 0:  # which is quickly told
+        return
     for value in _PLACEHOLDERS:
         here = (points_2d == value).all(axis=1)
         if np.count_nonzero(here) >= least:

@@ -5,8 +5,10 @@ The format is described in docs/formats/observation.md.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -69,8 +71,8 @@ class ImageEvidence(Document, kw_only=True, eq=False):
     @property
     def given(self) -> dict[str, Any]:
         """The fields that are known, by name."""
-        values = {name: getattr(self, name) for name in ImageEvidence.__struct_fields__}
-        return {name: value for name, value in values.items() if value is not None}
+        names = ImageEvidence.__struct_fields__
+        return {name: value for name in names if (value := getattr(self, name)) is not None}
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -236,7 +238,7 @@ def read_image_fields(read: ViewFields, *, needs_xyz: bool = True) -> ObservedIm
     """
     for name in ("name", "semantic_id"):
         require_unique(read.keypoints, name)
-    camera = Camera.from_dict(read.camera)
+    camera = _camera(read.camera)
     pixels = [each.uv or (None, None) for each in read.keypoints]
     points_2d = np.array(pixels, dtype=float).reshape(-1, 2)  # NaN for None
     is_found = ~unmeasured(points_2d)
@@ -264,17 +266,32 @@ def read_image_fields(read: ViewFields, *, needs_xyz: bool = True) -> ObservedIm
     )
 
 
+def _camera(form: Any) -> Camera:
+    """The camera of a form in a file, which most images of a run share."""
+    try:
+        return _camera_of(json.dumps(form))
+    except (TypeError, ValueError, RecursionError):  # of NumPy's arrays
+        return Camera.from_dict(form)
+
+
+@lru_cache(maxsize=64)
+def _camera_of(text: str) -> Camera:
+    return Camera.from_dict(json.loads(text))
+
+
 def _column(keypoints: Mapping[int, KeypointFields], name: str) -> Any:
     """One optional field of all keypoints, by rows, as a list; None where none has it."""
-    values = {row: getattr(keypoint, name) for row, keypoint in keypoints.items()}
-    missing = [row for row, value in values.items() if value is None]
-    if missing and len(missing) < len(values):
+    values = [getattr(keypoint, name) for keypoint in keypoints.values()]
+    missing = [row for row, value in zip(keypoints, values, strict=True) if value is None]
+    if len(missing) == len(values):
+        return None
+    if missing:
         raise DataError(
             "missing, though other keypoints have it",
             where=f"keypoints[{missing[0]}].{name}",
             fix="give it for all keypoints or for none",
         )
-    return None if missing or not values else list(values.values())
+    return values
 
 
 def write_image_fields(image: ObservedImage, folder: Path | None) -> dict[str, Any]:

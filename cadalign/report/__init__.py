@@ -1,6 +1,5 @@
-"""The result of runs as one page, and as tables for papers."""
+"""The page of runs: headline table, plots and gallery; several runs side by side."""
 
-from cadalign.report.headline import FORMATS, headline_text
 from cadalign.report.page import write_report
 
-__all__ = ["FORMATS", "headline_text", "write_report"]
+__all__ = ["write_report"]

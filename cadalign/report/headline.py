@@ -1,22 +1,20 @@
-"""Headline tables: their rows, best values and failures, and as Markdown and CSV."""
+"""Headline tables: their rows, best values and failures."""
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from cadalign.errors import InputError
 from cadalign.evaluation.experiments.photos import TRUTH
 from cadalign.evaluation.methods import LIMIT
 from cadalign.evaluation.metrics import HIGH, Metric
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.runs.work import FAILED, SKIPPED
-from cadalign.evaluation.summary import ALL, Summary, csv_text, group_name
-from cadalign.report.runs import by_spec, read_runs
+from cadalign.evaluation.summary import ALL, Summary, group_name
+from cadalign.report.runs import by_spec
 
 _MOST_REASONS = 200
 _REFERENCES = {LIMIT, TRUTH, "exact"}
@@ -131,58 +129,3 @@ def _reasons(index: int, run: Run, group: Metric, wanted: str) -> list[Failure]:
         {"run": index, "category": category, "method": method, "reason": reason, "count": count}
         for (category, method, reason), count in counts.most_common(_MOST_REASONS)
     ]
-
-
-# As text ------------------------------------------------------------------------------------------
-
-FORMATS = ("md", "csv")
-# A reader of Markdown takes these for marks, or for HTML.
-_MARKDOWN: dict[int, str] = str.maketrans(
-    {character: f"\\{character}" for character in "\\`*_{}[]()#+!|~$"}
-    | {"<": "&lt;", ">": "&gt;", "&": "&amp;", "\n": " ", "\r": " "}
-)
-
-
-def headline_text(runs: Sequence[str | os.PathLike[str]], *, format: str) -> str:
-    """The headline table of runs as text.
-
-    Parameters
-    ----------
-    runs : sequence of path-like
-        Folders of runs; see `cadalign.report.write_report`.
-    format : {"md", "csv"}
-        Best values are bold in Markdown; numbers of CSV are not rounded.
-
-    Examples
-    --------
-    >>> print(headline_text(["runs/keypointnet"], format="md"))  # doctest: +SKIP
-    """
-    if format not in FORMATS:
-        raise InputError(
-            f"unknown format {format!r}", where="format", fix=f"known are {', '.join(FORMATS)}"
-        )
-    found = read_runs(runs)
-    return table_text(headline_of(found), [run.name for run in found], format=format)
-
-
-def table_text(headline: Headline, names: Sequence[str], *, format: str) -> str:
-    """The table as text; ``names`` are those of the runs. See `headline_text`."""
-    headings = (column.heading for column in headline.columns)
-    head = [*(["run"] if len(names) > 1 else []), headline.group, "method", *headings]
-    rows = [
-        (row, [*([names[row.run]] if len(names) > 1 else []), row.category, row.method])
-        for row in headline.rows
-    ]
-    if format == "csv":  # a cell that is None is empty
-        keys = [column.key for column in headline.columns]
-        return csv_text([head, *([*labels, *map(row.cells.get, keys)] for row, labels in rows)])
-    marks = ["---"] * (len(head) - len(headline.columns)) + ["---:"] * len(headline.columns)
-    lines = [[text.translate(_MARKDOWN) for text in head], marks]
-    for row, labels in rows:
-        line = [label.translate(_MARKDOWN) for label in labels]
-        for column in headline.columns:
-            text = column.rounded(row.cells[column.key]).translate(_MARKDOWN)
-            line.append(f"**{text}**" if column.key in row.best else text)
-        lines.append(line)
-    table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-    return f"{table}\n\n{headline.note.translate(_MARKDOWN)}\n"

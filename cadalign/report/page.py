@@ -80,8 +80,6 @@ _ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 def write_report(
     runs: Sequence[str | os.PathLike[str]],
     path: str | os.PathLike[str],
-    *,
-    title: str | None = None,
 ) -> Path:
     """Write the result of runs as a page that needs no network.
 
@@ -92,8 +90,6 @@ def write_report(
         observations stand beside each other and beside one with truth.
     path : path-like
         The page to write.
-    title : str, optional
-        By default it says what was run on what.
 
     Returns
     -------
@@ -120,7 +116,7 @@ def write_report(
         summary += f" The last {media.left_out:,} instances are shown without pictures and poses."
     payload = {
         "format": _FORMAT,
-        "title": title or title_of(found),
+        "title": title_of(found),
         "summary": summary,
         "runs": [_run_dict(run) for run in found],
         "methods": [method_dict(name, k) for k, name in enumerate(all_methods(found))],

@@ -75,15 +75,18 @@ def test_the_table_holds_the_best_match_of_each(
     with (run / "results.csv").open() as file:
         texts = list(csv.DictReader(file))
     assert [row["match_id"] for row in texts] == [model_id for _, model_id in found]
-    assert "top_ids" not in texts[0]
     texts_of = case.queries.read_text().splitlines()
     for line, row, single in zip(texts_of, rows, Results.open(run), strict=True):
         seen = json.loads(line)["keypoints"]
         expected = case.library.retrieve(
             [each["uv"] for each in seen], [each["semantic_id"] for each in seen], CAMERA, top=4
         )
-        assert row["top_ids"] == [match.model_id for match in expected]
-        assert row["top_scores"] == [match.score for match in expected]
+        listed = [each.split() for each in row["matches"].split("; ")]
+        assert [tuple(each[:2]) for each in listed] == [
+            (match.category, match.model_id) for match in expected
+        ]
+        scores = [float(each[2]) for each in listed]
+        np.testing.assert_allclose(scores, [match.score for match in expected], rtol=1e-3)
         assert isinstance(single, Result)
         np.testing.assert_allclose(
             single.alignment.packed, expected[0].alignment.packed, rtol=1e-12

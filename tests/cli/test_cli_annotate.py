@@ -22,8 +22,7 @@ def test_out_folder_is_made(case: Case, capsys: pytest.CaptureFixture[str]) -> N
     file = case.folder / "file"
     file.write_text("")
     message = refusal(capsys, case.photo, case.model, "--out", file / "out")
-    reason = "the folder cannot be created (Not a directory); choose another --out"
-    assert message == f"{file / 'out'}: {reason}"
+    assert message.startswith(f"{file / 'out'}: cannot be written (Not a directory); ")
 
 
 def test_folder_of_the_observation_is_made(

@@ -13,7 +13,7 @@ from cadalign import Result, ShapeModel, View, align
 from cadalign.cli import main
 from cadalign.datasets import load_mesh
 from cadalign.errors import InputError
-from cadalign.export import AlignedObject, ExportView, export_object
+from cadalign.export import ExportView
 from cadalign.io.evidence import ImageEvidence, ObservedImage
 from cadalign.io.images import write_image
 from cadalign.io.meshes.files import write_mesh
@@ -27,15 +27,8 @@ MORE = np.vstack([KEYPOINTS, wedge().vertices[2:5], [[0.1, 0.2, 0.3]]])
 def observed(tmp_path: Path) -> Path:
     """An observation with photo and model, in ``photo.json``."""
     write_image(tmp_path / "000007.png", photo_of(CAMERA))
-    plain = AlignedObject((ExportView(CAMERA, POSE),), mesh=wedge())
-    export_object(tmp_path / "stretched.obj", plain, frame="model")
     path = tmp_path / "wedge.obj"
-    text = (tmp_path / "stretched.obj").read_text().splitlines()
-    rows = iter(wedge().vertices.tolist())
-    lines = [
-        "v " + " ".join(map(str, next(rows))) if line.startswith("v ") else line for line in text
-    ]
-    path.write_text("\n".join(lines) + "\n")
+    write_mesh(path, wedge(), kind="obj")
     pixels = CAMERA.project(POSE.apply(MORE))
     image = tmp_path / "000007.png"
     Observation(MORE, pixels, CAMERA, image=image, model=path).save(tmp_path / "photo.json")
@@ -57,9 +50,9 @@ def test_a_fit_is_exported_with_photo_and_model(
     assert main(["export", str(result), "--to", str(tmp_path / "out" / "wedge.glb")]) == 0
     scene = trimesh.load(tmp_path / "out" / "wedge.glb")
     assert set(scene.geometry) == {"wedge_0", "photo_0"}
-    assert main(["export", str(result), "--to", str(tmp_path / "wedge.ply"), "--metres", "2"]) == 0
+    assert main(["export", str(result), "--to", str(tmp_path / "wedge.ply")]) == 0
     mesh = load_mesh(tmp_path / "wedge.ply")
-    np.testing.assert_allclose(mesh.vertices, 2 * POSE.apply(wedge().vertices), atol=1e-4)
+    np.testing.assert_allclose(mesh.vertices, POSE.apply(wedge().vertices), atol=1e-4)
     assert "the mesh, with vertex colours" in capsys.readouterr().err
 
 
@@ -71,9 +64,6 @@ def test_the_command_says_what_is_missing(
     result, to = tmp_path / "photo_fit" / "fit.json", ("--to", tmp_path / "a.glb")
     said = refusal(capsys, result, "--to", tmp_path / "a.json")
     assert "the name does not tell the format" in said
-    assert "--format: unknown format 'x3d'" in refusal(capsys, result, *to, "--format", "x3d")
-    said = refusal(capsys, result, *to, "--frame", "rig")
-    assert "--frame: the views have no known motion" in said
     Result.load(result).save(result)  # which writes no observation
     assert "the file holds no fit with the observation" in refusal(capsys, result, *to)
     result.write_text(result.read_text()[:200])
@@ -81,23 +71,14 @@ def test_the_command_says_what_is_missing(
     assert "no such file" in refusal(capsys, tmp_path / "gone.json", *to)
 
 
-@pytest.mark.parametrize(
-    ("name", "format"),
-    [
-        ("wedge.obj", "obj"),
-        ("wedge.mtl", "ply"),
-        ("000007.png", "glb"),
-        ("photo_fit/fit.json", "glb"),
-    ],
-)
 def test_what_is_exported_is_not_written_over(
-    tmp_path: Path, observed: Path, capsys: pytest.CaptureFixture[str], name: str, format: str
+    tmp_path: Path, observed: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "wedge.mtl").write_text("newmtl cloth\n")
     assert main(["fit", str(observed), "--no-picture"]) == 0
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
     fit = tmp_path / "photo_fit" / "fit.json"
-    said = refusal(capsys, fit, "--to", tmp_path / name, "--format", format)
+    said = refusal(capsys, fit, "--to", tmp_path / "wedge.obj")
     assert "what is to be written is made from this file; give another name" in said
     assert before == {path: path.read_bytes() for path in before}
 
@@ -122,8 +103,8 @@ def test_views_and_warped_mesh_of_a_joint_fit(tmp_path: Path, observed: Path) ->
     Observation(**vars(images[0]), model=first.model, others=(images[1],)).save(path)
     assert main(["fit", str(path), "--shape-sigma", "0.05"]) == 0
     result = tmp_path / "two_fit" / "fit.json"
-    target = tmp_path / "rig.ply"
-    assert main(["export", str(result), "--to", str(target), "--frame", "rig"]) == 0
+    target = tmp_path / "first.ply"
+    assert main(["export", str(result), "--to", str(target)]) == 0
     mesh = load_mesh(target)
     # Keypoints 0 and 1 are vertices of the wedge; the object's are where the mesh was warped to.
     placed = POSE.apply(object_points)

@@ -153,12 +153,12 @@ def test_photo_and_model_are_drawn(tmp_path: Path) -> None:
 
 
 def test_the_photo_is_not_drawn_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    photo = tmp_path / "photo.png"
+    photo = tmp_path / "overlay.png"
     cv2.imwrite(str(photo), np.zeros((480, 640, 3), dtype=np.uint8))
     before = photo.read_bytes()
     (tmp_path / "model.obj").write_text(TETRAHEDRON)
     path = write_observation(tmp_path / "chair.json", image=photo, model=tmp_path / "model.obj")
-    line = refusal_line(capsys, "fit", path, "--overlay", photo)
+    line = refusal_line(capsys, "fit", path, "--out", tmp_path)
     assert line == f"{photo}: what is to be written is made from this file; give another name"
     assert photo.read_bytes() == before
 
@@ -176,8 +176,7 @@ def test_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     [
         (
             ["--sigma", "0"],
-            "--sigma: 0.0 is not a standard deviation; give a positive number, one per keypoint, "
-            "or a 2 x 2 covariance per keypoint, in pixels",
+            "--sigma: 0.0 is not a positive number",
         ),
         (
             ["--method", "best"],

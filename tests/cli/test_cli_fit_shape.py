@@ -253,7 +253,7 @@ def test_keypoints_that_the_shape_cannot_take_are_named(
 @pytest.mark.parametrize(
     ("flags", "text"),
     [
-        ("--shape-sigma=0", "--shape-sigma: 0.0 is not positive"),
+        ("--shape-sigma=0", "--shape-sigma: 0.0 is not a positive number"),
         ("--shape none.shape", "none.shape: no such file"),
         (
             "--shape box.shape --shape-sigma 0.1",

@@ -13,12 +13,10 @@ from support.refusals import refusal_line
 
 from cadalign import Alignment, Camera
 from cadalign.cli import main
-from cadalign.datasets import load_mesh
 from cadalign.geometry.rotations import angles_between, rotation_from_vector
 from cadalign.geometry.symmetry import FACING
-from cadalign.io.images import read_image, write_image
+from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
-from cadalign.render import Scene, cast_geometry
 
 UP = np.array([0.0, 1.0, 0.0])
 CAMERA = Camera(320, 240, 450.0, 450.0, 159.5, 119.5)
@@ -71,26 +69,3 @@ def test_what_is_no_symmetry_is_refused_by_file_and_field(
     line = refusal_line(capsys, "fit", path)
     assert "box.json" in line
     assert "symmetry.fold: '-1' is no number of rotations" in line
-
-
-@pytest.mark.parametrize("flags", [[], ["--shape-sigma", "0.02"]])
-def test_the_overlay_shows_the_model_over_the_photo(tmp_path: Path, flags: list[str]) -> None:
-    path = write_observation(tmp_path)
-    target = tmp_path / "pictures" / "over.png"
-    target.parent.mkdir()
-    assert main(["fit", str(path), "--overlay", str(target), *flags]) == 0
-    picture = read_image(target, CAMERA)
-    mesh = load_mesh(tmp_path / "box.obj")
-    mask = cast_geometry(Scene(mesh), CAMERA, TRUTH).mask
-    changed = (np.abs(picture.astype(int) - 90) > 3).any(axis=2)
-    assert changed[mask].mean() > 0.99
-
-
-@pytest.mark.slow
-def test_overlays_that_cannot_be_drawn_are_refused_before_the_fit(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write_observation(tmp_path, model=None)
-    line = refusal_line(capsys, "fit", path, "--overlay", tmp_path / "o.png")
-    assert "--overlay: " in line
-    assert not (tmp_path / "box_fit").exists()

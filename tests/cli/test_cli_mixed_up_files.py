@@ -82,8 +82,6 @@ def test_folder_is_no_file_to_write(
         ["shape", "learn", str(sample_root), "--category", "chair", "--out"],
         ["observe", "found.json", "model.keypoints.json", "--out"],
         ["report", "none", "--out"],
-        ["export", "seen_fit", "--format", "obj", "--to"],
-        ["export", "seen_fit", "--format", "ply", "--to"],
     ):
         line = refusal_line(capsys, *command, out)
         assert line == f"{out or '.'}: is a folder; give a file's name"

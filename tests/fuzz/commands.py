@@ -25,7 +25,7 @@ _COMMANDS: dict[str, list[str]] = {
     "observe": ["--image", "--out", "--object", "--min-score"],
     "retrieve": ["--library", "--out", "--top", "--category", "--json", "--loss"],
     "render": ["--out", "--width", "--height", "--view", "--keypoints"],
-    "report": ["--out", "--format"],
+    "report": ["--out"],
     "library": ["build", "show", "--out", "--categories"],
     "evaluate": ["keypointnet", "correspondences", "retrieval", "unseen", "--methods",
                  "--noise-px", "--shape"],

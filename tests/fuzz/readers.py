@@ -28,7 +28,8 @@ from cadalign.datasets import (
 )
 from cadalign.io.images import photo_size, read_photo
 from cadalign.io.observation import Observation
-from cadalign.report import headline_text
+from cadalign.report.headline import headline_of
+from cadalign.report.runs import read_runs
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.models import SEAL
 
@@ -217,7 +218,7 @@ def _write_annotations(folder: Path) -> Path:
 
 
 def _read_run(path: Path) -> object:
-    return headline_text([path.parent], format="csv")
+    return headline_of(read_runs([path.parent])).to_dict()
 
 
 FORMATS = {

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from cadalign import Alignment, Camera, Material, Mesh
+from cadalign import Alignment, Camera, Mesh
 from cadalign.errors import InputError
+from cadalign.geometry import Material
 from cadalign.render import RaycastRenderer, Scene, cast_geometry, look_at
 from cadalign.render.canvas import bytes_from_linear, linear_from_bytes
 from cadalign.render.surface import coincident_faces, corner_normals

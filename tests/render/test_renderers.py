@@ -16,8 +16,9 @@ import pytest
 import trimesh
 from support.renderers import ball, renderer_or_skip
 
-from cadalign import Alignment, Camera, Material, Mesh
+from cadalign import Alignment, Camera, Mesh
 from cadalign.errors import InputError, RenderError
+from cadalign.geometry import Material
 from cadalign.render import (
     RaycastRenderer,
     Scene,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cadalign import Alignment, Camera, Library, Match
-from cadalign.retrieval import LibraryModel
+from cadalign import Alignment, Camera, Library
+from cadalign.retrieval import LibraryModel, Match
 from cadalign.retrieval.absence import distances, shape_distance
 
 CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)

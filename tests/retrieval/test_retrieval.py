@@ -14,11 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import eigh
 
-from cadalign import Alignment, Box, Camera, Library, Match, fit
+from cadalign import Alignment, Box, Camera, Library, fit
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.options import LOSSES
 from cadalign.evaluation.simulation import random_rotation
-from cadalign.retrieval import LibraryModel, ranking
+from cadalign.retrieval import LibraryModel, Match, ranking
 from cadalign.retrieval.absence import shape_distance
 from cadalign.retrieval.kernels import error_bound, search_all
 from cadalign.retrieval.options import RetrievalOptions

@@ -13,13 +13,14 @@ import pytest
 from support.files import write_json
 from support.refusals import refusal_line
 
-from cadalign import Library, Match
+from cadalign import Library
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA as CAMERA
 from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
 from cadalign.render import Frame, RaycastRenderer, Scene, look_at
+from cadalign.retrieval import Match
 from cadalign.retrieval.folder import draw_match
 
 
@@ -156,8 +157,8 @@ def test_refused_options_are_named_as_they_are_typed(
     assert refusal_line(capsys, "retrieve", *case.arguments, "--shape-sigma", "-1") == (
         "--shape-sigma: must be >= 0, not -1.0"
     )
-    assert refusal_line(capsys, "retrieve", *case.arguments, "--workers", "0") == (
-        "--workers: must be >= 1, or -1 for all cores, not 0"
+    assert refusal_line(capsys, "retrieve", *case.arguments, "--workers", "2") == (
+        "--workers: has no effect on one observation; leave it out"
     )
     assert refusal_line(capsys, "retrieve", *case.arguments, "--category", "tabel").startswith(
         "--category: unknown category 'tabel'; known are "

@@ -203,9 +203,11 @@ def outside_image(
         text = f"{where}the keypoints span {extent:.2g} px, and sigma is {sigma:g} px: are these "
         found.append(EstimateWarning("unit", text + "pixels?", view))
     outside = np.flatnonzero(~camera.contains(points_2d)).tolist()
+    if 2 * len(outside) <= len(points_2d):
+        return tuple(found)
     last = own - PIXEL_CENTRE
     beyond = (points_2d < -PIXEL_CENTRE).all(axis=0) | (points_2d > last).all(axis=0)
-    if 2 * len(outside) > len(points_2d) and (beyond.any() or not agree):
+    if beyond.any() or not agree:
         text = (
             f"{where}{len(outside)} of {len(points_2d)} keypoints lie outside of the image of "
             f"{size}: are they of another resolution than the camera, or of another photo?"

@@ -27,15 +27,7 @@ from cadalign.io.files import write_whole
 DONE_ANEW = "remove it and start the same run again: what is missing is done anew"
 # A table's row groups must not show in which pieces its rows came.
 ROW_GROUP = 1 << 12
-_TYPES = {
-    str: pa.string(),
-    int: pa.int64(),
-    float: pa.float64(),
-    bool: pa.bool_(),
-    list[float]: pa.list_(pa.float64()),
-    list[bool]: pa.list_(pa.bool_()),
-    list[str]: pa.list_(pa.string()),
-}
+_TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 Cells = dict[str, npt.NDArray[Any]]
 """Columns of a table by name."""
 SECONDS: Columns = (("seconds", float),)

@@ -25,7 +25,7 @@ T_contra = TypeVar("T_contra", contravariant=True)
 Row = dict[str, Any]
 """Cells of a table by column; what is missing or None is an empty cell."""
 Columns = tuple[tuple[str, Any], ...]
-"""Names of a table's columns and their types: str, int, float, bool, or list of one but int."""
+"""Names of a table's columns and their types: str, int, float or bool."""
 
 COLUMNS: Columns = (("method", str), ("status", str), ("reason", str))
 """Columns of the result table of every experiment."""

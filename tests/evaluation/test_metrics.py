@@ -17,10 +17,8 @@ from support.solving import broken, depth_error, linear
 import cadalign
 from cadalign.cli import main
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.experiments.photos import SETS
 from cadalign.evaluation.methods import FunctionMetric
 from cadalign.evaluation.metrics import BOX_IOU, ROTATION, Metric
-from cadalign.evaluation.metrics.photos import score_columns
 from cadalign.evaluation.plots import cumulative
 from cadalign.report import headline_text
 
@@ -175,11 +173,6 @@ def test_what_a_module_prints_is_not_the_output(
     assert json.loads(printed.out)["failed"] == 0
     assert "at import" in printed.err
     assert "hello" in printed.err
-
-
-def test_sets_of_metrics_have_columns_of_their_own() -> None:
-    names = [name for name, _ in score_columns(SETS)]
-    assert len(names) == len(set(names))
 
 
 @pytest.mark.long

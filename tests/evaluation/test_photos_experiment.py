@@ -166,18 +166,17 @@ class TestMethods:
     def test_what_an_object_lacks_is_left_out(self, tmp_path: Path) -> None:
         root = write_pix3d(tmp_path / "data", photos=2)
         (root / "mask" / "1.png").unlink()
-        methods = ("rigid", "rigid+mask", "rigid+gravity", "shape")
+        methods = ("rigid", "rigid+mask", "rigid+gravity")
         found = done(root, tmp_path / "run", methods=methods)
         rows = found.results.to_pylist()
         assert [row["status"] for row in rows] == [
-            *("ok", "ok", "left out", "left out"),
-            *("ok", "left out", "left out", "left out"),
+            *("ok", "ok", "left out"),
+            *("ok", "left out", "left out"),
         ]
-        assert [row["reason"] for row in rows[4:]] == [
+        assert [row["reason"] for row in rows[3:]] == [
             "",
             "the object has no mask",
             "the direction of gravity is not known",
-            "there is no shape model of table",
         ]
 
     def test_few_keypoints_are_left_out(self, tmp_path: Path) -> None:
@@ -324,8 +323,7 @@ class TestPage:
         (("--methods", "best"), "--methods: unknown method 'best'"),
         (("--methods", "rigid+mask+mask"), "--methods: unknown method 'rigid+mask+mask'"),
         (("--methods", "truth+mask"), "--methods: truth takes keypoints alone"),
-        (("--sigma", "0"), "--sigma: 0.0 is not positive"),
-        (("--shape", "nowhere.shape"), "nowhere.shape: no such file"),
+        (("--methods", "shape"), "--methods: unknown method 'shape'"),
     ],
 )
 def test_refusals(

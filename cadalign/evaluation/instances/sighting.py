@@ -224,8 +224,8 @@ class Sighting:
         return self.model.xyz[[row_of[name] for name in self.names]]
 
 
-def sight(target: PhotoTarget, protocol: Protocol, *, sigma: float | None) -> Sighting:
-    """Collect what methods are given of an object, ``sigma`` [px] in place of the protocol's.
+def sight(target: PhotoTarget, protocol: Protocol) -> Sighting:
+    """Collect what methods are given of an object.
 
     Raises LeftOutError if it has no camera, no model, or too few keypoints; and DataError if its
     model cannot be read.
@@ -250,7 +250,7 @@ def sight(target: PhotoTarget, protocol: Protocol, *, sigma: float | None) -> Si
         source=ANNOTATED if marks.scores is None else DETECTED,
         names=names,
         points_2d=pixels,
-        sigma=_sigma(target, protocol) if sigma is None else sigma,
+        sigma=_sigma(target, protocol),
         model=model,
         bounds=bounds,
         width=1.0 if gt is None else float(gt.scale[0]),

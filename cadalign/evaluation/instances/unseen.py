@@ -5,21 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray, instance_rng
+from cadalign.arrays import FloatArray, IntArray, instance_rng
 from cadalign.datasets import KeypointNet
-from cadalign.errors import DataError, DegenerateError
+from cadalign.errors import DataError
 from cadalign.estimation.align import align
 from cadalign.estimation.model import Model
-from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
 from cadalign.evaluation.experiments.keypointnet import KeypointTasks
-from cadalign.evaluation.experiments.unseen import COLUMNS, METHODS, LearnedFiles, UnseenOptions
+from cadalign.evaluation.experiments.unseen import COLUMNS, METHODS, UnseenOptions, learned_shape
 from cadalign.evaluation.instances.instance import (
     KEYPOINT_CAMERA,
     KeypointTask,
@@ -48,11 +48,6 @@ from cadalign.metrics import (
 )
 from cadalign.shapes.model import ShapeModel
 
-_LEAST_SIGMA = 0.5  # of retrieval [px]: keypoints without noise would leave no model any chance
-_SIMILAR = 0.02  # of retrieval: misfit of the best model, as a share of its extent
-_INLIER_BOUND = 3.5  # standard deviations
-_MISFIT_PX = 30.0  # a residual that another model of the category leaves
-_LEAST_SHARED = 6
 # Free of the size: log(y / x) and log(z / x).
 _RATIOS = np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
 
@@ -71,9 +66,8 @@ class UnseenObject:
     options: UnseenOptions
     gt: Alignment  # the pose
     rows: IntArray  # (n,), rows of the given keypoints among all of the object
-    points_2d: FloatArray  # (n, 2), the given keypoints [px], with noise and outliers
-    is_outlier: BoolArray  # (n,)
-    learned: LearnedFiles | None = None
+    points_2d: FloatArray  # (n, 2), the given keypoints [px], with noise
+    learned: Path = Path()  # folder of the shape models by category
 
     @property
     def xyz(self) -> FloatArray:
@@ -88,8 +82,7 @@ class UnseenObject:
     @property
     def shape(self) -> ShapeModel:
         """The shape model of the category."""
-        assert self.learned is not None
-        return self.learned.shape(self.task.category)
+        return learned_shape(self.learned, self.task.category)
 
     def view_of(self, model: Model | ShapeModel) -> View:
         """Those given keypoints that a model has."""
@@ -99,7 +92,7 @@ class UnseenObject:
 
 
 def observe_object(task: KeypointTask, options: UnseenOptions) -> UnseenObject:
-    """Draw a view of an object, the keypoints that are given, their noise and outliers.
+    """Draw a view of an object, the keypoints that are given, and their noise.
 
     Views are those of `sample_hull_view`; hidden keypoints may be given, too. Everything random
     follows from (seed, category, model id, view): view, order of keypoints and unit noise are the
@@ -114,13 +107,9 @@ def observe_object(task: KeypointTask, options: UnseenOptions) -> UnseenObject:
     gt, _ = sample_hull_view(task.hull, KEYPOINT_CAMERA, rng=rng, min_visible=0)
     rng = instance_rng(options.seed, *names, "keypoints")
     order, noise = rng.permutation(count), rng.standard_normal((count, 2))
-    elsewhere = rng.uniform(0, (KEYPOINT_CAMERA.width, KEYPOINT_CAMERA.height), (count, 2))
-    given = order[: options.keypoints]
-    rows = np.sort(given)
-    is_outlier = np.isin(rows, given[: round(options.outliers * len(given))])
+    rows = np.sort(order[: options.keypoints])
     points = KEYPOINT_CAMERA.project(gt.apply(xyz[rows])) + options.noise_px * noise[rows]
-    points[is_outlier] = elsewhere[rows][is_outlier]
-    return UnseenObject(task, options, gt, rows, points, is_outlier)
+    return UnseenObject(task, options, gt, rows, points)
 
 
 # Methods ------------------------------------------------------------------------------------------
@@ -143,6 +132,10 @@ class ShapeEstimate:
         return cls(result.alignment, result.bounds, ids, result.points_3d, result)
 
 
+def _aligned(model: Model | ShapeModel, seen: UnseenObject) -> ShapeEstimate:
+    return ShapeEstimate.of(align(model, seen.view_of(model)))
+
+
 def _of_shape(seen: UnseenObject) -> ShapeEstimate:
     return _aligned(seen.shape, seen)
 
@@ -154,61 +147,16 @@ def _of_own_model(seen: UnseenObject) -> ShapeEstimate:
 def _of_mean(seen: UnseenObject, *, stretch: str | None) -> ShapeEstimate:
     points, ids = seen.shape.mean, seen.shape.ids
     model = Model(points_3d=points[:-2], ids=ids, bounds=points[-2:], stretch=stretch)
-    return _aligned(model, seen, misfit_px=_MISFIT_PX)
-
-
-def _of_random_model(seen: UnseenObject, *, stretch: str | None) -> ShapeEstimate:
-    assert seen.learned is not None
-    library, task = seen.learned.library(), seen.task
-    keys = [key for key in library.keys if key[0] == task.category]
-    names = (task.category, task.model_id, str(task.view), "another model")
-    least = min(_LEAST_SHARED, len(seen.ids))
-    for place in instance_rng(seen.options.seed, *names).permutation(len(keys)).tolist():
-        other = library[keys[place]]
-        if np.isin(seen.ids, other.ids).sum() >= least:
-            ids = other.ids.tolist()
-            model = Model(points_3d=other.xyz, ids=ids, bounds=other.bounds, stretch=stretch)
-            return _aligned(model, seen, misfit_px=_MISFIT_PX)
-    raise DegenerateError(f"no other model has {least} of the keypoints", where="keypoints")
-
-
-def _aligned(
-    model: Model | ShapeModel, seen: UnseenObject, *, misfit_px: float = 0.0
-) -> ShapeEstimate:
-    bound = max(_INLIER_BOUND * seen.options.sigma, misfit_px)
-    ransac = RansacOptions(max_reproj_error=bound) if seen.options.outliers else None
-    return ShapeEstimate.of(align(model, seen.view_of(model), ransac=ransac))
-
-
-def _nearest(seen: UnseenObject) -> ShapeEstimate:
-    assert seen.learned is not None
-    library = seen.learned.library()
-    first = library.retrieve(
-        seen.points_2d,
-        seen.ids,
-        KEYPOINT_CAMERA,
-        top=1,
-        category=seen.task.category,
-        sigma=max(seen.options.noise_px, _LEAST_SIGMA),
-        shape_sigma=_SIMILAR,
-        loss="cauchy" if seen.options.outliers else "linear",
-        workers=1,
-    )[0]
-    model = library[first.category, first.model_id]
-    return ShapeEstimate(first.alignment, model.bounds, model.ids, model.xyz)
+    return _aligned(model, seen)
 
 
 def _bound(seen: UnseenObject) -> ShapeEstimate:
-    kept = ~seen.is_outlier
-    points, pixels = seen.xyz[seen.rows[kept]], seen.points_2d[kept]
-    alignment = limit_estimate(points, pixels, KEYPOINT_CAMERA, seen.gt)
+    points = seen.xyz[seen.rows]
+    alignment = limit_estimate(points, seen.points_2d, KEYPOINT_CAMERA, seen.gt)
     return ShapeEstimate(alignment, seen.task.hull.bounds, seen.task.ids, seen.xyz)
 
 
 _SOLVERS: dict[str, Callable[[UnseenObject], ShapeEstimate]] = {
-    "random-rigid": partial(_of_random_model, stretch="none"),
-    "random-stretched": partial(_of_random_model, stretch=None),
-    "nearest": _nearest,
     "mean-rigid": partial(_of_mean, stretch="none"),
     "mean-stretched": partial(_of_mean, stretch=None),
     SHAPE: _of_shape,
@@ -217,7 +165,7 @@ _SOLVERS: dict[str, Callable[[UnseenObject], ShapeEstimate]] = {
 }
 
 
-def unseen_benchmark(learned: LearnedFiles, options: UnseenOptions) -> Benchmark:
+def unseen_benchmark(learned: Path, options: UnseenOptions) -> Benchmark:
     """The methods of the options on unseen objects."""
     own = {name: Method(name, _SOLVERS[name]) for name in METHODS}
     setting = UnseenObjects(learned, options)
@@ -234,7 +182,7 @@ class UnseenObjects(Setting):
     columns = COLUMNS
     record_columns = RECORD_COLUMNS
 
-    learned: LearnedFiles
+    learned: Path
     options: UnseenOptions
 
     def case(self, task: KeypointTask) -> Case:

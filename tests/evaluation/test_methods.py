@@ -70,8 +70,6 @@ def test_a_method_of_an_experiment_is_not_hidden(tmp_path: Path) -> None:
         cadalign.evaluate(tmp_path, "unseen", methods=[shape])
     with pytest.raises(InputError, match="'rigid' is the name of more than one; give the func"):
         PhotosOptions(tmp_path, methods=(rigid,))  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="known are optimal, optimal-unstretched"):
-        cadalign.evaluate(tmp_path, "retrieval", methods=["linear"])
 
 
 # --- every experiment --------------------------------------------------------------------------

@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import VIEW_NAMES
 from cadalign.evaluation.methods import LIMIT, SHAPE
 from cadalign.evaluation.options import ViewOptions
-from cadalign.evaluation.plots import Plot, cumulative_curves, share_traces
+from cadalign.evaluation.plots import cumulative_curves
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Columns, Plan, fingerprint
 from cadalign.evaluation.summary import (
@@ -36,7 +35,6 @@ from cadalign.io.files import made_folder
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.instance import KeypointTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.tables import Cells, Run
     from cadalign.shapes.model import ShapeModel
 
 logger = logging.getLogger("cadalign")
@@ -132,30 +130,6 @@ _CURVES = (
     (metrics.ROTATION, np.array([0.5, 1, 2, 3, 5, 7.5, 10, 15, 20, 30])),
     (replace(metrics.BOX_IOU_UP_TO_SCALE, log=False), np.arange(0, 1.01, 0.1)),
 )
-_LEVELS = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.68, 0.8, 0.9, 0.95, 0.99])
-_CALIBRATED = (("rotation_level", "rotation"), ("stretch_level", "stretch"))
-
-
-def plots(runs: Sequence[Run]) -> list[Plot]:
-    """Shares of objects within an error, and of truths within stated regions, by method."""
-    curves = cumulative_curves(runs, curves=_CURVES, of="of unseen objects")
-    return [*curves, *(_calibration(runs, column, name) for column, name in _CALIBRATED)]
-
-
-def _calibration(runs: Sequence[Run], column: str, name: str) -> Plot:
-    def shares(rows: Cells) -> FloatArray | None:
-        levels = known(rows[column])
-        return (levels <= _LEVELS[:, None]).mean(axis=1) if len(levels) else None
-
-    return Plot(
-        id=f"calibration_{name}",
-        x=metrics.NOMINAL,
-        y=metrics.COVERED,
-        traces=share_traces(runs, 100 * _LEVELS, shares),
-        note="over all categories; uncertainties are right where both are equal",
-        title=f"Calibration of the {name}",
-    )
-
 
 # Learned shapes -----------------------------------------------------------------------------------
 
@@ -221,7 +195,7 @@ SPEC = Spec(
     summarize=partial(summarize, statistics=_STATISTICS),
     console=_CONSOLE,
     console_note="lengths in model diagonals; scaled: about the camera centre",
-    plots=plots,
+    plots=partial(cumulative_curves, curves=_CURVES, of="of unseen objects"),
     topic="unseen objects",
     subject="views of objects that are no stretched copy of any model",
     metrics=_MEDIANS,

@@ -187,7 +187,6 @@ STRETCH_IN_95 = rate("stretch_in_95", "stretches within 95 %", "95%", **_COVERED
 KEYPOINTS_IN_68 = rate("keypoints_within_68", "keypoints within 68 %", "kp in 68%", **_COVERED)
 KEYPOINTS_IN_95 = rate("keypoints_within_95", "keypoints within 95 %", "95%", **_COVERED)
 COVERED = rate("covered", "truths within the region", **_COVERED)
-NOMINAL = rate("nominal", "stated probability of a region", **_COVERED)
 
 # What tasks are grouped by.
 CATEGORY = Metric("category", "category", better=None)

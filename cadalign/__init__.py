@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from cadalign.estimation.result_parts import EvidenceSummary
     from cadalign.estimation.results import Results
     from cadalign.estimation.view import View
-    from cadalign.evaluation.api import evaluate, simulate
+    from cadalign.evaluation.api import evaluate
     from cadalign.geometry.alignment import Alignment, Box
     from cadalign.geometry.camera import Camera
     from cadalign.geometry.mesh import Material, Mesh
@@ -67,7 +67,6 @@ __all__ = [
     "render",
     "retrieval",
     "shapes",
-    "simulate",
     "solvers",
 ]
 

@@ -64,9 +64,8 @@ ax.legend()
 # experiments: random points, random poses, stretches from 0.5 to 2, a camera of 640 x 480 px with
 # f = 150 px and 2 px of noise. ``make paper`` makes all of its figures at their size.
 
-rows = cadalign.simulate(
-    "points", values=[8, 16, 32, 64, 128], runs=40, methods=["aepnp", "optimal"], workers=0
-)
+sweep = {"sweep": "points", "values": [8, 16, 32, 64, 128], "runs": 40}
+rows = cadalign.evaluate(experiment="simulate", **sweep, methods=["aepnp", "optimal"], workers=0)
 medians = rows.groupby(["points", "method"])["rotation_error_deg"].median().unstack()
 print(medians.round(2).to_string())
 

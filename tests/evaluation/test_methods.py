@@ -24,7 +24,7 @@ from cadalign.evaluation.experiments.photos import PhotosOptions
 
 def simulate(methods: Any, **options: Any) -> Any:
     options = {"values": [20], "runs": 3, "workers": 0, **options}
-    return cadalign.simulate("points", methods=methods, **options)
+    return cadalign.evaluate(experiment="simulate", sweep="points", methods=methods, **options)
 
 
 # --- functions as methods ----------------------------------------------------------------------
@@ -105,7 +105,8 @@ import cadalign
 def mine(points_3d, points_2d, camera):
     return cadalign.fit(points_3d, points_2d, camera, method="aepnp")
 def simulate(methods):
-    return cadalign.simulate("points", values=[20], runs=2, workers=1, methods=methods)
+    sweep = {"sweep": "points", "values": [20], "runs": 2}
+    return cadalign.evaluate(experiment="simulate", **sweep, workers=1, methods=methods)
 print((simulate(["aepnp"]).status == "ok").all())
 try:
     simulate([mine])

@@ -25,7 +25,7 @@ from cadalign.report import headline_text
 
 def simulate(**options: Any) -> Any:
     options = {"values": [20], "runs": 3, "methods": ["aepnp"], "workers": 0, **options}
-    return cadalign.simulate("points", **options)
+    return cadalign.evaluate(experiment="simulate", sweep="points", **options)
 
 
 @pytest.mark.parametrize("given", [depth_error, "support.solving:depth_error"])

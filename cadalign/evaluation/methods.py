@@ -86,7 +86,6 @@ class Method:
     is_general: bool = False
     has_statistics: bool = False
     """``solve`` states uncertainties and alternatives, ``solve_many`` does not."""
-    is_robust: bool = False  # it searches for inliers
 
 
 # Names for a method together with options of `cadalign.fit`.
@@ -116,7 +115,6 @@ def fit_methods() -> dict[str, Method]:
             partial(_fit_many, name=name),
             is_general=True,
             has_statistics=name == "optimal" or name in _VARIANTS or name in _RANSAC,
-            is_robust=name in _RANSAC,
         )
         for name in (*METHODS, *_VARIANTS, *_RANSAC)
     ]

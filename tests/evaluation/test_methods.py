@@ -39,8 +39,9 @@ def test_a_function_stands_beside_built_in_methods(given: Any) -> None:
 
 
 def test_a_function_is_told_the_noise_if_it_asks_for_it() -> None:
-    assert (simulate([weighted], noise_px=2.0).status == "ok").all()
-    assert set(simulate([weighted], noise_px=1.0).status) == {"failed"}
+    sweep = {"sweep": "noise", "values": [1, 2], "runs": 1, "methods": [weighted]}
+    table = cadalign.evaluate(experiment="simulate", **sweep, workers=0)
+    assert table.status.tolist() == ["failed", "ok"]
 
 
 @pytest.mark.parametrize("bad", BAD, ids=lambda bad: bad.__name__)

@@ -85,7 +85,7 @@ def test_every_experiment_with_functions_takes_it(real_data: Path) -> None:
         (
             real_data / "sfm/maupertuis_colmap",
             "correspondences",
-            {"methods": ["aepnp", linear], "draws": 1, "max_images": 1, "outliers": [0.0]},
+            {"methods": ["aepnp", linear], "draws": 1, "outliers": [0.0]},
         ),
     ):
         table = cadalign.evaluate(root, experiment, **common, **options)

@@ -33,7 +33,6 @@ from cadalign.evaluation.summary import (
     Quartiles,
     Summary,
     group_name,
-    median,
     share,
     summarize,
     where,
@@ -45,6 +44,9 @@ if TYPE_CHECKING:
     from cadalign.estimation.result import Result
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.tables import Run
+
+
+_MAX_ITERATIONS = 10_000  # of a search for inliers
 
 
 @dataclass(frozen=True)
@@ -79,10 +81,6 @@ class CorrespondenceOptions(FunctionOptions):
     The others get all points."""
     max_reproj_error: float = 4.0
     """Largest reprojection error of an inlier, in pixels."""
-    max_iterations: int = 10_000
-    """Bound on the samples of a search for inliers."""
-    max_images: int | None = None
-    """Largest number of images, the first ones."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -104,23 +102,21 @@ class CorrespondenceOptions(FunctionOptions):
                     where="outliers",
                     fix="give numbers from 0 to less than 1",
                 )
-        self.check_least(draws=1, max_images=1)
+        self.check_least(draws=1)
         self.ransac(0)
 
     def ransac(self, seed: int) -> RansacOptions:
         """The options of a search for inliers; the minimal solver is the method's."""
-        return RansacOptions(
-            max_reproj_error=self.max_reproj_error, max_iterations=self.max_iterations, seed=seed
-        )
+        error = self.max_reproj_error
+        return RansacOptions(max_reproj_error=error, max_iterations=_MAX_ITERATIONS, seed=seed)
 
 
 NAMES: Columns = (("image", str), ("draw", int), ("outliers", float), ("method", str))
 COLUMNS: Columns = (
     *NAMES,
-    *(("status", str), ("reason", str), ("points", int), ("inliers", int)),
+    *(("status", str), ("reason", str), ("points", int)),
     *(("rotation_error_deg", float), ("translation_error", float)),
     *(("scale_y_error", float), ("scale_z_error", float), ("success", bool)),
-    *(("inlier_precision", float), ("inlier_recall", float)),
 )
 """Columns of the result table; see docs/formats/runs.md."""
 ERRORS = (metrics.ROTATION, metrics.TRANSLATION_OF_DISTANCE, metrics.SCALE_Y, metrics.SCALE_Z)
@@ -147,7 +143,7 @@ def correspondence_tasks(
     images: CorrespondenceSet, options: CorrespondenceOptions
 ) -> list[CorrespondenceTask]:
     """All draws, image by image and share by share; raises DataError if no image can be read."""
-    names = images.names[: options.max_images]
+    names = images.names
     if not names:
         raise DataError("there are no images", where=str(images.root))
     for _ in images:  # finds what cannot be read
@@ -197,30 +193,17 @@ class SpoiledImages(Setting):
         return Case(task.names, facts, MethodInput.of_problem(truth, 1.0, ransac=ransac))
 
     def row(self, method: Method, given: MethodInput, estimate: Alignment | Result) -> Row:
-        return errors_of(estimate, given, is_robust=method.is_robust)
+        return errors_of(estimate, given)
 
 
-def errors_of(found: Alignment | Result, given: MethodInput, *, is_robust: bool = False) -> Row:
-    """Errors of an estimate by column; of its inliers where they were searched for."""
+def errors_of(found: Alignment | Result, given: MethodInput) -> Row:
+    """Errors of an estimate by column."""
     assert given.gt is not None
     distance = np.linalg.norm(given.gt.apply(given.points_3d).mean(axis=0))
     errors = alignment_errors(est=pose_of(found), gt=given.gt, length=float(distance))
     scales = max(errors["scale_y_error"], errors["scale_z_error"])
-    row: Row = {
-        "points": len(given.points_3d),
-        **errors,
-        "success": errors["rotation_error_deg"] < _SUCCESS_DEG and scales <= _SUCCESS_SCALE,
-    }
-    if not is_robust or isinstance(found, Alignment):
-        return row
-    inliers = np.ones(len(given.points_3d), bool) if given.inliers is None else given.inliers
-    kept, kept_inliers = int(found.inliers.sum()), int((found.inliers & inliers).sum())
-    return {
-        **row,
-        "inliers": kept,
-        "inlier_precision": kept_inliers / max(kept, 1),
-        "inlier_recall": kept_inliers / max(int(inliers.sum()), 1),
-    }
+    is_success = errors["rotation_error_deg"] < _SUCCESS_DEG and scales <= _SUCCESS_SCALE
+    return {"points": len(given.points_3d), **errors, "success": is_success}
 
 
 def spoil(seen: Correspondences, outliers: float, *, rng: np.random.Generator) -> SimulatedProblem:
@@ -260,10 +243,7 @@ def _pixels_anywhere(camera: Camera, count: int, rng: np.random.Generator) -> Fl
 
 # Summary ------------------------------------------------------------------------------------------
 
-HEADLINE = (
-    *(metrics.INSTANCES, metrics.FAILED, metrics.SUCCESS, *ERRORS),
-    *(metrics.INLIER_RECALL, metrics.MILLISECONDS),
-)
+HEADLINE = (*(metrics.INSTANCES, metrics.FAILED, metrics.SUCCESS, *ERRORS, metrics.MILLISECONDS),)
 
 
 def _quartiles(key: str) -> Callable[[Group], Quartiles]:
@@ -279,7 +259,6 @@ def _quartiles(key: str) -> Callable[[Group], Quartiles]:
 _STATISTICS = {
     "success": share(lambda solved: solved["success"].astype(bool)),
     **{metric.key: _quartiles(metric.key) for metric in ERRORS},
-    **{key: median(key) for key in ("inlier_precision", "inlier_recall")},
     "milliseconds": lambda group: Quartiles.of(1e3 * group.rows["seconds"]),
 }
 

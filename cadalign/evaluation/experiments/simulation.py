@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, dataclass, fields, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import tyro
 
 from cadalign.arrays import instance_rng
-from cadalign.errors import DataError, InputError, quote, refuse_unused, unknown
+from cadalign.errors import DataError, InputError, quote, unknown
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
 from cadalign.evaluation.methods import Method, MethodInput, pose_of
@@ -93,10 +93,6 @@ class SweepOptions(FunctionOptions):
     """Values of the quantity that is varied, instead of the sweep's own."""
     runs: int | None = None
     """Problems for each value."""
-    points: int | None = None
-    """Number of points, where it is held."""
-    noise_px: float | None = None
-    """Standard deviation of the noise in pixels, where it is held."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -108,15 +104,12 @@ class SweepOptions(FunctionOptions):
             self.replace_values(values=tuple(float(value) for value in self.values))
         self.check_least(runs=1)
         _check_values(self.kind)
-        refuse_unused(self, [self.kind.column], "where it is varied")
 
     @property
     def kind(self) -> SweepKind:
         """The sweep, with what is given in place of its own settings."""
-        names = {field.name for field in fields(SweepKind)}
-        given = {
-            name: value for name, value in vars(self).items() if name in names and value is not None
-        }
+        given = {name: getattr(self, name) for name in ("methods", "values", "runs")}
+        given = {name: value for name, value in given.items() if value is not None}
         return replace(SWEEPS[self.sweep], **given)
 
     @property
@@ -140,13 +133,10 @@ _CHECKS: dict[str, tuple[Callable[[float], bool], str, str]] = {
 def _check_values(kind: SweepKind) -> None:
     if not kind.values:
         raise InputError("none is given", where="values")
-    settings = {column: (getattr(kind, column),) for column in _CHECKS}
-    for column, values in {**settings, kind.column: kind.values}.items():
-        valid, what, fix = _CHECKS[column]
-        for value in values:
-            if not valid(value):
-                where = "values" if column == kind.column else column
-                raise InputError(f"{value:g} is not {what}", where=where, fix=fix)
+    valid, what, fix = _CHECKS[kind.column]
+    for value in kind.values:
+        if not valid(value):
+            raise InputError(f"{value:g} is not {what}", where="values", fix=fix)
 
 
 ERRORS = (metrics.ROTATION, metrics.TRANSLATION_IN_UNITS, metrics.SCALE_Y, metrics.SCALE_Z)

@@ -141,7 +141,6 @@ SUCCESS = rate("success", "success", "succ%")
 SUCCESS_5 = rate("success_5deg_5pct", "within 5 deg, 5 %", "5/5 %*")
 SUCCESS_10 = rate("success_10deg_10pct", "within 10 deg, 10 %")
 OVER_BOUND = Metric("over_limit", "R error over Cramer-Rao bound", better=None)
-INLIER_RECALL = rate("inlier_recall", "inliers kept", "found%")
 
 RANK_1 = rate("rank_1", "true model first", "first%")
 RANK_5 = rate("rank_5", "true model among the first 5", "top5%", head="among the first 5")

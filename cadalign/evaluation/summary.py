@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 ALL = "all"
 """Name of the summary over all categories."""
-MEAN = "mean of categories"
-"""Name of the summary of the categories' own values."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +157,7 @@ def summarize(
         chosen = np.ones(len(cells["method"]), dtype=bool)
         for key, value in zip(by, values, strict=True):
             chosen &= (cells[key] == value) | (value is None)
-        labels = [f"category {each}" if each in (ALL, MEAN) else each for each in values]
+        labels = [f"category {each}" if each == ALL else each for each in values]
         labels = [ALL if each is None else each for each in labels]
         for method in run.methods:
             rows = where(cells, chosen & (cells["method"] == method))
@@ -194,16 +192,6 @@ def mean(key: str) -> Callable[[Group], float]:
 def quartiles(key: str) -> Callable[[Group], Quartiles]:
     """The quartiles of a column over the rows that are ok."""
     return lambda group: Quartiles.of_solved(group.solved[key].astype(float))
-
-
-def percentile(key: str, percent: float) -> Callable[[Group], float]:
-    """A percentile of a column, NaN where all cells are missing."""
-
-    def made(group: Group) -> float:
-        values = known(group.solved[key])
-        return float(np.percentile(values, percent)) if len(values) else np.nan
-
-    return made
 
 
 def share(is_within: Callable[[Cells], BoolArray]) -> Callable[[Group], float]:

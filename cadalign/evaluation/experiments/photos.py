@@ -5,7 +5,6 @@ A method's name is a base, and the evidence beside the keypoints, as in ``rigid+
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -33,13 +32,10 @@ from cadalign.evaluation.metrics.photos import (
 from cadalign.evaluation.options import FunctionOptions, is_function
 from cadalign.evaluation.plots import cumulative_curves
 from cadalign.evaluation.registry import Spec
-from cadalign.evaluation.runs.work import LEFT_OUT, UNREADABLE, Columns, Plan
+from cadalign.evaluation.runs.work import LEFT_OUT, Columns, Plan
 from cadalign.evaluation.summary import (
-    ALL,
-    MEAN,
     Summary,
     mean,
-    mean_of,
     median,
     milliseconds,
     summarize,
@@ -148,7 +144,7 @@ _CONSOLE = (
 
 
 def summarize_objects(run: Run) -> list[Summary]:
-    """A summary for every category and method, for all together, and the mean of categories."""
+    """A summary for every category and method, and for all together."""
     cells = run.cells
     statistics = {
         "keypoints": mean("keypoints"),
@@ -156,22 +152,7 @@ def summarize_objects(run: Run) -> list[Summary]:
         metrics.RMS.key: median(metrics.RMS.key),
         "milliseconds": milliseconds,
     }
-    found = summarize(run, statistics, apart=LEFT_OUT)
-    single = [each for each in found if each.group not in (ALL, UNREADABLE)]
-    if len({each.group for each in single}) < 2:
-        return found
-    whole = [each for each in found if each.group == ALL]
-    return [*found, *(_mean(every, single) for every in whole)]
-
-
-def _mean(every: Summary, single: Sequence[Summary]) -> Summary:
-    """The mean of a method's values over categories; its counts are those of all."""
-    own = [each for each in single if each.method == every.method]
-    values = {
-        key: value if isinstance(value, int) else mean_of(np.array([s.values[key] for s in own]))
-        for key, value in every.values.items()
-    }
-    return Summary(MEAN, {"category": MEAN, "method": every.method}, values)
+    return summarize(run, statistics, apart=LEFT_OUT)
 
 
 _CURVES = (

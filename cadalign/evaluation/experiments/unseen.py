@@ -27,7 +27,6 @@ from cadalign.evaluation.summary import (
     mean_of,
     medians,
     milliseconds,
-    percentile,
     summarize,
 )
 from cadalign.io.files import made_folder
@@ -80,16 +79,15 @@ class UnseenOptions(ViewOptions):
 
 COLUMNS: Columns = (
     *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int)),
-    *(("rotation_error_deg", float), ("best_rotation_error_deg", float)),
-    *(("translation_error", float), ("translation_error_up_to_scale", float), ("box_iou", float)),
+    *(("rotation_error_deg", float), ("translation_error", float)),
+    *(("translation_error_up_to_scale", float), ("box_iou", float)),
     *(("box_iou_up_to_scale", float), ("keypoint_error", float)),
     *(("rotation_level", float), ("stretch_level", float)),
     *(("keypoints_within_68", float), ("keypoints_within_95", float)),
 )
 """Columns of the result table; see docs/formats/runs.md."""
 _MEDIANS = (
-    *(metrics.ROTATION, metrics.BEST_ROTATION),
-    *(metrics.TRANSLATION, metrics.TRANSLATION_UP_TO_SCALE),
+    *(metrics.ROTATION, metrics.TRANSLATION, metrics.TRANSLATION_UP_TO_SCALE),
     *(metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE, metrics.KEYPOINT_ERROR),
 )
 _COVERAGE = (
@@ -98,8 +96,8 @@ _COVERAGE = (
     *(metrics.KEYPOINTS_IN_68, metrics.KEYPOINTS_IN_95),
 )
 HEADLINE = (
-    *(metrics.INSTANCES, metrics.FAILED, metrics.KEYPOINTS, metrics.ROTATION, metrics.ROTATION_90),
-    *(*_MEDIANS[1:], *_COVERAGE, metrics.QUERY_MILLISECONDS),
+    *(metrics.INSTANCES, metrics.FAILED, metrics.KEYPOINTS, *_MEDIANS, *_COVERAGE),
+    metrics.QUERY_MILLISECONDS,
 )
 
 
@@ -111,7 +109,6 @@ def _within(level: str, nominal: float) -> Callable[[Group], float]:
 _STATISTICS = {
     "keypoints": mean("keypoints"),
     **medians(*_MEDIANS),
-    "rotation_error_deg_90": percentile("rotation_error_deg", 90),
     **{
         f"{name}_in_{percent}": _within(f"{name}_level", percent / 100)
         for name in ("rotation", "stretch")
@@ -121,8 +118,7 @@ _STATISTICS = {
     "milliseconds": milliseconds,
 }
 _CONSOLE = (
-    *(metrics.INSTANCES, metrics.FAILED),
-    *(replace(metrics.ROTATION, digits=2), replace(metrics.ROTATION_90, digits=1)),
+    *(metrics.INSTANCES, metrics.FAILED, replace(metrics.ROTATION, digits=2)),
     *(replace(metrics.TRANSLATION_UP_TO_SCALE, digits=3), metrics.BOX_IOU_UP_TO_SCALE),
     *(replace(metrics.KEYPOINT_ERROR, digits=3), *_COVERAGE, metrics.QUERY_MILLISECONDS),
 )

@@ -93,8 +93,8 @@ def estimate_object(sighting: Sighting, *, method: str) -> PhotoEstimate:
             raise LeftOutError("the true pose is not known")
         return PhotoEstimate(gt, box)
     if base == EPNP:
-        points = sighting.points_3d * sighting.width
-        found = fit(points, sighting.points_2d, sighting.camera, method="epnp")
+        given = sighting.given
+        found = fit(given.points_3d, given.points_2d, given.camera, method="epnp")
         return estimate_of_model(found.alignment, sighting)
     model = _model(base, sighting, with_mesh=bool(_OUTLINED & evidence))
     result = align(model, _view(sighting, evidence))
@@ -109,13 +109,12 @@ def _model(base: str, sighting: Sighting, *, with_mesh: bool) -> Model:
     elif base == PRIOR:
         kind = {"stretch_sigma": SIMILAR_SCALE_SIGMA}
     elif base == SIMILAR:
-        diagonal = float(np.linalg.norm(np.ptp(bounds, axis=0)))
-        kind = {"shape_sigma": _SIMILAR_SIGMA * diagonal}
+        kind = {"shape_sigma": _SIMILAR_SIGMA * float(np.linalg.norm(np.ptp(bounds, axis=0)))}
     if with_mesh:
-        cad = sighting.target.cad
-        if cad is None or cad.scene is None:
+        scene = sighting.target.scene
+        if scene is None:
             raise LeftOutError("the model has no mesh for the mask")
-        kind["mesh"] = Mesh(cad.scene.mesh.vertices * width, cad.scene.mesh.faces)
+        kind["mesh"] = Mesh(scene.mesh.vertices * width, scene.mesh.faces)
     return Model(
         points_3d=sighting.model.xyz * width,
         ids=sighting.model.names,
@@ -140,8 +139,8 @@ def _view(sighting: Sighting, evidence: Collection[str]) -> View:
         if photo.image is None:
             raise LeftOutError("the image is not there")
         given["image"] = photo.read_image()
-    how = {"ids": sighting.names, "sigma": sighting.sigma, **given}
-    return View(sighting.camera, sighting.points_2d, **how)
+    seen = sighting.given
+    return View(seen.camera, seen.points_2d, ids=sighting.names, sigma=seen.sigma, **given)
 
 
 def estimate_of_model(
@@ -186,14 +185,7 @@ class PhotoObjects(Setting):
         return Case(target.names, facts, sighting)
 
     def given(self, sighting: Sighting) -> MethodInput:
-        return MethodInput(
-            sighting.points_3d * sighting.width,
-            sighting.points_2d,
-            sighting.camera,
-            sighting.sigma,
-            bounds=sighting.bounds * sighting.width,
-            gt=sighting.target.gt,
-        )
+        return sighting.given
 
     def answered(
         self, method: Method, sighting: Sighting, answer: Alignment | Result
@@ -217,12 +209,12 @@ class PhotoObjects(Setting):
         return record_of(
             outcomes,
             [_described(each, sighting) for each in estimates],
-            camera=sighting.camera,
+            camera=sighting.given.camera,
             gt=sighting.target.gt,
             stretch=np.ones(3),
             bounds=sighting.bounds,
             points_3d=sighting.points_3d,
-            points_2d=sighting.points_2d,
+            points_2d=sighting.given.points_2d,
             ids=np.arange(len(sighting.names)),
         )
 
@@ -244,7 +236,7 @@ def _rms(found: PhotoEstimate, sighting: Sighting) -> float | None:
         residuals = found.result.residuals
     else:
         points = found.alignment.apply(sighting.points_3d)
-        residuals = sighting.camera.project_where_ahead(points) - sighting.points_2d
+        residuals = sighting.given.camera.project_where_ahead(points) - sighting.given.points_2d
     rms = float(np.sqrt((residuals**2).sum(axis=1).mean())) if len(residuals) else np.nan
     return rms if np.isfinite(rms) else None
 
@@ -262,7 +254,7 @@ def _described(estimate: PhotoEstimate | Any, sighting: Sighting) -> Estimate | 
         model.xyz,
         model_bounds=sighting.bounds,
         rms=result.rms,
-        sigma=sighting.sigma,
+        sigma=sighting.given.sigma,
     )
 
 
@@ -271,13 +263,13 @@ def draw_sighting(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate
 
     The photo is grey where there is none.
     """
-    names, camera, cad = sighting.target.names, sighting.camera, sighting.target.cad
+    names, camera, scene = sighting.target.names, sighting.given.camera, sighting.target.scene
     stem = record_stem(names["category"], names["model_id"])
     try:
         photo = sighting.target.photo.read_image()
     except DataError:
         photo = np.full((camera.height, camera.width, 3), NO_PHOTO, dtype=np.uint8)
     boxes = {"gt_box": sighting.target.gt_box, "est_box": estimate.box}
-    write_pictures(folder, stem, photo, camera, observed=sighting.points_2d, **boxes)
-    if cad is not None and cad.scene is not None:
-        write_preview(folder.previews / f"{stem}.json", cad.scene.mesh)
+    write_pictures(folder, stem, photo, camera, observed=sighting.given.points_2d, **boxes)
+    if scene is not None:
+        write_preview(folder.previews / f"{stem}.json", scene.mesh)

@@ -19,7 +19,7 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Warnings
 from cadalign.evaluation.methods import pose_of
 from cadalign.evaluation.runs.work import Columns, Outcome
-from cadalign.geometry.alignment import Alignment, Uncertainty
+from cadalign.geometry.alignment import Alignment, Uncertainty, extent
 from cadalign.geometry.camera import Camera
 
 RECORD_COLUMNS: Columns = (("category", str), ("model_id", str), ("view", int), ("exhibit", str))
@@ -77,7 +77,7 @@ def aligned_shape(
     """
     points, bounds = found.points_3d[rows], found.bounds
     if spans_points:
-        bounds = np.stack([points.min(axis=0), points.max(axis=0)])
+        bounds = extent(points)
     alignment = box_alignment(found.alignment, bounds, model_bounds=model_bounds)
     target = alignment.inverse(found.alignment.apply(points))
     shape = AlignedShape(alignment, source, target, **more)

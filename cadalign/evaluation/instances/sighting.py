@@ -22,6 +22,7 @@ from cadalign.datasets.photo import (
 from cadalign.errors import DataError
 from cadalign.estimation.fit import fit
 from cadalign.evaluation.benchmark import Case
+from cadalign.evaluation.methods import MethodInput
 from cadalign.evaluation.metrics.photos import Protocol
 from cadalign.evaluation.runs.work import (
     UNREADABLE,
@@ -30,7 +31,7 @@ from cadalign.evaluation.runs.work import (
     fingerprint,
     fingerprint_of_files,
 )
-from cadalign.geometry.alignment import Alignment, Box
+from cadalign.geometry.alignment import Alignment, Box, extent
 from cadalign.geometry.camera import Camera
 from cadalign.render.scene import Scene
 
@@ -82,33 +83,16 @@ def reopened(root: Path) -> PhotoDataset:
 
 
 @dataclass(frozen=True)
-class Cad:
-    """A CAD model of the data set in a folder."""
+class _Cad:
+    """A CAD model by its name, for which its mesh is kept."""
 
-    root: str  # the folder
+    root: str
     model_id: str
-    model: CadModel = field(compare=False, repr=False)  # where it is read from
-
-    @property
-    def scene(self) -> Scene | None:
-        """The mesh; None if there is none that can be read."""
-        return _scene(self)
-
-    @property
-    def bounds(self) -> FloatArray | None:
-        """The bounding box (2, 3): the annotation's, the mesh's or that of the keypoints."""
-        if self.model.bounds is not None:
-            return np.asarray(self.model.bounds)
-        if self.scene is not None:
-            return np.asarray(self.scene.bounds)
-        points = self.model.load_keypoints()
-        return (
-            None if points is None else np.array([points.xyz.min(axis=0), points.xyz.max(axis=0)])
-        )
+    model: CadModel = field(compare=False)
 
 
 @lru_cache(maxsize=_KEPT)
-def _scene(cad: Cad) -> Scene | None:
+def _scene(cad: _Cad) -> Scene | None:
     try:
         scene = Scene(cad.model.load_mesh())
     except DataError:
@@ -126,15 +110,21 @@ class PhotoTarget:
     is_shown: bool = False  # its pictures are drawn
 
     @property
-    def cad(self) -> Cad | None:
-        """The CAD model."""
+    def scene(self) -> Scene | None:
+        """The mesh of the CAD model; None if there is none that can be read."""
         model = self.found.model
-        return None if model is None else Cad(self.root, model.model_id, model)
+        return None if model is None else _scene(_Cad(self.root, model.model_id, model))
 
     @property
     def bounds(self) -> FloatArray | None:
-        """The box (2, 3) of the CAD model."""
-        return None if self.cad is None else self.cad.bounds
+        """The box (2, 3) of the CAD model: the annotation's, the mesh's or its keypoints'."""
+        model = self.found.model
+        if model is None or model.bounds is not None:
+            return None if model is None else np.asarray(model.bounds)
+        if self.scene is not None:
+            return np.asarray(self.scene.bounds)
+        points = model.load_keypoints()
+        return None if points is None else extent(points.xyz)
 
     @property
     def gt(self) -> Alignment | None:
@@ -207,21 +197,14 @@ class Sighting:
     """The keypoints of an object that methods are given."""
 
     target: PhotoTarget
-    camera: Camera  # with a focal length
     source: str  # annotated or detected: where the keypoints come from
     names: tuple[str, ...]  # (n,), the given keypoints
-    points_2d: FloatArray  # (n, 2), [px]
-    sigma: float  # their standard deviation [px]
+    points_3d: FloatArray  # (n, 3), their places on the model, in its own unit
     model: NamedPoints  # all keypoints of the model, in its own unit
     bounds: FloatArray  # (2, 3), the model's box, in its own unit
     width: float  # factor of the model's size that gives it the object's width
     protocol: Protocol  # of the data set
-
-    @property
-    def points_3d(self) -> FloatArray:
-        """The given keypoints on the model (n, 3), in its own unit."""
-        row_of = {name: row for row, name in enumerate(self.model.names)}
-        return self.model.xyz[[row_of[name] for name in self.names]]
+    given: MethodInput  # of the model with the object's width
 
 
 def sight(target: PhotoTarget, protocol: Protocol) -> Sighting:
@@ -230,12 +213,12 @@ def sight(target: PhotoTarget, protocol: Protocol) -> Sighting:
     Raises LeftOutError if it has no camera, no model, or too few keypoints; and DataError if its
     model cannot be read.
     """
-    camera, cad = target.camera, target.cad
+    camera, cad = target.camera, target.found.model
     if camera is None:
         raise LeftOutError("the photo's camera is not known")
     if cad is None:
         raise LeftOutError("no model is annotated for the object")
-    model = cad.model.load_keypoints()
+    model = cad.load_keypoints()
     marks = target.found.keypoints
     if marks is None or model is None:
         raise LeftOutError("there are no keypoints")
@@ -244,19 +227,21 @@ def sight(target: PhotoTarget, protocol: Protocol) -> Sighting:
         raise LeftOutError(f"{len(names)} keypoints are fewer than {_LEAST_KEYPOINTS}")
     bounds, gt = target.bounds, target.gt
     assert bounds is not None  # of the keypoints at least
-    sighting = Sighting(
+    row_of = {name: row for row, name in enumerate(model.names)}
+    points, width = model.xyz[[row_of[name] for name in names]], float(gt.scale[0]) if gt else 1.0
+    sigma = _sigma(target, protocol)
+    given = MethodInput(points * width, pixels, camera, sigma, bounds=bounds * width, gt=gt)
+    return Sighting(
         target=target,
-        camera=camera,
         source=ANNOTATED if marks.scores is None else DETECTED,
         names=names,
-        points_2d=pixels,
-        sigma=_sigma(target, protocol),
+        points_3d=points,
         model=model,
         bounds=bounds,
-        width=1.0 if gt is None else float(gt.scale[0]),
+        width=width,
         protocol=protocol,
+        given=given if camera.focal_known else _calibrated(given),
     )
-    return sighting if camera.focal_known else _calibrated(sighting)
 
 
 def _marked(marks: PhotoKeypoints, model: NamedPoints) -> tuple[tuple[str, ...], FloatArray]:
@@ -275,13 +260,13 @@ def _sigma(target: PhotoTarget, protocol: Protocol) -> float:
     return max(protocol.sigma_of_side * float(max(right - left, bottom - top)), _LEAST_PX)
 
 
-def _calibrated(sighting: Sighting) -> Sighting:
+def _calibrated(given: MethodInput) -> MethodInput:
     found = fit(
-        sighting.points_3d * sighting.width,
-        sighting.points_2d,
-        sighting.camera,
-        sigma=sighting.sigma,
+        given.points_3d,
+        given.points_2d,
+        given.camera,
+        sigma=given.sigma,
         stretch_sigma=_FOCAL_PRIOR,
         focal="estimate",
     )
-    return replace(sighting, camera=found.camera)
+    return replace(given, camera=found.camera)

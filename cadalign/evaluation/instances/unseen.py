@@ -39,7 +39,7 @@ from cadalign.evaluation.metrics.errors import (
     probability_level,
 )
 from cadalign.evaluation.runs.work import Outcome, Row
-from cadalign.geometry.alignment import Alignment, Box
+from cadalign.geometry.alignment import Alignment, Box, extent
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.metrics import (
     rotation_error,
@@ -233,17 +233,14 @@ class UnseenObjects(Setting):
 
 def _errors(found: ShapeEstimate, seen: UnseenObject) -> Row:
     est, gt = found.alignment, seen.gt
-    others = () if found.result is None else found.result.alternatives
-    poses = [est, *(other.alignment for other in others)]
     known, rows = _shared(found, seen)
     own = found.points_3d[rows]
-    box = Box.from_model([own.min(axis=0), own.max(axis=0)], est)
+    box = Box.from_model(extent(own), est)
     gt_box = Box.from_model(seen.task.hull.bounds, gt)
     centre = Alignment(est.rotation, box.center, np.ones(3))
     gt_centre = Alignment(gt.rotation, gt_box.center, np.ones(3))
     values: Row = {
         "rotation_error_deg": rotation_error(est=est, gt=gt),
-        "best_rotation_error_deg": min(rotation_error(est=one, gt=gt) for one in poses),
         "translation_error": translation_error(est=centre, gt=gt_centre),
         "translation_error_up_to_scale": translation_error_up_to_scale(est=centre, gt=gt_centre),
         "box_iou": overlap(est=box, gt=gt_box),

@@ -161,20 +161,6 @@ QUERY_MILLISECONDS = replace(
     MILLISECONDS, label="time of a query", head="time of a query", digits=1
 )
 
-ROTATION_90 = _like(
-    ROTATION,
-    "rotation_error_deg_90",
-    "90th percentile of the rotation error",
-    "R error, 90 %",
-    "R90",
-)
-BEST_ROTATION = _like(
-    ROTATION,
-    "best_rotation_error_deg",
-    "rotation error of the best alternative",
-    "R error, best alternative",
-    "best R",
-)
 KEYPOINT_ERROR = Metric("keypoint_error", "keypoint error", "diagonals", 4, symbol="kp")
 """Root mean square, up to scale, of a method's estimate of all keypoints."""
 # Shares of the truths within regions of a stated probability.

@@ -199,25 +199,19 @@ class Benchmark:
                 answers.append((Outcome(names, case.facts | row, seconds=seconds), estimate))
         return answers
 
-    def _measured(self, method: Method, pairs: Sequence[Pair]) -> Sequence[Row | Exception]:
-        """The cells of each estimate, or why there are none."""
+    def _measured(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
+        """The cells of each estimate, those of further metrics too, or why there are none."""
         rows = self.setting.measure(method, pairs) if pairs else []
-        if not self.metrics:
-            return rows
-        return [self._further(*each) for each in zip(pairs, rows, strict=True)]
+        return [
+            row if isinstance(row, Exception) else attempt(self._further, row, *pair)
+            for pair, row in zip(pairs, rows, strict=True)
+        ]
 
-    def _further(self, pair: Pair, row: Row | Exception) -> Row | Exception:
-        """The cells of an estimate with those of further metrics."""
-        if isinstance(row, Exception):
+    def _further(self, row: Row, instance: Any, estimate: Any) -> Row:
+        if not self.metrics:
             return row
-        instance, estimate = pair
         given = self.setting.given(instance)
-        for each in self.metrics:
-            value = attempt(each.measure, estimate, given)
-            if isinstance(value, Exception):
-                return value
-            row[each.metric.key] = value
-        return row
+        return row | {each.metric.key: each.measure(estimate, given) for each in self.metrics}
 
     def _solved(self, method: Method, instances: Sequence[Any]) -> list[tuple[Any, float | None]]:
         """A method's estimate of every instance, or why there is none, and its seconds."""

@@ -1,4 +1,4 @@
-"""Figures of runs: lines with quartile bands, and curves of shares, a colour for each method."""
+"""Figures of runs: lines of medians, and curves of shares, a colour for each method."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cadalign.evaluation import metrics
 from cadalign.evaluation.methods import LIMIT
 from cadalign.evaluation.metrics import HIGH, Metric
 from cadalign.evaluation.runs.work import FAILED, OK
-from cadalign.evaluation.summary import Quartiles, Summary, known, where
+from cadalign.evaluation.summary import Summary, known, where
 from cadalign.io.files import write_whole
 
 if TYPE_CHECKING:
@@ -52,13 +52,12 @@ STYLE: dict[Any, Any] = {
 }
 """Settings of matplotlib that all figures share."""
 
-QUARTILES_NOTE = "line: median, band: quartiles"
 _DIGITS = 6
 
 
 @dataclass(frozen=True)
 class Trace:
-    """A line of a plot, in the units of its axes, with the ends of a band if it has one.
+    """A line of a plot, in the units of its axes.
 
     ``run`` is the place of the run among those that are compared. Values are None where there is
     none.
@@ -68,26 +67,13 @@ class Trace:
     method: str
     x: list[float]
     y: list[float | None]
-    low: list[float | None] | None = None
-    high: list[float | None] | None = None
 
     @classmethod
     def of(
-        cls, run: int, method: str, x: Sequence[float], y: Sequence[float | Quartiles], unit: Metric
+        cls, run: int, method: str, x: Sequence[float], y: Sequence[float], unit: Metric
     ) -> Trace:
-        """A line through values, or through medians with quartiles as its band."""
-        quartiles = [q for q in y if isinstance(q, Quartiles)]
-        if not quartiles:
-            return cls(run, method, list(x), compact([unit.shown(value) for value in y]))
-        middle, low, high = (
-            compact([unit.shown(getattr(q, name)) for q in quartiles])
-            for name in ("median", "lower", "upper")
-        )
-        return cls(run, method, list(x), middle, low, high)
-
-    def to_dict(self) -> dict[str, Any]:
-        """The line for the page."""
-        return {name: value for name, value in vars(self).items() if value is not None}
+        """A line through values."""
+        return cls(run, method, list(x), compact([unit.shown(value) for value in y]))
 
 
 @dataclass(frozen=True)
@@ -112,7 +98,7 @@ class Plot:
             "id": self.id,
             "title": f"{title[0].upper()}{title[1:]}",
             **axes,
-            "traces": [trace.to_dict() for trace in self.traces],
+            "traces": [vars(trace) for trace in self.traces],
             "note": self.note,
         }
 
@@ -161,7 +147,7 @@ def draw_plot(path: Path, plot: Plot) -> list[Path]:
 
 
 def _draw_lines(axes: Axes, plot: Plot) -> None:
-    """Draw lines, which end where there is no value, and their bands."""
+    """Draw lines, which end where there is no value."""
     methods = list(dict.fromkeys(trace.method for trace in plot.traces))
     for trace in plot.traces:
         place, is_limit = methods.index(trace.method), trace.method == LIMIT
@@ -174,10 +160,6 @@ def _draw_lines(axes: Axes, plot: Plot) -> None:
             marker="" if is_limit else _MARKERS[place % len(_MARKERS)],
             label=trace.method,
         )
-        # The Cramer-Rao bound is a floor whose band would hide the others.
-        if trace.low is not None and trace.high is not None and not is_limit:
-            low, high = (np.array(end, dtype=float) for end in (trace.low, trace.high))
-            axes.fill_between(trace.x, low, high, color=color, alpha=0.14, linewidth=0)
 
 
 def cumulative(runs: Sequence[Run], metric: Metric, places: FloatArray, *, title: str) -> Plot:

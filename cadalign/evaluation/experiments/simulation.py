@@ -23,11 +23,11 @@ from cadalign.evaluation.methods import Method, MethodInput, pose_of
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.options import FunctionOptions, plain_value
-from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, plot_against
+from cadalign.evaluation.plots import Plot, plot_against
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Columns, Plan, Row
 from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
-from cadalign.evaluation.summary import Summary, group_name, quartiles, summarize
+from cadalign.evaluation.summary import Summary, group_name, medians, summarize
 from cadalign.geometry.alignment import Alignment
 
 if TYPE_CHECKING:
@@ -221,17 +221,16 @@ def varied(run: Run) -> Metric:
 
 
 def summarize_sweep(run: Run) -> list[Summary]:
-    """Quartiles of every metric for every value and method, over the problems that are solved."""
-    statistics = {metric.key: quartiles(metric.key) for metric in (*ERRORS, *run.metrics)}
+    """Medians of every metric for every value and method, over the problems that are solved."""
     name = partial(group_name, varied(run))
-    return summarize(run, statistics, by=(kind_of(run).column,), name=name)
+    return summarize(run, medians(*ERRORS), by=(kind_of(run).column,), name=name)
 
 
 def plots(runs: Sequence[Run]) -> list[Plot]:
     """Errors against the quantity that is varied."""
     x, found = varied(runs[0]), [summarize_sweep(run) for run in runs]
     return [
-        plot_against(found, x, metric, place=x.key, note=QUARTILES_NOTE)
+        plot_against(found, x, metric, place=x.key, note="medians")
         for metric in (*ERRORS, *runs[0].metrics)
     ]
 

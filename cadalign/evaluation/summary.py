@@ -100,15 +100,14 @@ def summarize(
     by: Sequence[str] = (CATEGORY.key,),
     name: Callable[..., str] = str,
     apart: str = SKIPPED,
-    cells: Cells | None = None,
 ) -> list[Summary]:
     """Statistics of every method on every group of tasks, and on all categories together.
 
     Tasks of a group share the cells of the columns ``by``, of which ``name`` makes its name;
     without columns there is one group. Rows of the status ``apart`` do not count. Medians of the
-    run's further metrics are added. ``cells`` take the place of the run's.
+    run's further metrics are added.
     """
-    cells = run.cells if cells is None else cells
+    cells = run.cells
     statistics = {**statistics, **{each.key: median(each.key) for each in run.metrics}}
     choices: list[list[Any]] = [sorted(set(cells[key].tolist())) for key in by]
     if by[:1] == (CATEGORY.key,) and len(choices[0]) > 1:

@@ -35,7 +35,6 @@ from cadalign.evaluation.summary import (
     milliseconds,
     share,
     summarize,
-    where,
 )
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -142,16 +141,10 @@ _opened = lru_cache(maxsize=1)(open_correspondences)
 def correspondence_tasks(
     images: CorrespondenceSet, options: CorrespondenceOptions
 ) -> list[CorrespondenceTask]:
-    """All draws, image by image and share by share; raises DataError if no image can be read."""
+    """All draws, image by image and share by share; raises DataError if there are no images."""
     names = images.names
     if not names:
         raise DataError("there are no images", where=str(images.root))
-    for _ in images:  # finds what cannot be read
-        pass
-    if set(names) <= set(images.problems):
-        first = images.problems[names[0]]
-        what = f"none of {len(names)} images can be read; the first: {first}"
-        raise DataError(what, where=str(images.root))
     draws = range(options.draws)
     return [
         CorrespondenceTask(name, share, draw)
@@ -268,14 +261,9 @@ _STATISTICS = {
 
 
 def summarize_shares(run: Run) -> list[Summary]:
-    """A summary for every share of outliers and method, of the images that can be read."""
-    return summarize(
-        run,
-        _STATISTICS,
-        by=("outliers",),
-        name=partial(group_name, metrics.OUTLIERS),
-        cells=where(run.cells, ~np.isnan(run.cells["points"].astype(float))),
-    )
+    """A summary for every share of outliers and method."""
+    name = partial(group_name, metrics.OUTLIERS)
+    return summarize(run, _STATISTICS, by=("outliers",), name=name)
 
 
 def plots(runs: Sequence[Run]) -> list[Plot]:

@@ -8,7 +8,7 @@ model, and ``leave-out``, where it and all that count as it are taken out.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, asdict, dataclass, replace
+from dataclasses import KW_ONLY, asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -30,9 +30,8 @@ from cadalign.evaluation.instances.instance import (
 )
 from cadalign.evaluation.methods import Method
 from cadalign.evaluation.metrics import QUERIES
-from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
+from cadalign.evaluation.metrics.errors import overlap
 from cadalign.evaluation.options import ModelOptions
-from cadalign.evaluation.plots import Plot, plot_against
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Columns, Plan, Row
 from cadalign.evaluation.summary import (
@@ -202,7 +201,7 @@ class RetrievalQueries(Setting):
         (task, query), library, first = instance, opened_library(self.library), matches[0]
         gt = library[task.category, task.model_id]
         alike = same_shapes(library, gt.key)
-        boxes = {"est": first.box, "gt": Box.from_model(gt.bounds, query.gt)}
+        gt_box = Box.from_model(gt.bounds, query.gt)
         keys = [(match.category, match.model_id) for match in matches]
         ranks = (rank for rank, key in enumerate(keys, start=1) if key in alike)
         best = library[first.category, first.model_id]
@@ -214,8 +213,8 @@ class RetrievalQueries(Setting):
             "shared": first.shared,
             "rms_px": first.rms,
             "shape_distance": shape_distance(best, gt),
-            "box_iou": overlap(**boxes),
-            "box_iou_up_to_scale": overlap_up_to_scale(**boxes),
+            "box_iou": overlap(est=first.box, gt=gt_box),
+            "box_iou_up_to_scale": overlap(est=first.box, gt=gt_box, up_to_scale=True),
             "rotation_error_deg": rotation_error(est=first.alignment, gt=query.gt),
         }
 
@@ -269,13 +268,6 @@ HEADLINE = (
     *(metrics.NONE, metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
     *(metrics.MATCH_ROTATION, metrics.QUERY_MILLISECONDS),
 )
-_KEYPOINTS = replace(metrics.KEYPOINTS, label="keypoints in the image", log=False)
-_PLOTS = (
-    (metrics.RANK_1, LEAVE_IN),
-    (metrics.RANK_5, LEAVE_IN),
-    (replace(metrics.BOX_IOU, label="median box IoU"), LEAVE_OUT),
-    (replace(metrics.SHAPE_DISTANCE, label="median shape distance"), LEAVE_OUT),
-)
 
 
 def _of_ranks(statistic: Callable[[FloatArray], FloatArray]) -> Callable[[Group], float]:
@@ -309,25 +301,6 @@ def summarize_queries(run: Run) -> list[Summary]:
     )
 
 
-def plots(runs: Sequence[Run]) -> list[Plot]:
-    """Rates and medians against the number of keypoints, over all categories."""
-    # All categories together, or the only one, come last.
-    found = [
-        [each for each in summaries if each["category"] == summaries[-1]["category"]]
-        for summaries in map(summarize_queries, runs)
-    ]
-    drawn = []
-    for metric, protocol in _PLOTS:
-        words = {
-            "id": f"{protocol.replace('-', '_')}_{metric.key}",
-            "note": "over all categories",
-            "title": f"{metric.label}, {protocol}",
-        }
-        chosen = [[each for each in some if each["protocol"] == protocol] for some in found]
-        drawn.append(plot_against(chosen, _KEYPOINTS, metric, place="keypoints", **words))
-    return drawn
-
-
 _CHUNK = 16
 
 
@@ -357,7 +330,6 @@ SPEC = Spec(
     summarize=summarize_queries,
     console=HEADLINE[2:],
     group=lambda run: QUERIES,
-    plots=plots,
     topic="retrieval",
     subject="views of models",
     note=(

@@ -35,7 +35,6 @@ from cadalign.evaluation.methods import LIMIT, SHAPE, Method, MethodInput
 from cadalign.evaluation.metrics.errors import (
     limit_estimate,
     overlap,
-    overlap_up_to_scale,
     probability_level,
 )
 from cadalign.evaluation.runs.work import Outcome, Row
@@ -244,7 +243,7 @@ def _errors(found: ShapeEstimate, seen: UnseenObject) -> Row:
         "translation_error": translation_error(est=centre, gt=gt_centre),
         "translation_error_up_to_scale": translation_error_up_to_scale(est=centre, gt=gt_centre),
         "box_iou": overlap(est=box, gt=gt_box),
-        "box_iou_up_to_scale": overlap_up_to_scale(est=box, gt=gt_box),
+        "box_iou_up_to_scale": overlap(est=box, gt=gt_box, up_to_scale=True),
         "keypoint_error": _distance_up_to_scale(est.apply(own), gt.apply(seen.xyz[known])),
     }
     if found.result is not None:

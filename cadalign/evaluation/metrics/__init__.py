@@ -139,7 +139,6 @@ SYM_BOX_IOU = replace(BOX_IOU, key="sym_box_iou", label="box IoU, symmetry-aware
 
 SUCCESS = rate("success", "success", "succ%")
 SUCCESS_5 = rate("success_5deg_5pct", "within 5 deg, 5 %", "5/5 %*")
-SUCCESS_10 = rate("success_10deg_10pct", "within 10 deg, 10 %")
 OVER_BOUND = Metric("over_limit", "R error over Cramer-Rao bound", better=None)
 
 RANK_1 = rate("rank_1", "true model first", "first%")

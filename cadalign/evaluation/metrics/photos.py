@@ -21,7 +21,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.evaluation import metrics
 from cadalign.evaluation.metrics import Metric
-from cadalign.evaluation.metrics.errors import overlap_up_to_scale
+from cadalign.evaluation.metrics.errors import overlap
 from cadalign.evaluation.runs.work import Row
 from cadalign.evaluation.summary import Group, known, medians
 from cadalign.geometry.alignment import Alignment, Box
@@ -130,7 +130,7 @@ def measure_box(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) ->
     if gt_box is not None and min(box.volume, gt_box.volume) > 0:
         iou = symmetric_box_iou(est=box, gt=gt_box, symmetry=found.symmetry)
         values[metrics.BOX_IOU.key] = iou
-        values[metrics.BOX_IOU_UP_TO_SCALE.key] = overlap_up_to_scale(est=box, gt=gt_box)
+        values[metrics.BOX_IOU_UP_TO_SCALE.key] = overlap(est=box, gt=gt_box, up_to_scale=True)
     return values
 
 

@@ -74,13 +74,11 @@ class Setting:
 
     def _cases(self, task: Any) -> list[Case]:
         found = attempt(self.case, task)
-        if isinstance(found, Exception):
-            return [replace(case, error=found) for case in self.failed(task)]
-        return [found]
+        return [replace(self.failed(task), error=found) if isinstance(found, Exception) else found]
 
-    def failed(self, task: Any) -> list[Case]:
-        """The cases, without instances, of a task that could not be evaluated."""
-        return [Case(task.names)]
+    def failed(self, task: Any) -> Case:
+        """The case, without an instance, of a task that could not be evaluated."""
+        return Case(task.names)
 
     def given(self, instance: Any) -> MethodInput:
         """The instance as general methods are given it; by default it is that."""
@@ -162,10 +160,10 @@ class Benchmark:
 
     def failure(self, task: Any, reason: str) -> list[Row]:
         """A failed row for every method."""
+        case = self.setting.failed(task)
         return [
             self._blank
             | Outcome({**case.names, "method": method.name}, case.facts, FAILED, reason).row()
-            for case in self.setting.failed(task)
             for method in self.methods
         ]
 

@@ -93,9 +93,8 @@ _VARIANTS: dict[str, dict[str, Any]] = {
     "optimal-huber": {"method": "optimal", "loss": "huber"},
     "optimal-cauchy": {"method": "optimal", "loss": "cauchy"},
 }
-# Robust ones, named after what they return: the optimum over all inliers, or the best hypothesis of
-# a minimal solver as it is. With the linear solver, on 6 points, these are the AEPnP paper's two
-# steps: RANSAC-AEPnP, and the same with non-linear refinement.
+# Robust ones, the minimal solver and whether the optimum over all inliers is returned. With the
+# linear solver, on 6 points, these are the AEPnP paper's RANSAC-AEPnP, and the same refined.
 _RANSAC: dict[str, dict[str, Any]] = {
     "ransac-optimal": {"minimal": "ap4p", "refine": True},
     "ransac-ap4p": {"minimal": "ap4p", "refine": False},

@@ -32,7 +32,6 @@ COLORS = (
     *("#332288", "#999933", "#882255", "#44AA99", "#AA4499", "#117733"),
 )
 """Colours of lines, in their order."""
-_MARKERS = "os^DvP<X>phd"
 
 
 def color_of(method: str, place: int) -> str:
@@ -43,10 +42,6 @@ def color_of(method: str, place: int) -> str:
 STYLE: dict[Any, Any] = {
     "axes.grid": True,
     "grid.color": "0.9",
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "legend.frameon": False,
     "pdf.fonttype": 42,  # TrueType, which publishers ask for
     "figure.dpi": 160,
 }
@@ -157,7 +152,7 @@ def _draw_lines(axes: Axes, plot: Plot) -> None:
             np.array(trace.y, dtype=float),
             color=color,
             linestyle="--" if is_limit else "-",
-            marker="" if is_limit else _MARKERS[place % len(_MARKERS)],
+            marker="" if is_limit else "o",
             label=trace.method,
         )
 

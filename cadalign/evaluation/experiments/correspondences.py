@@ -173,8 +173,8 @@ class SpoiledImages(Setting):
 
     options: CorrespondenceOptions
 
-    def failed(self, task: CorrespondenceTask) -> list[Case]:
-        return [Case(task.names, {"success": False})]
+    def failed(self, task: CorrespondenceTask) -> Case:
+        return Case(task.names, {"success": False})
 
     def case(self, task: CorrespondenceTask) -> Case:
         seen = _opened(self.options.path)[task.image]

@@ -147,7 +147,7 @@ class KeypointViews(Setting):
 
     def cases(self, tasks: Sequence[KeypointTask]) -> list[Case]:
         return [
-            replace(self.failed(task)[0], error=instance)
+            replace(self.failed(task), error=instance)
             if isinstance(instance, Exception)
             else self._case(task, instance)
             for task, instance in zip(tasks, self._instances(tasks), strict=True)
@@ -164,23 +164,23 @@ class KeypointViews(Setting):
         }
         return Case(task.names, facts, (task, instance))
 
-    def failed(self, task: KeypointTask) -> list[Case]:
-        return [Case(task.names, {} if task.problem else {"symmetry": str(task.symmetry)})]
+    def failed(self, task: KeypointTask) -> Case:
+        return Case(task.names, {} if task.problem else {"symmetry": str(task.symmetry)})
 
     def _instances(self, tasks: Sequence[KeypointTask]) -> list[Instance | Exception]:
         names = ("noise_px", "min_visible", "seed")
         how = {name: getattr(self.options, name) for name in names}
         plain = [task for task in tasks if not task.problem and task.model is None]
         of_hulls = iter(make_hull_instances(plain, **how))
-        instances: list[Instance | Exception] = []
-        for task in tasks:
+
+        def made(task: KeypointTask) -> Instance | Exception:
             if task.problem:
-                instances.append(DataError(task.problem))
-            elif task.model is None:
-                instances.append(next(of_hulls))
-            else:
-                instances.append(attempt(partial(_with_mesh, task, **how)))
-        return instances
+                return DataError(task.problem)
+            return (
+                next(of_hulls) if task.model is None else attempt(partial(_with_mesh, task, **how))
+            )
+
+        return list(map(made, tasks))
 
     def given(self, view: KeypointView) -> MethodInput:
         _, found = view

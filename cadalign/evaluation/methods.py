@@ -313,15 +313,9 @@ class FunctionMetric:
         if "gt" in self.parameters and given.gt is None:
             return None
         where = f"metric {self.metric.key}"
-        found = {
-            "est": pose_of(estimate),
-            "result": estimate
-            if isinstance(estimate, Result)
-            else getattr(estimate, "result", None),
-        }
-        arguments = {
-            name: found[name] if name in found else getattr(given, name) for name in self.parameters
-        }
+        result = estimate if isinstance(estimate, Result) else getattr(estimate, "result", None)
+        known = {**vars(given), "est": pose_of(estimate), "result": result}
+        arguments = {name: known[name] for name in self.parameters}
         try:
             value = _loaded(self.function, "metrics")(**arguments)
         except Exception as error:

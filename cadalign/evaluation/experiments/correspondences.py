@@ -7,7 +7,7 @@ share of the image points is moved to anywhere in the image. All methods get the
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from cadalign.evaluation.runs.tables import Run
 
 
-_MAX_ITERATIONS = 10_000  # of a search for inliers
+_SEARCH = RansacOptions(max_reproj_error=4.0, max_iterations=10_000)
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,6 @@ class CorrespondenceOptions(FunctionOptions):
     """Methods of `cadalign fit`, optimal-huber, optimal-cauchy, and those that search for inliers:
     ransac-optimal, ransac-ap4p, and the paper's two steps, ransac-aepnp and ransac-aepnp-refined.
     The others get all points."""
-    max_reproj_error: float = 4.0
-    """Largest reprojection error of an inlier, in pixels."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -102,12 +100,6 @@ class CorrespondenceOptions(FunctionOptions):
                     fix="give numbers from 0 to less than 1",
                 )
         self.check_least(draws=1)
-        self.ransac(0)
-
-    def ransac(self, seed: int) -> RansacOptions:
-        """The options of a search for inliers; the minimal solver is the method's."""
-        error = self.max_reproj_error
-        return RansacOptions(max_reproj_error=error, max_iterations=_MAX_ITERATIONS, seed=seed)
 
 
 NAMES: Columns = (("image", str), ("draw", int), ("outliers", float), ("method", str))
@@ -181,7 +173,7 @@ class SpoiledImages(Setting):
         names = (task.image, str(task.draw), repr(task.outliers))
         rng = instance_rng(self.options.seed, *names)
         truth = spoil(seen, task.outliers, rng=rng)
-        ransac = self.options.ransac(int(rng.integers(2**31)))
+        ransac = replace(_SEARCH, seed=int(rng.integers(2**31)))
         facts = {"points": len(seen), "success": False}
         return Case(task.names, facts, MethodInput.of_problem(truth, 1.0, ransac=ransac))
 

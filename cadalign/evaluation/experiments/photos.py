@@ -125,7 +125,7 @@ def protocol_of(kind: str) -> Protocol:
 # Summary ------------------------------------------------------------------------------------------
 
 COLUMNS: Columns = (
-    *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int), ("source", str)),
+    *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int)),
     ("rms_px", float),
     *((each.key, float) for each in dict.fromkeys((*MEDIANS, *(rate.column for rate in RATES)))),
 )
@@ -138,7 +138,7 @@ HEADLINE = (
     *(metrics.RMS, metrics.QUERY_MILLISECONDS),
 )
 _CONSOLE = (
-    *(*_COUNTS, *(rate.metric for rate in RATES[:2]), *MEDIANS[:3]),
+    *(*_COUNTS, *(rate.metric for rate in RATES[:2]), *MEDIANS[:2]),
     *(replace(metrics.RMS, symbol="rms px"), metrics.QUERY_MILLISECONDS),
 )
 

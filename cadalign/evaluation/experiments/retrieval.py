@@ -264,7 +264,7 @@ def same_shapes(library: Library, key: ModelKey) -> frozenset[ModelKey]:
 # Summary ------------------------------------------------------------------------------------------
 
 HEADLINE = (
-    *(metrics.INSTANCES, metrics.FAILED, metrics.RANK_1, metrics.RANK_5, metrics.RECIPROCAL_RANK),
+    *(metrics.INSTANCES, metrics.FAILED, metrics.RANK_1, metrics.RECIPROCAL_RANK),
     *(metrics.NONE, metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
     *(metrics.MATCH_ROTATION, metrics.QUERY_MILLISECONDS),
 )
@@ -282,7 +282,6 @@ def _of_ranks(statistic: Callable[[FloatArray], FloatArray]) -> Callable[[Group]
 
 _STATISTICS = {
     "rank_1": _of_ranks(lambda ranks: (ranks == 1).astype(float)),
-    "rank_5": _of_ranks(lambda ranks: (ranks <= 5).astype(float)),
     "reciprocal_rank": _of_ranks(lambda ranks: np.nan_to_num(1 / ranks)),
     "none": lambda group: mean_of(known(group.solved["none_probability"]) > 0.5),
     **medians(metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),

@@ -181,7 +181,7 @@ class PhotoObjects(Setting):
         sighting = attempt(partial(sight, target, protocol))
         if isinstance(sighting, Exception):
             return Case(target.names, error=sighting)
-        facts = {"keypoints": len(sighting.names), "source": sighting.source}
+        facts = {"keypoints": len(sighting.names)}
         return Case(target.names, facts, sighting)
 
     def given(self, sighting: Sighting) -> MethodInput:

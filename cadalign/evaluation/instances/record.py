@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -37,7 +37,7 @@ _LEAST_SCALE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class AlignedShape:
-    """The estimate of an object's own shape, or an alternative to it, for an instance's record.
+    """The estimate of an object's own shape, for an instance's record.
 
     ``source`` (k, 3) are keypoints of the given model, ``target`` (k, 3) their places on the
     estimated object, in the model's coordinates: the alignment takes both into the camera's.
@@ -50,8 +50,6 @@ class AlignedShape:
     sigma: float = np.nan  # standard deviation of the keypoints [px]
     std: Uncertainty | None = None  # None for a method that states none
     warnings: Warnings = ()
-    alternatives: tuple[AlignedShape, ...] = ()
-    relative_likelihood: float = 1.0  # of an alternative
 
 
 Estimate = Result | AlignedShape | Alignment | Exception
@@ -70,25 +68,18 @@ def aligned_shape(
 ) -> AlignedShape:
     """An estimate of pose and shape in terms of a model, with what remains of the shape as a warp.
 
-    ``found`` is a result, an alternative to it or another estimate with an ``alignment``,
-    ``points_3d`` and ``bounds``; ``rows`` are those of the estimated keypoints that the model has
-    at the places ``source``. The estimated box is theirs where it ``spans_points``. ``more`` are
-    further fields.
+    ``found`` is a result or another estimate with an ``alignment``, ``points_3d`` and ``bounds``;
+    ``rows`` are those of the estimated keypoints that the model has at the places ``source``. The
+    estimated box is theirs where it ``spans_points``. ``more`` are further fields.
     """
     points, bounds = found.points_3d[rows], found.bounds
     if spans_points:
         bounds = extent(points)
     alignment = box_alignment(found.alignment, bounds, model_bounds=model_bounds)
     target = alignment.inverse(found.alignment.apply(points))
-    shape = AlignedShape(alignment, source, target, **more)
-    if not isinstance(found, Result):
-        return shape
-    how: dict[str, Any] = {"model_bounds": model_bounds, "spans_points": spans_points}
-    alternatives = tuple(
-        aligned_shape(other, rows, source, relative_likelihood=other.relative_likelihood, **how)
-        for other in found.alternatives
-    )
-    return replace(shape, std=found.std, warnings=found.warnings, alternatives=alternatives)
+    if isinstance(found, Result):
+        more |= {"std": found.std, "warnings": found.warnings}
+    return AlignedShape(alignment, source, target, **more)
 
 
 def box_alignment(
@@ -163,8 +154,8 @@ def _described(outcome: Outcome, estimate: Estimate) -> dict[str, Any]:
         "std": None if fit is None or fit.std is None else vars(fit.std),
         "warnings": [] if fit is None else [each.text for each in fit.warnings],
         "alternatives": [
-            {**_pose(other.alignment), **_warp(other), "likelihood": other.relative_likelihood}
-            for other in (() if fit is None else fit.alternatives)
+            {**_pose(other.alignment), "likelihood": other.relative_likelihood}
+            for other in (estimate.alternatives if isinstance(estimate, Result) else ())
         ],
     }
 

@@ -36,9 +36,8 @@ from cadalign.geometry.camera import Camera
 from cadalign.render.scene import Scene
 
 _KEPT = 16
-ANNOTATED, DETECTED = "annotated", "detected"
 _LEAST_KEYPOINTS = 6
-_LEAST_SCORE = 0.4  # of a detected keypoint that methods are given
+_SIGMA_OF_SIDE = 1 / 64  # of the rectangle's longer side: networks' heatmaps have 64 cells
 _LEAST_PX = 0.5  # a standard deviation that keypoints are given at least
 _FOCAL_PRIOR = 0.2  # of the logs of scales, while the focal length is estimated
 
@@ -180,13 +179,10 @@ def targets_of(task: PhotoTask, root: Path, *, pictures: int) -> list[PhotoTarge
 
 
 def rectangle_of(found: PhotoObject) -> FloatArray:
-    """The object's rectangle [px], or that of its keypoints."""
-    if found.bbox is not None:
-        return found.bbox
-    if found.keypoints is None or not len(found.keypoints):
+    """The object's rectangle [px]."""
+    if found.bbox is None:
         raise LeftOutError("the object's place in the photo is not known")
-    points = found.keypoints.points_2d
-    return np.concatenate([points.min(axis=0), points.max(axis=0)])
+    return found.bbox
 
 
 # What methods are given ---------------------------------------------------------------------------
@@ -197,7 +193,6 @@ class Sighting:
     """The keypoints of an object that methods are given."""
 
     target: PhotoTarget
-    source: str  # annotated or detected: where the keypoints come from
     names: tuple[str, ...]  # (n,), the given keypoints
     points_3d: FloatArray  # (n, 3), their places on the model, in its own unit
     model: NamedPoints  # all keypoints of the model, in its own unit
@@ -233,7 +228,6 @@ def sight(target: PhotoTarget, protocol: Protocol) -> Sighting:
     given = MethodInput(points * width, pixels, camera, sigma, bounds=bounds * width, gt=gt)
     return Sighting(
         target=target,
-        source=ANNOTATED if marks.scores is None else DETECTED,
         names=names,
         points_3d=points,
         model=model,
@@ -247,8 +241,6 @@ def sight(target: PhotoTarget, protocol: Protocol) -> Sighting:
 def _marked(marks: PhotoKeypoints, model: NamedPoints) -> tuple[tuple[str, ...], FloatArray]:
     """The visible keypoints that the model has, and their pixels."""
     good = np.isin(marks.names, model.names)
-    if marks.scores is not None:
-        good &= marks.scores > _LEAST_SCORE
     return tuple(np.array(marks.names)[good].tolist()), marks.points_2d[good]
 
 
@@ -257,7 +249,7 @@ def _sigma(target: PhotoTarget, protocol: Protocol) -> float:
     if protocol.sigma_of_width is not None and target.photo.camera is not None:
         return protocol.sigma_of_width * target.photo.camera.width
     left, top, right, bottom = rectangle_of(target.found)
-    return max(protocol.sigma_of_side * float(max(right - left, bottom - top)), _LEAST_PX)
+    return max(_SIGMA_OF_SIDE * float(max(right - left, bottom - top)), _LEAST_PX)
 
 
 def _calibrated(given: MethodInput) -> MethodInput:

@@ -142,11 +142,9 @@ SUCCESS_5 = rate("success_5deg_5pct", "within 5 deg, 5 %", "5/5 %*")
 OVER_BOUND = Metric("over_limit", "R error over Cramer-Rao bound", better=None)
 
 RANK_1 = rate("rank_1", "true model first", "first%")
-RANK_5 = rate("rank_5", "true model among the first 5", "top5%", head="among the first 5")
 RECIPROCAL_RANK = Metric(
     "reciprocal_rank", "mean reciprocal rank", digits=3, better=HIGH, symbol="MRR", log=False
 )
-SCORE = rate("score", "score", "score%", better=None)
 NONE = rate("none", "none of the models", "none%", head="none of these", better=None)
 """More likely none of the library's models than one: false in one protocol, true in the other."""
 SHAPE_DISTANCE = Metric(

@@ -61,10 +61,9 @@ class Protocol:
 
     measures: tuple[Measure, ...]
     up_axis: str = "y"  # the upward axis of its models
-    sigma_of_side: float = 1 / 64
-    """Standard deviation of its keypoints as a share of the longer side of the object's rectangle:
-    networks' heatmaps have 64 cells."""
-    sigma_of_width: float | None = None  # the same as a share of the image's width
+    sigma_of_width: float | None = None
+    """Standard deviation of its keypoints as a share of the image's width, by default 1/64 of the
+    longer side of the object's rectangle."""
 
     def score(self, target: PhotoTarget, est: Alignment, box: Box) -> Row:
         """Errors of an estimate by column; none where the truth is not known."""
@@ -103,7 +102,6 @@ def measure_viewpoint(target: PhotoTarget, est: Alignment, gt: Alignment, box: B
 # Boxes --------------------------------------------------------------------------------------------
 
 _STEPS = 20  # about an axis of symmetry, as NOCS tries
-_TRANSLATION = Metric("translation_cm", "translation error", "cm", symbol="t cm")
 
 
 def symmetric_box_iou(*, est: Box, gt: Box, symmetry: Symmetry) -> float:
@@ -121,17 +119,14 @@ def symmetric_box_iou(*, est: Box, gt: Box, symmetry: Symmetry) -> float:
 
 
 def measure_box(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
-    """The error of the place, where the size is known, and the overlap of the boxes."""
-    found, gt_box = target.found, target.gt_box
-    values: Row = {}
-    if found.truth.metres is not None:
-        gap = float(np.linalg.norm(est.translation - gt.translation))
-        values[_TRANSLATION.key] = 100 * found.truth.metres * gap
-    if gt_box is not None and min(box.volume, gt_box.volume) > 0:
-        iou = symmetric_box_iou(est=box, gt=gt_box, symmetry=found.symmetry)
-        values[metrics.BOX_IOU.key] = iou
-        values[metrics.BOX_IOU_UP_TO_SCALE.key] = overlap(est=box, gt=gt_box, up_to_scale=True)
-    return values
+    """The overlap of the boxes."""
+    gt_box = target.gt_box
+    if gt_box is None or min(box.volume, gt_box.volume) <= 0:
+        return {}
+    return {
+        metrics.BOX_IOU.key: symmetric_box_iou(est=box, gt=gt_box, symmetry=target.found.symmetry),
+        metrics.BOX_IOU_UP_TO_SCALE.key: overlap(est=box, gt=gt_box, up_to_scale=True),
+    }
 
 
 # Scan2CAD -----------------------------------------------------------------------------------------
@@ -181,10 +176,7 @@ def measure_scan2cad(target: PhotoTarget, est: Alignment, gt: Alignment, box: Bo
     return scan2cad_errors(est=est, gt=gt, symmetry=target.found.symmetry, center=center)
 
 
-MEDIANS = (
-    *(ROTATION, _TRANSLATION, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
-    *(_TRANSLATION_M, _SCALE),
-)
+MEDIANS = (*(ROTATION, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE, _TRANSLATION_M, _SCALE),)
 """Columns whose medians are shown."""
 RATES = (
     Rate(_ACCURACY, ROTATION, _ACCURACY_DEG),

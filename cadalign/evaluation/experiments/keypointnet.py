@@ -308,8 +308,8 @@ class DemoOptions(ExperimentOptions):
     """Align stretched models to pictures of the originals and show the result.
 
     For each model: choose a view, render it, stretch the model by factors from 0.5 to 2 along y
-    and z, add noise to its visible keypoints, fit, and draw true (green) and predicted (red) box.
-    Writes results.parquet and index.html.
+    and z, add 1 px of noise to its visible keypoints, fit, and draw true (green) and predicted
+    (red) box. Writes results.parquet and index.html.
     """
 
     experiment = "demo"
@@ -322,13 +322,10 @@ class DemoOptions(ExperimentOptions):
     """Categories to take; all by default."""
     per_category: int = 6
     """Largest number of models of each category."""
-    noise_px: float = 1.0
-    """Standard deviation of the keypoints' noise, in pixels."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_least(per_category=1)
-        self.check_noise("noise_px")
 
     @property
     def default_workers(self) -> int:
@@ -353,11 +350,7 @@ def plan_demo(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
             fix="put the meshes beside the annotations, or name the folder that holds both",
         )
     views = KeypointNetOptions(
-        root,
-        methods=("optimal",),
-        noise_px=options.noise_px,
-        seed=options.seed,
-        max_models=options.per_category,
+        root, methods=("optimal",), seed=options.seed, max_models=options.per_category
     )
     tasks = KeypointTasks(dataset, views)
     benchmark = keypointnet_benchmark(views, folder.made_for_pictures())

@@ -161,8 +161,7 @@ _CURVES = (
 )
 
 
-_CHUNK, _LARGE_CHUNK = 4, 32
-_LARGE = 500  # photos
+_CHUNK = 8
 
 
 def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
@@ -173,11 +172,10 @@ def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
     dataset = reopened(options.root)
     tasks = photo_tasks(dataset, options.max_photos)
     pictures = folder.made_for_pictures()
-    chunk = _CHUNK if len(tasks) < _LARGE else _LARGE_CHUNK
     return photos_benchmark(options, pictures).plan(
         options,
         tasks,
-        chunk=chunk,
+        chunk=_CHUNK,
         kind=dataset.kind,
         annotations=annotations_of(dataset, tasks),
     )

@@ -253,8 +253,8 @@ def _described(estimate: PhotoEstimate | Any, sighting: Sighting) -> Estimate | 
         np.arange(len(model)),
         model.xyz,
         model_bounds=sighting.bounds,
-        rms=result.rms,
         sigma=sighting.given.sigma,
+        result=result,
     )
 
 

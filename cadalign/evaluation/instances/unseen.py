@@ -299,11 +299,11 @@ def _coverage(result: Result, seen: UnseenObject, known: IntArray, rows: IntArra
 def _described(found: ShapeEstimate, seen: UnseenObject) -> AlignedShape:
     known, rows = _shared(found, seen)
     return aligned_shape(
-        found if found.result is None else found.result,
+        found,
         rows,
         seen.xyz[known],
         model_bounds=seen.task.hull.bounds,
         spans_points=True,
-        rms=np.nan if found.result is None else found.result.rms,
         sigma=seen.options.sigma,
+        result=found.result,
     )

@@ -266,7 +266,7 @@ def same_shapes(library: Library, key: ModelKey) -> frozenset[ModelKey]:
 HEADLINE = (
     *(metrics.INSTANCES, metrics.FAILED, metrics.RANK_1, metrics.RECIPROCAL_RANK),
     *(metrics.NONE, metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
-    *(metrics.MATCH_ROTATION, metrics.QUERY_MILLISECONDS),
+    *(metrics.ROTATION, metrics.QUERY_MILLISECONDS),
 )
 
 

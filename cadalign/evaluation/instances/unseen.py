@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -131,42 +130,25 @@ class ShapeEstimate:
         return cls(result.alignment, result.bounds, ids, result.points_3d, result)
 
 
-def _aligned(model: Model | ShapeModel, seen: UnseenObject) -> ShapeEstimate:
+def solve_object(seen: UnseenObject, *, method: str) -> ShapeEstimate:
+    """The estimate of a method by name; see `UnseenOptions.methods`."""
+    model: Model | ShapeModel = seen.shape
+    if method == LIMIT:
+        points, pixels = seen.xyz[seen.rows], seen.points_2d
+        alignment = limit_estimate(points, pixels, KEYPOINT_CAMERA, seen.gt)
+        return ShapeEstimate(alignment, seen.task.hull.bounds, seen.task.ids, seen.xyz)
+    if method == "exact":
+        model = Model(points_3d=seen.xyz, ids=seen.task.ids.tolist())
+    elif method != SHAPE:
+        mean, stretch = seen.shape.mean, "none" if method == "mean-rigid" else None
+        ids, bounds = seen.shape.ids, mean[-2:]
+        model = Model(points_3d=mean[:-2], ids=ids, bounds=bounds, stretch=stretch)
     return ShapeEstimate.of(align(model, seen.view_of(model)))
-
-
-def _of_shape(seen: UnseenObject) -> ShapeEstimate:
-    return _aligned(seen.shape, seen)
-
-
-def _of_own_model(seen: UnseenObject) -> ShapeEstimate:
-    return _aligned(Model(points_3d=seen.xyz, ids=seen.task.ids.tolist()), seen)
-
-
-def _of_mean(seen: UnseenObject, *, stretch: str | None) -> ShapeEstimate:
-    points, ids = seen.shape.mean, seen.shape.ids
-    model = Model(points_3d=points[:-2], ids=ids, bounds=points[-2:], stretch=stretch)
-    return _aligned(model, seen)
-
-
-def _bound(seen: UnseenObject) -> ShapeEstimate:
-    points = seen.xyz[seen.rows]
-    alignment = limit_estimate(points, seen.points_2d, KEYPOINT_CAMERA, seen.gt)
-    return ShapeEstimate(alignment, seen.task.hull.bounds, seen.task.ids, seen.xyz)
-
-
-_SOLVERS: dict[str, Callable[[UnseenObject], ShapeEstimate]] = {
-    "mean-rigid": partial(_of_mean, stretch="none"),
-    "mean-stretched": partial(_of_mean, stretch=None),
-    SHAPE: _of_shape,
-    "exact": _of_own_model,
-    LIMIT: _bound,
-}
 
 
 def unseen_benchmark(learned: Path, options: UnseenOptions) -> Benchmark:
     """The methods of the options on unseen objects."""
-    own = {name: Method(name, _SOLVERS[name]) for name in METHODS}
+    own = {name: Method(name, partial(solve_object, method=name)) for name in METHODS}
     setting = UnseenObjects(learned, options)
     return Benchmark.chosen(setting, options.methods, own, metrics=options.metrics)
 

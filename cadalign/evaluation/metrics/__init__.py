@@ -150,13 +150,7 @@ NONE = rate("none", "none of the models", "none%", head="none of these", better=
 SHAPE_DISTANCE = Metric(
     "shape_distance", "shape distance", "%", factor=100.0, symbol="shape%", log=False
 )
-MATCH_ROTATION = replace(ROTATION, digits=2)
-"""Metrics of the best match, which is another object as a rule."""
-
-MILLISECONDS = Metric("milliseconds", "time of one call", "ms", symbol="ms")
-QUERY_MILLISECONDS = replace(
-    MILLISECONDS, label="time of a query", head="time of a query", digits=1
-)
+QUERY_MILLISECONDS = Metric("milliseconds", "time of a query", "ms", 1, symbol="ms")
 
 KEYPOINT_ERROR = Metric("keypoint_error", "keypoint error", "diagonals", 4, symbol="kp")
 """Root mean square, up to scale, of a method's estimate of all keypoints."""

@@ -82,9 +82,9 @@ def read_cells(path: Path, columns: Columns, *, is_record: bool = False) -> pa.T
     with _reading(path, DONE_ANEW):
         names = [name for name, _ in columns]
         table = pq.read_table(path, columns=names, use_threads=False)
-        if is_record and names[-1] in table.column_names:
-            table = table.filter(table[names[-1]].is_valid())
-    return checked(table, columns, path=path, fix=DONE_ANEW)
+        if table.schema != schema_of(columns):
+            raise DataError("not a table of such a run", where=str(path), fix=DONE_ANEW)
+        return table.filter(table[names[-1]].is_valid()) if is_record else table
 
 
 def read_groups(path: Path, *, fix: str) -> Iterator[pa.Table]:

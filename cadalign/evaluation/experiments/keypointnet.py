@@ -281,21 +281,15 @@ def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
     )
     tasks = KeypointTasks(dataset, options)
     drawn = options.render == "overlay"
-    if drawn:
-        _check_drawable(dataset, options)
-    benchmark = keypointnet_benchmark(options, folder.made_for_pictures() if drawn else None)
-    chunk = _CHUNK_DRAWN if drawn else _CHUNK if len(tasks) < _LARGE else _LARGE_CHUNK
-    return benchmark.plan(options, tasks, chunk=chunk, annotations=tasks.fingerprint())
-
-
-def _check_drawable(dataset: KeypointNet, options: KeypointNetOptions) -> None:
-    """Refuse overlays, before the run, where there is no mesh to draw."""
-    if options.visibility == "hull" or not dataset.subset(with_mesh=True).ids():
+    if drawn and (options.visibility == "hull" or not dataset.subset(with_mesh=True).ids()):
         raise InputError(
             "no mesh of the models is used, so that there is nothing to draw",
             where="render",
             fix="name ShapeNet's folder by shapenet, leave out visibility hull, or draw nothing",
         )
+    benchmark = keypointnet_benchmark(options, folder.made_for_pictures() if drawn else None)
+    chunk = _CHUNK_DRAWN if drawn else _CHUNK if len(tasks) < _LARGE else _LARGE_CHUNK
+    return benchmark.plan(options, tasks, chunk=chunk, annotations=tasks.fingerprint())
 
 
 # Demonstration ------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ problems that a method solved at one value.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
@@ -118,24 +118,20 @@ class SweepOptions(FunctionOptions):
         return f"simulate_{self.sweep}"
 
 
-# Quantities that may be varied: a check, a name, and values to give.
-_CHECKS: dict[str, tuple[Callable[[float], bool], str, str]] = {
-    "points": (
-        lambda value: value >= 4 and value == int(value),
-        "a number of points",
-        "give 4 or more",
-    ),
-    "noise_px": (lambda value: 0 <= value < math.inf, "a noise level", "give pixels, 0 or more"),
-    "outlier_share": (lambda value: 0 <= value < 1, "a share", "give 0 to 0.95"),
+# Quantities that may be varied: the least value, the bound above, a name, and values to give.
+_RANGES = {
+    "points": (4, math.inf, "a number of points", "give 4 or more"),
+    "noise_px": (0, math.inf, "a noise level", "give pixels, 0 or more"),
+    "outlier_share": (0, 1, "a share", "give 0 to 0.95"),
 }
 
 
 def _check_values(kind: SweepKind) -> None:
     if not kind.values:
         raise InputError("none is given", where="values")
-    valid, what, fix = _CHECKS[kind.column]
+    least, bound, what, fix = _RANGES[kind.column]
     for value in kind.values:
-        if not valid(value):
+        if not least <= value < bound or (kind.column == "points" and value != int(value)):
             raise InputError(f"{value:g} is not {what}", where="values", fix=fix)
 
 

@@ -200,14 +200,14 @@ class Benchmark:
     def _measured(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
         """The cells of each estimate, those of further metrics too, or why there are none."""
         rows = self.setting.measure(method, pairs) if pairs else []
+        if not self.metrics:
+            return rows
         return [
             row if isinstance(row, Exception) else attempt(self._further, row, *pair)
             for pair, row in zip(pairs, rows, strict=True)
         ]
 
     def _further(self, row: Row, instance: Any, estimate: Any) -> Row:
-        if not self.metrics:
-            return row
         given = self.setting.given(instance)
         return row | {each.metric.key: each.measure(estimate, given) for each in self.metrics}
 

@@ -153,7 +153,8 @@ def _fit_many(inputs: Sequence[MethodInput], *, name: str) -> list[Alignment | C
             camera,
             **fit_options(name, sigma=sigma, ransac=None),
         )
-        found += [batch.errors.get(b) or batch.alignment(b) for b in range(len(batch))]
+        errors = batch.errors  # made anew at every look
+        found += [errors.get(b) or batch.alignment(b) for b in range(len(batch))]
     return found
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from cadalign.estimation.result import Result
     from cadalign.estimation.results import Results
     from cadalign.estimation.view import View
-    from cadalign.evaluation.api import evaluate, simulate
+    from cadalign.evaluation.api import evaluate
     from cadalign.geometry.alignment import Alignment, Box
     from cadalign.geometry.camera import Camera
     from cadalign.geometry.mesh import Mesh
@@ -59,7 +59,6 @@ __all__ = [
     "load_mesh",
     "metrics",
     "render",
-    "simulate",
 ]
 
 __getattr__ = lazy_names(__name__)

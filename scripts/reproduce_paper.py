@@ -72,7 +72,7 @@ def reproduce_paper(plan: PaperPlan) -> Path:
     sections = [
         "# The AEPnP paper's tables and figures\n",
         f"Seed {plan.seed}.{quick} Every run's own folder, with all rows, its configuration and "
-        "more figures, lies beside this file. Lines are medians, bands quartiles; the dashed line "
+        "more figures, lies beside this file. Lines are medians; the dashed line "
         "is the Cramer-Rao bound, the least error that any unbiased method can have.\n",
         _table_section(plan),
         *(_sweep_section(plan, name) for name in SWEEPS),
@@ -97,8 +97,7 @@ def _sweep_section(plan: PaperPlan, name: str) -> str:
     summaries = SIMULATION.write(_run(plan, options, f"simulate_{name}"))
     keys = [metric.key for metric in ERRORS]
     rows = [
-        {kind.column: value}
-        | {s.method: s[keys[0]].median for s in summaries if s[kind.column] == value}
+        {kind.column: value} | {s.method: s[keys[0]] for s in summaries if s[kind.column] == value}
         for value in kind.values
     ]
     images = "\n".join(f"![{name}: {key}](simulate_{name}/figures/{key}.png)" for key in keys)

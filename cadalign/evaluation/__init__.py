@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.api import evaluate, simulate
+    from cadalign.evaluation.api import evaluate
 
-__all__ = ["evaluate", "simulate"]
+__all__ = ["evaluate"]
 
 __getattr__ = lazy_names(__name__)

@@ -54,7 +54,7 @@ def evaluate(
         ``--noise-px 2``. The options of ``keypointnet`` are the fields of
         `cadalign.evaluation.experiments.keypointnet.KeypointNetOptions`: ``categories``, ``split``,
         ``noise_px``, ``min_visible``, ``views_per_model``, ``max_models``, ``methods``,
-        ``shape``, ``visibility``, ``render``, ``metrics``, ``seed``. Among ``methods`` and
+        ``visibility``, ``render``, ``metrics``, ``seed``. Among ``methods`` and
         ``metrics`` may be functions of one's own, as callables or as texts ``module:function``.
         Worker processes import them; others need ``workers=0``.
 
@@ -76,6 +76,9 @@ def evaluate(
     >>> table = evaluate("keypointnet", split="test")  # doctest: +SKIP
     >>> table.groupby("method").rotation_error_deg.median()  # doctest: +SKIP
     >>> table = evaluate("colmap_model", "correspondences", draws=5)  # doctest: +SKIP
+    >>> how = {"sweep": "points", "values": [8], "runs": 3, "methods": ["aepnp"]}
+    >>> evaluate(experiment="simulate", **how, workers=0).status.tolist()
+    ['ok', 'ok', 'ok']
     """
     source = () if root is None else (as_path(root, "root"),)
     for name in {"methods", "metrics"}.intersection(options):
@@ -109,37 +112,6 @@ def _check_given(
         if each.name not in given and each.default is MISSING:
             fix = f"{experiment} cannot do without"
             raise InputError("is not given", where=each.name, fix=fix)
-
-
-def simulate(sweep: str, **options: Any) -> pd.DataFrame:
-    """Repeat the AEPnP paper's simulation.
-
-    Parameters
-    ----------
-    sweep : {"noise", "points", "outliers"}
-        The quantity that is varied.
-    **options
-        ``methods``, ``values``, ``runs``, ``points``, ``noise_px`` in place of the sweep's own (see
-        `cadalign.evaluation.experiments.simulation.SWEEPS`), ``seed``; and ``workers``, ``dask``,
-        ``out`` as for `evaluate`.
-
-    Returns
-    -------
-    pandas.DataFrame
-        A row for every problem and method.
-
-    Raises
-    ------
-    InputError
-        If the sweep, a method or a value is unknown or invalid.
-
-    Examples
-    --------
-    >>> table = simulate("points", values=[8], runs=3, methods=["aepnp"], workers=0)
-    >>> table.status.tolist()
-    ['ok', 'ok', 'ok']
-    """
-    return evaluate(experiment="simulate", sweep=sweep, **options)
 
 
 def run(

@@ -74,13 +74,11 @@ class Setting:
 
     def _cases(self, task: Any) -> list[Case]:
         found = attempt(self.case, task)
-        if isinstance(found, Exception):
-            return [replace(case, error=found) for case in self.failed(task)]
-        return [found]
+        return [replace(self.failed(task), error=found) if isinstance(found, Exception) else found]
 
-    def failed(self, task: Any) -> list[Case]:
-        """The cases, without instances, of a task that could not be evaluated."""
-        return [Case(task.names)]
+    def failed(self, task: Any) -> Case:
+        """The case, without an instance, of a task that could not be evaluated."""
+        return Case(task.names)
 
     def given(self, instance: Any) -> MethodInput:
         """The instance as general methods are given it; by default it is that."""
@@ -162,10 +160,10 @@ class Benchmark:
 
     def failure(self, task: Any, reason: str) -> list[Row]:
         """A failed row for every method."""
+        case = self.setting.failed(task)
         return [
             self._blank
             | Outcome({**case.names, "method": method.name}, case.facts, FAILED, reason).row()
-            for case in self.setting.failed(task)
             for method in self.methods
         ]
 
@@ -199,25 +197,19 @@ class Benchmark:
                 answers.append((Outcome(names, case.facts | row, seconds=seconds), estimate))
         return answers
 
-    def _measured(self, method: Method, pairs: Sequence[Pair]) -> Sequence[Row | Exception]:
-        """The cells of each estimate, or why there are none."""
+    def _measured(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
+        """The cells of each estimate, those of further metrics too, or why there are none."""
         rows = self.setting.measure(method, pairs) if pairs else []
         if not self.metrics:
             return rows
-        return [self._further(*each) for each in zip(pairs, rows, strict=True)]
+        return [
+            row if isinstance(row, Exception) else attempt(self._further, row, *pair)
+            for pair, row in zip(pairs, rows, strict=True)
+        ]
 
-    def _further(self, pair: Pair, row: Row | Exception) -> Row | Exception:
-        """The cells of an estimate with those of further metrics."""
-        if isinstance(row, Exception):
-            return row
-        instance, estimate = pair
+    def _further(self, row: Row, instance: Any, estimate: Any) -> Row:
         given = self.setting.given(instance)
-        for each in self.metrics:
-            value = attempt(each.measure, estimate, given)
-            if isinstance(value, Exception):
-                return value
-            row[each.metric.key] = value
-        return row
+        return row | {each.metric.key: each.measure(estimate, given) for each in self.metrics}
 
     def _solved(self, method: Method, instances: Sequence[Any]) -> list[tuple[Any, float | None]]:
         """A method's estimate of every instance, or why there is none, and its seconds."""

@@ -86,7 +86,6 @@ class Method:
     is_general: bool = False
     has_statistics: bool = False
     """``solve`` states uncertainties and alternatives, ``solve_many`` does not."""
-    is_robust: bool = False  # it searches for inliers
 
 
 # Names for a method together with options of `cadalign.fit`.
@@ -94,9 +93,8 @@ _VARIANTS: dict[str, dict[str, Any]] = {
     "optimal-huber": {"method": "optimal", "loss": "huber"},
     "optimal-cauchy": {"method": "optimal", "loss": "cauchy"},
 }
-# Robust ones, named after what they return: the optimum over all inliers, or the best hypothesis of
-# a minimal solver as it is. With the linear solver, on 6 points, these are the AEPnP paper's two
-# steps: RANSAC-AEPnP, and the same with non-linear refinement.
+# Robust ones, the minimal solver and whether the optimum over all inliers is returned. With the
+# linear solver, on 6 points, these are the AEPnP paper's RANSAC-AEPnP, and the same refined.
 _RANSAC: dict[str, dict[str, Any]] = {
     "ransac-optimal": {"minimal": "ap4p", "refine": True},
     "ransac-ap4p": {"minimal": "ap4p", "refine": False},
@@ -116,7 +114,6 @@ def fit_methods() -> dict[str, Method]:
             partial(_fit_many, name=name),
             is_general=True,
             has_statistics=name == "optimal" or name in _VARIANTS or name in _RANSAC,
-            is_robust=name in _RANSAC,
         )
         for name in (*METHODS, *_VARIANTS, *_RANSAC)
     ]
@@ -156,7 +153,8 @@ def _fit_many(inputs: Sequence[MethodInput], *, name: str) -> list[Alignment | C
             camera,
             **fit_options(name, sigma=sigma, ransac=None),
         )
-        found += [batch.errors.get(b) or batch.alignment(b) for b in range(len(batch))]
+        errors = batch.errors  # made anew at every look
+        found += [errors.get(b) or batch.alignment(b) for b in range(len(batch))]
     return found
 
 
@@ -316,15 +314,9 @@ class FunctionMetric:
         if "gt" in self.parameters and given.gt is None:
             return None
         where = f"metric {self.metric.key}"
-        found = {
-            "est": pose_of(estimate),
-            "result": estimate
-            if isinstance(estimate, Result)
-            else getattr(estimate, "result", None),
-        }
-        arguments = {
-            name: found[name] if name in found else getattr(given, name) for name in self.parameters
-        }
+        result = estimate if isinstance(estimate, Result) else getattr(estimate, "result", None)
+        known = {**vars(given), "est": pose_of(estimate), "result": result}
+        arguments = {name: known[name] for name in self.parameters}
         try:
             value = _loaded(self.function, "metrics")(**arguments)
         except Exception as error:

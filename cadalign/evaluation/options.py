@@ -213,8 +213,7 @@ def absolute_paths(value: T) -> T:
 
 def tuples(options: dict[str, Any]) -> dict[str, Any]:
     """Make the lists and other iterables among options tuples."""
-    plain = (str, bytes, int, float, Path, type(None))
     return {
-        name: value if isinstance(value, plain) or not hasattr(value, "__iter__") else tuple(value)
+        name: value if isinstance(value, str) or not hasattr(value, "__iter__") else tuple(value)
         for name, value in options.items()
     }

@@ -1,10 +1,9 @@
-"""Figures of runs: lines with quartile bands, and curves of shares, a colour for each method."""
+"""Figures of runs: lines of medians, and curves of shares, a colour for each method."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,12 +17,11 @@ from cadalign.evaluation import metrics
 from cadalign.evaluation.methods import LIMIT
 from cadalign.evaluation.metrics import HIGH, Metric
 from cadalign.evaluation.runs.work import FAILED, OK
-from cadalign.evaluation.summary import Quartiles, Summary, known, where
+from cadalign.evaluation.summary import Summary, known, where
 from cadalign.io.files import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
     from cadalign.evaluation.runs.tables import Cells, Run
 
@@ -34,7 +32,6 @@ COLORS = (
     *("#332288", "#999933", "#882255", "#44AA99", "#AA4499", "#117733"),
 )
 """Colours of lines, in their order."""
-_MARKERS = "os^DvP<X>phd"
 
 
 def color_of(method: str, place: int) -> str:
@@ -43,53 +40,19 @@ def color_of(method: str, place: int) -> str:
 
 
 STYLE: dict[Any, Any] = {
-    "font.size": 10,
     "axes.grid": True,
-    "axes.grid.which": "both",
     "grid.color": "0.9",
-    "grid.linewidth": 0.6,
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-    "lines.linewidth": 1.8,
-    "lines.markersize": 5,
     "pdf.fonttype": 42,  # TrueType, which publishers ask for
     "figure.dpi": 160,
 }
 """Settings of matplotlib that all figures share."""
 
-
-@contextmanager
-def new_figure(**options: Any) -> Iterator[Figure]:
-    """A figure in the project's style, drawn without a display."""
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    with rc_context(STYLE):
-        yield Figure(layout="constrained", **options)
-
-
-def save_figure(figure: Figure, path: Path) -> list[Path]:
-    """Write a figure as PNG and PDF, ``path`` being without an ending; returns the files."""
-    files = [path.with_name(f"{path.name}.{ending}") for ending in ("png", "pdf")]
-    for file in files:
-        # Without its date a PDF is the same in every run.
-        metadata: Any = {"CreationDate": None} if file.suffix == ".pdf" else {"Software": None}
-        write_whole(file, partial(figure.savefig, metadata=metadata))
-        figure.set_layout_engine("none")  # the first file's is the second's
-    return files
-
-
-QUARTILES_NOTE = "line: median, band: quartiles"
 _DIGITS = 6
-_MOST_TICKS = 30
 
 
 @dataclass(frozen=True)
 class Trace:
-    """A line of a plot, in the units of its axes, with the ends of a band if it has one.
+    """A line of a plot, in the units of its axes.
 
     ``run`` is the place of the run among those that are compared. Values are None where there is
     none.
@@ -99,26 +62,13 @@ class Trace:
     method: str
     x: list[float]
     y: list[float | None]
-    low: list[float | None] | None = None
-    high: list[float | None] | None = None
 
     @classmethod
     def of(
-        cls, run: int, method: str, x: Sequence[float], y: Sequence[float | Quartiles], unit: Metric
+        cls, run: int, method: str, x: Sequence[float], y: Sequence[float], unit: Metric
     ) -> Trace:
-        """A line through values, or through medians with quartiles as its band."""
-        quartiles = [q for q in y if isinstance(q, Quartiles)]
-        if not quartiles:
-            return cls(run, method, list(x), compact([unit.shown(value) for value in y]))
-        middle, low, high = (
-            compact([unit.shown(getattr(q, name)) for q in quartiles])
-            for name in ("median", "lower", "upper")
-        )
-        return cls(run, method, list(x), middle, low, high)
-
-    def to_dict(self) -> dict[str, Any]:
-        """The line for the page."""
-        return {name: value for name, value in vars(self).items() if value is not None}
+        """A line through values."""
+        return cls(run, method, list(x), compact([unit.shown(value) for value in y]))
 
 
 @dataclass(frozen=True)
@@ -143,7 +93,7 @@ class Plot:
             "id": self.id,
             "title": f"{title[0].upper()}{title[1:]}",
             **axes,
-            "traces": [trace.to_dict() for trace in self.traces],
+            "traces": [vars(trace) for trace in self.traces],
             "note": self.note,
         }
 
@@ -171,76 +121,40 @@ def compact(values: npt.ArrayLike | Sequence[float | None]) -> list[float | None
 
 
 def draw_plot(path: Path, plot: Plot) -> list[Path]:
-    """Draw a plot into a file, PNG and PDF; ``path`` has no ending.
+    """Draw a plot without a display, as PNG and PDF; ``path`` has no ending. Returns the files."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
 
-    A line ends where there is no value, and a band without an upper end goes to the top.
-    """
-    x, y = plot.x, plot.y
-    with new_figure(figsize=(6.4, 4.2 + 0.12 * max(0, len(plot.traces) - 6))) as figure:
-        axes = figure.add_subplot()
-        bands = _draw_lines(axes, plot)
-        if y.log:
-            axes.set_yscale("log")
-        elif y.unit == "%":
-            axes.set_ylim(-3, max(103, axes.get_ylim()[1]))
-        bottom, top = axes.get_ylim()
-        for places, low, high, color in bands:
-            above = np.where(np.isnan(high) & ~np.isnan(low), top, high)
-            axes.fill_between(places, low, above, color=color, alpha=0.14, linewidth=0)
-        axes.set_ylim(bottom, top)
-        ticks = sorted({round(value, 6) for trace in plot.traces for value in trace.x})
-        if x.log:
-            axes.set_xscale("log")
-        if len(ticks) <= _MOST_TICKS:
-            axes.set_xticks(ticks, [f"{value:g}" for value in ticks])
-            axes.minorticks_off()
-            axes.tick_params(axis="x", labelrotation=45 if len(ticks) > 9 else 0)
-        if y.log:
-            axes.yaxis.set_major_formatter("{x:g}")
-        axes.set_xlabel(x.axis)
-        axes.set_ylabel(y.axis)
+    files = [path.with_name(f"{path.name}.{ending}") for ending in ("png", "pdf")]
+    with rc_context(STYLE):
+        figure = Figure(figsize=(6.4, 4.8), layout="constrained")
+        scales = {f"{name}scale": "log" for name in ("x", "y") if getattr(plot, name).log}
+        axes = figure.add_subplot(xlabel=plot.x.axis, ylabel=plot.y.axis, **scales)
         axes.set_title(plot.note, fontsize=9, color="0.35", loc="left")
+        _draw_lines(axes, plot)
         figure.legend(loc="outside lower center", ncols=2, handlelength=3.6)
-        return save_figure(figure, path)
+        for file in files:
+            # Without its date a PDF is the same in every run.
+            metadata: Any = {"CreationDate": None} if file.suffix == ".pdf" else {"Software": None}
+            write_whole(file, partial(figure.savefig, metadata=metadata))
+            figure.set_layout_engine("none")  # the first file's is the second's
+    return files
 
 
-def _draw_lines(axes: Axes, plot: Plot) -> list[tuple[Any, Any, Any, str]]:
-    """Draw lines; returns their bands."""
-    bands = []
+def _draw_lines(axes: Axes, plot: Plot) -> None:
+    """Draw lines, which end where there is no value."""
     methods = list(dict.fromkeys(trace.method for trace in plot.traces))
     for trace in plot.traces:
         place, is_limit = methods.index(trace.method), trace.method == LIMIT
         color = color_of(trace.method, place)
-        has_markers = not is_limit and len(trace.x) <= _MOST_TICKS
-        middle = np.array(trace.y, dtype=float)
-        if not np.isfinite(middle).any():
-            continue
         axes.plot(
             trace.x,
-            middle,
+            np.array(trace.y, dtype=float),
             color=color,
             linestyle="--" if is_limit else "-",
-            marker=_MARKERS[place % len(_MARKERS)] if has_markers else "",
+            marker="" if is_limit else "o",
             label=trace.method,
         )
-        # The Cramer-Rao bound is a floor whose band would hide the others.
-        if trace.low is not None and trace.high is not None and not is_limit:
-            low, high = (np.array(end, dtype=float) for end in (trace.low, trace.high))
-            axes.plot(trace.x, low, trace.x, high, alpha=0)  # make room for the band
-            bands.append((trace.x, low, high, color))
-    return bands
-
-
-def share_traces(
-    runs: Sequence[Run], places: FloatArray, shares: Callable[[Cells], FloatArray | None]
-) -> list[Trace]:
-    """Lines of shares of a method's rows at places (k,) of the axis; None where there is no row."""
-    return [
-        Trace.of(index, method, places.tolist(), found.tolist(), metrics.COVERED)
-        for index, run in enumerate(runs)
-        for method in run.methods
-        if (found := shares(where(run.cells, run.cells["method"] == method))) is not None
-    ]
 
 
 def cumulative(runs: Sequence[Run], metric: Metric, places: FloatArray, *, title: str) -> Plot:
@@ -258,11 +172,17 @@ def cumulative(runs: Sequence[Run], metric: Metric, places: FloatArray, *, title
         count = len(errors) + int((rows["status"] == FAILED).sum())
         return np.asarray(is_within(errors, places[:, None]).sum(axis=1) / max(count, 1))
 
+    traces = [
+        Trace.of(index, method, places.tolist(), shares(rows).tolist(), metrics.COVERED)
+        for index, run in enumerate(runs)
+        for method in run.methods
+        for rows in [where(run.cells, run.cells["method"] == method)]
+    ]
     return Plot(
         id=f"within_{metric.key}",
         x=metric,
         y=replace(metrics.COVERED, key="share", label=f"objects with {words}", better=HIGH),
-        traces=share_traces(runs, places, shares),
+        traces=traces,
         note="over all categories; failures count",
         title=title,
     )

@@ -23,16 +23,14 @@ if TYPE_CHECKING:
 
 ALL = "all"
 """Name of the summary over all categories."""
-MEAN = "mean of categories"
-"""Name of the summary of the categories' own values."""
 
 
 @dataclass(frozen=True)
 class Summary:
     """Numbers of one method on one group of tasks: a row of ``summary.csv``, a line of a headline.
 
-    ``names`` are the columns that name the row, the method among them; ``values`` numbers and
-    `Quartiles` by column, in the metrics' own units, NaN for what is unknown.
+    ``names`` are the columns that name the row, the method among them; ``values`` numbers by
+    column, in the metrics' own units, NaN for what is unknown.
     """
 
     group: str
@@ -49,21 +47,12 @@ class Summary:
         return self.names[column] if column in self.names else self.values[column]
 
     def number(self, key: str) -> float | None:
-        """The number of a metric, the median where there are quartiles; None if there is none."""
-        value = self.values.get(key)
-        return value.median if isinstance(value, Quartiles) else value
+        """The number of a metric; None if there is none."""
+        return self.values.get(key)
 
     def cells(self) -> Row:
-        """All cells, flat: quartiles are three."""
-        cells = dict(self.names)
-        for name, value in self.values.items():
-            if isinstance(value, Quartiles):
-                cells[f"{name}_lower_quartile"] = value.lower
-                cells[f"{name}_median"] = value.median
-                cells[f"{name}_upper_quartile"] = value.upper
-            else:
-                cells[name] = value
-        return cells
+        """All cells of the row."""
+        return self.names | self.values
 
 
 @dataclass(frozen=True)
@@ -80,36 +69,6 @@ class ConsoleTable:
     rows: list[tuple[str, ...]]
     note: str = ""
     grouped: bool = True
-
-
-@dataclass(frozen=True)
-class Quartiles:
-    """Quartiles, NaN where there are none."""
-
-    lower: float
-    median: float
-    upper: float
-
-    @classmethod
-    def of(cls, values: FloatArray) -> Quartiles:
-        """Quartiles of values (n,), infinite ones being failures.
-
-        A quartile is NaN where so many failed that it is a failure: giving up on the hard inputs
-        does not improve it.
-        """
-        if not len(values):
-            return cls(np.nan, np.nan, np.nan)
-        # Order statistics: interpolation would reckon with infinities.
-        found = np.percentile(values, [25, 50, 75], method="inverted_cdf")
-        return cls(*np.where(np.isfinite(found), found, np.nan).tolist())
-
-    @classmethod
-    def of_solved(cls, values: FloatArray) -> Quartiles:
-        """Quartiles of the finite ones of values (n,)."""
-        values = values[np.isfinite(values)]
-        if not len(values):
-            return cls(np.nan, np.nan, np.nan)
-        return cls(*np.percentile(values, [25, 50, 75]).tolist())
 
 
 def summary_csv(summaries: Sequence[Summary], *, rename: Mapping[str, str]) -> str:
@@ -141,15 +100,14 @@ def summarize(
     by: Sequence[str] = (CATEGORY.key,),
     name: Callable[..., str] = str,
     apart: str = SKIPPED,
-    cells: Cells | None = None,
 ) -> list[Summary]:
     """Statistics of every method on every group of tasks, and on all categories together.
 
     Tasks of a group share the cells of the columns ``by``, of which ``name`` makes its name;
     without columns there is one group. Rows of the status ``apart`` do not count. Medians of the
-    run's further metrics are added. ``cells`` take the place of the run's.
+    run's further metrics are added.
     """
-    cells = run.cells if cells is None else cells
+    cells = run.cells
     statistics = {**statistics, **{each.key: median(each.key) for each in run.metrics}}
     choices: list[list[Any]] = [sorted(set(cells[key].tolist())) for key in by]
     if by[:1] == (CATEGORY.key,) and len(choices[0]) > 1:
@@ -159,7 +117,7 @@ def summarize(
         chosen = np.ones(len(cells["method"]), dtype=bool)
         for key, value in zip(by, values, strict=True):
             chosen &= (cells[key] == value) | (value is None)
-        labels = [f"category {each}" if each in (ALL, MEAN) else each for each in values]
+        labels = [f"category {each}" if each == ALL else each for each in values]
         labels = [ALL if each is None else each for each in labels]
         for method in run.methods:
             rows = where(cells, chosen & (cells["method"] == method))
@@ -189,21 +147,6 @@ def median(key: str, factor: float = 1.0) -> Callable[[Group], float]:
 def mean(key: str) -> Callable[[Group], float]:
     """The mean of a column."""
     return lambda group: mean_of(group.solved[key])
-
-
-def quartiles(key: str) -> Callable[[Group], Quartiles]:
-    """The quartiles of a column over the rows that are ok."""
-    return lambda group: Quartiles.of_solved(group.solved[key].astype(float))
-
-
-def percentile(key: str, percent: float) -> Callable[[Group], float]:
-    """A percentile of a column, NaN where all cells are missing."""
-
-    def made(group: Group) -> float:
-        values = known(group.solved[key])
-        return float(np.percentile(values, percent)) if len(values) else np.nan
-
-    return made
 
 
 def share(is_within: Callable[[Cells], BoolArray]) -> Callable[[Group], float]:

@@ -209,7 +209,6 @@ def test_exit_code_is_1_where_every_instance_fails(root: Path, tmp_path: Path) -
     ("options", "text"),
     [
         (["--per-category", "0"], "--per-category: 0 is less than 1"),
-        (["--noise-px", "nan"], "--noise-px: nan is not a noise level"),
         (
             ["--root", "/nowhere/at/all"],
             "/nowhere/at/all: no such folder; give KeypointNet's root",

@@ -180,7 +180,7 @@ def row(method: str, error: float | None) -> dict[str, Any]:
     if error is None:
         return {**names, "status": FAILED, "reason": "why"}
     numbers = dict.fromkeys(("rotation_error_deg", "sym_rotation_error_deg"), error)
-    small = {"sym_translation_error": 0.06, "scale_y_error": 0.01, "scale_z_error": 0.01}
+    small = {"sym_translation_error": 0.04, "scale_y_error": 0.01, "scale_z_error": 0.01}
     other = {"translation_error": 0.06, "keypoints": 7}
     return {**names, "status": OK, "reason": "", **numbers, **small, **other}
 
@@ -199,8 +199,7 @@ def test_failed_rows_count_against_success_and_not_in_medians() -> None:
     optimal, limit = summaries_of(rows)
     assert (optimal["instances"], optimal["failed"]) == (5, 1)
     assert optimal["rotation_error_deg"] == 6.5
-    assert optimal["success_5deg_5pct"] == 0.0  # the translation is 6 % off
-    assert optimal["success_10deg_10pct"] == pytest.approx(3 / 5)
+    assert optimal["success_5deg_5pct"] == pytest.approx(2 / 5)
     assert optimal["over_limit"] == pytest.approx(3.25)
     assert limit["over_limit"] == 1.0
     assert np.isnan(optimal["box_iou"])

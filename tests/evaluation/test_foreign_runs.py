@@ -141,9 +141,8 @@ def test_damaged_timings_may_be_removed(run: Path, capsys: pytest.CaptureFixture
     assert line.endswith("; remove it: the run is shown without times")
     (run / "timings.parquet").unlink()
     assert main(["report", str(run)]) == 0
-    table = cadalign.simulate(
-        "points", values=(8, 10), runs=40, methods=("aepnp",), workers=0, out=run
-    )
+    sweep = {"sweep": "points", "values": (8, 10), "runs": 40, "methods": ("aepnp",)}
+    table = cadalign.evaluate(experiment="simulate", **sweep, workers=0, out=run)
     assert table.seconds.isna().all()
 
 

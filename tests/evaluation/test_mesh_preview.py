@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cadalign import Mesh
-from cadalign.evaluation.instances.pictures import MeshPreview, preview_of
+from cadalign.evaluation.instances.pictures import preview_of
 
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
 QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
@@ -35,13 +36,25 @@ def sphere(rings: int, *, squash: float = 1.0) -> Mesh:
     return Mesh(points, faces)
 
 
+def preview_of_mesh(mesh: Mesh, **most: int) -> SimpleNamespace:
+    """Vertices, faces and edges of a mesh's preview, by way of JSON."""
+    data = json.loads(json.dumps(preview_of(mesh, **most)))
+    index = "<u4" if data["wide"] else "<u2"
+    counts = np.frombuffer(base64.b64decode(data["vertices"]), "<u2").reshape(-1, 3)
+    return SimpleNamespace(
+        vertices=np.array(data["lo"]) + counts * data["step"],
+        faces=np.frombuffer(base64.b64decode(data["faces"]), index).reshape(-1, 3),
+        edges=np.frombuffer(base64.b64decode(data["edges"]), index).reshape(-1, 2),
+    )
+
+
 def test_a_light_model_stays_as_it_is_and_its_creases_are_edges() -> None:
-    preview = preview_of(cube())
+    preview = preview_of_mesh(cube())
     assert len(preview.faces) == 12
     assert len(preview.vertices) == 8
     assert len(preview.edges) == 12
     lengths = np.linalg.norm(np.diff(preview.vertices[preview.edges], axis=1), axis=2)
-    np.testing.assert_allclose(lengths, 1)  # no diagonals
+    np.testing.assert_allclose(lengths, 1, atol=1e-4)  # no diagonals
 
 
 @pytest.mark.long
@@ -50,7 +63,7 @@ def test_there_are_never_more_triangles_or_lines_than_asked_for(
     rings: int, squash: float, most: int
 ) -> None:
     mesh = sphere(rings, squash=squash)
-    preview = preview_of(mesh, max_faces=most, max_edges=most)
+    preview = preview_of_mesh(mesh, max_faces=most, max_edges=most)
     assert len(preview.faces) <= most
     assert len(preview.edges) <= most
     assert np.isfinite(preview.vertices).all()
@@ -68,7 +81,7 @@ def test_a_mast_thinner_than_a_cell_becomes_a_line() -> None:
     mast = (CUBE - 0.5) * [1e-3, 3.0, 1e-3] + [0, 2.4, 0]
     faces = np.concatenate([hull.faces, cube().faces + len(hull.vertices)])
     mesh = Mesh(np.concatenate([hull.vertices, mast]), faces)
-    preview = preview_of(mesh)
+    preview = preview_of_mesh(mesh)
     assert preview.vertices[:, 1].max() > 3.8
     top = int(preview.vertices[:, 1].argmax())
     assert (preview.edges == top).any()
@@ -76,28 +89,16 @@ def test_a_mast_thinner_than_a_cell_becomes_a_line() -> None:
 
 def test_parts_without_area_do_no_harm() -> None:
     point = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
-    preview = preview_of(point)
+    preview = preview_of_mesh(point)
     assert len(preview.faces) == len(preview.edges) == 0
-    assert decoded(preview) is not None
-
-
-def decoded(preview: MeshPreview) -> dict[str, np.ndarray]:
-    data = json.loads(json.dumps(preview.to_dict()))
-    index = "<u4" if data["wide"] else "<u2"
-    counts = np.frombuffer(base64.b64decode(data["vertices"]), "<u2").reshape(-1, 3)
-    return {
-        "vertices": np.array(data["lo"]) + counts * data["step"],
-        "faces": np.frombuffer(base64.b64decode(data["faces"]), index).reshape(-1, 3),
-        "edges": np.frombuffer(base64.b64decode(data["edges"]), index).reshape(-1, 2),
-    }
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("rings", [20, 200])
 def test_json_holds_the_same_to_16_bits(rings: int) -> None:
-    preview = preview_of(sphere(rings), max_faces=200_000)
-    found = decoded(preview)
+    mesh = sphere(rings)
+    preview = preview_of_mesh(mesh, max_faces=200_000)
     assert (len(preview.vertices) > 65536) == (rings == 200)
-    np.testing.assert_allclose(found["vertices"], preview.vertices, atol=2 / 65535)
-    np.testing.assert_array_equal(found["faces"], preview.faces)
-    np.testing.assert_array_equal(found["edges"], preview.edges)
+    found = preview.vertices[preview.faces].mean(axis=(0, 1))
+    np.testing.assert_allclose(np.linalg.norm(preview.vertices, axis=1), 1, atol=2e-4)
+    np.testing.assert_allclose(found, 0, atol=2e-2)

@@ -24,7 +24,7 @@ from cadalign.evaluation.experiments.photos import PhotosOptions
 
 def simulate(methods: Any, **options: Any) -> Any:
     options = {"values": [20], "runs": 3, "workers": 0, **options}
-    return cadalign.simulate("points", methods=methods, **options)
+    return cadalign.evaluate(experiment="simulate", sweep="points", methods=methods, **options)
 
 
 # --- functions as methods ----------------------------------------------------------------------
@@ -39,8 +39,9 @@ def test_a_function_stands_beside_built_in_methods(given: Any) -> None:
 
 
 def test_a_function_is_told_the_noise_if_it_asks_for_it() -> None:
-    assert (simulate([weighted], noise_px=2.0).status == "ok").all()
-    assert set(simulate([weighted], noise_px=1.0).status) == {"failed"}
+    sweep = {"sweep": "noise", "values": [1, 2], "runs": 1, "methods": [weighted]}
+    table = cadalign.evaluate(experiment="simulate", **sweep, workers=0)
+    assert table.status.tolist() == ["failed", "ok"]
 
 
 @pytest.mark.parametrize("bad", BAD, ids=lambda bad: bad.__name__)
@@ -70,8 +71,6 @@ def test_a_method_of_an_experiment_is_not_hidden(tmp_path: Path) -> None:
         cadalign.evaluate(tmp_path, "unseen", methods=[shape])
     with pytest.raises(InputError, match="'rigid' is the name of more than one; give the func"):
         PhotosOptions(tmp_path, methods=(rigid,))  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="known are optimal, optimal-unstretched"):
-        cadalign.evaluate(tmp_path, "retrieval", methods=["linear"])
 
 
 # --- every experiment --------------------------------------------------------------------------
@@ -107,7 +106,8 @@ import cadalign
 def mine(points_3d, points_2d, camera):
     return cadalign.fit(points_3d, points_2d, camera, method="aepnp")
 def simulate(methods):
-    return cadalign.simulate("points", values=[20], runs=2, workers=1, methods=methods)
+    sweep = {"sweep": "points", "values": [20], "runs": 2}
+    return cadalign.evaluate(experiment="simulate", **sweep, workers=1, methods=methods)
 print((simulate(["aepnp"]).status == "ok").all())
 try:
     simulate([mine])

@@ -17,16 +17,14 @@ from support.solving import broken, depth_error, linear
 import cadalign
 from cadalign.cli import main
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.experiments.photos import SETS
 from cadalign.evaluation.methods import FunctionMetric
 from cadalign.evaluation.metrics import BOX_IOU, ROTATION, Metric
-from cadalign.evaluation.metrics.photos import score_columns
 from cadalign.evaluation.plots import cumulative
 
 
 def simulate(**options: Any) -> Any:
     options = {"values": [20], "runs": 3, "methods": ["aepnp"], "workers": 0, **options}
-    return cadalign.simulate("points", **options)
+    return cadalign.evaluate(experiment="simulate", sweep="points", **options)
 
 
 @pytest.mark.parametrize("given", [depth_error, "support.solving:depth_error"])
@@ -85,7 +83,7 @@ def test_every_experiment_with_functions_takes_it(real_data: Path) -> None:
         (
             real_data / "sfm/maupertuis_colmap",
             "correspondences",
-            {"methods": ["aepnp", linear], "draws": 1, "max_images": 1, "outliers": [0.0]},
+            {"methods": ["aepnp", linear], "draws": 1, "outliers": [0.0]},
         ),
     ):
         table = cadalign.evaluate(root, experiment, **common, **options)
@@ -173,11 +171,6 @@ def test_what_a_module_prints_is_not_the_output(
     assert json.loads(printed.out)["failed"] == 0
     assert "at import" in printed.err
     assert "hello" in printed.err
-
-
-def test_sets_of_metrics_have_columns_of_their_own() -> None:
-    names = [name for name, _ in score_columns(SETS)]
-    assert len(names) == len(set(names))
 
 
 @pytest.mark.long

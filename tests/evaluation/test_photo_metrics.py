@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,14 +12,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cadalign import Alignment
+from cadalign.evaluation import metrics
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics.photos import (
-    ROTATION,
-    VIEWPOINT,
+    RATES,
+    Protocol,
+    Rate,
     scan2cad_errors,
-    score_alignment,
-    score_columns,
-    statistics_of,
     symmetric_box_iou,
 )
 from cadalign.evaluation.summary import Group
@@ -47,26 +45,20 @@ def test_accuracy_at_pi_6():
     """Two of four errors are below 30 degrees; 30 is not below 30."""
     cells = {"rotation_error_deg": [10.0, 29.9, 30.0, 50.0], "method": ["rigid"] * 4}
     arrays = {name: np.array(values, dtype=object) for name, values in cells.items()}
-    found = statistics_of([VIEWPOINT], arrays)
-    assert found["accuracy_pi_6"](Group(arrays, arrays)) == 0.5
+    (rate,) = (each for each in RATES if each.metric.key == "accuracy_pi_6")
+    assert rate.of(Group(arrays, arrays)) == 0.5
 
 
-def test_a_new_metric_is_a_line_of_a_set() -> None:
+def test_a_new_metric_is_a_cell_of_a_measure() -> None:
     """A function of one's own is a metric, too: see `test_metrics`."""
-    depth = Metric("depth_off", "depth error", "m")
-    extended = replace(
-        VIEWPOINT,
-        measure=lambda target, est, gt, box: {depth.key: abs(float((est - gt).sum()))},
-        medians=(*VIEWPOINT.medians, depth),
-    )
-    assert score_columns([extended])[-1] == (depth.key, float)
+    protocol = Protocol((lambda target, est, gt, box: {"depth": float((est - gt).sum())},))
     target: Any = SimpleNamespace(gt=np.array([0.0, 0.0, 2.0]))
-    ests: list[Any] = [target.gt + [0, 0, off] for off in (0.25, 0.5, 2.0)]
-    box: Any = None
-    rows = [score_alignment(target, [extended], est, box) for est in ests]
-    cells = {depth.key: np.array([row[depth.key] for row in rows])}
-    found = statistics_of([extended], cells | {ROTATION.key: np.full(3, np.nan)})
-    assert found[depth.key](Group(cells, cells)) == 0.5
+    est, box = target.gt + [0, 0, 0.25], cast(Any, None)
+    assert protocol.score(target, est, box) == {"depth": 0.25}
+    assert protocol.score(cast(Any, SimpleNamespace(gt=None)), est, box) == {}
+    rate = Rate(metrics.SUCCESS, Metric("depth", "depth error", "m"), limit=0.5)
+    cells = {"depth": np.array([0.25, 0.5, 2.0, 0.1]), "method": np.array(["mine"] * 4)}
+    assert rate.of(Group(cells, cells)) == 0.5
 
 
 # Scan2CAD -----------------------------------------------------------------------------------------

@@ -105,10 +105,8 @@ def _read_photo(path: Path) -> object:
 
 def _write_run(changed: str) -> Callable[[Path], Path]:
     def write(folder: Path) -> Path:
-        methods = ("optimal", "limit")
-        cadalign.simulate(
-            "noise", out=folder / "run", values=(1,), runs=2, points=8, methods=methods, workers=0
-        )
+        sweep = {"sweep": "points", "values": (8,), "runs": 2, "methods": ("optimal", "limit")}
+        cadalign.evaluate(experiment="simulate", out=folder / "run", **sweep, workers=0)
         return folder / "run" / changed
 
     return write

@@ -143,7 +143,7 @@ class _Maker:
             "pictures": {str(i): _picture(i, (640, 480)) for i in shown},
             "thumbs": {str(i): _picture(i, (240, 180)) for i in shown},
             "exhibits": exhibits,
-            "meshes": {"0": preview_of(self.mesh).to_dict()},
+            "meshes": {"0": preview_of(self.mesh)},
         }
 
     def _string(self, text: str) -> int:

@@ -5,9 +5,6 @@ A method's name is a base, and the evidence beside the keypoints, as in ``rigid+
 
 from __future__ import annotations
 
-import math
-from collections import Counter
-from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -21,42 +18,37 @@ from cadalign.datasets.scan2cad import Scan2CAD
 from cadalign.errors import InputError, quote
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import VIEW_NAMES
-from cadalign.evaluation.methods import SHAPE
 from cadalign.evaluation.metrics import BOX_IOU
 from cadalign.evaluation.metrics.photos import (
-    BOX,
+    MEDIANS,
+    RATES,
     ROTATION,
-    SCAN2CAD,
-    VIEWPOINT,
     Protocol,
-    score_columns,
+    measure_box,
+    measure_scan2cad,
+    measure_viewpoint,
     statistics_of,
 )
 from cadalign.evaluation.options import FunctionOptions, is_function
 from cadalign.evaluation.plots import cumulative_curves
 from cadalign.evaluation.registry import Spec
-from cadalign.evaluation.runs.work import LEFT_OUT, UNREADABLE, Columns, Plan, fingerprint
+from cadalign.evaluation.runs.work import LEFT_OUT, Columns, Plan
 from cadalign.evaluation.summary import (
-    ALL,
-    MEAN,
     Summary,
     mean,
-    mean_of,
     median,
     milliseconds,
     summarize,
 )
-from cadalign.io.files import read_bytes
 
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.sighting import PhotoTask
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.tables import Run
-    from cadalign.shapes.model import ShapeModel
 
 EPNP, RIGID, STRETCHED, PRIOR, SIMILAR = "epnp", "rigid", "stretched", "prior", "similar"
 TRUTH = "truth"
-BASES = (EPNP, RIGID, STRETCHED, PRIOR, SIMILAR, SHAPE)
+BASES = (EPNP, RIGID, STRETCHED, PRIOR, SIMILAR)
 MASK, GRAVITY, IMAGE = "mask", "gravity", "image"
 EVIDENCE = (MASK, GRAVITY, IMAGE)
 
@@ -65,11 +57,10 @@ EVIDENCE = (MASK, GRAVITY, IMAGE)
 class PhotosOptions(FunctionOptions):
     """Evaluate methods on photos of real objects, by the metrics of their data set.
 
-    The folder may hold Scan2CAD, PASCAL3D+ or Pix3D. Keypoints
-    are the annotated ones. The model's width (x) is given,
-    as one image leaves size open; with a shape model in metres it is estimated. The
-    run's folder gets results.parquet with a row per object and method, summary.csv, figures and
-    report.html. A killed run continues when the same command is started again.
+    The folder may hold Scan2CAD, PASCAL3D+ or Pix3D. Keypoints are the annotated ones. The model's
+    width (x) is given, as one image leaves size open. The run's folder gets results.parquet with a
+    row per object and method, summary.csv, figures and report.html. A killed run continues when the
+    same command is started again.
     """
 
     experiment = "photos"
@@ -79,31 +70,22 @@ class PhotosOptions(FunctionOptions):
     _: KW_ONLY
     categories: tuple[str, ...] | None = None
     """Categories to take; all by default."""
-    methods: tuple[str, ...] = ()
+    methods: tuple[str, ...] = BASES
     """epnp, rigid; stretched, prior (stretched, with a prior on the scales), similar (prior, and
-    keypoints that differ from the model's by 4 % of its diagonal), shape (a shape model); each also
-    with evidence, as in rigid+mask, rigid+image (the photo itself) or similar+mask+gravity; and
-    truth. By default the first five, and shape where there is one."""
-    shape: tuple[Path, ...] = ()
-    """Files of `cadalign shape learn`, each for its category."""
+    keypoints that differ from the model's by 4 % of its diagonal); each but epnp also with
+    evidence, as in rigid+mask, rigid+image (the photo itself) or similar+mask+gravity; and
+    truth."""
     max_photos: int | None = None
     """Number of photos to take, the first ones; all by default."""
     pictures: int = 100
     """Number of photos whose pictures the report shows, the first ones."""
-    sigma: float | None = None
-    """Standard deviation of annotated keypoints that methods are given, in pixels; by
-    default that of the data set."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_least(max_photos=1, pictures=0)
-        if self.sigma is not None and not 0 < self.sigma < math.inf:
-            raise InputError(f"{self.sigma} is not positive", where="sigma")
         own = [each for each in self.methods if not is_function(each)]
         for name in own:
             _check_method(name)
-        bases = BASES if self.shape else BASES[:-1]
-        self.replace_values(methods=self.methods or bases)
         self.check_methods((*BASES, TRUTH, *own))
 
 
@@ -121,20 +103,18 @@ def _check_method(method: str) -> None:
         fix = f"known are {', '.join((*BASES, TRUTH))}, with {', '.join(f'+{e}' for e in EVIDENCE)}"
         raise InputError(f"unknown method {quote(method)}", where="methods", fix=fix)
     if evidence and base in (EPNP, TRUTH):
-        fix = "give rigid, stretched, prior, similar or shape the evidence"
+        fix = "give rigid, stretched, prior or similar the evidence"
         raise InputError(f"{base} takes keypoints alone", where="methods", fix=fix)
-
-
-SETS = (VIEWPOINT, BOX, SCAN2CAD)
-"""All sets of metrics, in the order of the result table's columns."""
 
 
 _PROTOCOLS = {
     # Annotators' points on scan and model are about 5 cm apart, 8 px in an image of 480.
-    Scan2CAD.kind: Protocol((VIEWPOINT, SCAN2CAD, BOX), sigma_of_width=1 / 60),
-    Pascal3D.kind: Protocol((VIEWPOINT,), up_axis="z"),
+    Scan2CAD.kind: Protocol(
+        (measure_viewpoint, measure_scan2cad, measure_box), sigma_of_width=1 / 60
+    ),
+    Pascal3D.kind: Protocol((measure_viewpoint,), up_axis="z"),
 }
-_OTHER = Protocol((VIEWPOINT, BOX))
+_OTHER = Protocol((measure_viewpoint, measure_box))
 
 
 def protocol_of(kind: str) -> Protocol:
@@ -145,51 +125,34 @@ def protocol_of(kind: str) -> Protocol:
 # Summary ------------------------------------------------------------------------------------------
 
 COLUMNS: Columns = (
-    *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int), ("source", str)),
-    *(("rms_px", float), *score_columns(SETS)),
+    *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int)),
+    ("rms_px", float),
+    *((each.key, float) for each in dict.fromkeys((*MEDIANS, *(rate.column for rate in RATES)))),
 )
 """Columns of the result table; see docs/formats/runs.md."""
 
 
-# The data sets' own first.
-_OWN_FIRST = (SCAN2CAD, VIEWPOINT, BOX)
 _COUNTS = (metrics.INSTANCES, metrics.FAILED, metrics.LEFT_OUT)
 HEADLINE = (
-    *(*_COUNTS, metrics.KEYPOINTS),
-    *(metric for each in _OWN_FIRST for metric in each.shown),
+    *(*_COUNTS, metrics.KEYPOINTS, *(rate.metric for rate in RATES), *MEDIANS),
     *(metrics.RMS, metrics.QUERY_MILLISECONDS),
 )
 _CONSOLE = (
-    *(*_COUNTS, *SCAN2CAD.shown[:1], *VIEWPOINT.shown, *BOX.shown[:2]),
+    *(*_COUNTS, *(rate.metric for rate in RATES[:2]), *MEDIANS[:2]),
     *(replace(metrics.RMS, symbol="rms px"), metrics.QUERY_MILLISECONDS),
 )
 
 
 def summarize_objects(run: Run) -> list[Summary]:
-    """A summary for every category and method, for all together, and the mean of categories."""
+    """A summary for every category and method, and for all together."""
     cells = run.cells
     statistics = {
         "keypoints": mean("keypoints"),
-        **statistics_of(SETS, cells),
+        **statistics_of(cells),
         metrics.RMS.key: median(metrics.RMS.key),
         "milliseconds": milliseconds,
     }
-    found = summarize(run, statistics, apart=LEFT_OUT)
-    single = [each for each in found if each.group not in (ALL, UNREADABLE)]
-    if len({each.group for each in single}) < 2:
-        return found
-    whole = [each for each in found if each.group == ALL]
-    return [*found, *(_mean(every, single) for every in whole)]
-
-
-def _mean(every: Summary, single: Sequence[Summary]) -> Summary:
-    """The mean of a method's values over categories; its counts are those of all."""
-    own = [each for each in single if each.method == every.method]
-    values = {
-        key: value if isinstance(value, int) else mean_of(np.array([s.values[key] for s in own]))
-        for key, value in every.values.items()
-    }
-    return Summary(MEAN, {"category": MEAN, "method": every.method}, values)
+    return summarize(run, statistics, apart=LEFT_OUT)
 
 
 _CURVES = (
@@ -198,24 +161,7 @@ _CURVES = (
 )
 
 
-def shapes_of(files: Sequence[Path]) -> tuple[ShapeModel, ...]:
-    """The shape models of some files.
-
-    Raises InputError if two files are of the same category; and DataError if one cannot be read.
-    """
-    from cadalign.shapes.model import ShapeModel
-
-    given = [ShapeModel.open(path) for path in files]
-    counts = Counter(each.category for each in given)
-    twice = next((name for name, count in counts.items() if count > 1), None)
-    if twice is not None:
-        what, fix = f"two files are of the category {quote(twice)}", "give one for each category"
-        raise InputError(what, where="shape", fix=fix)
-    return tuple(given)
-
-
-_CHUNK, _LARGE_CHUNK = 4, 32
-_LARGE = 500  # photos
+_CHUNK = 8
 
 
 def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
@@ -224,16 +170,13 @@ def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
     from cadalign.evaluation.instances.sighting import annotations_of, photo_tasks, reopened
 
     dataset = reopened(options.root)
-    shapes = shapes_of(options.shape)
     tasks = photo_tasks(dataset, options.max_photos)
     pictures = folder.made_for_pictures()
-    chunk = _CHUNK if len(tasks) < _LARGE else _LARGE_CHUNK
-    return photos_benchmark(options, shapes, pictures).plan(
+    return photos_benchmark(options, pictures).plan(
         options,
         tasks,
-        chunk=chunk,
+        chunk=_CHUNK,
         kind=dataset.kind,
-        shapes=fingerprint(*map(read_bytes, options.shape)),
         annotations=annotations_of(dataset, tasks),
     )
 
@@ -250,7 +193,7 @@ SPEC = Spec(
     apart=LEFT_OUT,
     topic="alignment to photos",
     subject="photos",
-    metrics=(*(metric for each in SETS for metric in each.medians), metrics.RMS),
+    metrics=(*MEDIANS, metrics.RMS),
     about=(
         "Green is the truth, red what a method found: its box, and the model warped to the "
         "estimated shape."
@@ -258,7 +201,6 @@ SPEC = Spec(
     note=(
         "Medians over the objects that did not fail, and shares of all, of which failures count as "
         "misses; objects without camera, model or enough keypoints are left out. The model's width "
-        "is the object's, as one image leaves size open, where no shape model in metres "
-        "determines it."
+        "is the object's, as one image leaves size open."
     ),
 )

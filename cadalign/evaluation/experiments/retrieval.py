@@ -7,13 +7,11 @@ model, and ``leave-out``, where it and all that count as it are taken out.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, asdict, dataclass, replace
+from dataclasses import KW_ONLY, asdict, dataclass
 from functools import lru_cache, partial
-from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
@@ -21,7 +19,7 @@ import tyro
 from cadalign.arrays import FloatArray, IntArray, instance_rng
 from cadalign.datasets import KeypointNet
 from cadalign.datasets.shapenet import require_category
-from cadalign.errors import InputError, unknown
+from cadalign.errors import InputError
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
 from cadalign.evaluation.instances.instance import (
@@ -32,16 +30,14 @@ from cadalign.evaluation.instances.instance import (
 )
 from cadalign.evaluation.methods import Method
 from cadalign.evaluation.metrics import QUERIES
-from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
+from cadalign.evaluation.metrics.errors import overlap
 from cadalign.evaluation.options import ModelOptions
-from cadalign.evaluation.plots import Plot, plot_against
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Columns, Plan, Row
 from cadalign.evaluation.summary import (
     Group,
     Summary,
     known,
-    mean,
     mean_of,
     median,
     medians,
@@ -49,6 +45,7 @@ from cadalign.evaluation.summary import (
     summarize,
 )
 from cadalign.geometry.alignment import Alignment, Box
+from cadalign.io.files import made_folder
 from cadalign.metrics import rotation_error
 
 if TYPE_CHECKING:
@@ -61,11 +58,9 @@ if TYPE_CHECKING:
 
 LEAVE_IN, LEAVE_OUT = "leave-in", "leave-out"
 """Protocols: the library holds the true model, or it doesn't."""
-_METHODS: dict[str, dict[str, Any]] = {
-    "optimal": {},
-    "optimal-unstretched": {"stretch": "none"},
-}
-"""Options of `cadalign.Library.retrieve` by method."""
+
+METHOD = "optimal"
+"""The name of the one method, `cadalign.Library.retrieve`."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +70,8 @@ class RetrievalRunOptions(ModelOptions):
     Each model is stretched by factors from 0.5 to 2 along y and z and seen from a random view; some
     of its visible keypoints, with noise, are looked up in a library that holds the model
     (leave-in), and in one that doesn't (leave-out). The run's folder gets results.parquet with a
-    row per query, protocol and method, summary.csv, figures and the library. Killed, it goes on
-    where it was when the same command is started again.
+    row per query and protocol, summary.csv, figures and the library. Killed, it goes on where it
+    was when the same command is started again.
     """
 
     experiment = "retrieval"
@@ -84,35 +79,27 @@ class RetrievalRunOptions(ModelOptions):
     root: Annotated[Path, tyro.conf.Positional]
     """Folder in KeypointNet's layout, or a library's file."""
     _: KW_ONLY
-    noises_px: tuple[float, ...] = (1.0, 3.0, 5.0)
-    """Standard deviations of the keypoints' noise, in pixels."""
+    noise_px: float = 1.0
+    """Standard deviation of the keypoints' noise, in pixels."""
     keypoints: tuple[int, ...] = (6, 7, 8, 9, 10)
     """Numbers of visible keypoints that are given."""
-    methods: tuple[str, ...] = ("optimal", "optimal-unstretched")
-    """optimal, optimal-unstretched."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for method in self.methods or ("",):
-            if method not in _METHODS:
-                raise unknown("method", method, _METHODS, where="methods")
-        self.replace_values(methods=tuple(dict.fromkeys(self.methods)))
-        for name, least in (("noises_px", 0), ("keypoints", 4)):
-            values = tuple(sorted(set(getattr(self, name))))
-            self.replace_values(**{name: values})
-            if not values:
-                raise InputError("none is given", where=name)
-            if not least <= values[0] or not values[-1] < math.inf:
-                raise InputError(f"{values[0]:g} is less than {least}", where=name)
+        self.check_noise("noise_px")
+        self.replace_values(keypoints=tuple(sorted(set(self.keypoints))))
+        if not self.keypoints:
+            raise InputError("none is given", where="keypoints")
+        if self.keypoints[0] < 4:
+            raise InputError(f"{self.keypoints[0]} is less than 4", where="keypoints")
 
 
 COLUMNS: Columns = (
     *(("category", str), ("model_id", str), ("noise_px", float), ("keypoints", int)),
     *(("protocol", str), ("method", str), ("status", str), ("reason", str)),
-    *(("alike", int), ("rank", int), ("matched_category", str), ("matched_id", str)),
-    *(("score", float), ("shared", int), ("none_probability", float), ("rms_px", float)),
-    *(("shape_distance", float), ("box_iou", float)),
-    *(("box_iou_up_to_scale", float), ("rotation_error_deg", float)),
+    *(("rank", int), ("matched_id", str), ("score", float), ("shared", int)),
+    *(("none_probability", float), ("rms_px", float), ("shape_distance", float)),
+    *(("box_iou", float), ("box_iou_up_to_scale", float), ("rotation_error_deg", float)),
 )
 
 TOP = 50
@@ -138,7 +125,7 @@ class RetrievalTask:
 
 
 def retrieval_tasks(library: Library, options: RetrievalRunOptions) -> list[RetrievalTask]:
-    """Every model with every noise and number of keypoints that it has, model by model."""
+    """Every model with every number of keypoints that it has, model by model."""
     names = library.categories
     if options.categories is not None:
         chosen = {require_category(name, names, where="categories") for name in options.categories}
@@ -150,8 +137,7 @@ def retrieval_tasks(library: Library, options: RetrievalRunOptions) -> list[Retr
         for key in (own[i * len(own) // count] for i in range(count)):
             most = len(library[key].xyz)
             tasks += [
-                RetrievalTask(*key, noise, keypoints, protocol)
-                for noise in options.noises_px
+                RetrievalTask(*key, options.noise_px, keypoints, protocol)
                 for keypoints in options.keypoints
                 if keypoints <= most
                 for protocol in (LEAVE_IN, LEAVE_OUT)
@@ -215,39 +201,33 @@ class RetrievalQueries(Setting):
         (task, query), library, first = instance, opened_library(self.library), matches[0]
         gt = library[task.category, task.model_id]
         alike = same_shapes(library, gt.key)
-        best = library[first.category, first.model_id]
-        boxes = {"est": first.box, "gt": Box.from_model(gt.bounds, query.gt)}
+        gt_box = Box.from_model(gt.bounds, query.gt)
         keys = [(match.category, match.model_id) for match in matches]
         ranks = (rank for rank, key in enumerate(keys, start=1) if key in alike)
+        best = library[first.category, first.model_id]
         return {
-            "alike": len(alike),
             "rank": next(ranks, None),
-            "matched_category": first.category,
             "matched_id": first.model_id,
             "score": first.score,
             "none_probability": first.none_probability,
             "shared": first.shared,
             "rms_px": first.rms,
-            "shape_distance": shape_distance(best, gt) if best.category == gt.category else None,
-            "box_iou": overlap(**boxes),
-            "box_iou_up_to_scale": overlap_up_to_scale(**boxes),
+            "shape_distance": shape_distance(best, gt),
+            "box_iou": overlap(est=first.box, gt=gt_box),
+            "box_iou_up_to_scale": overlap(est=first.box, gt=gt_box, up_to_scale=True),
             "rotation_error_deg": rotation_error(est=first.alignment, gt=query.gt),
         }
 
 
 def retrieval_benchmark(library: str, options: RetrievalRunOptions) -> Benchmark:
-    """The methods of the options on queries of a library's file."""
-    how: dict[str, Any] = {"library": library, "options": options}
-    methods = (Method(name, partial(_retrieve, method=name, **how)) for name in options.methods)
-    return Benchmark(RetrievalQueries(library, options), tuple(methods))
+    """Retrieval from a library's file."""
+    method = Method(METHOD, partial(_retrieve, library=library))
+    return Benchmark(RetrievalQueries(library, options), (method,))
 
 
-def _retrieve(
-    instance: RetrievalInstance, *, method: str, library: str, options: RetrievalRunOptions
-) -> list[Match]:
+def _retrieve(instance: RetrievalInstance, *, library: str) -> list[Match]:
     (task, query), opened = instance, opened_library(library)
-    alike = same_shapes(opened, (task.category, task.model_id))
-    is_exact = task.protocol == LEAVE_IN and method == "optimal"
+    leaves_out = task.protocol == LEAVE_OUT
     return opened.retrieve(
         query.points_2d,
         query.ids,
@@ -255,10 +235,9 @@ def _retrieve(
         top=TOP,
         category=task.category,
         sigma=max(task.noise_px, _LEAST_SIGMA),
-        shape_sigma=0.0 if is_exact else _SHAPE_SIGMA,
-        exclude=alike if task.protocol == LEAVE_OUT else (),
+        shape_sigma=_SHAPE_SIGMA if leaves_out else 0.0,
+        exclude=same_shapes(opened, (task.category, task.model_id)) if leaves_out else (),
         workers=1,
-        **_METHODS[method],
     )
 
 
@@ -285,16 +264,9 @@ def same_shapes(library: Library, key: ModelKey) -> frozenset[ModelKey]:
 # Summary ------------------------------------------------------------------------------------------
 
 HEADLINE = (
-    *(metrics.INSTANCES, metrics.FAILED, metrics.RANK_1, metrics.RANK_5, metrics.RECIPROCAL_RANK),
+    *(metrics.INSTANCES, metrics.FAILED, metrics.RANK_1, metrics.RECIPROCAL_RANK),
     *(metrics.NONE, metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
-    *(metrics.MATCH_ROTATION, metrics.QUERY_MILLISECONDS),
-)
-_KEYPOINTS = replace(metrics.KEYPOINTS, label="keypoints in the image", log=False)
-_PLOTS = (
-    (metrics.RANK_1, LEAVE_IN),
-    (metrics.RANK_5, LEAVE_IN),
-    (replace(metrics.BOX_IOU, label="median box IoU"), LEAVE_OUT),
-    (replace(metrics.SHAPE_DISTANCE, label="median shape distance"), LEAVE_OUT),
+    *(metrics.ROTATION, metrics.QUERY_MILLISECONDS),
 )
 
 
@@ -310,55 +282,29 @@ def _of_ranks(statistic: Callable[[FloatArray], FloatArray]) -> Callable[[Group]
 
 _STATISTICS = {
     "rank_1": _of_ranks(lambda ranks: (ranks == 1).astype(float)),
-    "rank_5": _of_ranks(lambda ranks: (ranks <= 5).astype(float)),
     "reciprocal_rank": _of_ranks(lambda ranks: np.nan_to_num(1 / ranks)),
-    "score": mean("score"),
     "none": lambda group: mean_of(known(group.solved["none_probability"]) > 0.5),
     **medians(metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
-    "mean_box_iou": mean("box_iou"),
     "rotation_error_deg": median("rotation_error_deg"),
     "milliseconds": milliseconds,
 }
 
 
 def summarize_queries(run: Run) -> list[Summary]:
-    """A summary for every category, protocol, noise, number of keypoints and method."""
+    """A summary for every category, protocol and number of keypoints."""
     return summarize(
         run,
         _STATISTICS,
-        by=("category", "protocol", "noise_px", "keypoints"),
-        name="{}, {}, {:g} px, {} keypoints".format,
+        by=("category", "protocol", "keypoints"),
+        name="{}, {}, {} keypoints".format,
     )
-
-
-def plots(runs: Sequence[Run]) -> list[Plot]:
-    """Rates and medians against the number of keypoints, over all categories, for each noise."""
-    # All categories together, or the only one, come last.
-    found = [
-        [each for each in summaries if each["category"] == summaries[-1]["category"]]
-        for summaries in map(summarize_queries, runs)
-    ]
-    drawn = []
-    noises = sorted({each["noise_px"] for summaries in found for each in summaries})
-    for (metric, protocol), noise in product(_PLOTS, noises):
-        words = {
-            "id": f"{protocol.replace('-', '_')}_{metric.key}_{noise:g}",
-            "note": "over all categories",
-            "title": f"{metric.label}, {noise:g} px of noise, {protocol}",
-        }
-        chosen = [
-            [s for s in some if (s["protocol"], s["noise_px"]) == (protocol, noise)]
-            for some in found
-        ]
-        drawn.append(plot_against(chosen, _KEYPOINTS, metric, place="keypoints", **words))
-    return drawn
 
 
 _CHUNK = 16
 
 
 def plan(options: RetrievalRunOptions, folder: RunFolder) -> Plan[RetrievalTask]:
-    """Plan a run over the models of a library, which the folder gets as ``library.cadalign``."""
+    """Plan a run over the models of a library, which the folder gets, named after its hash."""
     from cadalign.retrieval.library import Library
 
     if options.root.is_file():
@@ -367,13 +313,9 @@ def plan(options: RetrievalRunOptions, folder: RunFolder) -> Plan[RetrievalTask]
         dataset = KeypointNet(options.root, shapenet_root=options.shapenet)
         library = Library.from_models(dataset.subset(categories=options.categories))
     tasks = retrieval_tasks(library, options)
-    folder.make()
-    file = folder.path / "library.cadalign"
     name = library.fingerprint[:16]
-    claimed = folder.read_config()
-    # One that no run.json speaks of is from a run that died before it began, perhaps another's; the
-    # library of another run, which is to be refused, stays as it is.
-    if claimed is None or claimed.get("library") == name:
+    file = made_folder(folder.path / "library") / f"{name}.cadalign"
+    if not file.is_file():
         library.save(file)
     benchmark = retrieval_benchmark(str(file.absolute()), options)
     return benchmark.plan(options, tasks, chunk=_CHUNK, library=name)
@@ -387,7 +329,6 @@ SPEC = Spec(
     summarize=summarize_queries,
     console=HEADLINE[2:],
     group=lambda run: QUERIES,
-    plots=plots,
     topic="retrieval",
     subject="views of models",
     note=(

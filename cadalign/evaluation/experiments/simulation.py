@@ -8,26 +8,26 @@ problems that a method solved at one value.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, dataclass, fields, replace
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import tyro
 
 from cadalign.arrays import instance_rng
-from cadalign.errors import DataError, InputError, quote, refuse_unused, unknown
+from cadalign.errors import DataError, InputError, quote, unknown
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
 from cadalign.evaluation.methods import Method, MethodInput, pose_of
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.options import FunctionOptions, plain_value
-from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, plot_against
+from cadalign.evaluation.plots import Plot, plot_against
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Columns, Plan, Row
 from cadalign.evaluation.simulation import SimulatedProblem, simulate_problem
-from cadalign.evaluation.summary import Summary, group_name, quartiles, summarize
+from cadalign.evaluation.summary import Summary, group_name, medians, summarize
 from cadalign.geometry.alignment import Alignment
 
 if TYPE_CHECKING:
@@ -93,10 +93,6 @@ class SweepOptions(FunctionOptions):
     """Values of the quantity that is varied, instead of the sweep's own."""
     runs: int | None = None
     """Problems for each value."""
-    points: int | None = None
-    """Number of points, where it is held."""
-    noise_px: float | None = None
-    """Standard deviation of the noise in pixels, where it is held."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -108,15 +104,12 @@ class SweepOptions(FunctionOptions):
             self.replace_values(values=tuple(float(value) for value in self.values))
         self.check_least(runs=1)
         _check_values(self.kind)
-        refuse_unused(self, [self.kind.column], "where it is varied")
 
     @property
     def kind(self) -> SweepKind:
         """The sweep, with what is given in place of its own settings."""
-        names = {field.name for field in fields(SweepKind)}
-        given = {
-            name: value for name, value in vars(self).items() if name in names and value is not None
-        }
+        given = {name: getattr(self, name) for name in ("methods", "values", "runs")}
+        given = {name: value for name, value in given.items() if value is not None}
         return replace(SWEEPS[self.sweep], **given)
 
     @property
@@ -125,28 +118,21 @@ class SweepOptions(FunctionOptions):
         return f"simulate_{self.sweep}"
 
 
-# Quantities that may be varied: a check, a name, and values to give.
-_CHECKS: dict[str, tuple[Callable[[float], bool], str, str]] = {
-    "points": (
-        lambda value: value >= 4 and value == int(value),
-        "a number of points",
-        "give 4 or more",
-    ),
-    "noise_px": (lambda value: 0 <= value < math.inf, "a noise level", "give pixels, 0 or more"),
-    "outlier_share": (lambda value: 0 <= value < 1, "a share", "give 0 to 0.95"),
+# Quantities that may be varied: the least value, the bound above, a name, and values to give.
+_RANGES = {
+    "points": (4, math.inf, "a number of points", "give 4 or more"),
+    "noise_px": (0, math.inf, "a noise level", "give pixels, 0 or more"),
+    "outlier_share": (0, 1, "a share", "give 0 to 0.95"),
 }
 
 
 def _check_values(kind: SweepKind) -> None:
     if not kind.values:
         raise InputError("none is given", where="values")
-    settings = {column: (getattr(kind, column),) for column in _CHECKS}
-    for column, values in {**settings, kind.column: kind.values}.items():
-        valid, what, fix = _CHECKS[column]
-        for value in values:
-            if not valid(value):
-                where = "values" if column == kind.column else column
-                raise InputError(f"{value:g} is not {what}", where=where, fix=fix)
+    least, bound, what, fix = _RANGES[kind.column]
+    for value in kind.values:
+        if not least <= value < bound or (kind.column == "points" and value != int(value)):
+            raise InputError(f"{value:g} is not {what}", where="values", fix=fix)
 
 
 ERRORS = (metrics.ROTATION, metrics.TRANSLATION_IN_UNITS, metrics.SCALE_Y, metrics.SCALE_Z)
@@ -231,17 +217,16 @@ def varied(run: Run) -> Metric:
 
 
 def summarize_sweep(run: Run) -> list[Summary]:
-    """Quartiles of every metric for every value and method, over the problems that are solved."""
-    statistics = {metric.key: quartiles(metric.key) for metric in (*ERRORS, *run.metrics)}
+    """Medians of every metric for every value and method, over the problems that are solved."""
     name = partial(group_name, varied(run))
-    return summarize(run, statistics, by=(kind_of(run).column,), name=name)
+    return summarize(run, medians(*ERRORS), by=(kind_of(run).column,), name=name)
 
 
 def plots(runs: Sequence[Run]) -> list[Plot]:
     """Errors against the quantity that is varied."""
     x, found = varied(runs[0]), [summarize_sweep(run) for run in runs]
     return [
-        plot_against(found, x, metric, place=x.key, note=QUARTILES_NOTE)
+        plot_against(found, x, metric, place=x.key, note="medians")
         for metric in (*ERRORS, *runs[0].metrics)
     ]
 

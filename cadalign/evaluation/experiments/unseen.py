@@ -11,17 +11,15 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
 from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import VIEW_NAMES
-from cadalign.evaluation.experiments.retrieval import opened_library
 from cadalign.evaluation.methods import LIMIT, SHAPE
 from cadalign.evaluation.options import ViewOptions
-from cadalign.evaluation.plots import Plot, cumulative_curves, share_traces
+from cadalign.evaluation.plots import cumulative_curves
 from cadalign.evaluation.registry import Spec
-from cadalign.evaluation.runs.work import Columns, Plan
+from cadalign.evaluation.runs.work import Columns, Plan, fingerprint
 from cadalign.evaluation.summary import (
     Group,
     known,
@@ -29,7 +27,6 @@ from cadalign.evaluation.summary import (
     mean_of,
     medians,
     milliseconds,
-    percentile,
     summarize,
 )
 from cadalign.io.files import made_folder
@@ -37,27 +34,22 @@ from cadalign.io.files import made_folder
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.instance import KeypointTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.tables import Cells, Run
-    from cadalign.retrieval.library import Library
     from cadalign.shapes.model import ShapeModel
 
 logger = logging.getLogger("cadalign")
 
-METHODS = (
-    *("random-rigid", "random-stretched", "nearest", "mean-rigid", "mean-stretched"),
-    *(SHAPE, "exact", LIMIT),
-)
+METHODS = ("mean-rigid", "mean-stretched", SHAPE, "exact", LIMIT)
 
 
 @dataclass(frozen=True)
 class UnseenOptions(ViewOptions):
     """Evaluate alignment to objects that are no stretched copy of any model.
 
-    Objects of one split of KeypointNet are aligned with models of the other split, by
-    category: another model, the nearest one of a library, the mean shape, or the learned shape
-    model; and, for comparison, with the object's own model. The run's folder gets results.parquet
-    with a row per object, view and method, summary.csv, figures, report.html and the learned
-    shapes. A killed run continues when the same command is started again.
+    Objects of one split of KeypointNet are aligned with what is learned of their category from
+    the models of the other split: the mean shape, or the shape model; and, for comparison, with the
+    object's own model. The run's folder gets results.parquet with a row per object, view and
+    method, summary.csv, figures, report.html and the learned shapes. A killed run continues when
+    the same command is started again.
     """
 
     experiment = "unseen"
@@ -72,13 +64,9 @@ class UnseenOptions(ViewOptions):
     """Standard deviation of the keypoints' noise, in pixels."""
     keypoints: int | None = None
     """Number of keypoints that are given, drawn at random; all by default."""
-    outliers: float = 0.0
-    """Share of the given keypoints that are moved to anywhere in the image; methods then search
-    for those that agree."""
     methods: tuple[str, ...] = METHODS
-    """random-rigid, random-stretched: a random model of the category; nearest: the best of the
-    library; mean-rigid, mean-stretched: the category's mean; shape: its shape model; exact: the
-    object's own model, stretched; limit: the Cramer-Rao bound of the latter."""
+    """mean-rigid, mean-stretched: the category's mean; shape: its shape model; exact: the object's
+    own model, stretched; limit: the Cramer-Rao bound of the latter."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -86,23 +74,20 @@ class UnseenOptions(ViewOptions):
             what, fix = f"both are {self.split!r}", "objects must not be among the models"
             raise InputError(what, where="split, train", fix=fix)
         self.check_least(keypoints=1)
-        if not 0 <= self.outliers < 1:
-            raise InputError(f"{self.outliers} is not a share below 1", where="outliers")
         self.check_methods(METHODS)
 
 
 COLUMNS: Columns = (
     *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int)),
-    *(("rotation_error_deg", float), ("best_rotation_error_deg", float)),
-    *(("translation_error", float), ("translation_error_up_to_scale", float), ("box_iou", float)),
+    *(("rotation_error_deg", float), ("translation_error", float)),
+    *(("translation_error_up_to_scale", float), ("box_iou", float)),
     *(("box_iou_up_to_scale", float), ("keypoint_error", float)),
     *(("rotation_level", float), ("stretch_level", float)),
     *(("keypoints_within_68", float), ("keypoints_within_95", float)),
 )
 """Columns of the result table; see docs/formats/runs.md."""
 _MEDIANS = (
-    *(metrics.ROTATION, metrics.BEST_ROTATION),
-    *(metrics.TRANSLATION, metrics.TRANSLATION_UP_TO_SCALE),
+    *(metrics.ROTATION, metrics.TRANSLATION, metrics.TRANSLATION_UP_TO_SCALE),
     *(metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE, metrics.KEYPOINT_ERROR),
 )
 _COVERAGE = (
@@ -111,8 +96,8 @@ _COVERAGE = (
     *(metrics.KEYPOINTS_IN_68, metrics.KEYPOINTS_IN_95),
 )
 HEADLINE = (
-    *(metrics.INSTANCES, metrics.FAILED, metrics.KEYPOINTS, metrics.ROTATION, metrics.ROTATION_90),
-    *(*_MEDIANS[1:], *_COVERAGE, metrics.QUERY_MILLISECONDS),
+    *(metrics.INSTANCES, metrics.FAILED, metrics.KEYPOINTS, *_MEDIANS, *_COVERAGE),
+    metrics.QUERY_MILLISECONDS,
 )
 
 
@@ -124,7 +109,6 @@ def _within(level: str, nominal: float) -> Callable[[Group], float]:
 _STATISTICS = {
     "keypoints": mean("keypoints"),
     **medians(*_MEDIANS),
-    "rotation_error_deg_90": percentile("rotation_error_deg", 90),
     **{
         f"{name}_in_{percent}": _within(f"{name}_level", percent / 100)
         for name in ("rotation", "stretch")
@@ -134,8 +118,7 @@ _STATISTICS = {
     "milliseconds": milliseconds,
 }
 _CONSOLE = (
-    *(metrics.INSTANCES, metrics.FAILED),
-    *(replace(metrics.ROTATION, digits=2), replace(metrics.ROTATION_90, digits=1)),
+    *(metrics.INSTANCES, metrics.FAILED, replace(metrics.ROTATION, digits=2)),
     *(replace(metrics.TRANSLATION_UP_TO_SCALE, digits=3), metrics.BOX_IOU_UP_TO_SCALE),
     *(replace(metrics.KEYPOINT_ERROR, digits=3), *_COVERAGE, metrics.QUERY_MILLISECONDS),
 )
@@ -143,84 +126,45 @@ _CURVES = (
     (metrics.ROTATION, np.array([0.5, 1, 2, 3, 5, 7.5, 10, 15, 20, 30])),
     (replace(metrics.BOX_IOU_UP_TO_SCALE, log=False), np.arange(0, 1.01, 0.1)),
 )
-_LEVELS = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.68, 0.8, 0.9, 0.95, 0.99])
-_CALIBRATED = (("rotation_level", "rotation"), ("stretch_level", "stretch"))
 
-
-def plots(runs: Sequence[Run]) -> list[Plot]:
-    """Shares of objects within an error, and of truths within stated regions, by method."""
-    curves = cumulative_curves(runs, curves=_CURVES, of="of unseen objects")
-    return [*curves, *(_calibration(runs, column, name) for column, name in _CALIBRATED)]
-
-
-def _calibration(runs: Sequence[Run], column: str, name: str) -> Plot:
-    def shares(rows: Cells) -> FloatArray | None:
-        levels = known(rows[column])
-        return (levels <= _LEVELS[:, None]).mean(axis=1) if len(levels) else None
-
-    return Plot(
-        id=f"calibration_{name}",
-        x=metrics.NOMINAL,
-        y=metrics.COVERED,
-        traces=share_traces(runs, 100 * _LEVELS, shares),
-        note="over all categories; uncertainties are right where both are equal",
-        title=f"Calibration of the {name}",
-    )
-
-
-# Learned models ----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class LearnedFiles:
-    """Folder of shape models by category and of a library; small: workers open what they need."""
-
-    folder: Path
-
-    def shape(self, category: str) -> ShapeModel:
-        """The shape model of a category."""
-        return _open_shape(self.folder / f"{category}.shape")
-
-    def library(self) -> Library:
-        """The library."""
-        return opened_library(self.folder / "library.cadalign")
+# Learned shapes -----------------------------------------------------------------------------------
 
 
 @lru_cache(maxsize=32)
-def _open_shape(path: Path) -> ShapeModel:
+def learned_shape(folder: Path, category: str) -> ShapeModel:
+    """The shape model of a category, read once in every process."""
     from cadalign.shapes.model import ShapeModel
 
-    return ShapeModel.open(path)
+    return ShapeModel.open(folder / f"{category}.shape")
 
 
 def learn(
     dataset: KeypointNet, categories: Sequence[str], *, split: str, folder: RunFolder
-) -> LearnedFiles:
-    """Learn from the models of a split, or find in a folder what was learned from them before.
+) -> Path:
+    """Learn shapes from the models of a split, or find in a folder what was learned before.
 
     Boxes are those of the keypoints. The files' folder is named after a hash of the models, so that
     those of other models are neither used nor overwritten.
 
     Raises InputError if there is no such split, or a category has too few models in it.
     """
-    from cadalign.retrieval.library import Library
-    from cadalign.retrieval.models import LibraryModel
     from cadalign.shapes.model import ShapeModel
 
     train = dataset.subset(categories=categories, split=split)
-    models = [model for category in categories for model in train[category]]
-    library = Library.from_models(
-        [LibraryModel.of_annotated(model, with_mesh=False) for model in models]
+    models = {category: list(train[category]) for category in categories}
+    parts = (
+        part
+        for category in categories
+        for model in models[category]
+        for part in (category, model.model_id, model.keypoints.ids, model.keypoints.xyz)
     )
-    place = made_folder(folder.path / "learned" / library.fingerprint[:16])
+    place = made_folder(folder.path / "learned" / fingerprint(*parts))
     for category in categories:
         file = place / f"{category}.shape"
         if not file.is_file():
-            logger.info("learning the shape of %s from %d models", category, len(train[category]))
+            logger.info("learning the shape of %s from %d models", category, len(models[category]))
             ShapeModel.from_dataset(dataset, category, split=split, meshes=False).save(file)
-    if not (place / "library.cadalign").is_file():
-        library.save(place / "library.cadalign")
-    return LearnedFiles(place.absolute())
+    return place.absolute()
 
 
 _CHUNK = 8
@@ -234,7 +178,7 @@ def plan(options: UnseenOptions, folder: RunFolder) -> Plan[KeypointTask]:
     tasks = unseen_tasks(dataset, options)
     categories = sorted({category for category, _ in tasks.keys})
     learned = learn(dataset, categories, split=options.train, folder=folder)
-    hashes = {"annotations": tasks.fingerprint(), "learned": learned.folder.name}
+    hashes = {"annotations": tasks.fingerprint(), "learned": learned.name}
     benchmark = unseen_benchmark(learned, options)
     return benchmark.plan(options, tasks, chunk=_CHUNK, **hashes)
 
@@ -247,7 +191,7 @@ SPEC = Spec(
     summarize=partial(summarize, statistics=_STATISTICS),
     console=_CONSOLE,
     console_note="lengths in model diagonals; scaled: about the camera centre",
-    plots=plots,
+    plots=partial(cumulative_curves, curves=_CURVES, of="of unseen objects"),
     topic="unseen objects",
     subject="views of objects that are no stretched copy of any model",
     metrics=_MEDIANS,

@@ -25,7 +25,7 @@ from cadalign.datasets import AnnotatedModel, KeypointNet, check_solid
 from cadalign.datasets.keypoints import annotated_symmetry
 from cadalign.errors import CadalignError, TooFewVisibleError
 from cadalign.evaluation.runs.work import Row
-from cadalign.geometry.alignment import Alignment, Box
+from cadalign.geometry.alignment import Alignment, Box, extent
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import perspective
 from cadalign.geometry.symmetry import Symmetry
@@ -58,7 +58,7 @@ class KeypointHull:
     @cached_property
     def bounds(self) -> FloatArray:
         """The keypoints' lowest and highest coordinates, (2, 3) float."""
-        return np.array([self.xyz.min(axis=0), self.xyz.max(axis=0)])
+        return extent(self.xyz)
 
     def visible_from(self, position: FloatArray) -> BoolArray:
         """Mask (k,) of the keypoints that count as visible from a place (3,) of the model."""

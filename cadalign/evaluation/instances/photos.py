@@ -42,7 +42,6 @@ from cadalign.evaluation.instances.record import (
     RECORD_COLUMNS,
     Estimate,
     aligned_shape,
-    box_alignment,
     record_of,
     record_stem,
 )
@@ -54,14 +53,12 @@ from cadalign.evaluation.instances.sighting import (
     sight,
     targets_of,
 )
-from cadalign.evaluation.methods import SHAPE, Method, MethodInput
-from cadalign.evaluation.metrics.photos import score_alignment
+from cadalign.evaluation.methods import Method, MethodInput
 from cadalign.evaluation.options import is_function
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import LeftOutError, Outcome, Row
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.mesh import Mesh
-from cadalign.shapes.model import ShapeModel
 
 # Evidence about the model's outline, which needs a mesh.
 _OUTLINED = frozenset({MASK, IMAGE})
@@ -83,13 +80,11 @@ class PhotoEstimate:
     result: Result | None = None  # with shape and covariances
 
 
-def estimate_object(
-    sighting: Sighting, *, method: str, shapes: Collection[ShapeModel]
-) -> PhotoEstimate:
+def estimate_object(sighting: Sighting, *, method: str) -> PhotoEstimate:
     """The estimate of a method by name; see `PhotosOptions.methods`.
 
-    ``shapes`` are models of the categories that they name. Raises LeftOutError if the object lacks
-    what the method needs; and CadalignError if there is no estimate.
+    Raises LeftOutError if the object lacks what the method needs; and CadalignError if there is no
+    estimate.
     """
     base, evidence = parts_of(method)
     if base == TRUTH:
@@ -98,11 +93,9 @@ def estimate_object(
             raise LeftOutError("the true pose is not known")
         return PhotoEstimate(gt, box)
     if base == EPNP:
-        points = sighting.points_3d * sighting.width
-        found = fit(points, sighting.points_2d, sighting.camera, method="epnp")
+        given = sighting.given
+        found = fit(given.points_3d, given.points_2d, given.camera, method="epnp")
         return estimate_of_model(found.alignment, sighting)
-    if base == SHAPE:
-        return _of_shape(sighting, shapes, evidence)
     model = _model(base, sighting, with_mesh=bool(_OUTLINED & evidence))
     result = align(model, _view(sighting, evidence))
     return estimate_of_model(result.alignment, sighting, result)
@@ -116,13 +109,12 @@ def _model(base: str, sighting: Sighting, *, with_mesh: bool) -> Model:
     elif base == PRIOR:
         kind = {"stretch_sigma": SIMILAR_SCALE_SIGMA}
     elif base == SIMILAR:
-        diagonal = float(np.linalg.norm(np.ptp(bounds, axis=0)))
-        kind = {"shape_sigma": _SIMILAR_SIGMA * diagonal}
+        kind = {"shape_sigma": _SIMILAR_SIGMA * float(np.linalg.norm(np.ptp(bounds, axis=0)))}
     if with_mesh:
-        cad = sighting.target.cad
-        if cad is None or cad.scene is None:
+        scene = sighting.target.scene
+        if scene is None:
             raise LeftOutError("the model has no mesh for the mask")
-        kind["mesh"] = Mesh(cad.scene.mesh.vertices * width, cad.scene.mesh.faces)
+        kind["mesh"] = Mesh(scene.mesh.vertices * width, scene.mesh.faces)
     return Model(
         points_3d=sighting.model.xyz * width,
         ids=sighting.model.names,
@@ -132,7 +124,7 @@ def _model(base: str, sighting: Sighting, *, with_mesh: bool) -> Model:
     )
 
 
-def _view(sighting: Sighting, evidence: Collection[str], *, rows: Any = slice(None)) -> View:
+def _view(sighting: Sighting, evidence: Collection[str]) -> View:
     photo, found = sighting.target.photo, sighting.target.found
     given: dict[str, Any] = {}
     if MASK in evidence:
@@ -147,9 +139,8 @@ def _view(sighting: Sighting, evidence: Collection[str], *, rows: Any = slice(No
         if photo.image is None:
             raise LeftOutError("the image is not there")
         given["image"] = photo.read_image()
-    names = tuple(np.array(sighting.names)[rows].tolist())
-    pixels = sighting.points_2d[rows]
-    return View(sighting.camera, pixels, ids=names, sigma=sighting.sigma, **given)
+    seen = sighting.given
+    return View(seen.camera, seen.points_2d, ids=sighting.names, sigma=seen.sigma, **given)
 
 
 def estimate_of_model(
@@ -160,33 +151,6 @@ def estimate_of_model(
     box = Box.from_model(bounds, found)
     alignment = Alignment(found.rotation, found.translation, found.scale * sighting.width)
     return PhotoEstimate(alignment, box, result)
-
-
-def _of_shape(
-    sighting: Sighting, shapes: Collection[ShapeModel], evidence: Collection[str]
-) -> PhotoEstimate:
-    category = sighting.target.found.category
-    shape = next((each for each in shapes if each.category == category), None)
-    if shape is None:
-        raise LeftOutError(f"there is no shape model of {category}")
-    if _OUTLINED & frozenset(evidence):
-        raise LeftOutError("a shape model has no mesh for the mask")
-    if GRAVITY in evidence and shape.up_axis is None:
-        raise LeftOutError("the shape model has no up axis for gravity")
-    known = np.isin(sighting.names, [str(name) for name in shape.ids])
-    if not known.any():
-        raise LeftOutError("the shape model has none of the keypoints")
-    view = _view(sighting, evidence, rows=known)
-    result = align(shape, view)
-    factor = 1.0
-    if shape.unit != "m" and sighting.target.gt is not None:  # the object's width is known
-        wanted = float(np.ptp(sighting.bounds[:, 0])) * sighting.width
-        factor = wanted / float(result.box.extents[0])
-    # Scaled about the camera centre.
-    found, shift = result.alignment, result.alignment.translation * factor
-    moved = Alignment(found.rotation, shift, found.scale * factor)
-    alignment = box_alignment(moved, result.bounds, model_bounds=sighting.bounds)
-    return PhotoEstimate(alignment, Box.from_model(result.bounds, moved), result)
 
 
 # Setting ------------------------------------------------------------------------------------------
@@ -214,21 +178,14 @@ class PhotoObjects(Setting):
 
     def _case(self, target: PhotoTarget) -> Case:
         protocol = protocol_of(opened(self.options.root).kind)
-        sighting = attempt(partial(sight, target, protocol, sigma=self.options.sigma))
+        sighting = attempt(partial(sight, target, protocol))
         if isinstance(sighting, Exception):
             return Case(target.names, error=sighting)
-        facts = {"keypoints": len(sighting.names), "source": sighting.source}
+        facts = {"keypoints": len(sighting.names)}
         return Case(target.names, facts, sighting)
 
     def given(self, sighting: Sighting) -> MethodInput:
-        return MethodInput(
-            sighting.points_3d * sighting.width,
-            sighting.points_2d,
-            sighting.camera,
-            sighting.sigma,
-            bounds=sighting.bounds * sighting.width,
-            gt=sighting.target.gt,
-        )
+        return sighting.given
 
     def answered(
         self, method: Method, sighting: Sighting, answer: Alignment | Result
@@ -239,8 +196,7 @@ class PhotoObjects(Setting):
         return estimate_of_model(answer.alignment, sighting, answer if is_of_model else None)
 
     def row(self, method: Method, sighting: Sighting, estimate: PhotoEstimate) -> Row:
-        sets = sighting.protocol.metrics
-        scores = score_alignment(sighting.target, sets, estimate.alignment, estimate.box)
+        scores = sighting.protocol.score(sighting.target, estimate.alignment, estimate.box)
         return {"rms_px": _rms(estimate, sighting)} | scores
 
     def finish(self, case: Case, outcomes: list[Outcome], estimates: list[Any]) -> str | None:
@@ -253,22 +209,20 @@ class PhotoObjects(Setting):
         return record_of(
             outcomes,
             [_described(each, sighting) for each in estimates],
-            camera=sighting.camera,
+            camera=sighting.given.camera,
             gt=sighting.target.gt,
             stretch=np.ones(3),
             bounds=sighting.bounds,
             points_3d=sighting.points_3d,
-            points_2d=sighting.points_2d,
+            points_2d=sighting.given.points_2d,
             ids=np.arange(len(sighting.names)),
         )
 
 
-def photos_benchmark(
-    options: PhotosOptions, shapes: tuple[ShapeModel, ...], drawn_in: RunFolder
-) -> Benchmark:
+def photos_benchmark(options: PhotosOptions, drawn_in: RunFolder) -> Benchmark:
     """The methods of the options on objects in photos."""
     own = {
-        name: Method(name, partial(estimate_object, method=name, shapes=shapes))
+        name: Method(name, partial(estimate_object, method=name))
         for name in options.methods
         if not is_function(name)
     }
@@ -282,7 +236,7 @@ def _rms(found: PhotoEstimate, sighting: Sighting) -> float | None:
         residuals = found.result.residuals
     else:
         points = found.alignment.apply(sighting.points_3d)
-        residuals = sighting.camera.project_where_ahead(points) - sighting.points_2d
+        residuals = sighting.given.camera.project_where_ahead(points) - sighting.given.points_2d
     rms = float(np.sqrt((residuals**2).sum(axis=1).mean())) if len(residuals) else np.nan
     return rms if np.isfinite(rms) else None
 
@@ -294,15 +248,13 @@ def _described(estimate: PhotoEstimate | Any, sighting: Sighting) -> Estimate | 
     result, model = estimate.result, sighting.model
     if result is None:
         return estimate.alignment
-    row_of = {str(name): row for row, name in enumerate(result.ids)}
-    known = [row for row, name in enumerate(model.names) if name in row_of]
     return aligned_shape(
         result,
-        [row_of[model.names[row]] for row in known],
-        model.xyz[known],
+        np.arange(len(model)),
+        model.xyz,
         model_bounds=sighting.bounds,
-        rms=result.rms,
-        sigma=sighting.sigma,
+        sigma=sighting.given.sigma,
+        result=result,
     )
 
 
@@ -311,13 +263,13 @@ def draw_sighting(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate
 
     The photo is grey where there is none.
     """
-    names, camera, cad = sighting.target.names, sighting.camera, sighting.target.cad
+    names, camera, scene = sighting.target.names, sighting.given.camera, sighting.target.scene
     stem = record_stem(names["category"], names["model_id"])
     try:
         photo = sighting.target.photo.read_image()
     except DataError:
         photo = np.full((camera.height, camera.width, 3), NO_PHOTO, dtype=np.uint8)
     boxes = {"gt_box": sighting.target.gt_box, "est_box": estimate.box}
-    write_pictures(folder, stem, photo, camera, observed=sighting.points_2d, **boxes)
-    if cad is not None and cad.scene is not None:
-        write_preview(folder.previews / f"{stem}.json", cad.scene.mesh)
+    write_pictures(folder, stem, photo, camera, observed=sighting.given.points_2d, **boxes)
+    if scene is not None:
+        write_preview(folder.previews / f"{stem}.json", scene.mesh)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import FloatArray
 from cadalign.errors import RenderError
 from cadalign.evaluation.instances.instance import Instance
 from cadalign.evaluation.instances.record import record_stem
@@ -140,39 +140,14 @@ _FINEST = 1 << 15  # cells along the longest side: the steps of 16-bit coordinat
 _CREASE_DEG = 30.0
 
 
-@dataclass(frozen=True, eq=False)
-class MeshPreview:
-    """A simplified model [model units].
-
-    ``edges`` are pairs of vertices for a wireframe: parts too thin for triangles, creases and
-    borders.
-    """
-
-    vertices: FloatArray
-    faces: IntArray
-    edges: IntArray
-
-    def to_dict(self) -> dict[str, Any]:
-        """The preview for JSON: arrays as base64, little-endian; vertex = lo + step * uint16."""
-        placed = self.vertices if len(self.vertices) else np.zeros((1, 3))
-        low = placed.min(axis=0)
-        step = np.maximum(np.ptp(placed, axis=0), 1e-12) / (2 * _FINEST - 1)
-        wide = len(self.vertices) > 2 * _FINEST
-        index = "<u4" if wide else "<u2"
-        return {
-            "lo": low.tolist(),
-            "step": step.tolist(),
-            "vertices": _base64(np.round((self.vertices - low) / step), "<u2"),
-            "faces": _base64(self.faces, index),
-            "edges": _base64(self.edges, index),
-            "wide": wide,
-        }
-
-
 def preview_of(
     mesh: Mesh, *, max_faces: int = _MOST_PARTS, max_edges: int = _MOST_PARTS
-) -> MeshPreview:
-    """Simplify a mesh to at most so many triangles and lines, by merging vertices on a grid."""
+) -> dict[str, Any]:
+    """Simplify a mesh to at most so many triangles and lines, by merging vertices on a grid.
+
+    Returns arrays for JSON as base64, little-endian: vertex = lo + step * uint16. ``edges`` are
+    pairs of vertices for a wireframe: parts too thin for triangles, creases and borders.
+    """
     small = cluster(mesh, cells=_FINEST)
     if len(small.faces) > max_faces:
         small = simplify(mesh, max_faces=max_faces)
@@ -180,13 +155,24 @@ def preview_of(
     creases = edges.ends[edges.creased]
     length = np.linalg.norm(small.vertices[creases[:, 0]] - small.vertices[creases[:, 1]], axis=1)
     longest = creases[np.argsort(-length, kind="stable")]
-    lines = np.concatenate([small.wires, longest])[:max_edges]
-    return MeshPreview(small.vertices, small.faces, lines)
+    placed = small.vertices if len(small.vertices) else np.zeros((1, 3))
+    low = placed.min(axis=0)
+    step = np.maximum(np.ptp(placed, axis=0), 1e-12) / (2 * _FINEST - 1)
+    wide = len(small.vertices) > 2 * _FINEST
+    index = "<u4" if wide else "<u2"
+    return {
+        "lo": low.tolist(),
+        "step": step.tolist(),
+        "vertices": _base64(np.round((small.vertices - low) / step), "<u2"),
+        "faces": _base64(small.faces, index),
+        "edges": _base64(np.concatenate([small.wires, longest])[:max_edges], index),
+        "wide": wide,
+    }
 
 
 def write_preview(path: Path, mesh: Mesh) -> None:
     """Write a preview of a mesh as JSON."""
-    write_text(path, dense_json(preview_of(mesh).to_dict()))
+    write_text(path, dense_json(preview_of(mesh)))
 
 
 def _base64(values: npt.NDArray[Any], kind: str) -> str:

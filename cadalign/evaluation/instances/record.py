@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -16,10 +16,9 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import Warnings
 from cadalign.evaluation.methods import pose_of
 from cadalign.evaluation.runs.work import Columns, Outcome
-from cadalign.geometry.alignment import Alignment, Uncertainty
+from cadalign.geometry.alignment import Alignment, extent
 from cadalign.geometry.camera import Camera
 
 RECORD_COLUMNS: Columns = (("category", str), ("model_id", str), ("view", int), ("exhibit", str))
@@ -37,7 +36,7 @@ _LEAST_SCALE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class AlignedShape:
-    """The estimate of an object's own shape, or an alternative to it, for an instance's record.
+    """The estimate of an object's own shape, for an instance's record.
 
     ``source`` (k, 3) are keypoints of the given model, ``target`` (k, 3) their places on the
     estimated object, in the model's coordinates: the alignment takes both into the camera's.
@@ -46,12 +45,8 @@ class AlignedShape:
     alignment: Alignment  # takes the box of the model that methods are given to the estimated one
     source: FloatArray
     target: FloatArray
-    rms: float = np.nan  # of the residuals [px]
-    sigma: float = np.nan  # standard deviation of the keypoints [px]
-    std: Uncertainty | None = None  # None for a method that states none
-    warnings: Warnings = ()
-    alternatives: tuple[AlignedShape, ...] = ()
-    relative_likelihood: float = 1.0  # of an alternative
+    sigma: float  # standard deviation of the keypoints [px]
+    result: Result | None  # None for a method that states no uncertainties
 
 
 Estimate = Result | AlignedShape | Alignment | Exception
@@ -65,30 +60,21 @@ def aligned_shape(
     source: FloatArray,
     *,
     model_bounds: FloatArray,
+    sigma: float,
+    result: Result | None,
     spans_points: bool = False,
-    **more: Any,
 ) -> AlignedShape:
     """An estimate of pose and shape in terms of a model, with what remains of the shape as a warp.
 
-    ``found`` is a result, an alternative to it or another estimate with an ``alignment``,
-    ``points_3d`` and ``bounds``; ``rows`` are those of the estimated keypoints that the model has
-    at the places ``source``. The estimated box is theirs where it ``spans_points``. ``more`` are
-    further fields.
+    ``found`` is a result or another estimate with an ``alignment``, ``points_3d`` and ``bounds``;
+    ``rows`` are those of the estimated keypoints that the model has at the places ``source``. The
+    estimated box is theirs where it ``spans_points``.
     """
-    points, bounds = found.points_3d[rows], found.bounds
-    if spans_points:
-        bounds = np.stack([points.min(axis=0), points.max(axis=0)])
+    points = found.points_3d[rows]
+    bounds = extent(points) if spans_points else found.bounds
     alignment = box_alignment(found.alignment, bounds, model_bounds=model_bounds)
     target = alignment.inverse(found.alignment.apply(points))
-    shape = AlignedShape(alignment, source, target, **more)
-    if not isinstance(found, Result):
-        return shape
-    how: dict[str, Any] = {"model_bounds": model_bounds, "spans_points": spans_points}
-    alternatives = tuple(
-        aligned_shape(other, rows, source, relative_likelihood=other.relative_likelihood, **how)
-        for other in found.alternatives
-    )
-    return replace(shape, std=found.std, warnings=found.warnings, alternatives=alternatives)
+    return AlignedShape(alignment, source, target, sigma, result)
 
 
 def box_alignment(
@@ -149,22 +135,20 @@ def _described(outcome: Outcome, estimate: Estimate) -> dict[str, Any]:
     method = outcome.names["method"]
     if not outcome.is_ok or isinstance(estimate, Exception):
         return {"method": method, "reason": outcome.reason}
-    fit = None if isinstance(estimate, Alignment) else estimate
+    result = estimate if isinstance(estimate, Result) else getattr(estimate, "result", None)
     # The residual of the result table, or else the estimate's own.
-    rms = outcome.values.get("rms_px")
-    if rms is None and isinstance(estimate, AlignedShape):
-        rms = estimate.rms
+    rms = outcome.values.get("rms_px", None if result is None else result.rms)
     return {
         "method": method,
         **_pose(pose_of(estimate)),
         **_warp(estimate),
         "rms_px": None if rms is None or not np.isfinite(rms) else round(rms, _PIXEL_DIGITS),
-        "sigma": None if fit is None else fit.sigma,
-        "std": None if fit is None or fit.std is None else vars(fit.std),
-        "warnings": [] if fit is None else [each.text for each in fit.warnings],
+        "sigma": getattr(estimate, "sigma", None),
+        "std": None if result is None or result.std is None else vars(result.std),
+        "warnings": [] if result is None else [each.text for each in result.warnings],
         "alternatives": [
-            {**_pose(other.alignment), **_warp(other), "likelihood": other.relative_likelihood}
-            for other in (() if fit is None else fit.alternatives)
+            {**_pose(other.alignment), "likelihood": other.relative_likelihood}
+            for other in (estimate.alternatives if isinstance(estimate, Result) else ())
         ],
     }
 

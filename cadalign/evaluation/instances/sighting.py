@@ -22,6 +22,7 @@ from cadalign.datasets.photo import (
 from cadalign.errors import DataError
 from cadalign.estimation.fit import fit
 from cadalign.evaluation.benchmark import Case
+from cadalign.evaluation.methods import MethodInput
 from cadalign.evaluation.metrics.photos import Protocol
 from cadalign.evaluation.runs.work import (
     UNREADABLE,
@@ -30,13 +31,13 @@ from cadalign.evaluation.runs.work import (
     fingerprint,
     fingerprint_of_files,
 )
-from cadalign.geometry.alignment import Alignment, Box
+from cadalign.geometry.alignment import Alignment, Box, extent
 from cadalign.geometry.camera import Camera
 from cadalign.render.scene import Scene
 
 _KEPT = 16
-ANNOTATED = "annotated"
 _LEAST_KEYPOINTS = 6
+_SIGMA_OF_SIDE = 1 / 64  # of the rectangle's longer side: networks' heatmaps have 64 cells
 _LEAST_PX = 0.5  # a standard deviation that keypoints are given at least
 _FOCAL_PRIOR = 0.2  # of the logs of scales, while the focal length is estimated
 
@@ -81,33 +82,16 @@ def reopened(root: Path) -> PhotoDataset:
 
 
 @dataclass(frozen=True)
-class Cad:
-    """A CAD model of the data set in a folder."""
+class _Cad:
+    """A CAD model by its name, for which its mesh is kept."""
 
-    root: str  # the folder
+    root: str
     model_id: str
-    model: CadModel = field(compare=False, repr=False)  # where it is read from
-
-    @property
-    def scene(self) -> Scene | None:
-        """The mesh; None if there is none that can be read."""
-        return _scene(self)
-
-    @property
-    def bounds(self) -> FloatArray | None:
-        """The bounding box (2, 3): the annotation's, the mesh's or that of the keypoints."""
-        if self.model.bounds is not None:
-            return np.asarray(self.model.bounds)
-        if self.scene is not None:
-            return np.asarray(self.scene.bounds)
-        points = self.model.load_keypoints()
-        return (
-            None if points is None else np.array([points.xyz.min(axis=0), points.xyz.max(axis=0)])
-        )
+    model: CadModel = field(compare=False)
 
 
 @lru_cache(maxsize=_KEPT)
-def _scene(cad: Cad) -> Scene | None:
+def _scene(cad: _Cad) -> Scene | None:
     try:
         scene = Scene(cad.model.load_mesh())
     except DataError:
@@ -125,15 +109,21 @@ class PhotoTarget:
     is_shown: bool = False  # its pictures are drawn
 
     @property
-    def cad(self) -> Cad | None:
-        """The CAD model."""
+    def scene(self) -> Scene | None:
+        """The mesh of the CAD model; None if there is none that can be read."""
         model = self.found.model
-        return None if model is None else Cad(self.root, model.model_id, model)
+        return None if model is None else _scene(_Cad(self.root, model.model_id, model))
 
     @property
     def bounds(self) -> FloatArray | None:
-        """The box (2, 3) of the CAD model."""
-        return None if self.cad is None else self.cad.bounds
+        """The box (2, 3) of the CAD model: the annotation's, the mesh's or its keypoints'."""
+        model = self.found.model
+        if model is None or model.bounds is not None:
+            return None if model is None else np.asarray(model.bounds)
+        if self.scene is not None:
+            return np.asarray(self.scene.bounds)
+        points = model.load_keypoints()
+        return None if points is None else extent(points.xyz)
 
     @property
     def gt(self) -> Alignment | None:
@@ -189,13 +179,10 @@ def targets_of(task: PhotoTask, root: Path, *, pictures: int) -> list[PhotoTarge
 
 
 def rectangle_of(found: PhotoObject) -> FloatArray:
-    """The object's rectangle [px], or that of its keypoints."""
-    if found.bbox is not None:
-        return found.bbox
-    if found.keypoints is None or not len(found.keypoints):
+    """The object's rectangle [px]."""
+    if found.bbox is None:
         raise LeftOutError("the object's place in the photo is not known")
-    points = found.keypoints.points_2d
-    return np.concatenate([points.min(axis=0), points.max(axis=0)])
+    return found.bbox
 
 
 # What methods are given ---------------------------------------------------------------------------
@@ -206,35 +193,27 @@ class Sighting:
     """The keypoints of an object that methods are given."""
 
     target: PhotoTarget
-    camera: Camera  # with a focal length
-    source: str  # annotated or detected: where the keypoints come from
     names: tuple[str, ...]  # (n,), the given keypoints
-    points_2d: FloatArray  # (n, 2), [px]
-    sigma: float  # their standard deviation [px]
+    points_3d: FloatArray  # (n, 3), their places on the model, in its own unit
     model: NamedPoints  # all keypoints of the model, in its own unit
     bounds: FloatArray  # (2, 3), the model's box, in its own unit
     width: float  # factor of the model's size that gives it the object's width
     protocol: Protocol  # of the data set
-
-    @property
-    def points_3d(self) -> FloatArray:
-        """The given keypoints on the model (n, 3), in its own unit."""
-        row_of = {name: row for row, name in enumerate(self.model.names)}
-        return self.model.xyz[[row_of[name] for name in self.names]]
+    given: MethodInput  # of the model with the object's width
 
 
-def sight(target: PhotoTarget, protocol: Protocol, *, sigma: float | None) -> Sighting:
-    """Collect what methods are given of an object, ``sigma`` [px] in place of the protocol's.
+def sight(target: PhotoTarget, protocol: Protocol) -> Sighting:
+    """Collect what methods are given of an object.
 
     Raises LeftOutError if it has no camera, no model, or too few keypoints; and DataError if its
     model cannot be read.
     """
-    camera, cad = target.camera, target.cad
+    camera, cad = target.camera, target.found.model
     if camera is None:
         raise LeftOutError("the photo's camera is not known")
     if cad is None:
         raise LeftOutError("no model is annotated for the object")
-    model = cad.model.load_keypoints()
+    model = cad.load_keypoints()
     marks = target.found.keypoints
     if marks is None or model is None:
         raise LeftOutError("there are no keypoints")
@@ -243,19 +222,20 @@ def sight(target: PhotoTarget, protocol: Protocol, *, sigma: float | None) -> Si
         raise LeftOutError(f"{len(names)} keypoints are fewer than {_LEAST_KEYPOINTS}")
     bounds, gt = target.bounds, target.gt
     assert bounds is not None  # of the keypoints at least
-    sighting = Sighting(
+    row_of = {name: row for row, name in enumerate(model.names)}
+    points, width = model.xyz[[row_of[name] for name in names]], float(gt.scale[0]) if gt else 1.0
+    sigma = _sigma(target, protocol)
+    given = MethodInput(points * width, pixels, camera, sigma, bounds=bounds * width, gt=gt)
+    return Sighting(
         target=target,
-        camera=camera,
-        source=ANNOTATED,
         names=names,
-        points_2d=pixels,
-        sigma=_sigma(target, protocol) if sigma is None else sigma,
+        points_3d=points,
         model=model,
         bounds=bounds,
-        width=1.0 if gt is None else float(gt.scale[0]),
+        width=width,
         protocol=protocol,
+        given=given if camera.focal_known else _calibrated(given),
     )
-    return sighting if camera.focal_known else _calibrated(sighting)
 
 
 def _marked(marks: PhotoKeypoints, model: NamedPoints) -> tuple[tuple[str, ...], FloatArray]:
@@ -269,16 +249,16 @@ def _sigma(target: PhotoTarget, protocol: Protocol) -> float:
     if protocol.sigma_of_width is not None and target.photo.camera is not None:
         return protocol.sigma_of_width * target.photo.camera.width
     left, top, right, bottom = rectangle_of(target.found)
-    return max(protocol.sigma_of_side * float(max(right - left, bottom - top)), _LEAST_PX)
+    return max(_SIGMA_OF_SIDE * float(max(right - left, bottom - top)), _LEAST_PX)
 
 
-def _calibrated(sighting: Sighting) -> Sighting:
+def _calibrated(given: MethodInput) -> MethodInput:
     found = fit(
-        sighting.points_3d * sighting.width,
-        sighting.points_2d,
-        sighting.camera,
-        sigma=sighting.sigma,
+        given.points_3d,
+        given.points_2d,
+        given.camera,
+        sigma=given.sigma,
         stretch_sigma=_FOCAL_PRIOR,
         focal="estimate",
     )
-    return replace(sighting, camera=found.camera)
+    return replace(given, camera=found.camera)

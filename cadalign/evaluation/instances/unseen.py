@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray, instance_rng
+from cadalign.arrays import FloatArray, IntArray, instance_rng
 from cadalign.datasets import KeypointNet
-from cadalign.errors import DataError, DegenerateError
+from cadalign.errors import DataError
 from cadalign.estimation.align import align
 from cadalign.estimation.model import Model
-from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
 from cadalign.evaluation.experiments.keypointnet import KeypointTasks
-from cadalign.evaluation.experiments.unseen import COLUMNS, METHODS, LearnedFiles, UnseenOptions
+from cadalign.evaluation.experiments.unseen import COLUMNS, METHODS, UnseenOptions, learned_shape
 from cadalign.evaluation.instances.instance import (
     KEYPOINT_CAMERA,
     KeypointTask,
@@ -35,11 +34,10 @@ from cadalign.evaluation.methods import LIMIT, SHAPE, Method, MethodInput
 from cadalign.evaluation.metrics.errors import (
     limit_estimate,
     overlap,
-    overlap_up_to_scale,
     probability_level,
 )
 from cadalign.evaluation.runs.work import Outcome, Row
-from cadalign.geometry.alignment import Alignment, Box
+from cadalign.geometry.alignment import Alignment, Box, extent
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.metrics import (
     rotation_error,
@@ -48,11 +46,6 @@ from cadalign.metrics import (
 )
 from cadalign.shapes.model import ShapeModel
 
-_LEAST_SIGMA = 0.5  # of retrieval [px]: keypoints without noise would leave no model any chance
-_SIMILAR = 0.02  # of retrieval: misfit of the best model, as a share of its extent
-_INLIER_BOUND = 3.5  # standard deviations
-_MISFIT_PX = 30.0  # a residual that another model of the category leaves
-_LEAST_SHARED = 6
 # Free of the size: log(y / x) and log(z / x).
 _RATIOS = np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
 
@@ -71,9 +64,8 @@ class UnseenObject:
     options: UnseenOptions
     gt: Alignment  # the pose
     rows: IntArray  # (n,), rows of the given keypoints among all of the object
-    points_2d: FloatArray  # (n, 2), the given keypoints [px], with noise and outliers
-    is_outlier: BoolArray  # (n,)
-    learned: LearnedFiles | None = None
+    points_2d: FloatArray  # (n, 2), the given keypoints [px], with noise
+    learned: Path = Path()  # folder of the shape models by category
 
     @property
     def xyz(self) -> FloatArray:
@@ -88,8 +80,7 @@ class UnseenObject:
     @property
     def shape(self) -> ShapeModel:
         """The shape model of the category."""
-        assert self.learned is not None
-        return self.learned.shape(self.task.category)
+        return learned_shape(self.learned, self.task.category)
 
     def view_of(self, model: Model | ShapeModel) -> View:
         """Those given keypoints that a model has."""
@@ -99,7 +90,7 @@ class UnseenObject:
 
 
 def observe_object(task: KeypointTask, options: UnseenOptions) -> UnseenObject:
-    """Draw a view of an object, the keypoints that are given, their noise and outliers.
+    """Draw a view of an object, the keypoints that are given, and their noise.
 
     Views are those of `sample_hull_view`; hidden keypoints may be given, too. Everything random
     follows from (seed, category, model id, view): view, order of keypoints and unit noise are the
@@ -114,13 +105,9 @@ def observe_object(task: KeypointTask, options: UnseenOptions) -> UnseenObject:
     gt, _ = sample_hull_view(task.hull, KEYPOINT_CAMERA, rng=rng, min_visible=0)
     rng = instance_rng(options.seed, *names, "keypoints")
     order, noise = rng.permutation(count), rng.standard_normal((count, 2))
-    elsewhere = rng.uniform(0, (KEYPOINT_CAMERA.width, KEYPOINT_CAMERA.height), (count, 2))
-    given = order[: options.keypoints]
-    rows = np.sort(given)
-    is_outlier = np.isin(rows, given[: round(options.outliers * len(given))])
+    rows = np.sort(order[: options.keypoints])
     points = KEYPOINT_CAMERA.project(gt.apply(xyz[rows])) + options.noise_px * noise[rows]
-    points[is_outlier] = elsewhere[rows][is_outlier]
-    return UnseenObject(task, options, gt, rows, points, is_outlier)
+    return UnseenObject(task, options, gt, rows, points)
 
 
 # Methods ------------------------------------------------------------------------------------------
@@ -143,83 +130,25 @@ class ShapeEstimate:
         return cls(result.alignment, result.bounds, ids, result.points_3d, result)
 
 
-def _of_shape(seen: UnseenObject) -> ShapeEstimate:
-    return _aligned(seen.shape, seen)
+def solve_object(seen: UnseenObject, *, method: str) -> ShapeEstimate:
+    """The estimate of a method by name; see `UnseenOptions.methods`."""
+    model: Model | ShapeModel = seen.shape
+    if method == LIMIT:
+        points, pixels = seen.xyz[seen.rows], seen.points_2d
+        alignment = limit_estimate(points, pixels, KEYPOINT_CAMERA, seen.gt)
+        return ShapeEstimate(alignment, seen.task.hull.bounds, seen.task.ids, seen.xyz)
+    if method == "exact":
+        model = Model(points_3d=seen.xyz, ids=seen.task.ids.tolist())
+    elif method != SHAPE:
+        mean, stretch = seen.shape.mean, "none" if method == "mean-rigid" else None
+        ids, bounds = seen.shape.ids, mean[-2:]
+        model = Model(points_3d=mean[:-2], ids=ids, bounds=bounds, stretch=stretch)
+    return ShapeEstimate.of(align(model, seen.view_of(model)))
 
 
-def _of_own_model(seen: UnseenObject) -> ShapeEstimate:
-    return _aligned(Model(points_3d=seen.xyz, ids=seen.task.ids.tolist()), seen)
-
-
-def _of_mean(seen: UnseenObject, *, stretch: str | None) -> ShapeEstimate:
-    points, ids = seen.shape.mean, seen.shape.ids
-    model = Model(points_3d=points[:-2], ids=ids, bounds=points[-2:], stretch=stretch)
-    return _aligned(model, seen, misfit_px=_MISFIT_PX)
-
-
-def _of_random_model(seen: UnseenObject, *, stretch: str | None) -> ShapeEstimate:
-    assert seen.learned is not None
-    library, task = seen.learned.library(), seen.task
-    keys = [key for key in library.keys if key[0] == task.category]
-    names = (task.category, task.model_id, str(task.view), "another model")
-    least = min(_LEAST_SHARED, len(seen.ids))
-    for place in instance_rng(seen.options.seed, *names).permutation(len(keys)).tolist():
-        other = library[keys[place]]
-        if np.isin(seen.ids, other.ids).sum() >= least:
-            ids = other.ids.tolist()
-            model = Model(points_3d=other.xyz, ids=ids, bounds=other.bounds, stretch=stretch)
-            return _aligned(model, seen, misfit_px=_MISFIT_PX)
-    raise DegenerateError(f"no other model has {least} of the keypoints", where="keypoints")
-
-
-def _aligned(
-    model: Model | ShapeModel, seen: UnseenObject, *, misfit_px: float = 0.0
-) -> ShapeEstimate:
-    bound = max(_INLIER_BOUND * seen.options.sigma, misfit_px)
-    ransac = RansacOptions(max_reproj_error=bound) if seen.options.outliers else None
-    return ShapeEstimate.of(align(model, seen.view_of(model), ransac=ransac))
-
-
-def _nearest(seen: UnseenObject) -> ShapeEstimate:
-    assert seen.learned is not None
-    library = seen.learned.library()
-    first = library.retrieve(
-        seen.points_2d,
-        seen.ids,
-        KEYPOINT_CAMERA,
-        top=1,
-        category=seen.task.category,
-        sigma=max(seen.options.noise_px, _LEAST_SIGMA),
-        shape_sigma=_SIMILAR,
-        loss="cauchy" if seen.options.outliers else "linear",
-        workers=1,
-    )[0]
-    model = library[first.category, first.model_id]
-    return ShapeEstimate(first.alignment, model.bounds, model.ids, model.xyz)
-
-
-def _bound(seen: UnseenObject) -> ShapeEstimate:
-    kept = ~seen.is_outlier
-    points, pixels = seen.xyz[seen.rows[kept]], seen.points_2d[kept]
-    alignment = limit_estimate(points, pixels, KEYPOINT_CAMERA, seen.gt)
-    return ShapeEstimate(alignment, seen.task.hull.bounds, seen.task.ids, seen.xyz)
-
-
-_SOLVERS: dict[str, Callable[[UnseenObject], ShapeEstimate]] = {
-    "random-rigid": partial(_of_random_model, stretch="none"),
-    "random-stretched": partial(_of_random_model, stretch=None),
-    "nearest": _nearest,
-    "mean-rigid": partial(_of_mean, stretch="none"),
-    "mean-stretched": partial(_of_mean, stretch=None),
-    SHAPE: _of_shape,
-    "exact": _of_own_model,
-    LIMIT: _bound,
-}
-
-
-def unseen_benchmark(learned: LearnedFiles, options: UnseenOptions) -> Benchmark:
+def unseen_benchmark(learned: Path, options: UnseenOptions) -> Benchmark:
     """The methods of the options on unseen objects."""
-    own = {name: Method(name, _SOLVERS[name]) for name in METHODS}
+    own = {name: Method(name, partial(solve_object, method=name)) for name in METHODS}
     setting = UnseenObjects(learned, options)
     return Benchmark.chosen(setting, options.methods, own, metrics=options.metrics)
 
@@ -234,7 +163,7 @@ class UnseenObjects(Setting):
     columns = COLUMNS
     record_columns = RECORD_COLUMNS
 
-    learned: LearnedFiles
+    learned: Path
     options: UnseenOptions
 
     def case(self, task: KeypointTask) -> Case:
@@ -285,21 +214,18 @@ class UnseenObjects(Setting):
 
 def _errors(found: ShapeEstimate, seen: UnseenObject) -> Row:
     est, gt = found.alignment, seen.gt
-    others = () if found.result is None else found.result.alternatives
-    poses = [est, *(other.alignment for other in others)]
     known, rows = _shared(found, seen)
     own = found.points_3d[rows]
-    box = Box.from_model([own.min(axis=0), own.max(axis=0)], est)
+    box = Box.from_model(extent(own), est)
     gt_box = Box.from_model(seen.task.hull.bounds, gt)
     centre = Alignment(est.rotation, box.center, np.ones(3))
     gt_centre = Alignment(gt.rotation, gt_box.center, np.ones(3))
     values: Row = {
         "rotation_error_deg": rotation_error(est=est, gt=gt),
-        "best_rotation_error_deg": min(rotation_error(est=one, gt=gt) for one in poses),
         "translation_error": translation_error(est=centre, gt=gt_centre),
         "translation_error_up_to_scale": translation_error_up_to_scale(est=centre, gt=gt_centre),
         "box_iou": overlap(est=box, gt=gt_box),
-        "box_iou_up_to_scale": overlap_up_to_scale(est=box, gt=gt_box),
+        "box_iou_up_to_scale": overlap(est=box, gt=gt_box, up_to_scale=True),
         "keypoint_error": _distance_up_to_scale(est.apply(own), gt.apply(seen.xyz[known])),
     }
     if found.result is not None:
@@ -355,11 +281,11 @@ def _coverage(result: Result, seen: UnseenObject, known: IntArray, rows: IntArra
 def _described(found: ShapeEstimate, seen: UnseenObject) -> AlignedShape:
     known, rows = _shared(found, seen)
     return aligned_shape(
-        found if found.result is None else found.result,
+        found,
         rows,
         seen.xyz[known],
         model_bounds=seen.task.hull.bounds,
         spans_points=True,
-        rms=np.nan if found.result is None else found.result.rms,
         sigma=seen.options.sigma,
+        result=found.result,
     )

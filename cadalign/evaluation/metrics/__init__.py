@@ -139,43 +139,19 @@ SYM_BOX_IOU = replace(BOX_IOU, key="sym_box_iou", label="box IoU, symmetry-aware
 
 SUCCESS = rate("success", "success", "succ%")
 SUCCESS_5 = rate("success_5deg_5pct", "within 5 deg, 5 %", "5/5 %*")
-SUCCESS_10 = rate("success_10deg_10pct", "within 10 deg, 10 %")
 OVER_BOUND = Metric("over_limit", "R error over Cramer-Rao bound", better=None)
-INLIER_RECALL = rate("inlier_recall", "inliers kept", "found%")
 
 RANK_1 = rate("rank_1", "true model first", "first%")
-RANK_5 = rate("rank_5", "true model among the first 5", "top5%", head="among the first 5")
 RECIPROCAL_RANK = Metric(
     "reciprocal_rank", "mean reciprocal rank", digits=3, better=HIGH, symbol="MRR", log=False
 )
-SCORE = rate("score", "score", "score%", better=None)
 NONE = rate("none", "none of the models", "none%", head="none of these", better=None)
 """More likely none of the library's models than one: false in one protocol, true in the other."""
 SHAPE_DISTANCE = Metric(
     "shape_distance", "shape distance", "%", factor=100.0, symbol="shape%", log=False
 )
-MATCH_ROTATION = replace(ROTATION, digits=2)
-"""Metrics of the best match, which is another object as a rule."""
+QUERY_MILLISECONDS = Metric("milliseconds", "time of a query", "ms", 1, symbol="ms")
 
-MILLISECONDS = Metric("milliseconds", "time of one call", "ms", symbol="ms")
-QUERY_MILLISECONDS = replace(
-    MILLISECONDS, label="time of a query", head="time of a query", digits=1
-)
-
-ROTATION_90 = _like(
-    ROTATION,
-    "rotation_error_deg_90",
-    "90th percentile of the rotation error",
-    "R error, 90 %",
-    "R90",
-)
-BEST_ROTATION = _like(
-    ROTATION,
-    "best_rotation_error_deg",
-    "rotation error of the best alternative",
-    "R error, best alternative",
-    "best R",
-)
 KEYPOINT_ERROR = Metric("keypoint_error", "keypoint error", "diagonals", 4, symbol="kp")
 """Root mean square, up to scale, of a method's estimate of all keypoints."""
 # Shares of the truths within regions of a stated probability.
@@ -187,7 +163,6 @@ STRETCH_IN_95 = rate("stretch_in_95", "stretches within 95 %", "95%", **_COVERED
 KEYPOINTS_IN_68 = rate("keypoints_within_68", "keypoints within 68 %", "kp in 68%", **_COVERED)
 KEYPOINTS_IN_95 = rate("keypoints_within_95", "keypoints within 95 %", "95%", **_COVERED)
 COVERED = rate("covered", "truths within the region", **_COVERED)
-NOMINAL = rate("nominal", "stated probability of a region", **_COVERED)
 
 # What tasks are grouped by.
 CATEGORY = Metric("category", "category", better=None)

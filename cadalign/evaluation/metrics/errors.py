@@ -55,18 +55,13 @@ def alignment_errors(*, est: Alignment, gt: Alignment, length: float = 1.0) -> d
     }
 
 
-def overlap(*, est: Box, gt: Box) -> float | None:
-    """Intersection over union of two boxes; None where one has no volume."""
-    try:
-        return box_iou(est=est, gt=gt)
-    except InputError:
-        return None
+def overlap(*, est: Box, gt: Box, up_to_scale: bool = False) -> float | None:
+    """Intersection over union of two boxes; None where one has no volume.
 
-
-def overlap_up_to_scale(*, est: Box, gt: Box) -> float | None:
-    """Like `overlap`, after the estimate was scaled about the camera centre."""
+    ``up_to_scale`` scales the estimate about the camera centre first.
+    """
     try:
-        return box_iou_up_to_scale(est=est, gt=gt)
+        return (box_iou_up_to_scale if up_to_scale else box_iou)(est=est, gt=gt)
     except InputError:
         return None
 

@@ -1,7 +1,7 @@
-"""Metrics of photos: sets of them, those of PASCAL3D+, of boxes, and of Scan2CAD.
+"""Metrics of photos: those of PASCAL3D+, of boxes, and of Scan2CAD.
 
-A set is what a data set's protocol measures of each object, and shows of many. A new metric of
-photos is a line of one set; a new set has its place in `cadalign.evaluation.experiments.photos`.
+A new metric of photos is a cell of a measure, and a line of `MEDIANS` or `RATES`; a new data set
+has its measures in `cadalign.evaluation.experiments.photos`.
 
 Tulsiani, Malik, "Viewpoints and Keypoints", CVPR 2015, section 4.1: accuracy at pi/6, median error.
 Wang et al., "Normalized Object Coordinate Space for Category-Level 6D Object Pose and Size
@@ -12,9 +12,8 @@ the benchmark's script: 20 cm, 20 degrees and 20 % of scale.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,8 +21,8 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.evaluation import metrics
 from cadalign.evaluation.metrics import Metric
-from cadalign.evaluation.metrics.errors import overlap_up_to_scale
-from cadalign.evaluation.runs.work import Columns, Row
+from cadalign.evaluation.metrics.errors import overlap
+from cadalign.evaluation.runs.work import Row
 from cadalign.evaluation.summary import Group, known, medians
 from cadalign.geometry.alignment import Alignment, Box
 from cadalign.geometry.rotations import rotation_from_vector
@@ -35,6 +34,10 @@ if TYPE_CHECKING:
     from cadalign.evaluation.runs.tables import Cells
     from cadalign.evaluation.summary import Statistics
 
+Measure = Callable[["PhotoTarget", Alignment, Alignment, Box], Row]
+"""Errors by column, some of which may lack: of an object, an estimate of the data set's model, the
+true one, and the estimated box, all in the frame of the photo's camera."""
+
 
 @dataclass(frozen=True)
 class Rate:
@@ -45,85 +48,38 @@ class Rate:
     limit: float | None = None
     """Values below it count; without one, those that are not 0."""
 
-    def count(self, values: FloatArray) -> int:
-        """Number of the values (n,) that count."""
+    def of(self, group: Group) -> float:
+        """The share; failures count as misses."""
+        values = known(group.solved[self.column.key])
+        count = len(values) + len(group.rows["method"]) - len(group.solved["method"])
         within = values > 0 if self.limit is None else values < self.limit
-        return int(within.sum())
-
-
-@dataclass(frozen=True)
-class MetricSet:
-    """Metrics of a protocol."""
-
-    measure: Callable[[PhotoTarget, Alignment, Alignment, Box], Row]
-    """Errors by column, some of which may be None: of an object, an estimate of the data set's
-    model, the true one, and the estimated box."""
-    medians: tuple[Metric, ...]  # columns whose medians are shown
-    rates: tuple[Rate, ...] = ()
-
-    @property
-    def shown(self) -> tuple[Metric, ...]:
-        """The columns of its summary."""
-        return (*(rate.metric for rate in self.rates), *self.medians)
+        return int(within.sum()) / count if count else np.nan
 
 
 @dataclass(frozen=True)
 class Protocol:
     """Evaluation of a data set: its metrics, and what it is given."""
 
-    metrics: tuple[MetricSet, ...]
+    measures: tuple[Measure, ...]
     up_axis: str = "y"  # the upward axis of its models
-    sigma_of_side: float = 1 / 64
-    """Standard deviation of its keypoints as a share of the longer side of the object's rectangle:
-    networks' heatmaps have 64 cells."""
-    sigma_of_width: float | None = None  # the same as a share of the image's width
+    sigma_of_width: float | None = None
+    """Standard deviation of its keypoints as a share of the image's width, by default 1/64 of the
+    longer side of the object's rectangle."""
+
+    def score(self, target: PhotoTarget, est: Alignment, box: Box) -> Row:
+        """Errors of an estimate by column; none where the truth is not known."""
+        gt = target.gt
+        rows = [] if gt is None else [each(target, est, gt, box) for each in self.measures]
+        return {name: value for row in rows for name, value in row.items()}
 
 
-def score_columns(sets: Iterable[MetricSet]) -> Columns:
-    """The columns of some sets in the result table."""
-    found = (m for each in sets for m in (*each.medians, *(rate.column for rate in each.rates)))
-    return tuple(dict.fromkeys((metric.key, float) for metric in found))
-
-
-def score_alignment(
-    target: PhotoTarget, sets: Sequence[MetricSet], est: Alignment, box: Box
-) -> Row:
-    """Errors of an estimate by column; none where the truth is not known.
-
-    ``est`` aligns the data set's model, ``box`` is the estimated box, both in the frame of the
-    photo's camera.
-    """
-    gt = target.gt
-    if gt is None:
-        return {}
-    return {
-        name: value
-        for each in sets
-        for name, value in each.measure(target, est, gt, box).items()
-        if value is not None
-    }
-
-
-def statistics_of(sets: Sequence[MetricSet], cells: Cells) -> Statistics:
+def statistics_of(cells: Cells) -> Statistics:
     """Medians of the objects that did not fail, and shares of all whose truth is known.
 
-    Failures count as misses. Shares of a column that has no value in a whole table, of ``cells``,
-    are left out.
+    Shares of a column that has no value in a whole table, of ``cells``, are left out.
     """
-    found = medians(*(metric for each in sets for metric in each.medians))
-    rates = (rate for each in sets for rate in each.rates)
-    shares = {
-        rate.metric.key: partial(_rate, rate)
-        for rate in rates
-        if len(known(cells[rate.column.key]))
-    }
-    return {**found, **shares}
-
-
-def _rate(rate: Rate, group: Group) -> float:
-    values = known(group.solved[rate.column.key])
-    count = len(values) + len(group.rows["method"]) - len(group.solved["method"])
-    return rate.count(values) / count if count else np.nan
+    shares = {rate.metric.key: rate.of for rate in RATES if len(known(cells[rate.column.key]))}
+    return {**medians(*MEDIANS), **shares}
 
 
 def model_rotation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry) -> float:
@@ -133,23 +89,20 @@ def model_rotation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry) -
 
 # PASCAL3D+ ----------------------------------------------------------------------------------------
 
-ACCURACY_DEG = 30.0
-"""pi/6 [degrees]."""
+_ACCURACY_DEG = 30.0  # pi/6
 ROTATION = replace(metrics.ROTATION, digits=2)
-ACCURACY = metrics.rate("accuracy_pi_6", "accuracy at pi/6", "Acc pi/6")
+_ACCURACY = metrics.rate("accuracy_pi_6", "accuracy at pi/6", "Acc pi/6")
 
 
-def _measure_viewpoint(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
+def measure_viewpoint(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
+    """The error of the viewpoint, over the object's symmetries."""
     error = model_rotation_error(est=est, gt=gt, symmetry=target.found.symmetry)
     return {ROTATION.key: error}
 
 
-VIEWPOINT = MetricSet(_measure_viewpoint, (ROTATION,), (Rate(ACCURACY, ROTATION, ACCURACY_DEG),))
-
 # Boxes --------------------------------------------------------------------------------------------
 
 _STEPS = 20  # about an axis of symmetry, as NOCS tries
-TRANSLATION = Metric("translation_cm", "translation error", "cm", symbol="t cm")
 
 
 def symmetric_box_iou(*, est: Box, gt: Box, symmetry: Symmetry) -> float:
@@ -166,20 +119,16 @@ def symmetric_box_iou(*, est: Box, gt: Box, symmetry: Symmetry) -> float:
     return max(box_iou(est=box, gt=gt) for box in boxes)
 
 
-def _measure_box(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
-    found, gt_box = target.found, target.gt_box
-    values: Row = {}
-    if found.truth.metres is not None:
-        gap = float(np.linalg.norm(est.translation - gt.translation))
-        values[TRANSLATION.key] = 100 * found.truth.metres * gap
-    if gt_box is not None and min(box.volume, gt_box.volume) > 0:
-        iou = symmetric_box_iou(est=box, gt=gt_box, symmetry=found.symmetry)
-        values[metrics.BOX_IOU.key] = iou
-        values[metrics.BOX_IOU_UP_TO_SCALE.key] = overlap_up_to_scale(est=box, gt=gt_box)
-    return values
+def measure_box(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
+    """The overlap of the boxes."""
+    gt_box = target.gt_box
+    if gt_box is None or min(box.volume, gt_box.volume) <= 0:
+        return {}
+    return {
+        metrics.BOX_IOU.key: symmetric_box_iou(est=box, gt=gt_box, symmetry=target.found.symmetry),
+        metrics.BOX_IOU_UP_TO_SCALE.key: overlap(est=box, gt=gt_box, up_to_scale=True),
+    }
 
-
-BOX = MetricSet(_measure_box, (TRANSLATION, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE))
 
 # Scan2CAD -----------------------------------------------------------------------------------------
 
@@ -221,14 +170,18 @@ def scan2cad_errors(
     }
 
 
-def _measure_scan2cad(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
-    # The benchmark's script takes minus the centre of the model's box.
+def measure_scan2cad(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
+    """The errors of `scan2cad_errors`, at the centre that the benchmark's script takes."""
+    # That is minus the centre of the model's box.
     center = None if target.bounds is None else -target.bounds.mean(axis=0)
     return scan2cad_errors(est=est, gt=gt, symmetry=target.found.symmetry, center=center)
 
 
-SCAN2CAD = MetricSet(
-    _measure_scan2cad,
-    (_TRANSLATION_M, _SCALE),
-    (Rate(_ALIGNED, _ALIGNED), Rate(_ALIGNED_AXES, _ALIGNED_AXES)),
+MEDIANS = (*(ROTATION, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE, _TRANSLATION_M, _SCALE),)
+"""Columns whose medians are shown."""
+RATES = (
+    Rate(_ACCURACY, ROTATION, _ACCURACY_DEG),
+    Rate(_ALIGNED, _ALIGNED),
+    Rate(_ALIGNED_AXES, _ALIGNED_AXES),
 )
+"""Shares of objects that are shown."""

@@ -3,15 +3,14 @@
 One loop serves every executor of the standard library's interface: threads of this process,
 processes of this machine, a Dask cluster. A finished chunk is a file in ``parts`` of the run's
 folder (`cadalign.evaluation.runs.folder`), which appears whole or not at all. Started again, a run
-does the chunks that have none, or whose tables are damaged. Chunks are the same whatever the number
-of workers, and their rows follow from the run's seed and the tasks' names, so nothing in
-``results.parquet`` shows how often the run was interrupted or who did the work.
+does the chunks that have none. Chunks are the same whatever the number of workers, and their rows
+follow from the run's seed and the tasks' names, so nothing in ``results.parquet`` shows how often
+the run was interrupted or who did the work.
 """
 
 from __future__ import annotations
 
 import copy
-import logging
 import pickle
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -20,6 +19,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -28,11 +28,9 @@ from cadalign.arrays import worker_count
 from cadalign.errors import CadalignError, InputError, quote
 from cadalign.evaluation.runs.executors import cluster, in_threads, processes
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.tables import SECONDS, is_whole, read_cells, write_rows, write_tables
+from cadalign.evaluation.runs.tables import SECONDS, read_cells, write_rows, write_tables
 from cadalign.evaluation.runs.work import AbortError, Columns, Experiment, Plan, Row, reason_of
 from cadalign.io.files import made_folder
-
-logger = logging.getLogger("cadalign")
 
 T = TypeVar("T")
 Chunk = tuple[int, Sequence[Any]]
@@ -121,7 +119,7 @@ def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: 
     own = [each for each in experiment.record_columns if each not in experiment.columns]
     columns: Columns = (*experiment.columns, *SECONDS, *own)
     starts = range(0, len(tasks), size)
-    missing = [k for k in range(len(starts)) if not _is_done(folder.part(k), columns)]
+    missing = [k for k in range(len(starts)) if not folder.part(k).is_file()]
     done = len(tasks) - sum(min(size, len(tasks) - starts[index]) for index in missing)
     on_progress(Progress(done, len(tasks)))
     chunks = ((index, tasks[starts[index] : starts[index] + size]) for index in missing)
@@ -129,14 +127,6 @@ def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: 
         write_rows(folder.part(index), columns, rows)
         done += len(some)
         on_progress(Progress(done, len(tasks)))
-
-
-def _is_done(part: Path, columns: Columns) -> bool:
-    """True if a chunk can be read; one that was done, but is damaged, is told of."""
-    if not part.is_file() or is_whole(part, columns):
-        return part.is_file()
-    logger.warning("%s: damaged; its tasks are done again", part)
-    return False
 
 
 def _sweep(path: Path) -> None:
@@ -177,27 +167,36 @@ def _pass(
     running: dict[Future[list[Row]], Chunk] = {}
     window = 1  # the first chunk alone: it compiles the kernels that all workers need
     while True:
+        reason = ""  # why the executor is dead
         with workers.open() as (executor, size):
-            is_broken = False
             while True:
-                while not is_broken and len(running) < window:
-                    chunk = next(source, None)
-                    if chunk is None:
+                for chunk in islice(source, 0 if reason else window - len(running)):
+                    try:
+                        running[executor.submit(call, chunk[1])] = chunk
+                    except Exception as error:
+                        # The pool is closing since a process has died, or the scheduler is gone.
+                        if not workers.deaths:
+                            raise
+                        reason = reason_of(error)
+                        lost.append(chunk)
                         break
-                    running[_submitted(executor, workers, call, chunk[1])] = chunk
                 if not running:
                     break
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
                     chunk = running.pop(future)
                     try:
-                        rows = _rows_of(future, workers)
+                        rows = future.result()
+                    except CadalignError:
+                        raise
                     except workers.deaths as error:
-                        is_broken, reason = True, reason_of(error)
+                        reason = reason_of(error)
                         lost.append(chunk)
-                        continue
-                    window, deaths = size, 0
-                    yield chunk, rows
-        if not is_broken:
+                    except Exception as error:
+                        raise _cannot_work(error) from error
+                    else:
+                        window, deaths = size, 0
+                        yield chunk, rows
+        if not reason:
             return
         deaths += 1
         if deaths == _MOST_DEATHS:
@@ -206,34 +205,13 @@ def _pass(
             raise CadalignError(what, where="workers", fix=fix)
 
 
-def _submitted(
-    executor: Executor, workers: Workers, call: Callable[..., Any], tasks: Sequence[Any]
-) -> Future[Any]:
-    """Hand out a call; the future of a dead executor has the error that says so."""
-    future: Future[Any] = Future()
-    try:
-        return executor.submit(call, tasks)
-    except Exception as error:
-        # The pool is closing its pipes, since a process has died, or the scheduler is gone.
-        if not workers.deaths:
-            raise
-        future.set_exception(workers.deaths[-1](reason_of(error)))
-    return future
-
-
-def _rows_of(future: Future[list[Row]], workers: Workers) -> list[Row]:
-    known: tuple[type[Exception], ...] = (CadalignError, *workers.deaths)
-    try:
-        return future.result()
-    except known:
-        raise
-    except Exception as error:
-        raise CadalignError(
-            f"a worker cannot work: {reason_of(error)}",
-            where="workers",
-            fix="cadalign must be installed there, in the same version as here, and modules of "
-            "your functions, too",
-        ) from error
+def _cannot_work(error: Exception) -> CadalignError:
+    return CadalignError(
+        f"a worker cannot work: {reason_of(error)}",
+        where="workers",
+        fix="cadalign must be installed there, in the same version as here, and modules of your "
+        "functions, too",
+    )
 
 
 def evaluate_chunk(experiment: Experiment[T], tasks: Sequence[T]) -> list[Row]:

@@ -15,12 +15,7 @@ from msgspec import Meta, field
 
 from cadalign.errors import DataError
 from cadalign.io.documents import Count, ForeignDocument, convert, in_file, read_json
-from cadalign.io.files import (
-    locked,
-    made_folder,
-    refuse_nul,
-    write_json,
-)
+from cadalign.io.files import locked, made_folder, refuse_nul, write_json
 
 _FORMAT = 1
 _LONGEST_VALUE = 80
@@ -78,13 +73,6 @@ class RunFolder:
         """Make the folder."""
         made_folder(self.path)
 
-    def refuse_others(self, *names: str) -> None:
-        """Raise a DataError for a file of these names that no run has written."""
-        for name in () if self.config_file.exists() else names:
-            if (self.path / name).exists():
-                what = f"holds {name}, which is no run's: there is no {self.config_file.name}"
-                raise DataError(what, where=str(self.path), fix=_FIX_FOREIGN)
-
     def made_for_pictures(self) -> RunFolder:
         """Make the folder and those in it that pictures go to; returns it by its full path."""
         self.make()
@@ -122,19 +110,18 @@ class RunFolder:
         if found is None:
             if self.parts.exists() or self.results.exists():
                 raise DataError("holds results, but no run.json", where=str(self.path), fix=_FIX)
-            self.refuse_others(*_WRITTEN)
+            foreign = next((name for name in _WRITTEN if (self.path / name).exists()), None)
+            if foreign is not None:
+                what = f"holds {foreign}, which is no run's: there is no {self.config_file.name}"
+                raise DataError(what, where=str(self.path), fix=_FIX_FOREIGN)
             write_json(self.config_file, wanted)
             return
         differences = list(_differences(found, wanted))
         if differences:
             listed, rest = differences[:_MOST_DIFFERENCES], len(differences) - _MOST_DIFFERENCES
             more = f"; and {rest} more differences" if rest > 0 else ""
-            raise self.another("; ".join(listed) + more)
-
-    def another(self, differences: str) -> DataError:
-        """The error of a folder that holds another run."""
-        what = f"the folder holds a run with another configuration: {differences}"
-        return DataError(what, where=str(self.path), fix=_FIX)
+            what = f"the folder holds a run with another configuration: {'; '.join(listed)}{more}"
+            raise DataError(what, where=str(self.path), fix=_FIX)
 
 
 class _Config(ForeignDocument):

@@ -74,6 +74,8 @@ def read_cells(path: Path, columns: Columns, *, is_record: bool = False) -> pa.T
     with _reading(path, DONE_ANEW):
         names = [name for name, _ in columns]
         table = pq.read_table(path, columns=names, use_threads=False)
+        if table.schema != schema_of(columns):
+            raise DataError("not a table of such a run", where=str(path), fix=DONE_ANEW)
         return table.filter(table[names[-1]].is_valid()) if is_record else table
 
 
@@ -97,14 +99,6 @@ def _reading(path: Path, fix: str) -> Iterator[None]:
         reason = " ".join(str(error).split())[:200]
         what = f"not a table that can be read ({reason})"
         raise DataError(what, where=str(path), fix=fix) from None
-
-
-def is_whole(path: Path, columns: Columns) -> bool:
-    """True if a file is a table of exactly these columns and can be read to its end."""
-    try:
-        return bool(read_table(path).schema.equals(schema_of(columns)))
-    except DataError:
-        return False
 
 
 def checked(table: pa.Table, columns: Columns, *, path: Path, fix: str) -> pa.Table:

@@ -121,7 +121,7 @@ def as_positive(value: Any, *, name: str) -> float:
         If it is not a positive number, or its square is out of range.
     """
     if not is_number(value) or not value > 0:
-        raise InputError(f"{quote(value)} is not positive", where=name)
+        raise InputError(f"{quote(value)} is not positive and finite", where=name)
     number = float(value)
     if not _LEAST <= number <= _MOST:
         raise InputError(f"{number} is not between {_LEAST:g} and {_MOST:g}", where=name)

@@ -57,7 +57,7 @@ def test_version_is_the_same_everywhere() -> None:
 def test_dir_lists_public_names_and_nothing_else() -> None:
     names = dir(cadalign)
     assert names == sorted({*cadalign.__all__, "__version__"})
-    assert {"fit", "align", "Library", "Observation", "View", "Model", "shapes"} <= set(names)
+    assert {"fit", "align", "Library", "Observation", "View", "Model", "ShapeModel"} <= set(names)
     values = [getattr(cadalign, name) for name in set(names) - {"__version__"}]
     origins = [getattr(value, "__module__", None) or value.__name__ for value in values]
     assert {origin.split(".")[0] for origin in origins} == {"cadalign"}

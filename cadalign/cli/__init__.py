@@ -51,7 +51,7 @@ COMMANDS = {  # the class of each in its module, and the first sentence of its d
     ),
     "doctor": (
         "doctor.Doctor",
-        "Show versions, processor cores and the cache of compiled solvers.",
+        "Check the renderers, and show how to enable missing ones.",
     ),
 }
 

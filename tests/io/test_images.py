@@ -184,6 +184,6 @@ def test_focal_length_that_cannot_be_right_is_ignored_with_a_warning(
 def test_priors_that_are_none_are_refused(value: Any) -> None:
     with pytest.raises(InputError) as caught:
         FocalPrior(value)
-    assert str(caught.value) == f"focal_prior.focal: {quote(value)} is not positive"
+    assert str(caught.value) == f"focal_prior.focal: {quote(value)} is not positive and finite"
     with pytest.raises(InputError, match=r"focal_prior\.relative_sigma: .* is not positive"):
         FocalPrior(900.0, value)

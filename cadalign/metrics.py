@@ -1,9 +1,9 @@
 """Errors between an estimate and the truth.
 
-All metrics take ``est`` and ``gt`` by keyword, score a perfect estimate as perfect, and refuse NaN.
-Errors of alignments take the model's ``symmetry``, too: the truth is then that of `nearest_truth`.
-Names in the plural are their formulas for stacks, whose arrays have leading dimensions (...) more:
-nothing is checked, and errors of a stack are those of its members, bit for bit.
+Metrics take the estimate and the truth, score a perfect estimate as perfect, and refuse NaN. Errors
+of alignments accept the model's ``symmetry`` and then use the truth of `nearest_truth`. Functions
+with plural names are the formulas for stacks of arrays with leading dimensions (...). They check
+nothing, and give each member the same error, bit for bit.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ _Poses = Alignment | Alignments
 _Boxes = Box | Boxes
 
 
-def nearest_truth(*, est: Alignment, gt: Alignment, symmetry: Symmetry) -> Alignment:
+def nearest_truth(est: Alignment, gt: Alignment, *, symmetry: Symmetry) -> Alignment:
     """The truth whose rotation is nearest to the estimate's, among those that are equal.
 
     The model's symmetries take it to itself, so that several alignments place the same object; see
@@ -89,24 +89,24 @@ def _truth(est: Alignment, gt: Alignment, symmetry: Symmetry | None) -> Alignmen
     return gt if symmetry is None else nearest_truth(est=est, gt=gt, symmetry=symmetry)
 
 
-def rotation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry | None = None) -> float:
+def rotation_error(est: Alignment, gt: Alignment, *, symmetry: Symmetry | None = None) -> float:
     """Angle of the rotation between estimate and truth [degrees], 0 to 180.
 
     Examples
     --------
-    >>> rotation_error(est=Alignment.identity(), gt=Alignment.identity())
+    >>> rotation_error(Alignment.identity(), Alignment.identity())
     0.0
     """
     return float(rotation_errors(est=est, gt=_truth(est, gt, symmetry)))
 
 
-def translation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry | None = None) -> float:
+def translation_error(est: Alignment, gt: Alignment, *, symmetry: Symmetry | None = None) -> float:
     """Distance between the two translations [model units]."""
     return float(translation_errors(est=est, gt=_truth(est, gt, symmetry)))
 
 
 def translation_error_up_to_scale(
-    *, est: Alignment, gt: Alignment, symmetry: Symmetry | None = None
+    est: Alignment, gt: Alignment, *, symmetry: Symmetry | None = None
 ) -> float:
     """Distance of the true translation from the ray through the estimated one [model units].
 
@@ -124,7 +124,7 @@ def translation_error_up_to_scale(
     return float(translation_errors_up_to_scale(est=est, gt=_truth(est, gt, symmetry)))
 
 
-def scale_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry | None = None) -> FloatArray:
+def scale_error(est: Alignment, gt: Alignment, *, symmetry: Symmetry | None = None) -> FloatArray:
     """Relative error of the scale along each axis, (3,) float: ``|s_est - s_gt| / s_gt``.
 
     Examples
@@ -136,7 +136,7 @@ def scale_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry | None = No
     return scale_errors(est=est, gt=_truth(est, gt, symmetry))
 
 
-def box_iou(*, est: Box, gt: Box) -> float:
+def box_iou(est: Box, gt: Box) -> float:
     """Volume of the intersection of two oriented boxes over that of their union, 0 to 1.
 
     Exact to rounding; see `cadalign.geometry.clipping.intersection_volume`. Raises InputError if a
@@ -152,7 +152,7 @@ def box_iou(*, est: Box, gt: Box) -> float:
     return float(box_ious(est=est, gt=gt))
 
 
-def box_iou_up_to_scale(*, est: Box, gt: Box) -> float:
+def box_iou_up_to_scale(est: Box, gt: Box) -> float:
     """Largest box IoU over all factors by which the estimate is scaled about the origin, 0 to 1.
 
     The origin is the camera centre, from which one image does not determine an object's distance.

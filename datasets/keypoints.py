@@ -5,6 +5,7 @@ Files are read model by model, so that one bad model spoils no other.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Annotated, Any
@@ -54,6 +55,10 @@ class Keypoints:
 
     def __len__(self) -> int:
         return len(self.xyz)
+
+    def __iter__(self) -> Iterator[tuple[int, FloatArray]]:
+        """The id and the position (3,) of each keypoint."""
+        return zip(self.ids.tolist(), self.xyz, strict=True)
 
     def on_mesh(self, mesh: Mesh) -> FloatArray:
         """The same points rebuilt from faces and barycentric coordinates, (k, 3) float.

@@ -2,6 +2,7 @@
 
 python scripts/make_pictures.py overview
 python scripts/make_pictures.py chairs --files chairs     # with the files of the worked example
+python scripts/make_pictures.py concepts
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import cv2
 import numpy as np
 import tyro
 
-from cadalign import Box, Camera, Observation, fit
+from cadalign import Alignment, Box, Camera, Library, Observation, ShapeModel, View, align, fit
 from cadalign.datasets import AnnotatedModel, KeypointNet, ModelKeypoints, write_sample_dataset
 from cadalign.evaluation.instances.instance import load_scene, make_instance
 from cadalign.io.images import read_image, write_image
@@ -28,6 +29,9 @@ from cadalign.render import (
     visible_keypoints,
 )
 from cadalign.render.canvas import ByteImage
+from cadalign.render.overlay import draw_result
+from cadalign.retrieval.folder import draw_match
+from cadalign.shapes.warp import warp_mesh
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 MODELS = (("chair", "000"), ("car", "002"), ("bottle", "002"), ("vessel", "003"))
@@ -125,6 +129,105 @@ def still(scene: Scene) -> ByteImage:
     return frame.composite(PHOTO_GROUND)
 
 
+def concepts() -> None:
+    """Pictures of the pages on concepts, one each."""
+    with tempfile.TemporaryDirectory() as folder:
+        root = write_sample_dataset(Path(folder) / "sample", per_category=60)
+        dataset = KeypointNet(root)
+        pages = {
+            "determined": _boxes_that_agree(dataset["chair", "sample_chair_000"]),
+            "uncertainty": _regions(dataset),
+            "symmetry": _equal_poses(dataset["bottle", "sample_bottle_002"]),
+            "shape_models": _modes(dataset),
+            "retrieval": _matches(dataset),
+        }
+        for name, pictures in pages.items():
+            write_row(DOCS / "concepts" / f"{name}.png", pictures, width=1200)
+
+
+def _boxes_that_agree(model: AnnotatedModel) -> list[ByteImage]:
+    """True and predicted box from the front, where they agree, and from the side."""
+    scene, xyz = Scene(model.load_mesh()), model.keypoints.xyz
+    front = xyz[np.argsort(xyz[:, 2])[:4]]  # in one plane
+    poses = [pose_in_view(scene, CHAIR_CAMERA, Angles(azimuth=a, elevation=4.0)) for a in (0, 70)]
+    pixels = CHAIR_CAMERA.project(poses[0].apply(front))
+    pixels += np.random.default_rng(3).normal(0, 1.5, pixels.shape)
+    shallow = np.array([1.0, 1.0, 0.5])  # of a model half as deep as the object
+    result = fit(front * shallow, pixels, CHAIR_CAMERA, stretch_sigma=0.3)
+    turn = poses[1].rotation @ poses[0].rotation.T
+    shift = poses[1].translation - turn @ poses[0].translation
+    seen = Alignment(
+        turn @ result.alignment.rotation,
+        turn @ result.alignment.translation + shift,
+        result.alignment.scale,
+    )
+    return [
+        draw_overlay(
+            RaycastRenderer().render(scene, CHAIR_CAMERA, true, samples=16).composite(PHOTO_GROUND),
+            CHAIR_CAMERA,
+            gt_box=Box.from_model(scene.bounds, true),
+            est_box=Box.from_model(scene.bounds * shallow, estimate),
+            observed=pixels if true is poses[0] else None,
+            legend=False,
+        )
+        for true, estimate in zip(poses, (result.alignment, seen), strict=True)
+    ]
+
+
+def _view_of(model: AnnotatedModel, *, noise_px: float) -> tuple[ByteImage, View]:
+    """A photo of a chair, and its visible keypoints."""
+    scene = Scene(model.load_mesh())
+    pose = pose_in_view(scene, CHAIR_CAMERA, CHAIR_VIEW)
+    visible = visible_keypoints(scene, model.keypoints.xyz, CHAIR_CAMERA, pose)
+    pixels = CHAIR_CAMERA.project(pose.apply(model.keypoints.xyz[visible]))
+    pixels += np.random.default_rng(0).normal(0, noise_px, pixels.shape)
+    return still(scene), View(
+        CHAIR_CAMERA, pixels, ids=model.keypoints.ids[visible], sigma=noise_px
+    )
+
+
+def _regions(dataset: KeypointNet) -> list[ByteImage]:
+    """95 % regions of the keypoints of a learned shape: by all that are visible, and by four."""
+    shape = ShapeModel.from_dataset(dataset, "chair", split="train")
+    photo, view = _view_of(dataset.subset(split="test")["chair"][0], noise_px=2.0)
+    few = View(CHAIR_CAMERA, view.pixels[:4], ids=view.keypoint_ids[:4], sigma=2.0)
+    return [draw_result(photo, align(shape, each)) for each in (view, few)]
+
+
+def _equal_poses(model: AnnotatedModel) -> list[ByteImage]:
+    """A bottle in three turns about its axis, with the axes of its box."""
+    scene = Scene(model.load_mesh())
+    pictures = []
+    for degrees in (0, 40, 90):
+        pose = pose_in_view(scene, CHAIR_CAMERA, Angles(azimuth=degrees, elevation=24.0))
+        frame = RaycastRenderer().render(scene, CHAIR_CAMERA, pose, samples=16)
+        box = Box.from_model(scene.bounds, pose)
+        pictures.append(
+            draw_overlay(frame.composite(PHOTO_GROUND), CHAIR_CAMERA, est_box=box, legend=False)
+        )
+    return pictures
+
+
+def _modes(dataset: KeypointNet) -> list[ByteImage]:
+    """A chair warped by 3 standard deviations of the second mode; the first is the size."""
+    shape = ShapeModel.from_dataset(dataset, "chair", split="train")
+    component, model = shape.components[0], dataset["chair", "sample_chair_000"]
+    rows = [shape.ids.index(int(label)) for label in model.keypoints.ids]
+    mesh = model.load_mesh()
+    return [
+        still(Scene(warp_mesh(mesh, model.keypoints.xyz, places[rows], bounds=places[-2:])))
+        for places in (component.mean + factor * component.modes[1] for factor in (-3, 0, 3))
+    ]
+
+
+def _matches(dataset: KeypointNet) -> list[ByteImage]:
+    """The photo of a chair, and the three best matches of a library over it."""
+    photo, view = _view_of(dataset["chair", "sample_chair_006"], noise_px=1.0)
+    library = Library.from_models(dataset["chair"])
+    matches = library.retrieve(view.pixels, view.keypoint_ids, CHAIR_CAMERA, top=3)
+    return [photo, *(draw_match(photo, CHAIR_CAMERA, match) for match in matches)]
+
+
 def write_row(path: Path, pictures: Sequence[np.ndarray], *, width: int) -> None:
     """Write pictures of one height side by side, shrunk to a width [px] in all."""
     row = np.hstack(pictures)
@@ -133,4 +236,6 @@ def write_row(path: Path, pictures: Sequence[np.ndarray], *, width: int) -> None
 
 
 if __name__ == "__main__":
-    tyro.extras.subcommand_cli_from_dict({each.__name__: each for each in (overview, chairs)})
+    tyro.extras.subcommand_cli_from_dict(
+        {each.__name__: each for each in (overview, chairs, concepts)}
+    )

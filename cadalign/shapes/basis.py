@@ -112,6 +112,12 @@ def find_mirror(completed: FloatArray, axis: int) -> Mirror:
     return Mirror(axis, offset, tuple(partner.tolist()))
 
 
+def is_symmetry(completed: FloatArray, mirror: Mirror) -> bool:
+    """True if the mirror image of the mean is as near to it as models are; see `find_mirror`."""
+    mean = completed.mean(axis=0, keepdims=True)
+    return bool(np.abs(mirrored(mean, mirror) - mean).mean() <= np.abs(completed - mean).mean())
+
+
 def mirrored(rows: FloatArray, mirror: Mirror) -> FloatArray:
     """Mirror models' keypoints and box corners, (N, m + 2, 3) float, NaN where missing."""
     exchanged = rows[:, [*mirror.partners, -BOX_ROWS, -1]]

@@ -17,7 +17,13 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, require_counts
 from cadalign.errors import InputError
-from cadalign.shapes.basis import Mirror, component_of_covariance, find_mirror, mirrored
+from cadalign.shapes.basis import (
+    Mirror,
+    component_of_covariance,
+    find_mirror,
+    is_symmetry,
+    mirrored,
+)
 from cadalign.shapes.calibration import ShapeCalibration, calibrate, excesses_of, learn_margins
 from cadalign.shapes.examples import Example, tabulated
 from cadalign.shapes.gaussians import (
@@ -164,7 +170,10 @@ class _CrossValidation:
 
     def _with_mirror(self, best: _Trial) -> _Trial:
         completed = self._models.completed()
-        mirrors = [find_mirror(completed, axis) for axis in range(3)]
+        found = [find_mirror(completed, axis) for axis in range(3)]
+        mirrors = [each for each in found if is_symmetry(completed, each)]
+        if not mirrors:
+            return best
         mirrored = self._best(replace(best.recipe, mirror=each) for each in mirrors)
         # Twice as many models to learn from are worth a little.
         return mirrored if _is_enough(mirrored.scores, best.scores, _TOLERANCE) else best

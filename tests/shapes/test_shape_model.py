@@ -19,7 +19,7 @@ from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.io.files import Seal
-from cadalign.shapes.basis import find_mirror
+from cadalign.shapes.basis import find_mirror, is_symmetry
 from cadalign.shapes.examples import Example
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.outputs import SEAL
@@ -432,3 +432,14 @@ def test_real_models_that_were_held_out_are_likely(real_data: Path, category: st
     assert np.median(np.abs(errors)) < 0.6 * np.median(np.abs(spreads))
     assert 0.6 < (np.abs(whitened) < 1).mean() < 0.95
     assert (np.abs(whitened) < 2).mean() > 0.88
+
+
+def test_a_mirror_is_learned_only_of_a_category_that_is_symmetric() -> None:
+    """Chairs whose front differs from their back are no chairs once these are exchanged."""
+    rows = np.array([each.points_3d for each in tables(20)])
+    box = np.stack([rows.min(axis=1), rows.max(axis=1)], axis=1)
+    completed = np.concatenate([rows, box], axis=1)
+    assert is_symmetry(completed, find_mirror(completed, 0))
+    leaning = completed + np.where(np.arange(3) == 2, 0.6, 0.0) * completed[..., 1:2]
+    assert is_symmetry(leaning, find_mirror(leaning, 0))
+    assert not is_symmetry(leaning, find_mirror(leaning, 2))

@@ -1,4 +1,4 @@
-"""Drawing: scenes, renderers, visibility, views, overlays and pictures."""
+"""Rendering: scenes, renderers, keypoint visibility, viewpoints and overlays."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Lines, markers and text on an image: antialiased, with a dark casing that sets them off."""
+"""Antialiased lines, markers and text with a dark casing; sRGB and linear light."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from cadalign.geometry.pixels import rescaled_pixels
 Color = tuple[int, int, int]
 
 CASING: Color = (18, 20, 24)
-# OpenCV takes whole numbers; this many bits of them are the fraction of a pixel.
+# OpenCV takes fixed-point coordinates, with this many fractional bits.
 _SHIFT = 4
-# Farther off than this [px] OpenCV's whole numbers would overflow.
+# Larger coordinates [px] would overflow in OpenCV.
 _FARTHEST = 1e6
 _PLATE_OPACITY = 0.62
 _SMALL_SIDE = 1000
-# Widths of dark borders, in units; markers are small and need more to stand out.
+# Widths of casings, in units; markers are small and need a wider one.
 _LINE_CASING, _MARKER_CASING = 0.6, 0.75
 
 _Strokes = tuple[tuple[Color, int], tuple[Color, int]]
 
 
 LegendEntry = tuple[str, Color, str]
-"""A line of the legend: text, colour, and its marker, a "line", "ring" or "cross"."""
+"""Entry of the legend: text, colour, and marker, which is "line", "ring" or "cross"."""
 
 
 class Canvas:
-    """An image that is drawn on, a small one at twice its size, for finer lines.
+    """An image to draw on. A small one is enlarged to twice its size, for finer lines.
 
-    The image (h, w, 3) uint8 is copied. All methods take its pixels.
+    The image (h, w, 3) uint8 is copied. All methods take pixels of the original image.
 
     Attributes
     ----------
     image : (h, w, 3) uint8
-        The canvas.
+        The enlarged image.
     unit : float
-        The width of a thin line [px], which grows with the image.
+        Width of a thin line [px], in proportion to the image.
     """
 
     def __init__(self, image: ByteImage) -> None:
@@ -51,8 +51,8 @@ class Canvas:
         self.image: ByteImage = np.asarray(enlarged, dtype=np.uint8)
         self.unit = max(0.5, min(rows, columns) / 480)
 
-    def finished(self) -> ByteImage:
-        """The drawn image at its own size; where nothing was drawn it is what it was."""
+    def finish(self) -> ByteImage:
+        """Return the image at its original size; pixels without drawing are unchanged."""
         if self._zoom == 1:
             return self.image
         rows, columns = self.image.shape[:2]
@@ -60,30 +60,30 @@ class Canvas:
         return np.asarray(cv2.resize(self.image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
     def _strokes(self, color: Color, *, width: float, casing: float) -> _Strokes:
-        """Colour and thickness [canvas px] of a line's dark border, then of the line itself."""
+        """Colour and thickness [canvas px] of a line's casing, then of the line itself."""
         scale = self.unit * self._zoom
         inner, border = (max(1, round(value * scale)) for value in (width, casing))
         return (CASING, inner + 2 * border), (color, inner)
 
-    def blend_from(self, before: ByteImage, *, opacity: float) -> None:
-        """Let what was drawn since ``before`` was copied show through to it."""
+    def fade(self, before: ByteImage, *, opacity: float) -> None:
+        """Give an opacity to everything drawn since the copy ``before`` of the image."""
         self.image = np.asarray(
             cv2.addWeighted(self.image, opacity, before, 1 - opacity, 0), dtype=np.uint8
         )
 
     def line(self, points: FloatArray, color: Color, *, width: float, dashed: bool = False) -> None:
-        """Draw a line through (n, 2) pixels; its width is in units."""
+        """Draw a line through pixels (n, 2); ``width`` is in units."""
         parts = _dashes(points, 7 * self.unit, 5 * self.unit) if dashed else points[None]
         self._lines(parts, self._strokes(color, width=width, casing=_LINE_CASING))
 
     def _lines(self, parts: FloatArray, strokes: _Strokes) -> None:
-        """Draw lines through (m, n, 2) pixels, the dark borders of all of them first."""
+        """Draw lines through pixels (m, n, 2), all casings first."""
         for shade, thickness in strokes:
             whole = list(self._whole(parts))
             cv2.polylines(self.image, whole, False, shade, thickness, cv2.LINE_AA, _SHIFT)
 
     def dot(self, point: FloatArray, color: Color, *, radius: float) -> None:
-        """Draw a disc without casing."""
+        """Draw a disc without a casing."""
         self._circle(point, color, radius, -1)
 
     def ring(self, point: FloatArray, color: Color, *, radius: float) -> None:
@@ -110,7 +110,7 @@ class Canvas:
         along = along / length
         (_, outer), (_, inner) = self._strokes(color, width=width, casing=_LINE_CASING)
         half, head = inner / 2 / self._zoom, min(4.5 * width * self.unit, length)
-        # One side of its outline from the tip on, along the arrow and across; then the other side.
+        # One side of the outline from the tip, along and across the arrow; then the other side.
         side = np.array([[0, 0], [-head, 0.42 * head], [-head, half], [-length, half]])
         outline = np.concatenate([side, side[:0:-1] * (1, -1)])
         whole = self._whole(end + outline @ [along, [-along[1], along[0]]])
@@ -118,7 +118,7 @@ class Canvas:
         cv2.fillPoly(self.image, [whole], color, cv2.LINE_AA, _SHIFT)
 
     def label(self, text: str, middle: FloatArray, color: Color) -> None:
-        """Write a short text about a point."""
+        """Write a short text centred at a pixel (2,)."""
         rows, columns = self.image.shape[:2]
         x, y = rescaled_pixels(middle, self._zoom)
         if not (0 <= x < columns and 0 <= y < rows):
@@ -137,7 +137,7 @@ class Canvas:
         self.image = np.array(picture)
 
     def legend(self, entries: list[LegendEntry], *, keep_clear: FloatArray) -> None:
-        """Write a legend into the corner that covers the fewest of some pixels (n, 2)."""
+        """Draw a legend in the corner where it covers the fewest ``keep_clear`` pixels (n, 2)."""
         size = round(12.5 * self.unit * self._zoom)
         font = ImageFont.load_default(size=size)
         pad, swatch, pitch = 0.7 * size, 1.9 * size, 1.45 * size
@@ -173,7 +173,7 @@ class Canvas:
     def _emptiest_corner(
         self, width: int, height: int, gap: int, keep_clear: FloatArray
     ) -> tuple[int, int]:
-        """Left and top of a plate in the corner where it covers the fewest pixels (n, 2)."""
+        """Left and top of a plate in the corner where it covers the fewest pixels."""
         rows, columns = self.image.shape[:2]
         corners = [
             (left, top)
@@ -181,20 +181,20 @@ class Canvas:
             for left in (gap, columns - width - gap)
         ]
 
-        def covered(corner: tuple[int, int]) -> int:
+        def count_covered(corner: tuple[int, int]) -> int:
             inside = (keep_clear >= corner) & (keep_clear <= np.add(corner, (width, height)))
             return int(inside.all(axis=1).sum())
 
-        return min(corners, key=covered)
+        return min(corners, key=count_covered)
 
     def _whole(self, points: FloatArray) -> np.ndarray[tuple[int, ...], np.dtype[np.int32]]:
-        """Pixels in OpenCV's whole numbers with a fraction, of the canvas."""
+        """Convert pixels to OpenCV's fixed-point coordinates on the canvas."""
         held = np.clip(rescaled_pixels(points, self._zoom), -_FARTHEST, _FARTHEST)
         return np.asarray(np.rint(held * (1 << _SHIFT)), dtype=np.int32)
 
 
 def _dashes(points: FloatArray, dash: float, gap: float) -> FloatArray:
-    """Cut a line (n, 2) into straight dashes [px], (m, 2, 2); the first and last are whole."""
+    """Cut a line (n, 2) into straight dashes [px], (m, 2, 2), the first and last of full length."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     reached = np.concatenate([[0.0], np.cumsum(steps)])
     count = min(max(1, round((reached[-1] + gap) / (dash + gap))), 1000)
@@ -217,7 +217,7 @@ def linear_from_srgb(encoded: LinearArray) -> LinearArray:
 
 
 _DECODED = linear_from_srgb(np.arange(256, dtype=np.float32) / np.float32(255))
-# The bytes of the squares of 0 to 1, which spread the dark values about as sRGB does.
+# sRGB bytes by the square root of linear light, which resolves dark values about as sRGB does.
 _STEPS = 1 << 14
 _LIMITS = linear_from_srgb((np.arange(255, dtype=np.float32) + np.float32(0.5)) / np.float32(255))
 _ENCODED = np.searchsorted(_LIMITS, np.linspace(0, 1, _STEPS + 1) ** 2).astype(np.uint8)
@@ -235,13 +235,13 @@ def bytes_from_linear(linear: LinearArray) -> ByteImage:
 
 
 def composite(color: ByteImage, background: npt.ArrayLike) -> ByteImage:
-    """Put an image with opacity (h, w, 4) before a colour or a photo; see `Frame.composite`."""
+    """Composite an image with opacity (h, w, 4) over a background; see `Frame.composite`."""
     behind = np.asarray(background)
     shape = (*color.shape[:2], 3)
     if behind.shape not in ((3,), shape):
         raise InputError(f"shape {behind.shape} is neither (3,) nor {shape}", where="background")
     if behind.dtype.kind not in "ui" or behind.min(initial=0) < 0 or behind.max(initial=0) > 255:
-        raise InputError("not whole numbers from 0 to 255", where="background")
+        raise InputError("values must be integers from 0 to 255", where="background")
     result: ByteImage = np.empty(shape, dtype=np.uint8)
     result[:] = behind
     opacity = color[:, :, 3]

@@ -1,4 +1,4 @@
-"""Layers of pictures: the model, its lines, keypoints and their uncertainty; sheets of pictures."""
+"""Layers of pictures: model, edges, keypoints and their uncertainty; contact sheets."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from cadalign.render.scene import LIGHT_GREY, Frame, Geometry
 from cadalign.render.viewpoints import seen_in_image
 
 _SHADED_OPACITY, _VEIL_OPACITY = 0.6, 0.5
-# How much of the veil's colour is the model's own, so that its parts can be told apart.
+# Share of the shading in the veil's colour, which makes the model's parts distinguishable.
 _OWN_SHARE = 0.45
 _LINE_OPACITY = 0.9
 _CASING_OPACITY = 0.45
-# Neighbouring pixels whose normals differ by more than this [degrees] lie on both sides of an edge.
+# Least angle between the normals of neighbouring pixels on both sides of an edge [degrees].
 _EDGE_ANGLE = 25.0
-# And those whose depths differ by more than this share of what the slope explains.
+# Least difference of their depths, as a share of the depth.
 _DEPTH_STEP = 0.02
 
 
-def with_model(image: ByteImage, geometry: Geometry, color: Color) -> ByteImage:
-    """Put a model over an image: a `Frame` in its own colours, mere geometry as a veil in a colour.
+def blend_model(image: ByteImage, geometry: Geometry, color: Color) -> ByteImage:
+    """Blend a model over an image: a `Frame` in its own colours, other geometry as a coloured veil.
 
-    Refuses a frame of another size.
+    Raises InputError if the sizes differ.
     """
     if geometry.depth.shape != image.shape[:2]:
         rows, columns = geometry.depth.shape
@@ -53,7 +53,7 @@ def with_model(image: ByteImage, geometry: Geometry, color: Color) -> ByteImage:
         front[:, :, 3] *= _SHADED_OPACITY
         return composite((front + np.float32(0.5)).astype(np.uint8), image)
     grey = np.float32(0.35) + np.float32(0.65) * np.abs(geometry.normal[:, :, 2:])
-    # White in the light, the colour itself in the middle, dark in the shade.
+    # White in the light, the colour itself in between, dark in the shade.
     tinted = np.minimum(2 * grey, 1) * np.array(color, np.float32) + np.maximum(2 * grey - 1, 0) * (
         255 - np.array(color, np.float32)
     )
@@ -63,18 +63,18 @@ def with_model(image: ByteImage, geometry: Geometry, color: Color) -> ByteImage:
 
 
 def feature_lines(geometry: Geometry) -> npt.NDArray[np.bool_]:
-    """Pixels on the outline of the object, or beside a fold or a step in its surface, (h, w)."""
+    """Pixels on the object's outline, or on a crease or depth step of its surface, (h, w) bool."""
     lines = np.zeros(geometry.depth.shape, dtype=bool)
     for first, second in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
         one, other = geometry.mask[first], geometry.mask[second]
         both = one & other
         cosine = np.einsum("rck,rck->rc", geometry.normal[first], geometry.normal[second])
         near, far = geometry.depth[first], geometry.depth[second]
-        # A surface that is seen edge-on changes its depth quickly without having a step.
+        # The depth of a surface seen at a grazing angle changes quickly without a step.
         slope = np.maximum(np.abs(geometry.normal[first][:, :, 2]), 0.05)
         step = np.abs(near - far) * slope > _DEPTH_STEP * np.minimum(near, far)
         changes = both & ((cosine < np.cos(np.radians(_EDGE_ANGLE))) | step)
-        # Of a step the line belongs to the nearer side, of an outline to the object's.
+        # The line is on the nearer side of a step, and on the object's side of an outline.
         lines[first] |= (one & ~other) | (changes & (near <= far))
         lines[second] |= (other & ~one) | (changes & (near > far))
     return lines
@@ -111,11 +111,10 @@ _LEAST_REGION = 3.0  # px across; smaller ones are hidden by the markers
 
 @dataclass(frozen=True, eq=False)
 class KeypointMarks:
-    """Keypoints to be drawn [px], each empty where there is none.
+    """Keypoints to draw [px]; arrays are empty where there is nothing to draw.
 
     ``observed`` (k, 2), ``reprojected`` (m, 2), ``unseen`` (n, 2) and ``outliers`` (o, 2) are
-    points, ``residuals`` (r, 2, 2) lines from one to another, and ``regions`` (q, j, 2) closed
-    curves.
+    points, ``residuals`` (r, 2, 2) lines between two points, ``regions`` (q, j, 2) closed curves.
     """
 
     observed: FloatArray
@@ -126,7 +125,7 @@ class KeypointMarks:
     residuals: FloatArray
 
     @classmethod
-    def checked(
+    def from_arrays(
         cls,
         observed: npt.ArrayLike | None,
         reprojected: npt.ArrayLike | None,
@@ -134,7 +133,7 @@ class KeypointMarks:
         regions: npt.ArrayLike | None,
         outliers: npt.ArrayLike | None,
     ) -> KeypointMarks:
-        """The marks of `draw_overlay`'s arguments; raises InputError where they don't match."""
+        """Convert arguments of `draw_overlay`; raises InputError if their shapes don't match."""
         given = {"observed": observed, "unseen": unseen, "outliers": outliers}
         points = {
             name: as_points(np.empty((0, 2)) if each is None else each, name=name, dimension=2)
@@ -159,7 +158,7 @@ class KeypointMarks:
 
     @property
     def _markers(self) -> list[tuple[FloatArray, LegendEntry, float]]:
-        """Points, their line of the legend, and their radius, in the order they are drawn."""
+        """Points, legend entry and radius of each kind, in drawing order."""
         return [
             (self.observed, ("observed", OBSERVED_COLOR, "ring"), 5),
             (self.reprojected, ("reprojected", REPROJECTED_COLOR, "cross"), 3.5),
@@ -172,7 +171,7 @@ class KeypointMarks:
         before = canvas.image.copy()
         for region in self.regions:
             canvas.line(np.concatenate([region, region[:1]]), UNSEEN_COLOR, width=0.7)
-        canvas.blend_from(before, opacity=_REGION_OPACITY)
+        canvas.fade(before, opacity=_REGION_OPACITY)
         for pair in self.residuals:
             canvas.line(pair, REPROJECTED_COLOR, width=1.0)
         for points, (_, color, marker), radius in self._markers:
@@ -182,7 +181,7 @@ class KeypointMarks:
 
     @property
     def legend(self) -> list[LegendEntry]:
-        """Names and colours of what is drawn."""
+        """Legend entries of what is drawn."""
         entries = [entry for points, entry, _ in self._markers if len(points)]
         if len(self.regions):
             entries.append((f"{100 * REGION_SHARE:.0f} % region", UNSEEN_COLOR, "line"))
@@ -195,10 +194,10 @@ class KeypointMarks:
 
 
 def confidence_regions(points_2d: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Outlines (k, 48, 2) of the ellipses that hold each point with `REGION_SHARE` probability.
+    """Outlines (k, 48, 2) of confidence ellipses, with the probability `REGION_SHARE`.
 
-    ``points_2d`` (n, 2) [px] are their centres, ``covariances`` (n, 2, 2) [px squared]; ellipses of
-    less than 3 px across are left out.
+    ``points_2d`` (n, 2) [px] are the centres, ``covariances`` (n, 2, 2) [px squared]. Ellipses less
+    than 3 px across are omitted.
 
     Examples
     --------
@@ -217,7 +216,7 @@ def confidence_regions(points_2d: FloatArray, covariances: FloatArray) -> FloatA
 
 
 def _finite(points: FloatArray) -> FloatArray:
-    """The rows that are finite, those behind the camera left out."""
+    """Rows that are finite, which means in front of the camera."""
     return np.asarray(points[np.isfinite(points).all(axis=tuple(range(1, points.ndim)))])
 
 
@@ -234,21 +233,21 @@ def keypoint_picture(
     cam_from_model: Alignment,
     visible: npt.NDArray[np.bool_],
 ) -> ByteImage:
-    """Draw numbered keypoints (k, 3) over a picture: ``visible`` ones (k,) yellow, others grey."""
+    """Draw numbered keypoints (k, 3) on a picture: ``visible`` ones (k,) yellow, others grey."""
     canvas = Canvas(image)
     in_camera = cam_from_model.apply(points_3d)
     inside = seen_in_image(camera, in_camera)
-    # The seen ones last, on top of the others.
+    # Visible ones last, on top of the others.
     for row in sorted(np.flatnonzero(inside), key=lambda row: bool(visible[row])):
         color = REPROJECTED_COLOR if visible[row] else _HIDDEN_COLOR
         (place,) = camera.project(in_camera[row : row + 1])
         canvas.ring(place, color, radius=4)
         canvas.label(str(row), place + np.array([11, -9]) * canvas.unit, color)
-    return canvas.finished()
+    return canvas.finish()
 
 
 def contact_sheet(pictures: Mapping[str, ByteImage]) -> ByteImage:
-    """Put pictures of one size side by side, each with its name beneath."""
+    """Arrange pictures of one size in a grid, each above its name."""
     height, width = next(iter(pictures.values())).shape[:2]
     across = int(np.ceil(np.sqrt(len(pictures))))
     down = -(-len(pictures) // across)

@@ -1,6 +1,6 @@
-"""Colour by OpenGL, by way of pyrender; geometry, which OpenGL blurs, by ray casting.
+"""Renderer with pyrender (OpenGL) for the colour and ray casting for the exact geometry.
 
-Importing this module loads pyrender, which may fail in many ways: `cadalign.render.probe` does.
+Only `cadalign.render.probe` imports this module: importing pyrender may fail or crash.
 """
 
 from __future__ import annotations
@@ -41,26 +41,25 @@ import pyrender
 from OpenGL import GL
 
 _ROUGHNESS = 0.55
-# OpenGL's own number; pyrender exports no name for it.
+# OpenGL's constant; pyrender has no name for it.
 _TRIANGLES = 4
 _NEAR_SHARE = 1e-4
-# The clipping planes stand this far off the model, in diagonals.
+# Distance of the clipping planes from the model, in diagonals.
 _CLEARANCE = 0.01
-# Half of the sky's light comes from above; the shader gives the ground's to all sides alike.
+# Half of the sky's light is directional, from above; the rest is ambient.
 _SKY_SHARE = 0.5
-_LARGEST = 4096  # side of an image that OpenGL draws [px]; larger ones are ray cast
-# Sizes of what is drawn are rounded up, so that buffers are not made anew for every frame.
+_LARGEST = 4096  # side [px] of images that OpenGL draws; larger ones are ray cast
+# Image sizes are rounded up to multiples of this, so that frames share buffers.
 _SIZE_STEP = 64
 
 
 class PyrenderRenderer:
-    """Draws colour with OpenGL under EGL; depth, triangle numbers and normals are ray cast.
+    """Renderer with OpenGL under EGL; depth, triangle indices and normals are ray cast.
 
-    Ray casting draws models with transparent parts, which OpenGL would need sorted, and what a lens
-    with distortion sees.
-    A process has one OpenGL context, however many of these there are; a forked process must not
-    use its parent's, so start pools with "spawn". Where OpenGL's libraries are broken
-    the whole process may die: `make_renderer` tries it in another one first.
+    Models with transparent parts and cameras with lens distortion are ray cast entirely. All
+    renderers of a process share one OpenGL context. A forked process must not use its parent's
+    context, so start pools with "spawn". Broken OpenGL libraries may crash the process:
+    `make_renderer` tests them in a subprocess first.
     """
 
     name = "pyrender"
@@ -74,11 +73,11 @@ class PyrenderRenderer:
 
     @property
     def device(self) -> str:
-        """Name of the graphics card, or llvmpipe for Mesa on the processor."""
+        """Name of the GPU, or llvmpipe for Mesa on the CPU."""
         return self._context.device
 
     def __reduce__(self) -> tuple[object, ...]:
-        # OpenGL's objects belong to this process; another one makes its own.
+        # OpenGL objects belong to this process; other processes make their own.
         return partial(PyrenderRenderer, studio=self.studio), ()
 
     def render(
@@ -86,7 +85,7 @@ class PyrenderRenderer:
     ) -> Frame:
         """Draw a scene; see `RaycastRenderer.render`.
 
-        OpenGL antialiases with 4 samples whatever ``samples`` says; 1 turns antialiasing off.
+        OpenGL antialiases with 4 samples for all ``samples`` above 1.
         """
         is_bent = camera.is_wide or bool(camera.distortion)
         is_large = max(camera.width, camera.height) > _LARGEST
@@ -105,24 +104,24 @@ class PyrenderRenderer:
         return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
 
     def _draw(self, block: Rectangle) -> ByteImage:
-        """Draw a block of an image, premultiplied (h, w, 4)."""
+        """Draw a block of an image, premultiplied, (h, w, 4)."""
         width, height = (-(-n // _SIZE_STEP) * _SIZE_STEP for n in (block.width, block.height))
         drawn = self._context.draw(self._stage.scene, width=width, height=height)
         return drawn[: block.height, : block.width]
 
 
 class GlContext:
-    """Draws pyrender scenes; make it with `shared_context` alone.
+    """OpenGL context that draws pyrender scenes; only `shared_context` makes it.
 
-    Two contexts in one process disturb each other, and one that a process inherits from its parent
-    blocks forever.
+    Two contexts in one process disturb each other, and a context inherited by a fork blocks
+    forever.
     """
 
     def __init__(self) -> None:
         try:
-            self._renderer = pyrender.OffscreenRenderer(64, 64)  # its context is the current one
+            self._renderer = pyrender.OffscreenRenderer(64, 64)  # makes its context current
             name = GL.glGetString(GL.GL_RENDERER)
-        except Exception as error:  # PyOpenGL and ctypes raise what they like
+        except Exception as error:  # PyOpenGL and ctypes raise errors of many types
             raise RenderError(
                 f"OpenGL does not start ({type(error).__name__}: {_beginning(error)})",
                 where="pyrender",
@@ -132,7 +131,7 @@ class GlContext:
         self._flags = pyrender.RenderFlags.RGBA
         self._lock = threading.Lock()
         self._process = os.getpid()
-        # Left to the interpreter's end, PyOpenGL would complain that half of it is gone.
+        # Later in the interpreter's shutdown, PyOpenGL would print errors.
         atexit.register(self._close)
 
     def _close(self) -> None:
@@ -141,7 +140,7 @@ class GlContext:
                 self._renderer.delete()
 
     def check_process(self) -> None:
-        """Refuse a process that was forked from the one that made the context."""
+        """Raise RenderError in a process forked from the one that made the context."""
         if os.getpid() != self._process:
             raise RenderError(
                 "this process was forked from one that draws with OpenGL",
@@ -150,14 +149,14 @@ class GlContext:
             )
 
     def draw(self, scene: Any, *, width: int, height: int) -> ByteImage:
-        """Draw a `pyrender.Scene`; (height, width, 4) uint8, red, green and blue premultiplied."""
+        """Draw a `pyrender.Scene`; returns (height, width, 4) uint8, premultiplied."""
         self.check_process()
         with self._lock:
             self._renderer.viewport_width = width
             self._renderer.viewport_height = height
             try:
                 color, _ = self._renderer.render(scene, flags=self._flags)
-            except Exception as error:  # PyOpenGL's errors have no common base with ours
+            except Exception as error:  # PyOpenGL raises errors of many types
                 raise RenderError(
                     f"OpenGL failed to draw ({type(error).__name__}: {_beginning(error)})",
                     where="pyrender",
@@ -168,12 +167,12 @@ class GlContext:
 
 @cache
 def shared_context() -> GlContext:
-    """The process's context, made on the first call; a `RenderError` if OpenGL does not start."""
+    """The context of this process; raises RenderError if OpenGL does not start."""
     return GlContext()
 
 
 def _beginning(error: Exception) -> str:
-    """The beginning of a message on one line; PyOpenGL's go on for dozens."""
+    """Start of a message, on one line; PyOpenGL's have dozens of lines."""
     return " ".join(str(error).split())[:160] or "no reason given"
 
 
@@ -181,51 +180,50 @@ def _beginning(error: Exception) -> str:
 
 
 def gl_meshes(scene: Scene) -> tuple[Any, Any]:
-    """Make the `pyrender.Mesh` pair of an opaque scene.
+    """Make two `pyrender.Mesh` of an opaque scene, with opposite windings.
 
-    Its shader lights one side of a triangle only. So every triangle is given twice, in one mesh as
-    it is and in the other turned round with its normals, and OpenGL culls what is turned away: the
-    two sides look alike, as with ray casting. Where triangles coincide, the one wound towards
-    the viewer is kept.
+    pyrender's shader lights only one side of a triangle. So the second mesh has every triangle with
+    reversed winding and normals, and OpenGL culls the back faces of both: the two sides look alike,
+    as with ray casting. Of coincident triangles, the one wound towards the viewer is kept.
     """
     alike, opposite = scene.coincident_faces
     own = np.arange(len(alike))
     first = alike == own
     sides = (np.flatnonzero(first), np.flatnonzero(first & (opposite == own)))
-    return _mesh(scene, sides[0], turned=False), _mesh(scene, sides[1], turned=True)
+    return _mesh(scene, sides[0], reverse=False), _mesh(scene, sides[1], reverse=True)
 
 
-def _mesh(scene: Scene, faces: IntArray, *, turned: bool) -> Any:
+def _mesh(scene: Scene, faces: IntArray, *, reverse: bool) -> Any:
     primitives = []
     for number, material in enumerate(scene.mesh.materials):
         chosen = faces[scene.mesh.face_material[faces] == number]
         if len(chosen):
-            primitives.append(_primitive(scene, material, chosen, turned=turned))
+            primitives.append(_primitive(scene, material, chosen, reverse=reverse))
     return pyrender.Mesh(primitives=primitives)
 
 
-def _primitive(scene: Scene, material: Material, faces: IntArray, *, turned: bool) -> Any:
+def _primitive(scene: Scene, material: Material, faces: IntArray, *, reverse: bool) -> Any:
     mesh = scene.mesh
     texture = None if mesh.corner_uv is None else material.texture
     (factor,) = linear_colors(np.array([material.color]))
     colors: LinearArray | None = None
     if mesh.vertex_colors is not None:
-        # They take the place of the material's colour.
+        # Vertex colours replace the material's colour.
         colors, factor = linear_colors(mesh.vertex_colors), np.ones(4, dtype=np.float32)
-        colors[:, :3] = _lifted(colors[:, :3])
+        colors[:, :3] = _lift_black(colors[:, :3])
     elif texture is None:
-        factor[:3] = _lifted(factor[:3])
+        factor[:3] = _lift_black(factor[:3])
 
     def corners(values: npt.NDArray[Any] | None) -> LinearArray | None:
-        """Values (m, 3, k) of triangles' corners one after the other, (3 f, k) float32."""
+        """Stack values (m, 3, k) of the chosen triangles' corners, (3 f, k) float32."""
         if values is None:
             return None
-        chosen = values[faces][:, ::-1] if turned else values[faces]
+        chosen = values[faces][:, ::-1] if reverse else values[faces]
         return np.ascontiguousarray(chosen.reshape(-1, values.shape[2]), dtype=np.float32)
 
     return pyrender.Primitive(
         positions=corners(scene.triangles),
-        normals=corners(scene.corner_normals * (-1 if turned else 1)),
+        normals=corners(scene.corner_normals * (-1 if reverse else 1)),
         texcoord_0=None if texture is None else corners(mesh.corner_uv),
         color_0=None if colors is None else corners(colors[mesh.faces]),
         material=pyrender.MetallicRoughnessMaterial(
@@ -239,26 +237,26 @@ def _primitive(scene: Scene, material: Material, faces: IntArray, *, turned: boo
     )
 
 
-def _lifted(color: LinearArray) -> LinearArray:
+def _lift_black(color: LinearArray) -> LinearArray:
     return np.asarray(DARKEST + (1 - DARKEST) * color, dtype=np.float32)
 
 
 def _texture(image: npt.NDArray[np.uint8]) -> Any:
-    """An opaque RGBA texture: rows of other widths than 4 bytes a pixel would be misread."""
+    """Make an opaque RGBA texture: OpenGL misreads rows that are not multiples of 4 bytes."""
     rgba = np.full((*image.shape[:2], 4), 255, dtype=np.uint8)
     rgba[:, :, :3] = image[:, :, :3]
     return pyrender.Texture(source=rgba, source_channels="RGBA")
 
 
 class GlStage:
-    """A `pyrender.Scene`: lights and camera that stand still, a mesh that stays loaded.
+    """A `pyrender.Scene` with fixed lights and camera, and the mesh that was drawn last.
 
-    OpenGL's lights have no size, so shadows' edges are harder than in ray-cast frames.
+    OpenGL's lights have no size, so shading changes more sharply than in ray-cast frames.
     """
 
     def __init__(self, studio: Studio) -> None:
         sky = studio.sky_power - studio.ground_power
-        # A light of some size reaches round the object; here that part comes from everywhere.
+        # Large lights reach around the object; here that part is ambient light.
         around = 0.5 * studio.wrap * (studio.key_power + studio.fill_power)
         ambient = np.full(3, studio.ground_power + (1 - _SKY_SHARE) * sky + around)
         self.scene: Any = pyrender.Scene(bg_color=np.zeros(4), ambient_light=ambient)
@@ -273,7 +271,7 @@ class GlStage:
     def place(
         self, scene: Scene, camera: Camera, cam_from_model: Alignment, corner: tuple[int, int]
     ) -> None:
-        """Put a scene's mesh where it is seen, in the part of an image that begins at a pixel."""
+        """Pose a scene's mesh for the block of an image with the top left pixel ``corner``."""
         if scene is not self._shown:
             for node in self._nodes:
                 self.scene.remove_node(node)
@@ -293,10 +291,10 @@ class GlStage:
         lens.cy = camera.cy + PIXEL_CENTRE - corner[1]
 
     def _add_light(self, power: float) -> Any:
-        # The shader divides by pi, as a surface spreads its light over the hemisphere.
+        # The shader divides by pi, as for a Lambertian surface.
         return self.scene.add(pyrender.DirectionalLight(color=np.ones(3), intensity=np.pi * power))
 
     def _turn(self, light: Any, direction: FloatArray) -> None:
-        """Let a light shine from a direction (3,): along its +z axis."""
+        """Rotate a light to shine from a direction (3,), its +z axis."""
         pose = align_vectors(np.array([0.0, 0.0, 1.0]), direction)  # type: ignore[no-untyped-call]
         self.scene.set_pose(light, pose)

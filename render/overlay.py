@@ -1,4 +1,4 @@
-"""Overlays: boxes, axes and keypoints of an alignment drawn over its photo."""
+"""Overlays: draw an alignment's model, box, axes and keypoints over its photo."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from cadalign.io.images import read_image
 from cadalign.io.meshes.files import load_mesh, mesh_at
 from cadalign.io.observation import Observation
 from cadalign.render.canvas import ByteImage, Canvas, Color, LegendEntry, composite
-from cadalign.render.layers import KeypointMarks, confidence_regions, draw_lines, with_model
+from cadalign.render.layers import KeypointMarks, blend_model, confidence_regions, draw_lines
 from cadalign.render.posed import within_lens_field
 from cadalign.render.raycast import RaycastRenderer, cast_geometry
 from cadalign.render.scene import LIGHT_GREY, Geometry, Scene, check_image_size
@@ -30,12 +30,11 @@ logger = logging.getLogger("cadalign")
 
 GT_COLOR: Color = (40, 205, 80)
 EST_COLOR: Color = (240, 50, 50)
-# Red-ish, green-ish and blue-ish, but none of them a box's colour.
+# Reddish, greenish and bluish, but different from the boxes' colours.
 AXIS_COLORS: tuple[Color, Color, Color] = ((255, 150, 60), (110, 235, 205), (95, 150, 255))
 
 _HIDDEN_OPACITY = 0.6
-# Lines are cut off this many images away.
-_CUT_OFF = 20
+_CUT_OFF = 20  # image sizes away, where lines end
 _LINE_POINTS = 65
 _SAME = 1e-9  # of the model's size
 _INSIDE = 0.5  # least probability of a pixel of the object
@@ -44,15 +43,15 @@ _CONTOUR_COLOR = (70, 190, 250)
 
 @dataclass(frozen=True)
 class _Stroke:
-    """A line to be drawn: the farther away, the sooner."""
+    """A line to draw."""
 
     depth: float
     points: FloatArray
     color: Color
     is_hidden: bool = False
-    """Behind the box itself."""
+    """Whether its own box hides it."""
     arrow: str = ""
-    """The letter at its tip."""
+    """Letter at the tip of an arrow; empty for a plain line."""
 
 
 def draw_overlay(
@@ -72,37 +71,35 @@ def draw_overlay(
 ) -> ByteImage:
     """Draw an alignment over its image.
 
-    The true box is green, the predicted one red; their far edges are dashed. Three arrows run from
-    the predicted box's centre (or the true one's, without a prediction) to its faces, so that
-    their lengths show the stretch. The predicted model itself lies over the photo with its
-    edges. Observed keypoints are white rings, reprojected ones yellow
-    crosses, and a thin line between the two is the residual. Keypoints that were not observed are
-    small rings, and thin curves hold those that are uncertain. What lies behind the camera is cut
-    off.
+    The true box is green, the predicted one red; hidden edges are dashed. Three arrows run from the
+    centre of the predicted box (of the true box without a prediction) to its faces: their lengths
+    show the stretch. Observed keypoints are white rings, reprojected ones yellow crosses, and a
+    thin line between the two is the residual. Keypoints that were not observed are small rings, and
+    thin curves are confidence regions. Parts behind the camera are not drawn.
 
     Parameters
     ----------
     image : (h, w), (h, w, 3) or (h, w, 4) uint8
-        Grey, RGB or RGBA (put on light grey), of the camera's size.
+        Grey, RGB or RGBA (over light grey), of the camera's size.
     camera : Camera
     gt_box, est_box : Box, optional
         The true and the predicted box, in the camera frame.
     est_frame : Geometry, optional
-        The predicted model for this camera: a `Frame` of `RaycastRenderer` is shown in its own
-        colours, what `cast_geometry` gives as a red veil.
+        The predicted model, rendered with this camera: a `Frame` is drawn in its own colours, the
+        geometry of `cast_geometry` as a red veil.
     observed, reprojected : (k, 2) float, optional
-        Keypoints [px]; if both are given they belong together, row by row. Reprojected ones that
-        are not finite, behind the camera, are left out.
+        Keypoints [px]; if both are given, their rows correspond. Reprojected ones that are not
+        finite (behind the camera) are omitted.
     unseen : (n, 2) float, optional
         Predicted keypoints that were not observed [px].
     regions : (r, j, 2) float, optional
-        Outlines of regions that hold keypoints [px], as of `confidence_regions`.
+        Outlines of confidence regions of keypoints [px], as of `confidence_regions`.
     outliers : (n, 2) float, optional
-        Observed keypoints that the estimate left out [px]: their rings are grey.
+        Observed keypoints that the estimate rejected [px]: their rings are grey.
     axes : bool
         Whether to draw the axes.
     legend : bool
-        Whether to draw it.
+        Whether to draw the legend.
 
     Returns
     -------
@@ -111,7 +108,7 @@ def draw_overlay(
     Raises
     ------
     InputError
-        If the image is of another kind or size, or the keypoints don't match.
+        If the image has the wrong type or size, or the keypoints' shapes don't match.
     RenderError
         If the image is too large.
 
@@ -125,11 +122,11 @@ def draw_overlay(
     check_image_size(camera)
     pixels = _as_rgb(image, camera)
     if est_frame is not None:
-        pixels = with_model(pixels, est_frame, EST_COLOR)
+        pixels = blend_model(pixels, est_frame, EST_COLOR)
     canvas = Canvas(pixels)
     if est_frame is not None:
         draw_lines(canvas, est_frame, EST_COLOR)
-    marks = KeypointMarks.checked(observed, reprojected, unseen, regions, outliers)
+    marks = KeypointMarks.from_arrays(observed, reprojected, unseen, regions, outliers)
     strokes: list[_Stroke] = []
     for box, color in ((gt_box, GT_COLOR), (est_box, EST_COLOR)):
         if box is not None:
@@ -151,15 +148,15 @@ def draw_overlay(
     if legend and entries:
         lines = [stroke.points for stroke in strokes]
         canvas.legend(entries, keep_clear=np.concatenate([*lines, marks.pixels]))
-    return canvas.finished()
+    return canvas.finish()
 
 
 def _as_rgb(image: Any, camera: Camera) -> ByteImage:
-    """Turn the image into RGB (h, w, 3), or say what is wrong with it."""
+    """Convert an image to RGB (h, w, 3); raises InputError if it does not fit the camera."""
     pixels = np.asarray(image)
     if pixels.dtype != np.uint8:
         raise InputError(
-            f"its values are {pixels.dtype}, not uint8", where="image", fix="scale it to 0 to 255"
+            f"its values are {pixels.dtype}, not uint8", where="image", fix="scale them to 0 to 255"
         )
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
@@ -180,10 +177,10 @@ def _as_rgb(image: Any, camera: Camera) -> ByteImage:
 
 
 def _edge_strokes(box: Box, color: Color, camera: Camera) -> list[_Stroke]:
-    """A box's edges, those behind the box itself hidden."""
+    """Edges of a box; those that the box itself hides are marked."""
     strokes: list[_Stroke] = []
     corners = box.corners
-    # Where the camera is, along each axis from the centre, in half extents.
+    # The camera's position in the box's axes, from its centre.
     position = -(box.center @ box.rotation)
     half = box.extents / 2
     shows = {(k, sign): sign * position[k] > half[k] for k in range(3) for sign in (-1, 1)}
@@ -205,7 +202,7 @@ def _axis_strokes(box: Box, camera: Camera) -> list[_Stroke]:
 
 
 def _strokes(ends: FloatArray, camera: Camera, color: Color, **style: Any) -> list[_Stroke]:
-    """Project a segment (2, 3); none if it is not seen, several if a lens cuts it up."""
+    """Project a segment (2, 3): no stroke if it is invisible, several where a lens splits it."""
     points = ends[0] + np.linspace(0, 1, _LINE_POINTS)[:, None] * (ends[1] - ends[0])
     pixels = camera.project_where_ahead(points)
     kept = within_lens_field(camera, points)
@@ -220,13 +217,13 @@ def _strokes(ends: FloatArray, camera: Camera, color: Color, **style: Any) -> li
 
 
 def _draw_strokes(canvas: Canvas, strokes: list[_Stroke]) -> None:
-    """Hidden edges thin, dashed and faint; then the others, the nearest last."""
+    """Draw hidden edges thin, dashed and faint; then the others, the nearest last."""
     by_depth = sorted(strokes, key=lambda stroke: -stroke.depth)
     before = canvas.image.copy()
     for stroke in by_depth:
         if stroke.is_hidden:
             canvas.line(stroke.points, stroke.color, width=1.2, dashed=True)
-    canvas.blend_from(before, opacity=_HIDDEN_OPACITY)
+    canvas.fade(before, opacity=_HIDDEN_OPACITY)
     for stroke in by_depth:
         if stroke.is_hidden:
             continue
@@ -235,7 +232,7 @@ def _draw_strokes(canvas: Canvas, strokes: list[_Stroke]) -> None:
         else:
             canvas.line(stroke.points, stroke.color, width=2.0)
             for end in stroke.points[[0, -1]]:
-                # Fills the notch that a casing cuts into the edge it meets.
+                # Fill the notch where the casing of one edge crosses another edge.
                 canvas.dot(end, stroke.color, radius=1.2)
     for stroke in strokes:
         if stroke.arrow:
@@ -250,19 +247,19 @@ def _draw_strokes(canvas: Canvas, strokes: list[_Stroke]) -> None:
 def overlay_model(
     image: npt.ArrayLike, camera: Camera, mesh: Mesh | Scene, alignment: Alignment
 ) -> ByteImage:
-    """Draw an aligned model over its photo, shaded, with its edges, its box and its axes.
+    """Draw an aligned, shaded model over its photo, with its edges, box and axes.
 
     Parameters
     ----------
     image : (h, w), (h, w, 3) or (h, w, 4) uint8
         The photo, of the camera's size.
     camera : Camera
-        Its lens distortion bends the model, the box and the axes.
+        Its lens distortion is applied to the model, the box and the axes.
     mesh : Mesh or Scene
-        The model, before its stretch: a result's ``mesh()`` where the object's shape was estimated.
-        A `Scene` is prepared once for many photos.
+        The model before its stretch: ``result.mesh()`` where the shape was estimated. A `Scene`
+        can be reused for many photos.
     alignment : Alignment
-        The model's pose and stretch, of a result or the truth.
+        Pose and stretch of the model, estimated or true.
 
     Returns
     -------
@@ -271,7 +268,7 @@ def overlay_model(
     Raises
     ------
     InputError
-        If the image is of another kind or size.
+        If the image has the wrong type or size.
     RenderError
         If the image is too large.
 
@@ -303,13 +300,13 @@ def draw_result(
     mask: npt.NDArray[Any] | None = None,
     number: int = 0,
 ) -> ByteImage:
-    """Draw the estimated box, keypoints with their uncertainty, and mesh over the photo of a view.
+    """Draw an estimate over the photo of a view: box, mesh, and keypoints with their uncertainty.
 
-    Keypoints that the view does not show are drawn with the regions that hold them; where the views
-    have a pose each, regions are drawn in the first one alone. ``photo`` is as for `draw_overlay`,
-    ``result`` a `cadalign.Result`; ``mesh`` the object's in the model's frame before the stretch,
-    see `mesh_of`; ``bounds`` (2, 3) the box to draw in that frame, by default the result's;
-    ``mask`` (h, w) the view's, whose contour is drawn; ``number`` the view's in the result.
+    Confidence regions of keypoints that were not observed are drawn in the first view, or in all
+    views of a rig. ``photo`` is as for `draw_overlay`, ``result`` a `cadalign.Result`, and
+    ``number`` the index of the view. ``mesh`` (see `mesh_of`) and the box's ``bounds`` (2, 3) are
+    in the model frame before the stretch; by default the bounds are the result's. The contour of
+    ``mask`` (h, w) is drawn.
     """
     view = result.views[number]
     camera, alignment = view.camera, view.alignment
@@ -343,7 +340,7 @@ def draw_result(
 
 
 def photo_of(image: Path | str | npt.ArrayLike | None, camera: Camera) -> npt.NDArray[Any]:
-    """The pixels of a photo, grey where there is none; refuses images that are too large."""
+    """Pixels of a photo, grey without one; raises RenderError if it is too large."""
     check_image_size(camera)
     if image is None:
         return np.full((camera.height, camera.width, 3), LIGHT_GREY, dtype=np.uint8)
@@ -353,7 +350,7 @@ def photo_of(image: Path | str | npt.ArrayLike | None, camera: Camera) -> npt.ND
 
 
 def draw_contour(image: ByteImage, mask: npt.NDArray[Any]) -> ByteImage:
-    """Draw the contour of a mask (h, w) over an image; returns a copy."""
+    """Draw the contour of a mask (h, w) on a copy of an image."""
     inside = (mask > _INSIDE).astype(np.uint8)
     contours, _ = cv2.findContours(inside, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     drawn = image.copy()
@@ -362,10 +359,10 @@ def draw_contour(image: ByteImage, mask: npt.NDArray[Any]) -> ByteImage:
 
 
 def mesh_of(observation: Observation, result: Any) -> Mesh | None:
-    """The object's mesh, warped from the observation's model or the nearest training model.
+    """Mesh of the object in the model frame before the stretch; None where no mesh is known.
 
-    Of a fit of pairs the model's own. In the model's frame, before the stretch. None where no mesh
-    is known; a training mesh that cannot be read is warned of (logger "cadalign").
+    Results of `align` warp the observation's model or the nearest training model; others have the
+    model's own mesh. An unreadable training mesh gives a warning (logger "cadalign").
     """
     if result.method != "align":
         return None if observation.model is None else mesh_at(observation.model)
@@ -392,7 +389,7 @@ def mesh_of(observation: Observation, result: Any) -> Mesh | None:
 
 
 def drawable_mesh(result: Any, mesh: Mesh | str | os.PathLike[str] | None = None) -> Mesh | None:
-    """The mesh of a result; None where there is none to warp, or the model's cannot be read."""
+    """Mesh of a result; None where no mesh is known or the training mesh is unreadable."""
     try:
         return cast(Mesh, result.mesh(mesh))
     except (InputError, DataError) as error:

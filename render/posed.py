@@ -1,4 +1,4 @@
-"""A scene seen by a camera: rays, hits and the light that comes back along them."""
+"""A scene in front of a camera: ray casting and shading."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from cadalign.render.scene import Scene
 from cadalign.render.surface import Studio
 
 _MAX_LAYERS = 8
-# What is hidden to this share is left out.
-_SEEN_THROUGH = 1 / 64
-# How far behind a transparent hit the ray goes on, in diagonals of the model.
+# A ray stops once less than this share of the light comes through.
+_LEAST_TRANSMITTANCE = 1 / 64
+# A ray goes on this far behind a transparent hit, in diagonals of the model.
 _LAYER_GAP = 2e-5
-# Pixels left about the object.
+# Pixels around the object.
 _MARGIN = 2
 _POINTS_PER_SIDE = 65
 
@@ -48,16 +48,16 @@ class Rectangle:
 
     @property
     def height(self) -> int:
-        """Rows [px]."""
+        """Number of rows."""
         return self.bottom - self.top
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """The block's rows and columns, to index images with."""
+        """Row and column slices for indexing images."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
     def bands(self, rows: int) -> list[Rectangle]:
-        """Cut the block into bands of at most so many rows, which is at least one."""
+        """Cut the block into bands of at most ``rows`` rows, at least one."""
         step = max(1, rows)
         return [
             Rectangle(self.left, top, self.right, min(top + step, self.bottom))
@@ -73,7 +73,7 @@ class Rectangle:
 
 
 class PosedScene:
-    """A scene placed before a camera, seen in a block of its pixels; made by `pose_scene`."""
+    """A scene in front of a camera, and the block of pixels that shows it; see `pose_scene`."""
 
     def __init__(
         self,
@@ -98,10 +98,10 @@ class PosedScene:
         normals = scene.face_normals @ self._normal_matrix.T
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
         self.normals: LinearArray = (normals * self._side[:, None]).astype(np.float32)
-        """The faces' unit normals in the camera frame, (m, 3) float32, on the side that is seen."""
+        """Unit face normals in the camera frame, (m, 3) float32, towards the camera."""
 
-    def hits(self, pixels: FloatArray) -> tuple[FloatArray, FaceArray, FloatArray]:
-        """Rays (n, 3) of pixels (n, 2) and what is seen along them; see `cast`."""
+    def cast_pixels(self, pixels: FloatArray) -> tuple[FloatArray, FaceArray, FloatArray]:
+        """Rays (n, 3) of pixels (n, 2), and the triangles and depths of their hits; see `cast`."""
         rays, valid = self.camera.rays_where_valid(pixels)
         face, depth = self.cast(rays)
         face[~valid] = -1
@@ -110,26 +110,26 @@ class PosedScene:
     def cast(
         self, rays: FloatArray, *, start: FloatArray | None = None
     ) -> tuple[FaceArray, FloatArray]:
-        """Find what is seen along rays (n, 3) of the camera: triangles and depths, both (n,).
+        """Cast camera rays (n, 3); returns the triangles and depths of the hits, both (n,).
 
-        A depth is the multiple of its ray that leads to the hit.
+        Depth times ray is the point of the hit. The triangle is -1 without a hit.
         """
         directions = self._directions(rays)
         face, depth = self._caster.first_hits(self._origin, directions, start=start)
-        # Of coincident triangles those wound to the camera are shown.
+        # Show the coincident triangle that is wound towards the camera.
         return np.where(face >= 0, self._shown[face], np.int32(-1)), depth
 
     @cached_property
     def diagonal(self) -> float:
-        """The diagonal of the stretched model's bounding box [model units]."""
+        """Diagonal of the stretched model's bounding box [model units]."""
         return self.scene.stretched_diagonal(self._alignment)
 
     def blocked(
         self, points_cam: FloatArray, directions: FloatArray, *, reach: float
     ) -> npt.NDArray[np.bool_]:
-        """Find the rays that hit a part of the object within a distance, (n,) bool.
+        """Whether each ray hits the object within a distance, (n,) bool.
 
-        ``points_cam`` and the unit ``directions`` (n, 3) are in the camera frame, ``reach`` in
+        Starts ``points_cam`` and unit ``directions`` (n, 3) are in the camera frame, ``reach`` in
         model units.
         """
         columns = self._model_from_ray.T
@@ -137,12 +137,12 @@ class PosedScene:
             (points_cam - self._alignment.translation) @ columns, directions @ columns, reach=reach
         )
 
-    def light_of_hits(
+    def shade_hits(
         self, rays: FloatArray, face: FaceArray, depth: FloatArray, studio: Studio
     ) -> LinearArray:
-        """Colour seen along rays (n, 3) of the camera whose first hits are known.
+        """Shade camera rays (n, 3) from their first hits, through transparent surfaces.
 
-        Linear light, premultiplied, and opacity: (n, 4) float32.
+        Returns linear light, premultiplied, and opacity, (n, 4) float32.
         """
         result = np.zeros((len(face), 4), dtype=np.float32)
         active = np.flatnonzero(face >= 0)
@@ -154,7 +154,7 @@ class PosedScene:
             seen[:, :3] += color[:, :3] * through[:, None]
             seen[:, 3] += through
             result[active] = seen
-            going = np.flatnonzero(seen[:, 3] < 1 - _SEEN_THROUGH)
+            going = np.flatnonzero(seen[:, 3] < 1 - _LEAST_TRANSMITTANCE)
             if not len(going):
                 break
             rays, depth = rays[going], depth[going]
@@ -168,7 +168,7 @@ class PosedScene:
     def _shade(
         self, rays: FloatArray, face: FaceArray, depth: FloatArray, studio: Studio
     ) -> LinearArray:
-        """Light and opacity (n, 4) of hits, not premultiplied."""
+        """Linear light and opacity of hits, not premultiplied, (n, 4)."""
         surface = self.scene.surface
         weights = self._weights(rays, face, depth)
         normal = self._smooth_normals(face, weights)
@@ -182,11 +182,11 @@ class PosedScene:
         """Barycentric coordinates of hits, (n, 3)."""
         points = self._origin + self._directions(rays) * depth[:, None]
         weights = barycentric_of(self.scene.triangles[face], points)
-        # The float32 caster may hit a triangle a hair outside of it.
+        # The float32 ray caster may hit slightly outside the triangle.
         return np.asarray(np.clip(np.nan_to_num(weights), 0, 1), dtype=np.float32)
 
     def _smooth_normals(self, face: FaceArray, weights: LinearArray) -> LinearArray:
-        """Unit normals (n, 3) in the camera frame, blended between the corners of triangles."""
+        """Unit normals (n, 3) in the camera frame, interpolated between the triangles' corners."""
         blended = np.einsum("nc,nck->nk", weights, self.scene.corner_normals[face])
         turned = blended @ self._normal_matrix.T.astype(np.float32)
         length = np.sqrt(np.einsum("nk,nk->n", turned, turned))
@@ -194,14 +194,17 @@ class PosedScene:
         return np.asarray(turned * (side / np.maximum(length, np.float32(1e-30)))[:, None])
 
     def _directions(self, rays: FloatArray) -> FloatArray:
-        """Directions (n, 3) in the model frame of the camera's."""
+        """Convert camera rays (n, 3) to directions in the model frame."""
         return np.asarray(rays @ self._model_from_ray.T)
 
 
 def pose_scene(
     scene: Scene, camera: Camera, cam_from_model: Alignment, *, caster: RayCaster | None = None
 ) -> PosedScene | None:
-    """Place a scene before a camera; None if it is unseen. The caster is by default its own."""
+    """Place a scene in front of a camera; None if no pixel shows it.
+
+    ``caster`` is the scene's by default.
+    """
     block = _object_rectangle(scene, camera, cam_from_model)
     if block is None:
         return None
@@ -209,7 +212,7 @@ def pose_scene(
 
 
 def _object_rectangle(scene: Scene, camera: Camera, cam_from_model: Alignment) -> Rectangle | None:
-    """The block of pixels that holds all of the object and a margin; None if it is unseen."""
+    """Block of pixels around the object, with a margin; None if no pixel shows it."""
     points = scene.used_vertices @ cam_from_model.linear.T + cam_from_model.translation
     whole = Rectangle(0, 0, camera.width, camera.height)
     if camera.is_wide:
@@ -224,7 +227,7 @@ def _object_rectangle(scene: Scene, camera: Camera, cam_from_model: Alignment) -
         return whole
     pixels = camera.pixels_of_rays(outline)
     size = (camera.width, camera.height)
-    # Clip before converting to whole numbers, which far-off pixels would overflow.
+    # Clip before converting to integers, which distant pixels would overflow.
     first = np.clip(np.floor(pixels.min(axis=0)) - _MARGIN, 0, size).astype(int)
     last = np.clip(np.ceil(pixels.max(axis=0)) + _MARGIN + 1, 0, size).astype(int)
     if (first >= last).any():
@@ -233,7 +236,7 @@ def _object_rectangle(scene: Scene, camera: Camera, cam_from_model: Alignment) -
 
 
 def _outline(low: FloatArray, high: FloatArray) -> FloatArray:
-    """Directions (n, 3) along the border of a rectangle of normalised ones."""
+    """Rays (n, 3) along the border of a rectangle in normalised coordinates."""
     share = np.linspace(0, 1, _POINTS_PER_SIDE)[:, None]
     corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
     following = np.roll(corners, -1, axis=0)
@@ -245,12 +248,10 @@ _STEPS = 24
 
 
 def within_lens_field(camera: Camera, points_cam: FloatArray) -> npt.NDArray[np.bool_]:
-    """Find the points up to which the lens model maps outer points farther out than inner ones.
+    """Whether points (n, 3) are in front of the camera with a valid lens model, (n,) bool.
 
-    A distortion polynomial turns back at some radius and from there on folds far-off directions
-    into the image. Points beyond are not seen by the camera, wherever the model puts them.
-    Returns (n,) bool for points (n, 3): the camera sees them, and the distorted radius grows all
-    the way from the centre to the point.
+    A distortion polynomial decreases beyond some radius, and maps distant directions back into the
+    image. A point is valid if the distorted radius grows all the way from the centre to it.
     """
     seen = camera.sees(points_cam)
     if camera.is_wide or not camera.distortion:
@@ -269,11 +270,11 @@ _MAX_THREADS = 8
 _Part = TypeVar("_Part")
 
 
-def in_threads(draw: Callable[[_Part], None], parts: Sequence[_Part]) -> None:
-    """Draw parts of a frame side by side; embree and NumPy let go of the interpreter lock."""
+def draw_in_threads(draw: Callable[[_Part], None], parts: Sequence[_Part]) -> None:
+    """Draw parts of a frame in threads; embree and NumPy release the interpreter lock."""
     if len(parts) == 1:
         draw(parts[0])
         return
     with ThreadPoolExecutor(min(os.cpu_count() or 1, _MAX_THREADS)) as pool:
-        # Asking for the results raises what a part has raised.
+        # Reading the results raises the errors of the threads.
         list(pool.map(draw, parts))

@@ -1,4 +1,4 @@
-"""Renderers by name: tried in a process of their own, and chosen."""
+"""Renderers by name; they are tested in a subprocess."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ REMEDIES = {
     "raycast": "pip install --force-reinstall embreex trimesh",
 }
 """Commands that install what a renderer needs, on Debian."""
-# The last line of the child's output begins so; libraries write what they like before it.
+# Prefix of the subprocess's last line of output; libraries may write other lines before it.
 _MARK = "cadalign-probe "
 _CHILD = (
     "import sys, json; sys.path[:] = json.loads(sys.argv[1]); "
@@ -43,28 +43,28 @@ _CHILD = (
 
 @dataclass(frozen=True)
 class Probe:
-    """Result of trying a renderer."""
+    """Result of testing a renderer."""
 
     name: str
-    """The renderer."""
+    """Name of the renderer."""
     works: bool
     detail: str
-    """Device that draws, or the reason of the failure."""
+    """The device, or the reason of the failure."""
 
 
 @cache
 def probe_renderer(name: str) -> Probe:
-    """Try a renderer in a process of its own; the result is kept for the life of this one.
+    """Test a renderer in a subprocess; the result is cached.
 
     Parameters
     ----------
     name : str
-        One of `RENDERERS`.
+        A key of `RENDERERS`.
 
     Raises
     ------
     InputError
-        If there is no such renderer.
+        If the name is unknown.
     """
     if name not in RENDERERS:
         raise unknown("renderer", name, RENDERERS)
@@ -81,7 +81,7 @@ def probe_renderer(name: str) -> Probe:
     except subprocess.TimeoutExpired:
         return Probe(name, False, f"no frame within {_TIMEOUT} seconds")
     except OSError as error:
-        return Probe(name, False, f"no process to try it in ({error})")
+        return Probe(name, False, f"the test process cannot be started ({error})")
     for line in reversed(child.stdout.splitlines()):
         if line.startswith(_MARK):
             return Probe(**json.loads(line.removeprefix(_MARK)))
@@ -93,10 +93,10 @@ def probe_renderer(name: str) -> Probe:
 
 
 def report(name: str) -> None:
-    """Try a renderer in this process and write the result to standard output, for the parent."""
+    """Test a renderer in this process and write the result to standard output."""
     try:
         result = _try(name)
-    except Exception as error:  # whatever it is, the parent wants to know
+    except Exception as error:  # the parent process reports any error
         reason = error.what if isinstance(error, CadalignError) else str(error)
         result = Probe(name, False, reason or type(error).__name__)
     sys.stdout.write(f"\n{_MARK}{json.dumps(asdict(result))}\n")
@@ -104,7 +104,7 @@ def report(name: str) -> None:
 
 
 def load_renderer(name: str, studio: Studio | None) -> Renderer:
-    """Make a renderer in this process, even if that takes the process down."""
+    """Make a renderer without a test, which may crash the process."""
     module, _, kind = RENDERERS[name].partition(":")
     renderer: Renderer = getattr(import_module(module), kind)(studio=studio)
     return renderer
@@ -119,7 +119,7 @@ def _try(name: str) -> Probe:
     frame = renderer.render(Scene(kite), camera, pose)
     seen = float((frame.color[:, :, 3] > 127).mean())
     if not (frame.mask.any() and abs(seen - frame.mask.mean()) < 0.1):
-        return Probe(name, False, "it draws a kite wrongly")
+        return Probe(name, False, "it renders a test image incorrectly")
     return Probe(name, True, str(getattr(renderer, "device", "processor")))
 
 
@@ -127,24 +127,23 @@ logger = logging.getLogger("cadalign")
 
 AUTO = "auto"
 
-# Of OpenGL's devices, programs that run on the processor.
-_IMITATIONS = ("llvmpipe", "softpipe", "swrast", "software rasterizer", "swiftshader")
+# OpenGL devices that are software on the CPU.
+_SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software rasterizer", "swiftshader")
 
 
 def make_renderer(name: str = AUTO, *, studio: Studio | None = None) -> Renderer:
     """Make a renderer.
 
-    Renderers other than ``raycast`` are tried in a process of their own first, once in the life of
-    this one, since broken graphics libraries would take this process down.
+    Renderers other than ``raycast`` are first tested in a subprocess, since broken graphics
+    libraries would crash this process.
 
     Parameters
     ----------
     name : str
         ``raycast`` works everywhere; ``pyrender`` draws the colour with OpenGL; ``open3d`` casts
-        rays with Open3D. ``auto`` takes pyrender where it works on a graphics card, and raycast
-        elsewhere: OpenGL imitated on the processor takes as long and smooths edges less, and
-        Open3D casts no faster. It says which (logger "cadalign", level info; the renderer's
-        ``name``).
+        rays with Open3D. ``auto`` is pyrender where it works on a GPU, and raycast elsewhere:
+        OpenGL on the CPU is no faster and antialiases less, and Open3D is no faster either. The
+        choice is logged (logger "cadalign", level info).
     studio : Studio, optional
         The lights.
 
@@ -155,9 +154,9 @@ def make_renderer(name: str = AUTO, *, studio: Studio | None = None) -> Renderer
     Raises
     ------
     InputError
-        If there is no renderer of that name.
+        If the name is unknown.
     RenderError
-        If the one asked for does not work here.
+        If the renderer does not work on this machine.
 
     Examples
     --------
@@ -180,12 +179,12 @@ def make_renderer(name: str = AUTO, *, studio: Studio | None = None) -> Renderer
 
 
 def best_renderer() -> str:
-    """The renderer that "auto" takes here, by name; ray casting needs no proof."""
+    """Name of the renderer that "auto" selects on this machine."""
     found = probe_renderer("pyrender")
     if not found.works:
         name, reason = "raycast", f"pyrender does not work here: {found.detail}"
-    elif any(name in found.detail.lower() for name in _IMITATIONS):
-        name, reason = "raycast", f"OpenGL has no graphics card here but {found.detail}"
+    elif any(name in found.detail.lower() for name in _SOFTWARE):
+        name, reason = "raycast", f"OpenGL runs on the CPU here: {found.detail}"
     else:
         name, reason = "pyrender", found.detail
     logger.info("renderer: %s (%s)", name, reason)

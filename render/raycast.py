@@ -1,4 +1,4 @@
-"""Drawing by ray casting: exact geometry and antialiased, shaded colour; needs no display."""
+"""Renderer by ray casting: exact geometry and antialiased, shaded colour; needs no display."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.raycaster import FaceArray, RayCaster
 from cadalign.render.canvas import ByteImage, LinearArray, bytes_from_linear
-from cadalign.render.posed import PosedScene, Rectangle, in_threads, pose_scene
+from cadalign.render.posed import PosedScene, Rectangle, draw_in_threads, pose_scene
 from cadalign.render.scene import Frame, Geometry, Scene, check_image_size
 from cadalign.render.surface import Studio
 
 # Small enough for the processor's caches, large enough for NumPy's overhead not to show.
 _RAYS_AT_ONCE = 1 << 15
-# Neighbouring pixels that differ by more than this in a channel (of 255) are sampled again.
+# Pixels that differ from a neighbour by more than this in a channel (of 255) are antialiased.
 _VISIBLE_STEP = 6
 _MAX_SAMPLES = 256
 
 
 class RaycastRenderer:
-    """Draws with embree on the processor; the renderer that works everywhere.
+    """Renderer with embree on the CPU; works everywhere.
 
     Parameters
     ----------
@@ -60,18 +60,16 @@ class RaycastRenderer:
         scene : Scene
             The prepared mesh.
         camera : Camera
-            The camera; its lens distortion is drawn too.
+            Its lens distortion is rendered too.
         cam_from_model : Alignment
-            Where the mesh is and how it is stretched. What lies behind the camera is not seen.
+            Pose and stretch of the mesh. Parts behind the camera are not drawn.
         samples : int
-            Rays per pixel where the colour changes from one pixel to the next; 1 turns
-            antialiasing off.
+            Rays per pixel where neighbouring colours differ; 1 turns antialiasing off.
 
         Returns
         -------
         Frame
-            All of it empty if the object is not in the image; pixels are empty where the lens
-            model cannot be inverted.
+            Pixels are empty where no object is, and where the lens model cannot be inverted.
 
         Raises
         ------
@@ -88,10 +86,10 @@ class RaycastRenderer:
         def shade(
             posed: PosedScene, band: Rectangle, rays: FloatArray, face: FaceArray, depth: FloatArray
         ) -> None:
-            light = posed.light_of_hits(rays, face, depth, self.studio)
+            light = posed.shade_hits(rays, face, depth, self.studio)
             color[band.slices] = _encode(light).reshape(band.height, band.width, 4)
 
-        # Made now, before several threads ask for them at once.
+        # Computed now, since several threads use them.
         _ = scene.surface, scene.corner_normals
         geometry = geometry_of(camera, posed, shade)
         if posed is not None:
@@ -105,28 +103,29 @@ class RaycastRenderer:
 
     def _antialias(self, color: ByteImage, posed: PosedScene, samples: int) -> None:
         """Cast more rays through pixels that differ from their neighbours."""
-        rows, columns = np.nonzero(_unlike_neighbours(color[posed.block.slices]))
+        rows, columns = np.nonzero(_find_contrast(color[posed.block.slices]))
         pixels = np.column_stack([columns + posed.block.left, rows + posed.block.top])
         offsets = _subpixel_offsets(samples)
         step = max(1, _RAYS_AT_ONCE // samples)
 
         def draw(part: IntArray) -> None:
-            hits = posed.hits((part[:, None] + offsets).reshape(-1, 2))
-            light = posed.light_of_hits(*hits, self.studio).reshape(-1, samples, 4)
+            hits = posed.cast_pixels((part[:, None] + offsets).reshape(-1, 2))
+            light = posed.shade_hits(*hits, self.studio).reshape(-1, samples, 4)
             color[part[:, 1], part[:, 0]] = _encode(light.mean(axis=1))
 
-        in_threads(draw, [pixels[begin : begin + step] for begin in range(0, len(pixels), step)])
+        begins = range(0, len(pixels), step)
+        draw_in_threads(draw, [pixels[begin : begin + step] for begin in begins])
 
 
 class Open3DRenderer(RaycastRenderer):
-    """Draws as `RaycastRenderer` does; Open3D finds the hits."""
+    """`RaycastRenderer` with the ray caster of Open3D."""
 
     name = "open3d"
 
     def __init__(self, *, studio: Studio | None) -> None:
         try:
             import open3d  # noqa: F401
-        except (ImportError, OSError) as error:  # OSError: a library of the system is missing
+        except (ImportError, OSError) as error:  # OSError: a system library is missing
             raise RenderError(
                 f"Open3D cannot be imported ({error})",
                 where="open3d",
@@ -139,7 +138,7 @@ class Open3DRenderer(RaycastRenderer):
 
 
 def cast_geometry(scene: Scene, camera: Camera, cam_from_model: Alignment) -> Geometry:
-    """Depth, triangle numbers and normals without colour: one ray through each pixel's centre.
+    """Render depth, triangle indices and normals without colour, one ray per pixel centre.
 
     Returns
     -------
@@ -165,10 +164,10 @@ _Shade = Callable[[PosedScene, Rectangle, FloatArray, FaceArray, FloatArray], No
 
 
 def geometry_of(camera: Camera, posed: PosedScene | None, shade: _Shade | None = None) -> Geometry:
-    """Hits of one ray through each pixel's centre, which ``shade`` draws; none of an unseen scene.
+    """Render depth, triangle indices and normals; empty without a posed scene.
 
-    ``shade`` takes the scene, a part of its block, and the rays, triangles and depths of the pixels
-    there.
+    ``shade`` draws the colour: it takes the scene, a band of its block, and the rays, triangles and
+    depths of the band's pixels.
     """
     whole = (camera.height, camera.width)
     face_id = np.full(whole, -1, dtype=np.int32)
@@ -177,7 +176,7 @@ def geometry_of(camera: Camera, posed: PosedScene | None, shade: _Shade | None =
         return geometry
 
     def draw(band: Rectangle) -> None:
-        rays, face, depth = posed.hits(band.pixels)
+        rays, face, depth = posed.cast_pixels(band.pixels)
         hit = np.flatnonzero(face >= 0)
         shape = (band.height, band.width)
         geometry.face_id[band.slices] = face.reshape(shape)
@@ -188,19 +187,19 @@ def geometry_of(camera: Camera, posed: PosedScene | None, shade: _Shade | None =
         if shade is not None:
             shade(posed, band, rays, face, depth)
 
-    in_threads(draw, posed.block.bands(_RAYS_AT_ONCE // posed.block.width))
+    draw_in_threads(draw, posed.block.bands(_RAYS_AT_ONCE // posed.block.width))
     return geometry
 
 
-def _unlike_neighbours(color: ByteImage) -> BoolArray:
-    """Pixels of (h, w, k) that visibly differ from one of 8 neighbours, (h, w) bool."""
+def _find_contrast(color: ByteImage) -> BoolArray:
+    """Whether each pixel visibly differs from one of its 8 neighbours, (h, w) bool."""
     around = np.ones((3, 3), dtype=np.uint8)
     span = cv2.subtract(cv2.dilate(color, around), cv2.erode(color, around))
     return np.asarray(span.reshape(color.shape).max(axis=2) > _VISIBLE_STEP)
 
 
 def _subpixel_offsets(count: int) -> FloatArray:
-    """Points spread evenly over a pixel, (count, 2) from -0.5 to 0.5, their mean at the centre.
+    """Evenly spread points of a pixel, (count, 2) from -0.5 to 0.5, with the mean 0.
 
     The R2 sequence: M. Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018.
     """
@@ -211,7 +210,7 @@ def _subpixel_offsets(count: int) -> FloatArray:
 
 
 def _encode(light: LinearArray) -> ByteImage:
-    """Turn premultiplied linear light (n, 4) into sRGB bytes with straight opacity."""
+    """Convert premultiplied linear light (n, 4) to sRGB bytes, not premultiplied."""
     opacity = light[:, 3:]
     straight = np.asarray(light[:, :3] / np.maximum(opacity, 1e-6), dtype=np.float32)
     result: ByteImage = np.empty(light.shape, dtype=np.uint8)
@@ -222,28 +221,28 @@ def _encode(light: LinearArray) -> ByteImage:
 
 # Ambient occlusion --------------------------------------------------------------------------------
 
-# Rays of a point; each of 4 x 4 neighbours has its own, and shares what they find.
+# Rays per point. The points of a 4 x 4 tile have different rays, and their results are averaged.
 _RAYS = 8
 _TILE = 4
-# Above this many pixels of the object every second, third, ... row and column is enough.
+# Above this many pixels, only every second, third, ... row and column is sampled.
 _MAX_POINTS = 12_000
-# How far off the surface rays start, in diagonals.
+# Distance of the rays' starts from the surface, in diagonals.
 _LIFT = 2e-3
 _SAME_SIDE = 0.85
 _FEW_ALIKE = 6
 _POINTS_AT_ONCE = 1 << 12
-# Points of the unit sphere, evenly spread, (16, 8, 3): each neighbour takes every 16th, so that
-# each has some of all heights.
+# Evenly spread points of the unit sphere, (16, 8, 3). Each point of a tile takes every 16th, so
+# that it has points of all heights.
 _NUMBER = np.arange(_RAYS * _TILE * _TILE) + 0.5
 _HEIGHT = 1 - 2 * _NUMBER / len(_NUMBER)
 _TURN = np.exp(1j * _NUMBER * np.pi * (3 - np.sqrt(5))) * np.sqrt(1 - _HEIGHT**2)
 _SPHERE = np.column_stack([_TURN.real, _TURN.imag, _HEIGHT]).reshape(_RAYS, -1, 3).swapaxes(0, 1)
-# Encoded values are about the 2.2th root of light.
+# sRGB values are about the 2.2th root of light.
 _ENCODING = 1 / 2.2
 
 
 def darken_corners(color: ByteImage, geometry: Geometry, posed: PosedScene, studio: Studio) -> None:
-    """Darken, in place, corners and places under other parts of the object."""
+    """Apply ambient occlusion to the colours, in place."""
     if studio.occlusion <= 0:
         return
     openness = _openness(geometry, posed, studio.occlusion_reach * posed.diagonal)
@@ -255,7 +254,7 @@ def darken_corners(color: ByteImage, geometry: Geometry, posed: PosedScene, stud
 
 
 def _openness(geometry: Geometry, posed: PosedScene, reach: float) -> LinearArray | None:
-    """Share of the sky that the block's pixels see, (h, w) float32; None without pixels."""
+    """Visible share of the sky at the block's pixels, (h, w) float32; None without hits."""
     block = posed.block
     covered = int(geometry.mask[block.slices].sum())
     step = max(1, int(np.ceil(np.sqrt(covered / _MAX_POINTS))))
@@ -282,17 +281,17 @@ def _openness(geometry: Geometry, posed: PosedScene, reach: float) -> LinearArra
         sky[rows_of, columns_of] = 1 - blocked.reshape(-1, _RAYS).mean(axis=1)
 
     begins = range(0, len(inside), _POINTS_AT_ONCE)
-    in_threads(look, [slice(begin, begin + _POINTS_AT_ONCE) for begin in begins])
+    draw_in_threads(look, [slice(begin, begin + _POINTS_AT_ONCE) for begin in begins])
     smooth, alike = _share_with_neighbours(sky, hit, depth, normal, posed.diagonal)
-    # A groove or a bevel narrower than the grid is hit here and there: its dashes would show.
-    filled = _filled(smooth, hit & (alike >= _FEW_ALIKE))
+    # A groove or bevel narrower than the grid is only hit here and there, and would look dashed.
+    filled = _fill_gaps(smooth, hit & (alike >= _FEW_ALIKE))
     size = block.width, block.height
     return np.asarray(cv2.resize(filled, size, interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def _sky_directions(normal: LinearArray, tile: npt.NDArray[np.int64]) -> FloatArray:
-    """Unit directions (n, 8, 3) about normals (n, 3), dense where light falls straight."""
-    # A point of the unit sphere about the normal's tip is that dense: cosine-weighted.
+    """Cosine-weighted unit directions (n, 8, 3) around normals (n, 3)."""
+    # Points of the unit sphere around the normal's tip are cosine-weighted directions.
     towards = normal[:, None] + _SPHERE[tile]
     return np.asarray(towards / np.linalg.norm(towards, axis=2, keepdims=True))
 
@@ -304,7 +303,7 @@ def _share_with_neighbours(
     normal: LinearArray,
     diagonal: float,
 ) -> tuple[LinearArray, LinearArray]:
-    """Average over the 4 x 4 neighbours on the same piece of surface, and how many those are."""
+    """Average over those of the 4 x 4 neighbours on the same surface; returns their number too."""
     rows, columns = hit.shape
     before, after = _TILE // 2, _TILE - _TILE // 2 - 1
     pad = ((before, after), (before, after))
@@ -325,11 +324,11 @@ def _share_with_neighbours(
     return np.asarray(mean, dtype=np.float32), np.asarray(weight)
 
 
-def _filled(sky: LinearArray, known: npt.NDArray[np.bool_]) -> LinearArray:
-    """Spread known values to the places beside them, in place of what is there."""
+def _fill_gaps(sky: LinearArray, known: npt.NDArray[np.bool_]) -> LinearArray:
+    """Replace unknown values by the average of known ones within two pixels."""
     filled = np.where(known, sky, 0).astype(np.float32)
     weight = known.astype(np.float32)
-    # Twice: the border of the object too takes the value beside it, or a bright rim would be left.
+    # The second pass fills the object's border, which would otherwise have a bright rim.
     for _ in range(2):
         total = cv2.boxFilter(filled, -1, (3, 3), normalize=False)
         count = cv2.boxFilter(weight, -1, (3, 3), normalize=False)

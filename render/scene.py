@@ -1,4 +1,4 @@
-"""Scenes, the frames that renderers make of them, and the interface of all renderers."""
+"""Scenes, frames, and the interface of renderers."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from cadalign.render.surface import SurfaceColors, coincident_faces, corner_norm
 
 
 class Scene:
-    """A mesh and everything that is derived from it for drawing, each made once, when first needed.
+    """A mesh prepared for rendering; each derived quantity is computed once, on first use.
 
-    Poses and stretches need no preparation: rays are cast in the model's own frame, where a
-    camera ray through the normalised coordinates (u, v) is the line
+    A pose or stretch needs no preparation: rays are cast in the model frame, where the camera ray
+    through the normalised coordinates (u, v) is the line
 
         x = -L^-1 t + depth * L^-1 (u, v, 1),    L = rotation @ diag(scale).
 
@@ -44,7 +44,7 @@ class Scene:
         self.mesh = mesh
 
     def __reduce__(self) -> tuple[object, ...]:
-        # The ray hierarchy cannot be pickled; worker processes build their own.
+        # The ray caster cannot be pickled; worker processes build their own.
         return Scene, (self.mesh,)
 
     @cached_property
@@ -54,52 +54,52 @@ class Scene:
 
     @property
     def diagonal(self) -> float:
-        """The length of the bounding box's diagonal [model units]."""
+        """Diagonal of the bounding box [model units]."""
         return float(np.linalg.norm(self.bounds[1] - self.bounds[0]))
 
     def stretched_diagonal(self, alignment: Alignment) -> float:
-        """The same of the stretched model."""
+        """Diagonal of the stretched model's bounding box [model units]."""
         return float(np.linalg.norm((self.bounds[1] - self.bounds[0]) * alignment.scale))
 
     @cached_property
     def caster(self) -> RayCaster:
-        """The ray hierarchy."""
+        """The ray caster."""
         return RayCaster(self.mesh, self.face_normals)
 
     @cached_property
     def open3d_caster(self) -> RayCaster:
-        """The same built by Open3D, which must be importable."""
+        """The ray caster of Open3D, which must be installed."""
         return RayCaster(self.mesh, self.face_normals, engine=Open3DEngine)
 
     @cached_property
     def used_vertices(self) -> FloatArray:
-        """The vertices that faces use, (n, 3) float."""
+        """Vertices that faces use, (n, 3) float."""
         return np.asarray(self.mesh.vertices[self.mesh.is_used])
 
     @cached_property
     def triangles(self) -> FloatArray:
-        """The corners of all triangles, (m, 3, 3) float."""
+        """Corners of the triangles, (m, 3, 3) float."""
         return self.mesh.triangles
 
     @cached_property
     def face_normals(self) -> FloatArray:
-        """Unit normals of the triangles, (m, 3) float; zero for one without area."""
+        """Unit normals of the triangles, (m, 3) float; zero without area."""
         return face_normals(self.triangles)
 
     @cached_property
     def corner_normals(self) -> npt.NDArray[np.float32]:
-        """Smooth normals at the triangles' corners, (m, 3, 3) float32, on their face's side."""
+        """Smooth normals at the triangles' corners, (m, 3, 3) float32, on the side of the face."""
         normals = corner_normals(self.mesh.vertices, self.mesh.faces, self.face_normals)
         return normals.astype(np.float32)
 
     @cached_property
     def coincident_faces(self) -> tuple[IntArray, IntArray]:
-        """The triangle to show of those in one place; see `coincident_faces`."""
+        """Which of coincident triangles to show, from either side; see `coincident_faces`."""
         return coincident_faces(self.mesh.vertices, self.mesh.faces)
 
     @cached_property
     def surface(self) -> SurfaceColors:
-        """The colours of the mesh."""
+        """Colours of the mesh."""
         return SurfaceColors(self.mesh)
 
 
@@ -110,15 +110,16 @@ MAX_PIXELS = 100_000_000
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """The hit of the ray through the centre of each pixel: exact, not antialiased."""
+    """The surface at each pixel's centre: exact, not antialiased."""
 
     depth: FloatArray
-    """(h, w), the camera's z, of a wide lens the distance from it [model units]; 0 for nothing."""
+    """(h, w) float [model units], z in the camera frame, or the distance for a wide lens; 0 where
+    empty."""
     face_id: npt.NDArray[np.int32]
-    """(h, w) int32, the number of the mesh's triangle; -1 where nothing is."""
+    """(h, w) int32, index of the mesh's triangle; -1 where empty."""
     normal: npt.NDArray[np.float32]
-    """(h, w, 3) float32, the triangle's unit normal in the camera frame, on the side that is seen;
-    0 where nothing is."""
+    """(h, w, 3) float32, unit normal of the triangle in the camera frame, towards the camera; 0
+    where empty."""
 
     @property
     def mask(self) -> npt.NDArray[np.bool_]:
@@ -133,10 +134,10 @@ class Frame(Geometry):
     Parameters
     ----------
     depth, face_id, normal
-        See `Geometry`; `mask` is there too.
+        See `Geometry`, which has the `mask` too.
     color : (h, w, 4) uint8
-        sRGB and opacity, not premultiplied: at silhouettes the colour is the object's and the
-        opacity its share of the pixel.
+        sRGB and opacity, not premultiplied. At silhouettes the colour is the object's, and the
+        opacity the share of the pixel that it covers.
     """
 
     color: ByteImage
@@ -162,7 +163,7 @@ class Frame(Geometry):
 
 
 class Renderer(Protocol):
-    """Draws a scene as a camera sees it."""
+    """Interface of renderers."""
 
     @property
     def name(self) -> str:
@@ -171,11 +172,11 @@ class Renderer(Protocol):
     def render(
         self, scene: Scene, camera: Camera, cam_from_model: Alignment, *, samples: int = 8
     ) -> Frame:
-        """Draw one frame; see `RaycastRenderer.render`."""
+        """Render one frame; see `RaycastRenderer.render`."""
 
 
 def check_image_size(camera: Camera) -> None:
-    """Refuse images too large to be drawn."""
+    """Raise RenderError if an image is too large to be rendered."""
     if max(camera.width, camera.height) > MAX_SIDE or camera.width * camera.height > MAX_PIXELS:
         raise RenderError(
             f"{camera.width} x {camera.height} px is too large to be drawn; the limits are "

@@ -1,4 +1,4 @@
-"""Surfaces of a mesh: colours, smooth normals, coincident faces, and the light of the studio."""
+"""Shading: colours of a mesh, smooth normals, coincident faces, and the lights."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from cadalign.render.canvas import LinearArray, linear_from_bytes, linear_from_s
 class SurfaceColors:
     """The colours of a mesh, in linear light.
 
-    Vertex colours, where there are any, take the place of the materials' plain colour; a texture
-    multiplies with it. Textures repeat outside [0, 1]; their v runs up from the bottom row.
+    Vertex colours replace the materials' colours; textures are multiplied with them. Textures
+    repeat outside [0, 1]; v points up from the bottom row.
     """
 
     def __init__(self, mesh: Mesh) -> None:
@@ -40,16 +40,16 @@ class SurfaceColors:
 
     @property
     def opaque(self) -> bool:
-        """Nothing can be seen through the surface."""
+        """Whether the whole surface is opaque."""
         color = self._face_color if self._corner_color is None else self._corner_color
         return bool((color[..., 3] >= 1).all()) and all(
             bool((texture[..., 3] >= 1).all()) for texture in self._textures.values()
         )
 
     def color(self, face: FaceArray, weights: LinearArray) -> LinearArray:
-        """Look up linear colour and opacity (n, 4), not premultiplied, at points of triangles (n,).
+        """Linear colour and opacity (n, 4), not premultiplied, at points of triangles (n,).
 
-        ``weights`` (n, 3) are their barycentric coordinates.
+        ``weights`` (n, 3) are the points' barycentric coordinates.
         """
         if self._corner_color is None:
             color = self._face_color[face]
@@ -67,14 +67,14 @@ class SurfaceColors:
 
 
 def linear_colors(color: npt.NDArray[Any]) -> LinearArray:
-    """Decode sRGB colours (n, 4) from 0 to 1, whose opacity stays, to linear light; float32."""
+    """Decode sRGB colours with opacity (n, 4), 0 to 1, to linear light; float32."""
     linear = color.astype(np.float32)
     linear[:, :3] = linear_from_srgb(linear[:, :3])
     return linear
 
 
 def sample_texture(texture: LinearArray, uv: LinearArray) -> LinearArray:
-    """Read a texture (h, w, 4) bilinearly at (n, 2) texture coordinates; (n, 4) float32."""
+    """Sample a texture (h, w, 4) bilinearly at texture coordinates (n, 2); (n, 4) float32."""
     from scipy.ndimage import map_coordinates  # takes time to import
 
     height, width = texture.shape[:2]
@@ -85,7 +85,7 @@ def sample_texture(texture: LinearArray, uv: LinearArray) -> LinearArray:
 
 
 def _linear_texture(texture: npt.NDArray[np.uint8]) -> LinearArray:
-    """Turn an image (h, w, 3 or 4) into linear light with opacity (h, w, 4)."""
+    """Convert an image (h, w, 3 or 4) to linear light with opacity, (h, w, 4)."""
     result = np.ones((*texture.shape[:2], 4), dtype=np.float32)
     result[:, :, : texture.shape[2]] = texture / np.float32(255)
     result[:, :, :3] = linear_from_bytes(texture[:, :, :3])
@@ -93,16 +93,16 @@ def _linear_texture(texture: npt.NDArray[np.uint8]) -> LinearArray:
 
 
 def coincident_faces(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, IntArray]:
-    """Find, for each triangle, the first with the same corners wound alike, and the other way.
+    """Find the first triangles with the same corners and the same, and the opposite, winding.
 
-    Modellers such as SketchUp write every face twice, wound both ways, with the materials of its
-    front and of its back. The one to show is wound towards the viewer. Both results are (m,) int;
-    where no triangle is wound the other way, the two are the same.
+    Modellers such as SketchUp write every face twice, with opposite windings and the materials of
+    its front and back. The triangle wound towards the viewer is the one to show. Both results are
+    (m,) int; where no triangle has the opposite winding, they are the same.
     """
     corners = number_rows(vertices)[faces]
     place = number_rows(np.sort(corners, axis=1))
     a, b, c = corners.T
-    # Sorting takes an even or odd number of swaps: that is the winding.
+    # The winding is the parity of the swaps that sort the corners.
     winding = (((a > b) ^ (b > c)) ^ (a > c)).astype(np.int64)
     none = len(faces)
     first = np.full((place.max() + 1, 2), none)
@@ -112,19 +112,19 @@ def coincident_faces(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, I
     return alike, np.where(opposite < none, opposite, alike)
 
 
-# A point at which more triangles meet than this is left faceted: pairs grow with the square.
+# A point where more triangles meet stays faceted: the number of pairs is quadratic.
 _MAX_VALENCE = 1024
 _PAIRS_AT_ONCE = 1 << 20
 _SMOOTH_COSINE = np.cos(np.radians(40.0))
 
 
 def corner_normals(vertices: FloatArray, faces: IntArray, face_normals: FloatArray) -> FloatArray:
-    """Average, at each face's corners, the normals of faces that continue it smoothly, (m, 3, 3).
+    """Smooth unit normals at the faces' corners, (m, 3, 3), on the side of the face.
 
-    Faces meet where their vertices have the same position, whether they share the vertex or not.
-    Those that are turned the other way count with their normal reversed, since the faces of many
-    CAD models are turned at random. Each counts by its angle at the corner. Faces at an angle of
-    more than 40 degrees meet in an edge. The unit normals are on the side of their face.
+    The normals of adjacent faces are averaged, weighted by their angles at the corner. Faces are
+    adjacent where their vertices have the same position, even if they don't share the vertex. An
+    angle of more than 40 degrees between faces is an edge. A face of opposite orientation counts
+    with its normal reversed, since many CAD models have faces of random orientation.
     """
     point = number_rows(vertices)[faces].ravel()
     weight = _corner_angles(vertices[faces]).ravel()
@@ -145,7 +145,7 @@ def corner_normals(vertices: FloatArray, faces: IntArray, face_normals: FloatArr
 
 
 def _smooth(normals: FloatArray, weight: FloatArray) -> FloatArray:
-    """Average within groups of corners (g, c, 3) that share a point."""
+    """Average the normals (g, c, 3) of g points, each with c corners."""
     cosine = normals @ normals.transpose(0, 2, 1)
     share = np.where(np.abs(cosine) >= _SMOOTH_COSINE, np.sign(cosine) * weight[:, None, :], 0)
     total = share @ normals
@@ -154,7 +154,7 @@ def _smooth(normals: FloatArray, weight: FloatArray) -> FloatArray:
 
 
 def _corner_angles(triangles: FloatArray) -> FloatArray:
-    """The angles at the corners of triangles (m, 3, 3); (m, 3) radians."""
+    """Angles at the corners of triangles (m, 3, 3), in radians, (m, 3)."""
     after = np.roll(triangles, -1, axis=1) - triangles
     before = np.roll(triangles, 1, axis=1) - triangles
     scale = np.linalg.norm(after, axis=2) * np.linalg.norm(before, axis=2)
@@ -164,27 +164,27 @@ def _corner_angles(triangles: FloatArray) -> FloatArray:
 
 Direction = tuple[float, float, float]
 
-# No real paint is blacker; perfectly black parts would show no form.
+# Least albedo: perfectly black parts would show no shape.
 DARKEST = 0.015
 
 
 @dataclass(frozen=True)
 class Studio:
-    """Lights that stand still relative to the camera, and an ambient light from above.
+    """Lights: two fixed relative to the camera, and an ambient light from above.
 
     Parameters
     ----------
     key, fill : tuple of 3 float
-        Towards the light, in the camera frame (x right, y down, z forward).
+        Direction towards the light in the camera frame (x right, y down, z forward).
     key_power, fill_power, sky_power, ground_power : float
-        Light reflected by white that faces the light, or the upper or lower hemisphere.
+        Light reflected by a white surface that faces the light, the sky or the ground.
     wrap : float
-        How far a light reaches round the object, 0 (a point) to 1 (a hemisphere).
+        Size of the lights, which reach around the object: 0 (a point) to 1 (a hemisphere).
     gloss, gloss_exponent : float
-        Strength and narrowness of the key light's highlight.
+        Strength and sharpness of the key light's highlight.
     occlusion, occlusion_reach : float
-        Share of the light that is lost where other parts of the object hide the whole sky, and how
-        far off these may be, in diagonals of the object; 0 turns ambient occlusion off.
+        Ambient occlusion: share of the light lost where other parts of the object hide the whole
+        sky, and their largest distance, in diagonals of the object; 0 turns it off.
     """
 
     key: Direction = (-0.55, -0.75, -0.75)
@@ -202,10 +202,10 @@ class Studio:
     def shade(
         self, albedo: LinearArray, normal: LinearArray, view: LinearArray, up: FloatArray
     ) -> LinearArray:
-        """Linear light (n, 3) that points of a surface send towards the camera.
+        """Linear light (n, 3) that surface points reflect towards the camera.
 
-        ``albedo`` is linear colour; ``normal``, on the seen side, ``view``, from the points to the
-        camera, and ``up``, towards the sky, are unit vectors in the camera frame.
+        ``albedo`` (n, 3) is linear colour. The others are unit vectors in the camera frame:
+        ``normal`` (n, 3), ``view`` (n, 3) from the points to the camera, ``up`` (3,) to the sky.
         """
         key, fill = _unit(self.key), _unit(self.fill)
         towards_sky = 0.5 + 0.5 * (normal @ up.astype(np.float32))

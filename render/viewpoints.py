@@ -1,4 +1,4 @@
-"""Views of an object: cameras placed on a sphere about it, named ones, and what they see."""
+"""Viewpoints of an object: on a sphere, at random or by name, and visible keypoints."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from cadalign.render.scene import Scene
 _ATTEMPTS = 100
 _DISTANCE_STEPS = 50
 _FILL_TOLERANCE = 1e-3
-_STILL_FILL = 0.88  # of the image, by a still's model
+_STILL_FILL = 0.88  # share of the image that the model fills in `pose_in_view`
 
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """A camera's view of an object."""
+    """A pose of an object, and its visible keypoints."""
 
     cam_from_model: Alignment
-    """The object's pose in the camera frame."""
+    """Pose of the object in the camera frame."""
     visible: npt.NDArray[np.bool_]
-    """(k,), which keypoints are seen."""
+    """(k,) bool, which keypoints are visible."""
 
 
 def look_at(
@@ -38,19 +38,19 @@ def look_at(
     roll: float = 0.0,
     scale: npt.ArrayLike = (1.0, 1.0, 1.0),
 ) -> Alignment:
-    """The pose of a model that is looked at from a point of a sphere, its y axis up in the image.
+    """Pose of a model seen from a point on a sphere, with its y axis up in the image.
 
     Parameters
     ----------
     azimuth : float
-        Turn about the model's y axis [degrees]: 0 looks from +z, 90 from +x.
+        Angle about the model's y axis [degrees]: 0 looks from +z, 90 from +x.
     elevation : float
-        Height above the model's xz plane [degrees], -90 to 90.
+        Angle above the model's xz plane [degrees], -90 to 90.
     distance : float
-        From the camera to the model's origin, which appears at the principal point [model units],
-        positive.
+        Distance from the camera to the model's origin [model units], positive. The origin projects
+        to the principal point.
     roll : float
-        Turn of the camera about its line of sight [degrees]; positive turns the object
+        Rotation of the camera about its optical axis [degrees]; a positive roll rotates the object
         counterclockwise in the image.
     scale : (3,) float
         The stretch along the model's axes.
@@ -93,28 +93,28 @@ def sample_view(
     roll: float = 0.0,
     scale: npt.ArrayLike = (1.0, 1.0, 1.0),
 ) -> Viewpoint:
-    """Draw a view, evenly over the sphere, in which enough keypoints are seen.
+    """Sample a random view, uniformly over the sphere, in which enough keypoints are visible.
 
-    The object's box lies inside the image about its centre.
+    The object's box is centred in the image and inside it.
 
     Parameters
     ----------
     scene : Scene
         The object.
     keypoints : (k, 3) float
-        In model coordinates.
+        Keypoints in model coordinates.
     camera : Camera
     rng : numpy.random.Generator
-        Where all randomness comes from: the same state gives the same view.
+        The same state gives the same view.
     min_visible : int
-        How many keypoints must be seen.
+        Least number of visible keypoints.
     elevation : tuple of 2 float
         Lowest and highest elevation [degrees].
     fill : tuple of 2 float
-        Lowest and highest share of the image, in width or height, that the corners of the
-        object's box reach; 1 touches the border.
+        Range of the share of the image, in width or height, that the object's box fills; at 1 it
+        touches the border.
     roll : float
-        Largest turn of the camera about its line of sight [degrees].
+        Largest rotation of the camera about its optical axis [degrees].
     scale : (3,) float
         The stretch along the model's axes.
 
@@ -125,9 +125,9 @@ def sample_view(
     Raises
     ------
     TooFewVisibleError
-        A RenderError, if no view shows enough keypoints; it says how many the best one showed.
+        A RenderError, if no view shows enough keypoints.
     InputError
-        If an argument is out of its range.
+        If an argument is out of range.
     """
     points = as_points(keypoints, name="keypoints", dimension=3)
     _check_range(elevation, name="elevation", low=-90.0, high=90.0)
@@ -162,10 +162,9 @@ def frame_object(
     fill: float,
     scale: npt.ArrayLike = (1.0, 1.0, 1.0),
 ) -> Alignment:
-    """Move an object of given orientation to where it fills a given share of the image.
+    """Pose of an object of given orientation that fills a given share of the image.
 
-    The box's centre appears at the image's centre, so no corner lies farther from it than the
-    share of the way to the border.
+    The centre of the object's box projects to the image's centre.
 
     Parameters
     ----------
@@ -184,7 +183,7 @@ def frame_object(
     Raises
     ------
     RenderError
-        If no distance gives that share, as with a lens that bends too much.
+        If no distance gives that share, for example because of strong lens distortion.
     """
     placed = Alignment(
         as_floats(rotation, name="rotation", shape=(3, 3)),
@@ -196,7 +195,7 @@ def frame_object(
     size = float(np.linalg.norm(box.extents)) or 1.0
     middle = np.array([[(camera.width - 1) / 2, (camera.height - 1) / 2]])
     (axis,), _ = camera.rays_where_valid(middle)
-    # Depths of the box's centre: in the first a corner touches the camera's plane.
+    # Depths of the box's centre. At the near one, a corner may touch the camera plane.
     near, far = size / 2, 1e6 * size
     for _ in range(_DISTANCE_STEPS):
         depth = float(np.sqrt(near * far))
@@ -212,7 +211,7 @@ def frame_object(
 
 
 def _share(corners: FloatArray, camera: Camera, middle: FloatArray) -> float:
-    """Share of the way to the image's border that the farthest corner reaches."""
+    """Largest distance of a corner from the image's centre, as a share of that to the border."""
     if not within_lens_field(camera, corners).all():
         return np.inf
     offset = np.abs(camera.pixels_of_rays(corners) - middle)
@@ -220,7 +219,7 @@ def _share(corners: FloatArray, camera: Camera, middle: FloatArray) -> float:
 
 
 def _looking_rotation(azimuth: float, elevation: float, roll: float) -> FloatArray:
-    """Rotation from model to camera axes; angles in degrees."""
+    """Rotation (3, 3) from model to camera axes; angles in degrees."""
     turn, rise, tilt = np.radians([azimuth, elevation, roll])
     forward = -np.array([np.cos(rise) * np.sin(turn), np.sin(rise), np.cos(rise) * np.cos(turn)])
     right = np.array([np.cos(turn), 0.0, -np.sin(turn)])
@@ -246,7 +245,7 @@ VIEWS: dict[str, tuple[float, float]] = {
     "top": (180.0, 90.0),
     "bottom": (180.0, -90.0),
 }
-"""Azimuth and elevation [degrees] of the named views, see `look_at`; ShapeNet's models face -z."""
+"""Azimuth and elevation [degrees] of the named views, see `look_at`. ShapeNet models face -z."""
 
 
 @dataclass(frozen=True)
@@ -259,12 +258,12 @@ class Angles:
 
     @classmethod
     def parse(cls, text: str) -> Angles:
-        """Read a view's name, or ``azimuth,elevation`` or ``azimuth,elevation,roll``.
+        """Parse a view's name, ``azimuth,elevation`` or ``azimuth,elevation,roll``.
 
         Raises
         ------
         InputError
-            If it is neither.
+            If the text is none of these.
 
         Examples
         --------
@@ -289,7 +288,7 @@ class Angles:
 def pose_in_view(
     scene: Scene, camera: Camera, angles: Angles, *, scale: npt.ArrayLike = (1.0, 1.0, 1.0)
 ) -> Alignment:
-    """Place a model so that it fills the image, looked at from some angles.
+    """Pose of a model that fills the image, seen from given angles.
 
     Raises
     ------
@@ -300,9 +299,9 @@ def pose_in_view(
     return frame_object(scene.bounds, camera, rotation=rotation, fill=_STILL_FILL, scale=scale)
 
 
-_BENEATH = 2e-3  # how deep beneath the surface a point still lies on it [diagonals]
-# The centre, then four around it: keypoints like to sit on corners and edges, where a ray to the
-# point itself may just graze the surface beside it.
+_DEPTH_SLACK = 2e-3  # depth below the surface at which a keypoint is still visible [diagonals]
+# The centre and four points around it: many keypoints are on corners and edges, where a ray to the
+# keypoint itself may graze the surface beside it.
 _RAY_OFFSETS = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], dtype=float)
 
 
@@ -312,18 +311,18 @@ def visible_keypoints(
     camera: Camera,
     cam_from_model: Alignment,
 ) -> npt.NDArray[np.bool_]:
-    """Say which keypoints are inside the image, before the camera, and not hidden by the object.
+    """Find the keypoints that are inside the image and not hidden by the object.
 
-    Five rays go to each keypoint: to the point itself and to four places beside it, a fifth of a
-    percent of the (stretched) model's diagonal off. The keypoint is hidden if all of them meet the
-    surface farther than that before they get there: it may lie so deep beneath the surface.
+    Five rays are cast to each keypoint: to the point itself and to four points beside it, at 0.2 %
+    of the stretched model's diagonal. The keypoint is hidden if all of them hit the surface more
+    than this distance in front of their targets. So a keypoint may lie as deep below the surface.
 
     Parameters
     ----------
     scene : Scene
         The object.
     points_3d : (k, 3) float
-        Keypoints in model coordinates, on the surface or near it.
+        Keypoints in model coordinates, on or near the surface.
     camera : Camera
     cam_from_model : Alignment
 
@@ -334,7 +333,7 @@ def visible_keypoints(
     Raises
     ------
     InputError
-        If the points are not (k, 3) finite numbers.
+        If the points are not finite or not (k, 3).
 
     Examples
     --------
@@ -351,8 +350,8 @@ def visible_keypoints(
     chosen = np.flatnonzero(visible)
     if not len(chosen):
         return visible
-    slack = _BENEATH * scene.stretched_diagonal(cam_from_model)
-    targets = in_camera[chosen, None] + slack * _beside(in_camera[chosen])
+    slack = _DEPTH_SLACK * scene.stretched_diagonal(cam_from_model)
+    targets = in_camera[chosen, None] + slack * _ray_offsets(in_camera[chosen])
     # In the camera frame a ray ends at its target; in the model frame its parameter is the same.
     origin, model_from_ray = model_rays(cam_from_model)
     _, distance = scene.caster.first_hits(origin, targets.reshape(-1, 3) @ model_from_ray.T)
@@ -362,17 +361,17 @@ def visible_keypoints(
 
 
 def seen_in_image(camera: Camera, points_cam: FloatArray) -> npt.NDArray[np.bool_]:
-    """Say which camera-frame points (k, 3) lie before the camera and inside its image; (k,)."""
+    """Whether points (k, 3) in the camera frame are visible inside its image, (k,) bool."""
     seen = within_lens_field(camera, points_cam)
     seen[seen] = camera.contains(camera.pixels_of_rays(points_cam[seen]))
     return seen
 
 
-def _beside(points_cam: FloatArray) -> FloatArray:
-    """Offsets across the line of sight, of length 0 or 1, (k, 5, 3)."""
+def _ray_offsets(points_cam: FloatArray) -> FloatArray:
+    """Offsets perpendicular to the line of sight, of length 0 or 1, (k, 5, 3)."""
     sight = points_cam / np.linalg.norm(points_cam, axis=1, keepdims=True)
     across = np.column_stack([sight[:, 2], np.zeros(len(sight)), -sight[:, 0]])
-    across[np.abs(sight[:, 1]) > 0.99] = (1.0, 0.0, 0.0)  # seen by wide lenses alone
+    across[np.abs(sight[:, 1]) > 0.99] = (1.0, 0.0, 0.0)  # only seen by wide lenses
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     upright = np.cross(sight, across)
     axes = np.stack([across, upright], axis=1)

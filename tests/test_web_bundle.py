@@ -1,4 +1,4 @@
-"""The committed bundles are what the sources beside them make."""
+"""The committed bundles match their sources."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PAGES = ("report", "annotate")
 
 @pytest.fixture(scope="module")
 def rebuilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of bundles made anew from a copy of the sources."""
+    """Folder of bundles built from a copy of the sources."""
     copy = copy_with_modules(tmp_path_factory.mktemp("web"))
     command = [npm_or_skip(), "run", "build"]
     built = subprocess.run(command, cwd=copy, env=QUIET, capture_output=True, text=True)
@@ -24,29 +24,29 @@ def rebuilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.long
-def test_bundles_are_those_of_the_sources(rebuilt: Path) -> None:
+def test_bundles_match_the_sources(rebuilt: Path) -> None:
     committed = {path.name: path.read_bytes() for path in (WEB / "dist").iterdir()}
-    made = {path.name: path.read_bytes() for path in rebuilt.iterdir()}
-    assert sorted(made) == sorted(committed)
-    stale = [name for name in made if made[name] != committed[name]]
-    assert not stale, f"not built from the sources as they are: {stale}; run `make web`"
+    built = {path.name: path.read_bytes() for path in rebuilt.iterdir()}
+    assert sorted(built) == sorted(committed)
+    stale = [name for name in built if built[name] != committed[name]]
+    assert not stale, f"out of date: {stale}; run `make web`"
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_a_bundle_can_stand_inside_a_page(page: str) -> None:
+def test_bundles_can_be_inlined_in_html(page: str) -> None:
     assert "</script" not in asset(f"{page}.js").lower()
     assert "<!--" not in asset(f"{page}.js")
     assert "</style" not in asset(f"{page}.css").lower()
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_styles_ask_for_nothing_from_elsewhere(page: str) -> None:
+def test_styles_load_no_external_files(page: str) -> None:
     style = asset(f"{page}.css")
     assert "@import" not in style
     assert "url(" not in style
 
 
-def test_licences_travel_with_the_bundles() -> None:
+def test_licences_are_bundled() -> None:
     notices = asset("LICENSES.txt")
     for library in ("plotly.js-basic-dist-min", "three"):
         assert library in notices

@@ -1,4 +1,4 @@
-"""Aligned models in the formats of other tools."""
+"""Export of aligned objects to GLB, OBJ and PLY."""
 
 from cadalign.export.aligned_object import (
     FORMATS,

@@ -1,4 +1,4 @@
-"""An aligned object, its shape and views; the export formats by their files' endings."""
+"""Aligned objects, and the export formats by file extension."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ExportView:
     cam_from_model : Alignment
         Pose and stretch in this camera.
     image : path, optional
-        The photo's file.
+        File of the photo.
     """
 
     camera: Camera
@@ -49,14 +49,14 @@ class AlignedObject:
     Parameters
     ----------
     views : tuple of ExportView
-        Its photos, at least one. All have the same stretch.
+        The photos, at least one. All have the same stretch.
     mesh : Mesh
         The object's mesh in the model's frame before the stretch, warped where a shape was
         estimated.
     name : str
-        The model's name.
+        Name of the model.
     sources : tuple of Path
-        The files that it was read from, which no export writes over; nor over its photos.
+        Files that the object was read from. An export overwrites neither these nor the photos.
 
     Raises
     ------
@@ -79,7 +79,7 @@ class AlignedObject:
                 raise InputError(what, where="scale", fix="all views show one object")
 
     def first_from_cam(self, number: int) -> FloatArray:
-        """The rigid pose (4, 4) of a view's camera in the first one, by the object both see."""
+        """Rigid pose (4, 4) of a view's camera in the frame of the first camera."""
         there, here = self.views[0].cam_from_model, self.views[number].cam_from_model
         matrix = np.eye(4)
         matrix[:3, :3] = there.rotation @ here.rotation.T
@@ -88,13 +88,13 @@ class AlignedObject:
 
     @property
     def placed_mesh(self) -> Mesh:
-        """The mesh, stretched and placed in the first camera's frame."""
+        """The mesh, stretched and in the first camera's frame."""
         pose = self.views[0].cam_from_model
         return replace(self.mesh, vertices=pose.apply(self.mesh.vertices))
 
 
 class Format(NamedTuple):
-    """An export format, whose name is the ending of its files."""
+    """An export format."""
 
     about: str  # what is written
     write: Callable[[Path, AlignedObject], object]
@@ -117,11 +117,11 @@ FORMATS: dict[str, Format] = {
         lambda path, exported: write_mesh(path, exported.placed_mesh, kind="ply"),
     ),
 }
-"""The formats by name."""
+"""The formats by file extension."""
 
 
 def format_of(path: str | os.PathLike[str]) -> Format:
-    """The format that a path's ending means; raises InputError if none has this ending.
+    """Export format of a path's extension; raises InputError for an unknown extension.
 
     Examples
     --------
@@ -142,22 +142,22 @@ def export_object(path: str | os.PathLike[str], exported: AlignedObject) -> Path
     Parameters
     ----------
     path : path-like
-        The file, whose ending tells the format: ``.glb``, ``.obj`` or ``.ply``; folders above it
-        are made.
+        File to write; its extension selects the format: ``.glb``, ``.obj`` or ``.ply``. Missing
+        folders are created.
     exported : AlignedObject
 
     Returns
     -------
     Path
-        What was written.
+        The file.
 
     Raises
     ------
     InputError
-        If the ending is not known, or the object lacks what the format needs.
+        If the extension is unknown.
     DataError
-        If a photo cannot be read, or the file cannot be written or is one that the object was read
-        from.
+        If a photo cannot be read, or the file cannot be written or is one of the object's sources
+        or photos.
     """
     path = as_path(path)
     refuse_nul(path)

@@ -1,17 +1,16 @@
-"""GLB (binary glTF 2.0): the textured model, the cameras, and behind it the photos.
+"""Export to GLB (binary glTF 2.0): the textured model, the cameras and the photos.
 
-The first camera stands in the origin, looks along -z and has y up. Lengths are the model's.
-The model is a node whose transform holds pose and stretch. Every view is a camera node and a
-rectangle with the photo behind the object, seen from its camera's side only and unlit
-(KHR_materials_unlit).
+The first camera is at the origin, looks along -z and has y up. Lengths are in model units. The
+model is a node whose transform holds pose and stretch. Every view is a camera node and a rectangle
+with the photo behind the object, unlit (KHR_materials_unlit) and visible from the camera's side
+only.
 
-glTF's cameras have their principal point in the image's centre and no lens distortion. So the photo
-stands where the camera sees it, and the camera's field of view is the least one about the principal
-point that holds all of it: the image of that camera is the photo with a margin at one side. A
-distorted photo is resampled to a pinhole camera's.
+A glTF camera has its principal point at the image's centre and no lens distortion. So the camera's
+field of view is the smallest one about the principal point that contains the photo: the camera's
+image is the photo with a margin on one side. A distorted photo is resampled to a pinhole camera.
 
-Buffers, accessors and images are trimesh's. Cameras and materials are written here: trimesh has one
-camera, whose aspect ratio is that of angles, no unlit materials, and colours of 8 bits.
+trimesh writes buffers, accessors and images. This module writes cameras and materials: trimesh
+supports only one camera, with a wrong aspect ratio, no unlit materials, and 8-bit colours.
 """
 
 from __future__ import annotations
@@ -38,46 +37,46 @@ from cadalign.io.images import ByteImage, read_image
 _gltf: Any = trimesh.exchange.gltf  # which has no types
 _visual: Any = trimesh.visual
 _UNLIT = "KHR_materials_unlit"
-_CLAMP_TO_EDGE = 33071  # as OpenGL numbers it
-_OPAQUE = 0.999  # least opacity of what is drawn as opaque
+_CLAMP_TO_EDGE = 33071  # OpenGL's constant
+_OPAQUE = 0.999  # least opacity of an opaque material
 _WHITE = (1.0, 1.0, 1.0, 1.0)
 
 _BORDER = 0.5  # from the corner pixel's centre to the image's border [px]
-_GROWTH = 2.0  # how much larger than the photo an undistorted one may become, each way
-_AGREES = 1e-6
-_RIM = 1.5  # how far the border's colours go on beyond the photo [px]
-_BEHIND = 1.5  # depth of the photo over that of the object's farthest corner
-_NEAR, _FAR = 1e-3, 10.0  # depths between which a viewer draws, over that of the photo
+_GROWTH = 2.0  # largest size of the undistorted photo over the photo's, per axis
+_ROUND_TRIP = 1e-6  # largest error of distorting and undistorting a pixel
+_RIM = 1.5  # width of the border's colours beyond the photo [px]
+_BEHIND = 1.5  # depth of the photo, over the depth of the object's farthest corner
+_NEAR, _FAR = 1e-3, 10.0  # clipping planes of the cameras, over the depth of the photo
 
 
 _Node = tuple[str, trimesh.Trimesh, dict[str, Any], FloatArray]
-"""Name, mesh, material and place in the scene."""
+"""Name, mesh, material and pose in the scene."""
 
 
 class PlacedPhoto(NamedTuple):
-    """A photo in a scene, as a rectangle behind the object."""
+    """A photo as a rectangle behind the object."""
 
     image: ByteImage | None
     """The photo (h, w, 3), without lens distortion."""
     low: FloatArray
-    """Its top left corner (2,) in normalised image coordinates, x right and y down."""
+    """Top left corner (2,) in normalised image coordinates, x right and y down."""
     high: FloatArray
-    """Its bottom right corner (2,)."""
+    """Bottom right corner (2,)."""
     depth: float
-    """Depth at which it stands."""
+    """Depth of the rectangle."""
     pose: FloatArray
-    """Pose (4, 4) of its camera, which has glTF's axes."""
+    """Pose (4, 4) of the camera, with glTF's axes."""
 
     @property
-    def look(self) -> dict[str, float]:
-        """The camera of glTF that holds the photo about its principal point."""
+    def lens(self) -> dict[str, float]:
+        """The glTF camera, whose field of view is centred at the principal point."""
         across, down = np.maximum(np.abs(self.low), np.abs(self.high)).tolist()
         field = {"aspectRatio": across / down, "yfov": 2 * float(np.arctan(down))}
         return field | {"znear": _NEAR * self.depth, "zfar": _FAR * self.depth}
 
     @property
     def corners(self) -> FloatArray:
-        """Top left, bottom left, bottom right, top right, in glTF's axes; (4, 3) float."""
+        """Top left, bottom left, bottom right and top right corners in glTF's axes, (4, 3)."""
         (left, top), (right, bottom) = self.low, self.high
         rows = [[left, top, 1], [left, bottom, 1], [right, bottom, 1], [right, top, 1]]
         return np.asarray(np.array(rows) * self.depth * OPENGL_AXES)
@@ -111,13 +110,13 @@ def write_glb(path: Path, exported: AlignedObject) -> None:
 
 
 def _set_names(tree: dict[str, Any], names: dict[str, str]) -> None:
-    """Give nodes and meshes their names: of those of users trimesh changes some that are equal."""
+    """Set the names of nodes and meshes; trimesh would change repeated names."""
     for each in (*tree["nodes"], *tree["meshes"]):
         each["name"] = names.get(each["name"], each["name"])
 
 
 def _parts(mesh: Mesh) -> Iterator[tuple[trimesh.Trimesh, dict[str, Any]]]:
-    """Parts of one material as trimesh writes them, and their materials as glTF has them.
+    """Split a mesh by material; yields the parts and their glTF materials.
 
     Vertices with several texture coordinates are repeated.
     """
@@ -133,7 +132,7 @@ def _parts(mesh: Mesh) -> Iterator[tuple[trimesh.Trimesh, dict[str, Any]]]:
             own, material = mesh.vertex_colors[used], replace(material, color=_WHITE)
             linear = np.column_stack([srgb_to_linear(own[:, :3]), own[:, 3]])
             colors = np.round(255 * linear).astype(np.uint8)
-        look = _look(material)
+        look = _gltf_material(material)
         if texture is not None and mesh.corner_uv is not None:
             surface = _textured(mesh.vertices[used], faces, kept[:, 1:], texture)
             if texture.shape[2] == 4 and (texture[..., 3] < 255).any() and "alphaMode" not in look:
@@ -162,8 +161,8 @@ def _photo_node(name: str, photo: PlacedPhoto) -> _Node:
     return name, mesh, material, photo.pose
 
 
-def _look(material: Material) -> dict[str, Any]:
-    """A material as glTF has it."""
+def _gltf_material(material: Material) -> dict[str, Any]:
+    """Convert a material to glTF."""
     red, green, blue, alpha = material.color
     look: dict[str, Any] = {
         "name": material.name or "surface",
@@ -178,7 +177,7 @@ def _look(material: Material) -> dict[str, Any]:
 
 
 def _set_materials(tree: dict[str, Any], looks: dict[str, dict[str, Any]]) -> None:
-    """Replace trimesh's materials, which only bring the textures along."""
+    """Replace trimesh's materials, keeping their textures."""
     brought = tree.get("materials", [])
     tree["materials"] = []
     for mesh in tree["meshes"]:
@@ -194,7 +193,7 @@ def _set_materials(tree: dict[str, Any], looks: dict[str, dict[str, Any]]) -> No
             primitive["material"] = len(tree["materials"])
             tree["materials"].append({**look, "pbrMetallicRoughness": surface})
     if any(_UNLIT in look.get("extensions", {}) for look in looks.values()):
-        # By default a texture repeats, and the photo's borders would run into those opposite.
+        # By default a texture repeats: the photo's opposite borders would mix.
         tree["samplers"] = [{"wrapS": _CLAMP_TO_EDGE, "wrapT": _CLAMP_TO_EDGE}]
         tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", []), _UNLIT})
 
@@ -204,14 +203,14 @@ def _add_cameras(tree: dict[str, Any], photos: Sequence[PlacedPhoto]) -> None:
     roots = tree["scenes"][tree["scene"]]["nodes"]
     for number, photo in enumerate(photos):
         name = f"camera_{number}"
-        tree["cameras"].append({"name": name, "type": "perspective", "perspective": photo.look})
+        tree["cameras"].append({"name": name, "type": "perspective", "perspective": photo.lens})
         roots.append(len(tree["nodes"]))
         matrix = photo.pose.T.ravel().tolist()
         tree["nodes"].append({"name": name, "camera": number, "matrix": matrix})
 
 
 def _placed_photo(exported: AlignedObject, number: int) -> PlacedPhoto:
-    """A view's photo, behind the object's farthest corner."""
+    """Place a view's photo behind the object's farthest corner."""
     view = exported.views[number]
     image = None if view.image is None else read_image(view.image, view.camera)
     pose = OPENGL_FLIP @ exported.first_from_cam(number) @ OPENGL_FLIP
@@ -223,10 +222,10 @@ def _placed_photo(exported: AlignedObject, number: int) -> PlacedPhoto:
 def photo_plane(
     camera: Camera, image: ByteImage | None
 ) -> tuple[ByteImage | None, FloatArray, FloatArray]:
-    """A camera's photo without lens distortion, and its corners at depth 1; see `PlacedPhoto`."""
+    """Undistort a camera's photo; returns it and its corners at depth 1, see `PlacedPhoto`."""
     if camera.distortion:
         pinhole = _pinhole_of(camera)
-        image = None if image is None else _undistorted(image, camera, pinhole)
+        image = None if image is None else _undistort(image, camera, pinhole)
         camera = pinhole
     centre, focal = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
     size = np.array([camera.width, camera.height])
@@ -234,7 +233,7 @@ def photo_plane(
 
 
 def _pinhole_of(camera: Camera) -> Camera:
-    """A camera without distortion, of the same focal length, that holds all pixels it can."""
+    """Pinhole camera of the same focal length that contains the photo, within `_GROWTH`."""
     width, height = camera.width, camera.height
     across, down = np.arange(width + 1) - _BORDER, np.arange(height + 1) - _BORDER
     sides = [np.stack([across, np.full(width + 1, y)], axis=1) for y in (down[0], down[-1])]
@@ -251,21 +250,21 @@ def _pinhole_of(camera: Camera) -> Camera:
     return Camera(columns, rows, camera.fx, camera.fy, cx, cy)
 
 
-def _undistorted(image: ByteImage, camera: Camera, pinhole: Camera) -> ByteImage:
-    """The photo as the pinhole camera would have taken it, black where it shows nothing."""
+def _undistort(image: ByteImage, camera: Camera, pinhole: Camera) -> ByteImage:
+    """Resample the photo to the pinhole camera, black outside the photo."""
     columns, rows = np.meshgrid(np.arange(pinhole.width), np.arange(pinhole.height))
     targets = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float)
     normalized = pinhole.normalize(targets)
     sources = camera.pixels_from_normalized(normalized)
-    # Past the fold of the lens model a far place would be given a pixel of the photo.
+    # Where the lens model is not invertible, distant pixels would project into the photo.
     inside: BoolArray = np.asarray(np.isfinite(sources).all(axis=1))
     inside[inside] = camera.contains(sources[inside], margin=-_RIM)
     back, valid = camera.normalize_where_valid(sources[inside])
     gap = np.abs(back - normalized[inside]).max(axis=1, initial=0.0)
-    inside[inside] = valid & (gap < _AGREES)
+    inside[inside] = valid & (gap < _ROUND_TRIP)
     sources[~inside] = -10.0
     maps = sources.reshape(pinhole.height, pinhole.width, 2).astype(np.float32)
-    # The rim has its colour, or viewers would mix black into the photo's borders.
+    # Pixels beyond the border repeat its colour, since viewers would mix black into it.
     drawn = cv2.remap(
         image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )

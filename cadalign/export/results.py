@@ -1,4 +1,4 @@
-"""Results of estimates as text, as rows of tables, on axes and as aligned objects."""
+"""Conversion of results: to text, table rows, plots and aligned objects."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def result_text(result: Any) -> str:
-    """Keypoints, rotation, translation, stretch, focal length, what is uncertain, warnings."""
+    """Summary of a result: pose, stretch, focal length, uncertain quantities, warnings."""
     count, of = int(result.inliers.sum()), len(result.inliers)
     some = f"{count}" if count == of else f"{count} of {of}"
     views = "" if len(result.views) == 1 else f" in {len(result.views)} views"
@@ -60,7 +60,7 @@ def result_text(result: Any) -> str:
         for other in result.alternatives
     )
     if result.uncertain:
-        # The reason follows from the keypoints where all of them are seen, and are the evidence.
+        # Keypoints give a reason only if all are observed, and there is no other evidence.
         is_plain = len(result.evidence) < 2 and len(result.points_3d) == len(result.inliers)
         exact = result.points_3d[result.inliers] if is_plain else result.points_3d[:0]
         names = [name + why_open(name, exact, pose) for name in result.uncertain]
@@ -84,17 +84,17 @@ RESULT_COLUMNS: tuple[tuple[str, type], ...] = (
     *(("alternatives", int), ("uncertain", str)),
     *(("warning_count", int), ("warning_kinds", str), ("warnings", str)),
 )
-"""Names and types of the cells of a result in every table."""
+"""Names and types of the columns of a result in tables."""
 
 
 def failed_row(reason: str) -> dict[str, Any]:
-    """The cells of a problem without solution."""
+    """Table row of a failed problem."""
     texts = ("method", "uncertain", "warning_kinds", "warnings")
     return {"status": "failed", "reason": reason, **dict.fromkeys(texts, "")}
 
 
 def row_of(result: Any) -> dict[str, Any]:
-    """The cells of a `cadalign.Result`, by the names of `RESULT_COLUMNS`."""
+    """Table row of a `cadalign.Result`, with the keys of `RESULT_COLUMNS`."""
     pose, std, warnings = result.alignment, result.std, result.warnings
     sigma: Any = result.sigma
     if sigma is None and result.options is not None:
@@ -166,22 +166,23 @@ def object_of(
     photos: Sequence[str | os.PathLike[str] | None] = (),
     name: str = "model",
 ) -> AlignedObject:
-    """The object of a result.
+    """Convert a result to an `AlignedObject`, for `export_object`.
 
     Parameters
     ----------
     result : cadalign.Result
     mesh : Mesh or path, optional
-        The model's as given; it is warped where the result knows its model, see `Result.mesh`.
+        Mesh of the model; by default the result's. It is warped to an estimated shape, see
+        `Result.mesh`.
     photos : sequence of path or None
-        The photo of every view; by default none.
-    name
-        As for `AlignedObject`.
+        The photos of the views; by default none.
+    name : str
+        Name of the model.
 
     Raises
     ------
     InputError
-        If there are more or fewer photos than the result has views, or no mesh is known.
+        If the number of photos is not the number of views, or no mesh is known.
     """
     paths = [None if each is None else as_path(each, "photos") for each in photos]
     paths = paths or [None] * len(result.views)

@@ -1,4 +1,4 @@
-"""The page of runs: headline table, plots and gallery; several runs side by side."""
+"""Report of runs as an HTML page: headline table, plots and gallery."""
 
 from cadalign.report.page import write_report
 

@@ -1,4 +1,4 @@
-"""Headline tables: their rows, best values and failures."""
+"""Headline table: rows, best values and failures."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.runs.work import FAILED, SKIPPED
 from cadalign.evaluation.summary import ALL, Summary, group_name
-from cadalign.report.runs import by_spec
+from cadalign.report.runs import group_by_spec
 
 _MOST_REASONS = 200
 _REFERENCES = {LIMIT, TRUTH, "exact"}
-"""Methods that know what nobody does: the bound, the object's own model, the true pose."""
+"""Methods with information that is unknown in practice, such as the true pose."""
 
 
 @dataclass(frozen=True)
 class HeadlineRow:
-    """Numbers of one method on one group of tasks of a run.
+    """Values of one method on one group of a run's tasks.
 
-    ``cells`` are as displayed, None where there is none; ``best`` are the columns in which no
-    method did better on the same group.
+    ``cells`` are displayed values, None where unknown; ``best`` are the columns in which no method
+    of the group is better.
     """
 
     run: int
@@ -37,13 +37,13 @@ class HeadlineRow:
 
     @classmethod
     def of(cls, run: int, line: Summary, columns: Sequence[Metric]) -> HeadlineRow:
-        """A row of a line's values, in the columns' units."""
+        """Convert a summary to a row, in the columns' units."""
         cells = {column.key: column.shown(line.number(column.key)) for column in columns}
         return cls(run, line.group, line.method, cells)
 
 
 Failure = dict[str, Any]
-"""A ``reason`` of failures or of skipped instances, their ``count``, run, category and method."""
+"""A ``reason``, the ``count`` of failed or skipped instances, run, category and method."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Headline:
     note: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """The table for the page."""
+        """The table in the page's format."""
         return {
             "rows": list(map(asdict, self.rows)),
             "failures": self.failures,
@@ -70,14 +70,14 @@ class Headline:
 
 
 def headline_of(runs: Sequence[Run]) -> Headline:
-    """The headline table of runs of one kind."""
+    """Make the headline table of comparable runs."""
     lines = []
     for run in runs:
         found = spec_of(run).summarize(run)
-        # Those of all groups together come first.
+        # The summary over all groups comes first.
         lines.append(sorted(found, key=lambda line: line.group.split(", ")[0] != ALL))
     columns, notes = dict[str, Metric](), list[str]()
-    for spec, places in by_spec(runs):
+    for spec, places in group_by_spec(runs):
         own = [runs[k] for k in places]
         of_spec = [line for k in places for line in lines[k]]
         columns |= {each.key: each for each in spec.shown_columns(of_spec, own)}
@@ -85,7 +85,7 @@ def headline_of(runs: Sequence[Run]) -> Headline:
     shown = tuple(columns.values())
     rows, failures, skipped = [], [], []
     for index, run in enumerate(runs):
-        rows += _with_best([HeadlineRow.of(index, line, shown) for line in lines[index]], shown)
+        rows += _mark_best([HeadlineRow.of(index, line, shown) for line in lines[index]], shown)
         group = spec_of(run).group(run)
         failures += _reasons(index, run, group, FAILED)
         skipped += _reasons(index, run, group, SKIPPED)
@@ -99,8 +99,8 @@ def headline_of(runs: Sequence[Run]) -> Headline:
     )
 
 
-def _with_best(rows: Sequence[HeadlineRow], columns: Sequence[Metric]) -> list[HeadlineRow]:
-    """The rows with the best ones marked, among methods on the same that one could use."""
+def _mark_best(rows: Sequence[HeadlineRow], columns: Sequence[Metric]) -> list[HeadlineRow]:
+    """Mark the best values of each group, except for reference methods."""
     rivals: dict[str, list[HeadlineRow]] = {}
     for row in rows:
         if row.method not in _REFERENCES:
@@ -118,7 +118,7 @@ def _with_best(rows: Sequence[HeadlineRow], columns: Sequence[Metric]) -> list[H
 
 
 def _reasons(index: int, run: Run, group: Metric, wanted: str) -> list[Failure]:
-    """Reasons with their numbers, the most frequent first."""
+    """Count the reasons of a status, the most frequent first."""
     chosen = [run.results[name].to_pylist() for name in (group.key, "method", "status", "reason")]
     counts = Counter(
         (group_name(group, value), method, reason)

@@ -1,6 +1,6 @@
-"""The instances of runs: compact columns of their errors, pictures, mesh previews and records.
+"""Instances of runs: columns of their errors, pictures, mesh previews and records.
 
-Instances of several runs are joined by what names them.
+Instances of several runs are joined by their names.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from cadalign.io.files import listed, read_bytes
 InstanceName = tuple[str, str, int]
 """Category, model id, view."""
 MEDIA_LIMIT = 60_000_000
-"""Pictures and records of instances that a page has at most [bytes]."""
+"""Largest size of the pictures and records on a page [bytes]."""
 _COLUMNS = ("id", "run", "category", "model", "view", "keypoints", "exhibit", "thumb")
 
 
 @dataclass(frozen=True, eq=False)
 class InstanceTable:
-    """Columns of instances, one for each run that has it, and of their rows.
+    """Columns of instances and of their rows, one row per method; see `cadalign.report.page`.
 
-    ``strings`` are all texts, each once; other columns hold their places. The column ``id`` is the
-    same for the same instance of several runs. ``places`` are those of instances by (run, name).
+    An instance in several runs has the same ``id`` and an entry per run. Columns of texts are
+    indices into ``strings``. ``places`` are the indices of instances by (run, name).
     """
 
     strings: list[str]
@@ -46,17 +46,17 @@ class InstanceTable:
     places: dict[tuple[int, InstanceName], int]
 
     def to_dict(self) -> dict[str, Any]:
-        """The tables for the page."""
+        """The tables in the page's format."""
         return {"strings": self.strings, "instances": self.instances, "rows": self.rows}
 
 
 def instance_table(
     runs: Sequence[Run], methods: Sequence[str], metrics: Sequence[Metric]
 ) -> InstanceTable:
-    """The table of runs over views of models, their methods and metrics of the rows."""
+    """Make the table of runs, with the given methods and metrics."""
     texts: dict[str, int] = {}
 
-    def place_of(text: str) -> int:
+    def index_of(text: str) -> int:
         return texts.setdefault(text, len(texts))
 
     instances: dict[str, list[Any]] = {name: [] for name in _COLUMNS}
@@ -76,8 +76,8 @@ def instance_table(
                 instance = {
                     "id": ids.setdefault(name[1:] if joins else name, len(ids)),
                     "run": run_index,
-                    "category": place_of(name[0]),
-                    "model": place_of(name[1]),
+                    "category": index_of(name[0]),
+                    "model": index_of(name[1]),
                     "view": name[2],
                     "keypoints": cells["keypoints"][row],
                     "exhibit": -1,
@@ -87,7 +87,7 @@ def instance_table(
                     instances[column].append(cell)
             reason = cells["reason"][row]
             rows["instance"].append(places[key])
-            rows["reason"].append(place_of(reason) if reason else -1)
+            rows["reason"].append(index_of(reason) if reason else -1)
         rows["method"] += [number[name] for name in cells["method"]]
         rows["status"] += [int(status != OK) for status in cells["status"]]
         for metric in metrics:
@@ -96,9 +96,9 @@ def instance_table(
 
 
 def _cells(run: Run, metrics: Sequence[Metric]) -> dict[str, list[Any]]:
-    """The columns of a run's results as lists, without what was left out or skipped."""
-    without = pc.is_in(run.results["status"], value_set=pa.array([LEFT_OUT, SKIPPED]))
-    table = run.results.filter(pc.invert(without))
+    """Columns of a run's results as lists, without instances that were left out or skipped."""
+    dropped = pc.is_in(run.results["status"], value_set=pa.array([LEFT_OUT, SKIPPED]))
+    table = run.results.filter(pc.invert(dropped))
     named = ("category", "model_id", "view", "method", "status", "reason", "keypoints")
     cells = {name: table[name].to_pylist() for name in named}
     for name in (metric.key for metric in metrics):
@@ -113,23 +113,23 @@ def _cells(run: Run, metrics: Sequence[Metric]) -> dict[str, list[Any]]:
 
 @dataclass
 class Media:
-    """Pictures, mesh previews and instance records of a page, of the same content once."""
+    """Pictures, mesh previews and instance records of a page, without duplicates."""
 
     pictures: dict[str, str] = field(default_factory=dict)
     thumbs: dict[str, str] = field(default_factory=dict)
     meshes: dict[str, Any] = field(default_factory=dict)
     exhibits: dict[str, Any] = field(default_factory=dict)
     left_out: int = 0
-    """Number of the instances for which there was no room."""
+    """Number of instances without pictures and records, for lack of room."""
     _known: dict[bytes, str] = field(default_factory=dict)
     _size: int = 0
 
     def fill(self, runs: Sequence[Run], table: InstanceTable) -> None:
-        """Take in the pictures and records of runs, and enter their keys in the table."""
+        """Read the pictures and records of runs, and write their keys into the table."""
         for index, run in enumerate(runs):
             folder = run.folder
             folders = folder.pictures, folder.thumbs, folder.previews
-            # The names in a folder are read once: asking for thousands takes seconds.
+            # List each folder once: checking thousands of files takes seconds.
             there = {path for each in folders if each.is_dir() for path in listed(each)}
             for row in run.records(RECORD_COLUMNS):
                 name = (row["category"], row["model_id"], row["view"])
@@ -153,12 +153,12 @@ class Media:
                 self._size += len(row["exhibit"])
 
     def to_dict(self) -> dict[str, Any]:
-        """The page's part of it."""
+        """The media in the page's format."""
         names = ("pictures", "thumbs", "exhibits", "meshes")
         return {name: getattr(self, name) for name in names}
 
     def _key_of(self, path: Path, store: dict[str, Any]) -> str:
-        """Store a file, once for all with its content; returns its key."""
+        """Store a file, unless the same content is stored; returns its key."""
         data = read_bytes(path)
         digest = hashlib.sha256(path.parent.name.encode() + data).digest()
         if digest not in self._known:

@@ -1,6 +1,6 @@
-"""The page: one HTML file with everything inside.
+"""Report page: one self-contained HTML file.
 
-Its payload is one JSON object, which ``cadalign/web/report`` reads ::
+``cadalign/web/report`` reads its payload, one JSON object ::
 
     {
       "format": 1,
@@ -24,17 +24,17 @@ Its payload is one JSON object, which ``cadalign/web/report`` reads ::
       "exhibits": {key: exhibit}, "meshes": {key: mesh}
     }
 
-``tables`` holds columns, each a list: ``category``, ``model`` and ``reason`` are places in
-``strings`` (``reason`` -1 where there is none), ``method`` and ``run`` places in the lists above,
-``status`` is 1 for a failure. ``id`` is the same for the same instance of several runs. Numbers of
-rows are as results have them: shown is the value times the metric's ``factor``. The cells of the
-headline and the values of ``plots`` are as shown. What is unknown or not finite is null.
+The columns of ``tables`` are lists. ``category``, ``model`` and ``reason`` are indices into
+``strings`` (``reason`` is -1 for none), ``method`` and ``run`` indices into the lists above,
+``status`` is 1 for a failure. An instance has the same ``id`` in all runs. Values of rows are in
+the units of the results; the page multiplies them by the metric's ``factor``. Values of
+``headline`` and ``plots`` are in displayed units. Unknown and non-finite values are null.
 
 ``exhibit`` and ``thumb`` are keys, -1 for none. An exhibit is an instance record
-(`cadalign.evaluation.instances.record`) with the keys of its ``picture``, which has no boxes drawn
-in as thumbs have, and of its ``mesh``, both null where there is none. A mesh is a preview
-(`cadalign.evaluation.instances.pictures`) of the dataset's model: that, times the exhibit's
-``stretch``, is the model that methods were given.
+(`cadalign.evaluation.instances.record`) with the keys of its ``picture`` and ``mesh``, null for
+none. Thumbs have boxes drawn in, pictures have none. A mesh is a preview
+(`cadalign.evaluation.instances.pictures`) of the data set's model. Methods were given this model
+times the exhibit's ``stretch``.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ from cadalign.report.headline import headline_of
 from cadalign.report.instances import Media, instance_table
 from cadalign.report.runs import (
     all_methods,
-    by_spec,
+    group_by_spec,
     read_runs,
     settings_of,
     shown_metrics,
@@ -73,7 +73,7 @@ from cadalign.web import asset, fill
 
 _FORMAT = 1
 _INK, _INK_ON_DARK = "#1b1d21", "#e8e9ec"
-# JSON may have these escaped anywhere they can stand; HTML must not see them.
+# Characters that HTML could interpret; JSON allows the escapes in all strings.
 _ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 
 
@@ -81,20 +81,20 @@ def write_report(
     runs: Sequence[str | os.PathLike[str]],
     path: str | os.PathLike[str],
 ) -> Path:
-    """Write the result of runs as a page that needs no network.
+    """Write a report of runs as a self-contained HTML page.
 
     Parameters
     ----------
     runs : sequence of path-like
-        Folders of runs, finished or not; several of the same kind are compared, and runs over many
-        observations stand beside each other and beside one with truth.
+        Folders of runs, finished or not. Several runs are compared: runs of the same kind, or runs
+        over observations with each other and with an evaluation.
     path : path-like
         The page to write.
 
     Returns
     -------
     Path
-        The page. Its gallery has the pictures and poses of as many instances as 60 MB hold.
+        The page. Its gallery shows pictures and poses of instances up to a total of 60 MB.
 
     Examples
     --------
@@ -131,7 +131,7 @@ def write_report(
 
 
 def render_page(payload: dict[str, Any]) -> str:
-    """The HTML of a payload; texts in it cannot become part of the page."""
+    """Render a payload as HTML, with all texts escaped."""
     return fill(
         "report.html",
         title=escape(str(payload["title"])),
@@ -153,9 +153,9 @@ def _run_dict(run: Run) -> dict[str, Any]:
 
 
 def _plots(runs: Sequence[Run]) -> list[Plot]:
-    """The plots of all runs; those of several kinds share the plot of the same metric."""
+    """Plots of all runs; several kinds of runs share the plot of a metric."""
     found: dict[str, Plot] = {}
-    for spec, places in by_spec(runs):
+    for spec, places in group_by_spec(runs):
         for plot in spec.plots([runs[k] for k in places]):
             traces = [replace(trace, run=places[trace.run]) for trace in plot.traces]
             known = found.get(plot.id)
@@ -165,7 +165,7 @@ def _plots(runs: Sequence[Run]) -> list[Plot]:
 
 
 def method_dict(name: str, place: int) -> dict[str, Any]:
-    """A method for the page, by its place among all."""
+    """A method in the page's format; ``place`` is its index among all methods."""
     is_limit, color = name == LIMIT, color_of(name, place)
     return {
         "key": name,
@@ -177,5 +177,5 @@ def method_dict(name: str, place: int) -> dict[str, Any]:
 
 
 def _lighter(color: str) -> str:
-    """The colour (#rrggbb) on a dark ground."""
+    """Lighten a colour (#rrggbb) for a dark background."""
     return "#" + bytes(part + (255 - part) * 2 // 5 for part in bytes.fromhex(color[1:])).hex()

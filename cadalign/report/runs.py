@@ -1,4 +1,4 @@
-"""Runs that go into one report: title, summary and settings as text, methods and metrics."""
+"""Runs of a report: reading, title, summary, settings, methods and metrics."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ BATCHES.update(fit="cadalign.batch.spec", retrieve="cadalign.batch.retrievals")
 _LABELS = {
     "root": "dataset",
     "path": "dataset",
-    "min_visible": "least visible keypoints",
-    "max_models": "most models per category",
+    "min_visible": "minimum visible keypoints",
+    "max_models": "models per category, at most",
     "render": "pictures",
     "max_reproj_error": "inliers within",
-    "max_iterations": "most samples",
+    "max_iterations": "samples, at most",
 }
 _PIXELS = ("noise_px", "noises_px", "max_reproj_error")
 
 
 def read_runs(folders: Sequence[str | os.PathLike[str]]) -> list[Run]:
-    """Read runs that go into one report."""
+    """Read the runs of a report; raises InputError if they cannot be compared."""
     paths = [as_path(folder, "folder") for folder in folders]
     if not paths:
         raise InputError(
@@ -51,7 +51,7 @@ def read_runs(folders: Sequence[str | os.PathLike[str]]) -> list[Run]:
 
 
 def _require_comparable(runs: Sequence[Run]) -> None:
-    """Refuse runs of several kinds, but those that may stand beside others on instances."""
+    """Raise InputError for runs of several kinds, unless they can be joined by instances."""
     others = [run for run in runs if not spec_of(run).joins]
     joining = [run for run in runs if spec_of(run).joins]
     for run in others:
@@ -67,8 +67,8 @@ def _require_comparable(runs: Sequence[Run]) -> None:
             )
 
 
-def by_spec(runs: Sequence[Run]) -> list[tuple[Spec, list[int]]]:
-    """The specifications of runs, each with the places of its runs among them."""
+def group_by_spec(runs: Sequence[Run]) -> list[tuple[Spec, list[int]]]:
+    """Specifications of runs, each with the indices of its runs."""
     places: dict[str, list[int]] = {}
     for place, run in enumerate(runs):
         places.setdefault(spec_of(run).name, []).append(place)
@@ -76,11 +76,11 @@ def by_spec(runs: Sequence[Run]) -> list[tuple[Spec, list[int]]]:
 
 
 def shown_metrics(runs: Sequence[Run]) -> list[Metric]:
-    """Metrics of the instances that some run has measured; none for runs without instances.
+    """Metrics with values in some run; none for runs without instances.
 
-    Where nothing succeeded these are all of the columns.
+    If no fit succeeded, all metrics that are columns of the results.
     """
-    metrics = {metric.key: metric for spec, _ in by_spec(runs) for metric in spec.metrics}
+    metrics = {metric.key: metric for spec, _ in group_by_spec(runs) for metric in spec.metrics}
     further = {metric.key: metric for run in runs for metric in run.metrics} if metrics else {}
     columns = [(run.results, name) for run in runs for name in run.results.column_names]
     names = {name for _, name in columns}
@@ -90,7 +90,7 @@ def shown_metrics(runs: Sequence[Run]) -> list[Metric]:
 
 
 def all_methods(runs: Sequence[Run]) -> list[str]:
-    """The methods of all runs, in the order of the first that has them."""
+    """Methods of all runs, in the order of their first occurrence."""
     return list(dict.fromkeys(name for run in runs for name in run.methods))
 
 
@@ -102,7 +102,7 @@ def _read(path: Path, name: str) -> Run:
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """The fewest last parts of the paths that are distinct."""
+    """Shortest distinct trailing parts of the paths."""
     parts = [path.absolute().parts for path in paths]
     for count in range(1, max(map(len, parts)) + 1):
         names = ["/".join(some[-count:]) for some in parts]
@@ -112,8 +112,8 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 
 def title_of(runs: Sequence[Run]) -> str:
-    """A report's title."""
-    titles = [spec.title_of([runs[k] for k in places]) for spec, places in by_spec(runs)]
+    """Title of the report."""
+    titles = [spec.title_of([runs[k] for k in places]) for spec, places in group_by_spec(runs)]
     title = " and ".join(dict.fromkeys(titles))
     if len(runs) > 1:
         return f"{len(runs)} runs compared: {title}"
@@ -121,7 +121,7 @@ def title_of(runs: Sequence[Run]) -> str:
 
 
 def summary_of(runs: Sequence[Run]) -> str:
-    """One paragraph on methods, data, day and progress of runs."""
+    """Paragraph on the methods, data, date and progress of runs."""
     sentences = []
     for run in runs:
         before = f"{run.name}: " if len(runs) > 1 else ""
@@ -133,15 +133,15 @@ def summary_of(runs: Sequence[Run]) -> str:
         sentences.append(f"{before}{methods} {what}, with cadalign {version} on {run.day}.")
         if not run.is_finished:
             sentences.append(
-                f"The run is unfinished, {run.done:,} of {run.total:,} tasks are done: the numbers "
-                "are those of the finished ones."
+                f"The run is unfinished: {run.done:,} of {run.total:,} tasks are done, and the "
+                "numbers are of these tasks alone."
             )
-    about = dict.fromkeys(spec.about for spec, _ in by_spec(runs))
+    about = dict.fromkeys(spec.about for spec, _ in group_by_spec(runs))
     return " ".join([*sentences, *filter(None, about)])
 
 
 def settings_of(run: Run) -> list[tuple[str, str]]:
-    """A run's settings by name."""
+    """Settings of a run, as pairs of label and text."""
     config = run.config
     # Data first, methods and seed last.
     names = [field.name for field in fields(spec_of(run).options)]

@@ -1,27 +1,25 @@
-"""Probability that the object is none of a library's models; distances between their shapes.
+"""Probability that the object is none of a library's models; distances between shapes.
 
-Two hypotheses explain an image's keypoints. By the first, the object is model k of the library,
-stretched, with the covariances C_i of its keypoints in the image that the options give. By the
-second, it differs from k, its nearest model, by an unknown deviation tau per coordinate, as a
-share of the extent e of the keypoints in the image: their covariances are ``C_i + (tau e)^2 I``.
-All k are equally likely in both. What tau changes in the likelihood of model k is, with pose and
-stretch integrated out by Laplace's method, a flat prior of the pose and the options' one of the
-stretch::
+Two hypotheses are compared. In the first, the object is model k of the library, stretched, and its
+keypoints in the image have the covariances C_i of the options. In the second, the object differs
+from its nearest model k by an unknown deviation tau per coordinate, as a share of the extent e of
+the keypoints in the image: their covariances are ``C_i + (tau e)^2 I``. All k are equally likely in
+both. Pose and stretch are integrated out by Laplace's method, with a flat prior of the pose and the
+options' prior of the stretch. Then tau changes the likelihood of model k by the factor::
 
     B_k(tau) = l_k(tau) / l_k(0)
     log l_k(tau) = - sum over the shared keypoints [log det(C_i(tau)) + |r_i|^2] / 2
                    - sum of (log stretch / stretch_sigma)^2 / 2 - log det(H) / 2
 
-with the whitened errors r_i at the optimum, bent by a robust loss, and H the Hessian there. The
-logarithm of tau is Gaussian; its mean and standard deviation are those of the distances from the
-library's models to their nearest ones of another shape, in the category of k, the latter at least
-`LEAST_SPREAD`. So the odds of the second hypothesis are::
+with the whitened errors r_i and the Hessian H at the optimum; a robust loss replaces the squares.
+The logarithm of tau is Gaussian. Its mean and standard deviation (at least `LEAST_SPREAD`) are
+taken from the distances between the models in the category of k and their nearest models of another
+shape. With equal prior probabilities, the odds of the second hypothesis are::
 
     sum over k of score_k E[B_k(tau)]
 
-if both are equally likely before an image is seen. The sum is over the most likely models, which
-hold nearly all of it. Four keypoints, through which any model passes, decide nothing: the
-probability is then near 1/2.
+The sum is over the most likely models, which contribute nearly all of it. With four keypoints the
+probability is near 1/2, since any model fits them.
 """
 
 from __future__ import annotations
@@ -34,32 +32,38 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.estimation.problems import whitening_of
 from cadalign.retrieval.models import LibraryModel, ModelTable
-from cadalign.retrieval.ranking import CandidateSet, Observed, Ranking, bent, shared_keypoints
+from cadalign.retrieval.ranking import (
+    CandidateSet,
+    ObservedKeypoints,
+    Ranking,
+    apply_loss,
+    shared_keypoints,
+)
 from cadalign.solvers.projection import ray_derivatives
 
 SAME_SHAPE = 0.01
 """Distance below which two models count as the same shape."""
 LEAST_SPREAD = 0.7
-"""Least standard deviation of log tau: objects of other categories are farther away."""
-_MOST_LIKELY = 40  # models that the sum is over
-_STEPS = np.linspace(-2.5, 2.5, 11)  # of log tau, in its standard deviations
-_USUAL = (np.log(0.03), 1.0)  # mean and sigma of log tau where there is nothing to compare
-_FARTHEST = 1.0  # tau of two models that have nothing in common
-_ASKED = 64  # models of a category whose nearest ones are looked for
+"""Least standard deviation of log tau, since objects of other categories are farther away."""
+_MOST_LIKELY = 40  # number of models in the sum
+_STEPS = np.linspace(-2.5, 2.5, 11)  # of log tau, in standard deviations
+_USUAL = (np.log(0.03), 1.0)  # mean and standard deviation of log tau with fewer than 2 distances
+_FARTHEST = 1.0  # largest tau
+_MOST_SAMPLED = 64  # largest number of a category's models whose nearest models are searched
 _LEAST_SHARED = 4
-_RIDGE = 1e-12  # of the Hessian, where keypoints leave an unknown open
+_RIDGE = 1e-12  # added to the Hessian, in case an unknown is not determined
 
 
 def none_probability(
     table: ModelTable,
     candidates: CandidateSet,
-    observed: Observed,
+    observed: ObservedKeypoints,
     ranking: Ranking,
 ) -> float:
-    """Compute the probability that the object is none of the models; see the module."""
+    """Probability that the object is none of the models; see the module docstring."""
     chosen = ranking.candidates[:_MOST_LIKELY].tolist()
     shared = [shared_keypoints(candidates, observed, candidate) for candidate in chosen]
-    alike: dict[tuple[str, int], list[int]] = {}  # places of models that are computed together
+    alike: dict[tuple[str, int], list[int]] = {}  # ranks of the models to compute together
     for place, row in enumerate(candidates.models[chosen].tolist()):
         alike.setdefault((table.keys[row][0], len(shared[place][1])), []).append(place)
     extent = float(np.linalg.norm(np.ptp(observed.points_2d, axis=0)))
@@ -83,13 +87,13 @@ def _log_likelihoods(
     poses: FloatArray,
     points_3d: FloatArray,
     rows: IntArray,
-    observed: Observed,
+    observed: ObservedKeypoints,
     covariances: FloatArray,
 ) -> FloatArray:
-    """Log of l_k (t, m) for covariances (t, all keypoints, 2, 2), the poses optimal for t = 0.
+    """Log of l_k, (t, m), for m models and t covariances (t, all keypoints, 2, 2).
 
-    Poses (m, 15) are of models that share equally many keypoints (m, n, 3) with the image, where
-    they are in the ``rows`` (m, n).
+    The poses (m, 15) are optimal for the first covariances. All models share n keypoints (m, n, 3)
+    with the image, where they have the ``rows`` (m, n).
     """
     query = observed.query
     count = len(covariances)
@@ -111,10 +115,10 @@ def _log_likelihoods(
     hessian += _RIDGE * np.trace(hessian, axis1=2, axis2=3)[..., None, None] * np.eye(len(free))
     residuals = np.concatenate([across, down], axis=2)[..., None]
     slope = transposed @ residuals + (prior * stretches)[..., None]
-    # The optimum of a larger deviation is a step from that of the noise alone.
+    # The optimum for a larger deviation is one Newton step from the given pose.
     gain = (slope * np.linalg.solve(hessian, slope)).sum(axis=(2, 3))
     gain[0] = 0.0
-    costs = bent(across**2 + down**2, query.loss, query.loss_scale).sum(axis=2)
+    costs = apply_loss(across**2 + down**2, query.loss, query.loss_scale).sum(axis=2)
     costs += (prior * stretches**2).sum(axis=1) - gain
     determinants = np.log(np.linalg.det(covariances))[:, rows].sum(axis=2)
     return np.asarray(-0.5 * (determinants + costs + np.linalg.slogdet(hessian)[1]))
@@ -122,10 +126,10 @@ def _log_likelihoods(
 
 @lru_cache(maxsize=256)
 def deviation_of(table: ModelTable, category: str) -> tuple[float, float]:
-    """Mean and standard deviation of log tau: from models of a category to their nearest ones."""
+    """Mean and standard deviation of log tau, from distances between a category's models."""
     _, points = table.keypoints_of(category)
-    asked = points[:: -(-len(points) // _ASKED)]
-    gaps = np.array([distances(points, each, least=_LEAST_SHARED) for each in asked])
+    sampled = points[:: -(-len(points) // _MOST_SAMPLED)]
+    gaps = np.array([distances(points, each, least=_LEAST_SHARED) for each in sampled])
     gaps = np.where(gaps > SAME_SHAPE, gaps, np.inf).min(axis=1)
     nearest = np.minimum(gaps[np.isfinite(gaps)] / np.sqrt(3), _FARTHEST)
     if len(nearest) < 2:
@@ -135,10 +139,10 @@ def deviation_of(table: ModelTable, category: str) -> tuple[float, float]:
 
 
 def shape_distance(est: LibraryModel, gt: LibraryModel) -> float:
-    """Root mean square distance of the shared keypoints, as a share of the true ones' extent.
+    """Root mean square distance of the shared keypoints, as a share of the true keypoints' extent.
 
-    The estimated model is moved, and stretched along y and z (x is taken as known), to be closest
-    to the true one; it is not rotated. NaN with fewer than 2 shared keypoints.
+    The estimated model is first translated, and stretched along y and z (x is assumed to be known),
+    to be closest to the true model; it is not rotated. NaN with fewer than 2 shared keypoints.
 
     Examples
     --------
@@ -156,12 +160,12 @@ def shape_distance(est: LibraryModel, gt: LibraryModel) -> float:
 
 
 def distances(est: FloatArray, gt: FloatArray, *, least: int = 2) -> FloatArray:
-    """Compute the shape distance of models' keypoints (m, k, 3) from others (k, 3), (m,) float.
+    """Shape distances of models' keypoints (m, k, 3) from a model's (k, 3), (m,) float.
 
-    Keypoints that a model lacks are NaN: those that two models share are compared. The distance is
-    NaN where these are fewer than ``least``.
+    Missing keypoints are NaN; shared ones are compared. The distance is NaN with fewer than
+    ``least`` shared keypoints.
     """
-    # Keypoints, axes, models: sums over few numbers of many models are quick.
+    # In the order keypoints, axes, models, the sums are fast.
     moved, wanted = np.ascontiguousarray(est.transpose(1, 2, 0)), gt[:, :, None]
     known = ~np.isnan(moved[:, :1] + wanted[:, :1])
     counts = known.sum(axis=(0, 1))
@@ -170,7 +174,7 @@ def distances(est: FloatArray, gt: FloatArray, *, least: int = 2) -> FloatArray:
     moved -= known * (sum(moved) / numbers)
     wanted -= known * (sum(wanted) / numbers)
     squares, products = sum(moved**2), sum(moved * wanted)
-    # A mirrored or flat model cannot be stretched to the other.
+    # A mirrored or flat model has the stretch 0.
     scale = np.maximum(products, 0.0) / np.where(squares > 0, squares, 1.0)
     scale[0] = 1.0
     gaps = ((moved * scale - wanted) ** 2).sum(axis=1)

@@ -1,20 +1,20 @@
-"""Ranking of models that are only similar to the object, by the shape estimated from the image.
+"""Ranking of models by similarity to the shape estimated from the image.
 
-The category's `ShapeModel` is aligned with the image's keypoints, which gives the posterior of the
-object's shape, also of the parts that the image does not show. A model of the library is then as
-probable as its keypoints and box are under that posterior, widened by what tells a model from the
-object that it stands for:
+For objects that are not in the library. Aligning the category's `ShapeModel` with the image's
+keypoints gives the posterior of the object's shape, including its hidden parts. A model is scored
+by the probability of its keypoints and box under this posterior, with wider covariances:
 
-- its size and place, which one image does not determine;
-- a deviation of each coordinate: ``shape_sigma`` times the extent of the mean shape or, where that
-  is 0, the distance of the library's models from their nearest ones;
-- each keypoint of the image that the model lacks, by the probability `SPURIOUS`, and each of the
-  model's that the image lacks, by `MISSING_PROB`.
+- Size and place are free, since one image does not determine them.
+- Each coordinate has a deviation: ``shape_sigma`` times the extent of the mean shape or, if that is
+  0, the distance of the library's models from their nearest models.
 
-Keypoints that a model lacks are filled in with those that the category leads to expect. All models
-are ranked, but those that would reach behind the camera; none is searched for a pose.
-Matches have the pose of the estimated shape and the stretch that brings the model's keypoints and
-box closest to the estimated ones.
+Each keypoint of the image that the model lacks multiplies the probability by `SPURIOUS`, and each
+keypoint of the model that the image lacks by `MISSING_PROB`.
+
+Missing keypoints of a model are replaced by their expectation in the category. All models are
+ranked, except models that would reach behind the camera; there is no search for poses. Matches have
+the pose of the estimated shape, and the stretch that brings the model's keypoints and box closest
+to the estimated ones.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from cadalign.geometry.camera import faced, turned_alignment
 from cadalign.retrieval.kernels import MOST_STRETCH
 from cadalign.retrieval.models import ModelTable
 from cadalign.retrieval.options import MISSING_PROB, SPURIOUS, RetrievalOptions
-from cadalign.retrieval.ranking import CandidateSet, Observed, Ranking
+from cadalign.retrieval.ranking import CandidateSet, ObservedKeypoints, Ranking
 from cadalign.shapes.gaussians import Gaussians, Vectors, log_likelihoods
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import BOX_ROWS
@@ -48,33 +48,33 @@ from cadalign.solvers.marginal.equations import POSE_UNKNOWNS
 from cadalign.solvers.marginal.problem import Seen, coordinates_of
 
 _LEAST_KEYPOINTS = 3
-_FREE_SIZE = 1.0  # standard deviations of what the image leaves open: of the log size,
-_FREE_PLACE = 0.5  # and of the place, in extents of the shape
-_NEGLIGIBLE = 1e-9  # probability of a Gaussian that is left out
+_FREE_SIZE = 1.0  # standard deviation of the log size
+_FREE_PLACE = 0.5  # standard deviation of the place, in extents of the shape
+_NEGLIGIBLE = 1e-9  # largest weight of a Gaussian that is dropped
 _FLOOR = 1e-4  # least standard deviation of a coordinate, in extents of the shape
-_FLAT = 1e-9  # share of a model's variance along an axis without extent
-_MOST_NEIGHBOURS = 2000  # models among which the nearest ones are looked for
+_FLAT = 1e-9  # largest share of a model's variance along an axis without extent
+_MOST_NEIGHBOURS = 2000  # largest number of models among which nearest models are searched
 
 
 @dataclass(frozen=True, eq=False)
 class _Shapes:
-    """Models of a category in the terms of its shape model; means are weighted by `_weights`."""
+    """Models of a category, with its shape model's keypoints; means are weighted by `_weights`."""
 
-    centred: FloatArray  # (n, m + 2, 3), keypoints and boxes, completed, about their centres
+    centred: FloatArray  # (n, m + 2, 3), completed keypoints and boxes, centred
     centres: FloatArray  # (n, 3)
     squares: FloatArray  # (n, 3), variances
-    has: BoolArray  # (n, m), which keypoints they have
+    has: BoolArray  # (n, m), which keypoints the models have
     extent: float  # of the mean shape
-    deviation: float  # distance from their nearest ones per coordinate
+    deviation: float  # distance between nearest models, per coordinate
 
 
 def category_to_rank(shape: ShapeModel, options: RetrievalOptions, table: ModelTable) -> str:
-    """The category whose models a shape model ranks: that of the options, else its own.
+    """Category to rank by a shape model: the options' category, or else the shape model's.
 
     Raises
     ------
     InputError
-        If it is not in the library, or the shape model has no semantic ids.
+        If the category is not in the library, or the shape model has no semantic ids.
     """
     require_kind(shape, ShapeModel, "shape")
     if any(isinstance(label, str) for label in shape.ids):
@@ -87,7 +87,7 @@ def category_to_rank(shape: ShapeModel, options: RetrievalOptions, table: ModelT
 def rank_by_shape(
     table: ModelTable,
     candidates: CandidateSet,
-    observed: Observed,
+    observed: ObservedKeypoints,
     options: RetrievalOptions,
     shape: ShapeModel,
 ) -> Ranking:
@@ -96,7 +96,7 @@ def rank_by_shape(
     Raises
     ------
     InputError
-        If the shape model has less than 3 of the image's keypoints.
+        If the shape model has fewer than 3 of the image's keypoints.
     DegenerateError
         If the shape model cannot be aligned with the keypoints, or no model lies in front of the
         camera.
@@ -104,7 +104,7 @@ def rank_by_shape(
     query, sigma = observed.query, np.asarray(options.sigma)
     has = np.isin(query.ids, shape.ids)
     if has.sum() < _LEAST_KEYPOINTS:
-        what = f"the shape model has less than {_LEAST_KEYPOINTS} of the keypoints"
+        what = f"the shape model has fewer than {_LEAST_KEYPOINTS} of the keypoints"
         raise InputError(what, where="ids", fix="check them, or rank without shape")
     view = View(
         observed.camera,
@@ -140,9 +140,9 @@ def _rank_models(
     options: RetrievalOptions,
     turn: FloatArray,
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Log probabilities (c,) of a category's models, their poses (c, 15), and which are ahead.
+    """Log probabilities (c,) and poses (c, 15) of models; which are in front of the camera, (c,).
 
-    The ``turn`` (3, 3) leads from the camera's frame to that of the poses.
+    ``turn`` (3, 3) rotates the camera frame to the frame of the poses.
     """
     estimate = np.concatenate([result.points_3d, result.bounds])
     weights = _weights(len(estimate))
@@ -154,7 +154,7 @@ def _rank_models(
     if options.shape_sigma > 0:
         deviation = options.shape_sigma * known.extent
     vectors = Vectors(placed.reshape(len(models), -1), np.ones(len(models)))
-    logs = log_likelihoods(vectors, _widened(likely, estimate, deviation))
+    logs = log_likelihoods(vectors, _widen(likely, estimate, deviation))
     seen = np.array([label in result.views[0].ids for label in result.ids])
     has = known.has[models]
     logs = logs + (~has[:, seen]).sum(axis=1) * np.log(SPURIOUS)
@@ -170,8 +170,8 @@ def _rank_models(
     return logs, poses, ahead
 
 
-def _widened(shapes: Gaussians, estimate: FloatArray, deviation: float) -> Gaussians:
-    """The distribution of what similar models have in place of the object's shape."""
+def _widen(shapes: Gaussians, estimate: FloatArray, deviation: float) -> Gaussians:
+    """Distribution of similar models' shapes, given the distribution of the object's shape."""
     centred = estimate - estimate.mean(axis=0)
     extent = float(np.linalg.norm(np.ptp(estimate, axis=0)))
     size = _FREE_SIZE * centred.ravel()
@@ -182,7 +182,7 @@ def _widened(shapes: Gaussians, estimate: FloatArray, deviation: float) -> Gauss
 
 
 def _weights(count: int) -> FloatArray:
-    """Weights (count,) of the keypoints and, as much together, of the box."""
+    """Weights (count,): the keypoints have half of the total, the box the other half."""
     weights = np.full(count, 1 / (2 * (count - BOX_ROWS)))
     weights[-BOX_ROWS:] = 1 / (2 * BOX_ROWS)
     return weights
@@ -191,7 +191,7 @@ def _weights(count: int) -> FloatArray:
 def _scales(squares: FloatArray, products: FloatArray, free: str) -> FloatArray:
     """Scales (n, 3) that bring models closest to a shape, from their moments (n, 3).
 
-    The ``free`` axes have a scale each, the others share one.
+    Each ``free`` axis has its own scale, and the others share one.
     """
     total = np.maximum(squares.sum(axis=1), np.finfo(float).tiny)
     common = np.maximum(products.sum(axis=1) / total, np.finfo(float).eps)
@@ -199,7 +199,7 @@ def _scales(squares: FloatArray, products: FloatArray, free: str) -> FloatArray:
     held = [axis for axis, name in enumerate("xyz") if name not in free]
     for axes in (held, *([axis] for axis in range(3) if axis not in held)):
         square, product = squares[:, axes].sum(axis=1), products[:, axes].sum(axis=1)
-        # A flat or mirrored model leaves open the scale along this axis.
+        # A flat or mirrored model does not determine the scale along this axis.
         known = (square > _FLAT * total) & (product > 0)
         found = np.where(known, product / np.where(known, square, 1.0), common)
         scales[:, axes] = found[:, None]
@@ -207,7 +207,7 @@ def _scales(squares: FloatArray, products: FloatArray, free: str) -> FloatArray:
 
 
 def _poses(pose: Alignment, scales: FloatArray, shifts: FloatArray, free: str) -> FloatArray:
-    """Packed poses (n, 15) of scaled and shifted models, the scale of an axis not free being 1."""
+    """Packed poses (n, 15) of scaled and shifted models; axes not free have the scale 1."""
     held = next(axis for axis, name in enumerate("xyz") if name not in free)
     size = scales[:, [held]]
     stretch = np.clip(scales / size, 1 / MOST_STRETCH, MOST_STRETCH)
@@ -227,7 +227,7 @@ def _shapes_of(table: ModelTable, category: str, shape: ShapeModel) -> _Shapes:
     has = ~np.isnan(stacked[:, :-BOX_ROWS, 0])
     extent = float(np.linalg.norm(np.ptp(shape.mean, axis=0)))
     prior = gaussians_of(shape).widened(_FLOOR * extent)
-    flat = _completed(stacked.reshape(len(stacked), -1), prior)
+    flat = _complete(stacked.reshape(len(stacked), -1), prior)
     weights, full = _weights(stacked.shape[1]), flat.reshape(stacked.shape)
     centres = weights @ full
     centred = full - centres[:, None]
@@ -235,8 +235,8 @@ def _shapes_of(table: ModelTable, category: str, shape: ShapeModel) -> _Shapes:
     return _Shapes(centred, centres, squares, has, extent, _deviation(flat, prior))
 
 
-def _completed(values: FloatArray, prior: Gaussians) -> FloatArray:
-    """Vectors (n, d) with the expectation of their missing entries under a mixture."""
+def _complete(values: FloatArray, prior: Gaussians) -> FloatArray:
+    """Replace missing entries of vectors (n, d) by their expectation under a mixture."""
     vectors = Vectors(values, np.ones(len(values)))
     every = zip(prior.weights, prior.means, prior.covariances, strict=True)
     parts = [Gaussians(*(np.array([value]) for value in each)) for each in every]
@@ -247,9 +247,9 @@ def _completed(values: FloatArray, prior: Gaussians) -> FloatArray:
 
 
 def _deviation(values: FloatArray, prior: Gaussians) -> float:
-    """Deviation per coordinate of vectors (n, d) from their nearest ones, the median of all.
+    """Median deviation per coordinate of vectors (n, d) from their nearest vectors.
 
-    The prior's if there is only one vector.
+    With a single vector, it is the prior's deviation.
     """
     values = values[:: -(-len(values) // _MOST_NEIGHBOURS)]
     floor = float(np.sqrt(prior.covariances.diagonal(axis1=1, axis2=2).min()))
@@ -267,16 +267,16 @@ def _deviation(values: FloatArray, prior: Gaussians) -> float:
 def shape_posterior(
     result: Result, view: View, *, loss: str = "linear", loss_scale: float = 2.0
 ) -> tuple[Gaussians, float]:
-    """Posterior of the shape whose alignment with the inliers of one view is ``result``.
+    """Posterior of the shape and log evidence, from an alignment with the inliers of one view.
 
-    It is a mixture over stacked rows: x, y, z of each keypoint, then of the box's corners. The
-    logarithm of the evidence is up to a constant. Depths and directions are not used; the ``loss``
-    weights keypoints by their residuals.
+    The posterior is a mixture over x, y, z of each keypoint, then of the box's corners. The log
+    evidence has an unknown constant. Depths and directions are not used; the ``loss`` weights
+    keypoints by their residuals.
 
-    The reprojection errors are linear in shape and pose about the estimate. Whitened and projected
-    to what no change of the pose explains, they read ``A x = b + noise`` of unit covariance, with
-    the stacked rows x of the shape: each Gaussian of the category is conditioned on that in closed
-    form, and its weight grows with the probability that it gave to b.
+    The reprojection errors are linearised in shape and pose at the estimate. Whitened and projected
+    to the complement of all changes of the pose, they are ``A x = b + noise`` of unit covariance,
+    with the stacked rows x of the shape. Each Gaussian of the category is conditioned on this in
+    closed form; its weight is multiplied by its probability of b.
     """
     assert isinstance(result.model, ShapeModel)
     camera, rows_of = faced(view.camera, view.pixels), prior_of(result.model).rows_of
@@ -303,8 +303,8 @@ def shape_posterior(
         covariances.append(covariance - gain @ across)
     total = float(np.logaddexp.reduce(logs))
     shapes = Gaussians(np.exp(np.array(logs) - total), np.array(means), np.array(covariances))
-    # The estimate's objective has the log determinant of the shape, linear here: a slope by the
-    # keypoints, which moves the means. The box of an estimate is widened to hold what is seen.
+    # The estimate's objective includes a log determinant that depends on the keypoints. Its
+    # gradient there shifts the means. The box is no part of it, as it may have been enlarged.
     keypoints = result.points_3d.size
     gap = (estimate.ravel() - shapes.means[result.component])[:keypoints]
     own = shapes.covariances[result.component][:keypoints, :keypoints]

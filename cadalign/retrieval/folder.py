@@ -1,4 +1,4 @@
-"""Folder of a retrieval: matches as JSON, their observations, overlays, and a sheet of these."""
+"""Output folder of a retrieval: matches as JSON, observations and overlays."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ logger = logging.getLogger("cadalign")
 def write_retrieval(
     folder: Path, matches: Sequence[Match], query: Observation, *, image: ByteImage | None
 ) -> Path:
-    """Write the matches of a query's keypoints to a folder; returns the sheet of their overlays.
+    """Write the matches of a query to a folder; returns the path of ``matches.png``.
 
-    They are ``matches.json``, an overlay of each (``overlay_01.png``), all of them side by side
-    (``matches.png``), and the observation of each match's model (``match_01.json``), which
-    `cadalign fit` refines. Without a photo the overlays are drawn on grey.
+    The files are ``matches.json``, an overlay of each match (``overlay_01.png``), all overlays in a
+    grid (``matches.png``), and an observation of each match's model (``match_01.json``), for
+    `cadalign fit`. Without a photo the overlays have a grey background.
     """
     photo = photo_of(image, query.camera)
     for rank in range(1, len(matches) + 1):
@@ -47,25 +47,25 @@ def write_retrieval(
 
 
 def _files(folder: Path, rank: int) -> tuple[Path, Path]:
-    """A match's overlay and observation; ranks count from 1."""
+    """Paths of a match's overlay and observation; ranks count from 1."""
     return folder / f"overlay_{rank:02d}.png", folder / f"match_{rank:02d}.json"
 
 
 def draw_match(image: ByteImage, camera: Camera, match: Match) -> ByteImage:
-    """Draw a match over its photo: box, keypoints and, where there is a mesh, the model."""
+    """Draw a match over its photo: box, keypoints and, with a mesh, the model."""
     (seen,) = match.result.views
     return draw_overlay(
         image,
         camera,
         est_box=match.box,
-        est_frame=_cast(match, camera),  # without a mesh, keypoints and box are drawn
+        est_frame=_cast(match, camera),
         observed=seen.points_2d,
         reprojected=seen.points_2d + seen.residuals,
     )
 
 
 def none_text(matches: Sequence[Match]) -> str | None:
-    """Sentence on the probability that the object is none of the models."""
+    """Line of text with the probability that the object is none of the models."""
     probability = matches[0].none_probability if matches else None
     return None if probability is None else f"None of these: {score_text(probability)}"
 
@@ -76,10 +76,10 @@ def score_text(score: float) -> str:
 
 
 def _cast(match: Match, camera: Camera) -> Geometry | None:
-    """Cast rays at a match's mesh; None if there is none or, with a warning, it is unreadable."""
+    """Render a match's mesh; None without a mesh or, with a warning, if it is unreadable."""
     try:
         mesh = match.mesh()
         return None if mesh is None else cast_geometry(Scene(mesh), camera, match.alignment)
     except CadalignError as error:
-        logger.warning("no silhouette: %s", error)
+        logger.warning("the model is not drawn: %s", error)
         return None

@@ -1,7 +1,4 @@
-"""Compiled kernels of retrieval: lower bounds of candidates' costs, and the search for poses.
-
-The library's keypoints are concatenated, each model's in the order of their semantic ids.
-"""
+"""Compiled kernels of retrieval: lower bounds of candidates' costs, and the search for poses."""
 
 from __future__ import annotations
 
@@ -22,13 +19,13 @@ from cadalign.solvers.starts import choose_subsets, minimal_starts, rotation_sta
 from cadalign.solvers.unknowns import uncenter
 
 LEAST_SHARED = 4
-"""Least number of shared keypoints that determine an alignment."""
+"""Least number of shared keypoints of a candidate."""
 MOST_STRETCH = 4.0
-"""Largest stretch of a model; its inverse is the least."""
-_BOUNDED_FROM = 6  # a general linear camera passes through fewer points exactly
+"""Largest stretch of a model; the least is its inverse."""
+_BOUNDED_FROM = 6  # a general linear camera fits fewer points exactly
 _PROBE_ITERATIONS = 4
 _GRID_ROTATIONS = 48
-# A start is given up after the first steps if its cost exceeds the least one by this factor and
+# A start is dropped after its first steps if its cost exceeds the least cost by this factor and
 # this excess.
 _HOPELESS = 2.0
 _HOPELESS_EXCESS = 20.0
@@ -40,12 +37,12 @@ class Query(NamedTuple):
 
     ids: IntArray  # (n,), ascending
     rays: FloatArray  # (n, 2), normalised image coordinates
-    whitening: FloatArray  # (1 or n, 3); as of solvers.evidence.KeypointEvidence, as the next
+    whitening: FloatArray  # (1 or n, 3); this and the loss as in solvers.evidence.KeypointEvidence
     loss: int
     loss_scale: float
     prior_weight: float
     free: FloatArray  # (8,)
-    gains: FloatArray  # (n,), in log-likelihood, of a candidate that shares it without error
+    gains: FloatArray  # (n,), gain of log-likelihood by a shared keypoint without error
 
 
 class Candidates(NamedTuple):
@@ -58,7 +55,7 @@ class Candidates(NamedTuple):
 
 @kernel
 def bound_all(query: Query, candidates: Candidates) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Compute lower bounds of the costs, gains, and numbers of shared keypoints, (c,) each."""
+    """Lower bounds of the costs, gains, and numbers of shared keypoints, (c,) each."""
     count = candidates.spans.shape[0]
     bounds = np.zeros(count)
     gains = np.zeros(count)
@@ -86,11 +83,11 @@ def search_all(
     refined: int,
     iterations: int,
 ) -> tuple[FloatArray, FloatArray]:
-    """Search for the poses of the chosen candidates (m,); packed poses (m, 15) and costs (m,).
+    """Search the chosen candidates (m,) for poses; returns packed poses (m, 15) and costs (m,).
 
-    The linear solver proposes one pose, the minimal solver several for each of ``subsets``
-    4-subsets of the keypoints; the best ``refined`` poses are refined in at most ``iterations``
-    steps. The cost is infinite if no pose was found.
+    The linear solver proposes one pose, and the minimal solver several poses for each of
+    ``subsets`` 4-subsets of the keypoints. The best ``refined`` poses are refined in at most
+    ``iterations`` steps. The cost is infinite if no pose is found.
     """
     poses = np.zeros((chosen.shape[0], POSE_SIZE))
     costs = np.full(chosen.shape[0], np.inf)
@@ -119,7 +116,7 @@ def search_all(
 def _gather(
     query: Query, candidates: Candidates, c: int, points: FloatArray, seen: IntArray
 ) -> int:
-    """Write the shared model points, in the rows of the image, and these; returns their number."""
+    """Write the shared model points in the image's rows, and these rows; returns their number."""
     first, last = candidates.spans[c, 0], candidates.spans[c, 1]
     n = 0
     i = 0
@@ -141,7 +138,7 @@ def _gather(
 
 @kernel
 def _search(objective: Objective, effort: tuple[int, int, int], pose: FloatArray) -> float:
-    """Write the best pose found; returns its cost, or infinity."""
+    """Write the best pose; returns its cost, or infinity without a pose."""
     subsets, refined, iterations = effort
     starts = np.empty((subsets * MAX_SOLUTIONS + 1 + _GRID_ROTATIONS, POSE_SIZE))
     count = _propose(objective, subsets, starts)
@@ -162,7 +159,7 @@ def _search(objective: Objective, effort: tuple[int, int, int], pose: FloatArray
         if least < np.inf and square < _SAME_CHORD * _SAME_CHORD:
             continue
         cost, _, _ = refine(objective, iterations, probed[best])
-        cost = _within_limits(objective, iterations, probed[best], cost)
+        cost = _limit_stretch(objective, iterations, probed[best], cost)
         if cost < least:
             least = cost
             pose[:] = probed[best]
@@ -170,18 +167,18 @@ def _search(objective: Objective, effort: tuple[int, int, int], pose: FloatArray
 
 
 @kernel
-def _within_limits(objective: Objective, iterations: int, pose: FloatArray, cost: float) -> float:
-    """Clamp scales to the limits and refine the other unknowns; returns the cost."""
+def _limit_stretch(objective: Objective, iterations: int, pose: FloatArray, cost: float) -> float:
+    """Clamp the stretches and refine the other unknowns; returns the cost."""
     free = objective.free.copy()
     for _ in range(2):
-        beyond = False
+        clamped = False
         for j in range(2):
             held = min(max(pose[13 + j], 1.0 / MOST_STRETCH), MOST_STRETCH)
             if held != pose[13 + j]:
                 pose[13 + j] = held
                 free[6 + j] = 0.0
-                beyond = True
-        if not beyond:
+                clamped = True
+        if not clamped:
             break
         limited = Objective(free, objective.keypoints, objective.scale_prior)
         cost, _, _ = refine(limited, iterations, pose)
@@ -190,13 +187,13 @@ def _within_limits(objective: Objective, iterations: int, pose: FloatArray, cost
 
 @kernel
 def _propose(objective: Objective, subsets: int, starts: FloatArray) -> int:
-    """Write starting poses of the refinement; returns their number."""
+    """Write starting poses; returns their number."""
     points, rays, free = objective.keypoints.points, objective.keypoints.rays, objective.free
     chosen = np.empty((subsets, 4), dtype=np.int64)
     count = minimal_starts(points, rays, chosen, choose_subsets(points, chosen), starts)
     if aepnp_kernel(points, rays, starts[count]) == OK:
         count += 1
-    # Other starts are for coplanar points, and for fixed scales.
+    # These starts are for coplanar points and fixed scales.
     if count == 0 or free[6] == 0.0 or free[7] == 0.0:
         count += rotation_starts(points, rays, starts[count : count + _GRID_ROTATIONS])
     for j in range(2):
@@ -207,7 +204,7 @@ def _propose(objective: Objective, subsets: int, starts: FloatArray) -> int:
 
 @kernel
 def _probe(objective: Objective, starts: FloatArray, probed: FloatArray) -> FloatArray:
-    """Take a few steps from each of the best starts; returns their costs, or infinity."""
+    """Refine the best starts by a few steps; returns their costs, or infinity."""
     scores = np.empty(starts.shape[0])
     for k in range(starts.shape[0]):
         scores[k] = evaluate_cost(objective, starts[k])
@@ -232,7 +229,7 @@ _ROUNDS = 3  # more raise the bound by less than 1 %
 
 @kernel
 def least_weights(whitening: FloatArray, count: int) -> FloatArray:
-    """Smallest weight of a squared error of each ray, over all directions, (n,)."""
+    """Least weight of a squared error over all directions, for each ray, (n,)."""
     weights = np.empty(count)
     for i in range(count):
         w = i if whitening.shape[0] > 1 else 0
@@ -247,19 +244,19 @@ def least_weights(whitening: FloatArray, count: int) -> FloatArray:
 def error_bound(points: FloatArray, seen: IntArray, rays: FloatArray, weights: FloatArray) -> float:
     """Bound the sum of squared whitened errors over all poses and stretches from below.
 
-    The points have the rows of the image's rays, of which ``seen`` (n,) are those that have one.
+    Points and rays have the same rows; ``seen`` (n,) are the rows to use.
 
-    Let a_i = (1, x_i), and let a general linear camera take it to (c_x . a_i, c_y . a_i) / d_i with
-    the depth d_i = z . a_i; poses of stretched models are some of these cameras. With w_i the
-    weights and r_i the errors, and for any multipliers v_i > 0, the sum of v_i d_i^2 |r_i|^2 is at
-    least z' S z, the 4 x 4 problem of `cadalign.solvers.aepnp` with the weights v_i. It is at most
-    the sum of w_i |r_i|^2 times the largest v_i d_i^2 / w_i. If point i has that, z' S z is at
-    least d_i^2 / q_i with q_i = a_i' S^-1 a_i. So the least of w_i / (v_i q_i) over the points
-    bounds the sum of w_i |r_i|^2.
+    Let a_i = (1, x_i). A general linear camera projects it to (c_x . a_i, c_y . a_i) / d_i with the
+    depth d_i = z . a_i; the poses of stretched models are such cameras. Let w_i be the weights, r_i
+    the errors, and v_i > 0 any multipliers. The sum of v_i d_i^2 |r_i|^2 is at least z' S z, the
+    4 x 4 problem of `cadalign.solvers.aepnp` with the weights v_i. It is at most the sum of
+    w_i |r_i|^2 times the largest v_i d_i^2 / w_i. Let i be the point with the largest value. Then
+    z' S z is at least d_i^2 / q_i with q_i = a_i' S^-1 a_i. So the sum of w_i |r_i|^2 is at least
+    the least w_i / (v_i q_i) over all points.
 
-    The first multipliers are the weights. The next are 1 / q_i of the last ones, which are nearly
-    w_i / d_i^2 at the camera's depths: then v_i d_i^2 / w_i is the same for all points, and the
-    bound is that of a general linear camera.
+    The first multipliers are the weights. The next ones are 1 / q_i, which are nearly w_i / d_i^2
+    at the camera's depths. Then v_i d_i^2 / w_i is nearly the same for all points, and the bound is
+    close to the least cost of a general linear camera.
     """
     n = seen.shape[0]
     multipliers = np.empty(n)
@@ -281,7 +278,7 @@ def error_bound(points: FloatArray, seen: IntArray, rays: FloatArray, weights: F
 
 @inlined
 def _whiten(factor: FloatArray, row: FloatArray) -> float:
-    """Divide the first 4 of a row by a lower triangle, in place; returns their squared length."""
+    """Divide the first 4 entries by a lower triangle, in place; returns their squared length."""
     square = 0.0
     for j in range(4):
         for k in range(j):
@@ -295,9 +292,9 @@ def _whiten(factor: FloatArray, row: FloatArray) -> float:
 def _depth_variances(
     points: FloatArray, seen: IntArray, rays: FloatArray, multipliers: FloatArray
 ) -> FloatArray:
-    """Compute q_i of `error_bound`, (n,); the first is 0 if S is singular to rounding."""
+    """q_i of `error_bound`, (n,); the first is 0 if S is numerically singular."""
     n, total = seen.shape[0], multipliers.sum()
-    rows = np.ones((n, 6))  # 1, x, y, z, u, v, the latter five about their means
+    rows = np.ones((n, 6))  # 1, x, y, z, u, v, all but the 1 centred
     mean = np.zeros(6)
     for i in range(n):
         for j in range(3):

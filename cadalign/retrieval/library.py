@@ -1,4 +1,4 @@
-"""`cadalign.Library`: annotated CAD models, ranked by an image's keypoints."""
+"""`cadalign.Library`: retrieval of annotated CAD models by an image's keypoints."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from cadalign.io.kinds import MESH_ENDINGS
 from cadalign.retrieval.absence import none_probability
 from cadalign.retrieval.by_shape import category_to_rank, rank_by_shape
 from cadalign.retrieval.match import Match
-from cadalign.retrieval.models import LibraryModel, ModelKey, ModelTable, checked_key
+from cadalign.retrieval.models import LibraryModel, ModelKey, ModelTable, check_key
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import gather_candidates, make_matches, observe, rank
 from cadalign.shapes.model import ShapeModel
@@ -35,9 +35,8 @@ _FIX = f"`cadalign annotate PHOTO MODEL` marks keypoints, and writes MODEL{SUFFI
 class Library(ModelTable):
     """Annotated CAD models to retrieve from: keypoints, bounds and mesh paths.
 
-    The models are sorted by category and id, so that results do not depend on their order.
-    `Library.from_models` and `Library.from_folder` make a library, `Library.open` reads a saved
-    one.
+    The models are sorted by category and id, so results do not depend on their order.
+    `Library.from_models` and `Library.from_folder` make a library; `Library.open` reads its file.
 
     Examples
     --------
@@ -60,22 +59,21 @@ class Library(ModelTable):
 
     @classmethod
     def from_folder(cls, folder: str | os.PathLike[str]) -> Library:
-        """Make a library of own models: a folder of files ``NAME.keypoints.json`` and meshes.
+        """Make a library from a folder of files ``NAME.keypoints.json`` and meshes.
 
-        The folder that a file lies in is its category, NAME the model's id. The mesh is the one
-        that the file names, or else that of the same NAME beside it; without one the bounds are
-        those of the keypoints. Keypoints of the same name are the same on all models.
+        The category of a model is the name of its file's folder, the model's id is NAME. The mesh
+        is the file named in the keypoints file, or the mesh file NAME beside it. Models without a
+        mesh have the bounds of their keypoints. Keypoints of the same name correspond.
 
         Parameters
         ----------
         folder : str or path-like
-            It, and those below it, are looked through.
+            Searched with its subfolders.
 
         Raises
         ------
         DataError
-            If there are no models with keypoints, a file of keypoints cannot be read, or a name
-            has two semantic ids.
+            If there are no keypoints files, one cannot be read, or a name has two semantic ids.
 
         Examples
         --------
@@ -89,8 +87,8 @@ class Library(ModelTable):
         return map(self.model, range(len(self)))
 
     def __getitem__(self, key: ModelKey) -> LibraryModel:
-        """Find a model, as ``library["chair", model_id]``; raises InputError if there is none."""
-        category, model_id = checked_key(key, "library")
+        """Return a model, as in ``library["chair", model_id]``; raises InputError if unknown."""
+        category, model_id = check_key(key, "library")
         row = bisect_left(self.keys, (category, model_id))
         if self.keys[row : row + 1] != ((category, model_id),):
             raise InputError(f"no model {model_id!r} of {category!r}", where="library")
@@ -101,10 +99,10 @@ class Library(ModelTable):
 
     @property
     def keypoints(self) -> ModelKeypoints:
-        """Names and semantic ids of the models' keypoints, without places.
+        """Names and semantic ids of the models' keypoints, with all coordinates 0.
 
-        A detector's keypoints are paired with them. Those of a data set without names are called
-        "keypoint 3" by their id.
+        A detector's keypoints are matched with them by name. Keypoints without a name are called
+        "keypoint 3", with their id.
         """
         names = {number: name for name, number in self.names.items()}
         return ModelKeypoints(
@@ -115,10 +113,9 @@ class Library(ModelTable):
         )
 
     def ids_of(self, names: Sequence[str]) -> IntArray:
-        """The semantic ids (n,) of keypoints by their names.
+        """Semantic ids (n,) of keypoint names; raises InputError for an unknown name.
 
-        Capitals, and spaces for ``_`` and ``-``, don't count. Raises InputError if there is no
-        such name.
+        Case is ignored, and ``_`` and ``-`` are equal to a space.
         """
         known = {plain_name(each.name): each.semantic_id for each in self.keypoints.keypoints}
         unknown = [name for name in names if plain_name(name) not in known]
@@ -143,30 +140,28 @@ class Library(ModelTable):
         workers: int = -1,
         **options: Any,
     ) -> list[Match]:
-        """Rank the models by how well each, posed and stretched, explains an image's keypoints.
+        """Rank the models by the likelihood of an image's keypoints at the best pose and stretch.
 
-        Models are compared by their likelihood, also with different sets of keypoints; see
-        `cadalign.retrieval.options`. Poses are searched only for models whose bound on the
-        likelihood leaves them a chance: every match with a score above 1e-8 has the rank of an
-        exhaustive search, and up to 768 more models are searched to fill the list. Ties are broken
-        by category and id.
+        Likelihoods of models with different keypoints are comparable; see
+        `cadalign.retrieval.options`. A bound on the likelihood limits the search for poses to
+        promising models: every match with a score above 1e-8 has the rank of an exhaustive search,
+        and up to 768 more models are searched to fill the list. Ties are broken by category and id.
 
         Parameters
         ----------
         points_2d : (n, 2) float
             Keypoints in the image [px]; integers are pixel centres.
         ids : (n,) int or str
-            Semantic ids of the keypoints, or the library's names of them, without repetition. Ids
-            differ by category: without ``category`` each model reads them in its own category's
-            sense.
+            Distinct semantic ids of the keypoints, or their names in the library. The meaning of
+            an id depends on the category: without ``category``, it is that of each model's own.
         camera : Camera
-            The calibrated camera. Lens distortion is honoured.
+            The calibrated camera, with its lens distortion.
         shape : ShapeModel, optional
-            Rank by the shape that this estimates from the image, for objects that no model of the
-            library is, not even stretched: only models of ``category``, by default that of the
-            shape model. See `cadalign.retrieval.by_shape`.
+            For objects that are not in the library: rank models by their similarity to the shape
+            that this model estimates from the image. Only models of one category are ranked:
+            ``category``, or by default the shape model's. See `cadalign.retrieval.by_shape`.
         exclude : collection of (str, str)
-            Category and id of models to leave out; those that the library lacks make no difference.
+            Category and id of models to leave out; models that are not in the library are ignored.
         workers : int
             Number of threads; -1 for one per core.
         **options
@@ -176,8 +171,8 @@ class Library(ModelTable):
         Returns
         -------
         list of Match
-            The most likely first. Each has the ``none_probability`` that the object is none of the
-            library's models.
+            The most likely first. Each has ``none_probability``, the probability that the object
+            is none of the library's models.
 
         Raises
         ------
@@ -204,7 +199,7 @@ class Library(ModelTable):
             absent = none_probability(self, candidates, observed, ranking)
         else:
             category = category_to_rank(shape, chosen, self)
-            # The deviation of shapes is no noise of the keypoints here.
+            # Here shape_sigma is no noise of the keypoints; rank_by_shape uses it.
             plain = replace(chosen, shape_sigma=0.0, category=category)
             observed = observe(points_2d, ids, camera, plain)
             candidates = gather_candidates(self, observed, plain, exclude, workers)
@@ -213,29 +208,29 @@ class Library(ModelTable):
 
 
 def keypoint_files(folder: Path) -> list[Path]:
-    """The files of keypoints in a folder and in those below it."""
+    """Keypoints files in a folder and its subfolders."""
     return listed(folder, f"**/*{SUFFIX}")
 
 
 def _read_own_models(folder: Path) -> tuple[list[LibraryModel], dict[str, int]]:
-    """A folder's models, and semantic ids by name; raises as `Library.from_folder`."""
+    """Read a folder's models, and the semantic ids by name; see `Library.from_folder`."""
     files = keypoint_files(folder)
     if not files:
         raise DataError("no model with keypoints", where=str(folder), fix=_FIX)
     read = [(path, ModelKeypoints.load(path)) for path in files]
-    names = _numbers(read)
+    names = _semantic_ids(read)
     models = [_model(path, found, names) for path, found in read]
     meshes = [path for path in listed(folder, "**/*") if path.suffix.lower() in MESH_ENDINGS]
     used = {model.mesh_path for model in models}
     unused = [path for path in meshes if path.absolute() not in used]
     if unused:
-        said = "%d meshes have no keypoints and are left out, the first is %s; %s"
-        logger.warning(said, len(unused), unused[0], _FIX)
+        message = "%d meshes have no keypoints and are left out, the first is %s; %s"
+        logger.warning(message, len(unused), unused[0], _FIX)
     return models, names
 
 
-def _numbers(read: Sequence[tuple[Path, ModelKeypoints]]) -> dict[str, int]:
-    """Semantic ids by name: those of the files where all keypoints have one, else by the names."""
+def _semantic_ids(read: Sequence[tuple[Path, ModelKeypoints]]) -> dict[str, int]:
+    """Semantic ids by name: from the files if all keypoints have one, else in order of names."""
     entries = [(path, each) for path, found in read for each in found.keypoints]
     if any(each.semantic_id is None for _, each in entries):
         return {name: k for k, name in enumerate(sorted({each.name for _, each in entries}))}
@@ -255,4 +250,4 @@ def _model(path: Path, found: ModelKeypoints, names: dict[str, int]) -> LibraryM
         beside = (path.with_name(stem + suffix) for suffix in MESH_ENDINGS)
         mesh = next((each for each in beside if each.is_file()), None)
     ids = np.array([names[name] for name in found.names], dtype=np.int64)
-    return LibraryModel.measured(path.absolute().parent.name, stem, found.xyz, ids, mesh)
+    return LibraryModel.from_mesh(path.absolute().parent.name, stem, found.xyz, ids, mesh)

@@ -1,4 +1,4 @@
-"""Result of a retrieval: a match, and the uncertainty of its pose and stretch."""
+"""Matches of a retrieval, and the uncertainty of their pose and stretch."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ from cadalign.io.observation import Observation
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """A model of the library, posed and stretched to explain an image's keypoints."""
+    """A model of the library, aligned with an image's keypoints."""
 
     category: str
     model_id: str
     result: Result
-    """The match in the form of every estimate: camera, pose, stretch, the keypoints that model and
-    image share with their residuals, box, and JSON form. Its ``std`` is that of `cadalign.fit` of
-    the keypoints or, in a ranking by shape, that of the estimated shape, in the model's unit."""
+    """The alignment: camera, pose, stretch, box, and the keypoints that model and image share, with
+    residuals. Its ``std`` is as of `cadalign.fit`; in a ranking by shape it is the uncertainty of
+    the estimated shape's alignment, in the model's unit."""
     log_likelihood: float
     """Log-likelihood of all keypoints, marked and missing; see `cadalign.retrieval.options`."""
     score: float
-    """Probability that this is the model, given that it is in the library (in the category, if one
-    was named) and that all are equally likely a priori: the likelihood over the sum of all models'.
-    It is calibrated as far as the assumptions hold: nine in ten matches with the score 0.9 are
-    correct."""
+    """Probability that this is the object's model: the likelihood over the sum of all models'
+    likelihoods. It assumes that the object is in the library (in the category, if given) and all
+    models are equally likely a priori. Under these assumptions it is calibrated: nine in ten
+    matches with the score 0.9 are correct."""
     missing_ids: tuple[int, ...]
-    """Ids of the image's keypoints that the model lacks."""
+    """Semantic ids of the image's keypoints that the model lacks."""
     mesh_path: Path | None
     none_probability: float | None = None
-    """Probability that the object is none of the library's models, not even stretched: the same in
-    all matches of an image. See `cadalign.retrieval.absence`. None in a ranking by shape, which
-    takes the object for none of them."""
+    """Probability that the object is none of the library's models, even stretched; the same in all
+    matches of an image. See `cadalign.retrieval.absence`. None in a ranking by shape, which assumes
+    that the object is not in the library."""
 
     @property
     def alignment(self) -> Alignment:
@@ -58,12 +58,12 @@ class Match:
 
     @property
     def rms(self) -> float:
-        """Root mean square length of the shared keypoints' residuals [px]."""
+        """Root mean square length of the residuals [px]."""
         return self.result.rms
 
     @property
     def std(self) -> Uncertainty | None:
-        """Standard deviations of pose and stretch, if this is the model."""
+        """Standard deviations of pose and stretch, assuming that this is the object's model."""
         return self.result.std
 
     @property
@@ -80,18 +80,18 @@ class Match:
 
     @property
     def shared_text(self) -> str:
-        """The number of shared keypoints of those in the image, as tables show it."""
+        """Numbers of shared keypoints and of the image's keypoints, such as "7/9", for tables."""
         return f"{self.shared}/{self.shared + len(self.missing_ids)}"
 
     @property
     def stretch_texts(self) -> tuple[str, str]:
-        """The stretches along y and z with their standard deviations, as tables show them."""
+        """Stretches along y and z with their standard deviations, for tables."""
         std = (0.0, 0.0, 0.0) if self.std is None else self.std.scale
         _, y, z = map("{:.3f}{}".format, self.alignment.scale, map(deviation_text, std))
         return y, z
 
     def observation(self, seen: Observation) -> Observation:
-        """The keypoints of an observation that the model has, paired with the model's."""
+        """Select an observation's keypoints that the model has, and pair them with the model's."""
         given = cast(IntArray, seen.ids)
         shared = np.array(self.result.ids)
         kept = np.flatnonzero(np.isin(given, shared))
@@ -120,7 +120,7 @@ class Match:
         return None if self.mesh_path is None else load_mesh(self.mesh_path)
 
     def to_dict(self) -> dict[str, Any]:
-        """Write the match as plain lists and numbers, for JSON."""
+        """Convert the match to plain lists and numbers, for JSON."""
         names = ("category", "model_id", "score", "log_likelihood", "rms", "shared")
         box = {name: getattr(self.box, name).tolist() for name in ("center", "rotation", "extents")}
         return {
@@ -145,9 +145,9 @@ def posterior_of_keypoints(
     camera: Camera,
     options: FitOptions,
 ) -> Posterior:
-    """The posterior at the optimum of keypoints (n, 3), with residuals (n, 2) [px].
+    """Posterior of `cadalign.fit` at its optimum, of keypoints (n, 3) with residuals (n, 2) [px].
 
-    As of `cadalign.fit`; without a covariance where a pose is not determined at all.
+    It has no covariance if the pose is not determined.
     """
     information = pixel_information(options.sigma, len(points_3d))
     squares = np.einsum("ni,nij,nj->n", residuals, information, residuals)
@@ -169,7 +169,7 @@ def posterior_of_keypoints(
 
 
 def posterior_by_shape(shape: Result, alignment: Alignment, options: FitOptions) -> Posterior:
-    """The posterior of an estimated shape in the unit of a match, whose held length sets it."""
+    """Posterior of an estimated shape's alignment, in the unit of a match's model."""
     free = options.stretched_axes
     held = next(axis for axis, name in enumerate("xyz") if name not in free)
     change, size = np.eye(9), np.linalg.norm(shape.alignment.translation)

@@ -1,7 +1,7 @@
-"""Models of a library: `LibraryModel`, the `ModelTable` of all, and its file.
+"""Models of a library: `LibraryModel`, the table `ModelTable` of all models, and its file.
 
-The file is a sealed MessagePack document (see `cadalign.io.files`) of the table's fields, arrays
-as little-endian numbers: 50,000 models of 10 keypoints are 30 MB and open in some 0.1 s.
+The file is a sealed MessagePack document of the table's fields (see `cadalign.io.files`), with
+arrays of little-endian numbers.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ ModelKey = tuple[str, str]
 """Category name and model id."""
 
 _LARGEST = 1e50  # coordinate
-_MOST_BYTES = 1 << 33  # of ten million models
+_MOST_BYTES = 1 << 33  # enough for ten million models
 SEAL = Seal(
     magic=b"cadalign library",
     version=2,
@@ -58,7 +58,7 @@ class LibraryModel:
     ids: IntArray
     """Semantic ids (k,), valid for all models of the category."""
     bounds: FloatArray
-    """Lowest and highest coordinates of the mesh (2, 3); of the keypoints without a mesh."""
+    """Lowest and highest coordinates (2, 3) of the mesh, or without one of the keypoints."""
     mesh_path: Path | None = None
 
     def __post_init__(self) -> None:
@@ -72,27 +72,27 @@ class LibraryModel:
             object.__setattr__(self, name, read_only(value))
 
     @classmethod
-    def of_annotated(cls, model: AnnotatedModel, *, with_mesh: bool = True) -> LibraryModel:
-        """Make a library model of a data set's model, with the bounds of its mesh."""
+    def from_annotated(cls, model: AnnotatedModel, *, with_mesh: bool = True) -> LibraryModel:
+        """Convert a model of a data set, with the bounds of its mesh."""
         mesh = model.mesh_path if with_mesh else None
-        return cls.measured(
+        return cls.from_mesh(
             model.category, model.model_id, model.keypoints.xyz, model.keypoints.ids, mesh
         )
 
     @classmethod
-    def measured(
+    def from_mesh(
         cls, category: str, model_id: str, xyz: FloatArray, ids: IntArray, mesh: Path | None
     ) -> LibraryModel:
-        """Make a model with the bounds of its mesh.
+        """Make a model with the bounds of its mesh, or without one of its keypoints.
 
-        Without a mesh, or with a warning where it cannot be read, they are those of the keypoints.
+        An unreadable mesh gives a warning (logger "cadalign").
         """
         own = category, model_id, xyz, ids
         try:
             if mesh is not None:
                 return cls(*own, load_mesh(mesh).bounds, mesh.absolute())
         except CadalignError as error:
-            logger.warning("bounds are the keypoints': %s", error)
+            logger.warning("the bounds are taken from the keypoints: %s", error)
         return cls(*own, extent(xyz) if len(xyz) else np.zeros((2, 3)))
 
     @property
@@ -102,7 +102,7 @@ class LibraryModel:
 
 
 def check_semantic_ids(value: Any, count: int, *, where: str) -> IntArray:
-    """Convert semantic ids to (count,) int; raises InputError if invalid or repeated."""
+    """Convert semantic ids to (count,) int; raises InputError if they are invalid or repeated."""
     ids = np.asarray(value)
     if ids.shape != (count,) or (count and ids.dtype.kind not in "iu"):
         what = f"{ids.dtype} of shape {ids.shape}, expected whole numbers of shape ({count},)"
@@ -113,8 +113,8 @@ def check_semantic_ids(value: Any, count: int, *, where: str) -> IntArray:
     return ids.astype(np.int64)
 
 
-def checked_key(key: object, where: str) -> ModelKey:
-    """A model's category and id; InputError for anything else, which would name no model."""
+def check_key(key: object, where: str) -> ModelKey:
+    """Check a pair of category and model id; raises InputError for other values."""
     match key:
         case (str(category), str(model_id)) | [str(category), str(model_id)]:
             return category, model_id
@@ -123,7 +123,7 @@ def checked_key(key: object, where: str) -> ModelKey:
 
 
 class _Stored(Document):
-    """The content of a library's file."""
+    """Content of a library file."""
 
     keys: list[ModelKey]
     meshes: list[str | None]
@@ -136,20 +136,20 @@ class _Stored(Document):
 
 @dataclass(frozen=True, eq=False)
 class ModelTable:
-    """All models of a library, sorted by category and id, in arrays."""
+    """Models of a library, sorted by category and id, in arrays."""
 
     keys: tuple[ModelKey, ...]
     """Category and model id of every model."""
     meshes: tuple[str | None, ...]
-    """Paths of the meshes, None where there is none."""
+    """Path of every model's mesh, or None."""
     names: Mapping[str, int]
-    """Semantic ids by the keypoints' names; empty where they have none."""
+    """Semantic ids by keypoint name; empty without names."""
     offsets: IntArray
-    """Start of each model's keypoints, and the end of the last, (n + 1,) int."""
+    """Start of every model's keypoints, and the end of the last model's, (n + 1,) int."""
     ids: IntArray
     """Semantic ids of `xyz`, (k,) int."""
     xyz: FloatArray
-    """Keypoints of all models, each model's in the order of their ids, (k, 3) float."""
+    """Keypoints of all models, (k, 3) float; each model's in the order of their ids."""
     bounds: FloatArray
     """Lowest and highest coordinates of every model, (n, 2, 3) float."""
 
@@ -164,16 +164,16 @@ class ModelTable:
         *,
         names: Mapping[str, int] | None = None,
     ) -> Self:
-        """Make a library of models, or of a data set, of which meshes are read for their bounds.
+        """Make a library from models of any source, or from a data set.
 
-        If a mesh cannot be read, the keypoints' bounds are used, with a warning (logger
-        "cadalign").
+        The meshes of a data set's models are read for their bounds. If one is unreadable, the
+        bounds are taken from the keypoints, with a warning (logger "cadalign").
 
         Parameters
         ----------
         models : iterable of LibraryModel or AnnotatedModel
         names : mapping of str to int, optional
-            Semantic ids by the keypoints' names.
+            Semantic ids by keypoint name.
 
         Raises
         ------
@@ -200,12 +200,12 @@ class ModelTable:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a saved library.
+        """Read a library file.
 
         Raises
         ------
         DataError
-            If the file is missing, truncated, damaged, of another version, or of another format.
+            If the file is missing, damaged, or of another version or format.
         """
         content = read_bytes(as_path(path), most=_MOST_BYTES)
         try:
@@ -225,15 +225,15 @@ class ModelTable:
         return table
 
     def _check(self) -> None:
-        """Refuse arrays whose indices could lead out of them, whatever the file's checksum."""
+        """Check the arrays of a file, whose indices could be out of bounds; raises ValueError."""
         count, starts = len(self.keys), self.offsets
         if not len(self.meshes) == len(self.bounds) == len(starts) - 1 == count:
-            raise ValueError("its models have too few or too many values")
+            raise ValueError("meshes, bounds or offsets don't match the number of models")
         is_ascending = starts[0] == 0 and bool((np.diff(starts) >= 0).all())
         if not (is_ascending and starts[-1] == len(self.ids) == len(self.xyz)):
-            raise ValueError("keypoints and semantic ids differ in number")
+            raise ValueError("offsets, keypoints and semantic ids don't match")
         if not all((np.abs(each) < _LARGEST).all() for each in (self.xyz, self.bounds)):
-            raise ValueError("a coordinate is NaN, infinite or so large that its powers are")
+            raise ValueError(f"a coordinate is NaN or exceeds {_LARGEST:g}")
         if list(self.keys) != sorted(set(self.keys)):
             raise ValueError("models are not sorted by category and id")
 
@@ -243,7 +243,7 @@ class ModelTable:
 
     @property
     def fingerprint(self) -> str:
-        """Hash of the library's content, as text."""
+        """Hash of the library's content, in hexadecimal."""
         return checksum(self._payload).hex()
 
     @property
@@ -260,7 +260,7 @@ class ModelTable:
         return tuple(sorted({category for category, _ in self.keys}))
 
     def known_ids(self, category: str | None = None) -> IntArray:
-        """Semantic ids of a category's models, or of all, ascending."""
+        """Semantic ids of a category's models or of all models, ascending."""
         rows = slice(0, len(self)) if category is None else self.rows_of(category)
         return np.unique(self.ids[self.offsets[rows.start] : self.offsets[rows.stop]])
 
@@ -270,10 +270,7 @@ class ModelTable:
         return slice(bisect_left(names, category), bisect_right(names, category))
 
     def keypoints_of(self, category: str) -> tuple[IntArray, FloatArray]:
-        """Semantic ids (k,) of a category, and the keypoints (m, k, 3) of its models.
-
-        NaN where a model lacks one.
-        """
+        """Semantic ids (k,) of a category, and its models' keypoints (m, k, 3), NaN if missing."""
         rows = self.rows_of(category)
         offsets = self.offsets[rows.start : rows.stop + 1]
         own = slice(int(offsets[0]), int(offsets[-1]))
@@ -283,7 +280,7 @@ class ModelTable:
         return ids, points
 
     def model(self, row: int) -> LibraryModel:
-        """Make the model of a row."""
+        """Return the model of a row."""
         own = slice(int(self.offsets[row]), int(self.offsets[row + 1]))
         mesh, xyz, ids = self.meshes[row], self.xyz[own], self.ids[own]
         path = None if mesh is None else Path(mesh)
@@ -292,7 +289,7 @@ class ModelTable:
 
 def _library_model(model: object) -> LibraryModel:
     if isinstance(model, AnnotatedModel):
-        return LibraryModel.of_annotated(model)
+        return LibraryModel.from_annotated(model)
     if not isinstance(model, LibraryModel):
         what = f"expected a LibraryModel or a data set's model, got {type(model).__name__}"
         raise InputError(what, where="models", fix="give the models of `cadalign.datasets`")

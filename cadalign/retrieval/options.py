@@ -3,25 +3,23 @@
 A model of the library is scored by the likelihood of everything in the image, under these
 assumptions:
 
-- A keypoint of the object is marked in the image with the probability 1/2, independently of the
-  others; it may be hidden, or overlooked.
-- A marked keypoint lies at the projection of the model's keypoint, with Gaussian noise of the
-  standard deviation ``sigma``, to which ``shape_sigma`` adds the differences of shape. A robust
-  loss takes the place of the squared error.
-- An image shows .01 keypoints, on average, that the object does not have, anywhere in the image
-  with equal density.
-- The logarithms of the stretches along y and z are Gaussian about zero, with the standard deviation
-  .4, within 1/4 and 4.
+- Each keypoint of the object is marked in the image with the probability 1/2, independently.
+- A marked keypoint is at the projection of the model's keypoint, with Gaussian noise of the
+  standard deviation ``sigma``; ``shape_sigma`` adds the differences of shape. A robust loss
+  replaces the squared error.
+- An image has 0.01 spurious keypoints on average, uniformly distributed over the image.
+- The logarithms of the stretches along y and z are Gaussian with the mean 0 and the standard
+  deviation 0.4; stretches are limited to 1/4 to 4.
 
-So with N the number of shared keypoints, their errors r_i whitened by their covariances C_i, m the
-number of the model's keypoints that the image lacks and e of the image's that the model lacks::
+Let r_i be the errors of the shared keypoints, whitened by their covariances C_i. Let m be the
+number of the model's keypoints that the image lacks, and e the number of the image's keypoints that
+the model lacks::
 
     log-likelihood = sum over the shared [log(1/2) - log(2 pi) - log det(C_i) / 2 - |r_i|^2 / 2]
-                     + m log(1/2) + e log(.01 / area) + log density of the stretches
+                     + m log(1/2) + e log(0.01 / area) + log density of the stretches
 
-at the pose and stretch that maximise it. A model that lacks keypoints of the image has fewer errors
-to explain, but each of them costs some 15 units; each keypoint of a model that the image does not
-show costs 0.7.
+at the pose and stretch that maximise it. Each keypoint of the image that a model lacks lowers the
+log-likelihood by about 15, and each keypoint of a model that the image lacks by 0.7.
 """
 
 from __future__ import annotations
@@ -35,9 +33,9 @@ from cadalign.estimation.options import FitOptions, Sigma
 MISSING_PROB = 0.5
 """Probability that a keypoint of the object is not marked in the image."""
 SPURIOUS = 0.01
-"""Average number of keypoints in an image that the object does not have."""
+"""Average number of spurious keypoints in an image."""
 STRETCH_SIGMA = 0.4
-"""Standard deviation of a Gaussian prior on the logarithm of each stretch."""
+"""Standard deviation of the Gaussian prior on the logarithm of each stretch."""
 
 
 @dataclass(frozen=True)
@@ -48,20 +46,19 @@ class RetrievalOptions:
     """Standard deviation of the keypoints [px], one per keypoint, or a 2 x 2 covariance per
     keypoint."""
     loss: str = "linear"
-    """Loss on the length of a whitened residual: linear (squared), huber or cauchy; the robust ones
+    """Loss on the length of a whitened residual: linear (squared), huber or cauchy. The last two
     tolerate outliers."""
     loss_scale: float = 2.0
-    """Length at which a robust loss begins to bend [sigma]."""
+    """Length at which a robust loss departs from the squared loss [sigma]."""
     stretch: str | None = None
-    """Axes whose scale is estimated: by default both unknown ones; one of them, such as "y"; or
-    "none"."""
+    """Axes whose stretch is estimated: "y", "z" or "none"; by default both y and z."""
     top: int = 10
     """Largest number of matches to return."""
     category: str | None = None
-    """Name or synset id of the only category to compare with; by default all."""
+    """Name or synset id of the category to search; by default all."""
     shape_sigma: float = 0.0
-    """Distance of a model's keypoints from the object's, as a share of the extent of the keypoints
-    in the image: above 0, say 0.03, for libraries with only similar models."""
+    """Typical distance of a model's keypoints from the object's, as a share of the extent of the
+    keypoints in the image: for example 0.03 if the library only has similar models."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.top, int) or self.top < 1:
@@ -71,11 +68,11 @@ class RetrievalOptions:
             raise InputError("the noise must be known to compare models", where="sigma", fix=fix)
         if not 0 <= self.shape_sigma < math.inf:
             raise InputError(f"must be >= 0, not {self.shape_sigma}", where="shape_sigma")
-        _ = self.fitting  # checks the options that it shares with a fit
+        _ = self.fitting  # checks the other options
 
     @property
     def fitting(self) -> FitOptions:
-        """Options of the fit of each model; its sigma is not used."""
+        """Options of each model's fit; its sigma is not used."""
         return FitOptions(
             loss=self.loss,
             loss_scale=self.loss_scale,

@@ -1,4 +1,4 @@
-"""Retrieval of an observation's model."""
+"""Retrieval of models by an observation."""
 
 from __future__ import annotations
 
@@ -23,34 +23,34 @@ logger = logging.getLogger("cadalign")
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationRetrieval:
-    """Settings of the retrieval of an observation's model."""
+    """Settings of retrievals by observations."""
 
     library: Path
     """File that `cadalign library build` wrote."""
     shape: Path | None = None
-    """File that `cadalign shape learn` wrote: ranks its category's models by the shape estimated
-    from the keypoints, for objects that are not in the library."""
+    """File that `cadalign shape learn` wrote. With it, models of its category are ranked by their
+    similarity to the shape estimated from the keypoints, for objects not in the library."""
     sigma: float | None = None
-    """Standard deviation of the keypoints [px]; by default the file's, or 1."""
+    """Standard deviation of the keypoints [px]; by default the observation's, or 1."""
     ranking: RetrievalOptions = field(default_factory=RetrievalOptions)
 
     def opened(self) -> tuple[Library, ShapeModel | None]:
-        """The library and the shape, which runs use again and again; DataError if unreadable."""
+        """Read the library and the shape model, cached; raises DataError if unreadable."""
         return _library(self.library), None if self.shape is None else _shape(self.shape)
 
     def read(
         self, data: Any, where: str, *, folder: Path, changes: ObservationChanges
     ) -> Observation:
-        """Read the parsed form of an observation, with changes, whose keypoints need no xyz."""
+        """Convert a parsed observation and apply changes; its keypoints need no xyz."""
         with in_file(where):
             seen = Observation.from_dict(data, folder=folder, needs_xyz=False)
         return changes.applied_to(seen, where)
 
     def with_ids(self, seen: Observation, where: str) -> Observation:
-        """The observation with the library's semantic ids, by names where it has none itself.
+        """Add the library's semantic ids by keypoint names, unless the observation has ids.
 
-        Raises DataError if there are no keypoints, or these have neither; InputError if the library
-        has no such names.
+        Raises DataError if there are no keypoints, or if they have neither ids nor names;
+        InputError if the library lacks a name.
         """
         if seen.ids is not None and len(seen.points_2d):
             return seen
@@ -58,19 +58,19 @@ class ObservationRetrieval:
             if not len(seen.points_2d):
                 raise DataError("there are no keypoints")
             if seen.names is None:
-                fix = "give each the id, or the name, of the library's models for it"
+                fix = "give each its id or name in the library"
                 raise DataError("the keypoints have no semantic_id and no name", fix=fix)
             return replace(seen, ids=self.opened()[0].ids_of(seen.names))
 
     def retrieve(self, seen: Observation, where: str, *, workers: int = -1) -> list[Match]:
-        """Rank the library's models by an observation `with_ids`; see `Library.retrieve`."""
+        """Rank the library's models by an observation with ids; see `Library.retrieve`."""
         if seen.others:
-            said = "%s: models are ranked by the first of its %d photos alone"
-            logger.warning(said, where, len(seen.views))
+            message = "%s: models are ranked by the first of its %d photos alone"
+            logger.warning(message, where, len(seen.views))
         library, shape = self.opened()
         assert seen.ids is not None
-        stated = 1.0 if seen.sigma is None else seen.sigma
-        sigma = stated if self.sigma is None else self.sigma
+        own_sigma = 1.0 if seen.sigma is None else seen.sigma
+        sigma = own_sigma if self.sigma is None else self.sigma
         return library.retrieve(
             seen.points_2d,
             seen.ids,
@@ -83,13 +83,13 @@ class ObservationRetrieval:
 
 @once_per_file(4)
 def _library(path: Path) -> Library:
-    from cadalign.retrieval.library import Library  # only here: help of a command needs none
+    from cadalign.retrieval.library import Library  # not needed for the commands' help
 
     return Library.open(path)
 
 
 @once_per_file(4)
 def _shape(path: Path) -> ShapeModel:
-    from cadalign.shapes.model import ShapeModel  # not for help of a command
+    from cadalign.shapes.model import ShapeModel  # not needed for the commands' help
 
     return ShapeModel.open(path)

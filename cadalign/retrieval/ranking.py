@@ -1,11 +1,11 @@
 """Candidates of a query, and their ranking by a best-first search with bounds.
 
-A candidate is a model that shares enough keypoints with the image. The lower bound of its errors
-(`kernels.bound_all`) gives an upper bound of its log-likelihood. Candidates are searched in growing
-batches, in the order of their bounds, until the bounds of all others lie 20 below the best
+A candidate is a model that shares enough keypoints with the image. A lower bound of its errors
+(`kernels.bound_all`) gives an upper bound of its log-likelihood. Candidates are searched for poses
+in growing batches, in the order of their bounds, until all remaining bounds are 20 below the best
 log-likelihood found. So every match with a score above 1e-8 has the rank of an exhaustive search.
-If these do not fill the top list, up to 768 more candidates are searched, so that in a library of
-that size the whole list is exact.
+If the top list is not full, up to 768 more candidates are searched, so the whole list is exact in
+libraries of this size.
 
 Candidates are searched independently: the result does not depend on the order of the library or on
 the number of threads.
@@ -33,7 +33,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, faced, turned_alignment
 from cadalign.retrieval.kernels import LEAST_SHARED, Candidates, Query, bound_all, search_all
 from cadalign.retrieval.match import Match, posterior_by_shape, posterior_of_keypoints
-from cadalign.retrieval.models import ModelKey, ModelTable, check_semantic_ids, checked_key
+from cadalign.retrieval.models import ModelKey, ModelTable, check_key, check_semantic_ids
 from cadalign.retrieval.options import (
     MISSING_PROB,
     SPURIOUS,
@@ -42,37 +42,37 @@ from cadalign.retrieval.options import (
 )
 from cadalign.solvers.constants import CAUCHY, HUBER, POSE_SIZE
 
-_BOUNDED_AT_ONCE = 1024  # candidates that a thread bounds at a time
-_SEARCHED_AT_ONCE = 32  # and searches
+_BOUNDED_AT_ONCE = 1024  # candidates per thread task, for bounds
+_SEARCHED_AT_ONCE = 32  # candidates per thread task, for searches
 _FIRST_BATCH = 64
 _LARGEST_BATCH = 4096
-# Candidates this far below the best in log-likelihood are negligible: 50,000 of them together have
-# 1e-4 of its probability.
+# Candidates this far below the best log-likelihood are negligible: 50,000 of them have 1e-4 of its
+# probability.
 _NEGLIGIBLE = 20.0
-# Largest number of candidates that are searched to fill the rest of the top list.
+# Largest number of further candidates that are searched to fill the top list.
 _TO_FILL = 768
 _FILL_BATCH = 256
-_GUESS = 0.7  # errors are some 1.4 times their bound, or more
+_GUESS = 0.7  # half of a usual ratio of cost to bound, 1.4
 # 4-subsets for the minimal solver, refined starts, iterations. 1 to 3 % of all candidates miss
-# their optimum, less than 1 % of the best 30 of a query.
+# their optimum, and less than 1 % of a query's best 30.
 _EFFORT = (5, 4, 20)
-# With outliers, some of the subsets must be without any.
+# With outliers, more subsets are needed to have some without outliers.
 _ROBUST_EFFORT = (30, 10, 50)
-# For the top list and as many behind it, searched again so that the result is the optimum.
+# The best candidates, twice as many as the top list, are searched again with this effort.
 _FINAL_EFFORT = (35, 12, 200)
 
 
 @dataclass(frozen=True, eq=False)
-class Observed:
-    """An image's keypoints, in the order of their semantic ids."""
+class ObservedKeypoints:
+    """Keypoints of an image, in the order of their semantic ids."""
 
-    order: IntArray  # (n,), their rows as they were given
+    order: IntArray  # (n,), their rows in the arguments
     points_2d: FloatArray  # (n, 2) [px]
     covariances: FloatArray  # (n, 2, 2) [px^2]
     camera: Camera
-    facing: Camera  # the camera turned to the keypoints if its lens is wide, as poses and rays are
-    query: Query  # semantic ids and rays of the keypoints, for the kernels
-    spurious: float  # log-likelihood of the keypoints if all of them are spurious
+    facing: Camera  # the camera, rotated towards the keypoints if wide; the frame of poses and rays
+    query: Query  # the keypoints for the kernels
+    spurious: float  # log-likelihood of the keypoints if all are spurious
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,25 +81,25 @@ class CandidateSet:
 
     keypoints: Candidates  # for the kernels
     models: IntArray  # (c,), rows of the models in the table
-    base: FloatArray  # (c,), log-likelihood of a candidate that fits without error
-    bounds: FloatArray  # (c,), lower bounds of the costs, twice the loss of log-likelihood
+    base: FloatArray  # (c,), log-likelihoods without residuals
+    bounds: FloatArray  # (c,), lower bounds of the costs; a cost is twice a loss of log-likelihood
 
 
 @dataclass(frozen=True, eq=False)
 class Ranking:
-    """Searched candidates, one for each of m models, the best first."""
+    """Searched candidates (m,), the best first."""
 
     candidates: IntArray  # (m,), rows of the candidate set
     poses: FloatArray  # (m, 15), in the frame of the facing camera
     log_likelihoods: FloatArray  # (m,)
     scores: FloatArray  # (m,), probabilities of the models
-    shape: Result | None = None  # the estimated one, by which the models are ranked
+    shape: Result | None = None  # the estimated shape, if it ranks the models
 
 
 def observe(
     points_2d: npt.ArrayLike, ids: npt.ArrayLike, camera: Camera, options: RetrievalOptions
-) -> Observed:
-    """Check an image's keypoints and prepare them for the kernels."""
+) -> ObservedKeypoints:
+    """Check the keypoints of an image and convert them for the kernels."""
     require_kind(camera, Camera, "camera")
     pixels = as_points(points_2d, name="points_2d", dimension=2)
     ids = check_semantic_ids(ids, len(pixels), where="ids")
@@ -121,11 +121,13 @@ def observe(
         free=fitting.free,
         gains=density - 0.5 * np.log(np.linalg.det(covariances)) - off,
     )
-    return Observed(order, pixels, covariances, camera, facing, query, float(off) * len(ids))
+    return ObservedKeypoints(
+        order, pixels, covariances, camera, facing, query, float(off) * len(ids)
+    )
 
 
 def _covariances(options: RetrievalOptions, pixels: FloatArray, order: IntArray) -> FloatArray:
-    """Sum of the covariances of noise and shape, (n, 2, 2) float [px^2], in the given order."""
+    """Covariances of noise and shape together, (n, 2, 2) float [px^2], in ``order``."""
     count = len(pixels)
     sigma: Any = options.sigma  # the options refuse None
     if np.ndim(sigma) == 3:
@@ -140,31 +142,31 @@ def _covariances(options: RetrievalOptions, pixels: FloatArray, order: IntArray)
     return np.asarray(covariances + (options.shape_sigma * extent) ** 2 * np.eye(2))
 
 
-def bent(squares: FloatArray, loss: int, bend: float) -> FloatArray:
-    """Loss on squared whitened lengths of any shape, one of `cadalign.solvers.constants`."""
+def apply_loss(squares: FloatArray, loss: int, scale: float) -> FloatArray:
+    """Apply a loss of `cadalign.solvers.constants` to squared whitened lengths of any shape."""
     if loss == HUBER:
-        linear = 2 * bend * np.sqrt(squares) - bend**2
-        return np.asarray(np.where(squares <= bend**2, squares, linear))
+        linear = 2 * scale * np.sqrt(squares) - scale**2
+        return np.asarray(np.where(squares <= scale**2, squares, linear))
     if loss == CAUCHY:
-        return np.asarray(bend**2 * np.log1p(squares / bend**2))
+        return np.asarray(scale**2 * np.log1p(squares / scale**2))
     return squares
 
 
 def gather_candidates(
     table: ModelTable,
-    observed: Observed,
+    observed: ObservedKeypoints,
     options: RetrievalOptions,
     exclude: Collection[ModelKey],
     workers: int = -1,
 ) -> CandidateSet:
-    """Gather the candidates of a query, without the models to ``exclude``."""
+    """Gather the candidates of a query, without models to ``exclude``."""
     threads, query, category = worker_count(workers), observed.query, options.category
     if not len(table):
         raise InputError("the library is empty", where="library")
     if category is not None:
         category = require_category(category, table.categories, where="category")
     chosen = np.arange(len(table))[slice(None) if category is None else table.rows_of(category)]
-    if unwanted := {checked_key(key, "exclude") for key in exclude}:
+    if unwanted := {check_key(key, "exclude") for key in exclude}:
         chosen = chosen[[table.keys[row] not in unwanted for row in chosen.tolist()]]
         if not len(chosen):
             raise InputError("all models are excluded", where="exclude")
@@ -189,20 +191,20 @@ def gather_candidates(
         what = f"no model shares more than {shared.max()} keypoints with the image"
         fix = f"at least {LEAST_SHARED} are needed to align a model"
         raise DegenerateError(what, where="ids", fix=fix)
-    # The losses are concave in the squares and 0 at 0, so that of their sum is at most their sum.
-    bounds = bent(bounds, query.loss, query.loss_scale)
+    # Losses are concave and 0 at 0: the loss of a sum is at most the sum of the losses.
+    bounds = apply_loss(bounds, query.loss, query.loss_scale)
     counts = spans[:, 1] - spans[:, 0]
     base = gains + observed.spurious + (counts - shared) * np.log(MISSING_PROB)
-    axes = len(options.fitting.stretched_axes)  # the prior's log density at no stretch:
+    axes = len(options.fitting.stretched_axes)  # add the prior's log density at stretch 1
     base = base - axes * (0.5 * np.log(2 * np.pi) + np.log(STRETCH_SIGMA))
     kept_keypoints = candidates._replace(spans=spans[kept])
     return CandidateSet(kept_keypoints, chosen[kept], base[kept], bounds[kept])
 
 
 def rank(
-    candidates: CandidateSet, observed: Observed, options: RetrievalOptions, workers: int
+    candidates: CandidateSet, observed: ObservedKeypoints, options: RetrievalOptions, workers: int
 ) -> Ranking:
-    """Rank the models of a candidate set."""
+    """Search the candidates for poses and rank them."""
     effort = _EFFORT if options.loss == "linear" else _ROBUST_EFFORT
     with ThreadPoolExecutor(worker_count(workers)) as pool:
         found = _SearchState(candidates, observed, pool)
@@ -213,10 +215,10 @@ def rank(
 
 
 class _SearchState:
-    """Best pose of every candidate searched so far."""
+    """Best pose of every searched candidate."""
 
     def __init__(
-        self, candidates: CandidateSet, observed: Observed, pool: ThreadPoolExecutor
+        self, candidates: CandidateSet, observed: ObservedKeypoints, pool: ThreadPoolExecutor
     ) -> None:
         self._candidates, self._query, self._pool = candidates, observed.query, pool
         self._best = -np.inf
@@ -224,7 +226,7 @@ class _SearchState:
         self._reached = np.full(len(candidates.base), -np.inf)
 
     def search(self, chosen: IntArray, effort: tuple[int, int, int]) -> None:
-        """Search candidates for poses; a known better pose is kept."""
+        """Search candidates for poses, and keep better known poses."""
         if not len(chosen):
             return
 
@@ -241,7 +243,7 @@ class _SearchState:
         self._best = max(self._best, float(reached.max()))
 
     def search_in_order(self, effort: tuple[int, int, int], top: int) -> None:
-        """Search the candidates in the order of their bounds; see the module."""
+        """Search the candidates in the order of their bounds; see the module docstring."""
         base, bounds = self._candidates.base, self._candidates.bounds
         limits, guesses = base - 0.5 * bounds, base - _GUESS * bounds
         order = np.argsort(-limits, kind="stable")
@@ -261,12 +263,12 @@ class _SearchState:
             self.search(batch[limits[batch] >= self._last_of(top)], effort)
 
     def _last_of(self, top: int) -> float:
-        """Log-likelihood of the last model of the top list; minus infinity if it is not full."""
+        """Log-likelihood of the last model in the top list; minus infinity if it is not full."""
         best = self._reached[np.isfinite(self._reached)]
         return float(np.partition(best, -top)[-top]) if len(best) >= top else -np.inf
 
     def ranking(self) -> Ranking:
-        """Rank the models; ties in the library's order."""
+        """Rank the searched candidates; ties are in the library's order."""
         order = np.argsort(-self._reached, kind="stable")
         order = order[np.isfinite(self._reached[order])]
         if not len(order):
@@ -279,9 +281,9 @@ class _SearchState:
 
 
 def shared_keypoints(
-    candidates: CandidateSet, observed: Observed, candidate: int
+    candidates: CandidateSet, observed: ObservedKeypoints, candidate: int
 ) -> tuple[FloatArray, IntArray]:
-    """Select a candidate's keypoints in the image, (n, 3), and their rows there, (n,)."""
+    """Keypoints (n, 3) of a candidate that the image has, and their rows in the image (n,)."""
     keypoints = candidates.keypoints
     first, last = keypoints.spans[candidate].tolist()
     ids = keypoints.ids[first:last]
@@ -295,12 +297,12 @@ def shared_keypoints(
 def make_matches(
     table: ModelTable,
     candidates: CandidateSet,
-    observed: Observed,
+    observed: ObservedKeypoints,
     ranking: Ranking,
     options: RetrievalOptions,
     none_probability: float | None,
 ) -> list[Match]:
-    """Make matches of the first models of a ranking."""
+    """Make the matches of the first ``top`` candidates of a ranking."""
     matches = []
     for place, candidate in enumerate(ranking.candidates[: options.top].tolist()):
         points_3d, rows = shared_keypoints(candidates, observed, candidate)

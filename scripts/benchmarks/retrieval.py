@@ -105,7 +105,7 @@ def _unseen(given: BenchmarkData) -> Iterator[Row]:
     root = given.folder("keypointnet")
     for category in _CATEGORIES:
         shape = section.learned_shape(root, category)
-        without_mesh = partial(LibraryModel.of_annotated, with_mesh=False)
+        without_mesh = partial(LibraryModel.from_annotated, with_mesh=False)
         library = Library.from_models(list(map(without_mesh, KeypointNet(root)[category])))
         how = {"keypoints": None, "noise_px": _NOISE_PX}
         cases = []

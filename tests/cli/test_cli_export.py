@@ -1,4 +1,4 @@
-"""`cadalign export`: fits of files, as they are written and found."""
+"""`cadalign export`: fits of observation files, and errors."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_the_command_says_what_is_missing(
     assert "no such file" in refusal(capsys, tmp_path / "gone.json", *to)
 
 
-def test_what_is_exported_is_not_written_over(
+def test_inputs_are_not_overwritten(
     tmp_path: Path, observed: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "wedge.mtl").write_text("newmtl cloth\n")

@@ -1,4 +1,4 @@
-"""`cadalign render` and `cadalign doctor`: what they write, and what they refuse."""
+"""`cadalign render` and `cadalign doctor`: output and errors."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_a_file_that_cannot_be_written_is_named(model, tmp_path):
 # doctor
 
 
-def test_doctor_tells_what_works_and_how_to_enable_the_rest(monkeypatch, capsys):
+def test_doctor_shows_what_works_and_how_to_enable_the_rest(monkeypatch, capsys):
     good, bad = Probe("raycast", True, "processor"), Probe("pyrender", False, "no OpenGL")
     for probed, code in (([bad, good], 0), ([Probe("raycast", False, "embreex is gone")], 1)):
         monkeypatch.setattr("cadalign.cli.doctor.probed_renderers", lambda found=probed: found)
@@ -108,7 +108,7 @@ def test_doctor_tells_what_works_and_how_to_enable_the_rest(monkeypatch, capsys)
     assert "Compiled solvers: " in text
 
 
-def test_the_state_of_the_cache_is_told(tmp_path, monkeypatch):
+def test_the_state_of_the_cache_is_shown(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     assert compiled_cache() == f"none yet; they will be kept in {kernel_folder()}"
     assert kernel_folder().parent == tmp_path / "cache"

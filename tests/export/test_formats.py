@@ -1,4 +1,4 @@
-"""Mesh files for other tools, read back; what is not known is refused."""
+"""Exported mesh files, read back; unknown formats are refused."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_mesh_files_have_colours_of_materials(tmp_path: Path, name: str) -> None
         np.testing.assert_allclose(mesh.vertex_colors[vertex, :3], expected, atol=1 / 255)
 
 
-def test_names_tell_formats(tmp_path: Path) -> None:
+def test_the_extension_selects_the_format(tmp_path: Path) -> None:
     for name in FORMATS:
         assert format_of(f"folder/x.{name}") is FORMATS[name]
     with pytest.raises(InputError, match=r"a\.x3d: the name does not tell the format; give one"):

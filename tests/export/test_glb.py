@@ -1,4 +1,4 @@
-"""GLB files: what three.js and trimesh make of them."""
+"""GLB files, read by three.js and trimesh."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def tree_of(path: Path) -> dict[str, Any]:
 
 
 def agrees(three: ThreeViewer, path: Path, exported: AlignedObject) -> float:
-    """IoU of the silhouette in three.js with that of the overlay."""
+    """IoU of the silhouettes in three.js and in the overlay."""
     view = exported.views[0]
     drawn = three.show(path, part="mask", width=FINE * view.camera.width)
     cast = cast_geometry(Scene(exported.mesh), view.camera, view.cam_from_model)
@@ -71,7 +71,7 @@ def test_three_shows_the_object_where_the_overlay_does(
     assert np.quantile(gap, 0.999) <= 4
     both = three.show(path, part="all", width=FINE * camera.width).at_pixels(camera)
     mask = cast_geometry(Scene(exported.mesh), camera, POSE).mask
-    assert np.abs(both.astype(int) - photo)[~mask].mean() < 1.0  # the photo stands behind
+    assert np.abs(both.astype(int) - photo)[~mask].mean() < 1.0  # the photo is behind
 
 
 @pytest.mark.long
@@ -115,7 +115,7 @@ def test_trimesh_reads_mesh_texture_and_place(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.asarray(image.convert("RGB")), texture)
 
 
-def test_the_photos_borders_do_not_run_into_those_opposite(tmp_path: Path) -> None:
+def test_opposite_borders_of_the_photo_do_not_mix(tmp_path: Path) -> None:
     tree = tree_of(export_object(tmp_path / "wedge.glb", aligned(tmp_path)))
     unlit = "KHR_materials_unlit"
     (photo,) = (each for each in tree["materials"] if unlit in each.get("extensions", {}))
@@ -131,7 +131,7 @@ def test_colors_are_linear_light(tmp_path: Path) -> None:
     assert red["pbrMetallicRoughness"]["baseColorFactor"] == pytest.approx(linear, rel=1e-6)
 
 
-def test_vertex_colors_take_the_place_of_the_material_s(tmp_path: Path) -> None:
+def test_vertex_colors_replace_the_material_color(tmp_path: Path) -> None:
     exported = aligned(tmp_path)
     mesh = exported.mesh
     colors = np.tile([0.5, 0.25, 1.0, 1.0], (len(mesh.vertices), 1))
@@ -145,7 +145,7 @@ def test_vertex_colors_take_the_place_of_the_material_s(tmp_path: Path) -> None:
     assert np.abs(found.vertex_colors[:, :3] - [0.5, 0.25, 1.0]).max(axis=1).min() < 0.01
 
 
-def test_every_view_has_a_camera_where_it_stands(tmp_path: Path) -> None:
+def test_every_view_has_a_posed_camera(tmp_path: Path) -> None:
     exported = aligned(tmp_path)
     other, cam_from_first = turned(exported.views[0], 0.4)
     path = export_object(tmp_path / "two.glb", replace(exported, views=(*exported.views, other)))
@@ -169,14 +169,14 @@ def test_undistorted_photo_keeps_its_corners() -> None:
 
 
 @pytest.mark.long
-def test_what_is_missing_is_named(tmp_path: Path) -> None:
+def test_missing_inputs_are_named(tmp_path: Path) -> None:
     gone = replace(aligned(tmp_path).views[0], image=tmp_path / "gone.png")
     with pytest.raises(DataError, match=r"gone\.png: no such file"):
         export_object(tmp_path / "a.glb", replace(aligned(tmp_path), views=(gone,)))
     assert not (tmp_path / "a.glb").exists()
 
 
-def test_a_model_may_be_called_as_a_photo_is(tmp_path: Path) -> None:
+def test_a_model_may_have_the_name_of_a_photo(tmp_path: Path) -> None:
     path = export_object(tmp_path / "a.glb", aligned(tmp_path, name="photo"))
     scene = trimesh.load(path)
     assert isinstance(scene, trimesh.Scene)

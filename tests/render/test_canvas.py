@@ -1,4 +1,4 @@
-"""The canvas of pictures: legends and dashes at their places."""
+"""The canvas: positions of legends, dashes and markers."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ def test_a_legend_stands_in_the_corner_that_is_free(right: bool, below: bool) ->
     free = ((x > 320) == right) & ((y > 240) == below)
     drawn = np.stack([x[~free], y[~free]], axis=1)
     canvas.legend([("found", RED, "line")], keep_clear=drawn)
-    rows, columns = np.nonzero(canvas.finished().any(axis=2))
+    rows, columns = np.nonzero(canvas.finish().any(axis=2))
     assert ((columns > 320) == right).all()
     assert ((rows > 240) == below).all()
 
 
 @pytest.mark.parametrize("size", [(40, 640), (640, 40)])
-def test_a_legend_that_has_no_room_is_left_out(size: tuple[int, int]) -> None:
+def test_a_legend_without_room_is_omitted(size: tuple[int, int]) -> None:
     before = np.full((*size, 3), 90, np.uint8)
     canvas = Canvas(before)
     canvas.legend([(f"line {n}", RED, "line") for n in range(6)], keep_clear=NOWHERE)
-    np.testing.assert_array_equal(canvas.finished(), before)
+    np.testing.assert_array_equal(canvas.finish(), before)
 
 
 def test_dashes_are_spread_over_a_line_and_end_with_it() -> None:
@@ -52,8 +52,8 @@ def test_dashes_are_spread_over_a_line_and_end_with_it() -> None:
 def test_a_cross_is_as_large_as_its_radius_in_any_photo(size: tuple[int, int]) -> None:
     canvas = Canvas(np.zeros((*size, 3), np.uint8))
     canvas.cross(np.array([200.0, 150.0]), RED, radius=8.0)
-    picture = canvas.finished().astype(int)
-    rows, columns = np.nonzero(picture[:, :, 0] - picture[:, :, 1] > 100)  # without its casing
+    picture = canvas.finish().astype(int)
+    rows, columns = np.nonzero(picture[:, :, 0] - picture[:, :, 1] > 100)  # without the casing
     reach = 8.0 * size[0] / 480
     ends = columns.min(), columns.max(), rows.min(), rows.max()
     wanted = 200 - reach, 200 + reach, 150 - reach, 150 + reach

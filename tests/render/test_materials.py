@@ -1,4 +1,4 @@
-"""Files with every kind of material, drawn: colours end up where the file puts them."""
+"""Rendered colours of files with every kind of material."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _color_at(frame, pose, point):
     return part[:, :, :3].reshape(-1, 3).mean(axis=0)
 
 
-def test_what_is_behind_glass_is_seen_through_it(renderer, tmp_path):
+def test_objects_behind_glass_are_visible(renderer, tmp_path):
     scene, pose, frame = _drawn(renderer, write_glass_glb(tmp_path / "glass.glb"))
     assert not scene.surface.opaque
     ball = _color_at(frame, pose, (0.1, 0.2, 0.4))
@@ -75,7 +75,7 @@ def test_what_is_behind_glass_is_seen_through_it(renderer, tmp_path):
 
 
 @pytest.mark.long
-def test_real_models_are_recognisable_alike_by_every_renderer(renderer):
+def test_renderers_agree_on_real_models(renderer):
     data = os.environ.get("CADALIGN_DATA")
     if not data:
         pytest.skip("set CADALIGN_DATA to the real data")
@@ -88,5 +88,5 @@ def test_real_models_are_recognisable_alike_by_every_renderer(renderer):
         both = (frame.color[:, :, 3] == 255) & (expected.color[:, :, 3] == 255)
         assert both.sum() > 500
         difference = frame.color[both][:, :3].astype(int) - expected.color[both][:, :3]
-        # Lights without size and another filter of textures make some difference.
+        # OpenGL's lights have no size, and it filters textures differently.
         assert np.abs(difference).mean() < 20, path

@@ -1,4 +1,4 @@
-"""Overlays: what is drawn where, in which colour, on which background; the placed model."""
+"""Overlays: places and colours of everything drawn, on several backgrounds."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_boxes_are_drawn_along_their_near_edges(camera, background):
         image = draw_overlay(
             _blank(camera, background), camera, **{name: box}, axes=False, legend=False
         )
-        # From this side the edges at the corner nearest to the camera are seen.
+        # From this side, the edges at the nearest corner are visible.
         nearest = int(box.corners[:, 2].argmin())
         for bit in (1, 2, 4):
             ends = box.corners[[nearest, nearest ^ bit]]
@@ -122,7 +122,7 @@ def test_axes_reach_the_faces_of_the_stretched_box():
         along = (end - middle) / np.linalg.norm(end - middle)
         for pixel in ((middle + end) / 2, end - 2 * along):
             assert _has_color_near(image, pixel, AXIS_COLORS[k], within=1)
-        # The letter begins 5 px farther on.
+        # The letter starts 5 px beyond.
         assert not _has_color_near(image, end + 3 * along, AXIS_COLORS[k], within=0)
     without = draw_overlay(_blank(), CAMERA, est_box=box, legend=False, axes=False)
     assert not any(_near_color(without, color, 20).any() for color in AXIS_COLORS)
@@ -141,7 +141,7 @@ def test_keypoints_and_residuals_are_drawn(background):
         assert _has_color_near(image, point + np.array([0, 5.0]), OBSERVED_COLOR)
 
 
-def test_keypoints_that_were_left_out_have_grey_rings():
+def test_outliers_have_grey_rings():
     seen = np.array([[100.0, 100.0], [300.0, 200.0]])
     image = draw_overlay(_blank(), CAMERA, observed=seen, outliers=seen[1:], legend=False)
     kept, left_out = seen + np.array([0, 5.0])
@@ -170,14 +170,14 @@ def test_white_rings_show_on_white_by_their_casing():
 def test_a_marker_is_drawn_about_its_point():
     point = np.array([[200.37, 150.81]])
     image = draw_overlay(_blank(), CAMERA, observed=point, legend=False).astype(float)
-    # The casing is nearly as black as the background: weigh by what is bright.
+    # The casing is nearly as dark as the background, so brightness is the weight.
     weight = image.sum(axis=2)
     rows, columns = np.indices(weight.shape)
     center = np.array([(columns * weight).sum(), (rows * weight).sum()]) / weight.sum()
     np.testing.assert_allclose(center, point[0], atol=0.1)
 
 
-def test_background_stays_as_it_was():
+def test_background_is_unchanged():
     photo = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
     kept = photo.copy()
     image = draw_overlay(photo, CAMERA, gt_box=_box(), legend=False)
@@ -205,7 +205,7 @@ def test_legend_names_what_is_drawn():
 
 @pytest.mark.parametrize("camera", [CAMERA, BENT])
 def test_edges_behind_the_camera_are_cut_off(camera):
-    # The camera is inside the first box; the second lies wholly behind it.
+    # The camera is inside the first box; the second box is entirely behind it.
     inside = Box([0.1, 0, 0.5], np.eye(3), [2, 2, 6])
     image = draw_overlay(_blank(camera), camera, gt_box=inside, legend=False)
     assert _near_color(image, GT_COLOR).any()
@@ -231,7 +231,7 @@ def test_tiny_images_are_drawn_on_without_a_legend():
     assert image.shape == (18, 24, 3)
 
 
-def test_grey_and_rgba_images_are_taken():
+def test_grey_and_rgba_images_are_accepted():
     grey = np.full((480, 640), 77, dtype=np.uint8)
     np.testing.assert_array_equal(draw_overlay(grey, CAMERA), _blank(value=77))
     np.testing.assert_array_equal(draw_overlay(grey[:, :, None], CAMERA), _blank(value=77))
@@ -298,7 +298,7 @@ def test_frames_of_another_size_are_refused():
 
 
 def cover_of(camera, mesh, pose):
-    """Share of each pixel that the shaded model covers: what shows on white and not on black."""
+    """Share of each pixel that the shaded model covers, from drawings on white and on black."""
     black, white = (
         linear_from_bytes(overlay_model(_blank(camera, value), camera, mesh, pose))
         for value in (0, 255)
@@ -325,7 +325,7 @@ def test_the_model_covers_its_share_and_box_and_axes_are_drawn():
 
 
 @given(st.integers(0, 10_000))
-def test_regions_hold_their_share(seed):
+def test_regions_contain_their_share(seed):
     rng = np.random.default_rng(seed)
     center, root = rng.normal(0, 100, 2), 10 * rng.normal(size=(2, 2))
     covariance = root @ root.T + 9 * np.eye(2)
@@ -333,7 +333,7 @@ def test_regions_hold_their_share(seed):
     offsets = region - center
     squares = np.einsum("ni,ij,nj->n", offsets, np.linalg.inv(covariance), offsets)
     np.testing.assert_allclose(1 - np.exp(-squares / 2), REGION_SHARE)  # chi-square, 2 degrees
-    # Those that the markers hide are left out.
+    # Regions that the markers would hide are omitted.
     assert len(confidence_regions(np.zeros((2, 2)), np.array([0.1 * np.eye(2), np.eye(2)]))) == 1
 
 

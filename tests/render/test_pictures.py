@@ -1,4 +1,4 @@
-"""Plain pictures and sheets: they show what they say."""
+"""Feature lines, keypoint pictures, named views and contact sheets."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_lines_follow_outline_and_edges_but_not_diagonals(geometry):
     side = np.unique(rounded, axis=0, return_inverse=True)[1].reshape(120, 160)
     assert lines.sum() > 150
     assert lines.mean() < 0.1
-    # Away from the outline and from where two sides meet there are none.
+    # There are no lines away from the outline and the creases.
     border = np.zeros_like(lines)
     for shift in ((0, 1), (1, 0), (0, -1), (-1, 0)):
         rolled = np.roll(side, shift, (0, 1)), np.roll(geometry.mask, shift, (0, 1))
@@ -63,7 +63,7 @@ def test_keypoints_are_ringed_where_they_are(geometry):
     changed = (drawn != image).any(axis=2)
     places = CAMERA.project(pose.apply(points[:2]))
     rows, columns = np.nonzero(changed)
-    below = columns[rows > places[0, 1] + 1]  # the numbers stand above
+    below = columns[rows > places[0, 1] + 1]  # the numbers are above
     assert below.mean() == pytest.approx(places[:, 0].mean(), abs=0.6)
     assert np.ptp(below) > np.ptp(places[:, 0])
     seen = drawn[:, 80:].reshape(-1, 3).astype(int)
@@ -83,14 +83,14 @@ def test_unknown_views_are_refused():
 @pytest.mark.parametrize(
     ("name", "axis", "sign"), [("right", 0, 1), ("top", 1, 1), ("front", 2, -1)]
 )
-def test_named_views_look_from_where_they_say(name, axis, sign):
+def test_named_views_look_from_their_side(name, axis, sign):
     pose = pose_in_view(_box(), CAMERA, Angles.parse(name))
     eye = pose.inverse([[0, 0, 0]])[0]
     assert np.argmax(np.abs(eye)) == axis
     assert np.sign(eye[axis]) == sign
 
 
-def test_a_contact_sheet_holds_every_picture():
+def test_a_contact_sheet_contains_every_picture():
     values = {"a": 10, "b": 90, "c": 170}
     images = {name: np.full((30, 40, 3), value, np.uint8) for name, value in values.items()}
     sheet = contact_sheet(images)

@@ -27,7 +27,7 @@ def _mesh(shape, **options):
 
 
 def _quad_at(camera, left, top, right, bottom, *, depth=3.0):
-    """A quad parallel to the image whose edges lie at given pixels."""
+    """A quad parallel to the image, with edges at given pixels."""
     corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom]], dtype=float)
     rays = camera.normalize(corners)
     return Mesh(np.column_stack([rays, np.ones(4)]) * depth, QUAD_FACES)
@@ -50,7 +50,7 @@ def test_edge_crosses_a_pixel_centre_to_a_hundredth_of_a_pixel(camera, side, off
     edges[side] += offset
     vertical = side % 2 == 0
     if camera.distortion:
-        # A straight edge is bent in the image: look where it crosses the other edges' middle.
+        # A straight edge is curved in the image: test it at the middle of the other edges.
         middle = [75.0, 60.0]
         middle[0 if vertical else 1] = edges[side]
         ray = camera.normalize([middle])[0][0 if vertical else 1]
@@ -68,7 +68,7 @@ def test_edge_crosses_a_pixel_centre_to_a_hundredth_of_a_pixel(camera, side, off
 
 @pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("distance", [3.0, 1e4])
-def test_depth_is_exact_whatever_the_units(size, distance):
+def test_depth_is_exact_in_any_units(size, distance):
     plane = np.array([[-3, -2, -1], [3, -2, 0.5], [3, 2, 1.5], [-3, 2, 0.0]])
     camera = replace(CAMERA, fx=50.0 * distance, fy=50.0 * distance)
     frame = cast_geometry(
@@ -103,7 +103,7 @@ def test_stretching_by_the_pose_equals_stretching_the_mesh():
     np.testing.assert_allclose(by_pose.normal[same], by_mesh.normal[same], atol=1e-6)
 
 
-def test_normals_face_the_camera_however_the_faces_are_wound():
+def test_normals_face_the_camera_for_any_winding():
     sphere = trimesh.creation.icosphere(subdivisions=3)
     faces = np.array(sphere.faces)
     faces[::2] = faces[::2, ::-1]
@@ -153,7 +153,7 @@ def test_edges_stay_sharp_from_very_far_away():
     np.testing.assert_array_equal(mask.ravel()[clear], (beyond < 0)[clear])
 
 
-def test_empty_pixels_hold_the_documented_values():
+def test_empty_pixels_have_the_documented_values():
     frame = RaycastRenderer().render(Scene(_facing_quad()), CAMERA, _front_view())
     assert frame.depth[0, 0] == 0
     assert frame.face_id[0, 0] == -1
@@ -231,7 +231,7 @@ def test_materials_belong_to_faces():
         assert median.argmax() == channel
 
 
-def test_a_transparent_sheet_lets_what_is_behind_show():
+def test_objects_behind_a_transparent_sheet_are_visible():
     front = _facing_quad().vertices + np.array([0, 0, 0.5])
     vertices = np.concatenate([_facing_quad().vertices, front])
     faces = np.concatenate([QUAD_FACES, np.array(QUAD_FACES) + 4])
@@ -309,7 +309,7 @@ def test_composite_keeps_the_background_and_blends_in_linear_light():
             frame.composite(bad)
 
 
-def test_srgb_bytes_survive_the_way_to_linear_light_and_back():
+def test_srgb_bytes_round_trip_through_linear_light():
     every = np.arange(256, dtype=np.uint8)
     np.testing.assert_array_equal(bytes_from_linear(linear_from_bytes(every)), every)
 

@@ -68,7 +68,7 @@ def test_a_spawned_pool_draws_with_pyrender_after_the_parent_has(tmp_path):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
 @pytest.mark.filterwarnings("ignore:.*fork.*")
-def test_a_forked_process_is_refused_not_hung():
+def test_a_forked_process_raises_and_does_not_hang():
     renderer = renderer_or_skip("pyrender")
     shape = trimesh.creation.icosphere(subdivisions=2)
     scene = Scene(Mesh(shape.vertices, shape.faces))
@@ -125,6 +125,6 @@ def test_memory_stays_flat_over_many_frames():
         check=False,
     )
     assert done.returncode == 0, done.stderr[-2000:]
-    # 50 kB a frame: less than one frame's colours and depths, which would be kept by a leak.
+    # 50 kB per frame: less than the colours and depths of a frame, which a leak would keep.
     assert int(done.stdout.splitlines()[-1]) < 2_750, "kB more than after 25 frames"
     assert "GLError" not in done.stderr

@@ -1,4 +1,4 @@
-"""Every renderer against the others, against `Camera.project`, and against broken machines."""
+"""Renderers compared with each other and with `Camera.project`; broken graphics libraries."""
 
 from __future__ import annotations
 
@@ -103,11 +103,11 @@ def test_mask_edges_of_the_colour_lie_within_a_pixel_of_the_cast_ones(renderer, 
 @pytest.mark.long
 @pytest.mark.parametrize("camera", [CAMERA, SKEWED, BENT], ids=["plain", "skewed", "bent"])
 @pytest.mark.parametrize("place", [(20.3, 30.8), (79.5, 59.5), (130.62, 95.37)])
-def test_a_marker_is_drawn_where_project_says(renderer, camera, place):
-    # A disc parallel to the image, whose stretch is undone by its pose.
+def test_a_marker_is_drawn_at_its_projection(renderer, camera, place):
+    # A disc parallel to the image; its pose inverts the stretch of its mesh.
     size = 14.0
     if camera.distortion:
-        # Larger, so that OpenGL's four samples a pixel say more of where it is.
+        # Larger, since OpenGL has only four samples per pixel.
         camera = Camera(640, 480, 680.0, 560.0, 265.5, 253.5, camera.distortion)
         place = (4 * place[0] + 1.5, 4 * place[1] + 1.5)
         size = 30.0
@@ -127,13 +127,13 @@ def test_a_marker_is_drawn_where_project_says(renderer, camera, place):
 
 
 def _picture_middle(camera, center, radius):
-    """Where the middle of a disc's picture is: a lens shifts it against the middle's picture."""
+    """Centre of a disc's image, which distortion shifts from the image of its centre."""
     grid = np.linspace(-radius, radius, 801)
     x, y = (values.ravel() for values in np.meshgrid(grid, grid))
     inside = x**2 + y**2 < radius**2
     points = center + np.column_stack([x, y, np.zeros(len(x))])[inside]
     rays = points[:, :2] / points[:, 2:]
-    # Parts that the lens enlarges count for more.
+    # Parts that the lens enlarges have more weight.
     weight = np.linalg.det(camera.distortion_jacobian(rays))
     return np.average(camera.pixels_from_normalized(rays), axis=0, weights=weight)
 
@@ -145,7 +145,7 @@ def test_all_renderers_draw_about_the_same_colours(renderer):
     view = look_at(azimuth=20, elevation=20, distance=4)
     frame = renderer.render(Scene(mesh), CAMERA, view)
     truth = RaycastRenderer().render(Scene(mesh), CAMERA, view)
-    np.testing.assert_allclose(frame.depth, truth.depth, rtol=1e-9)  # whatever draws the colour
+    np.testing.assert_allclose(frame.depth, truth.depth, rtol=1e-9)  # for any renderer's colour
     both = (frame.color[:, :, 3] == 255) & (truth.color[:, :, 3] == 255)
     difference = np.abs(frame.color[both].astype(int) - truth.color[both])
     assert np.median(difference) < 25
@@ -174,7 +174,7 @@ def test_both_sides_of_a_face_are_lit_alike(renderer):
     assert there[60, 80, :3].min() > 100
 
 
-def test_of_coincident_faces_the_one_wound_to_the_camera_is_drawn(renderer):
+def test_coincident_faces_show_the_one_wound_towards_the_camera(renderer):
     faces = [*FACES, [2, 1, 0], [3, 2, 0]]
     materials = (Material(color=(1, 0, 0, 1)), Material(color=(0, 0, 1, 1)))
     mesh = Mesh(QUAD, faces, materials=materials, face_material=np.array([0, 0, 1, 1]))
@@ -217,7 +217,7 @@ def test_changing_between_scenes_draws_each_of_them(renderer):
         assert renderer.render(scene, CAMERA, view).color[60, 80, :3].argmax() == channel
 
 
-def test_what_is_prepared_of_a_mesh_is_prepared_once(renderer, monkeypatch):
+def test_a_mesh_is_prepared_once(renderer, monkeypatch):
     scene = Scene(_knot())
     renderer.render(scene, CAMERA, _view(scene, CAMERA))
     before = {name: id(value) for name, value in vars(scene).items()}
@@ -251,7 +251,7 @@ def test_ambient_occlusion_darkens_corners_alone():
     np.testing.assert_array_equal(plain.color[:, :, 3], dark.color[:, :, 3])
 
 
-# Choosing, and machines on which graphics do not work
+# Choice of the renderer, and broken graphics libraries
 
 
 @pytest.mark.parametrize(
@@ -261,12 +261,12 @@ def test_ambient_occlusion_darkens_corners_alone():
         (
             Probe("pyrender", True, "llvmpipe (LLVM 15)"),
             "raycast",
-            "no graphics card .*llvmpipe",
+            "OpenGL runs on the CPU .*llvmpipe",
         ),
         (Probe("pyrender", False, "no EGL"), "raycast", "pyrender does not work here: no EGL"),
     ],
 )
-def test_auto_takes_a_graphics_card_or_casts_rays_and_says_which(
+def test_auto_selects_pyrender_on_a_gpu_else_raycast_and_logs_it(
     monkeypatch, caplog, found, taken, said
 ):
     monkeypatch.setattr("cadalign.render.probe.probe_renderer", lambda name: found)
@@ -313,7 +313,7 @@ def test_a_broken_graphics_library_does_not_take_the_caller_down(
 
 
 @pytest.mark.long
-def test_a_missing_egl_device_is_told(monkeypatch):
+def test_a_missing_egl_device_is_reported(monkeypatch):
     renderer_or_skip("pyrender")
     monkeypatch.setenv("EGL_DEVICE_ID", "77")
     found = probing.probe_renderer.__wrapped__("pyrender")

@@ -1,4 +1,4 @@
-"""Sampled views: where the camera stands, what it frames, what it sees."""
+"""Sampled views: camera position, framing and visible keypoints."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_views_are_spread_evenly_within_the_band(scene, corners):
     low, high = np.sin(np.radians([10, 50]))
     assert low - 1e-9 <= height.min() < low + 0.03
     assert high - 0.03 < height.max() <= high + 1e-9
-    # Evenly over the sphere means evenly in height.
+    # A uniform distribution on the sphere is uniform in height.
     assert height.mean() == pytest.approx((low + high) / 2, abs=0.03)
     azimuth = np.arctan2(*np.array(directions)[:, [0, 2]].T)
     assert np.histogram(azimuth, bins=4, range=(-np.pi, np.pi))[0].min() > 70

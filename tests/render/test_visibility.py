@@ -1,4 +1,4 @@
-"""Keypoint visibility: cubes and plates where it is known, models against depth images."""
+"""Keypoint visibility: cubes and plates with known results, models against depth images."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_cube_corners_and_face_centres(azimuth, elevation, size):
     view = look_at(azimuth=azimuth, elevation=elevation, distance=8 * size)
     camera_at = view.inverse([[0, 0, 0]])[0]
     facing = AXES @ camera_at > size
-    # A corner is seen if one of its three faces is.
+    # A corner is visible if one of its three faces is.
     shows = {tuple(axis): face for axis, face in zip(AXES, facing, strict=True)}
     corners = [any(shows[tuple(sign[k] * np.eye(3)[k])] for k in range(3)) for sign in SIGNS]
     seen = visible_keypoints(scene, np.concatenate([AXES, SIGNS]) * size, CAMERA, view)
@@ -39,7 +39,7 @@ def test_cube_corners_and_face_centres(azimuth, elevation, size):
 
 
 def test_stretch_of_the_pose_counts(cube):
-    # Over the flattened cube the camera sees a point behind it that the cube hides.
+    # The flattened cube does not hide a point that the cube hides.
     points = [[0.0, 0.9, -1.5]]
     for height, seen in ((1.0, False), (0.1, True)):
         view = look_at(azimuth=0, elevation=15, distance=9, scale=(1, height, 1))
@@ -69,7 +69,7 @@ def test_points_outside_the_image_or_behind_the_camera_are_not_seen(cube):
 
 
 def test_a_lens_does_not_fold_far_off_points_into_the_image(cube):
-    # This lens puts directions beyond a slope of 1.05 nearer to the centre again.
+    # This lens maps slopes above 1.05 back towards the centre.
     camera = Camera(320, 240, 200, 200, 159.5, 119.5, (-0.3, 0, 0, 0))
     slopes = np.array([[0.3, 0.0], [1.0, 0.0], [1.6, 0.0], [-1.2, 1.2]])
     assert camera.contains(camera.pixels_from_normalized(slopes)).all()

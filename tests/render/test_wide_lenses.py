@@ -1,4 +1,4 @@
-"""Rendering and overlays with fisheye lenses, beside and behind the camera's plane too."""
+"""Rendering and overlays with fisheye lenses, also beside and behind the camera plane."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def placed(angle: float, about: float = 0.7, *, distance: float = 4.0) -> Alignm
 
 @pytest.mark.parametrize("about", [0.0, 0.7, np.pi / 2])
 @pytest.mark.parametrize("angle", [0, 60, 90, 104])
-def test_every_pixel_shows_what_projects_to_it(angle: float, about: float) -> None:
+def test_every_pixel_shows_the_point_that_projects_to_it(angle: float, about: float) -> None:
     camera, pose = FISHEYE, placed(angle, about)
     drawn = cast_geometry(BOX, camera, pose)
     rows, columns = np.nonzero(drawn.mask)
@@ -50,7 +50,7 @@ def test_every_pixel_shows_what_projects_to_it(angle: float, about: float) -> No
     np.testing.assert_allclose(camera.project(points), pixels, atol=0.01)
     in_model = (points - pose.translation) @ pose.rotation / pose.scale
     np.testing.assert_allclose(np.abs(in_model).max(axis=1), 1.0, atol=1e-4)
-    # The outline of a convex object is that of all its surface's projections.
+    # The outline of a convex object is the outline of its projected surface points.
     share = np.random.default_rng(0).dirichlet(np.ones(3), (12, 3000))
     surface = np.einsum("fnk,fkc->fnc", share, CORNERS[FACES]).reshape(-1, 3)
     seen = camera.project_where_ahead(pose.apply(surface))
@@ -99,7 +99,7 @@ def test_opengl_leaves_wide_lenses_to_rays() -> None:
     np.testing.assert_array_equal(drawn.color, expected.color)
 
 
-def test_the_photo_of_a_wide_lens_is_exported_as_a_pinholes() -> None:
+def test_the_photo_of_a_wide_lens_is_exported_as_a_pinhole_photo() -> None:
     rows, columns = np.indices((241, 241))
     image = np.stack([rows, columns, 0 * rows], axis=2).astype(np.uint8)
     flat, low, high = photo_plane(FISHEYE, image)

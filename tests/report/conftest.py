@@ -1,4 +1,4 @@
-"""A report's page, and a browser that fails the test where a page complains."""
+"""Report pages, and a browser that fails the test on a page's errors."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ def opened(browser: Browser) -> Iterator[Opened]:
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Address of the page of an ordinary run."""
+    """URL of the page of an ordinary run."""
     return write_page(tmp_path_factory.mktemp("plain") / "report.html", Recipe())
 
 
 @pytest.fixture(scope="module")
 def shown(browser: Browser, plain: str) -> Iterator[Shown]:
-    """Shows views of the page of an ordinary run, opened once for a module."""
+    """Function that shows a view of the page of an ordinary run, opened once per module."""
     with views_of(browser, plain) as show:
         yield show

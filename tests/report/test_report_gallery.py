@@ -1,4 +1,4 @@
-"""The report's gallery in a real browser: sorting, filtering, links, comparing, many instances."""
+"""The report's gallery in a browser: order, filters, links, comparison, many instances."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_the_worst_and_the_best_come_first(shown: Shown) -> None:
     assert card_names(page)[:12] == [i["model"] for i in best][:12]
 
 
-def test_filters_keep_what_they_say(shown: Shown) -> None:
+def test_filters_select_instances(shown: Shown) -> None:
     page = shown("")
     gallery = page.locator("#gallery")
     instances = listed(payload_of(Recipe()), "rotation_error_deg")
@@ -85,13 +85,13 @@ def test_the_fragment_restores_the_view(opened: Opened, shown: Shown) -> None:
     expect(other.locator(".chip[aria-pressed=false]")).to_have_text("aepnp-paper")
     other.keyboard.press("Escape")
     expect(other.locator("dialog[open]")).to_have_count(0)
-    # A link followed within the page works too, and nonsense in one does no harm.
+    # Links within the page work too; invalid values in a link are ignored.
     other.evaluate("location.hash = '#q=&category=bottle&order=nonsense&open=nobody&run=many'")
     expect(other.locator("#gallery .found")).to_have_text("8 instances of 24")
 
 
 def without_overlaps(payload: dict[str, Any]) -> dict[str, Any]:
-    """The payload's tables with the first 6 instances of each run aligned, but without box IoU."""
+    """Tables of the payload; the first 6 instances of each run have results without box IoU."""
     tables = payload["tables"]
     rows = tables["rows"]
     for row, instance in enumerate(rows["instance"]):

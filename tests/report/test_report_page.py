@@ -1,4 +1,4 @@
-"""The report's page in a real browser: all is there, nothing leaves it, texts stay texts."""
+"""The report's page in a browser: contents, no network access, escaped texts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.long
 
 @pytest.fixture(scope="module")
 def drawn(browser: Browser, plain: str) -> Iterator[Page]:
-    """The page of an ordinary run with all of it drawn; to be looked at, not changed."""
+    """The page of an ordinary run, with all plots drawn; tests must not change it."""
     with watched(browser) as open_page:
         page = open_page(plain)
         assert page.locator(".plot[data-drawn]").count() < 2  # the others are not in view
@@ -32,13 +32,13 @@ def drawn(browser: Browser, plain: str) -> Iterator[Page]:
         yield page
 
 
-def test_everything_of_a_run_is_there(drawn: Page) -> None:
+def test_all_contents_of_a_run_are_shown(drawn: Page) -> None:
     page = drawn
     expect(page).to_have_title("A report of chairs")
     expect(page.locator(".lead")).to_contain_text("24 views of chairs")
     table = page.locator("table.headline")
     expect(table.locator("tbody")).to_have_count(3)
-    # The best is told by weight and in words, not by a tint alone.
+    # The best value is marked by weight and text, not only by a tint.
     assert table.locator("b.best").count() == 15
     assert table.locator("b.best").first.inner_text().endswith("(best)")
     assert page.locator("b.best").first.evaluate("(e) => getComputedStyle(e).fontWeight") == "700"
@@ -65,7 +65,7 @@ def test_everything_of_a_run_is_there(drawn: Page) -> None:
         pytest.param(Recipe(done=9), "24 instances", id="unfinished"),
     ],
 )
-def test_unlucky_runs_are_shown_too(
+def test_runs_with_failures_are_shown(
     opened: Opened, tmp_path: Path, recipe: Recipe, found: str
 ) -> None:
     page = opened(write_page(tmp_path / "report.html", recipe))
@@ -97,7 +97,7 @@ def test_a_run_without_any_results_says_so(opened: Opened, tmp_path: Path) -> No
     expect(page.locator("#gallery")).to_have_count(0)
 
 
-def test_texts_from_data_stay_texts(opened: Opened, tmp_path: Path) -> None:
+def test_texts_from_data_are_escaped(opened: Opened, tmp_path: Path) -> None:
     payload = payload_of(Recipe(models=[HOSTILE], runs=2, failures=0.3))
     text = json.dumps(payload)
     hostile = json.dumps(HOSTILE)[1:-1]
@@ -111,7 +111,7 @@ def test_texts_from_data_stay_texts(opened: Opened, tmp_path: Path) -> None:
         details.evaluate("(details) => { details.open = true; }")
     page.locator("input[type=search]").fill("<img")
     expect(page.locator("#gallery .found")).to_have_text("2 instances of 48")
-    # The charts' own markup is no way in either: names are drawn letter by letter.
+    # Names are not markup of the plots either: they are drawn literally.
     expect(page.locator("#plot-rotation_error_deg .xtitle")).to_contain_text(HOSTILE)
     page.locator("#plot-rotation_error_deg").hover()
     page.locator(".card").first.click()
@@ -140,7 +140,7 @@ def test_switches_change_all_plots_and_the_gallery(opened: Opened, plain: str) -
 
 @pytest.fixture(scope="module")
 def two_runs(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    """The page of two runs with all of it drawn, and a dialog open."""
+    """The page of two runs, with all plots drawn and a dialog open."""
     with watched(browser) as open_page:
         page = open_page(write_page(tmp_path_factory.mktemp("two") / "report.html", Recipe(runs=2)))
         scroll_through(page)
@@ -162,7 +162,7 @@ def test_two_runs_are_shown_beside_each_other(two_runs: Page) -> None:
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_axe_finds_nothing_serious(opened: Opened, tmp_path: Path, scheme: str) -> None:
-    """Names of all that can be used, contrast, and whatever else people need who cannot see."""
+    """Accessibility: names of controls, contrast, and more."""
     page = opened(write_page(tmp_path / "report.html", Recipe(runs=2)), color_scheme=scheme)
     scroll_through(page)
     page.evaluate(axe_script())
@@ -173,7 +173,7 @@ def test_axe_finds_nothing_serious(opened: Opened, tmp_path: Path, scheme: str) 
 
 
 def serious(page: Page) -> list[str]:
-    """What axe finds that is serious, but in plots, whose markup is Plotly's."""
+    """Serious findings of axe, except in plots, whose markup is Plotly's."""
     found = page.evaluate("axe.run({ exclude: ['.plot'] }, { resultTypes: ['violations'] })")
     found = found["violations"]
     bad = [each for each in found if each["impact"] in ("serious", "critical")]
@@ -190,7 +190,7 @@ def test_tables_begin_with_all_and_are_whole_at_1440_pixels(opened: Opened, tmp_
         assert scroller.evaluate("(e) => e.scrollWidth - e.clientWidth") <= 0
 
 
-def test_a_phone_shows_all_of_it(opened: Opened, tmp_path: Path) -> None:
+def test_a_phone_shows_the_whole_page(opened: Opened, tmp_path: Path) -> None:
     phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
     page = opened(
         write_page(tmp_path / "report.html", Recipe(runs=2, models=[HOSTILE * 3])), **phone
@@ -213,7 +213,7 @@ def test_paper_gets_tables_plots_and_a_few_cards(
     page = opened(plain, color_scheme="dark")
     page.pdf(path=tmp_path / "page.pdf", print_background=True)
     assert (tmp_path / "page.pdf").read_bytes()[:5] == b"%PDF-"
-    # All plots were drawn for it, though none was scrolled to.
+    # All plots were drawn for printing, though no plot was in view.
     for plot in page.locator(".plot").all():
         expect(plot).to_have_attribute("data-drawn", re.compile(r"\d"))
     page.emulate_media(media="print")

@@ -1,4 +1,4 @@
-"""The report's payload: what it says of runs, finished or not, and that texts stay texts."""
+"""The report's payload: contents for finished and unfinished runs, escaped texts, errors."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def report(tmp_path: Path, *runs: Path, **options: Any) -> dict[str, Any]:
 
 
 def annotations(folder: Path, names: list[str], *, points: int = 12) -> Path:
-    """A dataset of annotations without meshes."""
+    """A data set of annotations without meshes."""
     rng = np.random.default_rng(0)
     entries = [
         {
@@ -148,7 +148,7 @@ def test_headline_marks_the_best_method_but_never_the_limit(payload: dict[str, A
             assert marked == [row["method"] for row in rivals if row["cells"][key] == best]
 
 
-def test_summary_says_what_was_run_on_what(payload: dict[str, Any], sample_root: Path) -> None:
+def test_summary_names_methods_and_data(payload: dict[str, Any], sample_root: Path) -> None:
     assert payload["summary"].startswith(
         "3 methods and the Cramer-Rao bound on views of models of sample (8), "
         "with cadalign 0.1.0 on 20"
@@ -173,7 +173,7 @@ def test_numbers_that_are_not_finite_become_null() -> None:
 # --- exhibits --------------------------------------------------------------------------------
 
 
-def test_exhibits_hold_what_the_errors_were_made_of(payload: dict[str, Any]) -> None:
+def test_exhibits_reproduce_the_errors(payload: dict[str, Any]) -> None:
     _, instances, rows = columns(payload)
     assert instances["exhibit"] == list(range(8))
     for place in range(8):
@@ -223,7 +223,7 @@ def test_pictures_show_the_model_without_boxes_and_thumbs_with_them(
         box = Box.from_model(exhibit["bounds"], alignment(exhibit["gt"]))
         camera = Camera(**exhibit["camera"])
         corners = camera.project(box.corners)
-        # Drawn where the scaled camera puts it: colours change along the box's edges.
+        # Colours change along the box's edges, projected by the scaled camera.
         nearest = plain[::2, ::2].astype(int)
         changed = np.abs(small.astype(int) - nearest).max(axis=2) > 60
         rows, cols = np.nonzero(changed)
@@ -240,7 +240,7 @@ def pixels(url: str) -> Any:
         return np.asarray(image.convert("RGB"))
 
 
-def test_pictures_that_are_gone_leave_the_page_right(drawn: Path, tmp_path: Path) -> None:
+def test_missing_pictures_are_omitted(drawn: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(drawn, tmp_path / "copy"))
     for name in ("pictures", "thumbs", "previews"):
         shutil.rmtree(copy / name)
@@ -293,7 +293,7 @@ def test_a_page_is_full_at_its_limit_and_says_so(
 # --- odd runs --------------------------------------------------------------------------------
 
 
-def test_texts_cannot_leave_their_place(tmp_path: Path) -> None:
+def test_texts_cannot_end_the_payload(tmp_path: Path) -> None:
     names = [HOSTILE, "a/b", "..", "x" * 300, "nul\0l", "\"'`", "μ-模型"]
     run = evaluate(annotations(tmp_path / "data", names), tmp_path / "run", methods=("optimal",))
     page = write_report([run], tmp_path / "page.html")
@@ -345,7 +345,7 @@ def test_an_unfinished_run_shows_what_there_is(tmp_path: Path) -> None:
 
 
 def half_finished(run: Path, options: KeypointNetOptions) -> Path:
-    """Put a run back to where its second chunk of three was missing."""
+    """Remove the second of three chunks from a run."""
     from cadalign.evaluation.runs.tables import write_rows
 
     folder = RunFolder(run)
@@ -361,7 +361,7 @@ def half_finished(run: Path, options: KeypointNetOptions) -> Path:
     return run
 
 
-def test_several_runs_are_joined_by_what_names_an_instance(tmp_path: Path) -> None:
+def test_several_runs_are_joined_by_instances(tmp_path: Path) -> None:
     root = annotations(tmp_path / "data", ["a", "b", "c"])
     first = evaluate(root, tmp_path / "x" / "run", methods=("optimal", "aepnp"))
     second = evaluate(
@@ -434,7 +434,7 @@ BEGUN = '{"experiment": "keypointnet", "tasks": 3, "chunk_size": 1}'
         ({"run.json": BEGUN, "results.parquet": "no table"}, "not a table that can be read"),
     ],
 )
-def test_what_is_no_run_is_refused(
+def test_other_folders_are_refused(
     tmp_path: Path, files: dict[str, str] | None, message: str
 ) -> None:
     if files is not None:
@@ -447,7 +447,7 @@ def test_what_is_no_run_is_refused(
     assert not (tmp_path / "report.html").exists()
 
 
-def test_runs_that_do_not_go_together_are_refused(drawn: Path, tmp_path: Path) -> None:
+def test_incomparable_runs_are_refused(drawn: Path, tmp_path: Path) -> None:
     for name in ("noise", "points"):
         options = SweepOptions(name, values=(8,), runs=1, methods=("aepnp",))
         do_run(options, RunFolder(tmp_path / name), workers=0, dask=None)

@@ -1,4 +1,4 @@
-"""The report's dialog in a real browser: overlays, numbers, keys, and the 3D view."""
+"""The report's dialog in a browser: overlays, numbers, keys, and the 3D view."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
 
 
 def look(canvas: Locator) -> np.ndarray:
-    """The canvas's pixels, (n, 4) of 8 bits; its scene is drawn with the next frame."""
+    """Pixels of the canvas, (n, 4) uint8, after the next frame."""
     canvas.evaluate(
         "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
     )
@@ -40,7 +40,7 @@ def look(canvas: Locator) -> np.ndarray:
 
 
 def changed(before: np.ndarray, after: np.ndarray) -> float:
-    """The share of pixels that differ."""
+    """Share of pixels that differ."""
     return float((np.abs(before - after).max(axis=1) > 24).mean())
 
 
@@ -105,7 +105,7 @@ def test_boxes_and_keypoints_are_where_the_camera_sees_them(shown: Shown) -> Non
         "(rings) => rings.map((ring) => [ring.cx.baseVal.value, ring.cy.baseVal.value])"
     )
     np.testing.assert_allclose(seen, exhibit["points_2d"], atol=1e-3)
-    # Pixel centres are whole numbers: the picture begins half a pixel before.
+    # Pixel centres are integers: the picture starts at -0.5.
     assert dialog.locator(".overlay").get_attribute("viewBox") == "-0.5 -0.5 640 480"
 
 
@@ -130,7 +130,7 @@ def test_keys_walk_through_and_close(shown: Shown) -> None:
         assert page.evaluate("!document.activeElement.closest('.page')")
     page.keyboard.press("Escape")
     expect(page.locator("dialog[open]")).to_have_count(0)
-    page.wait_for_function("!location.hash.includes('open=')")  # the event comes after it closed
+    page.wait_for_function("!location.hash.includes('open=')")  # the event follows the closing
     page.locator(".card").nth(2).press("Enter")
     expect(page.locator("dialog[open] h2")).to_have_text(order[2])
     page.go_back()
@@ -170,10 +170,10 @@ def test_the_scene_is_drawn_and_orbits(shown: Shown) -> None:
         views.append(look(canvas))
     assert all(changed(a, b) > 0.04 for a, b in itertools.pairwise(views))
     assert changed(views[0], views[-1]) < 0.01
-    assert page.locator("dialog h2").inner_text() == title  # arrows did not walk on
+    assert page.locator("dialog h2").inner_text() == title  # arrow keys did not change the instance
 
 
-def test_without_webgl_there_is_a_word(opened: Opened, plain: str) -> None:
+def test_without_webgl_there_is_a_message(opened: Opened, plain: str) -> None:
     page = opened(plain, script=NO_WEBGL, allowed="WebGL")
     dialog = open_first(page)
     expect(dialog.locator(".stage")).to_contain_text("needs WebGL")
@@ -185,7 +185,7 @@ def test_without_webgl_there_is_a_word(opened: Opened, plain: str) -> None:
 def test_a_warped_model_is_drawn_at_the_estimated_keypoints(
     opened: Opened, plain: str, tmp_path: Path
 ) -> None:
-    """In the overlay and in the 3D view; the box stays the estimate's."""
+    """In the overlay and the 3D view; the box is unchanged."""
     exhibits = payload_of(Recipe())["exhibits"]
     for exhibit in exhibits.values():
         places = np.array(exhibit["points_3d"])

@@ -18,7 +18,7 @@ BASE = np.random.default_rng(7).uniform(-0.3, 0.3, (10, 3))
 
 
 def shape(seed: int) -> np.ndarray:
-    """Keypoints of a model or an object: the category's, each moved by 3 % of the extent or so."""
+    """Keypoints of a model or an object: the category's, with noise of about 3 % of the extent."""
     return BASE + np.random.default_rng([5, seed]).normal(0, 0.03, BASE.shape)
 
 
@@ -29,7 +29,7 @@ LIBRARY = Library.from_models(
 
 
 def retrieve(seed: int, *, count: int = 10, **options: object) -> list[Match]:
-    """The matches of a view of the object of a seed, stretched; seeds below 30 are in LIBRARY."""
+    """Matches of a view of the stretched object of a seed; seeds below 30 are in LIBRARY."""
     rng = np.random.default_rng([6, seed])
     scale = np.array([1.0, *rng.uniform(0.7, 1.4, 2)])
     pose = Alignment(Rotation.random(random_state=rng).as_matrix(), [0.0, 0.0, 2.0], scale)
@@ -39,26 +39,26 @@ def retrieve(seed: int, *, count: int = 10, **options: object) -> list[Match]:
 
 
 @pytest.mark.long
-def test_objects_in_the_library_and_others_are_told_apart() -> None:
+def test_objects_outside_the_library_are_detected() -> None:
     inside = np.array([retrieve(seed)[0].none_probability for seed in range(30)])
     outside = np.array([retrieve(seed)[0].none_probability for seed in range(30, 60)])
-    assert (inside > 0.5).mean() <= 0.1  # false
-    assert (outside < 0.5).mean() <= 0.1  # missed
+    assert (inside > 0.5).mean() <= 0.1  # false positives
+    assert (outside < 0.5).mean() <= 0.1  # false negatives
 
 
 @pytest.mark.slow
-def test_probability_is_that_of_all_matches() -> None:
+def test_all_matches_have_the_same_probability() -> None:
     matches = retrieve(31)
     assert len({match.none_probability for match in matches}) == 1
     assert matches[0].to_dict()["none_probability"] == matches[0].none_probability
 
 
-def test_keypoints_that_fit_any_model_tell_nothing() -> None:
+def test_keypoints_that_fit_any_model_are_undecided() -> None:
     probabilities = [retrieve(seed, count=4)[0].none_probability for seed in (1, 2, 40, 41)]
     np.testing.assert_allclose(probabilities, 0.5, atol=0.15)
 
 
-def test_top_does_not_change_it() -> None:
+def test_top_does_not_change_the_probability() -> None:
     assert retrieve(40, top=1)[0].none_probability == pytest.approx(
         retrieve(40, top=20)[0].none_probability, rel=1e-6
     )
@@ -81,7 +81,7 @@ def test_distances_of_a_category_are_those_of_its_pairs_of_models() -> None:
             if len(shared) < 4:
                 assert np.isnan(distance)
                 continue
-            # The distance is a share of the extent of all the keypoints of the true model.
+            # Distances are shares of the extent of all keypoints of the true model.
             part = np.isin(every[row].ids, shared)
             extents = [
                 np.linalg.norm(np.ptp(xyz, axis=0))

@@ -1,4 +1,4 @@
-"""Libraries of CAD models: what they hold, their files, and what is refused."""
+"""Libraries of CAD models: contents, files, and errors."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ def assert_same(one: LibraryModel, other: LibraryModel) -> None:
     np.testing.assert_array_equal(one.bounds, other.bounds)
 
 
-# --- what it holds ---------------------------------------------------------------------------
+# --- contents --------------------------------------------------------------------------------
 
 
-def test_a_dataset_s_models_are_in_it_with_bounds_and_meshes(sample_root: Path) -> None:
+def test_library_of_a_data_set_has_bounds_and_meshes(sample_root: Path) -> None:
     dataset = KeypointNet(sample_root)
     library = Library.from_models(dataset)
     assert library.keys == tuple(sorted(dataset.ids()))
@@ -69,7 +69,7 @@ def test_categories_can_be_chosen(sample_root: Path) -> None:
     assert chairs.categories == ("chair",)
 
 
-def test_of_a_model_with_a_damaged_mesh_the_keypoints_bounds_are_taken(
+def test_a_damaged_mesh_leaves_the_bounds_of_the_keypoints(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     root = write_sample_dataset(tmp_path / "sample", per_category=1, categories=["chair"])
@@ -78,13 +78,13 @@ def test_of_a_model_with_a_damaged_mesh_the_keypoints_bounds_are_taken(
     model.mesh_path.write_text("nonsense")
     with caplog.at_level(logging.WARNING, logger="cadalign"):
         library = Library.from_models(KeypointNet(root))
-    assert "bounds are the keypoints'" in caplog.text
+    assert "bounds are taken from the keypoints" in caplog.text
     held = library[model.key]
     assert held.mesh_path is None
     np.testing.assert_array_equal(held.bounds[0], model.keypoints.xyz.min(axis=0))
 
 
-def test_the_order_in_which_models_come_does_not_show(tmp_path: Path) -> None:
+def test_the_order_of_models_does_not_matter(tmp_path: Path) -> None:
     models = [make_model(n, category=c) for n in range(5) for c in ("b", "a")]
     Library.from_models(models).save(tmp_path / "one")
     Library.from_models(models[::-1]).save(tmp_path / "other")
@@ -122,7 +122,7 @@ def test_malformed_models_are_refused() -> None:
         replace(model, ids=np.arange(7))
 
 
-# --- its file --------------------------------------------------------------------------------
+# --- files -----------------------------------------------------------------------------------
 
 
 def test_a_saved_library_is_the_same_when_opened(sample_root: Path, tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_a_library_without_models_can_be_saved_and_opened(tmp_path: Path) -> Non
     assert list(empty) == []
 
 
-def test_what_is_no_library_is_refused(tmp_path: Path) -> None:
+def test_other_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="nowhere: no such file"):
         Library.open(tmp_path / "nowhere")
     for content in (b"", b"cadalign", b"ARROW1\0\0" + bytes(200)):

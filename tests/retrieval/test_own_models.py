@@ -1,4 +1,4 @@
-"""Libraries of a user's own models, and detectors' files that are paired by the library's names."""
+"""Libraries of a user's own models, and detectors' files with the library's keypoint names."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def points_of(number: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class Case:
-    """Eight chairs, one of them without a mesh, and keypoints of three of them in photos."""
+    """Eight chairs, one without a mesh, and keypoints of three chairs in photos."""
 
     folder: Path
     seen: list[FloatArray]
@@ -126,7 +126,7 @@ def test_a_detectors_file_needs_no_model(
     source, run = tmp_path / f"found.{ending}", tmp_path / "run"
     source.write_text(written(case))
     camera = case.folder / "K.txt"
-    if ending == "csv":  # which does not say the photos' size
+    if ending == "csv":  # CSV has no photo sizes
         camera = tmp_path / "camera.json"
         write_json(camera, CAMERA.to_dict())
     options = [*case.library, "--camera", str(camera), "--no-picture", "--out", str(run)]
@@ -137,7 +137,7 @@ def test_a_detectors_file_needs_no_model(
     assert all(0 < row["scale_z_std"] < 0.2 for row in rows)
 
 
-def test_numbers_are_those_of_the_files_where_all_have_one(tmp_path: Path) -> None:
+def test_semantic_ids_of_files_are_kept_if_all_keypoints_have_one(tmp_path: Path) -> None:
     ids = {name: 3 * k for k, name in enumerate(NAMES)}
     for number in range(2):
         write_keypoints(tmp_path / f"{number}.keypoints.json", points_of(number), ids)
@@ -149,7 +149,7 @@ def test_numbers_are_those_of_the_files_where_all_have_one(tmp_path: Path) -> No
     assert Library.from_folder(tmp_path).keypoints.ids == tuple(range(7))
 
 
-def test_what_makes_no_library_is_said(
+def test_invalid_folders_are_refused(
     case: Case,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],

@@ -1,4 +1,4 @@
-"""`Library.retrieve`: the likelihood, the bound, what matches hold, and what is refused."""
+"""`Library.retrieve`: likelihood, bound, contents of matches, and invalid arguments."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from cadalign.retrieval import LibraryModel, Match, ranking
 from cadalign.retrieval.absence import shape_distance
 from cadalign.retrieval.kernels import error_bound, search_all
 from cadalign.retrieval.options import RetrievalOptions
-from cadalign.retrieval.ranking import Ranking, bent, gather_candidates, observe, rank
+from cadalign.retrieval.ranking import Ranking, apply_loss, gather_candidates, observe, rank
 
 CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)
 LENS = replace(CAMERA, distortion=(-0.1, 0.03, 0.001, -0.002))
@@ -31,7 +31,7 @@ IDS = np.arange(10)
 
 
 def make_model(number: int, ids: Sequence[int] = tuple(IDS), category: str = "box") -> LibraryModel:
-    """A model whose keypoint with a certain id depends on number and id alone."""
+    """A model whose keypoints only depend on its number and their ids."""
     xyz = np.array([np.random.default_rng([number, i]).uniform(-0.3, 0.3, 3) for i in ids])
     bounds = np.array([[-0.3] * 3, [0.3] * 3])
     return LibraryModel(category, f"{number:03d}", xyz, np.array(ids), bounds)
@@ -80,7 +80,7 @@ def test_the_model_is_found_with_pose_and_stretch(camera: Camera) -> None:
         np.testing.assert_allclose(best.alignment.rotation, pose.rotation, atol=0.01)
 
 
-def test_a_match_holds_what_belongs_to_its_pose() -> None:
+def test_contents_of_a_match_agree_with_its_pose() -> None:
     model = MODELS[3]
     pixels = view(model, pose_of(3), noise_px=2.0)
     shown = [1, 2, 4, 5, 6, 7, 8, 9]
@@ -111,7 +111,7 @@ def test_the_alignment_is_the_optimum_that_fit_finds() -> None:
 
 @pytest.mark.parametrize("camera", [CAMERA, FISHEYE], ids=["pinhole", "fisheye"])
 @pytest.mark.parametrize("loss", ["linear", "cauchy"])
-def test_a_match_states_the_deviations_that_a_fit_does(camera: Camera, loss: str) -> None:
+def test_std_of_a_match_is_that_of_a_fit(camera: Camera, loss: str) -> None:
     pixels = view(MODELS[1], pose_of(1), noise_px=2.0, camera=camera)
     options: dict[str, Any] = {"sigma": 2.0, "loss": loss}
     best = LIBRARY.retrieve(pixels, IDS, camera, **options)[0]
@@ -121,8 +121,8 @@ def test_a_match_states_the_deviations_that_a_fit_does(camera: Camera, loss: str
     assert best.stretch_texts[0].endswith(f" +- {100 * fitted.std.scale[1]:.2g} %")
 
 
-def test_the_log_likelihood_is_what_the_documentation_says() -> None:
-    """Of a model that lacks keypoints of the image, and has some which the image lacks."""
+def test_log_likelihood_follows_the_documented_formula() -> None:
+    """For a model that lacks keypoints of the image, and has keypoints that the image lacks."""
     model = make_model(5, ids=(0, 1, 2, 3, 4, 5, 8, 9))
     library = Library.from_models([model, make_model(6, ids=(6, 7))])
     whole = make_model(5)
@@ -155,11 +155,11 @@ def test_scores_are_likelihoods_over_their_sum() -> None:
     logs = np.array([match.log_likelihood for match in matches])
     np.testing.assert_allclose(scores, np.exp(logs - logs[0]) * scores[0], rtol=1e-9)
     assert (np.diff(scores) <= 0).all()
-    assert 0.02 < scores[0] < 0.98  # so that this tests something
+    assert 0.02 < scores[0] < 0.98  # otherwise the test is trivial
 
 
 def test_a_model_that_lacks_keypoints_of_the_image_has_to_fit_much_better() -> None:
-    """Fewer keypoints are explained with ease; that must not win."""
+    """Fewer keypoints are easier to fit, but must not rank higher."""
     few = [make_model(100 + n, ids=(0, 1, 2, 3)) for n in range(200)]
     library = Library.from_models([MODELS[0], *few])
     matches = library.retrieve(view(MODELS[0], pose_of(1), noise_px=2.0), IDS, CAMERA, sigma=2.0)
@@ -171,7 +171,7 @@ def test_a_model_that_lacks_keypoints_of_the_image_has_to_fit_much_better() -> N
 
 
 def test_hidden_keypoints_hardly_count() -> None:
-    """The same model with more keypoints, which this image does not show, loses by log 2 each."""
+    """Each keypoint of a model that the image lacks costs log 2."""
     model = make_model(7, ids=range(8))
     library = Library.from_models([model, replace(make_model(7), model_id="more")])
     pixels = view(model, pose_of(4), noise_px=1.0)
@@ -205,7 +205,7 @@ def test_shape_sigma_adds_a_share_of_the_extent_to_the_noise() -> None:
 
 
 @pytest.mark.long
-def test_a_robust_loss_tolerates_wrong_keypoints() -> None:
+def test_a_robust_loss_tolerates_outliers() -> None:
     found = {"linear": 0, "cauchy": 0}
     for number in range(8):
         pixels = view(MODELS[number], pose_of(number), noise_px=1.0, seed=number)
@@ -315,7 +315,7 @@ class TestCategories:
 def test_no_pose_has_errors_below_the_bound(
     seed: int, count: int, depth: float, noise_px: float, own_sigmas: bool, loss: str
 ) -> None:
-    """Also of poses so near that depths differ by large factors."""
+    """Also for close poses, with large ratios of depths."""
     rng = np.random.default_rng(seed)
     xyz = rng.uniform(-0.3, 0.3, (count, 3)) * rng.uniform(0.02, 1.0, 3)
     pose = Alignment(
@@ -340,7 +340,7 @@ def test_no_pose_has_errors_below_the_bound(
     )
     errors = pixels - seen
     squares = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
-    cost = bent(squares, LOSSES[loss], 1.5).sum()
+    cost = apply_loss(squares, LOSSES[loss], 1.5).sum()
     assert field.bounds[0] <= cost * (1 + 1e-9) + 1e-9
 
 
@@ -358,7 +358,7 @@ def depth_variances(
     return np.einsum("ni,ij,nj->n", a, np.linalg.inv(s), a), least, leverage
 
 
-def test_the_bound_is_the_least_error_that_the_linear_problem_leaves() -> None:
+def test_the_bound_is_the_least_error_of_the_linear_problem() -> None:
     for seed in range(10):
         rng = np.random.default_rng(seed)
         points, rays = rng.uniform(-0.3, 0.3, (9, 3)), rng.uniform(-0.2, 0.2, (9, 2))
@@ -377,7 +377,7 @@ def test_the_bound_is_the_least_error_that_the_linear_problem_leaves() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("loss", ["linear", "huber", "cauchy"])
-def test_the_bound_spares_most_of_the_work_and_changes_no_likely_match(
+def test_the_bound_saves_most_searches_and_changes_no_likely_match(
     loss: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     searched: list[int] = []
@@ -404,7 +404,7 @@ def likely(found: Ranking) -> list[int]:
 
 
 @pytest.mark.long
-def test_nothing_depends_on_the_order_of_anything_or_on_the_workers() -> None:
+def test_results_do_not_depend_on_orders_or_workers() -> None:
     rng = np.random.default_rng(0)
     shuffled = Library.from_models([MODELS[k] for k in rng.permutation(60)])
     for noise_px in (1.0, 8.0):
@@ -432,7 +432,7 @@ def test_ties_are_broken_by_the_id() -> None:
 PIXELS = view(MODELS[0], pose_of(0))
 
 
-def test_unknown_ids_are_refused_and_the_known_ones_named() -> None:
+def test_unknown_ids_raise_and_known_ids_are_named() -> None:
     with pytest.raises(InputError, match="library: the library is empty"):
         Library.from_models([]).retrieve(PIXELS, IDS, CAMERA)
     models = [
@@ -496,7 +496,7 @@ def test_retrieve_names_every_option() -> None:
 
 
 @given(seed=st.integers(0, 1000), y=st.floats(0.3, 3.0), z=st.floats(0.3, 3.0))
-def test_shape_distance_knows_no_place_and_no_stretch(seed: int, y: float, z: float) -> None:
+def test_shape_distance_ignores_place_and_stretch(seed: int, y: float, z: float) -> None:
     rng = np.random.default_rng(seed)
     model = MODELS[seed % 60]
     order = rng.permutation(10)

@@ -1,4 +1,4 @@
-"""`Library.retrieve(shape=...)`: ranking by the estimated shape, and what is refused."""
+"""`Library.retrieve(shape=...)`: ranking by the estimated shape, and invalid arguments."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ POSE = Alignment.from_packed(
 
 
 def make_table(number: int, category: str = "table") -> LibraryModel:
-    """A table of random width, height, depth, overhang and shelf, none a stretch of another."""
+    """A table of random width, height, depth, overhang and shelf."""
     rng = np.random.default_rng([number, 7])
     w, h, d = np.array([0.3, 0.25, 0.2]) * rng.uniform(0.6, 1.4, 3)
     inset, shelf = rng.uniform(0.1, 1.0, 2)
@@ -63,8 +63,8 @@ def first(model: LibraryModel, library: Library = LIBRARY, **options: Any) -> An
     return library.retrieve(seen(model, 1.0), model.ids, CAMERA, **options)[0]
 
 
-def test_a_match_by_shape_has_the_deviations_of_the_shape() -> None:
-    """In the unit of the matched model, whose length along x is held."""
+def test_a_match_by_shape_has_the_uncertainty_of_the_shape() -> None:
+    """In the unit of the matched model, whose length along x is fixed."""
     model, options = OBJECTS[0], {"ids": OBJECTS[0].ids.tolist(), "sigma": 1.0}
     of_shape = align(SHAPE, View(CAMERA, seen(model, 1.0), **options))
     best = first(model)
@@ -178,7 +178,7 @@ FEW = replace(NAMED, ids=tuple(range(100, 110)), category="table")
         ({"shape": "chair.shape"}, "shape: expected a cadalign.ShapeModel, got str"),
         ({"shape": replace(SHAPE, category="mug")}, "shape: unknown category 'mug'; known are tab"),
         ({"shape": NAMED}, "shape: its keypoints have names; learn it from models with semantic"),
-        ({"shape": FEW}, "ids: the shape model has less than 3 of the keypoints; check them, or"),
+        ({"shape": FEW}, "ids: the shape model has fewer than 3 of the keypoints; check them, or"),
     ],
 )
 def test_bad_input_is_refused(options: dict[str, Any], message: str) -> None:
@@ -234,7 +234,7 @@ def test_agrees_with_the_alignment_of_one_gaussian(camera: Camera, residual_sigm
     assert found.weights.tolist() == [1.0]
     means = found.means.reshape(-1, 3)
     np.testing.assert_allclose(means[:-2], result.points_3d, atol=2e-5)
-    # The box of an alignment is widened to hold the keypoints that are seen.
+    # The box of an alignment is enlarged to contain the observed keypoints.
     given = result.points_3d[:7]
     box = [np.minimum(means[-2], given.min(axis=0)), np.maximum(means[-1], given.max(axis=0))]
     np.testing.assert_allclose(box, result.bounds, atol=2e-5)

@@ -124,7 +124,7 @@ def test_a_table_of_the_matches_is_printed(case: Case, capsys: pytest.CaptureFix
 
 
 @pytest.mark.long
-def test_table_and_file_say_that_it_is_none_of_these(
+def test_table_and_file_have_none_probability(
     case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     others = Library.from_models(m for m in case.library if m.model_id != case.model_id)
@@ -184,7 +184,7 @@ def test_an_observation_of_a_mask_alone_is_refused(
 
 
 @pytest.mark.long
-def test_a_photo_that_moved_is_missed_only_where_it_is_shown(
+def test_a_missing_photo_only_matters_for_pictures(
     case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, gone = tmp_path / "moved.json", tmp_path / "gone.png"
@@ -230,7 +230,7 @@ def test_an_observation_is_not_retrieved_into_its_own_folder(
 # --- refusals --------------------------------------------------------------------------------
 
 
-def test_a_query_needs_no_model_points_but_ids_or_names(
+def test_a_query_needs_ids_or_names_but_no_xyz(
     case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data = json.loads((case.folder / "seen.json").read_text())
@@ -254,7 +254,7 @@ def test_a_query_needs_no_model_points_but_ids_or_names(
     assert f"{path}: the keypoints have no semantic_id and no name; give each" in line
 
 
-def test_what_the_library_refuses_is_one_line(
+def test_errors_of_the_library_are_one_line(
     case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     seen = case.arguments[0]

@@ -1,4 +1,4 @@
-"""A small textured object with its pose, stretch and photo, to be exported."""
+"""A small textured object with pose, stretch and photo, for tests of the export."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def wedge() -> Mesh:
 
 
 def photo_of(camera: Camera) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
-    """A smooth photo whose colours tell the place in it."""
+    """A smooth photo whose colours encode the pixel."""
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     red, green = 255 * columns / camera.width, 255 * rows / camera.height
     return np.stack([red, green, np.full_like(red, 90.0)], axis=2).astype(np.uint8)
@@ -65,7 +65,7 @@ def aligned(folder: Path, *, camera: Camera = CAMERA, **fields: Any) -> AlignedO
 
 
 def turned(view: ExportView, angle: float) -> tuple[ExportView, FloatArray]:
-    """The same object from a camera turned about the object; and that camera from the first one."""
+    """View of the object from a camera moved about it, and the motion from the first camera."""
     pose, motion = view.cam_from_model, np.eye(4)
     motion[:3, :3] = rotation_from_vector(np.array([0.0, angle, 0.0]))
     motion[:3, 3] = pose.translation - motion[:3, :3] @ pose.translation

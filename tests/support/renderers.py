@@ -1,4 +1,4 @@
-"""Renderers, as far as they work on this machine."""
+"""Renderers that work on this machine, and a ball."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cadalign.render.probe import probe_renderer
 
 
 def skip_unless_works(name: str) -> None:
-    """Skip the test where a renderer does not work; ray casting needs no proof."""
+    """Skip the test if a renderer does not work; ray casting always works."""
     if name == "raycast":
         return
     found = probe_renderer(name)
@@ -21,7 +21,7 @@ def skip_unless_works(name: str) -> None:
 
 
 def renderer_or_skip(name: str) -> Renderer:
-    """A renderer; the test is skipped where it does not work."""
+    """Make a renderer; skips the test if it does not work."""
     skip_unless_works(name)
     return make_renderer(name)
 

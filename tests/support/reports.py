@@ -1,4 +1,4 @@
-"""Payloads of report pages: runs as large, as odd and as unlucky as a test wants them."""
+"""Synthetic payloads of report pages."""
 
 from __future__ import annotations
 
@@ -53,31 +53,31 @@ def chair() -> Mesh:
 
 @dataclass
 class Recipe:
-    """What a payload is to hold."""
+    """Content of a synthetic payload."""
 
     instances: int = 24
     runs: int = 1
-    failures: float = 0.08  # share of fits
-    pictures: int = 6  # different ones, which instances share in turn
+    failures: float = 0.08  # share of failed fits
+    pictures: int = 6  # number of different pictures, which instances share in turn
     exhibits: bool = True
-    models: list[str] = field(default_factory=list)  # the first ids; others are made up
+    models: list[str] = field(default_factory=list)  # ids of the first models; others are generated
     categories: tuple[str, ...] = ("bottle", "chair", "vessel")
     done: int | None = None  # of an unfinished run
 
 
 def payload_of(recipe: Recipe) -> dict[str, Any]:
-    """The payload of a recipe; the same one always."""
+    """Make the payload of a recipe, deterministically."""
     return _Maker(recipe).payload()
 
 
 def write_page(path: Path, recipe: Recipe, **changes: Any) -> str:
-    """Write the page of a recipe, with parts of its payload replaced; its address."""
+    """Write the page of a recipe, with changes of its payload; returns its URL."""
     path.write_text(render_page({**payload_of(recipe), **changes}), encoding="utf-8")
     return path.as_uri()
 
 
 def listed(payload: dict[str, Any], metric: str, method: int = 0) -> list[dict[str, Any]]:
-    """The payload's instances with a method's value of a metric."""
+    """List the payload's instances, each with a method's value of a metric."""
     tables = payload["tables"]
     values = {
         instance: value
@@ -268,7 +268,7 @@ def _plot(runs: int, metric: Metric) -> dict[str, Any]:
 
 
 def _scenes(rng: np.random.Generator, count: int) -> list[tuple[Alignment, np.ndarray]]:
-    """The truths of pictures, and the stretches of the model that methods are given."""
+    """True alignments of pictures, and stretches of the model that methods are given."""
     return [_scene(rng) for _ in range(count)]
 
 
@@ -284,7 +284,7 @@ def _scene(rng: np.random.Generator) -> tuple[Alignment, np.ndarray]:
 
 @cache
 def _picture(index: int, size: tuple[int, int]) -> str:
-    """A picture of one colour, another for every number."""
+    """A picture of one colour, which depends on ``index``."""
     buffer = io.BytesIO()
     Image.new("RGB", size, (40 * index % 256, 120, 90)).save(buffer, "WEBP", quality=80, method=0)
     return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()

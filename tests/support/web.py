@@ -1,4 +1,4 @@
-"""The packages that the pages' scripts are made of, as npm gets them."""
+"""The npm packages of the pages' scripts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ QUIET = {**os.environ, "npm_config_update_notifier": "false"}
 
 
 def npm_or_skip() -> str:
-    """The program npm; the test is skipped where there is none."""
+    """Path of npm; skips the test without npm."""
     npm = shutil.which("npm")
     if npm is None:
         pytest.skip("no npm here; on Debian: apt-get install npm")
@@ -27,7 +27,7 @@ def npm_or_skip() -> str:
 
 
 def copy_with_modules(folder: Path) -> Path:
-    """Copy the pages' sources with their packages beside them; skip where npm cannot get these."""
+    """Copy the pages' sources and packages; skips the test if npm cannot install these."""
     copy = folder / "web"
     shutil.copytree(WEB, copy, ignore=shutil.ignore_patterns("node_modules", "dist", "__pycache__"))
     (copy / "node_modules").symlink_to(_modules())
@@ -36,7 +36,7 @@ def copy_with_modules(folder: Path) -> Path:
 
 @cache
 def _modules() -> Path:
-    """The folder of the packages; those that npm has to get are got once, for all tests."""
+    """Folder of the packages, installed once for all tests if needed."""
     if (WEB / "node_modules").is_dir():
         return WEB / "node_modules"
     npm, folder = npm_or_skip(), Path(tempfile.mkdtemp(prefix="cadalign-modules-"))
@@ -51,5 +51,5 @@ def _modules() -> Path:
 
 
 def axe_script() -> str:
-    """The source of axe-core, which finds what a page lacks for those who cannot see or click."""
+    """Source of axe-core, which checks the accessibility of pages."""
     return (_modules() / "axe-core" / "axe.min.js").read_text(encoding="utf-8")

@@ -1,14 +1,14 @@
-// Choices of one among several, made anew with what they stand in.
+// Radio buttons, and updates of their container.
 import { h } from "../common/dom.js";
 
-/** Put new contents in, and the focus back to the choice it was on. */
+/** Replace the contents of an element, and keep the focus on its radio button. */
 export function refill(host, parts) {
   const name = host.contains(document.activeElement) ? document.activeElement.name : "";
   host.replaceChildren(...parts.filter(Boolean));
   if (name) host.querySelector(`[name="${name}"]:checked`)?.focus();
 }
 
-/** A choice of one thing by radio buttons. */
+/** Radio buttons. */
 export function radios(legend, things, { checked, words, choose, kind = "radios" }) {
   return h(
     "fieldset",

@@ -1,4 +1,4 @@
-// The numbers of one instance: errors of every method, the estimate with its deviations, warnings.
+// Numbers of one instance: errors of all methods, the estimate with its uncertainty, warnings.
 import { h, table } from "../common/dom.js";
 import { radios } from "./choices.js";
 import { named, number, quantity } from "./format.js";
@@ -6,7 +6,7 @@ import { swatch } from "./swatch.js";
 
 const AXES = ["x", "y", "z"];
 
-/** A table of every method's errors on an instance. */
+/** Table of all methods' errors on an instance. */
 export function errorTable(report, instance, exhibit) {
   const metrics = report.metrics.filter(({ key }) =>
     report.measured.some((method) => report.error(instance, method.key, key) !== null),
@@ -36,7 +36,7 @@ export function errorTable(report, instance, exhibit) {
   return table("Errors", heads, rows, { label: "errors by method" });
 }
 
-/** A method's estimate in an exhibit, if there is one. */
+/** A method's estimate in an exhibit, or null. */
 export const estimateOf = (exhibit, method) =>
   exhibit?.estimates?.find((estimate) => estimate.method === method) ?? null;
 
@@ -75,7 +75,7 @@ export function estimateTable(exhibit, estimate, label) {
   return table(`Estimate of ${label}`, heads, rows, { label: "estimate" });
 }
 
-/** Warnings of an estimate, in the fit's own words. */
+/** List of an estimate's warnings, or null. */
 export function warningList({ warnings = [] }) {
   if (!warnings.length) return null;
   return h(
@@ -90,7 +90,7 @@ export function warningList({ warnings = [] }) {
   );
 }
 
-/** The other poses that explain the keypoints, to be drawn in place of the best. */
+/** Choice among the best pose and its alternatives. */
 export function alternativeChoice({ alternatives = [] }, chosen, choose) {
   if (!alternatives.length) return null;
   const words = (index) => {

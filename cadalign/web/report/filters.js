@@ -1,10 +1,10 @@
-// The switches that all parts of the page obey (methods, runs) and the gallery's form.
+// Switches of methods and runs for the whole page, and the form of the gallery.
 import { button, debounced, field, h } from "../common/dom.js";
 import { named } from "./format.js";
 import { EVERY, FILTERS } from "./selection.js";
 import { runSwatch, swatch } from "./swatch.js";
 
-/** Buttons that take methods and runs in and out everywhere. */
+/** Buttons that show and hide methods and runs on the whole page. */
 export function switches(report, state) {
   const update = [];
   const chips = (label, list, things) =>
@@ -35,7 +35,7 @@ export function switches(report, state) {
   return element;
 }
 
-/** A choice among [value, label] pairs, bound to a value of the state; else the first is shown. */
+/** Select box of [value, label] pairs, bound to a value of the state. */
 function choice(state, name, options) {
   const control = h(
     "select",

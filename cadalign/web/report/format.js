@@ -1,17 +1,17 @@
-// Numbers and words as the page shows them.
+// Formats of numbers and names.
 
 const MINUS = "\u2212";
 const NONE = "\u2013";
 
 const signed = (text) => text.replace(/^-/, MINUS);
 
-/** A number with so many decimals; without a count, three significant digits. */
+/** A number with a number of decimals, by default with three significant digits. */
 export function number(value, digits) {
   if (value == null || !Number.isFinite(value)) return NONE;
   if (Number.isInteger(value) && digits == null) return signed(value.toLocaleString("en-US"));
   if (digits != null) {
     const fixed = value.toFixed(digits);
-    // A value that rounds to nothing still is something.
+    // A small value that would be rounded to 0 keeps one digit.
     if (value !== 0 && Number(fixed) === 0) return signed(value.toPrecision(1));
     return signed(fixed);
   }
@@ -32,5 +32,5 @@ export const count = (value) => value.toLocaleString("en-US");
 export const plural = (value, one, many = `${one}s`) =>
   `${count(value)} ${value === 1 ? one : many}`;
 
-/** A metric's name with its unit, as an axis or a column has it. */
+/** A metric's name with its unit. */
 export const named = ({ label, unit }) => (unit ? `${label} [${unit}]` : label);

@@ -1,4 +1,4 @@
-// The gallery: cards of instances, so many at a time.
+// The gallery: cards of instances, shown in batches.
 import { button, h } from "../common/dom.js";
 import { galleryForm } from "./filters.js";
 import { count, plural, quantity } from "./format.js";
@@ -7,7 +7,7 @@ import { keyOf } from "./payload.js";
 import { FILTERS, criteria, select } from "./selection.js";
 import { swatch } from "./swatch.js";
 
-const LINES = 3; // at most so many methods' errors on a card
+const LINES = 3; // most methods whose errors are on a card
 const AT_A_TIME = 48;
 const DECIDES = [...FILTERS, "sort", "order", "hide", "hideruns"];
 
@@ -32,7 +32,7 @@ export class Gallery {
     this.update();
   }
 
-  /** Find anew what is shown. */
+  /** Select the instances and show the first batch. */
   update() {
     this.found = select(this.report, this.state);
     this.chosen = criteria(this.report, this.state);
@@ -99,7 +99,7 @@ export class Gallery {
     return rest > 0 ? [...lines, h("span", { class: "soft" }, `and ${rest} more`)] : lines;
   }
 
-  /** A picture; without one, boxes and keypoints alone still show what happened. */
+  /** A picture, or boxes and keypoints without one. */
   picture(instance) {
     const source = this.report.thumb(instance);
     if (source) {

@@ -1,9 +1,9 @@
-// The headline table, the failures behind it, and the settings of the runs.
+// The headline table, reasons of failures, and settings of the runs.
 import { h, table } from "../common/dom.js";
 import { count, number, plural } from "./format.js";
 import { swatch } from "./swatch.js";
 
-/** The top of the page: what was run, on what, how far. */
+/** The top of the page: title, summary, progress and settings. */
 export function heading(report) {
   return h(
     "header",
@@ -69,7 +69,7 @@ const legend = ({ group }) => [
 
 function resultTable(report, { columns, rows, group }) {
   const several = report.runs.length > 1;
-  // What holds for all comes first.
+  // The group of all categories comes first.
   const first = (name) => (name === "all" ? 0 : 1);
   const names = [...new Set(rows.map((row) => row.category))].sort(
     (a, b) => first(a) - first(b),
@@ -120,10 +120,10 @@ function resultTable(report, { columns, rows, group }) {
   );
 }
 
-// A category is a word of its own; a value of noise needs to be told what it is.
+// The name of a category is clear; a value, such as a noise level, needs the group's name.
 const groupWords = (group, name) => (group === "category" ? name : `${group}: ${name}`);
 
-/** Rows of the same method stand together, so that runs can be compared. */
+/** Sort rows by method, then by run. */
 function inOrder(report, rows) {
   const place = new Map(report.methods.map((method, index) => [method.key, index]));
   return rows.toSorted((a, b) => place.get(a.method) - place.get(b.method) || a.run - b.run);
@@ -153,7 +153,7 @@ function bodyRow(report, columns, row, several) {
 const shown = ({ digits }, value) =>
   number(value, Number.isInteger(value) && !digits ? undefined : digits);
 
-/** The reasons of what failed or was skipped, with their numbers. */
+/** Table of the reasons of failed or skipped fits, with counts. */
 function reasons(report, list, what) {
   if (!list.length) return null;
   const total = list.reduce((sum, failure) => sum + failure.count, 0);

@@ -21,14 +21,14 @@ const open = (instance) => viewer.open(instance);
 const gallery = report.instances.length ? new Gallery(report, state, { open }) : null;
 const plots = plotSection(report, state);
 
-// A demonstration is looked at first, an evaluation read.
+// A demo starts with pictures, an evaluation with numbers.
 const showsPictures = report.runs.every(({ what }) => what === "demo");
 const results = [headline(report), plots];
 const sections = (
   showsPictures ? [gallery?.element, ...results] : [...results, gallery?.element]
 ).filter(Boolean);
 const links = sections.map((section) =>
-  // The fragment holds the state, so these are not links to one.
+  // Buttons, not links: the fragment of the URL holds the state.
   button(section.querySelector("h2").textContent, () => section.scrollIntoView()),
 );
 const bar = h(
@@ -38,7 +38,7 @@ const bar = h(
   (plots || gallery) && switches(report, state),
 );
 document.body.append(h("div", { class: "page" }, heading(report), bar, h("main", {}, sections)));
-// What is scrolled to is not to end up under the bar.
+// Sections scroll to below the bar.
 new ResizeObserver(() => {
   document.documentElement.style.setProperty("--bar", `${bar.offsetHeight}px`);
 }).observe(bar);

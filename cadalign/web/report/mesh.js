@@ -1,4 +1,4 @@
-// A model as the payload packs it: coordinates quantised to 16 bits, indices of 16 or 32.
+// Models of the payload: coordinates quantised to 16 bits, indices of 16 or 32 bits.
 
 function bytesOf(base64) {
   const text = atob(base64);
@@ -22,7 +22,7 @@ export function unpackMesh({ lo, step, vertices, faces, edges, wide }) {
   };
 }
 
-/** The vertices as triples, and the feature edges as pairs of their indices. */
+/** Vertices as triples, and feature edges as pairs of indices. */
 export function wireOf({ vertices, edges }) {
   const points = Array.from({ length: vertices.length / 3 }, (_, i) => [
     vertices[3 * i],

@@ -31,7 +31,7 @@ export const LAYERS = [
  */
 export function overlay(exhibit, { picture, estimate, wire = null, layers, label }) {
   const { camera } = exhibit;
-  // Pixel centres are whole numbers, so a picture reaches half a pixel further on each side.
+  // Pixel centres are integers: a picture extends half a pixel beyond them.
   const drawing = svg("svg", {
     viewBox: `-0.5 -0.5 ${camera.width} ${camera.height}`,
     role: "img",
@@ -58,14 +58,14 @@ export function overlay(exhibit, { picture, estimate, wire = null, layers, label
   return drawing;
 }
 
-/** A box twice: a pale halo first, so that its lines stand out from any picture. */
+/** A box, drawn over a pale halo that separates it from the picture. */
 function boxPaths(camera, bounds, pose, kind) {
   const corners = transform(matrixOf(pose), cornersOf(bounds));
   const d = pathOf(camera, corners, BOX_EDGES);
   return [svg("path", { class: "halo", d }), svg("path", { class: `box ${kind}`, d })];
 }
 
-/** Observed keypoints as rings; where the prediction puts them as dots, tied to the rings. */
+/** Observed keypoints as rings, predicted ones as dots, and lines between them. */
 function keypoints(exhibit, pose) {
   const { camera, points_2d: seen = [], points_3d: model = [], semantic_ids: ids = [] } = exhibit;
   const group = svg("g", { class: "keypoints" });

@@ -1,7 +1,7 @@
-// The payload as the page speaks of it: instances with their rows.
+// The payload as instances with their rows.
 // Its format is described in cadalign/report/page.py.
 
-/** The payload that the page carries; its text is let go, as pictures make it large. */
+/** Parse the page's payload and remove its text, which may be large. */
 export function readPayload() {
   const element = document.getElementById("payload");
   const payload = JSON.parse(element.textContent);
@@ -9,7 +9,7 @@ export function readPayload() {
   return payload;
 }
 
-/** What names an instance within a run, in links too. */
+/** Key of an instance within a run, also in links. */
 export const keyOf = (instance) => `${instance.category}/${instance.model}/${instance.view ?? 0}`;
 
 export class Report {
@@ -29,7 +29,7 @@ export class Report {
     );
     this.siblings = Map.groupBy(this.instances, ({ id }) => id);
     const used = new Set(this.rows.method);
-    // A limit has numbers, but no poses: it stands in tables and plots only.
+    // A limit has no poses: it is only in tables and plots.
     this.measured = this.methods.filter((_, index) => used.has(index));
     this.fitted = this.measured.filter((method) => !method.is_limit);
   }
@@ -48,13 +48,13 @@ export class Report {
     return { method: table.method, status: table.status, reason, values };
   }
 
-  /** A metric of an instance by one method in the metric's unit; null where there is none. */
+  /** A method's value of a metric on an instance, in the metric's unit, or null. */
   error(instance, method, metric) {
     const row = instance.rows.get(method);
     return row === undefined ? null : (this.rows.values.get(metric)?.[row] ?? null);
   }
 
-  /** Whether a method was tried on an instance and gave nothing. */
+  /** Whether a method failed on an instance. */
   failed(instance, method) {
     const row = instance.rows.get(method);
     return row !== undefined && this.rows.status[row] !== 0;

@@ -1,4 +1,4 @@
-// The section of plots: each is drawn when it comes into view, and again when what it shows changes.
+// The section of plots: each is drawn when it comes into view, and again after changes.
 import { isPrinting, onThemeChange, themeColor } from "../common/colors.js";
 import { h } from "../common/dom.js";
 import { named } from "./format.js";
@@ -6,7 +6,7 @@ import { DASHES, SYMBOLS, colorOf, placeOf, runDash } from "./swatch.js";
 
 const PAPER = 330; // width of a plot on paper [CSS px]: two beside each other on A4 and letter
 const MARKERS = 16; // on a line at most
-// A finger that lands on a plot is to scroll the page.
+// On touch screens, a plot scrolls the page.
 const COARSE = matchMedia("(pointer: coarse)").matches;
 const CONFIG = {
   displaylogo: false,
@@ -44,7 +44,7 @@ function figure(report, state, plot) {
       ({ method, run }) => !methods.has(method) && !runs.has(String(run)),
     );
     const layout = layoutOf(plot, lines);
-    // The page is laid out for paper only after this.
+    // The browser makes the layout for printing after this event.
     if (isPrinting()) Object.assign(layout, { width: PAPER, height: 0.72 * PAPER });
     await library.react(host, tracesOf(report, lines), layout, CONFIG);
     host.dataset.drawn = "1";
@@ -64,7 +64,7 @@ function figure(report, state, plot) {
   );
 }
 
-/** A name as text: Plotly reads some tags and `%{...}` in what it is given. */
+/** Escape a name: Plotly interprets some tags and `%{...}`. */
 const plain = (text) =>
   String(text)
     .replaceAll("&", "&amp;")
@@ -72,7 +72,7 @@ const plain = (text) =>
     .replaceAll(">", "&gt;")
     .replaceAll("%{", "%\u200b{");
 
-/** The traces of some lines: a band where there are quartiles, then the line. */
+/** Traces of lines, each after a band of its quartiles, if known. */
 function tracesOf(report, lines) {
   return lines.flatMap(({ run, method: key, x, y, low, high }) => {
     const method = report.method.get(key);
@@ -94,14 +94,14 @@ function tracesOf(report, lines) {
   });
 }
 
-/** How many powers of ten positive values reach over. */
+/** Number of decades that positive values span. */
 function decades(values) {
   const positive = values.filter((value) => value > 0).map(Math.log10);
   const bound = (pick, start) => positive.reduce((a, b) => pick(a, b), start);
   return positive.length ? bound(Math.max, -Infinity) - bound(Math.min, Infinity) : 0;
 }
 
-/** The layout of a plot: no title and no legend, as the page has them. */
+/** Layout of a plot; the page has the title and the legend. */
 function layoutOf({ x, y }, lines) {
   const [ink, soft, line, card] = ["ink", "soft", "line", "card"].map(themeColor);
   const values = (...names) => lines.flatMap((one) => names.flatMap((name) => one[name] ?? []));

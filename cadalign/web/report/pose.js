@@ -1,4 +1,4 @@
-// Poses as the estimates give them: depth * (u, v, 1) = K (R diag(scale) x + t).
+// Poses of estimates: depth * (u, v, 1) = K (R diag(scale) x + t).
 
 import { warpOf } from "./warp.js";
 
@@ -15,13 +15,13 @@ export function matrixOf({ rotation, translation, scale }) {
   return rows;
 }
 
-/** The given model's points, from the data set's: stretched, and warped where the pose says so. */
+/** Stretch the data set's points to the given model, and warp them if the pose has a warp. */
 export function shapeOf(exhibit, pose, points) {
   const { stretch = ONES } = exhibit;
   return warped(exhibit, pose, points.map((point) => point.map((value, k) => value * stretch[k])));
 }
 
-/** Points of the given model, warped where the pose says so. */
+/** Points of the given model, warped if the pose has a warp. */
 export function warped({ bounds }, { warp }, points) {
   return warp && bounds ? warpOf(warp, bounds)(points) : points;
 }
@@ -40,7 +40,7 @@ export function pixel(camera, [x, y, z]) {
   return z > NEAR ? [(camera.fx * x) / z + camera.cx, (camera.fy * y) / z + camera.cy] : null;
 }
 
-/** The two pixels of a segment's part before the camera; null where there is none. */
+/** End pixels of the part of a segment in front of the camera, or null. */
 export function segment(camera, a, b) {
   const near = Math.max(NEAR, 1e-3 * Math.max(Math.abs(a[2]), Math.abs(b[2])));
   if (a[2] < near && b[2] < near) return null;
@@ -75,7 +75,7 @@ export const BOX_EDGES = [0, 1, 2, 3, 4, 5, 6, 7].flatMap((k) =>
   [1, 2, 4].filter((bit) => !(k & bit)).map((bit) => [k, k | bit]),
 );
 
-/** What a point in the camera's axes is in the upright axes of the object at a pose, row by row. */
+/** Transform from the camera's axes to the upright axes of the posed object, row by row. */
 export function anchorOf({ rotation: r, translation: t }) {
   return [0, 1, 2].flatMap((j) => [
     r[j],

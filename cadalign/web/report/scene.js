@@ -19,15 +19,15 @@ import { themeColor } from "../common/colors.js";
 import { Stage } from "../common/stage.js";
 import { BOX_EDGES, anchorOf, cornersOf, matrixOf, shapeOf } from "./pose.js";
 
-const FRUSTUM = 0.35; // the camera's size, as a part of its distance
+const FRUSTUM = 0.35; // size of the camera, relative to its distance
 
-/** The views of a scene, for the buttons that choose among them. */
+/** Views of a scene, with their labels. */
 export const VIEWS = [
   ["object", "The object"], ["picture", "As in the picture"], ["all", "With the camera"],
 ];
 
 export class Scene3D {
-  /** Throws where the browser has no WebGL. */
+  /** Throws without WebGL. */
   constructor(host) {
     this.stage = new Stage(host, {
       label: "3D view of the predicted and the true model; arrow keys turn it",
@@ -43,8 +43,8 @@ export class Scene3D {
    * @param {object} options
    * @param {object|null} options.estimate - the pose of the prediction
    * @param {object|null} options.mesh - the unpacked model, before its stretch
-   * @param {Set<string>} options.layers - as those of the overlay
-   * @param {boolean} options.stay - whether the view stays as it is
+   * @param {Set<string>} options.layers - keys of the overlay's `LAYERS`
+   * @param {boolean} options.stay - whether to keep the view
    */
   show(exhibit, { estimate, mesh, layers, stay }) {
     this.clear();
@@ -57,7 +57,7 @@ export class Scene3D {
     this.eye = new Group();
     this.addCamera(exhibit.camera, anchor);
     this.content.add(this.solids, this.eye);
-    // Framing measures the objects where they are, before anything is drawn.
+    // Framing uses the objects' world matrices, before the first drawing.
     this.content.updateMatrixWorld(true);
     this.stage.resize();
     if (!stay || !this.viewed) this.view("object");
@@ -71,7 +71,7 @@ export class Scene3D {
       const { points, edges } = mesh.wire;
       const shaped = shapeOf(exhibit, pose, points);
       const solid = new Mesh(geometryOf(shaped, mesh.faces), surface(color, kind));
-      // The true one is drawn over the predicted one, so that both are seen where they agree.
+      // The true model is drawn over the predicted one, so both are visible where they agree.
       solid.renderOrder = kind === "gt" ? 2 : 1;
       this.solids.add(placed(solid, matrix));
       if (layers.has("w")) {
@@ -118,7 +118,7 @@ export class Scene3D {
     this.eyeUp = new Vector3(0, -1, 0).transformDirection(this.world);
   }
 
-  /** Look at the object from beside the camera, from the camera, or from where both are seen. */
+  /** Look at the object from beside the camera, from the camera, or at both. */
   view(way) {
     this.viewed = true;
     const { camera, controls } = this.stage;
@@ -159,7 +159,7 @@ function placed(object, matrix) {
 function surface(color, kind) {
   const translucent = { transparent: true, opacity: 0.45, depthWrite: false };
   return new MeshLambertMaterial({
-    // Paler than the lines, which are to stand out from it.
+    // Paler than the lines, for contrast.
     color: new Color(color).lerp(new Color("white"), 0.3),
     side: DoubleSide,
     flatShading: true,

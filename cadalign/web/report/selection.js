@@ -1,12 +1,12 @@
-// Which instances the gallery shows, and in which order.
+// Filters and order of the gallery.
 
-/** The method's name that stands for all that are shown: the worst of them counts. */
+/** Value of the method filter for all shown methods, of which the worst counts. */
 export const EVERY = "*";
 
-/** What the gallery's filters are called in the state. */
+/** Names of the gallery's filters in the state. */
 export const FILTERS = ["category", "method", "status", "q", "run"];
 
-/** The choices of the gallery, read off the state. */
+/** Read the gallery's choices from the state. */
 export function criteria(report, state) {
   const hidden = state.words("hide");
   const shown = report.fitted.filter((method) => !hidden.has(method.key));
@@ -16,14 +16,14 @@ export function criteria(report, state) {
   return { metric, shown, methods: chosen ? [chosen] : shown, chosen };
 }
 
-/** The larger the worse; failures are worst, and what has no value is not a number. */
+/** Larger is worse: infinity for failures, NaN without a value. */
 function badness(report, instance, { metric, methods }) {
   let worst = NaN;
   for (const { key } of methods) {
     if (!instance.rows.has(key)) continue;
     const value = metric ? report.error(instance, key, metric.key) : null;
     const failed = report.failed(instance, key);
-    // A good fit may have no value, as the box IoU of a model without volume.
+    // A good fit may have no value: a model without volume has no box IoU.
     if (value === null && !failed) continue;
     const bad = failed ? Infinity : metric.better === "high" ? -value : value;
     if (!(worst >= bad)) worst = bad;

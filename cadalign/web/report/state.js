@@ -1,4 +1,4 @@
-// What is shown, kept in the URL's fragment: a link shows the same view.
+// The state of the page, kept in the URL's fragment: a link shows the same view.
 
 const DEFAULTS = {
   hide: "", // methods not shown, by key, separated by blanks
@@ -35,18 +35,18 @@ export class State {
     return this.#values[name];
   }
 
-  /** A whole number, or null where the state names none. */
+  /** A value as an integer, or null. */
   number(name) {
     const value = Number.parseInt(this.#values[name], 10);
     return Number.isNaN(value) ? null : value;
   }
 
-  /** The words of a value that is a list of them. */
+  /** A value that is a list, as the set of its words. */
   words(name) {
     return new Set(this.#values[name].split(" ").filter(Boolean));
   }
 
-  /** Take a word of a list in or out. */
+  /** Add a word to a list, or remove it. */
   toggle(name, word) {
     const words = this.words(name);
     if (!words.delete(word)) words.add(word);
@@ -54,11 +54,11 @@ export class State {
   }
 
   /**
-   * Change values, and tell those who listen.
+   * Change values and call the listeners.
    *
    * @param {object} changes
    * @param {object} options
-   * @param {boolean} options.remember - whether the browser's "back" is to undo it
+   * @param {boolean} options.remember - whether the browser's "back" undoes the change
    */
   set(changes, { remember = false } = {}) {
     this.#announce(() => {
@@ -78,7 +78,7 @@ export class State {
     return text && `#${text}`;
   }
 
-  /** Call back with the names of the values that changed. */
+  /** Add a listener, which is called with the names of changed values. */
   listen(action) {
     this.#listeners.push(action);
   }

@@ -1,10 +1,10 @@
-// A method's colour, line and symbol, as every legend of the page shows it.
+// Colours, lines and symbols of methods in all legends.
 import { svg } from "../common/dom.js";
 import { isDark } from "../common/colors.js";
 
 const DASHES = { solid: "", dash: "6 4", dot: "2 3", dashdot: "7 3 2 3" };
 
-/** Plotly's names of symbols, and the same as paths about the middle of a swatch. */
+/** Plotly's names of symbols, and their SVG paths, centred in a swatch. */
 export const SYMBOLS = [
   ["circle", "M9 5a4 4 0 1 0 8 0a4 4 0 1 0-8 0Z"],
   ["square", "M9.5 1.5h7v7h-7Z"],
@@ -15,17 +15,17 @@ export const SYMBOLS = [
   ["star", "M13 0l1.3 3.4 3.7.2-2.9 2.3 1 3.6-3.1-2-3.1 2 1-3.6L8 3.6l3.7-.2Z"],
 ];
 
-/** How the lines of each run are drawn where there are several. */
+/** Dash patterns of the runs. */
 export const runDash = (run) => Object.keys(DASHES)[run % 4];
 
-/** A method's place among the symbols. */
+/** Index of a method's symbol. */
 export const placeOf = (report, key) =>
   Math.max(
     report.methods.findIndex((method) => method.key === key),
     0,
   ) % SYMBOLS.length;
 
-/** A method's colour in the page's present light. */
+/** Colour of a method in the current theme. */
 export const colorOf = (method, dark = isDark()) =>
   (dark ? method?.color_dark : method?.color) ?? "#808080";
 

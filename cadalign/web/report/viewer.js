@@ -24,7 +24,7 @@ export class Viewer {
    * @param {Report} report
    * @param {State} state
    * @param {object} options
-   * @param {function} options.list - the instances to walk through by the arrow keys
+   * @param {function} options.list - returns the instances that the arrow keys step through
    */
   constructor(report, state, { list }) {
     this.report = report;
@@ -105,7 +105,7 @@ export class Viewer {
     );
   }
 
-  /** Do what the state says. */
+  /** Open or close the dialog according to the state. */
   sync() {
     const key = this.state.get("open");
     const instance = key ? this.report.find(this.state.get("openrun"), key) : null;
@@ -144,7 +144,7 @@ export class Viewer {
     this.walk(step);
   }
 
-  /** The methods tried on the instance, and the one whose prediction is drawn. */
+  /** Methods with a result for the instance, and the method whose prediction is drawn. */
   shown() {
     const tried = this.report.fitted.filter(({ key }) => this.instance.rows.has(key));
     const { chosen, shown } = criteria(this.report, this.state);
@@ -205,7 +205,7 @@ export class Viewer {
     });
   }
 
-  /** The unpacked model; kept, as several instances share one. */
+  /** The unpacked model, cached: several instances share it. */
   mesh(key) {
     if (key == null) return null;
     if (!this.meshes.has(key)) {
@@ -215,7 +215,7 @@ export class Viewer {
     return this.meshes.get(key);
   }
 
-  /** The pose to draw: the estimate's, or the alternative chosen in its place. */
+  /** The pose to draw: the estimate's, or the chosen alternative. */
   pose(exhibit, method) {
     const estimate = estimateOf(exhibit, method?.key);
     if (!estimate?.rotation) return null;

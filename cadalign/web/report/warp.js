@@ -1,4 +1,4 @@
-// Warp of a model to an estimated shape, as cadalign/shapes/warp.py has it for boxes that agree.
+// Warp of a model to an estimated shape; see cadalign/shapes/warp.py, here for equal boxes.
 
 // Lengths relative to the diagonal of model and keypoints.
 const ROUNDING = 0.02;
@@ -6,11 +6,11 @@ const MARGIN = 0.25;
 const COINCIDENT = 1e-6;
 
 /**
- * A function that warps points [x, y, z] such that given places come to others.
+ * A function that warps points [x, y, z] and moves given places to targets.
  *
  * @param {object} warp
  * @param {number[][]} warp.from - places on the model
- * @param {number[][]} warp.to - where they come to
+ * @param {number[][]} warp.to - their targets
  * @param {number[][]} bounds - the model's lowest and highest coordinates
  */
 export function warpOf({ from, to }, bounds) {
@@ -44,7 +44,7 @@ export function warpOf({ from, to }, bounds) {
 
 const distance = (a, b) => Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]);
 
-/** Places and their moves; coincident places are one, which moves by the mean. */
+/** Places and their moves; coincident places are merged, with the mean move. */
 function merged(from, to, tolerance) {
   const groups = [];
   from.forEach((place, i) => {
@@ -59,7 +59,7 @@ function merged(from, to, tolerance) {
   };
 }
 
-/** Radius of the kernel's rounded tip: less where places are near each other. */
+/** Radius of the kernel's rounded tip: smaller if places are close together. */
 function rounding(places, diagonal) {
   let least = places.length > 1 ? Infinity : diagonal;
   for (let i = 0; i < places.length; i++)
@@ -67,7 +67,7 @@ function rounding(places, diagonal) {
   return Math.min(ROUNDING * diagonal, least);
 }
 
-/** The solution of linear equations with several right sides, by elimination with pivots. */
+/** Solve linear equations with several right sides by Gaussian elimination. */
 function solve(matrix, sides) {
   const rows = matrix.map((row, i) => [...row, ...sides[i]]);
   const n = rows.length;

@@ -54,7 +54,6 @@ class Equations(NamedTuple):
 
 @kernel
 def empty_equations(unknowns: int) -> Equations:
-    """Allocate the equations of ``unknowns`` unknowns."""
     return Equations(
         np.empty((unknowns, unknowns)),
         np.empty(unknowns),

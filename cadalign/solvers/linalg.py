@@ -86,10 +86,7 @@ def mirror_upper(matrix: FloatArray) -> None:
 
 @kernel
 def cholesky(matrix: FloatArray, size: int, floor: float) -> bool:
-    """Replace the lower triangle by its Cholesky factor.
-
-    Returns False where a pivot is not above ``floor`` times its diagonal entry.
-    """
+    """Write the lower Cholesky factor in place; False for a pivot below ``floor`` * diagonal."""
     for i in range(size):
         diagonal = matrix[i, i]
         for j in range(i + 1):
@@ -212,10 +209,7 @@ def damp(blocks: FloatArray, border: FloatArray, damping: float) -> None:
 
 @kernel
 def eigenvectors_4(matrix: FloatArray, vectors: FloatArray) -> None:
-    """Diagonalise a symmetric matrix (4, 4) in place by Jacobi's method.
-
-    Eigenvectors are the columns of ``vectors``.
-    """
+    """Diagonalise a symmetric (4, 4) in place by Jacobi's method; eigenvectors are columns."""
     for i in range(4):
         for j in range(4):
             vectors[i, j] = 1.0 if i == j else 0.0

@@ -97,9 +97,9 @@ def out_of_range_error() -> DegenerateError:
 
 @fast_sums
 def _moments(points: FloatArray, rays: FloatArray, mean: FloatArray, products: FloatArray) -> None:
-    """Write the mean (5,) of x, y, z, u, v, and sums of centred products (10, 4).
+    """Write means (5,) of x, y, z, u, v and sums of centred products (10, 4).
 
-    Rows are the products 11, 1x, ..., zz of (1, x, y, z); columns the factors 1, u, v, u^2 + v^2.
+    Rows: 11, 1x, ..., zz of (1, x, y, z); columns: times 1, u, v, u^2 + v^2.
     """
     n = points.shape[0]
     homogeneous = rays.shape[1] == 3
@@ -177,11 +177,7 @@ def _to_points_basis(factor: FloatArray, vector: FloatArray) -> None:
 
 @kernel
 def _split_scale(linear: FloatArray, spread: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Write a rotation and return scales d (3,) > 0 with ``rotation @ diag(d)`` near ``linear``.
-
-    Newton steps maximise the sum of squared dot products of the columns, with ``linear``'s columns
-    weighted by ``spread`` (3,).
-    """
+    """Write a rotation and return scales d (3,) > 0 with ``rotation @ diag(d)`` near ``linear``."""
     columns = np.empty((3, 3))
     for j in range(3):
         for i in range(3):
@@ -267,10 +263,7 @@ def aepnp_kernel(points: FloatArray, rays: FloatArray, pose: FloatArray) -> int:
 def affine_rows(
     points: FloatArray, rays: FloatArray, mean: FloatArray, spread: FloatArray, rows: FloatArray
 ) -> int:
-    """Write the affine map (3, 4) from (1, x - mean) to the camera, up to a factor.
-
-    Also writes mean (5,) of x, y, z, u, v and spread (3,); returns a status.
-    """
+    """Write the affine map (3, 4) of (1, x - mean) to the camera, up to scale; returns a status."""
     if points.shape[0] < MIN_POINTS:
         return TOO_FEW
     products = np.empty((10, 4))

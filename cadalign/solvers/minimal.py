@@ -104,7 +104,6 @@ def ap4p_kernel(points: FloatArray, rays: FloatArray, solutions: FloatArray) -> 
 
 @kernel
 def minimal_memory() -> FloatArray:
-    """Allocate scratch space for `solve_subset`."""
     return np.empty((_ROWS, 16))
 
 
@@ -263,7 +262,6 @@ def _column(matrix: FloatArray, j: int) -> Triple:
 
 @kernel
 def p3p_memory() -> FloatArray:
-    """Allocate scratch space for `p3p_kernel`."""
     return np.empty((ROOTS_ROWS, 2 * _DEGREE))
 
 

@@ -62,7 +62,7 @@ def shift(motion: Motion, turned: Triple) -> Triple:
 
 
 @inlined
-def ray_and_depth(point: Triple) -> Triple:
+def ray_of(point: Triple) -> Triple:
     """Normalised image coordinates u, v and depth of a point in the camera."""
     inverse = 1.0 / point[2]
     return point[0] * inverse, point[1] * inverse, point[2]
@@ -70,7 +70,7 @@ def ray_and_depth(point: Triple) -> Triple:
 
 @inlined
 def ray_slopes(seen: Triple, weights: Triple) -> tuple[Triple, Triple]:
-    """Slopes of a u + b v and c v for ``weights`` (a, b, c), at the result of `ray_and_depth`."""
+    """Slopes of a u + b v and c v for ``weights`` (a, b, c), at the result of `ray_of`."""
     u, v, depth = seen
     inverse = 1.0 / depth
     e, f, h = weights[0] * inverse, weights[1] * inverse, weights[2] * inverse
@@ -111,7 +111,7 @@ def write_motion(turned: Triple, slope: Triple, rows: FloatArray, column: int) -
 @inlined
 def project_point(pose: Scalars, point: Triple) -> Triple:
     """Project a model point to normalised image coordinates u, v and depth."""
-    return ray_and_depth(shift(pose, turn(pose, stretch(pose, point))))
+    return ray_of(shift(pose, turn(pose, stretch(pose, point))))
 
 
 @inlined
@@ -132,7 +132,7 @@ def write_derivatives(
     """Write derivatives (8,) of a u + b v and of c v into columns ``first`` and ``second``."""
     stretched = stretch(pose, point)
     turned = turn(pose, stretched)
-    slopes = ray_slopes(ray_and_depth(shift(pose, turned)), weights)
+    slopes = ray_slopes(ray_of(shift(pose, turned)), weights)
     write_motion(turned, slopes[0], rows, first)
     write_motion(turned, slopes[1], rows, second)
     for k in range(1, 3):
@@ -165,10 +165,7 @@ def reproject_batch(
     cameras: FloatArray,
     statuses: IntArray,
 ) -> tuple[FloatArray, IntArray]:
-    """Residuals (n, 2) [px] of the first poses in (B, k, 15), and checked statuses (B,).
-
-    A status becomes NOT_FOUND if a point lies behind the camera, OUT_OF_RANGE on overflow.
-    """
+    """Residuals (n, 2) [px] of the first poses in (B, k, 15), and statuses (B,) after checks."""
     residuals = np.empty((points.shape[0], 2))
     checked = statuses.copy()
     for b in range(offsets.shape[0] - 1):

@@ -39,7 +39,7 @@ _REJECTION = 200.0  # likelihood ratio at which a hypothesis is rejected
 _LOCAL_POINTS = 120
 _LOCAL_ITERATIONS = 6
 _LOCAL_ROUNDS = 3
-_FIRST_THRESHOLD_FACTOR = 2.0  # the first local round uses a wider threshold
+_FIRST_FACTOR = 2.0  # the first local round uses a wider threshold
 _LEAST_POINTS = 5
 _FINAL_ROUNDS = 20
 _FINAL_ITERATIONS = 50
@@ -198,7 +198,7 @@ def score_pose(
 @kernel
 def _optimize_locally(objective: Objective, threshold: float, pose: FloatArray) -> None:
     for r in range(_LOCAL_ROUNDS):
-        factor = _FIRST_THRESHOLD_FACTOR + (1.0 - _FIRST_THRESHOLD_FACTOR) * r / (_LOCAL_ROUNDS - 1)
+        factor = _FIRST_FACTOR + (1.0 - _FIRST_FACTOR) * r / (_LOCAL_ROUNDS - 1)
         some = _inliers_of(objective, factor * threshold, pose, _LOCAL_POINTS)
         if some.keypoints.points.shape[0] < _LEAST_POINTS:
             break
@@ -293,10 +293,7 @@ def draw_subset(state: StateArray, count: int, confidence: FloatArray, chosen: I
 def rigid_hypotheses(
     keypoints: KeypointEvidence, draws: IntArray, limit: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Poses (S, 15) from samples ``draws`` (S, k), and their truncated scores (S,) on all points.
-
-    The first three points of a sample give poses; all its points refine them, and the best is kept.
-    """
+    """Poses (S, 15) from samples ``draws`` (S, k), and truncated scores (S,) on all points."""
     free = np.ones(UNKNOWNS)
     free[6:] = 0.0
     memory, solutions = p3p_memory(), np.empty((MAX_POSES, POSE_SIZE))

@@ -145,7 +145,6 @@ class Minima(NamedTuple):
 
 @kernel
 def empty_minima(most: int, size: int) -> Minima:
-    """Allocate ``most`` minima with states of ``size`` numbers."""
     return Minima(
         np.zeros((most, size)),
         np.full(most, np.inf),

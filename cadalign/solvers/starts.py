@@ -38,10 +38,7 @@ def minimal_starts(
 
 @kernel
 def choose_subsets(points: FloatArray, subsets: IntArray) -> int:
-    """Write all subsets of 3 or 4 points, or k that span a large area or volume, to (k, 3 or 4).
-
-    Returns the number of subsets.
-    """
+    """Fill ``subsets`` (k, 3 or 4) with all, or k of large area or volume; returns their number."""
     n = points.shape[0]
     wanted, size = subsets.shape
     draw = np.arange(size)
@@ -119,7 +116,7 @@ def rotation_starts(points: FloatArray, rays: FloatArray, poses: FloatArray) -> 
     rotation = np.empty((3, 3))
     matrix = np.empty((3, 3))
     right = np.empty(3)
-    unstretched_coordinate = np.ones(3)
+    coordinate_of = np.ones(3)
     found = 0
     for k in range(wanted):
         s = (k + 0.5) / wanted
@@ -155,7 +152,7 @@ def rotation_starts(points: FloatArray, rays: FloatArray, poses: FloatArray) -> 
         if not cholesky(matrix, 3, 1e-12):
             continue
         solve_cholesky(matrix, 3, right)
-        pack_pose(rotation, right, unstretched_coordinate, poses[found])
+        pack_pose(rotation, right, coordinate_of, poses[found])
         found += 1
     return found
 

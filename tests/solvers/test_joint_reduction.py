@@ -9,14 +9,7 @@ from support.sighted import sighted_evidence
 
 from cadalign.solvers.joint.covariance import information_of, joint_covariance
 from cadalign.solvers.joint.equations import empty_joint_equations
-from cadalign.solvers.joint.evidence import (
-    Evidence,
-    Offsets,
-    Shape,
-    State,
-    packed,
-    points_of,
-)
+from cadalign.solvers.joint.evidence import Evidence, Offsets, Shape, State, packed, points_of
 from cadalign.solvers.joint.search import search_joint, used_points
 from cadalign.solvers.joint.system import joint_system
 from cadalign.solvers.search import evaluate

@@ -18,13 +18,7 @@ from cadalign.solvers.marginal.equations import (
     evaluate_posed,
     posed_cost,
 )
-from cadalign.solvers.marginal.problem import (
-    Mixture,
-    Seen,
-    mixture_at,
-    shape_at,
-    target_of,
-)
+from cadalign.solvers.marginal.problem import Mixture, Seen, mixture_at, shape_at, target_of
 from cadalign.solvers.marginal.search import search_view
 from cadalign.solvers.search import refine
 from cadalign.solvers.unknowns import move_rigid
@@ -116,7 +110,7 @@ def test_derivatives_of_the_determinant_equal_finite_differences(loss: int) -> N
         (log_determinant(step) - log_determinant(-step)) / 4e-5 for step in 1e-5 * np.eye(27)
     ]
     evaluate_posed(system, state, room)
-    derivatives = np.concatenate([room.turned, room.slope])
+    derivatives = np.concatenate([room.pose_slope, room.slope])
     assert derivatives == pytest.approx(np.array(by_difference), rel=1e-5, abs=1e-6)
 
 

@@ -10,18 +10,8 @@ from support.sighted import sighted_evidence
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import kernel
-from cadalign.solvers.joint.evidence import (
-    Evidence,
-    Focals,
-    Shape,
-    State,
-)
-from cadalign.solvers.joint.rows import (
-    BlockEquation,
-    equations_of,
-    plain_equation,
-    write_equation,
-)
+from cadalign.solvers.joint.evidence import Evidence, Focals, Shape, State
+from cadalign.solvers.joint.rows import BlockEquation, equations_of, plain_equation, write_equation
 from cadalign.solvers.joint.search import equations_at, packed, refine_joint
 from cadalign.solvers.linalg import cross, triple
 from cadalign.solvers.projection import turn, turn_back

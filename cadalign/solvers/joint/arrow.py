@@ -72,10 +72,7 @@ def add_gradient(arrow: Arrow, pose: int, row: FloatArray) -> None:
 
 @kernel
 def add_rows(arrow: Arrow, pose: int, rows: FloatArray, columns: int, products: FloatArray) -> None:
-    """Add equations of one pose: ``rows`` (6 + b + 1, C) are derivatives, then the residuals.
-
-    ``products`` (7 + b, 7 + b) is scratch space.
-    """
+    """Add ``rows`` (6 + b + 1, C) of one pose, residuals last; ``products`` is scratch space."""
     unknowns = 6 + arrow.border.shape[0]
     first, own = border_start(arrow), arrow.blocks.shape[1] * pose
     matrix, right = products[:unknowns, :unknowns], products[unknowns, :unknowns]

@@ -32,10 +32,7 @@ class JointCovariance(NamedTuple):
 
 
 def joint_covariance(evidence: Evidence, state: State) -> JointCovariance:
-    """Inverse information; infinite if not determined.
-
-    A scale at its bound gets the information of the whole prior, not of the flank alone.
-    """
+    """Inverse information, infinite if not determined; a scale at its bound has its whole prior."""
     bound = evidence.scales.bound
     if bound.weight > 0:
         whole = ScalePrior(whole_information(bound), bound.width)
@@ -84,10 +81,7 @@ def _point_jacobians(
     equations: JointEquations,
     sighted: BoolArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Derivatives (m, 3, 6 + b) of points by pose and border, and covariances of the remainder.
-
-    The remainder (m, 3, 3) is the part of eliminated displacements and of unused modes.
-    """
+    """Derivatives (m, 3, 6 + b) of points by pose and border, other covariances (m, 3, 3)."""
     shape, scale, axes = reduced.shape, np.exp(state.log_scales), np.arange(3)
     modes, points = shape.modes.transpose(1, 2, 0), points_of(shape, state)
     first = 6 + len(evidence.focals.low)

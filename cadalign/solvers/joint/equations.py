@@ -25,10 +25,10 @@ from cadalign.solvers.joint.evidence import (
     Evidence,
     Shape,
     State,
+    coordinate_of,
     exp_triple,
     remove_displacements,
     stretched_point,
-    unstretched_coordinate,
 )
 from cadalign.solvers.joint.rows import count_block_equations, write_block_row
 from cadalign.solvers.linalg import cholesky, cross, dot, factorize, solve_factor_rows
@@ -340,7 +340,7 @@ def _add_slopes(
     for i in range(slopes.shape[0]):
         for c in range(3):
             if slopes[i, c] != 0.0:
-                gradient[first + c] += slopes[i, c] * unstretched_coordinate(shape, state, i, c)
+                gradient[first + c] += slopes[i, c] * coordinate_of(shape, state, i, c)
                 for k in range(shape.modes.shape[0]):
                     gradient[first + 3 + k] += slopes[i, c] * shape.modes[k, i, c]
 

@@ -87,10 +87,7 @@ class Focals(NamedTuple):
 
 
 class Directions(NamedTuple):
-    """Directions known as unit vectors ``model`` and ``camera`` (D, 3), in views ``image`` (D,).
-
-    ``whitening`` is (D, 3, 3) [1/rad].
-    """
+    """Unit vectors ``model``, ``camera`` (D, 3) in views (D,), ``whitening`` (D, 3, 3) [1/rad]."""
 
     model: FloatArray
     camera: FloatArray
@@ -246,16 +243,15 @@ def exp_triple(logs: FloatArray) -> Triple:
 
 @inlined
 def stretched_point(shape: Shape, state: State, scale: Triple, i: int) -> Triple:
-    """Point i in the model's frame, with ``scale`` applied."""
     return (
-        scale[0] * unstretched_coordinate(shape, state, i, 0),
-        scale[1] * unstretched_coordinate(shape, state, i, 1),
-        scale[2] * unstretched_coordinate(shape, state, i, 2),
+        scale[0] * coordinate_of(shape, state, i, 0),
+        scale[1] * coordinate_of(shape, state, i, 1),
+        scale[2] * coordinate_of(shape, state, i, 2),
     )
 
 
 @inlined
-def unstretched_coordinate(shape: Shape, state: State, i: int, a: int) -> float:
+def coordinate_of(shape: Shape, state: State, i: int, a: int) -> float:
     """Coordinate a of point i before the stretch."""
     value = shape.mean[i, a] + state.displacements[i, a]
     for k in range(shape.modes.shape[0]):

@@ -24,20 +24,13 @@ from cadalign.solvers.joint.evidence import (
     ScalePriors,
     Shape,
     State,
+    coordinate_of,
     exp_triple,
     remove_displacements,
     stretched_point,
-    unstretched_coordinate,
 )
 from cadalign.solvers.linalg import cross, dot, multiply, triple
-from cadalign.solvers.projection import (
-    ray_and_depth,
-    ray_slopes,
-    shift,
-    turn,
-    turn_back,
-    write_motion,
-)
+from cadalign.solvers.projection import ray_of, ray_slopes, shift, turn, turn_back, write_motion
 
 equations_of = kernel_family("equations_of")
 """``(block)``: number of equations of a block."""
@@ -63,7 +56,6 @@ class BlockEquation(NamedTuple):
 
 @kernel
 def count_block_equations(evidence: Evidence) -> int:
-    """Number of equations of all blocks."""
     count = 0
     for block in unrolled(evidence.blocks):
         count += equations_of(block)
@@ -150,9 +142,7 @@ def _write_offset(
         for a in range(3):
             along = sign * offsets.direction[j, a]
             if along != 0.0:
-                stretched = np.exp(state.log_scales[a]) * unstretched_coordinate(
-                    evidence.shape, state, i, a
-                )
+                stretched = np.exp(state.log_scales[a]) * coordinate_of(evidence.shape, state, i, a)
                 value += along * stretched
                 _add_shape(evidence.shape, state, i, a, weight * along, row)
     return plain_equation(p, value * weight)
@@ -164,7 +154,7 @@ def _add_shape(shape: Shape, state: State, i: int, a: int, slope: float, row: Fl
     modes = shape.modes.shape[0]
     first = row.shape[0] - modes - 3
     scale = slope * np.exp(state.log_scales[a])
-    row[first + a] += scale * unstretched_coordinate(shape, state, i, a)
+    row[first + a] += scale * coordinate_of(shape, state, i, a)
     for k in range(modes):
         row[first + 3 + k] += scale * shape.modes[k, i, a]
 
@@ -199,7 +189,7 @@ def write_rows(
         point = stretched_point(shape, state, scale, i)
         turned = turn(motion, point)
         in_camera, axis = shift(camera, turn(camera, shift(motion, turned))), triple(rig.axes[v])
-        place = ray_and_depth(in_camera)
+        place = ray_of(in_camera)
         u, w, depth = place
         if not depth > 0:
             return np.inf

@@ -36,10 +36,7 @@ class JointMinima(NamedTuple):
 def search_joint(
     evidence: Evidence, poses: FloatArray, log_focals: FloatArray, log_scales: FloatArray
 ) -> tuple[JointMinima, int]:
-    """Search for minima from S starts; also return the number of iterations.
-
-    Starts have the mean shape, poses (S, P, 12), log focals (S, F) and log scales (S, 3).
-    """
+    """Minima from starts (S, P, 12), (S, F), (S, 3) of the mean shape, and iterations."""
     reduction, count = reduce_modes(evidence), len(poses)
     fewer = reduction.evidence
     if not count:
@@ -85,7 +82,7 @@ def _has_latent(evidence: Evidence) -> bool:
 def refine_joint(
     evidence: Evidence, max_iterations: int, state: State
 ) -> tuple[float, float, State]:
-    """Improve a state; returns cost, score and state. Behind a camera, both are infinite."""
+    """Improve a state; returns cost, score (both infinite behind a camera) and state."""
     reduction, row = pack_reduced(evidence, state)
     fewer, effort = reduction.evidence, Effort(1, max_iterations, 0, np.inf)
     system = joint_system(fewer, integrates=_has_latent(fewer))
@@ -172,16 +169,16 @@ class Reduction(NamedTuple):
     (K + 3 u, r), the coefficients are ``basis @ reduced`` plus a remainder that moves none of these
     points; both keep a standard normal prior. With several poses, the displacements of sighted
     points become modes: row K + 3 j + a of the basis is axis a of point ``displaced[j]`` (u,).
-    ``whole`` is the shape before the reduction.
+    ``full_shape`` is the shape before the reduction.
     """
 
     evidence: Evidence
     basis: FloatArray
     displaced: IntArray
-    whole: Shape
+    full_shape: Shape
 
     def reduce_state(self, state: State) -> State:
-        moved = state.displacements[self.displaced] / self.whole.spread[self.displaced, None]
+        moved = state.displacements[self.displaced] / self.full_shape.spread[self.displaced, None]
         displacements = state.displacements.copy()
         displacements[self.displaced] = 0.0
         given = np.concatenate([state.coefficients, moved.ravel()])
@@ -190,13 +187,13 @@ class Reduction(NamedTuple):
     def expand_state(self, row: FloatArray) -> State:
         """Expand a packed reduced state to all coefficients and displacements."""
         focals, reduced = len(self.evidence.focals.low), self.basis.shape[1]
-        modes, points = len(self.whole.modes), len(self.whole.mean)
+        modes, points = len(self.full_shape.modes), len(self.full_shape.mean)
         sizes = focals, 3, reduced, 3 * points
         ends = np.cumsum([len(row) - sum(sizes), *sizes[:-1]])
         poses, log_focals, log_scales, fewer, moved = np.split(row, ends)
         given, displacements = self.basis @ fewer, moved.reshape(-1, 3).copy()
         own = given[modes:].reshape(-1, 3)
-        displacements[self.displaced] = own * self.whole.spread[self.displaced, None]
+        displacements[self.displaced] = own * self.full_shape.spread[self.displaced, None]
         return State(poses.reshape(-1, 12), log_focals, log_scales, given[:modes], displacements)
 
 

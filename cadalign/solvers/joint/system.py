@@ -83,9 +83,8 @@ def joint_system(evidence: Evidence, *, integrates: bool) -> Joint:
 @allocate.of(Joint)
 @kernel
 def _allocate(system: Joint) -> tuple[JointEquations, JointEquations]:
-    return empty_joint_equations(system.evidence, system.layout), empty_joint_equations(
-        system.evidence, system.layout
-    )
+    evidence, layout = system.evidence, system.layout
+    return empty_joint_equations(evidence, layout), empty_joint_equations(evidence, layout)
 
 
 @evaluate.of(Joint)
@@ -272,12 +271,10 @@ def _are_same(system: Joint, first_row: FloatArray, second_row: FloatArray) -> b
 
 @kernel
 def run_joint(system: Joint, starts: FloatArray, effort: Effort) -> tuple[Minima, JointEquations]:
-    """Search from starts (S, D); returns the minima, and equations.
+    """Search from starts (S, D); with ``effort.starts`` 0, evaluate costs and the last equations.
 
-    With ``effort.starts`` 0, only evaluate: ``costs`` are those of the starts, and equations those
-    of the last start. One kernel does both, to compile the equations only once. If the shape is
-    integrated out, a few steps on the plain cost select promising starts; ``costs`` of the minima
-    are plain ones.
+    One kernel does both, to compile the equations only once. If the shape is integrated out, a few
+    steps on the plain cost select promising starts; ``costs`` of the minima are plain ones.
     """
     plain = Joint(system.evidence, system.layout, False)
     integrates, size = system.integrates, starts.shape[1]

@@ -54,7 +54,7 @@ from cadalign.solvers.marginal.problem import (
 )
 from cadalign.solvers.projection import (
     motion_of,
-    ray_and_depth,
+    ray_of,
     ray_slopes,
     shift,
     slope_of_row,
@@ -69,7 +69,7 @@ POSE_UNKNOWNS = 6
 POSE = 12  # length of the pose at the start of a state
 _RESIDUAL = 6
 _SAME_CHORD = 0.05
-_LEAST_INFORMATION = 25.0  # about a rotation [1 / rad^2]; below, the posterior is not Gaussian
+_LEAST_INFORMATION = 25.0  # added about rotations [1 / rad^2]: large angles are not Gaussian
 
 
 class Posed(NamedTuple):
@@ -91,9 +91,9 @@ class PosedEquations(NamedTuple):
     (7, 2 n) are derivatives by the pose, then the residuals e, minus A S h if the shape is
     integrated out. ``by_shape`` (2 n, 3) are derivatives by the own point, not whitened. ``factor``
     (2 n, 2 n) is the upper Cholesky factor of M with an inverted diagonal. ``slope`` (3 n,) is h;
-    ``turned`` (6,) is half the derivative of log det M by the pose, for a constant shape. ``sums``
-    (2,) are the constant of the predicted decrease of F, and log det M. The columns of ``points``
-    (n, 3) are the depth and, for u and v, the residual times `weight_slope`.
+    ``pose_slope`` (6,) is half the derivative of log det M by the pose, for a constant shape.
+    ``sums`` (2,) are the constant of the predicted decrease of F, and log det M. The columns of
+    ``points`` (n, 3) are the depth and, for u and v, the residual times `weight_slope`.
     """
 
     normal: Equations
@@ -102,7 +102,7 @@ class PosedEquations(NamedTuple):
     by_shape: FloatArray
     factor: FloatArray
     slope: FloatArray
-    turned: FloatArray
+    pose_slope: FloatArray
     sums: FloatArray
     points: FloatArray
     right: FloatArray
@@ -163,7 +163,7 @@ def evaluate_posed(system: Posed, state: FloatArray, equations: PosedEquations) 
     mirror_upper(hessian)
     if system.integrates:
         for k in range(POSE_UNKNOWNS):
-            gradient[k] += equations.turned[k]
+            gradient[k] += equations.pose_slope[k]
     return cost
 
 
@@ -184,7 +184,7 @@ def _write_rows(system: Posed, state: FloatArray, equations: PosedEquations) -> 
         turned = turn(
             motion, (mean[i, 0] + offset[0], mean[i, 1] + offset[1], mean[i, 2] + offset[2])
         )
-        place = ray_and_depth(shift(motion, turned))
+        place = ray_of(shift(motion, turned))
         if not place[2] > 0:
             return np.inf
         du, dv = place[0] - seen.rays[i, 0], place[1] - seen.rays[i, 1]
@@ -212,7 +212,7 @@ def _write_slopes(system: Posed, state: FloatArray, equations: PosedEquations) -
     """Write half the derivatives of log det M by points and pose."""
     points, square, lever = equations.points, equations.square, equations.lever
     covariance, mean = system.target.covariance, system.target.mean
-    by_shape, slope, turned = equations.by_shape, equations.slope, equations.turned
+    by_shape, slope, turned = equations.by_shape, equations.slope, equations.pose_slope
     size = by_shape.shape[0]
     forced = np.empty(3 * mean.shape[0])
     for q in range(size):  # y_q: rows of S A' M^-1 for the own point
@@ -286,7 +286,7 @@ def _solve(system: Posed, equations: PosedEquations, damping: float, step: Float
     expected = float(equations.sums[0])
     if system.integrates:
         for k in range(POSE_UNKNOWNS):
-            expected -= 2.0 * equations.turned[k] * step[k]
+            expected -= 2.0 * equations.pose_slope[k] * step[k]
     for c in range(rows.shape[1]):
         total = rows[_RESIDUAL, c]
         for k in range(POSE_UNKNOWNS):

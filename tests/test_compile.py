@@ -1,4 +1,4 @@
-"""Compiled kernels on disk, where several processes compile and read them at the same time."""
+"""Disk cache of compiled kernels, used by several processes at the same time."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def one(x):
 """
 CALL = """
 import sys
-sys.dont_write_bytecode = True  # of sources that change more than once in a second
+sys.dont_write_bytecode = True  # the sources change more than once per second
 sys.path.insert(0, {folder!r})
 import importlib
 one = importlib.import_module({module!r}).one
@@ -76,7 +76,7 @@ print(sum(one.stats.cache_hits.values()))
 
 
 def call(folder: Path, module: str, value: float, cache: Path) -> int:
-    """Call a kernel in a process; gives how often code was found on disk."""
+    """Call a kernel in a new process; returns the number of cache hits."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("NUMBA_CACHE_DIR", str(cache))
         return hits(Program(CALL.format(folder=str(folder), module=module, value=value)))
@@ -133,7 +133,7 @@ def test_the_folder_is_named_by_versions_and_every_module_with_kernels(
 def test_kernels_do_without_private_names_of_numba(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One fit takes a minute then: members of a family, and the kernels that call them, do."""
+    """Small kernels and a family stand for a fit, which would take a minute."""
     code = """
 import numba.core.codegen, numpy as np, typing
 del numba.core.codegen.JITCodeLibrary
@@ -166,7 +166,7 @@ assert np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-9
 
 
 @pytest.mark.long
-def test_nothing_is_lost_where_nothing_can_be_written(tmp_path: Path) -> None:
+def test_kernels_compile_without_write_access(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     write(tmp_path / "a", "1.0")
     assert call(tmp_path / "a", "kernels", 2.0, tmp_path / "file") == 0
@@ -181,7 +181,7 @@ def cut(data: bytes) -> bytes:
 
 
 def zeroed(data: bytes) -> bytes:
-    """The last pages of a file that were not written when the power failed."""
+    """A file whose last pages a power failure left unwritten."""
     return data[: len(data) // 3] + bytes(len(data) - len(data) // 3)
 
 
@@ -192,7 +192,7 @@ def test_damaged_code_is_compiled_anew(
 ) -> None:
     (tmp_path / "a").mkdir()
     source = SOURCES.format(term="1.0")
-    # What another kernel calls has a file of its own.
+    # A kernel that another one calls has its own file.
     (tmp_path / "a" / "kernels.py").write_text(
         source.replace("one", "inner")
         + source.replace("x + 1.0", "inner(x)").split("import kernel")[1]
@@ -214,7 +214,7 @@ class Terminal(io.StringIO):
 
 
 @pytest.mark.parametrize("stream", [Terminal(), io.StringIO()])
-def test_a_terminal_is_told_once_that_compiling_takes_its_time(
+def test_compilation_is_announced_once_on_a_terminal(
     stream: io.StringIO, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
@@ -224,7 +224,7 @@ def test_a_terminal_is_told_once_that_compiling_takes_its_time(
         return 2.0 * x
 
     monkeypatch.setattr(sys, "stderr", stream)
-    once.tell_compiling.cache_clear()
+    once.announce_compiling.cache_clear()
     assert (doubled(1.0), doubled(1)) == (2.0, 2.0)
-    told = "Compiling cadalign's solvers, once for this version: this takes up to a minute\n"
-    assert stream.getvalue() == (told if stream.isatty() else "")
+    message = "Compiling cadalign's solvers (once per version, up to a minute)\n"
+    assert stream.getvalue() == (message if stream.isatty() else "")

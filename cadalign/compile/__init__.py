@@ -1,6 +1,6 @@
-"""Compile kernels, and keep their code on disk.
+"""Decorators that compile kernels with Numba and cache their code on disk.
 
-Nothing else in cadalign calls Numba's compiler.
+No other module of cadalign calls Numba's compiler.
 """
 
 from __future__ import annotations
@@ -14,48 +14,47 @@ from numba.extending import overload
 
 try:
     from cadalign.compile.once import KernelDispatcher
-except (ImportError, AttributeError):  # Numba has no longer what this rests on
+except (ImportError, AttributeError):  # this version of Numba lacks a private name
     KernelDispatcher = None  # type: ignore[assignment, misc]
 
 __all__ = ["borrowing", "fast_sums", "inlined", "kernel", "kernel_family", "unrolled"]
 
 unrolled = numba.literal_unroll
-"""Loop over a tuple of several types; the body is compiled for each."""
+"""Iterate over a tuple of mixed types; the loop body is compiled for each type."""
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 def kernel(function: F) -> F:
-    """Compile on first use, keep the result on disk, release the interpreter lock while running.
+    """Compile on first use, cache the code on disk, and release the GIL while it runs.
 
-    Floating-point operations keep their order and rounding: contraction into fused multiply-adds,
-    for one, differs between code just compiled and code read back from disk, and results must be
-    the same bit for bit.
+    Floating-point operations keep their order and rounding, so that results are identical bit for
+    bit. Fused multiply-adds, for example, differ between fresh code and code read from disk.
     """
-    return _compiled(function)
+    return _compile(function)
 
 
 def fast_sums(function: F) -> F:
-    """Like `kernel`, but sums may be reordered, so that they run on vector units."""
-    return _compiled(function, fastmath={"reassoc"})
+    """Like `kernel`, but sums may be reordered, so that they use SIMD instructions."""
+    return _compile(function, fastmath={"reassoc"})
 
 
 def inlined(function: F) -> F:
-    """Like `borrowing`, for a small function that is always compiled into its callers."""
-    return _compiled(function, forceinline=True, counts=False)
+    """Like `borrowing`, for a small function that is always inlined into its callers."""
+    return _compile(function, forceinline=True, counts=False)
 
 
 def borrowing(function: F) -> F:
-    """Like `kernel`, for a function that makes no arrays and returns none.
+    """Like `kernel`, without reference counts, for a function that allocates no array.
 
-    It works on arrays of its callers, and does not count its references to them: Numba counts by
-    atomic operations, a hundred of which take as long as an iteration with ten keypoints.
+    It must not return an array either. Numba counts references with atomic operations: a hundred
+    of them take as long as an iteration with ten keypoints.
     """
-    return _compiled(function, counts=False)
+    return _compile(function, counts=False)
 
 
-def _compiled(function: F, *, counts: bool = True, **chosen: Any) -> F:
-    # Options that are not said are those of the kernel that calls a function.
+def _compile(function: F, *, counts: bool = True, **chosen: Any) -> F:
+    # A function inherits an option that is not set here from the kernel that calls it.
     options: Any = {"nogil": True, "error_model": "numpy", "boundscheck": False}
     options |= {"fastmath": False, "forceinline": False, **chosen}
     if KernelDispatcher is None:
@@ -72,10 +71,10 @@ class KernelFamily(Protocol):
 
 
 def kernel_family(name: str) -> KernelFamily:
-    """A kernel of one name with a member for each type of its first argument.
+    """Create a kernel that dispatches on the type of its first argument, at compile time.
 
-    ``@family.of(kind)`` decorates the member for a type of NamedTuple. What calls the family is
-    compiled once for each of these types, with the member of that type in it.
+    ``@family.of(kind)`` registers the member for a type of NamedTuple. A kernel that calls the
+    family is compiled once for each of these types.
     """
     members: dict[type, Any] = {}
 

@@ -1,4 +1,4 @@
-"""Folder of compiled kernels."""
+"""Cache folder of compiled kernels."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _SOURCES = (
     "shapes/gaussians.py",
     "geometry/clipping.py",
 )
-"""Folders and files of all kernels, and of what compiles them."""
+"""Folders and files with kernels, and the compiler."""
 
 
 def kernel_folder() -> Path:
-    """Folder in $NUMBA_CACHE_DIR, or in the user's cache, named by sources and versions.
+    """Folder in $NUMBA_CACHE_DIR or in the user's cache, named by a hash of sources and versions.
 
-    Numba alone compiles a function anew when its own file changes, but not when one that it calls
-    in another file does.
+    A change of any source gives a new folder. Numba's own cache misses a change in another file
+    that a function calls.
     """
     users = Path(platformdirs.user_cache_dir("cadalign", appauthor=False), "kernels")
     return Path(os.environ.get("NUMBA_CACHE_DIR") or users) / _version(_PACKAGE)

@@ -1,8 +1,9 @@
-"""Kernels whose parts are optimized once, in the kernel that Python calls, and kept on disk.
+"""Dispatcher and disk cache that let LLVM optimize each kernel only once.
 
-Left alone, Numba optimizes every function, and again as a part of each that calls it, at every
-level: a first call takes three times as long. This module alone uses private names of Numba;
-`cadalign.compile` does without it where one of them is missing.
+By default Numba optimizes a function alone and again within each of its callers, which makes a
+first call three times as slow. Here a function that kernels call stays unoptimized until it is
+linked into the kernel that Python calls. Only this module uses private names of Numba. If one is
+missing, `cadalign.compile` uses Numba's own dispatcher.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ from numba.core.serialize import dumps
 from cadalign.compile.folder import kernel_folder
 
 _KIND = "part"
-_DIGITS = 20  # of the code that names a form
+_DIGITS = 20  # of the hash in a file name
 _CHECKSUM = hashlib.sha256().digest_size
 
 
 class KernelDispatcher(CPUDispatcher):
-    """A function compiled for Python and, apart from that, for the kernels that call it."""
+    """Compiles a function twice: for calls from Python, and as a part of other kernels."""
 
     def __init__(self, function: Any, options: dict[str, Any]) -> None:
         super().__init__(function, targetoptions=options, pipeline_class=KernelCompiler)
@@ -47,7 +48,7 @@ class KernelDispatcher(CPUDispatcher):
         return part
 
     def get_call_template(self, arguments: Any, keywords: Any) -> Any:
-        """Types of a call by a kernel; the number 3 takes the code of any integer."""
+        """Resolve a call from a kernel; literal types are widened, so 3 shares the integer code."""
         named = {name: types.unliteral(kind) for name, kind in keywords.items()}
         return self._part.get_call_template(tuple(map(types.unliteral, arguments)), named)
 
@@ -56,27 +57,27 @@ class KernelDispatcher(CPUDispatcher):
 
 
 class KernelLibrary(JITCodeLibrary):
-    """Code that Python calls, without LLVM's slow and useless rewriting of addresses in loops."""
+    """Code that Python calls, without LLVM's loop strength reduction: slow and no gain here."""
 
     def _finalize_final_module(self) -> None:
         binding.set_option("cadalign", "-disable-lsr=true")
-        try:  # Numba's lock keeps other compilations out
+        try:  # Numba's lock excludes other compilations
             super()._finalize_final_module()
         finally:
             binding.set_option("cadalign", "-disable-lsr=false")
 
 
 class PartLibrary(JITCodeLibrary):
-    """Code that is linked into kernels: intermediate code, optimized there, without an address."""
+    """Intermediate code that is linked into kernels and optimized there; it has no address."""
 
-    is_optimized = False  # what may be reordered is, by itself: that once, for the same bits in all
+    is_optimized = False  # True for code with reordered sums: all its callers get the same bits
 
     @property
     def codegen(self) -> Any:
         return self
 
     def set_env(self, name: str, environment: Any) -> None:
-        """Nothing: the kernel that the function ends up in is told its environment."""
+        """Do nothing: the kernel that includes this code sets its environment."""
 
     def get_pointer_to_function(self, name: str) -> int:
         return 0
@@ -105,20 +106,19 @@ class PartLibrary(JITCodeLibrary):
 
 
 @cache
-def tell_compiling() -> None:
-    """Say on a terminal or in a notebook, once in a process, that compiling takes its time."""
+def announce_compiling() -> None:
+    """Announce the compilation on a terminal or in a notebook, once per process."""
     if sys.stderr.isatty() or "ipykernel" in sys.modules:
-        told = "Compiling cadalign's solvers, once for this version: this takes up to a minute\n"
-        sys.stderr.write(told)
+        sys.stderr.write("Compiling cadalign's solvers (once per version, up to a minute)\n")
         sys.stderr.flush()
 
 
 class KernelCompiler(compiler.Compiler):
-    """Compiler of a kernel that Python calls, or of one that other kernels call."""
+    """Compiler of a kernel for Python, or of a part of other kernels."""
 
     def compile_extra(self, function: Any) -> Any:
-        """Compile a function; what it calls, Numba's own functions among it, becomes its parts."""
-        tell_compiling()
+        """Compile a function; the functions that it calls, also Numba's own, become parts."""
+        announce_compiling()
         codegen = self.state.targetctx.codegen()
         is_part, is_fast = self.state.flags.no_cpython_wrapper, bool(self.state.flags.fastmath)
         library = PartLibrary if is_part else KernelLibrary
@@ -133,7 +133,7 @@ class KernelCompiler(compiler.Compiler):
 
 
 class _CodeReader(pickle.Unpickler):
-    """A reader that imports nothing: Numba imports the module of every function in the code."""
+    """Unpickler that does not import the modules of compiled functions, as Numba's would."""
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == ("numba.core.environment", "_rebuild_env"):
@@ -142,7 +142,7 @@ class _CodeReader(pickle.Unpickler):
 
 
 def _environment(module: str, constants: list[Any], name: str) -> Any:
-    """Constants of a compiled function; only code in object mode reads its module's variables."""
+    """Environment with a function's constants; only object mode needs the module's variables."""
     found = lookup_environment(name)
     if found is None:
         found = Environment({"__name__": module})
@@ -152,24 +152,24 @@ def _environment(module: str, constants: list[Any], name: str) -> Any:
 
 
 class KernelCache:
-    """Compiled forms of one kernel, a file each, of code for Python or for other kernels.
+    """Disk cache of one kernel, with one file per signature and use.
 
-    A file begins with its checksum: what a power failure left of it might crash.
+    A file begins with a checksum, because damaged code could crash the process.
     """
 
     def __init__(self, function: Any, use: str) -> None:
         self._name = f"{function.__module__}.{function.__name__}"
-        self._place = function.__code__.co_firstlineno, use
+        self._location = function.__code__.co_firstlineno, use
         self.cache_path = str(kernel_folder())
 
     def _file(self, signature: Any, codegen: Any) -> Path:
-        form = repr((self._name, self._place, signature, codegen.magic_tuple()))
+        form = repr((self._name, self._location, signature, codegen.magic_tuple()))
         code = hashlib.sha256(form.encode()).hexdigest()[:_DIGITS]
         return Path(self.cache_path) / f"{self._name}-{code}.nbc"
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """Compiled code for a signature; None if there is none, or it is damaged."""
-        rtsys.initialize(target_context)  # all that code calls; Numba would import its front end
+        """Load the code for a signature; None if it is missing or damaged."""
+        rtsys.initialize(target_context)  # enough to run code, without importing Numba's front end
         try:
             content = self._file(signature, target_context.codegen()).read_bytes()
         except OSError:
@@ -181,11 +181,11 @@ class KernelCache:
         return compiler.CompileResult._rebuild(target_context, *parts)
 
     def save_overload(self, signature: Any, found: Any) -> None:
-        """Save code; where that is not possible every process compiles for itself."""
+        """Save code; without write access every process compiles for itself."""
         content = dumps(found._reduce())
         file = self._file(signature, found.codegen)
         written = file.with_suffix(f".{os.getpid()}")
-        with suppress(OSError):  # `cadalign doctor` says so
+        with suppress(OSError):  # `cadalign doctor` reports it
             file.parent.mkdir(parents=True, exist_ok=True)
             written.write_bytes(hashlib.sha256(content).digest() + content)
             written.replace(file)

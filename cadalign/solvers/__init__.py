@@ -1,7 +1,8 @@
-"""The solvers behind `cadalign.fit`, without its checks: points and rays in, alignments out.
+"""PnP solvers of `cadalign.fit`, without its input checks.
 
-`aepnp` is linear, `ap4p` minimal; `aepnp_paper` and `epnp` are baselines. All take ``points_3d``
-(n, 3) and ``rays`` (n, 2), the normalised image coordinates that `cadalign.Camera.normalize` gives.
+`aepnp` is a linear solver, `ap4p` a minimal one; `aepnp_paper` and `epnp` are baselines. All take
+``points_3d`` (n, 3) and ``rays`` (n, 2), normalised image coordinates as from
+`cadalign.Camera.normalize`.
 """
 
 from typing import TYPE_CHECKING

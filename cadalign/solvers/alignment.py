@@ -1,7 +1,7 @@
-"""The system of pose and stretch: 8 unknowns, from the keypoints of one view, and their covariance.
+"""Pose and stretch (8 unknowns) from the keypoints of one view, and their covariance.
 
 To add evidence, write a block as in `cadalign.solvers.evidence`, give `Objective` a field for it,
-and add its terms in `add_evidence` and `evaluate_cost`; everything else sums them through these.
+and add its terms in `evaluate_alignment` and `evaluate_cost`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from cadalign.solvers.evidence import (
     KeypointEvidence,
     add_keypoints,
     add_scale_prior,
-    beyond,
+    excess_of,
     keypoint_cost,
 )
 from cadalign.solvers.linalg import (
@@ -29,14 +29,14 @@ from cadalign.solvers.linalg import (
     mirror_upper,
     solve_cholesky,
 )
-from cadalign.solvers.search import are_same, cost_at, evaluate, move, room_of, score_of, solve
+from cadalign.solvers.search import allocate, are_same, cost_at, evaluate, move, score_of, solve
 from cadalign.solvers.unknowns import move_pose, uncenter
 
 _SAME_CHORD = 1e-3
 
 
 class Objective(NamedTuple):
-    """Evidence of one problem; ``free`` (8,) is 0 for an unknown that keeps its value, else 1."""
+    """Evidence of one problem; ``free`` (8,) is 1 for an estimated unknown, 0 for a fixed one."""
 
     free: FloatArray
     keypoints: KeypointEvidence
@@ -53,8 +53,7 @@ class Equations(NamedTuple):
 
 
 @kernel
-def room_for(unknowns: int) -> Equations:
-    """Room for the equations of so many unknowns."""
+def empty_equations(unknowns: int) -> Equations:
     return Equations(
         np.empty((unknowns, unknowns)),
         np.empty(unknowns),
@@ -63,16 +62,16 @@ def room_for(unknowns: int) -> Equations:
     )
 
 
-@room_of.of(Objective)
+@allocate.of(Objective)
 @kernel
-def _room_of(objective: Objective) -> tuple[Equations, Equations]:
-    return room_for(UNKNOWNS), room_for(UNKNOWNS)
+def _allocate(objective: Objective) -> tuple[Equations, Equations]:
+    return empty_equations(UNKNOWNS), empty_equations(UNKNOWNS)
 
 
 @evaluate.of(Objective)
 @borrowing
 def evaluate_alignment(objective: Objective, pose: FloatArray, equations: Equations) -> float:
-    """Build the Gauss-Newton system at a pose (15,); unit rows for unknowns that are not free."""
+    """Write the Gauss-Newton system at a pose (15,), with unit rows for fixed unknowns."""
     hessian, gradient = equations.hessian, equations.gradient
     hessian[:] = 0.0
     gradient[:] = 0.0
@@ -94,7 +93,7 @@ def evaluate_alignment(objective: Objective, pose: FloatArray, equations: Equati
 @borrowing
 def evaluate_cost(objective: Objective, pose: FloatArray) -> float:
     prior = objective.scale_prior
-    y, z = beyond(np.log(pose[13]), prior.width), beyond(np.log(pose[14]), prior.width)
+    y, z = excess_of(np.log(pose[13]), prior.width), excess_of(np.log(pose[14]), prior.width)
     return keypoint_cost(objective.keypoints, pose) + float(prior.weight * (y * y + z * z))
 
 
@@ -106,9 +105,9 @@ def _solve(objective: Objective, equations: Equations, damping: float, step: Flo
 
 @inlined
 def solve_damped(equations: Equations, unknowns: int, damping: float, step: FloatArray) -> float:
-    """Write the damped step; returns the decrease that it predicts, NaN for no solution."""
+    """Write the damped step; returns the decrease that it predicts, NaN if singular."""
     hessian, gradient, factor = equations.hessian, equations.gradient, equations.factor
-    least = 1e-300  # holds unknowns without evidence where they are
+    least = 1e-300  # keeps unknowns without evidence at their values
     for k in range(unknowns):
         least = max(least, LEAST_INFORMATION * hessian[k, k])
     for k in range(unknowns):
@@ -170,10 +169,10 @@ def replace_points(objective: Objective, points: FloatArray) -> Objective:
 
 @kernel
 def covariance_of(objective: Objective, pose: FloatArray, covariance: FloatArray) -> int:
-    """Write the covariance (8, 8) at a pose (15,); returns -1, or an undetermined unknown."""
+    """Write the covariance (8, 8) at a pose (15,); returns an undetermined unknown, or -1."""
     center, unit = center_and_unit(objective.keypoints.points)
     local = replace_points(objective, (objective.keypoints.points - center) / unit)
-    equations = room_for(UNKNOWNS)
+    equations = empty_equations(UNKNOWNS)
     evaluate_alignment(local, _center(pose, center, unit), equations)
     undetermined = _invert(equations.hessian, objective.free, covariance)
     _uncenter_covariance(pose, center, unit, covariance)
@@ -182,7 +181,7 @@ def covariance_of(objective: Objective, pose: FloatArray, covariance: FloatArray
 
 @kernel
 def center_and_unit(points: FloatArray) -> tuple[FloatArray, float]:
-    """The points' mean, and their root mean square distance from it."""
+    """Mean of the points, and their root mean square distance from it."""
     n = points.shape[0]
     center = np.zeros(3)
     for i in range(n):
@@ -197,7 +196,7 @@ def center_and_unit(points: FloatArray) -> tuple[FloatArray, float]:
 
 @kernel
 def _center(pose: FloatArray, center: FloatArray, unit: float) -> FloatArray:
-    """The pose of points (x - center) / unit, in these units."""
+    """Convert a pose of points x to one of points (x - center) / unit."""
     centered = pose.copy()
     uncenter(centered, -center, 1.0)
     for c in range(3):
@@ -207,7 +206,7 @@ def _center(pose: FloatArray, center: FloatArray, unit: float) -> FloatArray:
 
 @kernel
 def _invert(information: FloatArray, free: FloatArray, covariance: FloatArray) -> int:
-    """Write the inverse of an information matrix (8, 8); returns as `covariance_of`."""
+    """Write the inverse of an information matrix (8, 8); same return value as `covariance_of`."""
     diagonal = np.diag(information).copy()
     covariance[:] = 0.0
     if not cholesky(information, UNKNOWNS, UNOBSERVABLE):
@@ -233,7 +232,7 @@ def _invert(information: FloatArray, free: FloatArray, covariance: FloatArray) -
 def _uncenter_covariance(
     pose: FloatArray, center: FloatArray, unit: float, covariance: FloatArray
 ) -> None:
-    """Carry the covariance to points x: t = unit t' - R S center, and its derivatives."""
+    """Propagate the covariance to points x by the derivatives of t = unit t' - R S center."""
     size = UNKNOWNS
     jacobian = np.eye(size)
     shift = np.zeros(3)

@@ -20,26 +20,27 @@ def aepnp_paper(
     """Solve anisotropic PnP with the linear null-space solver of the AEPnP paper.
 
     Wei, Leutenegger, Kneip, "AEPnP: A Less-constrained EPnP Solver for Pose Estimation with
-    Anisotropic Scaling": four control points at the unit axes' ends and the origin; a point's
-    weights on them are (x, y, z, 1 - x - y - z), which the stretch leaves valid. Every point gives
-    two equations that are linear in the 12 camera-frame coordinates of the control points; their
-    null vector, up to its scale, holds the stretched axes. Axes are normalised one by one, so
-    noise leaves them not quite orthogonal: the returned rotation is the nearest one.
+    Anisotropic Scaling". The four control points are the origin and the ends of the unit axes. A
+    point has the weights (x, y, z, 1 - x - y - z) on them, with or without stretch. Every point
+    gives two linear equations in the 12 camera-frame coordinates of the control points. Their null
+    vector holds the stretched axes up to a common factor. Each axis is normalised separately, so
+    noise makes them not quite orthogonal; the nearest rotation is returned.
 
     Parameters
     ----------
     points_3d, rays
-        As for `cadalign.solvers.aepnp`; no directions.
+        As for `cadalign.solvers.aepnp`, but rays only as (n, 2).
 
     Returns
     -------
     rotation, translation, scale
-        As of `cadalign.solvers.aepnp`.
+        As from `cadalign.solvers.aepnp`.
 
     Raises
     ------
     DegenerateError
-        If there are fewer than 6 points, an axis comes out with no length, or numbers overflow.
+        If there are fewer than 6 points, they lie in one plane, an axis of the solution has zero
+        length, or numbers overflow.
     """
     points = np.asarray(points_3d, dtype=float)
     count = len(points)
@@ -57,7 +58,7 @@ def aepnp_paper(
     size = np.abs(squares).max()
     if not np.isfinite(size):
         raise out_of_range_error()
-    # Of norm 1: LAPACK does not converge where the squares of the entries overflow.
+    # Normalise: LAPACK does not converge where the squares of the entries overflow.
     _, vectors = np.linalg.eigh(squares / size)
     control_points = vectors[:, 0].reshape(4, 3)
     if (weights @ control_points[:, 2]).sum() < 0:
@@ -66,7 +67,7 @@ def aepnp_paper(
     axes = (control_points[:3] - origin).T
     lengths = np.linalg.norm(axes, axis=0)
     if not (lengths > 1e-12 * np.abs(control_points).max()).all():
-        what = "an axis of the model came out with no length"
+        what = "an axis of the solution has zero length"
         raise DegenerateError(what, where="points_3d", fix=SPAN_FIX)
     left, _, right = np.linalg.svd(axes / lengths)
     rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
@@ -99,7 +100,7 @@ def epnp(
     DegenerateError
         If there are fewer than 4 points or OpenCV finds no pose.
     """
-    import cv2  # takes longer to import than the rest
+    import cv2  # slow to import
 
     points = np.ascontiguousarray(points_3d, dtype=float)
     if len(points) < _EPNP_POINTS:
@@ -117,7 +118,7 @@ def epnp(
             flags=cv2.SOLVEPNP_EPNP,
         )
     except cv2.error as error:
-        raise DegenerateError(f"OpenCV refused the points ({error})", where="epnp") from None
+        raise DegenerateError(f"OpenCV rejected the points ({error})", where="epnp") from None
     if not found or not (np.isfinite(rotation_vector).all() and np.isfinite(translation).all()):
         raise DegenerateError("OpenCV found no pose", where="epnp")
     rotation, _ = cv2.Rodrigues(rotation_vector)

@@ -1,4 +1,4 @@
-"""Constants that compiled kernels share with their callers; importing them needs no compiler."""
+"""Constants shared by compiled kernels and their callers; imports without Numba."""
 
 from typing import Final, NamedTuple
 
@@ -8,36 +8,36 @@ POSE_SIZE: Final = 15
 """Length of a packed alignment: rotation row by row (9), translation (3), scale (3)."""
 
 UNOBSERVABLE: Final = 1e-11
-"""Share of an unknown's information that the others must leave for it to count as determined."""
+"""Least information about a determined unknown given the others, relative to its own."""
 
 LINEAR: Final = 0
 HUBER: Final = 1
 CAUCHY: Final = 2
-"""Losses on the length of a whitened residual."""
+"""Loss functions of the length of a whitened residual."""
 
 AP4P: Final = 0
 AEPNP: Final = 1
-"""Minimal solvers of RANSAC."""
+"""Solvers of RANSAC samples."""
 SAMPLE_SIZES: Final = (4, 6)
-"""Points per sample, by minimal solver."""
+"""Points per sample, indexed by `AP4P` and `AEPNP`."""
 LEAST_POINTS: Final = 3
-"""Keypoints that leave a pose a few alternatives; fewer leave it open."""
+"""Least number of keypoints that leave a finite number of poses."""
 
 
 class ScalePrior(NamedTuple):
-    """Prior on log scales: flat up to ``width``, then a Gaussian flank; ``weight`` 0 is none."""
+    """Prior on log scales: flat within +-``width``, Gaussian beyond; ``weight`` 0 for none."""
 
     weight: float
     width: float
 
 
 OK: Final = 0
-"""Status of a solved problem; kernels return one in place of an exception."""
+"""Status of a solved problem; kernels return a status instead of raising."""
 TOO_FEW: Final = 1
-"""Fewer points than the method needs."""
+"""Status: fewer points than the method needs."""
 DEGENERATE: Final = 2
-"""The points do not span a volume."""
+"""Status: the points do not span a volume."""
 NOT_FOUND: Final = 3
-"""No alignment with all points in front of the camera."""
+"""Status: no alignment with all points in front of the camera."""
 OUT_OF_RANGE: Final = 4
-"""The numbers of the solution overflow."""
+"""Status: the numbers of the solution overflow."""

@@ -1,8 +1,7 @@
-"""Draws from the posterior of an alignment: where each leads, and how likely it is.
+"""Draws from the posterior of an alignment: their deviations and log densities.
 
-The coordinates, in which the posterior is nearly Gaussian, are steps from an alignment: a rotation
-vector, the change of the centroid's direction (u, v) and of its log distance, and the logarithms of
-scales and focal length over the alignment's.
+The posterior is nearly Gaussian in these 10 coordinates, all relative to the estimate: rotation
+vector (3), the centroid's direction (u, v) and log depth (3), log scales (3), log focal length.
 """
 
 from __future__ import annotations
@@ -17,28 +16,28 @@ from cadalign.solvers.projection import project_point, scalars_of
 from cadalign.solvers.unknowns import move_rigid
 
 COORDINATES = 10
-_MOST_LOG_RATIO = 3.0  # of distance, scales and focal length to the estimates: priors end there
+_MOST_LOG_RATIO = 3.0  # largest log change of distance, scales and focal length: the priors' bound
 
 
 class CentredAlignment(NamedTuple):
-    """An alignment of keypoints about their centroid."""
+    """An alignment of keypoints, relative to their centroid."""
 
     pose: FloatArray  # (15,) packed; the translation is the centroid in the camera
-    center: FloatArray  # (3,) of the keypoints
-    translation: FloatArray  # (3,) of the alignment
+    center: FloatArray  # (3,) centroid of the keypoints in the model
+    translation: FloatArray  # (3,) of the alignment itself
 
 
 class WhitenedPixels(NamedTuple):
-    """Whitened pixels over the principal point, as linear in rays: ``fixed + slopes ray``."""
+    """Whitened pixels relative to the principal point, linear in rays: ``fixed + slopes @ ray``."""
 
     points: FloatArray  # (n, 3) about their centroid
     slopes: FloatArray  # (n, 2, 2)
     fixed: FloatArray  # (n, 2)
-    seen: FloatArray  # (n, 2)
+    seen: FloatArray  # (n, 2), observed
 
 
 class LogPriors(NamedTuple):
-    """Priors on logarithms: of scales, free within a width, and on the change of a focal length."""
+    """Priors on log scales (flat within a width) and on the log change of a focal length."""
 
     scale_weight: float
     scale_width: float
@@ -52,8 +51,8 @@ def weigh_draws(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Deviations (k, 10), costs (k,) and log densities (k,) at coordinates (k, 10).
 
-    Deviations are of the unknowns of a result's covariance; costs are infinite behind the camera;
-    densities are over uniform rotations.
+    Deviations are in the unknowns of a result's covariance. Costs are infinite behind the camera.
+    Densities are relative to uniformly distributed rotations.
     """
     count = len(steps)
     deviations, costs, logs = steps.copy(), np.empty(count), np.empty(count)
@@ -75,7 +74,7 @@ def weigh_draws(
         for j in range(5, COORDINATES):
             within = within and abs(step[j]) <= _MOST_LOG_RATIO
         logs[k] = -0.5 * costs[k] if within else -np.inf
-        if within and angle > 0.0:  # uniform rotations, over their vectors
+        if within and angle > 0.0:  # density of uniform rotations in rotation vectors
             logs[k] += 2.0 * np.log(np.sin(0.5 * angle) / (0.5 * angle))
     return deviations, costs, logs
 

@@ -1,8 +1,8 @@
-"""Evidence about an alignment: each block adds its part to the cost and the normal equations.
+"""Blocks of evidence about an alignment: their costs and normal equations.
 
-A block is a NamedTuple of its data with two kernels: one returns its cost at a pose, the other also
-adds J' W J to the upper triangle of a ``hessian`` (U, U) and J' W r to a ``gradient`` (U,), in the
-order of `cadalign.solvers.unknowns`. `cadalign.solvers.alignment` sums the blocks.
+A block is a NamedTuple of data with two kernels. One returns the cost at a pose. The other also
+adds J' W J to the upper triangle of a ``hessian`` (U, U) and J' W r to a ``gradient`` (U,), ordered
+as in `cadalign.solvers.unknowns`. `cadalign.solvers.alignment` sums the blocks.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ from cadalign.solvers.linalg import Triple, add_products, copy_into
 from cadalign.solvers.projection import Scalars, project_point, scalars_of, write_derivatives
 
 BLOCK = 32
-"""Points whose derivatives are written before their products are summed."""
+"""Number of points whose derivatives are buffered before their products are summed."""
 
 
 class KeypointEvidence(NamedTuple):
-    """Model points (n, 3), their observed rays (n, 2), and the loss on their whitened residuals.
+    """Model points (n, 3), observed rays (n, 2), and the loss of their whitened residuals.
 
-    A row (a, b, c) of ``whitening`` (1 or n, 3) is such that (a du + b dv, c dv) has unit
-    covariance for an error (du, dv) of a ray. The loss starts to bend at the length ``loss_scale``.
+    With a row (a, b, c) of ``whitening`` (1 or n, 3), an error (du, dv) of a ray has the whitened
+    residual (a du + b dv, c dv), of unit covariance. ``loss_scale`` is the length at which the loss
+    departs from squares.
     """
 
     points: FloatArray
@@ -43,7 +44,7 @@ def add_keypoints(
     hessian: FloatArray,
     gradient: FloatArray,
 ) -> float:
-    """Add the keypoints' part; returns its cost. ``rows`` (9, 2 * BLOCK) is scratch space."""
+    """Add the keypoints' equations; returns their cost. ``rows`` (9, 2 * BLOCK) is scratch."""
     cost = 0.0
     for start in range(0, keypoints.points.shape[0], BLOCK):
         size = min(BLOCK, keypoints.points.shape[0] - start)
@@ -58,7 +59,7 @@ def add_keypoints(
 def _write_rows(
     keypoints: KeypointEvidence, pose: FloatArray, start: int, size: int, rows: FloatArray
 ) -> float:
-    """Write derivatives and, last, residuals, those of v behind those of u; returns the cost."""
+    """Write derivatives and, in the last row, residuals: all u, then all v; returns the cost."""
     points, rays, whitening = keypoints.points, keypoints.rays, keypoints.whitening
     scalars = scalars_of(pose)
     loss, loss_scale = keypoints.loss, keypoints.loss_scale
@@ -82,7 +83,10 @@ def _write_rows(
 
 
 class Weight(NamedTuple):
-    """Cost of a ray's error, whitened residual (u, v) and whitening, times the weight's root."""
+    """Cost of a ray's error, and the square ``root`` of its weight.
+
+    The whitened residual (u, v) and the whitening are multiplied by this root.
+    """
 
     cost: float
     root: float
@@ -93,7 +97,7 @@ class Weight(NamedTuple):
 
 @inlined
 def weigh_error(weights: Triple, du: float, dv: float, loss: int, loss_scale: float) -> Weight:
-    """Whiten an error (du, dv) of a ray, and weigh it by its loss."""
+    """Whiten an error (du, dv) of a ray, and weight it by the loss."""
     u, v = weights[0] * du + weights[1] * dv, weights[2] * dv
     cost, root = loss_and_root(loss, loss_scale, u * u + v * v)
     whitening = root * weights[0], root * weights[1], root * weights[2]
@@ -102,7 +106,7 @@ def weigh_error(weights: Triple, du: float, dv: float, loss: int, loss_scale: fl
 
 @inlined
 def loss_and_root(loss: int, scale: float, square: float) -> tuple[float, float]:
-    """The loss of a squared residual, and the root of the weight that it gives to the residual."""
+    """Loss of a squared residual, and the square root of the residual's weight."""
     if loss == LINEAR:
         return square, 1.0
     if loss == HUBER:
@@ -115,8 +119,8 @@ def loss_and_root(loss: int, scale: float, square: float) -> tuple[float, float]
 
 
 @inlined
-def fall_of_weight(loss: int, scale: float, root: float, square: float) -> float:
-    """Derivative of the logarithm of the weight's root, over r' dr, of weighted residuals r."""
+def weight_slope(loss: int, scale: float, root: float, square: float) -> float:
+    """Change of log(root) per r' dr, with the weight's ``root`` and weighted residuals r."""
     if loss == LINEAR or root == 1.0:
         return 0.0
     return -0.5 / square if loss == HUBER else -1.0 / (scale * scale)
@@ -136,7 +140,7 @@ def squared_error(keypoints: KeypointEvidence, pose: Scalars, i: int) -> float:
 
 @borrowing
 def keypoint_cost(keypoints: KeypointEvidence, pose: FloatArray) -> float:
-    """The keypoints' cost; infinite if a point lies behind the camera."""
+    """Cost of the keypoints; infinite if a point lies behind the camera."""
     scalars = scalars_of(pose)
     cost = 0.0
     for i in range(keypoints.points.shape[0]):
@@ -147,7 +151,7 @@ def keypoint_cost(keypoints: KeypointEvidence, pose: FloatArray) -> float:
 
 @kernel
 def take_keypoints(keypoints: KeypointEvidence, chosen: IntArray) -> KeypointEvidence:
-    """The keypoints with the numbers ``chosen`` (k,)."""
+    """Select the keypoints with the indices ``chosen`` (k,)."""
     count = chosen.shape[0]
     each = keypoints.whitening.shape[0] > 1
     points = np.empty((count, 3))
@@ -162,7 +166,7 @@ def take_keypoints(keypoints: KeypointEvidence, chosen: IntArray) -> KeypointEvi
 
 
 @inlined
-def beyond(value: float, width: float) -> float:
+def excess_of(value: float, width: float) -> float:
     return value - min(max(value, -width), width)
 
 
@@ -175,7 +179,7 @@ def add_scale_prior(
     for k in range(2):
         log_scale = np.log(pose[13 + k])
         if abs(log_scale) >= prior.width:
-            excess = beyond(log_scale, prior.width)
+            excess = excess_of(log_scale, prior.width)
             cost += prior.weight * excess * excess
             gradient[6 + k] += prior.weight * excess
             hessian[6 + k, 6 + k] += prior.weight
@@ -184,14 +188,14 @@ def add_scale_prior(
 
 @kernel
 def whole_information(prior: ScalePrior) -> float:
-    """Inverse variance of the whole prior, flat part and flanks."""
+    """Inverse variance of the prior, including its flat part."""
     flank, width = 1.0 / np.sqrt(prior.weight), prior.width
-    half = flank * np.sqrt(np.pi / 2.0)  # area of one flank, over the height of the flat part
+    half = flank * np.sqrt(np.pi / 2.0)  # area of one flank relative to the flat density
     square = width**3 / 3.0 + half * (width**2 + flank**2) + 2.0 * width * flank**2
     return float((width + half) / square)
 
 
 @inlined
 def score_of_distance(distance: float) -> float:
-    """-2 log of the prior of a translation, t^-3: flat over directions and log distances."""
+    """-2 log of the translation prior |t|^-3, uniform in direction and log distance."""
     return float(6.0 * np.log(distance))

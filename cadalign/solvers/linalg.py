@@ -1,4 +1,4 @@
-"""Small dense linear algebra for the compiled kernels: fixed sizes, no allocation in loops."""
+"""Dense linear algebra for compiled kernels, without allocations in loops."""
 
 from __future__ import annotations
 
@@ -11,28 +11,27 @@ Triple = tuple[float, float, float]
 
 _COLUMNS = 32
 LEAST_INFORMATION = 1e-15
-"""Least information about an unknown, over that about the best known one."""
+"""Least information about an unknown, relative to the largest."""
 
 
 @inlined
-def plus(a: Triple, b: Triple) -> Triple:
+def add(a: Triple, b: Triple) -> Triple:
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 @inlined
-def minus(a: Triple, b: Triple) -> Triple:
+def subtract(a: Triple, b: Triple) -> Triple:
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @inlined
-def scaled(a: Triple, factor: float) -> Triple:
+def multiply(a: Triple, factor: float) -> Triple:
     return a[0] * factor, a[1] * factor, a[2] * factor
 
 
 @inlined
-def unit(a: Triple) -> Triple:
-    """The vector of length 1 along another one."""
-    return scaled(a, 1.0 / np.sqrt(dot(a, a)))
+def normalize(a: Triple) -> Triple:
+    return multiply(a, 1.0 / np.sqrt(dot(a, a)))
 
 
 @inlined
@@ -64,7 +63,7 @@ def second_moments(points: FloatArray) -> tuple[float, float, float, float, floa
 
 @fast_sums
 def add_products(rows: FloatArray, columns: int, hessian: FloatArray, gradient: FloatArray) -> None:
-    """Add J' J to the upper triangle (U, U) and J' r (U,); U ``rows`` are J', the next is r."""
+    """Add J' J to an upper triangle (U, U) and J' r to (U,); ``rows`` are J', then r."""
     unknowns = gradient.shape[0]
     for k in range(unknowns):
         for m in range(k, unknowns + 1):
@@ -87,7 +86,7 @@ def mirror_upper(matrix: FloatArray) -> None:
 
 @kernel
 def cholesky(matrix: FloatArray, size: int, floor: float) -> bool:
-    """Write the lower Cholesky factor; False where a pivot is under ``floor`` of its diagonal."""
+    """Write the lower Cholesky factor in place; False for a pivot below ``floor`` * diagonal."""
     for i in range(size):
         diagonal = matrix[i, i]
         for j in range(i + 1):
@@ -105,7 +104,7 @@ def cholesky(matrix: FloatArray, size: int, floor: float) -> bool:
 
 @kernel
 def solve_cholesky(factor: FloatArray, size: int, right: FloatArray) -> None:
-    """Solve in place, with the factor that `cholesky` left."""
+    """Solve in place, with a factor from `cholesky`."""
     for i in range(size):
         total = right[i]
         for k in range(i):
@@ -120,7 +119,7 @@ def solve_cholesky(factor: FloatArray, size: int, right: FloatArray) -> None:
 
 @fast_sums
 def factorize(matrix: FloatArray) -> bool:
-    """As `cholesky` with a floor of 0, of a large matrix: sums run on vector units."""
+    """Like `cholesky` with floor 0, but with SIMD sums, for large matrices."""
     for i in range(matrix.shape[0]):
         for j in range(i):
             total = 0.0
@@ -139,7 +138,7 @@ def factorize(matrix: FloatArray) -> bool:
 
 @fast_sums
 def solve_factor(factor: FloatArray, right: FloatArray) -> None:
-    """Solve in place, with the factor that `factorize` left."""
+    """Solve in place, with a factor from `factorize`."""
     size = factor.shape[0]
     for i in range(size):
         total = 0.0
@@ -154,7 +153,7 @@ def solve_factor(factor: FloatArray, right: FloatArray) -> None:
 
 @fast_sums
 def solve_factor_rows(factor: FloatArray, right: FloatArray) -> None:
-    """Solve for all columns of ``right`` (n, k) in place, by blocks that fit the cache."""
+    """Solve for all columns of ``right`` (n, k) in place, in blocks that fit the CPU cache."""
     size = factor.shape[0]
     for start in range(0, right.shape[1], _COLUMNS):
         block = right[:, start : start + _COLUMNS]
@@ -178,14 +177,14 @@ def solve_factor_rows(factor: FloatArray, right: FloatArray) -> None:
 
 @inlined
 def copy_into(target: FloatArray, source: FloatArray) -> None:
-    """Copy a vector; ``target[:] = source`` makes Numba compile text for its error message."""
+    """Copy a vector; ``target[:] = source`` would compile Numba's code for error messages."""
     for k in range(target.shape[0]):
         target[k] = source[k]
 
 
 @inlined
 def expected_decrease(gradient: FloatArray, step: FloatArray, size: int) -> float:
-    """The decrease of the cost that a Gauss-Newton step predicts."""
+    """Predicted decrease of the cost by a Gauss-Newton step."""
     expected = 0.0
     for k in range(size):
         expected -= gradient[k] * step[k]
@@ -194,7 +193,7 @@ def expected_decrease(gradient: FloatArray, step: FloatArray, size: int) -> floa
 
 @kernel
 def damp(blocks: FloatArray, border: FloatArray, damping: float) -> None:
-    """Add damping to the diagonals of blocks (P, k, k) and border (b, b), with a floor on it."""
+    """Add damping, and a small floor, to the diagonals of blocks (P, k, k) and border (b, b)."""
     least = 1e-300
     for p in range(blocks.shape[0]):
         for k in range(blocks.shape[1]):
@@ -210,7 +209,7 @@ def damp(blocks: FloatArray, border: FloatArray, damping: float) -> None:
 
 @kernel
 def eigenvectors_4(matrix: FloatArray, vectors: FloatArray) -> None:
-    """Diagonalise a symmetric matrix (4, 4) in place by Jacobi's method; vectors are columns."""
+    """Diagonalise a symmetric (4, 4) in place by Jacobi's method; eigenvectors are columns."""
     for i in range(4):
         for j in range(4):
             vectors[i, j] = 1.0 if i == j else 0.0
@@ -256,7 +255,7 @@ def eigenvectors_4(matrix: FloatArray, vectors: FloatArray) -> None:
 
 @kernel
 def rotation_from_quaternion(w: float, x: float, y: float, z: float, rotation: FloatArray) -> None:
-    """Write the rotation matrix of a quaternion of any length into ``rotation`` (3, 3)."""
+    """Write the rotation matrix (3, 3) of a quaternion of any length."""
     norm = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * norm, x * norm, y * norm, z * norm
     rotation[0, 0] = 1 - 2 * (y * y + z * z)
@@ -303,7 +302,7 @@ def nearest_rotation(
 
 @kernel
 def polish_rotation(matrix: FloatArray, rotation: FloatArray) -> None:
-    """Write the rotation nearest to a matrix that is nearly one, by two Newton-Schulz steps."""
+    """Write the rotation nearest to an almost orthogonal matrix, by two Newton-Schulz steps."""
     gram = np.empty((3, 3))
     for i in range(3):
         copy_into(rotation[i], matrix[i])

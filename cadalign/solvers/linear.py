@@ -1,4 +1,4 @@
-"""The linear solver: anisotropic PnP as one 4 x 4 eigenproblem, one pass over the points."""
+"""Linear solver: anisotropic PnP as a 4 x 4 eigenproblem, in one pass over the points."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from cadalign.solvers.unknowns import is_pose, pack_pose
 
 MIN_POINTS = 6
 SPAN_FIX = "a linear solver needs keypoints that span a volume"
-_CANCELLATION = 1e-13  # share of a second moment below which the rest is rounding error
-_FLATNESS = 1e-7  # smallest over largest spread of points that still span a volume
+_CANCELLATION = 1e-13  # relative pivot of the second moments below which it is rounding error
+_FLATNESS = 1e-7  # least ratio of smallest to largest spread of points that span a volume
 _NEWTON_STEPS = 10
 _BLOCK = 64
-_LEAST_COSINE = 0.05  # between a column of the linear block and the axis it is split into
+_LEAST_COSINE = 0.05  # between a column of the linear map and the rotated axis
 
 
 def aepnp(
@@ -32,12 +32,12 @@ def aepnp(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Solve anisotropic PnP linearly, without checking the input's values.
 
-    Let ``a = (1, x)`` for a point x, and let its camera-frame coordinates be linear in a:
-    ``(c_x . a, c_y . a, c_z . a)``. Minimising the sum of
-    ``(c_x . a - u c_z . a)^2 + (c_y . a - v c_z . a)^2`` over c_x and c_y in closed form leaves a
-    generalised symmetric 4 x 4 eigenproblem in c_z. Its metric, the points' own second moments,
-    removes the leading bias of noise in (u, v), so the estimate is consistent. Rotation and
-    stretch follow from the 3 x 3 block by alternating nearest rotations and column scales.
+    Let ``a = (1, x)`` for a point x. Its camera-frame coordinates are linear in a:
+    ``(c_x . a, c_y . a, c_z . a)``. Minimise the sum of
+    ``(c_x . a - u c_z . a)^2 + (c_y . a - v c_z . a)^2`` over c_x and c_y in closed form: a
+    generalised symmetric 4 x 4 eigenproblem in c_z remains. Its metric is the second moments of the
+    points, which removes the leading bias of noise in (u, v), so the estimate is consistent. Newton
+    steps on the rotation then split the 3 x 3 block into rotation and stretch.
 
     Parameters
     ----------
@@ -70,8 +70,8 @@ def aepnp(
 
 
 def aepnp_error(points_3d: FloatArray) -> DegenerateError:
-    """The error for points that `aepnp_kernel` calls degenerate."""
-    # Only here: kernels are compiled anew where a module that theirs imports has changed.
+    """Error for points that `aepnp_kernel` reports as degenerate."""
+    # Imported here: only errors need it.
     from cadalign.geometry.alignment import describe_plane
 
     if len(points_3d) < MIN_POINTS:
@@ -89,15 +89,18 @@ def aepnp_error(points_3d: FloatArray) -> DegenerateError:
 
 def out_of_range_error() -> DegenerateError:
     return DegenerateError(
-        "the alignment is beyond the range of floating-point numbers",
+        "the alignment overflows floating-point numbers",
         where="points_3d",
-        fix="give the model and the image in other units, and check for outlying values",
+        fix="rescale the model and the image, and check for extreme values",
     )
 
 
 @fast_sums
 def _moments(points: FloatArray, rays: FloatArray, mean: FloatArray, products: FloatArray) -> None:
-    """Sum products 11, 1x, ... zz of (1, x - mean) with 1, u, v, u^2 + v^2; means (5,) with uv."""
+    """Write means (5,) of x, y, z, u, v and sums of centred products (10, 4).
+
+    Rows: 11, 1x, ..., zz of (1, x, y, z); columns: times 1, u, v, u^2 + v^2.
+    """
     n = points.shape[0]
     homogeneous = rays.shape[1] == 3
     sx = sy = sz = su = sv = 0.0
@@ -139,7 +142,7 @@ def _moments(points: FloatArray, rays: FloatArray, mean: FloatArray, products: F
 
 @kernel
 def _unpack(products: FloatArray, column: int, matrix: FloatArray) -> None:
-    """Write one column of the sums as a symmetric 4 x 4 matrix."""
+    """Write one column of `_moments` as a symmetric 4 x 4 matrix."""
     k = 0
     for i in range(4):
         for j in range(i, 4):
@@ -150,7 +153,7 @@ def _unpack(products: FloatArray, column: int, matrix: FloatArray) -> None:
 @kernel
 def _whiten_matrix(factor: FloatArray, matrix: FloatArray) -> None:
     """Replace a symmetric matrix A by L^-1 A L^-T in place, for the Cholesky factor L."""
-    for _ in range(2):  # L^-1 A, transposed, and the same once more
+    for _ in range(2):  # multiply by L^-1 and transpose, twice
         for column in range(4):
             for i in range(4):
                 total = matrix[i, column]
@@ -174,7 +177,7 @@ def _to_points_basis(factor: FloatArray, vector: FloatArray) -> None:
 
 @kernel
 def _split_scale(linear: FloatArray, spread: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Rotation and positive scales d (3,): ``rotation @ diag(d)`` is close to ``linear``."""
+    """Write a rotation and return scales d (3,) > 0 with ``rotation @ diag(d)`` near ``linear``."""
     columns = np.empty((3, 3))
     for j in range(3):
         for i in range(3):
@@ -223,7 +226,7 @@ def _split_scale(linear: FloatArray, spread: FloatArray, rotation: FloatArray) -
 def aepnp_batch(
     points: FloatArray, rays: FloatArray, offsets: IntArray
 ) -> tuple[FloatArray, IntArray]:
-    """Packed poses (B, 1, 15) and statuses (B,) of problems ``offsets[b]:offsets[b + 1]``."""
+    """Packed poses (B, 1, 15) and statuses (B,); problem b has rows from ``offsets[b]``."""
     count = offsets.shape[0] - 1
     poses = np.empty((count, 1, POSE_SIZE))
     statuses = np.empty(count, dtype=np.int64)
@@ -235,7 +238,7 @@ def aepnp_batch(
 
 @kernel
 def aepnp_kernel(points: FloatArray, rays: FloatArray, pose: FloatArray) -> int:
-    """Compiled `aepnp`: writes the packed pose (15,), returns a status."""
+    """Compiled `aepnp`: write the packed pose (15,), return a status."""
     mean = np.empty(5)
     spread = np.empty(3)
     rows = np.empty((3, 4))
@@ -260,7 +263,7 @@ def aepnp_kernel(points: FloatArray, rays: FloatArray, pose: FloatArray) -> int:
 def affine_rows(
     points: FloatArray, rays: FloatArray, mean: FloatArray, spread: FloatArray, rows: FloatArray
 ) -> int:
-    """Write the affine map (3, 4) of (1, x - mean) to the camera, up to a factor; a status."""
+    """Write the affine map (3, 4) of (1, x - mean) to the camera, up to scale; returns a status."""
     if points.shape[0] < MIN_POINTS:
         return TOO_FEW
     products = np.empty((10, 4))
@@ -277,7 +280,8 @@ def affine_rows(
         if not factor[k, k] > _FLATNESS * largest:
             return DEGENERATE
 
-    # In the basis that whitens a, P is the identity and S = Q - U U - V V.
+    # With whitened a, the metric is the identity and the system is Q - U U - V V: U, V and Q are
+    # the moments weighted by u, v and u^2 + v^2.
     u_matrix = np.empty((4, 4))
     v_matrix = np.empty((4, 4))
     system = np.empty((4, 4))

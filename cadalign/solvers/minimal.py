@@ -1,6 +1,6 @@
-"""Minimal solvers: every alignment that reprojects 4 points, every pose that reprojects 3.
+"""Minimal solvers: all alignments that reproject 4 points exactly, all poses that reproject 3.
 
-The pose is of a model without stretch; another one looks like it from afar.
+Poses are of a model without stretch; `reflect` gives the pose that looks alike from afar.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from cadalign.solvers.linalg import (
     copy_into,
     cross,
     dot,
-    minus,
+    multiply,
+    normalize,
     polish_rotation,
-    scaled,
     second_moments,
-    unit,
+    subtract,
 )
 from cadalign.solvers.polynomial import ROOTS_ROWS, real_roots
 from cadalign.solvers.quadrics import (
@@ -34,20 +34,20 @@ from cadalign.solvers.unknowns import pack_pose
 
 MAX_SOLUTIONS = 8
 MAX_POSES = 8
-"""Of three points, without stretch."""
-_DEGREE = 4  # of their polynomial
-_LARGEST_RATIO = 30.0  # of their depths
+"""Largest number of poses of three points, without stretch."""
+_DEGREE = 4  # of the P3P polynomial
+_LARGEST_RATIO = 30.0  # of two depths of P3P
 _TOUCHING = 1e-4  # see `real_roots`
-_EXACT = 1e-6  # residual of the conics' difference, of a second solution
-_ZERO = 1e-12  # of the polynomial's constant
+_EXACT = 1e-6  # largest residual of a second P3P solution for one root
+_ZERO = 1e-12  # constant coefficient that counts as a root at zero
 _AXIS_STEPS = 8  # of the power method
 
-# Largest cosine between columns of a rotation. Columns that nearly cancel can be far from
-# orthogonal where the quadrics, which are relative to their summands, look exact.
+# Largest cosine between columns of a rotation. The quadrics' residuals are relative to their
+# summands, so short columns can be far from orthogonal despite small residuals.
 _ORTHOGONAL = 1e-4
 
 
-# Rows of the memory that all parts of the solver share, after those of `intersect_quadrics`.
+# Rows of the scratch memory, after those of `intersect_quadrics`.
 _SAMPLE = INTERSECTION_ROWS  # 4 points
 _RAYS = _SAMPLE + 4  # their unit rays
 _WEIGHTS = _RAYS + 4  # see `_column_weights`
@@ -60,9 +60,9 @@ def ap4p(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Solve anisotropic PnP from 4 points, without checking the input's values.
 
-    The four depths are the only unknowns: the columns of ``R diag(scale)`` are linear in them, and
-    that these are orthogonal makes three homogeneous quadrics, which meet in at most 8 points; see
-    `cadalign.solvers.quadrics`.
+    The four depths are the only unknowns. The columns of ``R diag(scale)`` are linear in them.
+    Orthogonality of the columns gives three homogeneous quadrics, which intersect in at most 8
+    points; see `cadalign.solvers.quadrics`.
 
     Parameters
     ----------
@@ -76,8 +76,10 @@ def ap4p(
     rotations : (k, 3, 3) float
     translations : (k, 3) float
     scales : (k, 3) float
-        (1, s_y, s_z) of each of the 0 to 8 solutions with all depths positive, those with the
-        least stretch (sum of squared log scales) first. None where the points lie in one plane.
+        (1, s_y, s_z).
+
+    The k = 0 to 8 solutions have positive depths, and are sorted by their stretch (sum of squared
+    log scales), least first. Points in one plane have no solution.
     """
     points = np.ascontiguousarray(points_3d, dtype=np.float64)
     directions = np.ascontiguousarray(rays, dtype=np.float64)
@@ -93,7 +95,7 @@ def ap4p(
 
 @kernel
 def ap4p_kernel(points: FloatArray, rays: FloatArray, solutions: FloatArray) -> int:
-    """Compiled `ap4p`: packs its solutions into (8, 15) ``solutions``, returns their number."""
+    """Compiled `ap4p`: pack the solutions into ``solutions`` (8, 15), return their number."""
     memory = minimal_memory()
     for i in range(4):
         _write_point(points, i, (rays[i, 0], rays[i, 1], rays[i, 2]), memory, i)
@@ -102,7 +104,6 @@ def ap4p_kernel(points: FloatArray, rays: FloatArray, solutions: FloatArray) -> 
 
 @kernel
 def minimal_memory() -> FloatArray:
-    """Scratch space for any number of calls of `solve_subset`."""
     return np.empty((_ROWS, 16))
 
 
@@ -114,7 +115,7 @@ def solve_subset(
     memory: FloatArray,
     solutions: FloatArray,
 ) -> int:
-    """Solve from the points with the 4 numbers ``chosen``; see `ap4p_kernel`."""
+    """Like `ap4p_kernel`, for the 4 points with the indices ``chosen``."""
     for i in range(4):
         c = chosen[i]
         _write_point(points, c, (rays[c, 0], rays[c, 1], 1.0), memory, i)
@@ -123,7 +124,7 @@ def solve_subset(
 
 @inlined
 def _write_point(points: FloatArray, i: int, ray: Triple, memory: FloatArray, row: int) -> None:
-    direction = unit(ray)
+    direction = normalize(ray)
     for c in range(3):
         memory[_SAMPLE + row, c] = points[i, c]
         memory[_RAYS + row, c] = direction[c]
@@ -145,11 +146,11 @@ def _solve_four(memory: FloatArray, solutions: FloatArray) -> int:
 
 @inlined
 def _column_weights(memory: FloatArray) -> bool:
-    """Weights by which camera-frame points add up to columns of R diag(s); False in a plane."""
+    """Write the weights of camera-frame points in the columns of R diag(s); False if coplanar."""
     a, b, c = _difference(memory, 1), _difference(memory, 2), _difference(memory, 3)
     bc, ca, ab = cross(b, c), cross(c, a), cross(a, b)
     determinant = dot(a, bc)
-    squares = 1.0  # of the lengths along the axes
+    squares = 1.0  # product of squared lengths along the axes
     for j in range(3):
         squares *= a[j] * a[j] + b[j] * b[j] + c[j] * c[j]
     if not abs(determinant) > 1e-9 * np.sqrt(squares):
@@ -164,16 +165,16 @@ def _column_weights(memory: FloatArray) -> bool:
 
 @inlined
 def _difference(memory: FloatArray, i: int) -> Triple:
-    return minus(_triple(memory, _SAMPLE + i), _triple(memory, _SAMPLE))
+    return subtract(_triple(memory, _SAMPLE + i), _triple(memory, _SAMPLE))
 
 
 @inlined
 def _split_columns(memory: FloatArray) -> None:
-    """Write the columns' derivatives by the unknowns; column j sums e_k times row 4 j + k.
+    """Write the columns' derivatives by the unknowns: column j is the sum of e_k times row 4 j + k.
 
-    The unknowns are not the depths d but e = H d / 2 with the Hadamard matrix H: depths of an
-    object are alike, so polynomials in their ratios cancel badly near 1; in e they are evaluated
-    near 0. Positive depths mean |e_k| < e_0.
+    The unknowns are e = H d / 2, with the depths d and the Hadamard matrix H. The depths of an
+    object are similar, so polynomials in their ratios suffer cancellation near 1; in e they are
+    evaluated near 0. Positive depths imply |e_k| < e_0.
     """
     for j in range(3):
         for c in range(3):
@@ -189,7 +190,7 @@ def _split_columns(memory: FloatArray) -> None:
 
 @inlined
 def _orthogonality_quadrics(memory: FloatArray) -> None:
-    """Write the quadrics, of largest coefficient 1, that vanish where columns are orthogonal."""
+    """Write the quadrics that vanish for orthogonal columns, with largest coefficient 1."""
     for row in range(3):
         j, k = _PARTS + 4 * (row // 2), _PARTS + 4 * ((row + 3) // 2)
         largest = 0.0
@@ -214,7 +215,7 @@ def _triple(memory: FloatArray, row: int) -> Triple:
 
 @kernel
 def _pack_solution(memory: FloatArray, row: int, solutions: FloatArray, count: int) -> bool:
-    """Pack rotation, translation and scale; False for a mirrored or inexact solution."""
+    """Pack rotation, translation and scale; False for a reflection or an inexact solution."""
     columns = np.empty((3, 3))
     for j in range(3):
         for i in range(3):
@@ -261,7 +262,6 @@ def _column(matrix: FloatArray, j: int) -> Triple:
 
 @kernel
 def p3p_memory() -> FloatArray:
-    """Scratch space for any number of calls of `p3p_kernel`."""
     return np.empty((ROOTS_ROWS, 2 * _DEGREE))
 
 
@@ -269,22 +269,22 @@ def p3p_memory() -> FloatArray:
 def p3p_kernel(
     points: FloatArray, rays: FloatArray, chosen: IntArray, memory: FloatArray, poses: FloatArray
 ) -> int:
-    """Pack the poses from 3 ``chosen`` points into ``poses`` (8, 15); returns their number.
+    """Pack the poses of 3 ``chosen`` points into ``poses`` (8, 15); returns their number.
 
-    The depths are d, (1 + e p) d and (1 + e q) d, with the chord e between two of the rays: p and q
-    are of one size near and far. The triangle's sides give two conics in p and q, whose difference
-    is linear in p: q is the root of a quartic, as in Grunert's of 1841.
+    The depths are d, (1 + e p) d and (1 + e q) d, where e is the chord between two unit rays; this
+    keeps the magnitudes of p and q independent of the distance. The triangle's sides give two
+    conics in p and q. Their difference is linear in p, so q is a root of a quartic (Grunert, 1841).
     """
     first, second, third = chosen[0], chosen[1], chosen[2]
     a, b, c = _triple(points, first), _triple(points, second), _triple(points, third)
     x, y, z = _unit_ray(rays, first), _unit_ray(rays, second), _unit_ray(rays, third)
-    side, chord = _apart(a, c), _apart(x, z)
+    side, chord = _squared_distance(a, c), _squared_distance(x, z)
     if not min(side, chord) > 0.0:
         return 0
     e = np.sqrt(chord)
-    near, far = _apart(x, y), _apart(y, z)
-    ratio, g = _apart(a, b) / side, near / e
-    excess = ratio - _apart(b, c) / side
+    near, far = _squared_distance(x, y), _squared_distance(y, z)
+    ratio, g = _squared_distance(a, b) / side, near / e
+    excess = ratio - _squared_distance(b, c) / side
     # p^2 + g p = k(q), and m(q) + p l(q) = 0
     k0, k1, k2 = ratio - near / chord, ratio * e, ratio
     m0, m1, m2 = (far - near) / chord + excess, far / e + excess * e, 1.0 + excess
@@ -299,7 +299,7 @@ def p3p_kernel(
     memory[0, 4] = m2 * m2 - k2 * n2
     count = 0
     found = real_roots(memory, 0, _DEGREE, _LARGEST_RATIO / e, _TOUCHING)
-    is_symmetric = abs(memory[0, 0]) < _ZERO  # the triangle, and is seen along its axis
+    is_symmetric = abs(memory[0, 0]) < _ZERO  # symmetric triangle, seen along its axis
     if is_symmetric and found < 2 * _DEGREE:
         memory[1, found] = 0.0
         found += 1
@@ -315,19 +315,19 @@ def p3p_kernel(
             depth = np.sqrt(side / chord / (1.0 + q * (e + q)))
             depths = depth, depth * (1.0 + e * p), depth * (1.0 + e * q)
             if count < MAX_POSES and min(depths) > 0.0:
-                seen = scaled(x, depths[0]), scaled(y, depths[1]), scaled(z, depths[2])
+                seen = multiply(x, depths[0]), multiply(y, depths[1]), multiply(z, depths[2])
                 count += _pack_motion((a, b, c), seen, poses[count])
     return count
 
 
 @inlined
 def _unit_ray(rays: FloatArray, i: int) -> Triple:
-    return unit((rays[i, 0], rays[i, 1], 1.0))
+    return normalize((rays[i, 0], rays[i, 1], 1.0))
 
 
 @inlined
-def _apart(first: Triple, second: Triple) -> float:
-    difference = minus(first, second)
+def _squared_distance(first: Triple, second: Triple) -> float:
+    difference = subtract(first, second)
     return dot(difference, difference)
 
 
@@ -335,7 +335,7 @@ def _apart(first: Triple, second: Triple) -> float:
 def _pack_motion(
     model: tuple[Triple, Triple, Triple], seen: tuple[Triple, Triple, Triple], pose: FloatArray
 ) -> bool:
-    """Pack the motion of a triangle onto a congruent one; False for points in one line."""
+    """Pack the motion of a triangle onto a congruent one; False for collinear points."""
     rotation, shift = np.empty((3, 3)), np.empty(3)
     before, after = _frame(model), _frame(seen)
     for i in range(3):
@@ -349,25 +349,25 @@ def _pack_motion(
 
 @inlined
 def _frame(corners: tuple[Triple, Triple, Triple]) -> tuple[Triple, Triple, Triple]:
-    """Axes of a triangle: along a side, in its plane, and across that."""
-    x = unit(minus(corners[2], corners[0]))
-    z = unit(cross(x, minus(corners[1], corners[0])))
+    """Axes of a triangle: along a side, in its plane, and along its normal."""
+    x = normalize(subtract(corners[2], corners[0]))
+    z = normalize(cross(x, subtract(corners[1], corners[0])))
     return x, cross(z, x), z
 
 
 @kernel
 def reflect(points: FloatArray, pose: FloatArray, other: FloatArray) -> None:
-    """Write the pose that looks like another one from afar: depths and the least axis reversed."""
+    """Write the pose that looks alike from afar: relative depths and the thinnest axis reversed."""
     xx, xy, xz, yy, yz, zz = second_moments(points)
-    # The adjugate's largest eigenvector is the moments' least one.
+    # The dominant eigenvector of the adjugate is the moments' eigenvector of least value.
     first = (yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy)
     second = (first[1], xx * zz - xz * xz, xy * xz - xx * yz)
     third = (first[2], second[2], xx * yy - xy * xy)
     axis = first if first[0] > max(second[1], third[2]) else second
     axis = third if third[2] > max(first[0], second[1]) else axis
     for _ in range(_AXIS_STEPS):
-        axis = unit((dot(first, axis), dot(second, axis), dot(third, axis)))
-    sight = unit((pose[9], pose[10], pose[11]))
+        axis = normalize((dot(first, axis), dot(second, axis), dot(third, axis)))
+    sight = normalize((pose[9], pose[10], pose[11]))
     copy_into(other, pose)
     for j in range(3):
         column = (pose[j], pose[3 + j], pose[6 + j])

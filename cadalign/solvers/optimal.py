@@ -1,4 +1,4 @@
-"""The optimum: the maximum-likelihood alignment, and the starts of the search for it."""
+"""Maximum-likelihood alignment of one view's keypoints, by a search from several starts."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ from cadalign.solvers.starts import choose_subsets, minimal_starts, relief, rota
 from cadalign.solvers.unknowns import orthonormalize, uncenter
 
 MAX_MINIMA = 12
-_COARSE_POINTS = 48  # that many tell the minima apart; all points then refine them
+_COARSE_POINTS = 48  # points of the first search; all points refine its minima
 _GRID_ROTATIONS = 96
 _GRID_REFINED = 20
 _PROBE_ITERATIONS = 6
 _TRIANGLES = 6
 _RIGID_REFINED = 6
 _MAX_ITERATIONS = 200
-_LEAST_RELIEF = 3.0  # of points whose subsets tell their depths
-_UNLIKELY = 40.0  # excess cost, over a unit variance, at which a coarse minimum is given up
+_LEAST_RELIEF = 3.0  # below it, depths of subsets are lost in noise: a grid of rotations helps
+_UNLIKELY = 40.0  # excess cost, per unit variance, at which a coarse minimum is dropped
 
 
 def rigid_flag(loss: int, free: FloatArray) -> bool | None:
-    """True for squared errors of a model without stretch, of which the code is compiled apart."""
+    """True for squared errors without stretch, otherwise None: a flag that specialises kernels."""
     return True if loss == LINEAR and free[6] == free[7] == 0.0 else None
 
 
@@ -63,12 +63,12 @@ def optimal_batch(
     min_points: int,
     rigid: bool | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray, IntArray]:
-    """Find the optimum of every problem, of the rows ``offsets[b]`` to ``offsets[b + 1]``.
+    """Find the optimum of B problems; problem b has the rows ``offsets[b]`` to ``offsets[b + 1]``.
 
-    ``loss_scale`` and ``prior_weight`` (B,) of a `ScalePrior` are in units of the whitening's
-    sigma. Returns the minima's poses (B, MAX_MINIMA, 15) and costs (B, MAX_MINIMA), the covariance
-    of the best (B, 8, 8), statuses (B,), and (B, 4) the number of minima, iterations, hypotheses,
-    and the number of an undetermined unknown or -1.
+    ``loss_scale`` (B,) and the ``prior_weight`` (B,) of a `ScalePrior` are in units of the
+    whitening's sigma. Returns poses (B, MAX_MINIMA, 15) and costs (B, MAX_MINIMA) of the minima,
+    the covariance of the best (B, 8, 8), statuses (B,), and info (B, 4): the numbers of minima,
+    iterations and hypotheses, and the index of an undetermined unknown, or -1.
     """
     count = offsets.shape[0] - 1
     poses = np.zeros((count, MAX_MINIMA, POSE_SIZE))
@@ -109,7 +109,7 @@ def _solve_one(
     costs: FloatArray,
     covariance: FloatArray,
 ) -> tuple[int, int, int, int]:
-    """Write the minima of one problem, the best first, and its covariance; returns the `info`."""
+    """Write the minima of one problem, best first, and its covariance; returns the ``info`` row."""
     points = objective.keypoints.points
     center, unit = center_and_unit(points)
     if not unit > 0:
@@ -129,14 +129,14 @@ def _solve_one(
 
 @kernel
 def _search_minima(objective: Objective, rigid: bool | None, minima: Minima) -> int:
-    """Find the minima, of many points first on some; returns the number of starts."""
+    """Find the minima, at first on a subset of many points; returns the number of starts."""
     linear = np.empty(POSE_SIZE)
     keypoints = objective.keypoints
     is_solved = aepnp_kernel(keypoints.points, keypoints.rays, linear) == OK
     n = keypoints.points.shape[0]
     if n <= _COARSE_POINTS:
         return _search_from_all_starts(objective, rigid, linear, is_solved, minima)
-    chosen = np.arange(_COARSE_POINTS) * n // _COARSE_POINTS  # evenly spread over their order
+    chosen = np.arange(_COARSE_POINTS) * n // _COARSE_POINTS  # evenly spaced indices
     coarse = replace_keypoints(objective, take_keypoints(keypoints, chosen))
     hypotheses = _search_from_all_starts(coarse, rigid, linear, is_solved, minima)
     found = minima.counts[0]
@@ -152,7 +152,7 @@ def _search_minima(objective: Objective, rigid: bool | None, minima: Minima) -> 
     minima.scores[:] = np.inf
     everything = Effort(MAX_MINIMA, _PROBE_ITERATIONS, _MAX_ITERATIONS, np.inf)
     search(objective, starts[:count], everything, 0, 0.0, minima)
-    if minima.counts[0] == 0 and is_solved:  # with strong noise, some may have no minimum
+    if minima.counts[0] == 0 and is_solved:  # strong noise can leave the subset no minimum
         copy_into(starts[0], linear)
         search(objective, starts[:1], everything, 0, 0.0, minima)
     return hypotheses
@@ -166,7 +166,7 @@ def _search_from_all_starts(
     is_solved: bool,
     minima: Minima,
 ) -> int:
-    """Refine the likeliest starts, the pose ``linear`` among them; returns their number."""
+    """Refine the likeliest starts, including the pose ``linear``; returns the number of starts."""
     if rigid is not None:
         return _search_rigid(objective, minima)
     points, rays, free = objective.keypoints.points, objective.keypoints.rays, objective.free
@@ -180,8 +180,7 @@ def _search_from_all_starts(
     if is_solved:
         copy_into(starts[count], linear)
         count += 1
-    # Other starts serve points that are nearly coplanar, or few subsets, and where the unstretched
-    # model is a better guess.
+    # A grid of rotations helps with nearly coplanar points, few subsets, and little stretch.
     prior = objective.scale_prior
     needs_grid = free[6] == 0.0 or free[7] == 0.0 or (prior.weight > 0.0 and prior.width == 0.0)
     needs_grid = needs_grid or points.shape[0] == 5
@@ -196,13 +195,13 @@ def _search_from_all_starts(
             for j in range(2):
                 if free[6 + j] == 0.0:
                     starts[k, 13 + j] = 1.0
-        _search_from(objective, starts[:count], refined, minima)
+        _search_starts(objective, starts[:count], refined, minima)
     return count
 
 
 @kernel
 def _search_rigid(objective: Objective, minima: Minima) -> int:
-    """Refine starts of a model without stretch: few triangles, and the reflected optimum."""
+    """Search without stretch, from a few triangles and the reflection of the optimum."""
     points, rays = objective.keypoints.points, objective.keypoints.rays
     triangles = np.empty((_TRIANGLES, 3), dtype=np.int64)
     starts = np.empty((max(_TRIANGLES * MAX_POSES, _GRID_ROTATIONS), POSE_SIZE))
@@ -210,19 +209,19 @@ def _search_rigid(objective: Objective, minima: Minima) -> int:
     count = 0
     for s in range(choose_subsets(points, triangles)):
         count += p3p_kernel(points, rays, triangles[s], memory, starts[count:])
-    _search_from(objective, starts[:count], _RIGID_REFINED, minima)
+    _search_starts(objective, starts[:count], _RIGID_REFINED, minima)
     if minima.counts[0] > 0:
         reflected = np.empty((1, POSE_SIZE))
         reflect(points, minima.states[0], reflected[0])
-        _search_from(objective, reflected, 1, minima)
+        _search_starts(objective, reflected, 1, minima)
         return count + 1
     found = rotation_starts(points, rays, starts[:_GRID_ROTATIONS])
-    _search_from(objective, starts[:found], _GRID_REFINED, minima)
+    _search_starts(objective, starts[:found], _GRID_REFINED, minima)
     return count + found
 
 
 @kernel
-def _search_from(objective: Objective, starts: FloatArray, refined: int, minima: Minima) -> None:
+def _search_starts(objective: Objective, starts: FloatArray, refined: int, minima: Minima) -> None:
     effort = Effort(refined, _PROBE_ITERATIONS, _MAX_ITERATIONS, np.inf)
     search(objective, starts, effort, 0, 0.0, minima)
 
@@ -231,9 +230,9 @@ def _search_from(objective: Objective, starts: FloatArray, refined: int, minima:
 def _effort(points: int, loss: int) -> tuple[int, int]:
     """Numbers of 4-subsets to solve and of starts to refine.
 
-    Measured on random problems: the optimum is missed in less than 0.1 % of them. Robust losses do
-    not follow outliers, of which few subsets of few keypoints are free: with 2 among 10 Cauchy's is
-    missed in less than 0.3 %, with 3 in 4 %.
+    Chosen so that less than 0.1 % of random problems miss the optimum. Robust losses need more
+    subsets, since few of them are free of outliers: Cauchy's loss misses less than 0.3 % with 2
+    outliers among 10 keypoints, and 4 % with 3.
     """
     if loss != LINEAR:
         return (70, 12) if points < 17 else (12, 8)

@@ -6,28 +6,27 @@ from cadalign.arrays import FloatArray
 from cadalign.compile import inlined, kernel
 
 _HALVINGS = 40
-_FRESH = 3  # halvings after which the coefficients about zero are computed anew
-_NARROW = 1e-3  # width over place of an interval in which roots are a pair or none
+_REFRESH_PERIOD = 3  # halvings after which the first interval's coefficients are recomputed
+_LEAST_RELATIVE_WIDTH = 1e-3  # below it, two sign changes are a pair of roots or none
 _NEWTON_STEPS = 60
-_EXACT = 1e-7  # last relative Newton step: the root itself is as good as the square
+_ROOT_TOLERANCE = 1e-7  # last relative Newton step; the remaining error is about its square
 
 ROOTS_ROWS = _HALVINGS + 3
-"""Rows that `real_roots` uses: coefficients, roots, and Bernstein coefficients of intervals."""
+"""Rows of memory for `real_roots`: coefficients, roots, Bernstein coefficients of intervals."""
 
 
 @inlined
 def real_roots(memory: FloatArray, first: int, degree: int, reach: float, touching: float) -> int:
-    """Real roots of a polynomial in (-reach, reach), and where it nearly touches zero.
+    """Write the real roots of a polynomial in (-reach, reach); returns their number.
 
-    Descartes' rule of signs on Bernstein coefficients: intervals whose signs change more than once
-    are halved (Lane, Riesenfeld, "Bounds on a polynomial", 1981). An extremum counts as a root
-    where its value is below the share ``touching`` of the sum of the terms' magnitudes: a double
-    root that rounding or noise has lifted off zero.
+    Intervals are halved until Descartes' rule of signs on their Bernstein coefficients allows one
+    root (Lane, Riesenfeld, "Bounds on a polynomial", 1981). An extremum also counts as a root if
+    its value is below ``touching`` times the sum of the terms' magnitudes: a double root that
+    rounding or noise has moved off zero.
 
-    Row ``first`` of ``memory`` holds the coefficients from the constant upwards, of degree 2 or
-    more; the next receives the roots, the rest of `ROOTS_ROWS` rows is scratch space: to pass a
-    single array spares the counting of references, which takes as long as the search. Returns the
-    number of roots.
+    Row ``first`` of ``memory`` holds the coefficients, constant first, of degree 2 or more. The
+    next row receives the roots; the other `ROOTS_ROWS` - 2 rows are scratch space. All data is in
+    one array because counting references to several takes as long as the search.
     """
     found = 0
     for end in (-reach, reach):
@@ -39,22 +38,22 @@ def real_roots(memory: FloatArray, first: int, degree: int, reach: float, touchi
 def _roots_up_to(
     memory: FloatArray, first: int, degree: int, end: float, touching: float, found: int
 ) -> int:
-    """Add the roots between zero and an end of either sign to those found; see `real_roots`."""
+    """Append the roots between zero and ``end``, of either sign; returns the new number."""
     top = first + 2
     _to_bernstein(memory, first, degree, end, top)
-    # Intervals are visited from zero outwards: here number ``index`` of the 2^depth of a depth, in
-    # row ``top``; the rows before it wait with the outer halves of those that it lies in.
+    # Depth-first from zero outwards: interval ``index`` of 2^depth is in row ``top``; the rows
+    # before it hold the outer halves that are still to be visited.
     depth = index = 0
     width = end
     while True:
         near = index * width
         far = near + width
-        if index == 0 and depth > 0 and depth % _FRESH == 0:
+        if index == 0 and depth > 0 and depth % _REFRESH_PERIOD == 0:
             _to_bernstein(memory, first, degree, far, top)
         changes = 0
         for k in range(degree):
             changes += (memory[top, k] > 0) != (memory[top, k + 1] > 0)
-        if changes > 1 and depth < _HALVINGS and abs(width) > _NARROW * abs(near):
+        if changes > 1 and depth < _HALVINGS and abs(width) > _LEAST_RELATIVE_WIDTH * abs(near):
             _halve(memory, top, degree)
             depth += 1
             index *= 2
@@ -68,7 +67,7 @@ def _roots_up_to(
                 found += 1
             else:
                 found = _add_pair(memory, first, degree, low, high, touching, top, found)
-        while index % 2 == 1:  # after an outer half, its parent is done as well
+        while index % 2 == 1:  # an outer half completes its parent
             depth -= 1
             index //= 2
             width *= 2.0
@@ -91,7 +90,7 @@ def _evaluate(memory: FloatArray, row: int, degree: int, x: float) -> tuple[floa
 
 @kernel
 def _root_between(memory: FloatArray, row: int, degree: int, low: float, high: float) -> float:
-    """The root between two points of opposite sign: Newton's method, kept inside by bisection."""
+    """Find the root between two points of opposite sign by Newton's method with bisection."""
     low_value, _ = _evaluate(memory, row, degree, low)
     high_value, _ = _evaluate(memory, row, degree, high)
     share = low_value / (low_value - high_value)
@@ -103,9 +102,9 @@ def _root_between(memory: FloatArray, row: int, degree: int, low: float, high: f
         else:
             high = x
         following = x - value / slope
-        if not low <= following <= high:  # also where the slope is zero
+        if not low <= following <= high:  # also if the slope is zero
             following = 0.5 * (low + high)
-        if abs(following - x) <= _EXACT * abs(x) or high - low <= 1e-16:
+        if abs(following - x) <= _ROOT_TOLERANCE * abs(x) or high - low <= 1e-16:
             return following
         x = following
     return x
@@ -113,10 +112,10 @@ def _root_between(memory: FloatArray, row: int, degree: int, low: float, high: f
 
 @inlined
 def _to_bernstein(memory: FloatArray, first: int, degree: int, end: float, top: int) -> None:
-    """Write the Bernstein coefficients for the interval from zero to an end into row ``top``."""
+    """Write the Bernstein coefficients on the interval from zero to ``end`` into row ``top``."""
     memory[top, 0] = memory[first, 0]
     scale = 1.0
-    for k in range(1, degree + 1):  # of x / end, over the binomial coefficients
+    for k in range(1, degree + 1):  # coefficients in x / end, divided by binomials
         scale *= end * k / (degree - k + 1)
         memory[top, k] = scale * memory[first, k]
     for i in range(degree):
@@ -126,7 +125,7 @@ def _to_bernstein(memory: FloatArray, first: int, degree: int, end: float, top: 
 
 @inlined
 def _halve(memory: FloatArray, top: int, degree: int) -> None:
-    """De Casteljau's algorithm: row ``top`` keeps the outer half, the next gets the inner one."""
+    """Halve by de Casteljau's algorithm: row ``top`` keeps the outer half, the next the inner."""
     for i in range(degree + 1):
         memory[top + 1, i] = memory[top, 0]
         for k in range(degree - i):
@@ -144,7 +143,7 @@ def _add_pair(
     derivative: int,
     found: int,
 ) -> int:
-    """Add two roots, or an extremum near zero, in a narrow interval; returns the new number."""
+    """Append two roots, or an extremum near zero, of a narrow interval; returns the new number."""
     low_value, low_slope = _evaluate(memory, first, degree, low)
     _, high_slope = _evaluate(memory, first, degree, high)
     if (low_slope > 0) == (high_slope > 0):

@@ -1,9 +1,9 @@
-"""Projection of model points and its derivatives: the one place that has their formulas.
+"""Projection of model points and its derivatives; all formulas are in this module.
 
 ``depth * (u, v, 1) = rotation @ diag(scale) @ x + translation`` for a packed pose (see
-`cadalign.solvers.unknowns`), given as a tuple of scalars so that loops keep it in registers. Where
-a shape varies, or several cameras share a pose, the parts serve: a `Motion` is the rotation row by
-row and the translation, and a slope the derivative of a residual by the point in the camera.
+`cadalign.solvers.unknowns`). The pose is passed as a tuple of scalars, so that loops keep it in
+registers. A `Motion` is a rotation, row by row, and a translation. A slope is the derivative of a
+residual by a point.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ Motion = tuple[float, ...] | FloatArray
 
 @inlined
 def motion_of(pose: FloatArray) -> Motion:
-    """The first 12 numbers of a packed pose as a tuple."""
+    """Rotation and translation of a packed pose, as a tuple of 12 numbers."""
     rotation = (pose[0], pose[1], pose[2], pose[3], pose[4], pose[5], pose[6], pose[7], pose[8])
     return rotation + (pose[9], pose[10], pose[11])
 
 
 @inlined
 def scalars_of(pose: FloatArray) -> Scalars:
-    """The 15 numbers of a packed pose as a tuple."""
+    """A packed pose as a tuple of 15 numbers."""
     return motion_of(pose) + (pose[12], pose[13], pose[14])
 
 
 @inlined
 def turn(motion: Motion, point: Triple) -> Triple:
-    """The rotated point."""
+    """Rotate a point."""
     x, y, z = point
     return (
         motion[0] * x + motion[1] * y + motion[2] * z,
@@ -46,7 +46,7 @@ def turn(motion: Motion, point: Triple) -> Triple:
 
 @inlined
 def turn_back(motion: Motion, slope: Triple) -> Triple:
-    """The slope by the point before the rotation."""
+    """Convert a slope by the rotated point to one by the point: multiply by the transpose."""
     x, y, z = slope
     return (
         motion[0] * x + motion[3] * y + motion[6] * z,
@@ -57,20 +57,20 @@ def turn_back(motion: Motion, slope: Triple) -> Triple:
 
 @inlined
 def shift(motion: Motion, turned: Triple) -> Triple:
-    """The moved point, from the rotated one."""
+    """Add the translation to a rotated point."""
     return turned[0] + motion[9], turned[1] + motion[10], turned[2] + motion[11]
 
 
 @inlined
-def see(point: Triple) -> Triple:
-    """Normalised image coordinates u, v of a point in the camera, and its depth."""
+def ray_of(point: Triple) -> Triple:
+    """Normalised image coordinates u, v and depth of a point in the camera."""
     inverse = 1.0 / point[2]
     return point[0] * inverse, point[1] * inverse, point[2]
 
 
 @inlined
 def ray_slopes(seen: Triple, weights: Triple) -> tuple[Triple, Triple]:
-    """Slopes of a u + b v and of c v for the ``weights`` (a, b, c), at a point that `see` gave."""
+    """Slopes of a u + b v and c v for ``weights`` (a, b, c), at the result of `ray_of`."""
     u, v, depth = seen
     inverse = 1.0 / depth
     e, f, h = weights[0] * inverse, weights[1] * inverse, weights[2] * inverse
@@ -81,16 +81,17 @@ def ray_slopes(seen: Triple, weights: Triple) -> tuple[Triple, Triple]:
 def slope_of_row(
     row: Triple, along: float, response: Triple, nearer: Triple, fall: float
 ) -> Triple:
-    """The slope of ``along = row . response`` by the point, for a response that is held.
+    """Derivative of ``along = row . response`` by the point, for a constant response.
 
-    The ``row`` a of a whitened residual is its slope. With the response y, and ``nearer`` d, the
-    camera's z over the depth, it is ``fall a - (d . y) a - (a . y) d``: what lies farther is seen
-    smaller, which a depth is not (d = 0); and a loss's weight changes by ``fall`` along the row.
+    ``row`` a is the slope of a whitened residual. With the response y, and ``nearer`` d (the
+    camera's z axis over the depth), the derivative is ``fall a - (d . y) a - (a . y) d``. The last
+    two terms are the decrease of rays with the depth; d = 0 for a residual of depth. ``fall`` is
+    the change of the loss's weight along the row.
 
-    The log determinant of ``M = I + A S A'``, by which integrating over a shape of covariance S
-    widens the residuals, has the derivative ``2 tr(dA P A')``, P the covariance of the shape given
-    the pose. Row a of A touches only the point that it is of: half the derivative by that is the
-    sum of these slopes over the rows, with the response ``y = (P A')`` of the point to each.
+    Integrating over a shape of covariance S gives the residuals the covariance ``M = I + A S A'``.
+    The derivative of log det M is ``2 tr(dA P A')``, with the covariance P of the shape given the
+    pose. A row a of A depends on one point only. Half the derivative by this point is the sum of
+    these slopes over its rows, each with its response ``y = P A'``.
     """
     shared = fall - dot(nearer, response)
     return (
@@ -102,20 +103,20 @@ def slope_of_row(
 
 @inlined
 def write_motion(turned: Triple, slope: Triple, rows: FloatArray, column: int) -> None:
-    """Write the derivatives by rotation vector and translation into ``rows[:6, column]``."""
+    """Write derivatives by rotation vector and translation into ``rows[:6, column]``."""
     rows[0, column], rows[1, column], rows[2, column] = cross(turned, slope)
     rows[3, column], rows[4, column], rows[5, column] = slope
 
 
 @inlined
 def project_point(pose: Scalars, point: Triple) -> Triple:
-    """Project a model point; normalised image coordinates u, v, and the depth."""
-    return see(shift(pose, turn(pose, stretch(pose, point))))
+    """Project a model point to normalised image coordinates u, v and depth."""
+    return ray_of(shift(pose, turn(pose, stretch(pose, point))))
 
 
 @inlined
 def stretch(pose: Scalars, point: Triple) -> Triple:
-    """The point with the scale of a packed pose."""
+    """Multiply a point by the scale of a packed pose."""
     return point[0] * pose[12], point[1] * pose[13], point[2] * pose[14]
 
 
@@ -131,7 +132,7 @@ def write_derivatives(
     """Write derivatives (8,) of a u + b v and of c v into columns ``first`` and ``second``."""
     stretched = stretch(pose, point)
     turned = turn(pose, stretched)
-    slopes = ray_slopes(see(shift(pose, turned)), weights)
+    slopes = ray_slopes(ray_of(shift(pose, turned)), weights)
     write_motion(turned, slopes[0], rows, first)
     write_motion(turned, slopes[1], rows, second)
     for k in range(1, 3):
@@ -164,7 +165,7 @@ def reproject_batch(
     cameras: FloatArray,
     statuses: IntArray,
 ) -> tuple[FloatArray, IntArray]:
-    """Residuals (n, 2) [px] of first poses (B, k, 15), and statuses (B,) with unseen points."""
+    """Residuals (n, 2) [px] of the first poses in (B, k, 15), and statuses (B,) after checks."""
     residuals = np.empty((points.shape[0], 2))
     checked = statuses.copy()
     for b in range(offsets.shape[0] - 1):
@@ -188,7 +189,7 @@ def reproject_batch(
 
 @kernel
 def all_finite(points_3d: FloatArray, points_2d: FloatArray) -> bool:
-    """True if no coordinate is NaN or infinite: a sum of zeros is zero only then."""
+    """True if no coordinate is NaN or infinite; only then is 0 times their sum 0."""
     total = 0.0
     for i in range(points_3d.shape[0]):
         total += 0.0 * (points_3d[i, 0] + points_3d[i, 1] + points_3d[i, 2])
@@ -199,7 +200,7 @@ def all_finite(points_3d: FloatArray, points_2d: FloatArray) -> bool:
 
 @kernel
 def pinhole_rays(points_2d: FloatArray, fx: float, fy: float, cx: float, cy: float) -> FloatArray:
-    """Normalised image coordinates (n, 2) of pixels (n, 2), for a lens without distortion."""
+    """Normalised image coordinates (n, 2) of pixels (n, 2), without distortion."""
     rays = np.empty((points_2d.shape[0], 2))
     for i in range(points_2d.shape[0]):
         rays[i, 0] = (points_2d[i, 0] - cx) / fx

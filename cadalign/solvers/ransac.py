@@ -1,9 +1,9 @@
-"""Robust search: LO-RANSAC over the minimal solver.
+"""Robust estimation by LO-RANSAC with a minimal solver.
 
-Truncated squared errors (MSAC) rank the hypotheses; a sequential probability ratio test rejects
-bad ones after a few points (Matas, Chum, "Randomized RANSAC with sequential probability ratio
-test", 2005); a new best one is optimised locally (Chum, Matas, Kittler, "Locally optimized RANSAC",
-2003).
+Truncated squared errors (MSAC) rank the hypotheses. A sequential probability ratio test rejects bad
+ones after a few points (Matas, Chum, "Randomized RANSAC with sequential probability ratio test",
+2005). Each new best hypothesis is optimised locally (Chum, Matas, Kittler, "Locally optimized
+RANSAC", 2003).
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ from cadalign.solvers.projection import scalars_of
 from cadalign.solvers.search import refine
 from cadalign.solvers.starts import next_subset
 
-_FEW_POINTS = 24  # so few are always all looked at
-_RANDOM_SUPPORT = 0.02  # share of the points that a wrong hypothesis fits, at first
-_LEAST_SUPPORT = 0.03  # share of the points that a hypothesis is expected to fit, at least
+_FEW_POINTS = 24  # up to so many points, the ratio test rejects nothing
+_RANDOM_SUPPORT = 0.02  # initial estimate of the inlier ratio of a wrong hypothesis
+_LEAST_SUPPORT = 0.03  # least expected inlier ratio of a correct hypothesis
 _REJECTION = 200.0  # likelihood ratio at which a hypothesis is rejected
 _LOCAL_POINTS = 120
 _LOCAL_ITERATIONS = 6
 _LOCAL_ROUNDS = 3
-_WIDE = 2.0  # thresholds within which the first round takes points
+_FIRST_FACTOR = 2.0  # the first local round uses a wider threshold
 _LEAST_POINTS = 5
 _FINAL_ROUNDS = 20
 _FINAL_ITERATIONS = 50
 _RIGID_ITERATIONS = 4
-_SHARES = 1 << 31  # of which a number is drawn by confidence
+_SHARES = 1 << 31  # resolution of random numbers in [0, 1)
 
 
 class Settings(NamedTuple):
-    """Options of `cadalign.RansacOptions`; an exhaustive search tries every subset once."""
+    """Fields of `cadalign.RansacOptions`; an ``exhaustive`` search tries every subset once."""
 
     threshold: float
     minimal: int
@@ -69,10 +69,11 @@ def ransac_kernel(
     pose: FloatArray,
     inliers: BoolArray,
 ) -> tuple[float, int, int]:
-    """Find the pose with the lowest truncated score [px^2]; returns it, iterations and hypotheses.
+    """Write the pose (15,) with the lowest truncated score [px^2], and its inliers (n,).
 
-    The objective has the points in random order. ``confidence`` (n,) is the cumulative share by
-    which every other sample is drawn, or empty.
+    Returns the score and the numbers of iterations and hypotheses. The objective's points must be
+    in random order. ``confidence`` (n,) holds cumulative probabilities for every other sample, or
+    is empty.
     """
     keypoints = objective.keypoints
     n = keypoints.points.shape[0]
@@ -97,7 +98,7 @@ def ransac_kernel(
             if iterations > 0 and not next_subset(chosen, n):
                 break
         else:
-            # The most trusted points may all lie on one side: every other sample is of all points.
+            # Confident points may all lie on one side, so every other sample ignores confidence.
             draw_subset(state, n, confidence if iterations % 2 == 0 else confidence[:0], chosen)
         iterations += 1
         found = _solve_sample(keypoints, settings.minimal, chosen, memory, candidates)
@@ -107,7 +108,7 @@ def ransac_kernel(
             score, support, seen = score_pose(
                 keypoints, candidates[k], limit, best, share, random_support
             )
-            if seen < n and seen > 0:  # rejected: learn how much support a wrong one finds
+            if seen < n and seen > 0:  # rejected: update the inlier ratio of wrong ones
                 random_support = 0.98 * random_support + 0.02 * max(support / seen, 0.002)
             if not score < best:
                 continue
@@ -124,7 +125,7 @@ def ransac_kernel(
                 needed = _needed_samples(best_support / n, settings)
                 needed *= 2.0 if confidence.shape[0] > 0 else 1.0
     if best < np.inf and settings.optimize:
-        best = _finish(objective, settings.threshold, best, pose)
+        best = _refine_inliers(objective, settings.threshold, best, pose)
     scalars = scalars_of(pose)
     for i in range(n):
         inliers[i] = squared_error(keypoints, scalars, i) < limit
@@ -133,11 +134,11 @@ def ransac_kernel(
 
 @kernel
 def _needed_samples(inlier_ratio: float, settings: Settings) -> float:
-    """The number of samples after which one without outliers was drawn, by the given chance."""
+    """Number of samples that include one without outliers, with the requested probability."""
     good = inlier_ratio**settings.size
     if good >= 1.0:
         return 1.0
-    # A rejection test that errs once in _REJECTION costs that many more samples.
+    # The test rejects one good hypothesis in _REJECTION.
     good *= 1.0 - 1.0 / _REJECTION
     return float(np.log(1.0 - settings.success_prob) / np.log1p(-good))
 
@@ -165,14 +166,14 @@ def score_pose(
     inlier_ratio: float,
     random_support: float,
 ) -> tuple[float, int, int]:
-    """Truncated score, number of inliers, and how many points were looked at.
+    """Truncated score, number of inliers, and number of points that were scored.
 
-    Gives up, with an infinite score, once the score exceeds the best one, or once the points seen
-    so far are much likelier under a wrong model than under one as good as the best.
+    Stops with an infinite score once the score exceeds ``best``, or once the points so far are much
+    likelier under a wrong hypothesis than under one as good as the best.
     """
     n = keypoints.points.shape[0]
     few = n <= _FEW_POINTS
-    # Before anything good is found, a hypothesis must look better than chance.
+    # Before a good hypothesis is found, the expected ratio must exceed chance.
     sought = min(max(inlier_ratio, _LEAST_SUPPORT, 1.5 * random_support), 0.99)
     miss = 1.0 if few else (1.0 - random_support) / (1.0 - sought)
     hit = 1.0 if few else random_support / sought
@@ -197,7 +198,7 @@ def score_pose(
 @kernel
 def _optimize_locally(objective: Objective, threshold: float, pose: FloatArray) -> None:
     for r in range(_LOCAL_ROUNDS):
-        factor = _WIDE + (1.0 - _WIDE) * r / (_LOCAL_ROUNDS - 1)
+        factor = _FIRST_FACTOR + (1.0 - _FIRST_FACTOR) * r / (_LOCAL_ROUNDS - 1)
         some = _inliers_of(objective, factor * threshold, pose, _LOCAL_POINTS)
         if some.keypoints.points.shape[0] < _LEAST_POINTS:
             break
@@ -206,7 +207,7 @@ def _optimize_locally(objective: Objective, threshold: float, pose: FloatArray) 
 
 @kernel
 def _inliers_of(objective: Objective, threshold: float, pose: FloatArray, most: int) -> Objective:
-    """The objective of the first ``most`` points that lie within a threshold."""
+    """Restrict the objective to the first ``most`` points with errors below the threshold."""
     limit = threshold * threshold
     scalars = scalars_of(pose)
     n = objective.keypoints.points.shape[0]
@@ -222,8 +223,8 @@ def _inliers_of(objective: Objective, threshold: float, pose: FloatArray, most: 
 
 
 @kernel
-def _finish(objective: Objective, threshold: float, best: float, pose: FloatArray) -> float:
-    """Refine on all inliers until they don't change any more; returns the score."""
+def _refine_inliers(objective: Objective, threshold: float, best: float, pose: FloatArray) -> float:
+    """Refine on all inliers until they are stable; returns the score."""
     trial = pose.copy()
     support = -1
     limit = threshold * threshold
@@ -250,7 +251,7 @@ StateArray = npt.NDArray[np.uint64]
 
 @kernel
 def seed_state(seed: int, state: StateArray) -> None:
-    """Start a random stream (1,) from a seed: one step of SplitMix64, never zero."""
+    """Seed the random state (1,) by one step of SplitMix64; the state is never zero."""
     z = np.uint64(seed) + np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -260,7 +261,7 @@ def seed_state(seed: int, state: StateArray) -> None:
 
 @kernel
 def draw_below(state: StateArray, bound: int) -> int:
-    """A whole number from 0 to ``bound - 1``; xorshift64*."""
+    """Draw an integer from 0 to ``bound - 1`` by xorshift64*."""
     x = state[0]
     x ^= x >> np.uint64(12)
     x ^= x << np.uint64(25)
@@ -271,7 +272,7 @@ def draw_below(state: StateArray, bound: int) -> int:
 
 @kernel
 def draw_subset(state: StateArray, count: int, confidence: FloatArray, chosen: IntArray) -> None:
-    """Draw distinct point numbers below ``count``, alike or by cumulative confidence (n,)."""
+    """Draw distinct indices below ``count``, uniformly or by cumulative confidence (n,)."""
     k = 0
     while k < chosen.shape[0]:
         if confidence.shape[0] == 0:
@@ -292,7 +293,7 @@ def draw_subset(state: StateArray, count: int, confidence: FloatArray, chosen: I
 def rigid_hypotheses(
     keypoints: KeypointEvidence, draws: IntArray, limit: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Poses (S, 15) of samples (S, k), from the first three, and truncated scores (S,) on all."""
+    """Poses (S, 15) from samples ``draws`` (S, k), and truncated scores (S,) on all points."""
     free = np.ones(UNKNOWNS)
     free[6:] = 0.0
     memory, solutions = p3p_memory(), np.empty((MAX_POSES, POSE_SIZE))

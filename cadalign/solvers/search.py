@@ -1,8 +1,8 @@
-"""Systems of unknowns, their one refinement and their one search for minima.
+"""Levenberg-Marquardt refinement and search for minima, generic over systems of unknowns.
 
-A system is a NamedTuple of all that is known about one object: evidence and priors. A state of it
-is a row of numbers (D,), whose layout the system knows; a step is one of its unknowns (U,). Each of
-the functions here is a family of kernels with a member for each system, in that system's module:
+A system is a NamedTuple of the evidence and priors of one object. Its state is a row of numbers
+(D,) in a layout of its own; a step is a vector of its unknowns (U,). The families of kernels below
+have one member for each system, in the module of that system:
 
 =========================  =====================================================================
 `alignment.Objective`       pose and stretch from the keypoints of one view
@@ -10,11 +10,11 @@ the functions here is a family of kernels with a member for each system, in that
 `joint.system.Joint`        poses, scales, focal lengths and shape from all evidence
 =========================  =====================================================================
 
-Costs are -2 log of a likelihood times a prior, up to a constant; equations hold half the cost's
-gradient, J' W r, and its Gauss-Newton matrix, J' W J. A cost is infinite behind a camera.
+A cost is -2 log (likelihood times prior), up to a constant, and infinite behind a camera. Equations
+hold half the gradient of the cost, J' W r, and its Gauss-Newton matrix, J' W J.
 
-`refine` is the one Levenberg-Marquardt loop; a search probes starts, refines the promising ones and
-tells minima apart.
+`refine` is the Levenberg-Marquardt loop. `search` probes starts, refines the promising ones and
+keeps distinct minima.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, kernel, kernel_family
 from cadalign.solvers.linalg import copy_into
 
-room_of = kernel_family("room_of")
-"""``(system)``: room for the equations that steps are from and for those of a trial, in turns.
+allocate = kernel_family("allocate")
+"""``(system)``: allocate two sets of equations, for the current state and for a trial.
 
 Their ``gradient`` has one entry for each unknown.
 """
@@ -42,17 +42,17 @@ solve = kernel_family("solve")
 Returns the decrease of the cost that the equations predict for it, NaN where they have no solution.
 """
 move = kernel_family("move")
-"""``(system, state, equations, damping, step, moved)``: write the state that a step leads to.
+"""``(system, state, equations, damping, step, moved)``: write the state after a step.
 
-What the equations eliminate follows it.
+Unknowns that the equations eliminate are set to their optimum.
 """
 score_of = kernel_family("score_of")
-"""``(system, state, cost)``: -2 log of the evidence by Laplace's approximation, but for a constant.
+"""``(system, state, cost)``: -2 log evidence by Laplace's approximation, up to a constant.
 
-Infinite where the unknowns are not determined; ``cost`` where the system ranks by cost.
+Infinite if the unknowns are not determined. A system that ranks by cost returns ``cost``.
 """
 are_same = kernel_family("are_same")
-"""``(system, first, second)``: True if two states lie at the same minimum."""
+"""``(system, first, second)``: True if two states belong to the same minimum."""
 
 _RELATIVE_DECREASE = 1e-12
 _ABSOLUTE_DECREASE = 1e-16
@@ -63,14 +63,14 @@ _LEAST_DAMPING = 1e-12
 
 @kernel
 def refine(system: Any, max_iterations: int, state: FloatArray) -> tuple[float, int, bool]:
-    """Improve ``state`` in place; returns the cost, the iterations, and if they converged."""
-    current, new = room_of(system)
+    """Improve ``state`` in place; returns cost, number of iterations, and True if converged."""
+    current, new = allocate(system)
     step = np.zeros(current.gradient.shape[0])
-    return _descend(system, max_iterations, state, state.copy(), step, current, new)
+    return _levenberg_marquardt(system, max_iterations, state, state.copy(), step, current, new)
 
 
 @borrowing
-def _descend(
+def _levenberg_marquardt(
     system: Any,
     max_iterations: int,
     state: FloatArray,
@@ -79,11 +79,11 @@ def _descend(
     current: Any,
     new: Any,
 ) -> tuple[float, int, bool]:
-    """Improve ``state``; ``trial`` is a copy of it, the others are room for equations and step."""
+    """Improve ``state``; ``trial`` is a copy of it, the other arrays are scratch space."""
     cost = np.inf
     damping = _FIRST_DAMPING
     growth = 4.0
-    expected = 0.0  # decrease of the cost by the step, on the quadratic model
+    expected = 0.0  # decrease of the cost that the quadratic model predicts
     done = False
     iterations = 0
     while True:
@@ -112,13 +112,16 @@ def _descend(
                 break
             damping *= growth
             growth *= 2.0
-        # A small step counts as the end only where it is not the damping that made it small.
+        # A small step means convergence only if damping did not cause it.
         done = damping < 1e-2 and expected <= _ABSOLUTE_DECREASE + _RELATIVE_DECREASE * cost
         move(system, state, current, damping, step, trial)
 
 
 class Effort(NamedTuple):
-    """Starts, refined by ``probe`` iterations, then by more, within ``unlikely`` of the best."""
+    """Limits of a search: number of starts, iterations of the probe, iterations afterwards.
+
+    A probed start whose cost exceeds the best by ``unlikely`` is dropped.
+    """
 
     starts: int
     probe: int
@@ -129,8 +132,8 @@ class Effort(NamedTuple):
 class Minima(NamedTuple):
     """Distinct minima, the best score first: ``states`` (M, D), ``costs`` (M,), ``scores`` (M,).
 
-    The ``label`` (M,) is that of each one's system; ``counts`` (2,) are numbers of minima and
-    iterations.
+    ``label`` (M,) tells which system each belongs to. ``counts`` (2,) are the numbers of minima
+    and of iterations.
     """
 
     states: FloatArray
@@ -141,8 +144,7 @@ class Minima(NamedTuple):
 
 
 @kernel
-def room_for_minima(most: int, size: int) -> Minima:
-    """Room for so many minima of states of a size."""
+def empty_minima(most: int, size: int) -> Minima:
     return Minima(
         np.zeros((most, size)),
         np.full(most, np.inf),
@@ -156,10 +158,10 @@ def room_for_minima(most: int, size: int) -> Minima:
 def search(
     system: Any, starts: FloatArray, effort: Effort, label: int, penalty: float, minima: Minima
 ) -> None:
-    """Add the minima that ``starts`` (S, D) lead to; ``penalty`` adds to their scores."""
+    """Add the minima reached from ``starts`` (S, D); ``penalty`` is added to their scores."""
     count = starts.shape[0]
     scores = np.empty(count)
-    for s in range(count):  # a single one has no rank
+    for s in range(count):  # a single start needs no rank
         scores[s] = cost_at(system, starts[s]) if count > 1 else 0.0
     most = min(effort.starts, count)
     probed, converged = np.full(most, np.inf), np.zeros(most, dtype=np.bool_)
@@ -199,7 +201,7 @@ def search(
 
 
 @kernel
-def descend(
+def refine_integrated(
     plain: Any,
     whole: Any,
     likely: Minima,
@@ -209,11 +211,12 @@ def descend(
     penalty: float,
     minima: Minima,
 ) -> None:
-    """Add the minima of the ``whole`` objective that ``likely`` states of a ``plain`` one lead to.
+    """Refine ``likely`` states of a ``plain`` objective on the ``whole`` one; add the minima.
 
-    The whole one has the shape integrated out. The most promising state comes first, none whose
-    score exceeds the best by ``unlikely``. Minima of the plain one are no starts: some lie so near
-    the camera that the descent ends in another minimum. ``costs`` are plain ones.
+    The whole objective has the shape integrated out. The most promising state is refined first; a
+    state whose score exceeds the best by ``unlikely`` is dropped. ``likely`` states should not be
+    converged on the plain objective: some of its minima lie so near the camera that refinement
+    ends in another minimum. ``costs`` of the result are plain ones.
     """
     count = likely.counts[0]
     scores = np.full(count, np.inf)
@@ -243,7 +246,7 @@ def descend(
 def add_minimum(
     system: Any, state: FloatArray, cost: float, label: int, penalty: float, minima: Minima
 ) -> None:
-    """Insert a state by its score, unless it is found already."""
+    """Insert a state by its score, unless its minimum is known already."""
     if not cost < np.inf or _find(system, state, cost, label, minima) >= 0:
         return
     score = score_of(system, state, cost) + penalty
@@ -266,7 +269,7 @@ def add_minimum(
 
 @kernel
 def _find(system: Any, state: FloatArray, cost: float, label: int, minima: Minima) -> int:
-    """Row of the minimum that a state coincides with, which takes the better of both; or -1."""
+    """Row of the minimum that a state belongs to, or -1; the row keeps the better state."""
     for k in range(minima.counts[0]):
         if minima.label[k] == label and are_same(system, state, minima.states[k]):
             if cost < minima.costs[k]:

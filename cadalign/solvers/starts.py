@@ -1,4 +1,4 @@
-"""Starts of a search for alignments: subsets of the points for minimal solvers, and rotations."""
+"""Starts of a search for alignments, from minimal solvers and from a grid of rotations."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from cadalign.solvers.linalg import (
     cholesky,
     cross,
     dot,
-    minus,
     rotation_from_quaternion,
     second_moments,
     solve_cholesky,
+    subtract,
     triple,
 )
 from cadalign.solvers.minimal import MAX_SOLUTIONS, minimal_memory, solve_subset
@@ -27,7 +27,7 @@ _LEAST_DEPTH = 1e-9
 def minimal_starts(
     points: FloatArray, rays: FloatArray, subsets: IntArray, count: int, poses: FloatArray
 ) -> int:
-    """Write every solution of the minimal solver on ``subsets`` (S, 4); returns their number."""
+    """Write all minimal solutions of the first ``count`` subsets (S, 4); returns their number."""
     memory = minimal_memory()
     found = 0
     for s in range(count):
@@ -38,7 +38,7 @@ def minimal_starts(
 
 @kernel
 def choose_subsets(points: FloatArray, subsets: IntArray) -> int:
-    """Fill ``subsets`` (k, 3 or 4) with all, or k that span much; returns how many were filled."""
+    """Fill ``subsets`` (k, 3 or 4) with all, or k of large area or volume; returns their number."""
     n = points.shape[0]
     wanted, size = subsets.shape
     draw = np.arange(size)
@@ -55,7 +55,7 @@ def choose_subsets(points: FloatArray, subsets: IntArray) -> int:
     state = np.uint64(88172645463325252)
     for _ in range(_DRAWS_PER_SUBSET * wanted):
         k = 0
-        while k < size:  # xorshift: a fixed sequence, the same for every problem
+        while k < size:  # xorshift with a fixed seed, so results are reproducible
             state ^= state << np.uint64(13)
             state ^= state >> np.uint64(7)
             state ^= state << np.uint64(17)
@@ -80,19 +80,19 @@ def choose_subsets(points: FloatArray, subsets: IntArray) -> int:
 
 @kernel
 def _extent(points: FloatArray, chosen: IntArray) -> float:
-    """Six times the volume of a tetrahedron, or the square of twice the area of a triangle."""
+    """6 times the volume of a tetrahedron, or 4 times the squared area of a triangle."""
     first = triple(points[chosen[0]])
-    u, v = minus(triple(points[chosen[1]]), first), minus(triple(points[chosen[2]]), first)
+    u, v = subtract(triple(points[chosen[1]]), first), subtract(triple(points[chosen[2]]), first)
     normal = cross(u, v)
     if chosen.shape[0] == 3:
         return dot(normal, normal)
-    return abs(dot(minus(triple(points[chosen[3]]), first), normal))
+    return abs(dot(subtract(triple(points[chosen[3]]), first), normal))
 
 
 @kernel
 def relief(points: FloatArray, rays: FloatArray, whitening: FloatArray) -> float:
-    """Root mean square distance of points (n, 3) from their plane in sigmas of the image, about."""
-    a, p, q, b, r, c = second_moments(points)  # centred, as the search has them
+    """Approximate RMS distance of centred points (n, 3) from their plane, in sigmas of rays."""
+    a, p, q, b, r, c = second_moments(points)
     minors = a * b - p * p + a * c - q * q + b * c - r * r
     determinant = a * (b * c - r * r) - p * (p * c - q * r) + q * (p * r - b * q)
     information = 0.0
@@ -106,16 +106,17 @@ def relief(points: FloatArray, rays: FloatArray, whitening: FloatArray) -> float
 
 @kernel
 def rotation_starts(points: FloatArray, rays: FloatArray, poses: FloatArray) -> int:
-    """Fill ``poses`` (k, 15) with poses of the unstretched model at k evenly spread rotations.
+    """Write poses (k, 15) of the unstretched model at k evenly spread rotations.
 
-    A super-Fibonacci spiral (Alexa, "Super-Fibonacci spirals: fast, low-discrepancy sampling of
-    SO(3)", 2022). The translation is linear then, and coplanar points do, too.
+    Rotations lie on a super-Fibonacci spiral (Alexa, "Super-Fibonacci spirals: fast,
+    low-discrepancy sampling of SO(3)", 2022). The translation follows from linear equations, also
+    for coplanar points. Returns the number of poses.
     """
     wanted = poses.shape[0]
     rotation = np.empty((3, 3))
     matrix = np.empty((3, 3))
     right = np.empty(3)
-    unstretched = np.ones(3)
+    coordinate_of = np.ones(3)
     found = 0
     for k in range(wanted):
         s = (k + 0.5) / wanted
@@ -151,7 +152,7 @@ def rotation_starts(points: FloatArray, rays: FloatArray, poses: FloatArray) -> 
         if not cholesky(matrix, 3, 1e-12):
             continue
         solve_cholesky(matrix, 3, right)
-        pack_pose(rotation, right, unstretched, poses[found])
+        pack_pose(rotation, right, coordinate_of, poses[found])
         found += 1
     return found
 
@@ -159,17 +160,17 @@ def rotation_starts(points: FloatArray, rays: FloatArray, poses: FloatArray) -> 
 def widen_by_shape(
     points: FloatArray, rays: FloatArray, variances: FloatArray, whitening: FloatArray
 ) -> FloatArray:
-    """Whitening (..., n, 3) widened by variances (..., n) of the shape's coordinates."""
+    """Whitening (..., n, 3) that includes variances (..., n) of the shape's coordinates."""
     extent, size = points.var(axis=-2).sum(axis=-1), rays.var(axis=0).sum()
     depth = np.maximum(np.sqrt(extent * 2.0 / 3.0 / max(size, 1e-30)), _LEAST_DEPTH)[..., None]
-    # The variances add up for a whitening (a, b, c) whose b is small beside a and c.
+    # Assumes a whitening (a, b, c) with small b.
     information = np.square(whitening[:, ::2]).sum(axis=1) / 2.0
     return np.asarray(whitening / np.sqrt(1.0 + variances / depth**2 * information)[..., None])
 
 
 @kernel
 def next_subset(chosen: IntArray, count: int) -> bool:
-    """Step to the next subset in lexicographic order; False after the last."""
+    """Advance to the next subset in lexicographic order; False after the last."""
     size = chosen.shape[0]
     i = size - 1
     while i >= 0 and chosen[i] == count - size + i:

@@ -1,8 +1,8 @@
-"""Unknowns of an alignment: their order, their packing, and the step that moves them.
+"""Unknowns of an alignment: order, packing and steps.
 
-A pose is packed into 15 numbers: rotation row by row (9), translation (3), scale (3). Its unknowns
-are, in this order, a rotation vector that is applied in the camera frame (3), the translation (3),
-log s_y and log s_z.
+A pose is packed into 15 numbers: rotation row by row (9), translation (3), scale (3). The unknowns
+are, in this order, a rotation vector applied in the camera frame (3), translation (3), log s_y and
+log s_z.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def pack_pose(
 
 @inlined
 def move_rigid(pose: FloatArray, step: FloatArray, moved: FloatArray) -> None:
-    """Write the rotation and translation that a step of their 6 unknowns leads to."""
+    """Write rotation and translation after a step of their 6 unknowns."""
     angle2 = step[0] * step[0] + step[1] * step[1] + step[2] * step[2]
     angle = np.sqrt(angle2)
     if angle > 1e-4:
@@ -54,7 +54,7 @@ def move_rigid(pose: FloatArray, step: FloatArray, moved: FloatArray) -> None:
 
 @kernel
 def move_pose(pose: FloatArray, step: FloatArray, moved: FloatArray) -> None:
-    """Write the pose that a step of the 8 unknowns leads to into ``moved``."""
+    """Write the pose after a step of the 8 unknowns into ``moved``."""
     move_rigid(pose, step, moved)
     moved[12] = pose[12]
     for k in range(2):
@@ -64,7 +64,7 @@ def move_pose(pose: FloatArray, step: FloatArray, moved: FloatArray) -> None:
 
 @kernel
 def uncenter(pose: FloatArray, center: FloatArray, unit: float) -> None:
-    """Turn the pose of points (x - center) / unit into the pose of points x, in place."""
+    """Convert the pose of points (x - center) / unit to the pose of points x, in place."""
     for c in range(3):
         pose[9 + c] *= unit
         for j in range(3):
@@ -73,14 +73,14 @@ def uncenter(pose: FloatArray, center: FloatArray, unit: float) -> None:
 
 @kernel
 def orthonormalize(pose: FloatArray) -> None:
-    """Remove the rounding errors of the steps from the rotation, in place."""
+    """Remove accumulated rounding errors from the rotation, in place."""
     rotation = pose[:9].reshape(3, 3)
     polish_rotation(rotation, rotation)
 
 
 @kernel
 def is_pose(pose: FloatArray) -> bool:
-    """True if all numbers are finite, the scales positive, and the rotation is one."""
+    """True if all numbers are finite, the scales positive, and the rotation orthogonal."""
     error = 0.0
     for i in range(3):
         for j in range(3):

@@ -1,7 +1,8 @@
-"""Alignment in PyTorch programs: `fit`, with gradients by keypoints, sigmas and model points.
+"""Alignment as a differentiable PyTorch function: `fit`.
 
-Needs the extra ``torch``: ``pip install "cadalign[torch]"``. Fits run in the compiled kernels,
-on the processor; gradients are those of the optimum, by the implicit function theorem.
+Gradients flow to keypoints, sigmas and model points, by the implicit function theorem at the
+optimum. Fits run on the CPU, in the compiled kernels. Needs the extra ``torch``:
+``pip install "cadalign[torch]"``.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ __all__ = ["PoseBatch", "fit"]
 class PoseBatch:
     """Alignments of B objects, with gradients.
 
-    ``depth (u, v, 1) = rotation diag(scale) x + translation`` in OpenCV's camera axes.
+    A model point x has the normalised image coordinates (u, v) of
+    ``depth (u, v, 1) = rotation diag(scale) x + translation``, in OpenCV's camera axes.
 
     Parameters
     ----------
@@ -35,11 +37,11 @@ class PoseBatch:
     scale : (B, 3) tensor
         Stretch along x, y and z.
     valid : (B,) bool tensor
-        Marks the estimates that exist and that the keypoints determine; the others have no
-        gradients, and those that do not exist are an identity.
+        True where a solution exists and the keypoints determine it. Elsewhere gradients are 0. A
+        problem without a solution has an identity rotation, translation (0, 0, 1) and scale 1.
     covariance : (B, 9, 9) tensor
         Inverse of the cost's Hessian, without gradients, in the order of
-        `cadalign.Result.covariance`; 0 for what is held or not determined.
+        `cadalign.Result.covariance`. Entries of fixed unknowns and of invalid problems are 0.
     """
 
     rotation: Tensor
@@ -49,7 +51,7 @@ class PoseBatch:
     covariance: Tensor
 
     def apply(self, points_3d: Tensor) -> Tensor:
-        """Model points (n, 3) or (B, n, 3) in the cameras; (B, n, 3) tensor."""
+        """Transform model points (n, 3) or (B, n, 3) to camera coordinates (B, n, 3)."""
         stretched = points_3d.to(self.scale) * self.scale[..., None, :]
         return stretched @ self.rotation.mT + self.translation[..., None, :]
 
@@ -69,27 +71,27 @@ def fit(
 ) -> PoseBatch:
     """Fit a batch of models to their keypoints, as `cadalign.fit` does, with gradients.
 
-    Problems without a solution do not raise: ``valid`` of the result marks the others. Gradients
-    are those of the optimum, by ``points_2d``, ``sigma`` and ``points_3d``; there are no second
-    ones, and `torch.func` (``grad``, ``vmap``) does not pass: a batch is what ``vmap`` would make.
+    Gradients flow to ``points_2d``, ``sigma`` and ``points_3d``. Second derivatives and
+    `torch.func` (``grad``, ``vmap``) are not supported. A problem without a solution does not
+    raise: its entry of ``valid`` is False.
 
     Parameters
     ----------
     points_3d : (n, 3) or (B, n, 3) tensor
         Keypoints on the models [model units].
     points_2d : (B, n, 2) tensor
-        The same keypoints in the images [px]. Its precision is the result's; the search itself is
-        in double precision, on the processor.
+        The same keypoints in the images [px]. The result has the dtype and the device of this
+        tensor. The search runs in double precision, on the CPU.
     camera : Camera or sequence of B Camera
     sigma : float or tensor that expands to (B, n)
         Standard deviations of the keypoints [px].
     mask : (B, n) bool tensor, optional
-        Marks the keypoints that are present. Those that are not finite, or whose sigma is not
-        positive, count as absent.
+        True for the keypoints to use. A keypoint that is not finite, or whose sigma is not
+        positive, is ignored.
     loss, loss_scale, stretch, stretch_sigma
         As for `cadalign.fit`.
     workers : int
-        Number of threads that share the problems; -1 for all cores.
+        Number of threads; -1 for all cores.
 
     Returns
     -------
@@ -98,8 +100,8 @@ def fit(
     Raises
     ------
     InputError
-        If a type, a shape or an option is wrong, a focal length is unknown, or a lens is a wide
-        one.
+        If a type, a shape or an option is wrong, a focal length is unknown, or a lens is wide
+        (`cadalign.Camera.is_wide`).
 
     Examples
     --------
@@ -117,8 +119,8 @@ def fit(
     >>> pixels.grad.shape
     torch.Size([1, 8, 2])
     """
-    # PyTorch, an extra, is imported when it is wanted.
-    from cadalign.torch.layer import FitTask, optima_of
+    # PyTorch is an optional dependency.
+    from cadalign.torch.layer import FitTask, solve_optima
 
     options = FitOptions(
         loss=loss, loss_scale=loss_scale, stretch=stretch, stretch_sigma=stretch_sigma
@@ -127,13 +129,13 @@ def fit(
     shape = tuple(points_2d.shape[:2])
     sigma = points_2d.new_tensor(float(sigma)) if is_number(sigma) else sigma
     mask = points_2d.new_tensor(True, dtype=bool) if mask is None else mask
-    _require_tensor(sigma, "sigma", fix="give a number or a tensor, standard deviations in pixels")
-    found = optima_of(
+    _require_tensor(sigma, "sigma", fix="give a number or a tensor [px]")
+    found = solve_optima(
         FitTask(_cameras(camera, len(points_2d)), options, workers),
-        _expanded(points_3d, (*shape, 3), "points_3d").double().cpu(),
+        _expand(points_3d, (*shape, 3), "points_3d").double().cpu(),
         points_2d.double().cpu(),
-        _expanded(sigma, shape, "sigma").double().cpu(),
-        _expanded(mask, shape, "mask").bool().cpu(),
+        _expand(sigma, shape, "sigma").double().cpu(),
+        _expand(mask, shape, "mask").bool().cpu(),
     )
     rotation, translation, scale, covariance = (each.to(points_2d) for each in found[:4])
     valid = found.valid.to(points_2d.device)
@@ -141,22 +143,19 @@ def fit(
 
 
 def _cameras(camera: Camera | Sequence[Camera], count: int) -> tuple[Camera, ...]:
-    """The camera of all, or those of ``count`` problems.
-
-    Raises InputError if it is neither one nor as many.
-    """
+    """Cameras as a tuple: one for all problems, or ``count``; otherwise raise InputError."""
     cameras = tuple(camera) if isinstance(camera, Iterable) else (camera,)
     for each in cameras:
         require_kind(each, Camera, "camera")
     if len(cameras) not in (1, count):
         what = f"{len(cameras)} cameras for {count} problems"
-        raise InputError(what, where="camera", fix="give one, or one for each problem")
+        raise InputError(what, where="camera", fix="give one camera, or one per problem")
     return cameras
 
 
 def _check_pixels(points_2d: Tensor) -> None:
     _require_tensor(points_2d, "points_2d")
-    if not points_2d.is_floating_point():  # the estimates are of its type
+    if not points_2d.is_floating_point():  # the result has its dtype
         what = f"expected floating point numbers, got {points_2d.dtype}"
         raise InputError(what, where="points_2d", fix="give points_2d.double()")
     if points_2d.ndim != 3 or points_2d.shape[2] != 2:
@@ -165,9 +164,8 @@ def _check_pixels(points_2d: Tensor) -> None:
 
 
 def _require_tensor(
-    value: object, where: str, *, fix: str = "torch.as_tensor makes one of an array"
+    value: object, where: str, *, fix: str = "convert it with torch.as_tensor(...)"
 ) -> None:
-    """Refuse what is no tensor."""
     from torch import Tensor
 
     if not isinstance(value, Tensor):
@@ -175,14 +173,10 @@ def _require_tensor(
         raise InputError(what, where=where, fix=fix)
 
 
-def _expanded(tensor: Tensor, shape: tuple[int, ...], where: str) -> Tensor:
-    """The tensor expanded to a shape.
-
-    Raises InputError if that is not possible, or it is no tensor.
-    """
+def _expand(tensor: Tensor, shape: tuple[int, ...], where: str) -> Tensor:
     _require_tensor(tensor, where)
     try:
         return tensor.expand(shape)
     except RuntimeError:
-        what = f"shape {tuple(tensor.shape)}, expected one that expands to {shape}"
+        what = f"shape {tuple(tensor.shape)} does not expand to {shape}"
         raise InputError(what, where=where) from None

@@ -1,13 +1,14 @@
-"""Optima of many problems at once, with their derivatives by the data.
+"""Optima of a batch of problems, with their derivatives by the data.
 
-The search is that of `cadalign.fit_batch`, in the compiled kernels. The optimum t of data d solves
-``g(t, d) = 0``, g half the gradient of the cost. So ``dt/dd = -H^-1 dg/dd`` with ``H = dg/dt`` (the
-implicit function theorem; of PnP: Chen et al., *End-to-end learnable geometric vision by
-backpropagating PnP optimization*, CVPR 2020). One Newton step, ``t - H^-1 g(t, d)`` with H held,
-has these derivatives, and removes what the search's tolerance leaves: PyTorch differentiates it.
+The search of `cadalign.fit_batch` finds the optimum t of data d. There half the gradient of the
+cost vanishes: ``g(t, d) = 0``. The implicit function theorem gives ``dt/dd = -H^-1 dg/dd``, with
+``H = dg/dt`` (for PnP: Chen et al., *End-to-end learnable geometric vision by backpropagating PnP
+optimization*, CVPR 2020). The Newton step ``t - H^-1 g(t, d)`` with a constant H has the same
+derivatives, so PyTorch differentiates this step. It also removes the error that the search's
+tolerance leaves.
 
-The unknowns t are those of `cadalign.Result.covariance`: rotation vector in the camera frame,
-translation, logarithms of the scales.
+The unknowns t are ordered as in `cadalign.Result.covariance`: rotation vector in the camera frame,
+translation, log scales.
 """
 
 from __future__ import annotations
@@ -36,14 +37,14 @@ except ImportError:
     ) from None
 
 _UNKNOWNS = 9
-_LARGEST_POLISH = 0.02  # turn [rad] or change of a logarithm beyond which a step is no polish
-_NO_POSE = np.array([1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1, 1, 1, 1])
-_LEAST_DEPTH = 1e-9  # of points behind the camera
-_LEAST_SHARE = 1e-10  # of an unknown's information that the others must leave
+_LARGEST_POLISH = 0.02  # largest rotation [rad] or log scale of a Newton step that is applied
+_IDENTITY_POSE = np.array([1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1, 1, 1, 1])
+_LEAST_DEPTH = 1e-9  # replaces smaller and negative depths
+_LEAST_SHARE = 1e-10  # least information about an unknown given the others, relative to its own
 
 
 class Optima(NamedTuple):
-    """Fits of B problems; the covariance (B, 9, 9) and the mask have no derivatives."""
+    """Fits of B problems. Covariance (B, 9, 9) and ``valid`` have no derivatives."""
 
     rotation: Tensor  # (B, 3, 3)
     translation: Tensor  # (B, 3)
@@ -54,9 +55,9 @@ class Optima(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FitTask:
-    """Input of a batch's fits beside tensors: one camera, or one for each problem.
+    """Cameras and options of a batch of fits: one camera for all, or one per problem.
 
-    Raises InputError for cameras that the derivatives don't know.
+    Raises InputError for a wide lens or an unknown focal length.
     """
 
     cameras: tuple[Camera, ...]
@@ -65,15 +66,15 @@ class FitTask:
 
     def __post_init__(self) -> None:
         if any(each.is_wide for each in self.cameras):
-            what = "wide lenses have no gradients"
+            what = "gradients are not implemented for wide lenses"
             raise InputError(what, where="camera", fix="undistort keypoints and camera first")
         if not all(each.focal_known for each in self.cameras):
             what = "the focal length is unknown"
             raise InputError(what, where="camera", fix="give it: camera.with_focal(...)")
 
 
-class _Once(torch.autograd.Function):
-    """The same numbers, whose derivatives can be taken once: the Newton step holds H."""
+class _FirstOrder(torch.autograd.Function):
+    """Identity that refuses a second derivative, since the Newton step treats H as constant."""
 
     @staticmethod
     def forward(ctx: Any, data: Tensor) -> Tensor:
@@ -86,32 +87,32 @@ class _Once(torch.autograd.Function):
 
 
 @np.errstate(all="ignore")
-def optima_of(
+def solve_optima(
     task: FitTask, points: Tensor, pixels: Tensor, sigmas: Tensor, mask: Tensor
 ) -> Optima:
-    """The optima of points (B, n, 3), pixels (B, n, 2), sigmas and mask (B, n), of double numbers.
+    """Solve for points (B, n, 3), pixels (B, n, 2), sigmas and mask (B, n), in double precision.
 
-    The derivatives are those before the Newton step: it is far below the noise.
+    Derivatives are taken before the Newton step, which is far below the noise.
     """
     options = task.options
-    points, pixels, sigmas = map(_Once.apply, (points, pixels, sigmas))
+    points, pixels, sigmas = map(_FirstOrder.apply, (points, pixels, sigmas))
     present = mask & points.isfinite().all(2) & pixels.isfinite().all(2)
     present &= sigmas.isfinite() & (sigmas > 0)
     points, pixels = (torch.where(present[..., None], each, 0.0) for each in (points, pixels))
     sigmas = torch.where(present, sigmas, 1.0)
     given = [each.detach().numpy() for each in (points, pixels, sigmas, present)]
-    poses, found = _searched(task, *given)
+    poses, found = _search(task, *given)
     cost = _Cost(task, poses, given[1], given[3])
-    with torch.enable_grad():  # by the step, also where the caller wants none
+    with torch.enable_grad():  # the Hessian needs it, even under torch.no_grad
         step = torch.zeros(len(poses), _UNKNOWNS, dtype=torch.float64, requires_grad=True)
-        total = cost.half_of(step, points, pixels, sigmas)
+        total = cost.half_cost(step, points, pixels, sigmas)
         (gradient,) = torch.autograd.grad(total, step, create_graph=True)
         free = torch.as_tensor(options.estimated_unknowns)
         rows = [
             torch.autograd.grad(gradient[:, k].sum(), step, retain_graph=True)[0]
             for k in free.tolist()
         ]
-    inverse, determined = _inverted(torch.stack(rows, 1)[:, :, free])
+    inverse, determined = _invert(torch.stack(rows, 1)[:, :, free])
     valid = determined & torch.as_tensor(found)
     covariance = torch.zeros(len(poses), _UNKNOWNS, _UNKNOWNS, dtype=torch.float64)
     covariance[:, free[:, None], free] = inverse
@@ -121,10 +122,10 @@ def optima_of(
         gradient = gradient.detach()
     polish = -(covariance @ gradient[..., None])[..., 0]
     is_small = polish.detach()[:, [0, 1, 2, 6, 7, 8]].abs().amax(1) < _LARGEST_POLISH
-    # Of a larger one the derivatives remain.
+    # A larger step is not applied, but keeps its derivatives.
     polish = polish - torch.where(is_small[:, None], 0.0, polish.detach())
     return Optima(
-        torch.linalg.matrix_exp(_crossed(polish[:, :3])) @ cost.rotation,
+        torch.linalg.matrix_exp(_cross_matrices(polish[:, :3])) @ cost.rotation,
         cost.translation + polish[:, 3:6],
         cost.scale * polish[:, 6:9].exp(),
         covariance,
@@ -133,7 +134,7 @@ def optima_of(
 
 
 class _Cost:
-    """Half the cost of problems as a function of a step from their optima, and of the data."""
+    """Half the cost as a function of a step from the optima and of the data."""
 
     def __init__(
         self, task: FitTask, poses: FloatArray, pixels: FloatArray, present: BoolArray
@@ -146,9 +147,9 @@ class _Cost:
         self._rays, self._by_rays = torch.as_tensor(rays), torch.as_tensor(by_rays)
         self._pixels = torch.as_tensor(pixels)
 
-    def half_of(self, step: Tensor, points: Tensor, pixels: Tensor, sigmas: Tensor) -> Tensor:
-        """Half the cost of all problems; exact in the step (B, 9) to the second order."""
-        turn = _crossed(step[:, :3])
+    def half_cost(self, step: Tensor, points: Tensor, pixels: Tensor, sigmas: Tensor) -> Tensor:
+        """Half the total cost, exact to second order in the step (B, 9)."""
+        turn = _cross_matrices(step[:, :3])
         turned = self.rotation + turn @ self.rotation + turn @ turn @ self.rotation / 2
         scale = self.scale * step[:, 6:9].exp()
         center = self.translation + step[:, 3:6]
@@ -156,13 +157,13 @@ class _Cost:
         rays = in_camera[..., :2] / in_camera[..., 2:].clamp(min=_LEAST_DEPTH)
         errors = (self._by_rays @ (rays - self._rays)[..., None])[..., 0] - (pixels - self._pixels)
         squares = (errors**2).sum(-1) / sigmas**2
-        total = torch.where(self._present, self._lost(squares), 0.0).sum()
+        total = torch.where(self._present, self._apply_loss(squares), 0.0).sum()
         prior = self._options.scale_prior
         logs = scale.log()
         beyond = logs - logs.clamp(-prior.width, prior.width)
         return (total + prior.weight * (beyond**2).sum()) / 2
 
-    def _lost(self, squares: Tensor) -> Tensor:
+    def _apply_loss(self, squares: Tensor) -> Tensor:
         bend = self._options.loss_scale
         if self._options.loss == "huber":
             outer = 2 * bend * squares.clamp(min=bend**2).sqrt() - bend**2
@@ -172,17 +173,17 @@ class _Cost:
         return squares
 
 
-def _crossed(vectors: Tensor) -> Tensor:
-    """Matrices (B, 3, 3) that take the cross product with vectors (B, 3) from the left."""
+def _cross_matrices(vectors: Tensor) -> Tensor:
+    """Cross product matrices (B, 3, 3): ``matrix @ x = cross(vector, x)`` for vectors (B, 3)."""
     x, y, z = vectors.unbind(1)
     rows = [torch.zeros_like(x), -z, y, z, torch.zeros_like(x), -x, -y, x, torch.zeros_like(x)]
     return torch.stack(rows, 1).reshape(-1, 3, 3)
 
 
-def _inverted(hessian: Tensor) -> tuple[Tensor, Tensor]:
-    """Inverses of H (B, u, u), and where the data determine all unknowns (B,).
+def _invert(hessian: Tensor) -> tuple[Tensor, Tensor]:
+    """Invert H (B, u, u); also return where the data determine all unknowns (B,).
 
-    The inverse is 0 where they do not, H being nearly singular or not positive.
+    The inverse is 0 where H is nearly singular or not positive definite.
     """
     diagonal = hessian.diagonal(dim1=1, dim2=2)
     usable = (diagonal > 0).all(1) & hessian.isfinite().all(2).all(1)
@@ -198,7 +199,7 @@ def _inverted(hessian: Tensor) -> tuple[Tensor, Tensor]:
 def _rays(
     pixels: FloatArray, present: BoolArray, cameras: tuple[Camera, ...]
 ) -> tuple[FloatArray, FloatArray]:
-    """Rays (B, n, 2) of pixels, and the derivatives (B, n, 2, 2) of the pixels by these."""
+    """Rays (B, n, 2) of pixels, and the derivatives (B, n, 2, 2) of pixels by rays."""
     rays, by_rays = np.zeros_like(pixels), np.zeros((*present.shape, 2, 2))
     for b, camera in enumerate(cameras):
         own = slice(None) if len(cameras) == 1 else slice(b, b + 1)
@@ -211,16 +212,16 @@ def _rays(
     return rays, by_rays
 
 
-def _searched(
+def _search(
     task: FitTask, points: FloatArray, pixels: FloatArray, sigmas: FloatArray, present: BoolArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Poses (B, 15) of the best minima, and for which problems there are any (B,)."""
+    """Packed poses (B, 15) of the best minima, and True where one was found (B,)."""
     cameras, options = task.cameras * (len(points) if len(task.cameras) == 1 else 1), task.options
     problems = [
         Problems(points[b, kept], pixels[b, kept], np.array([0, kept.sum()]), cameras[b])
         for b, kept in enumerate(present)
     ]
-    poses, valid = np.tile(_NO_POSE, (len(points), 1)), np.zeros(len(points), dtype=bool)
+    poses, valid = np.tile(_IDENTITY_POSE, (len(points), 1)), np.zeros(len(points), dtype=bool)
 
     def fit_alone(b: int) -> None:
         part = replace(options, sigma=sigmas[b, present[b]])
@@ -228,7 +229,7 @@ def _searched(
             poses[b] = fit_once(problems[b], part, None, None, 0.0).alignment.packed
             valid[b] = True
 
-    @np.errstate(all="ignore")  # holds for one thread only
+    @np.errstate(all="ignore")  # NumPy keeps this state per thread
     def run(first: int, last: int) -> None:
         if not are_solved_at_once(problems, options):
             for b in range(first, last):

@@ -1,4 +1,4 @@
-"""`cadalign.torch.fit`: results of the estimates, gradients, masks, failures."""
+"""`cadalign.torch.fit`: estimates, gradients, masks, failures."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def tensors(count: int = COUNT, **options: Any) -> tuple[Any, Any, Camera]:
     )
 
 
-def test_results_are_those_of_fit_batch() -> None:
+def test_results_equal_fit_batch() -> None:
     points, pixels, camera = tensors(12)
     found = fit(points, pixels, camera, sigma=0.5)
     expected = cadalign.fit_batch(points.numpy(), pixels.numpy(), camera, sigma=0.5)
@@ -63,7 +63,7 @@ def test_gradcheck(options: dict[str, Any]) -> None:
     assert torch.autograd.gradcheck(layer, inputs, eps=1e-5, atol=1e-7, rtol=1e-3, fast_mode=True)
 
 
-def test_gradients_of_a_lens_and_of_cameras_of_their_own() -> None:
+def test_gradients_with_distortion_and_with_one_camera_per_problem() -> None:
     points, pixels, camera = tensors(4)
     wider = Camera(640, 480, 900.0, 900.0, 319.5, 239.5)
     found = fit(points, pixels, camera)
@@ -75,7 +75,7 @@ def test_gradients_of_a_lens_and_of_cameras_of_their_own() -> None:
     one = fit(points, mixed, cameras)
     alone = fit(points[1:2], mixed[1:2], camera)
     np.testing.assert_allclose(one.rotation[1], alone.rotation[0], atol=1e-8)
-    kept = [0, 1, 3]  # with distortion, derivatives leave a small term out
+    kept = [0, 1, 3]  # derivatives neglect a small term of the distortion
 
     def layer(given: Any) -> tuple[Any, ...]:
         found = fit(points[kept], given, [cameras[k] for k in kept])
@@ -85,7 +85,7 @@ def test_gradients_of_a_lens_and_of_cameras_of_their_own() -> None:
     assert torch.autograd.gradcheck(layer, given, eps=1e-5, atol=1e-7, rtol=1e-3, fast_mode=True)
 
 
-def test_absent_keypoints_count_nothing() -> None:
+def test_masked_and_nan_keypoints_are_ignored() -> None:
     points, pixels, camera = tensors(6)
     mask = torch.ones(6, POINTS, dtype=torch.bool)
     mask[2, :3] = False
@@ -98,7 +98,7 @@ def test_absent_keypoints_count_nothing() -> None:
     found.scale.sum().backward()
     assert torch.isfinite(spoiled.grad).all()
     assert not spoiled.grad[2, :3].any()
-    by_nan = fit(points, spoiled, camera)  # what is not finite is absent
+    by_nan = fit(points, spoiled, camera)  # not finite: ignored
     np.testing.assert_allclose(by_nan.rotation.detach(), found.rotation.detach(), atol=1e-12)
 
 
@@ -122,7 +122,7 @@ def test_failed_and_degenerate_problems_are_marked_and_do_not_raise() -> None:
         assert gradient[4].any()
 
 
-def test_derivatives_are_taken_once() -> None:
+def test_second_derivatives_are_refused() -> None:
     points, pixels, camera = tensors(1)
     given = pixels.clone().requires_grad_()
     total = fit(points, given, camera).translation.sum()
@@ -154,11 +154,11 @@ def test_single_precision_is_kept() -> None:
         ),
         (
             lambda p, x, c: fit(p[:, :5], x, c),
-            "points_3d: shape (3, 5, 3), expected one that expands to (3, 10, 3)",
+            "points_3d: shape (3, 5, 3) does not expand to (3, 10, 3)",
         ),
         (
             lambda p, x, c: fit(p, x, [c, c]),
-            "camera: 2 cameras for 3 problems; give one, or one for each problem",
+            "camera: 2 cameras for 3 problems; give one camera, or one per problem",
         ),
         (
             lambda p, x, c: fit(p, x.round().long(), c),
@@ -166,20 +166,19 @@ def test_single_precision_is_kept() -> None:
         ),
         (
             lambda p, x, c: fit(p, x.numpy(), c),
-            "points_2d: expected a tensor, got ndarray; torch.as_tensor makes one of an array",
+            "points_2d: expected a tensor, got ndarray; convert it with torch.as_tensor(...)",
         ),
         (
             lambda p, x, c: fit(p.numpy(), x, c),
-            "points_3d: expected a tensor, got ndarray; torch.as_tensor makes one of an array",
+            "points_3d: expected a tensor, got ndarray; convert it with torch.as_tensor(...)",
         ),
         (
             lambda p, x, c: fit(p, x, c, mask=[True] * POINTS),
-            "mask: expected a tensor, got list; torch.as_tensor makes one of an array",
+            "mask: expected a tensor, got list; convert it with torch.as_tensor(...)",
         ),
         (
             lambda p, x, c: fit(p, x, c, sigma=None),
-            "sigma: expected a tensor, got NoneType; give a number or a tensor, standard "
-            "deviations in pixels",
+            "sigma: expected a tensor, got NoneType; give a number or a tensor [px]",
         ),
         (
             lambda p, x, c: fit(p, x, None),
@@ -187,7 +186,8 @@ def test_single_precision_is_kept() -> None:
         ),
         (
             lambda p, x, c: fit(p, x, Camera(640, 480, 500, 500, 319.5, 239.5, lens="fisheye")),
-            "camera: wide lenses have no gradients; undistort keypoints and camera first",
+            "camera: gradients are not implemented for wide lenses; undistort keypoints and "
+            "camera first",
         ),
         (
             lambda p, x, c: fit(p, x, Camera.without_focal(640, 480)),

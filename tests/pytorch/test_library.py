@@ -1,4 +1,4 @@
-"""PyTorch is an extra: nothing loads it unasked, and its absence is named."""
+"""PyTorch is optional: importing cadalign does not load it, and its absence has a message."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import cadalign
 from cadalign.errors import CadalignError
 
 
-def test_nothing_loads_pytorch_unasked() -> None:
+def test_import_does_not_load_pytorch() -> None:
     program = (
         "import sys, cadalign\nassert callable(cadalign.torch.fit)\nprint('torch' in sys.modules)"
     )

@@ -1,4 +1,4 @@
-"""The joint estimate's normal equations, against finite differences."""
+"""Normal equations of the joint system, against finite differences."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR, ScalePrior
 from cadalign.solvers.joint.covariance import information_of, joint_covariance
-from cadalign.solvers.joint.equations import joint_room
+from cadalign.solvers.joint.equations import empty_joint_equations
 from cadalign.solvers.joint.evidence import (
     Directions,
     Evidence,
@@ -94,7 +94,7 @@ def evidence_of(
 
 def gradient_of(evidence: Evidence, state: State, *, integrates: bool = False) -> np.ndarray:
     system = joint_system(evidence, integrates=integrates)
-    room = joint_room(system.evidence, system.layout)
+    room = empty_joint_equations(system.evidence, system.layout)
     assert evaluate(system, packed(state), room) < np.inf
     return room.gradient
 
@@ -103,9 +103,9 @@ def cost_of(evidence: Evidence, state: State, *, integrates: bool = False) -> fl
     return equations_at(evidence, packed(state), integrates=integrates)[0]
 
 
-def moved(evidence: Evidence, state: State, step: np.ndarray) -> State:
+def move_state(evidence: Evidence, state: State, step: np.ndarray) -> State:
     system = joint_system(evidence, integrates=False)
-    row, room = packed(state), joint_room(system.evidence, system.layout)
+    row, room = packed(state), empty_joint_equations(system.evidence, system.layout)
     evaluate(system, row, room)
     there = row.copy()
     move(system, row, room, 0.0, step, there)
@@ -124,8 +124,8 @@ def state_of(seed: int, poses: int, focals: int = 0) -> State:
     )
 
 
-def seen_from(evidence: Evidence, state: State) -> Evidence:
-    """The evidence that a state would give, but for 1 % of noise in the rays."""
+def predict_evidence(evidence: Evidence, state: State) -> Evidence:
+    """The evidence that a state predicts, with noise of 0.01 in the rays."""
     sightings, rig = evidence.sightings, evidence.rig
     seen = points_of(evidence.shape, state)[sightings.point]
     motions = state.poses[rig.pose[sightings.image]], rig.cam_from_rig[sightings.image]
@@ -139,7 +139,7 @@ def seen_from(evidence: Evidence, state: State) -> Evidence:
     return evidence._replace(sightings=sightings._replace(rays=rays, depths=depths))
 
 
-def test_a_known_direction_costs_nothing_where_the_model_s_is_turned_onto_it() -> None:
+def test_a_direction_that_agrees_with_the_pose_adds_no_cost() -> None:
     evidence = evidence_of(0, spread=0.0, poses=(0, 1), loss=LINEAR)
     state, up = state_of(0, 2), evidence.directions
     turns = [each[:9].reshape(3, 3) for each in (evidence.rig.cam_from_rig[1], state.poses[1])]
@@ -157,7 +157,7 @@ def test_a_known_direction_costs_nothing_where_the_model_s_is_turned_onto_it() -
     focals=st.sampled_from([0, 1, 2]),
     loss=st.sampled_from([LINEAR, HUBER, CAUCHY]),
 )
-def test_the_gradient_is_that_of_the_cost(
+def test_the_gradient_of_the_cost(
     seed: int, poses: tuple[int, int], focals: int, loss: int
 ) -> None:
     evidence = evidence_of(seed, spread=0.0, poses=poses, loss=loss, focals=focals, width=0.02)
@@ -166,7 +166,7 @@ def test_the_gradient_is_that_of_the_cost(
     slopes = np.empty(len(gradient))
     for k in range(len(slopes)):
         step = 1e-6 * np.eye(len(slopes))[k]
-        costs = [cost_of(evidence, moved(evidence, state, s)) for s in (step, -step)]
+        costs = [cost_of(evidence, move_state(evidence, state, s)) for s in (step, -step)]
         slopes[k] = (costs[0] - costs[1]) / 4e-6  # the cost has no factor 1/2
     assert np.allclose(slopes, gradient, rtol=1e-5, atol=1e-7 * np.abs(slopes).max())
 
@@ -179,22 +179,22 @@ def test_the_gradient_is_that_of_the_cost(
     spread=st.sampled_from([0.0, 0.05]),
     loss=st.sampled_from([LINEAR, HUBER, CAUCHY]),
 )
-def test_the_gradient_of_the_integrated_objective_is_that_of_the_cost(
+def test_the_gradient_of_the_log_determinant(
     seed: int, poses: tuple[int, int], focals: int, spread: float, loss: int
 ) -> None:
     spread *= poses == (0, 0)  # displacements of several poses are modes
     evidence = evidence_of(seed, spread=spread, poses=poses, loss=loss, focals=focals)
     state = state_of(seed, max(poses) + 1, focals)
     state.displacements[:] *= spread > 0
-    evidence = seen_from(evidence, state)
+    evidence = predict_evidence(evidence, state)
     gradient = gradient_of(evidence, state, integrates=True)
     plain = gradient_of(evidence, state)
     displaced = spread > 0
-    unknowns = len(gradient) - (MODES if displaced else 0)  # these move displacements, too
+    unknowns = len(gradient) - (MODES if displaced else 0)  # coefficients also move displacements
     slopes = np.empty(unknowns)
     for k in range(unknowns):
         step = 1e-5 * np.eye(len(gradient))[k]
-        ends = [moved(evidence, state, each) for each in (step, -step)]
+        ends = [move_state(evidence, state, each) for each in (step, -step)]
         if displaced:
             ends = [each._replace(displacements=state.displacements) for each in ends]
         volumes = [
@@ -202,18 +202,18 @@ def test_the_gradient_of_the_integrated_objective_is_that_of_the_cost(
         ]
         slopes[k] = (volumes[0] - volumes[1]) / 4e-5
     found = (gradient - plain)[:unknowns]
-    if displaced:  # what the shifted means add to the pose's equations
+    if displaced:  # the shifted means also change the gradient
         found -= shifts_of(evidence, state)[:unknowns]
     assert np.allclose(slopes, found, rtol=1e-4, atol=1e-5 * np.abs(slopes).max())
 
 
 def shifts_of(evidence: Evidence, state: State) -> np.ndarray:
-    """The change of the gradient by the prior means that the log determinant moves."""
+    """Change of the gradient due to the shifted prior means of displacements."""
     system = joint_system(evidence, integrates=True)
-    room = joint_room(system.evidence, system.layout)
+    room = empty_joint_equations(system.evidence, system.layout)
     evaluate(system, packed(state), room)
     shifted = room.rows[-4].copy()
-    plain = joint_room(evidence, system.layout)
+    plain = empty_joint_equations(evidence, system.layout)
     evaluate(joint_system(evidence, integrates=False), packed(state), plain)
     return np.asarray(room.rows[:-4] @ (shifted - plain.rows[-4]))
 
@@ -222,7 +222,7 @@ def test_eliminated_displacements_equal_modes_of_the_same_deviation() -> None:
     spread = 0.05
     evidence = evidence_of(5, spread=spread, poses=(0, 0), loss=LINEAR)
     each = spread * np.eye(3 * POINTS).reshape(-1, POINTS, 3)
-    evidence = seen_from(evidence, state_of(5, 1))
+    evidence = predict_evidence(evidence, state_of(5, 1))
     evidence = evidence.with_block(kept_rows(evidence.offsets, np.arange(0)))
     as_modes = evidence._replace(
         shape=Shape(
@@ -267,7 +267,7 @@ def test_covariances_of_points_are_propagated_from_the_unknowns(poses: tuple[int
     covariance = np.linalg.inv(information_of(evidence, state)[1])
 
     def in_model_and_camera(step: np.ndarray) -> np.ndarray:
-        there = moved(evidence, state, step)
+        there = move_state(evidence, state, step)
         places = [points_of(evidence.shape, there)]
         for motion in (there.poses[poses[0]], evidence.rig.cam_from_rig[0]):
             places.append(places[-1] @ motion[:9].reshape(3, 3).T + motion[9:])

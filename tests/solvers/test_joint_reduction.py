@@ -1,4 +1,4 @@
-"""Reduced modes: the same estimates, costs and covariances as with all modes."""
+"""Reduced modes give the same estimates, costs and covariances as all modes."""
 
 from __future__ import annotations
 
@@ -8,15 +8,8 @@ from scipy.spatial.transform import Rotation
 from support.sighted import sighted_evidence
 
 from cadalign.solvers.joint.covariance import information_of, joint_covariance
-from cadalign.solvers.joint.equations import joint_room
-from cadalign.solvers.joint.evidence import (
-    Evidence,
-    Offsets,
-    Shape,
-    State,
-    packed,
-    points_of,
-)
+from cadalign.solvers.joint.equations import empty_joint_equations
+from cadalign.solvers.joint.evidence import Evidence, Offsets, Shape, State, packed, points_of
 from cadalign.solvers.joint.search import search_joint, used_points
 from cadalign.solvers.joint.system import joint_system
 from cadalign.solvers.search import evaluate
@@ -31,7 +24,7 @@ def rank(request: pytest.FixtureRequest) -> int:
 
 @pytest.fixture
 def evidence(rank: int) -> Evidence:
-    """Six of nine points in one view; the modes move them in ``rank`` or all 18 directions."""
+    """Six of nine points in one view; modes move them in ``rank`` directions, or in all 18."""
     rng = np.random.default_rng(rank)
     mixed = rng.normal(size=(MODES, rank)) @ rng.normal(size=(rank, POINTS * 3))
     shape = Shape(
@@ -67,11 +60,11 @@ def mean_depth(evidence: Evidence, state: State) -> float:
     return float((points @ state.poses[0, 6:9] + state.poses[0, 11]).mean())
 
 
-def test_a_minimum_is_one_of_all_modes(evidence: Evidence, rank: int) -> None:
+def test_a_minimum_is_a_minimum_in_all_modes(evidence: Evidence, rank: int) -> None:
     state, score = best_of(evidence, rank)
     cost, information = information_of(evidence, state)
     system = joint_system(evidence, integrates=True)
-    room = joint_room(system.evidence, system.layout)
+    room = empty_joint_equations(system.evidence, system.layout)
     evaluate(system, packed(state), room)
     slope = np.linalg.solve(information, room.gradient)
     assert room.gradient @ slope < 1e-9 * max(cost, 1.0)
@@ -79,7 +72,7 @@ def test_a_minimum_is_one_of_all_modes(evidence: Evidence, rank: int) -> None:
     assert score == pytest.approx(cost + volume, rel=1e-9)
 
 
-def test_covariances_are_those_of_all_modes(evidence: Evidence, rank: int) -> None:
+def test_covariances_equal_those_of_all_modes(evidence: Evidence, rank: int) -> None:
     state, _ = best_of(evidence, rank)
     inverse = np.linalg.inv(information_of(evidence, state)[1])
     inverse[6:9] = inverse[:, 6:9] = 0.0
@@ -99,7 +92,7 @@ def test_covariances_are_those_of_all_modes(evidence: Evidence, rank: int) -> No
     assert np.allclose(seen, expected, atol=1e-9 * np.abs(expected).max())
 
 
-def test_points_of_every_kind_of_evidence_count(evidence: Evidence) -> None:
+def test_points_of_sightings_and_offsets_are_used(evidence: Evidence) -> None:
     ends, along = np.array([[6, 0], [7, -1]]), np.eye(3)[:2]
     offsets = Offsets(ends, np.array([-1, 0]), along, np.ones(2), np.ones(2))
     more = evidence.with_block(offsets)

@@ -1,4 +1,4 @@
-"""The search with the shape eliminated, against the joint estimate with the shape as unknowns."""
+"""Search with the shape integrated out, against a joint estimate of pose and shape."""
 
 from __future__ import annotations
 
@@ -14,17 +14,11 @@ from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR
 from cadalign.solvers.marginal.equations import (
     POSE,
     Posed,
+    empty_posed_equations,
     evaluate_posed,
     posed_cost,
-    posed_room,
 )
-from cadalign.solvers.marginal.problem import (
-    Mixture,
-    Seen,
-    mixture_at,
-    shape_at,
-    target_of,
-)
+from cadalign.solvers.marginal.problem import Mixture, Seen, mixture_at, shape_at, target_of
 from cadalign.solvers.marginal.search import search_view
 from cadalign.solvers.search import refine
 from cadalign.solvers.unknowns import move_rigid
@@ -33,7 +27,7 @@ KEYPOINTS, COMPONENTS = 9, 2
 
 
 def problem_of(seed: int, loss: int = LINEAR) -> tuple[Mixture, Seen, FloatArray]:
-    """A mixture, a view of a sample of its first component, and the true pose."""
+    """A mixture, keypoints of a sample of its first component, and the true pose."""
     rng = np.random.default_rng(seed)
     points = KEYPOINTS + 2
     means = rng.uniform(-1, 1, (COMPONENTS, points, 3))
@@ -56,7 +50,7 @@ def state_at(pose: FloatArray, keypoints: int) -> FloatArray:
 
 
 def stacked_cost(system: Posed, state: FloatArray) -> float:
-    """Squared residuals and the prior of the shape, written out, and log det M."""
+    """Cost of pose and shape computed with dense matrices."""
     (mean, covariance), seen = system.target, system.seen
     flat = state[POSE : POSE + mean.size]
     rotation = state[:9].reshape(3, 3)
@@ -74,8 +68,8 @@ def stacked_cost(system: Posed, state: FloatArray) -> float:
     return cost + float(np.linalg.slogdet(matrix)[1])
 
 
-def moved(state: FloatArray, step: FloatArray, offset: FloatArray) -> FloatArray:
-    """A state after a step (6,) of the pose and one (3 n,) of the offsets."""
+def move_state(state: FloatArray, step: FloatArray, offset: FloatArray) -> FloatArray:
+    """State after a step (6,) of the pose and a step (3 n,) of the offsets."""
     found = state.copy()
     move_rigid(state, step, found)
     found[POSE : POSE + offset.size] += offset
@@ -84,7 +78,7 @@ def moved(state: FloatArray, step: FloatArray, offset: FloatArray) -> FloatArray
 
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 1000), st.booleans())
-def test_a_minimum_is_one_of_pose_and_shape_together(seed: int, integrates: bool) -> None:
+def test_a_minimum_is_a_minimum_of_pose_and_shape(seed: int, integrates: bool) -> None:
     mixture, seen, pose = problem_of(seed)
     system = Posed(target_of(mixture_at(mixture, seen), 0), seen, integrates)
     state = state_at(pose, 7)
@@ -94,29 +88,29 @@ def test_a_minimum_is_one_of_pose_and_shape_together(seed: int, integrates: bool
     assert cost == pytest.approx(posed_cost(system, state))
     rng = np.random.default_rng(seed)
     for _ in range(20):
-        near = moved(state, rng.normal(0, 1e-3, 6), rng.normal(0, 1e-3, 21))
+        near = move_state(state, rng.normal(0, 1e-3, 6), rng.normal(0, 1e-3, 21))
         assert stacked_cost(system, near) > cost
 
 
 @pytest.mark.parametrize("loss", [LINEAR, HUBER, CAUCHY])
-def test_the_derivatives_of_the_determinant_are_finite_differences(loss: int) -> None:
+def test_derivatives_of_the_determinant_equal_finite_differences(loss: int) -> None:
     mixture, seen, pose = problem_of(2, loss)
     seen.rays[0] += 0.02  # an outlier
     system = Posed(target_of(mixture_at(mixture, seen), 0), seen, True)
     state = state_at(pose, 7)
     force = np.random.default_rng(2).normal(0, 0.5, 21)
     state[POSE:] = np.concatenate([system.target.covariance @ force, force])
-    room = posed_room(system)
+    room = empty_posed_equations(system)
 
     def log_determinant(step: FloatArray) -> float:
-        evaluate_posed(system, moved(state, step[:6], step[6:]), room)
+        evaluate_posed(system, move_state(state, step[:6], step[6:]), room)
         return float(room.sums[1])
 
     by_difference = [
         (log_determinant(step) - log_determinant(-step)) / 4e-5 for step in 1e-5 * np.eye(27)
     ]
     evaluate_posed(system, state, room)
-    derivatives = np.concatenate([room.turned, room.slope])
+    derivatives = np.concatenate([room.pose_slope, room.slope])
     assert derivatives == pytest.approx(np.array(by_difference), rel=1e-5, abs=1e-6)
 
 
@@ -134,7 +128,7 @@ def test_the_search_finds_the_pose_and_its_component(loss: int) -> None:
         assert (np.diff(minima.scores[:count]) >= 0).all()
 
 
-def test_a_given_start_is_searched_from() -> None:
+def test_a_given_start_is_used() -> None:
     mixture, seen, pose = problem_of(3)
     without, starts = search_view(mixture, seen, np.empty((0, 12)))
     given_one, more = search_view(mixture, seen, pose[None])
@@ -185,6 +179,6 @@ def test_points_behind_the_camera_have_no_cost() -> None:
     mixture, seen, pose = problem_of(0)
     behind = state_at(np.concatenate([pose[:9], -pose[9:]]), 7)
     system = Posed(target_of(mixture_at(mixture, seen), 0), seen, True)
-    assert evaluate_posed(system, behind, posed_room(system)) == np.inf
+    assert evaluate_posed(system, behind, empty_posed_equations(system)) == np.inf
     assert posed_cost(system, behind) == np.inf
     assert refine(system, 10, behind)[0] == np.inf

@@ -1,4 +1,4 @@
-"""Place and size of a cloud of points, and the plane in which it lies."""
+"""Center, size and plane of a set of points."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from cadalign.geometry.alignment import describe_plane
 from cadalign.solvers.alignment import center_and_unit
 
 
-def test_the_unit_of_points_is_their_root_mean_square_distance_from_the_mean() -> None:
+def test_unit_is_the_rms_distance_from_the_mean() -> None:
     points = np.random.default_rng(0).normal(0, 2.0, (30, 3)) + (100.0, -50.0, 7.0)
     center, unit = center_and_unit(points)
     np.testing.assert_allclose(center, points.mean(axis=0))
     assert unit == pytest.approx(np.linalg.norm(points.std(axis=0)))
 
 
-def test_the_plane_of_many_points_takes_memory_in_proportion_to_their_number() -> None:
+def test_plane_of_many_points_takes_linear_memory() -> None:
     points = np.random.default_rng(0).uniform(-1, 1, (300_000, 3))
     assert describe_plane(points) is None
     points[:, 1] = 0.5

@@ -1,4 +1,4 @@
-"""Real roots of polynomials: those that were put in come out."""
+"""Real roots of polynomials with known roots."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def roots_of(coefficients: np.ndarray, *, reach: float = 1.0) -> np.ndarray:
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(2, 8))
 def test_roots_inside_the_interval_are_found(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
-    # At least 0.05 apart, some of them outside of (-1, 1).
+    # At least 0.05 apart, some outside (-1, 1).
     roots = -1.5 + np.cumsum(rng.uniform(0.05, 3 / count, count))
     coefficients = rng.uniform(0.5, 2) * P.polyfromroots(roots)
     expected = roots[(roots > -1) & (roots < 1)]
@@ -32,7 +32,7 @@ def test_roots_inside_the_interval_are_found(seed: int, count: int) -> None:
 
 
 @given(seed=st.integers(0, 2**32 - 1), pairs=st.integers(1, 3))
-def test_complex_pairs_are_no_roots(seed: int, pairs: int) -> None:
+def test_complex_roots_are_ignored(seed: int, pairs: int) -> None:
     rng = np.random.default_rng(seed)
     real = np.sort(rng.uniform(-0.9, 0.9, 2))
     if real[1] - real[0] < 0.05:

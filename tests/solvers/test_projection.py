@@ -1,4 +1,4 @@
-"""The one projection and its derivatives, against finite differences."""
+"""Projection and its derivatives, against finite differences."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from cadalign.geometry.camera import projection_jacobian
 from cadalign.geometry.pixels import perspective
 from cadalign.solvers.alignment import (
     Objective,
+    empty_equations,
     evaluate_alignment,
     evaluate_cost,
-    room_for,
     solve_damped,
 )
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR, UNKNOWNS
@@ -42,7 +42,7 @@ def pose_and_points(seed: int, count: int = 7) -> tuple[Alignment, np.ndarray]:
     return alignment, rng.uniform(-1, 1, (count, 3))
 
 
-def moved(pose: np.ndarray, unknown: int, step: float) -> np.ndarray:
+def move_pose_by(pose: np.ndarray, unknown: int, step: float) -> np.ndarray:
     there = np.empty_like(pose)
     move_pose(pose, step * np.eye(UNKNOWNS)[unknown], there)
     return there
@@ -53,18 +53,21 @@ def project(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 @given(seed=seeds)
-def test_kernel_projects_as_alignment_and_perspective_do(seed: int) -> None:
+def test_kernel_equals_alignment_and_perspective(seed: int) -> None:
     alignment, points = pose_and_points(seed)
     rays = perspective(alignment.apply(points))
     np.testing.assert_allclose(project(alignment.packed, points), rays, rtol=0, atol=1e-14)
 
 
 @given(seed=seeds)
-def test_ray_derivatives_are_those_of_finite_differences(seed: int) -> None:
+def test_ray_derivatives_equal_finite_differences(seed: int) -> None:
     alignment, points = pose_and_points(seed)
     pose = alignment.packed
     numerical = [
-        (project(moved(pose, k, STEP), points) - project(moved(pose, k, -STEP), points))
+        (
+            project(move_pose_by(pose, k, STEP), points)
+            - project(move_pose_by(pose, k, -STEP), points)
+        )
         / (2 * STEP)
         for k in range(UNKNOWNS)
     ]
@@ -75,7 +78,7 @@ def test_ray_derivatives_are_those_of_finite_differences(seed: int) -> None:
 
 @pytest.mark.slow
 @given(seed=seeds, camera=st.sampled_from([PLAIN, LENS]))
-def test_pixel_derivatives_are_those_of_finite_differences(seed: int, camera: Camera) -> None:
+def test_pixel_derivatives_equal_finite_differences(seed: int, camera: Camera) -> None:
     alignment, points = pose_and_points(seed)
 
     def pixels(unknown: int, step: float) -> np.ndarray:
@@ -110,7 +113,7 @@ def test_pixel_derivatives_are_those_of_finite_differences(seed: int, camera: Ca
     width=st.sampled_from([0.0, 0.2]),
 )
 @settings(max_examples=30)
-def test_gradient_of_all_evidence_is_that_of_the_cost(
+def test_gradient_of_all_evidence_is_the_gradient_of_the_cost(
     loss: int, seed: int, each: bool, weight: float, width: float
 ) -> None:
     alignment, points = pose_and_points(seed, 40)  # more than a block of points
@@ -129,19 +132,19 @@ def test_gradient_of_all_evidence_is_that_of_the_cost(
         ),
         ScalePrior(weight, width),
     )
-    room = room_for(UNKNOWNS)
+    room = empty_equations(UNKNOWNS)
     cost = evaluate_alignment(objective, pose, room)
     hessian, gradient = room.hessian, room.gradient
     assert cost == pytest.approx(evaluate_cost(objective, pose), rel=1e-12)
     np.testing.assert_array_equal(hessian, hessian.T)
     for k in range(UNKNOWNS):
-        ahead, behind = (evaluate_cost(objective, moved(pose, k, s)) for s in (STEP, -STEP))
+        ahead, behind = (evaluate_cost(objective, move_pose_by(pose, k, s)) for s in (STEP, -STEP))
         slope = free[k] * (ahead - behind) / (4 * STEP)  # the gradient is half that of the cost
         assert gradient[k] == pytest.approx(slope, rel=1e-5, abs=1e-4 * np.sqrt(cost))
 
 
-def test_an_unknown_without_evidence_stays_where_it_is() -> None:
-    equations, step = room_for(3), np.empty(3)
+def test_an_unknown_without_evidence_keeps_its_value() -> None:
+    equations, step = empty_equations(3), np.empty(3)
     equations.hessian[:] = np.diag([4.0, 1e-3, 0.0])
     equations.gradient[:] = 2.0, 1e-3, 0.0
     assert solve_damped(equations, 3, 0.0, step) == pytest.approx(1.0 + 1e-3)

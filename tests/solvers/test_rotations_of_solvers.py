@@ -1,4 +1,4 @@
-"""Every result of a solver is a rotation, whatever the keypoints are."""
+"""Solvers return rotations for any keypoints."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def departure(rotation: np.ndarray) -> float:
     return float(error) if np.linalg.det(rotation) > 0 else np.inf
 
 
-def test_a_quaternion_of_any_length_is_its_rotation() -> None:
+def test_length_of_a_quaternion_does_not_matter() -> None:
     rng = np.random.default_rng(0)
     for x, y, z, w in rng.normal(size=(20, 4)) * rng.uniform(0.1, 10, (20, 1)):
         found = np.empty((3, 3))
@@ -44,7 +44,7 @@ def test_start_far_from_a_rotation_does_not_reach_the_result() -> None:
     ]
     result = fit(0.25 * CORNERS, points_2d, CAMERA, stretch="none")
     assert departure(result.alignment.rotation) < 1e-9
-    assert result.rms == pytest.approx(10.462, abs=1e-3)  # the best of all rotations
+    assert result.rms == pytest.approx(10.462, abs=1e-3)  # the global minimum
     assert Result.from_dict(result.to_dict()).alignment == result.alignment
 
 

@@ -1,7 +1,4 @@
-"""A kind of evidence in one module: the vanishing point of a direction of the model.
-
-It is an example of a block; a line gives it to the evidence.
-"""
+"""Example of a block of evidence: the vanishing point of a direction of the model."""
 
 from __future__ import annotations
 
@@ -13,18 +10,8 @@ from support.sighted import sighted_evidence
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import kernel
-from cadalign.solvers.joint.evidence import (
-    Evidence,
-    Focals,
-    Shape,
-    State,
-)
-from cadalign.solvers.joint.rows import (
-    BlockEquation,
-    equations_of,
-    plain_equation,
-    write_equation,
-)
+from cadalign.solvers.joint.evidence import Evidence, Focals, Shape, State
+from cadalign.solvers.joint.rows import BlockEquation, equations_of, plain_equation, write_equation
 from cadalign.solvers.joint.search import equations_at, packed, refine_joint
 from cadalign.solvers.linalg import cross, triple
 from cadalign.solvers.projection import turn, turn_back
@@ -33,8 +20,8 @@ from cadalign.solvers.projection import turn, turn_back
 class VanishingPoints(NamedTuple):
     """Directions ``model`` (D, 3) that vanish at ``rays`` (D, 2) of views ``image`` (D,).
 
-    ``weight`` (D,) is the inverse standard deviation of the rays, which are those of the cameras'
-    own focal lengths.
+    Rays are for the focal lengths of the cameras; ``weight`` (D,) is their inverse standard
+    deviation.
     """
 
     model: FloatArray
@@ -45,7 +32,7 @@ class VanishingPoints(NamedTuple):
 
 @equations_of.of(VanishingPoints)
 @kernel
-def _two_each(points: VanishingPoints) -> int:
+def _count_equations(points: VanishingPoints) -> int:
     return 2 * points.image.shape[0]
 
 
@@ -54,7 +41,7 @@ def _two_each(points: VanishingPoints) -> int:
 def _write_vanishing_point(
     points: VanishingPoints, evidence: Evidence, state: State, q: int, row: FloatArray
 ) -> BlockEquation:
-    """Write the equation ``f d_x / d_z = u`` of the direction d in the camera; v is the other."""
+    """Write the equation ``f d_x / d_z = u``, or of v, for the direction d in the camera."""
     n, axis = q // 2, q % 2
     v, weight = points.image[n], points.weight[n]
     camera, pose = evidence.rig.cam_from_rig[v], state.poses[evidence.rig.pose[v]]
@@ -76,12 +63,12 @@ def _write_vanishing_point(
 
 
 UP = np.array([0.0, 1.0, 0.0])
-FOCAL = 1.3  # over that of the rays
+FOCAL = 1.3  # relative to the rays' focal length
 POSE = np.append(Rotation.from_rotvec([0.7, 0.3, 0.2]).as_matrix(), [0.1, 0.2, 9.0])
 
 
 def evidence_of_one_view() -> Evidence:
-    """Keypoints of a small object, whose distance hides the focal length, in a view."""
+    """Keypoints of a small, distant object, which hardly determine the focal length."""
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 3))
     seen = points @ POSE[:9].reshape(3, 3).T + POSE[9:]
     rays = FOCAL * seen[:, :2] / seen[:, 2:]
@@ -91,8 +78,8 @@ def evidence_of_one_view() -> Evidence:
     return sighted_evidence(shape, rays, unknown)
 
 
-def with_vanishing_point(evidence: Evidence) -> Evidence:
-    """The evidence with the place at which the object's up axis vanishes."""
+def add_vanishing_point(evidence: Evidence) -> Evidence:
+    """Add the vanishing point of the object's up axis."""
     x, y, z = POSE[:9].reshape(3, 3) @ UP
     rays = FOCAL * np.array([[x / z, y / z]])
     image, weight = np.zeros(1, dtype=np.int64), np.array([500.0])
@@ -100,15 +87,15 @@ def with_vanishing_point(evidence: Evidence) -> Evidence:
 
 
 def state_at(turn_by: FloatArray, log_focal: float) -> State:
-    """A state beside the true one."""
+    """A state near the true one."""
     rotation = Rotation.from_rotvec(turn_by).as_matrix() @ POSE[:9].reshape(3, 3)
     poses = np.append(rotation, POSE[9:])[None]
     none = np.empty(0)
     return State(poses, np.array([log_focal]), np.zeros(3), none, np.zeros((8, 3)))
 
 
-def test_the_gradient_of_an_own_block_is_that_of_finite_differences() -> None:
-    evidence, step = with_vanishing_point(evidence_of_one_view()), 1e-6
+def test_gradient_of_a_custom_block_equals_finite_differences() -> None:
+    evidence, step = add_vanishing_point(evidence_of_one_view()), 1e-6
     place = np.array([0.02, -0.03, 0.01])
     gradient = equations_at(evidence, packed(state_at(place, 0.2)))[1].gradient
     turned = Rotation.from_rotvec(place)
@@ -122,10 +109,10 @@ def test_the_gradient_of_an_own_block_is_that_of_finite_differences() -> None:
     np.testing.assert_allclose(gradient[6], (after - before) / (4 * step), rtol=1e-5)
 
 
-def test_a_vanishing_point_tells_the_focal_length() -> None:
+def test_a_vanishing_point_determines_the_focal_length() -> None:
     evidence, start = evidence_of_one_view(), state_at(np.array([0.02, -0.03, 0.01]), 0.1)
     errors = []
-    for each in (evidence, with_vanishing_point(evidence)):
+    for each in (evidence, add_vanishing_point(evidence)):
         _, _, state = refine_joint(each, 100, start)
         errors.append(abs(float(state.log_focals[0]) - np.log(FOCAL)))
     assert errors[1] < 0.02

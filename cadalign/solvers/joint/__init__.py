@@ -1,1 +1,1 @@
-"""Kernels that estimate poses, scales and shape from all evidence together."""
+"""Joint estimation of poses, focal lengths, scales and shape from all evidence."""

@@ -1,7 +1,7 @@
-"""Normal equations of poses that share a border, factorized in linear time.
+"""Arrow-shaped normal equations of P poses and a shared border, factorized in linear time.
 
-The unknowns are 6 for each of P poses, and b that all share. A pose has products with itself and
-with the border alone, so that eliminating one after the other fills nothing in.
+The unknowns are 6 for each pose and b shared ones, the border. Different poses have no products
+with each other, so that eliminating one pose after the other causes no fill-in.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from cadalign.arrays import FloatArray
 from cadalign.compile import fast_sums, inlined, kernel
 from cadalign.solvers.linalg import add_products, factorize, mirror_upper, solve_factor
 
-_LEAST_SHARE = 1e-12  # of an unknown's information that the others must leave
+_LEAST_SHARE = 1e-12  # least information about an unknown given the others, relative to its own
 
 
 class Arrow(NamedTuple):
-    """A symmetric matrix: blocks (P, 6, 6), coupling (P, 6, b), border (b, b); and a right side."""
+    """Symmetric matrix of blocks (P, 6, 6), coupling (P, 6, b), border (b, b); and a gradient."""
 
     blocks: FloatArray
     coupling: FloatArray
@@ -49,7 +49,7 @@ def clear(arrow: Arrow) -> None:
 
 
 def dense_matrix(arrow: Arrow) -> FloatArray:
-    """All entries (U, U), the border last."""
+    """Dense matrix (U, U), the border last."""
     poses, size, border = arrow.coupling.shape
     last = size * poses
     whole = np.zeros((last + border, last + border))
@@ -63,8 +63,8 @@ def dense_matrix(arrow: Arrow) -> FloatArray:
 
 
 @inlined
-def add_slope(arrow: Arrow, pose: int, row: FloatArray) -> None:
-    """Add a derivative (6 + b,) by one pose and the border to the gradient."""
+def add_gradient(arrow: Arrow, pose: int, row: FloatArray) -> None:
+    """Add derivatives (6 + b,) by one pose and the border to the gradient."""
     first, own = border_start(arrow), arrow.blocks.shape[1] * pose
     for k in range(row.shape[0]):
         arrow.gradient[own + k if k < 6 else first + k - 6] += row[k]
@@ -72,7 +72,7 @@ def add_slope(arrow: Arrow, pose: int, row: FloatArray) -> None:
 
 @kernel
 def add_rows(arrow: Arrow, pose: int, rows: FloatArray, columns: int, products: FloatArray) -> None:
-    """Add a pose's equations (6 + b + 1, C), last the residuals; ``products`` is scratch space."""
+    """Add ``rows`` (6 + b + 1, C) of one pose, residuals last; ``products`` is scratch space."""
     unknowns = 6 + arrow.border.shape[0]
     first, own = border_start(arrow), arrow.blocks.shape[1] * pose
     matrix, right = products[:unknowns, :unknowns], products[unknowns, :unknowns]
@@ -92,8 +92,8 @@ def add_rows(arrow: Arrow, pose: int, rows: FloatArray, columns: int, products: 
 
 
 @inlined
-def hold(arrow: Arrow, k: int) -> None:
-    """Replace the equations of unknown k of the border by a unit row."""
+def fix_unknown(arrow: Arrow, k: int) -> None:
+    """Fix unknown k of the border: replace its equation by a unit row."""
     arrow.gradient[border_start(arrow) + k] = 0.0
     for p in range(arrow.blocks.shape[0]):
         for m in range(arrow.blocks.shape[1]):
@@ -104,11 +104,11 @@ def hold(arrow: Arrow, k: int) -> None:
 
 
 @kernel
-def decide_on_undetermined(arrow: Arrow, is_shared: bool) -> None:
-    """Make a singular matrix definite where several views share a shape, and else indefinite.
+def perturb_diagonal(arrow: Arrow, is_shared: bool) -> None:
+    """Make a singular matrix definite for several views of one shape, indefinite for one view.
 
-    What is open gets a deviation a million times its scale beside other views, and is refused for
-    one alone: rounding would tell whether the matrix has a Cholesky factor.
+    Otherwise rounding errors would decide whether a Cholesky factor exists. With several views, an
+    undetermined unknown gets a huge deviation; with one view, the factorization fails.
     """
     share = 1.0 + (_LEAST_SHARE if is_shared else -_LEAST_SHARE)
     for p in range(arrow.blocks.shape[0]):
@@ -120,7 +120,7 @@ def decide_on_undetermined(arrow: Arrow, is_shared: bool) -> None:
 
 @fast_sums
 def factorize_arrow(arrow: Arrow) -> bool:
-    """Replace a matrix by its factor; False where it is not positive definite."""
+    """Replace a matrix by its Cholesky factor; False if it is not positive definite."""
     poses, size, border = arrow.coupling.shape
     for p in range(poses):
         block, coupling = arrow.blocks[p], arrow.coupling[p]
@@ -146,7 +146,7 @@ def factorize_arrow(arrow: Arrow) -> bool:
 
 @fast_sums
 def solve_arrow(factor: Arrow, gradient: FloatArray, step: FloatArray) -> None:
-    """Write the solution of ``matrix @ step = -gradient`` with the factor of the matrix."""
+    """Solve ``matrix @ step = -gradient``, given the factor of the matrix."""
     poses, size, border = factor.coupling.shape
     for k in range(step.shape[0]):
         step[k] = -gradient[k]
@@ -179,7 +179,7 @@ def solve_arrow(factor: Arrow, gradient: FloatArray, step: FloatArray) -> None:
 
 @kernel
 def log_determinant(factor: Arrow) -> float:
-    """Log determinant of the matrix, from its factor."""
+    """Log determinant of the matrix, given its factor."""
     total = 0.0
     for p in range(factor.blocks.shape[0]):
         for k in range(factor.blocks.shape[1]):
@@ -190,7 +190,7 @@ def log_determinant(factor: Arrow) -> float:
 
 
 def invert_arrow(arrow: Arrow) -> Arrow | None:
-    """Blocks of the inverse; None where undetermined, as `decide_on_undetermined` has it."""
+    """Blocks of the inverse; None if not determined, by the criterion of `perturb_diagonal`."""
     share = _LEAST_SHARE if len(arrow.blocks) > 1 else -_LEAST_SHARE
     try:
         lower = np.linalg.inv(np.linalg.cholesky(arrow.blocks * (1.0 + share * np.eye(6))))

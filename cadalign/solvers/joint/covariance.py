@@ -1,4 +1,4 @@
-"""Covariance of a joint estimate: of its unknowns and of the object's points."""
+"""Covariance of a joint estimate: of the unknowns and of the object's points."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from cadalign.solvers.joint.search import equations_at, reduce_modes, sighted_po
 class JointCovariance(NamedTuple):
     """Covariances of the unknowns, and of every point in two frames.
 
-    Poses (P, 6, 6), poses with the border (P, 6, b), ``border`` (b, b): log focal lengths, log
-    scales, coefficients. ``points`` (m, 3, 3) of the whole shape are in the model's frame, ``seen``
-    (m, 3, 3) in the first view's camera, with its pose.
+    ``poses`` (P, 6, 6), ``cross`` (P, 6, b) of poses with the border, ``border`` (b, b) of log
+    focal lengths, log scales and coefficients. ``points`` (m, 3, 3) are in the model's frame,
+    ``seen`` (m, 3, 3) in the first view's camera, where they include the pose's uncertainty.
     """
 
     poses: FloatArray
@@ -32,13 +32,13 @@ class JointCovariance(NamedTuple):
 
 
 def joint_covariance(evidence: Evidence, state: State) -> JointCovariance:
-    """The inverse information; infinite if not determined, and of the whole prior at a bound."""
+    """Inverse information, infinite if not determined; a scale at its bound has its whole prior."""
     bound = evidence.scales.bound
     if bound.weight > 0:
         whole = ScalePrior(whole_information(bound), bound.width)
         evidence = evidence._replace(scales=evidence.scales._replace(bound=whole))
     reduction = reduce_modes(evidence)
-    reduced, fewer = reduction.evidence, reduction.reduced(state)
+    reduced, fewer = reduction.evidence, reduction.reduce_state(state)
     _, equations = equations_at(reduced, packed(fewer))
     inverse = invert_arrow(equations.arrow)
     first, modes = len(evidence.focals.low) + 3, len(evidence.shape.modes)
@@ -49,10 +49,10 @@ def joint_covariance(evidence: Evidence, state: State) -> JointCovariance:
         return JointCovariance(*(np.full(size, np.inf) for size in (*blocks, *of_points)))
     held = first - 3 + np.flatnonzero(evidence.scales.free == 0)
     inverse.border[held, held] = 0.0
-    rows, own = _points_by_unknowns(evidence, reduced, fewer, equations, sighted_points(evidence))
+    rows, own = _point_jacobians(evidence, reduced, fewer, equations, sighted_points(evidence))
     turn, rows_seen = _first_camera_frame(reduced, fewer, rows)
     unknowns = pose_and_border(inverse, evidence.rig.pose[0])
-    # The modes that the evidence does not tell apart keep their prior.
+    # Modes without evidence keep their prior.
     basis = reduction.basis[:modes]
     lift = np.zeros((first + modes, first + basis.shape[1]))
     lift[:first, :first] = np.eye(first)
@@ -69,19 +69,19 @@ def joint_covariance(evidence: Evidence, state: State) -> JointCovariance:
 
 
 def pose_and_border(inverse: Arrow | JointCovariance, pose: int) -> FloatArray:
-    """Covariance (6 + b, 6 + b) of one pose and of the unknowns that all views share."""
+    """Covariance (6 + b, 6 + b) of one pose and the border."""
     poses, cross, border, *_ = inverse
     return np.block([[poses[pose], cross[pose]], [cross[pose].T, border]])
 
 
-def _points_by_unknowns(
+def _point_jacobians(
     evidence: Evidence,
     reduced: Evidence,
     state: State,
     equations: JointEquations,
     sighted: BoolArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Derivatives (m, 3, 6 + b) of points by pose and border, covariances (m, 3, 3) of the rest."""
+    """Derivatives (m, 3, 6 + b) of points by pose and border, other covariances (m, 3, 3)."""
     shape, scale, axes = reduced.shape, np.exp(state.log_scales), np.arange(3)
     modes, points = shape.modes.transpose(1, 2, 0), points_of(shape, state)
     first = 6 + len(evidence.focals.low)
@@ -93,7 +93,7 @@ def _points_by_unknowns(
     begins, counts = equations.layout.columns[:, 0], np.diff(equations.layout.columns)[:, 0]
     eliminated = np.flatnonzero(counts)
     if len(eliminated):
-        # Columns of the equations, point after point: displacements follow their residuals.
+        # Columns are grouped by points; a displacement is linear in the residuals of its point.
         columns, unknowns = slice(counts.sum()), rows.shape[2]
         by_own = equations.rows[unknowns + 1 :, columns].T
         by_own = by_own * scale * np.repeat(squares, counts)[:, None]
@@ -110,7 +110,7 @@ def _points_by_unknowns(
 def _first_camera_frame(
     evidence: Evidence, state: State, rows: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Rotation (3, 3) of the first camera from the model, and derivatives (m, 3, 6 + b) there."""
+    """Rotation (3, 3) from the model to the first camera, and derivatives (m, 3, 6 + b) there."""
     rotation = state.poses[evidence.rig.pose[0], :9].reshape(3, 3)
     camera = evidence.rig.cam_from_rig[0, :9].reshape(3, 3)
     turn = camera @ rotation
@@ -122,12 +122,12 @@ def _first_camera_frame(
 
 
 def information_of(evidence: Evidence, state: State) -> tuple[float, FloatArray]:
-    """The cost at a state, and the information (U, U) about all unknowns, border last."""
+    """Cost at a state, and information (U, U) about all unknowns, border last."""
     cost, equations = equations_at(evidence, packed(state))
     return cost, dense_matrix(equations.arrow)
 
 
 def scaled_information(information: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Information (U, U) of unit diagonal, and the roots (U,) of its own."""
+    """Information (U, U) scaled to unit diagonal, and the square roots (U,) of its diagonal."""
     sizes = np.sqrt(np.maximum(information.diagonal(), 1e-300))
     return information / np.outer(sizes, sizes), sizes

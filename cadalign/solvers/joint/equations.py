@@ -1,15 +1,15 @@
-"""Normal equations of the joint system, with room for them; what is integrated out of them.
+"""Normal equations of the joint system: elimination of displacements, and log determinants.
 
-For the displacement d of a point that one pose sees, with the prior N(0, spread^2 I), the equations
-``r + J dx + D (e - d)``, with e the displacement to find, have the covariance I + spread^2 D D'
-about ``r - D d + J dx``. Whitening them by its Cholesky factor L leaves least squares in x alone,
-and ``e = -spread^2 D' L^-T (whitened residual)`` follows.
+**Elimination.** A point that one pose sees has the displacement e, with the prior
+N(0, spread^2 I) and the current value d. Its equations ``r + J dx + D (e - d)`` have the mean
+``r - D d + J dx`` and the covariance I + spread^2 D D'. Whitening by the Cholesky factor L of this
+covariance leaves least squares in x alone. Then ``e = -spread^2 D' L^-T (whitened residual)``.
 
-Coefficients and displacements that are integrated out leave a log determinant. Its slope h_q by
-the point of each equation is that of `cadalign.solvers.projection.slope_of_row`, in the rig's frame
-with the response y_q of the point; the derivative by a turn is ``X_i x h_q + y_q x a_q``, and
-stretch and focal length scale the rows as well. The equations of other blocks move with
-the coefficients alone.
+**Log determinant.** Integrating out coefficients and displacements adds a log determinant to the
+objective. Its slope h_q by the point of equation q is
+`cadalign.solvers.projection.slope_of_row` in the rig's frame, with the response y_q of the point.
+The derivative by a rotation is ``X_i x h_q + y_q x a_q``; stretch and focal length also scale the
+rows. The equations of blocks depend on the shape through the coefficients only.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, kernel
-from cadalign.solvers.joint.arrow import Arrow, add_slope, border_start, empty_arrow
+from cadalign.solvers.joint.arrow import Arrow, add_gradient, border_start, empty_arrow
 from cadalign.solvers.joint.evidence import (
     Evidence,
     Shape,
     State,
-    exp_of,
+    coordinate_of,
+    exp_triple,
     remove_displacements,
     stretched_point,
-    unstretched,
 )
 from cadalign.solvers.joint.rows import count_block_equations, write_block_row
 from cadalign.solvers.linalg import cholesky, cross, dot, factorize, solve_factor_rows
@@ -36,12 +36,11 @@ from cadalign.solvers.projection import slope_of_row, turn, turn_back
 
 
 class Layout(NamedTuple):
-    """Places of the equations of N sightings in the rows of derivatives.
+    """Columns of the equations of N sightings in the rows of derivatives.
 
-    The sightings of pose p are ``order[first[p]:first[p + 1]]``, point after point, with ``widths``
-    (N,) columns each: a contour point has one, a keypoint two or three. For one pose, the equations
-    of point i are the ``columns[i]`` (2,) of the rows, first and behind the last; none of several
-    poses.
+    The sightings of pose p are ``order[first[p]:first[p + 1]]``, grouped by points. Sighting n has
+    ``widths[n]`` columns: one for a contour point, two or three for a keypoint. With one pose, the
+    columns of point i are ``columns[i, 0]`` to ``columns[i, 1]``; otherwise this range is empty.
     """
 
     order: IntArray
@@ -53,10 +52,10 @@ class Layout(NamedTuple):
 class JointEquations(NamedTuple):
     """Normal equations, and scratch space.
 
-    ``gradient`` is that of the ``arrow``, ``factor`` of the damped one; for ``rows`` and ``seen``
-    see `write_rows`. ``log_determinant`` (1,) is that of the covariances by which eliminated
-    displacements widened equations; ``slopes`` (m, 3) are half the derivatives of the whole one by
-    unstretched points.
+    ``gradient`` is the gradient of the ``arrow``, ``factor`` the factor of the damped arrow. For
+    ``rows`` and ``seen`` see `write_rows`. ``log_determinant`` (1,) is the sum over the covariances
+    of eliminated displacements. ``slopes`` (m, 3) are half the derivatives of the total log
+    determinant by unstretched points.
     """
 
     arrow: Arrow
@@ -71,7 +70,6 @@ class JointEquations(NamedTuple):
 
 
 def layout_of(evidence: Evidence) -> Layout:
-    """The places of all equations of sightings."""
     sightings, points = evidence.sightings, len(evidence.shape.mean)
     pose = evidence.rig.pose[sightings.image]
     poses = int(evidence.rig.pose.max()) + 1
@@ -87,8 +85,7 @@ def layout_of(evidence: Evidence) -> Layout:
 
 
 @kernel
-def joint_room(evidence: Evidence, layout: Layout) -> JointEquations:
-    """Room for the normal equations."""
+def empty_joint_equations(evidence: Evidence, layout: Layout) -> JointEquations:
     poses, points = layout.first.shape[0] - 1, evidence.shape.mean.shape[0]
     border = evidence.focals.low.shape[0] + 3 + evidence.shape.modes.shape[0]
     most = total = 0
@@ -112,8 +109,10 @@ def joint_room(evidence: Evidence, layout: Layout) -> JointEquations:
 
 
 @kernel
-def eliminate(spread: FloatArray, displacements: FloatArray, equations: JointEquations) -> float:
-    """Whiten the equations of points with displacements; returns the cost of their prior."""
+def eliminate_displacements(
+    spread: FloatArray, displacements: FloatArray, equations: JointEquations
+) -> float:
+    """Whiten the equations of points with displacements; returns the cost of the prior."""
     rows, columns = equations.rows, equations.layout.columns
     last = rows.shape[0] - 4
     cost = 0.0
@@ -136,7 +135,7 @@ def eliminate(spread: FloatArray, displacements: FloatArray, equations: JointEqu
 def _whiten_columns(
     rows: FloatArray, start: int, end: int, spread: float, factor: FloatArray
 ) -> float:
-    """Whiten the columns of one point; returns the log determinant of their covariance."""
+    """Whiten the columns of one point; returns the log determinant of the covariance."""
     size = end - start
     last = rows.shape[0] - 3
     for p in range(size):
@@ -161,7 +160,7 @@ def _whiten_columns(
 
 @borrowing
 def shift_means(spread: FloatArray, equations: JointEquations) -> None:
-    """Move the displacements' prior means as the slopes of the log determinant do."""
+    """Move the prior means of displacements by the slopes of the log determinant."""
     rows, columns = equations.rows, equations.layout.columns
     unknowns = rows.shape[0] - 4
     beyond_pose = equations.gradient.shape[0] - unknowns
@@ -178,10 +177,10 @@ def shift_means(spread: FloatArray, equations: JointEquations) -> None:
 
 
 @borrowing
-def follow(
+def update_displacements(
     spread: FloatArray, equations: JointEquations, step: FloatArray, displacements: FloatArray
 ) -> None:
-    """Write the displacements that are best after a step."""
+    """Write the optimal displacements after a step."""
     rows, columns = equations.rows, equations.layout.columns
     unknowns = step.shape[0]
     for i in range(spread.shape[0]):
@@ -201,7 +200,7 @@ def follow(
 
 @kernel
 def add_log_determinant(evidence: Evidence, state: State, equations: JointEquations) -> float:
-    """Add half the derivative of the log determinant; returns that of the coefficients."""
+    """Add half the derivative of the log determinant; returns the coefficients' determinant."""
     modes, total = evidence.shape.modes.shape[0], equations.seen.shape[1]
     first = evidence.focals.low.shape[0] + 3
     factor = equations.arrow.border[first:, first:].copy()
@@ -211,7 +210,7 @@ def add_log_determinant(evidence: Evidence, state: State, equations: JointEquati
     for k in range(modes):
         volume += 2.0 * np.log(factor[k, k])
     spread, columns = evidence.shape.spread, equations.layout.columns
-    left = _left_of_displacements(spread, equations.rows, columns)
+    left = _undetermined_shares(spread, equations.rows, columns)
     by_model, response = np.empty((3, total)), np.empty((modes, total))
     _write_point_rows(evidence, state, equations, left, by_model, response)
     solve_factor_rows(factor, response)
@@ -223,7 +222,7 @@ def add_log_determinant(evidence: Evidence, state: State, equations: JointEquati
 
 @kernel
 def _add_block_slopes(evidence: Evidence, state: State, arrow: Arrow, factor: FloatArray) -> None:
-    """Add half the derivatives that blocks give: how rows move along the responses to them."""
+    """Add half the derivatives from blocks: the change of each row along its response."""
     first, total = 6 + evidence.focals.low.shape[0] + 3, count_block_equations(evidence)
     row, moved_row = np.empty(6 + arrow.border.shape[0]), np.empty(6 + arrow.border.shape[0])
     still, moved = remove_displacements(state), remove_displacements(state)
@@ -240,16 +239,16 @@ def _add_block_slopes(evidence: Evidence, state: State, arrow: Arrow, factor: Fl
             moved.coefficients[k] = still.coefficients[k] + response[k, q]
             along += equation.root * row[first + k] * response[k, q]
         write_block_row(evidence, moved, q, moved_row)
-        # A weight of a loss falls where the residual grows.
+        # The loss's weight falls as the residual grows.
         fall = along * equation.fall * equation.root * equation.residual
         for k in range(row.shape[0]):
             moved_row[k] = equation.root * (moved_row[k] - row[k] + fall * row[k])
-        add_slope(arrow, equation.pose, moved_row)
+        add_gradient(arrow, equation.pose, moved_row)
 
 
 @kernel
-def _left_of_displacements(spread: FloatArray, rows: FloatArray, columns: IntArray) -> FloatArray:
-    """Share (m, 3, 3) of each point's displacement that its whitened equations leave open."""
+def _undetermined_shares(spread: FloatArray, rows: FloatArray, columns: IntArray) -> FloatArray:
+    """Posterior over prior covariance (m, 3, 3) of each displacement, given its equations."""
     left = np.zeros((spread.shape[0], 3, 3))
     last = rows.shape[0] - 3
     for i in range(spread.shape[0]):
@@ -272,9 +271,9 @@ def _write_point_rows(
     by_model: FloatArray,
     by_modes: FloatArray,
 ) -> None:
-    """Write the rows by the point before the stretch (3, N), and by the coefficients (K, N)."""
+    """Write derivatives by unstretched points (3, N) and by coefficients (K, N)."""
     sightings, modes, seen = evidence.sightings, evidence.shape.modes, equations.seen
-    scale = exp_of(state.log_scales)
+    scale = exp_triple(state.log_scales)
     column = 0
     for n in equations.layout.order:
         i = sightings.point[n]
@@ -300,12 +299,12 @@ def _add_slopes(
     response: FloatArray,
     moved: FloatArray,
 ) -> None:
-    """Add half the derivatives, from the coefficients' ``response`` (K, N) to each equation."""
+    """Add half the derivatives from sightings, given the coefficients' ``response`` (K, N)."""
     shape, sightings, rig = evidence.shape, evidence.sightings, evidence.rig
     seen, slopes, gradient = equations.seen, equations.slopes, equations.gradient
     size, start = equations.arrow.blocks.shape[1], border_start(equations.arrow)
     first = start + evidence.focals.low.shape[0]
-    scale = exp_of(state.log_scales)
+    scale = exp_triple(state.log_scales)
     slopes[:] = 0.0
     column = 0
     for n in equations.layout.order:
@@ -324,7 +323,7 @@ def _add_slopes(
             d = seen[3, column], seen[4, column], seen[5, column]
             back, along = (moved[q, 0], moved[q, 1], moved[q, 2]), moved[q, 3]
             y = turn(motion, (scale[0] * back[0], scale[1] * back[1], scale[2] * back[2]))
-            # A weight of a loss falls where the residual grows.
+            # The loss's weight falls as the residual grows.
             fall = (in_image if q < of_depth else along) * seen[6, column]
             h = slope_of_row(a, along, y, d, fall)
             by_turn, by_row, by_point = cross(turned, h), cross(y, a), turn_back(motion, h)
@@ -341,7 +340,7 @@ def _add_slopes(
     for i in range(slopes.shape[0]):
         for c in range(3):
             if slopes[i, c] != 0.0:
-                gradient[first + c] += slopes[i, c] * unstretched(shape, state, i, c)
+                gradient[first + c] += slopes[i, c] * coordinate_of(shape, state, i, c)
                 for k in range(shape.modes.shape[0]):
                     gradient[first + 3 + k] += slopes[i, c] * shape.modes[k, i, c]
 
@@ -357,7 +356,7 @@ def _write_responses(
     count: int,
     moved: FloatArray,
 ) -> None:
-    """Write the responses (q, 4) of point i to its equations, and last what they are along them."""
+    """Write responses of point i to its equations (q, 3), and their dot products with the rows."""
     square = shape.spread[i] ** 2
     for q in range(count):
         column = first + q

@@ -1,13 +1,14 @@
-"""Joint estimation of poses, log scales, focal lengths and shape from everything that is known.
+"""Evidence and state of the joint system: poses, focal lengths, log scales and shape.
 
 A point of the object is ``x_i = diag(exp(log_scales)) @ (mean_i + sum_k c_k modes_ki + d_i)``, in
-the model's frame. The coefficients c have a standard normal prior, a displacement d_i has the
-standard deviation ``spread_i``. A sighting of a point is its ray in one view, its depth there, or
-both; a contour point is one whose ray counts along the contour's normal only. Views share one pose
-through known ``cam_from_rig``, or have one each; views of one camera share its focal length.
+the model's frame. The coefficients c have a standard normal prior; a displacement d_i has the
+standard deviation ``spread_i``. A sighting measures the ray of a point in one view, its depth
+there, or both. For a contour point, only the error along the contour's normal counts. Views of a
+rig share one pose through known ``cam_from_rig``; other views have their own pose. Views of one
+camera share its focal length.
 
-The unknowns stand in this order: six for every pose (a rotation vector applied in the rig's frame,
-the translation), then the border that all views share: log focal lengths, three log scales, the
+The order of the unknowns is: six for every pose (rotation vector applied in the rig's frame,
+translation), then the border, which all views share: log focal lengths, three log scales,
 coefficients. Displacements are eliminated.
 """
 
@@ -27,7 +28,7 @@ Table = TypeVar("Table", bound=tuple[Any, ...])
 
 
 class Shape(NamedTuple):
-    """Mean (m, 3) of the points, modes (K, m, 3) of unit deviation, displacements' spread (m,)."""
+    """Mean points (m, 3), modes (K, m, 3) for unit coefficients, spread (m,) of displacements."""
 
     mean: FloatArray
     modes: FloatArray
@@ -35,11 +36,12 @@ class Shape(NamedTuple):
 
 
 class Sightings(NamedTuple):
-    """Measurements of points in images, N of them, numbered by ``point`` and ``image`` (N,).
+    """N measurements of points in images, with the indices ``point`` and ``image`` (N,).
 
-    ``rays`` (N, 2) are normalised, with ``whitening`` (N, 3) as in `KeypointEvidence`; ``depths``
-    (N, 3) are depths, inverse deviations, 0 where there is none, and scales of Cauchy's loss, 0 for
-    that of the ray. ``loss``, ``loss_scale`` (N,) are those of each residual's length.
+    ``rays`` (N, 2) are normalised image coordinates, with ``whitening`` (N, 3) as in
+    `KeypointEvidence`, and ``loss`` and ``loss_scale`` (N,). The columns of ``depths`` (N, 3) are
+    the depth, its inverse standard deviation (0 for none), and the scale of its Cauchy loss (0 for
+    the ray's loss).
     """
 
     point: IntArray
@@ -52,9 +54,10 @@ class Sightings(NamedTuple):
 
 
 class Rig(NamedTuple):
-    """Cameras (V, 12), rotation row by row and translation, and the pose (V,) each belongs to.
+    """Cameras (V, 12), rotation row by row and translation, and the index of their pose (V,).
 
-    The pose of a view without evidence is -1. Depths are along the ``axes`` (V, 3) in the cameras.
+    A view without evidence has the pose -1. Depths are measured along ``axes`` (V, 3) of the
+    camera frames.
     """
 
     cam_from_rig: FloatArray
@@ -63,16 +66,17 @@ class Rig(NamedTuple):
 
     @property
     def is_shared(self) -> BoolArray:
-        """True for the views (V,) whose pose is that of other views, too."""
+        """True for the views (V,) that share their pose with another view."""
         counts = np.bincount(self.pose[self.pose >= 0])
         return np.asarray((self.pose >= 0) & (counts[self.pose] > 1))
 
 
 class Focals(NamedTuple):
-    """F focal lengths to estimate, relative to the rays'; ``group`` (V,) is each view's, or -1.
+    """F unknown focal lengths, as log ratios to the focal lengths that gave the rays.
 
-    Logarithms lie between ``low`` and ``high`` (F,), with a Gaussian prior of mean ``center`` (F,)
-    and inverse variance ``weight`` (F,), 0 for none.
+    ``group`` (V,) is the index of each view's focal length, or -1. A log ratio lies between ``low``
+    and ``high`` (F,), with a Gaussian prior of mean ``center`` (F,) and inverse variance ``weight``
+    (F,), 0 for none.
     """
 
     group: IntArray
@@ -83,7 +87,7 @@ class Focals(NamedTuple):
 
 
 class Directions(NamedTuple):
-    """Unit vectors ``model`` and ``camera`` (D, 3) in views, ``whitening`` (D, 3, 3) [1/rad]."""
+    """Unit vectors ``model``, ``camera`` (D, 3) in views (D,), ``whitening`` (D, 3, 3) [1/rad]."""
 
     model: FloatArray
     camera: FloatArray
@@ -92,10 +96,10 @@ class Directions(NamedTuple):
 
 
 class Offsets(NamedTuple):
-    """Distances ``value`` (L,) along a ``direction`` (L, 3) of the model between two of its points.
+    """Distances ``value`` (L,) between two points, along a ``direction`` (L, 3) of the model.
 
-    ``ends`` (L, 2) numbers these, -1 for the place of the camera ``image`` (L,), -1 where there is
-    none. ``weight`` (L,) is the inverse standard deviation.
+    ``ends`` (L, 2) are indices of points, or -1 for the center of the camera ``image`` (L,).
+    Without a camera, ``image`` is -1. ``weight`` (L,) is the inverse standard deviation.
     """
 
     ends: IntArray
@@ -106,10 +110,10 @@ class Offsets(NamedTuple):
 
 
 class ScalePriors(NamedTuple):
-    """Log scales: 1 in ``free`` (3,) where estimated, and their priors.
+    """Priors of log scales; ``free`` (3,) is 1 for an estimated one, 0 for a fixed one.
 
-    ``precision`` (3, 3) is the inverse covariance of a Gaussian, and ``bound`` the prior on each of
-    them; where all are free, on each about their mean.
+    ``precision`` (3, 3) is the inverse covariance of a Gaussian. ``bound`` is a prior on each log
+    scale, or, if all three are free, on its difference from their mean.
     """
 
     free: FloatArray
@@ -118,10 +122,10 @@ class ScalePriors(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """Everything that is known about one object.
+    """All evidence and priors of one object.
 
-    The ``blocks`` are tables of evidence beside sightings, one of a kind, those of directions and
-    offsets first; `cadalign.solvers.joint.rows` says what a block is.
+    ``blocks`` are tables of further evidence, at most one of each type, `Directions` and `Offsets`
+    first; `cadalign.solvers.joint.rows` defines a block.
     """
 
     shape: Shape
@@ -140,7 +144,7 @@ class Evidence(NamedTuple):
         return cast(Offsets, self.blocks[1])
 
     def with_block(self, block: Any) -> Evidence:
-        """The evidence with a block in the place of that of its kind, or as one more."""
+        """Replace the block of the same type, or append a block of a new type."""
         kinds = [type(each) for each in self.blocks]
         if type(block) not in kinds:
             return self._replace(blocks=(*self.blocks, block))
@@ -160,7 +164,7 @@ class State(NamedTuple):
 
 @kernel
 def unpack_state(shape: Shape, focals: int, row: FloatArray) -> State:
-    """The parts of a state that is a row of numbers; they share its memory."""
+    """Views of the parts of a packed state."""
     modes, points = shape.modes.shape[0], shape.mean.shape[0]
     a = row.shape[0] - 3 * points
     b = a - modes
@@ -178,13 +182,13 @@ def remove_displacements(state: State) -> State:
 
 
 def kept_rows(table: Table, kept: BoolArray | IntArray) -> Table:
-    """Some rows of a table of columns, such as `Sightings`."""
+    """Select rows of a table of columns, such as `Sightings`."""
     columns: list[Any] = [np.ascontiguousarray(column[kept]) for column in table]
     return type(table)(*columns)
 
 
 def stack_tables(tables: Sequence[Table]) -> Table:
-    """The rows of all tables, one after the other."""
+    """Concatenate tables of the same type."""
     return type(tables[0])(*map(np.concatenate, zip(*tables, strict=True)))
 
 
@@ -193,12 +197,12 @@ def packed(state: State) -> FloatArray:
 
 
 def log_focals_of(evidence: Evidence, state: State) -> FloatArray:
-    """Log focal length (V,) of every view over that of its rays; 0 where it is known."""
-    return np.append(state.log_focals, 0.0)[evidence.focals.group]  # the last, for -1
+    """Log ratio (V,) of each view's focal length to its rays'; 0 if the focal length is known."""
+    return np.append(state.log_focals, 0.0)[evidence.focals.group]  # group -1 takes the last
 
 
 def distances_of(evidence: Evidence, poses: FloatArray, points: FloatArray) -> FloatArray:
-    """Distances (L,) of the evidence's offsets, under poses (P, 12) of the points (m, 3)."""
+    """Distances (L,) that poses (P, 12) and points (m, 3) predict for the offsets."""
     offsets, rig = evidence.offsets, evidence.rig
     cameras, pose = rig.cam_from_rig[offsets.image], poses[rig.pose[offsets.image]]
     turned = np.einsum("lji,lj->li", cameras[:, :9].reshape(-1, 3, 3), cameras[:, 9:])
@@ -208,7 +212,7 @@ def distances_of(evidence: Evidence, poses: FloatArray, points: FloatArray) -> F
 
 
 def points_of(shape: Shape, state: State) -> FloatArray:
-    """The points (m, 3) in the model's frame."""
+    """Points (m, 3) of a shape in the model's frame."""
     varied = np.tensordot(state.coefficients, shape.modes, 1)
     return np.asarray(np.exp(state.log_scales) * (shape.mean + state.displacements + varied))
 
@@ -216,7 +220,7 @@ def points_of(shape: Shape, state: State) -> FloatArray:
 def seen_in_cameras(
     evidence: Evidence, poses: FloatArray, points: FloatArray, image: IntArray
 ) -> FloatArray:
-    """Points (N, 3) of the model in the cameras (N,) of views, under poses (P, 12)."""
+    """Transform model points (N, 3) to the cameras of views ``image`` (N,), by poses (P, 12)."""
     rig = evidence.rig
     for motion in (poses[rig.pose[image]], rig.cam_from_rig[image]):
         turned = np.einsum("nij,nj->ni", motion[:, :9].reshape(-1, 3, 3), points)
@@ -227,28 +231,27 @@ def seen_in_cameras(
 def depths_along_axes(
     evidence: Evidence, poses: FloatArray, points: FloatArray, image: IntArray
 ) -> FloatArray:
-    """Depths (N,) of points as `seen_in_cameras` takes them."""
+    """Depths (N,) along the rig's axes; parameters as for `seen_in_cameras`."""
     seen = seen_in_cameras(evidence, poses, points, image)
     return np.asarray((seen * evidence.rig.axes[image]).sum(axis=1))
 
 
 @inlined
-def exp_of(logs: FloatArray) -> Triple:
+def exp_triple(logs: FloatArray) -> Triple:
     return np.exp(logs[0]), np.exp(logs[1]), np.exp(logs[2])
 
 
 @inlined
 def stretched_point(shape: Shape, state: State, scale: Triple, i: int) -> Triple:
-    """Point i in the model's frame."""
     return (
-        scale[0] * unstretched(shape, state, i, 0),
-        scale[1] * unstretched(shape, state, i, 1),
-        scale[2] * unstretched(shape, state, i, 2),
+        scale[0] * coordinate_of(shape, state, i, 0),
+        scale[1] * coordinate_of(shape, state, i, 1),
+        scale[2] * coordinate_of(shape, state, i, 2),
     )
 
 
 @inlined
-def unstretched(shape: Shape, state: State, i: int, a: int) -> float:
+def coordinate_of(shape: Shape, state: State, i: int, a: int) -> float:
     """Coordinate a of point i before the stretch."""
     value = shape.mean[i, a] + state.displacements[i, a]
     for k in range(shape.modes.shape[0]):

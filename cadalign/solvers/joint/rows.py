@@ -1,9 +1,8 @@
-"""Equations of the joint system: those of sightings, of blocks of further evidence, and priors.
+"""Equations of the joint system: sightings, blocks of further evidence, and priors.
 
-An equation of a block is a row (6 + b,) of derivatives by a pose, the log focals, the log scales
-and the coefficients, and a residual that is linear in the coefficients. Displacements don't count.
-A block is a NamedTuple of columns with a member of the two families here; `Evidence.blocks` has one
-of each kind.
+A block is a NamedTuple of columns that registers a member of both families below. An equation of a
+block is a residual and its derivatives (6 + b,) by one pose, log focal lengths, log scales and
+coefficients. The residual must be linear in the coefficients, and ignores displacements.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, inlined, kernel, kernel_family, unrolled
 from cadalign.solvers.constants import CAUCHY
-from cadalign.solvers.evidence import beyond, fall_of_weight, loss_and_root, weigh_error
+from cadalign.solvers.evidence import excess_of, loss_and_root, weigh_error, weight_slope
 from cadalign.solvers.joint.arrow import Arrow, add_rows, border_start
 from cadalign.solvers.joint.evidence import (
     Directions,
@@ -25,25 +24,28 @@ from cadalign.solvers.joint.evidence import (
     ScalePriors,
     Shape,
     State,
-    exp_of,
+    coordinate_of,
+    exp_triple,
     remove_displacements,
     stretched_point,
-    unstretched,
 )
-from cadalign.solvers.linalg import cross, dot, scaled, triple
-from cadalign.solvers.projection import ray_slopes, see, shift, turn, turn_back, write_motion
+from cadalign.solvers.linalg import cross, dot, multiply, triple
+from cadalign.solvers.projection import ray_of, ray_slopes, shift, turn, turn_back, write_motion
 
 equations_of = kernel_family("equations_of")
-"""``(block)``: the number of its equations."""
+"""``(block)``: number of equations of a block."""
 write_equation = kernel_family("write_equation")
-"""``(block, evidence, state, q, row)``: write derivatives (6 + b,) of the residual of equation q.
+"""``(block, evidence, state, q, row)``: write the derivatives (6 + b,) of equation q.
 
-The row is zero before. Returns a `BlockEquation`; the state has no displacements.
+``row`` is zero on entry. Returns a `BlockEquation`; the state's displacements are zero.
 """
 
 
 class BlockEquation(NamedTuple):
-    """A whitened residual of one pose, the ``cost`` and weight's ``root`` by its loss, the fall."""
+    """A whitened residual of one pose, with its ``cost`` and weight by the loss.
+
+    ``root`` is the square root of the weight, ``fall`` its `weight_slope`.
+    """
 
     pose: int
     residual: float
@@ -54,7 +56,6 @@ class BlockEquation(NamedTuple):
 
 @kernel
 def count_block_equations(evidence: Evidence) -> int:
-    """Number of the equations of all blocks."""
     count = 0
     for block in unrolled(evidence.blocks):
         count += equations_of(block)
@@ -63,7 +64,7 @@ def count_block_equations(evidence: Evidence) -> int:
 
 @kernel
 def write_block_row(evidence: Evidence, state: State, q: int, row: FloatArray) -> BlockEquation:
-    """Write derivatives (6 + b,) of the residual of equation ``q``, block after block."""
+    """Write the derivatives (6 + b,) of equation ``q``, counted over all blocks."""
     row[:] = 0.0
     first = 0
     found = BlockEquation(0, 0.0, 0.0, 1.0, 0.0)
@@ -77,7 +78,7 @@ def write_block_row(evidence: Evidence, state: State, q: int, row: FloatArray) -
 
 @inlined
 def plain_equation(pose: int, residual: float) -> BlockEquation:
-    """An equation whose residual counts by its square."""
+    """An equation with squared loss."""
     return BlockEquation(pose, residual, residual * residual, 1.0, 0.0)
 
 
@@ -92,7 +93,7 @@ def _equations_of_directions(directions: Directions) -> int:
 def _write_direction(
     directions: Directions, evidence: Evidence, state: State, q: int, row: FloatArray
 ) -> BlockEquation:
-    """Write one of the three equations of a direction known in a camera, such as gravity."""
+    """Write one of the three equations of a known direction, such as gravity."""
     d, w = q // 3, q % 3
     v = directions.image[d]
     rig = evidence.rig
@@ -118,8 +119,8 @@ def _write_offset(
 ) -> BlockEquation:
     """Write the equation of a known distance along a direction of the model.
 
-    A camera's place in the model's frame is ``-R' q``, with the pose (R, t), the camera's (C, c) in
-    the rig and ``q = t + C' c``: along the direction d it is ``-(R d) . q``.
+    The center of a camera in the model's frame is ``-R' q``, with the pose (R, t), the camera
+    (C, c) in the rig and ``q = t + C' c``. Its coordinate along the direction d is ``-(R d) . q``.
     """
     rig = evidence.rig
     v, weight = offsets.image[j], offsets.weight[j]
@@ -141,7 +142,7 @@ def _write_offset(
         for a in range(3):
             along = sign * offsets.direction[j, a]
             if along != 0.0:
-                stretched = np.exp(state.log_scales[a]) * unstretched(evidence.shape, state, i, a)
+                stretched = np.exp(state.log_scales[a]) * coordinate_of(evidence.shape, state, i, a)
                 value += along * stretched
                 _add_shape(evidence.shape, state, i, a, weight * along, row)
     return plain_equation(p, value * weight)
@@ -149,11 +150,11 @@ def _write_offset(
 
 @inlined
 def _add_shape(shape: Shape, state: State, i: int, a: int, slope: float, row: FloatArray) -> None:
-    """Add the derivatives by scale and modes of ``slope`` times coordinate a of point i."""
+    """Add derivatives by scale and coefficients of ``slope`` times coordinate a of point i."""
     modes = shape.modes.shape[0]
     first = row.shape[0] - modes - 3
     scale = slope * np.exp(state.log_scales[a])
-    row[first + a] += scale * unstretched(shape, state, i, a)
+    row[first + a] += scale * coordinate_of(shape, state, i, a)
     for k in range(modes):
         row[first + 3 + k] += scale * shape.modes[k, i, a]
 
@@ -169,17 +170,17 @@ def write_rows(
 ) -> float:
     """Write whitened, loss-weighted derivatives and residuals of sightings; returns the cost.
 
-    The ``chosen`` sightings are of one pose. Rows of ``rows`` (6 + b + 4, C) are the unknowns of
-    that pose and of the border, the residual, and the point's displacement; columns are sightings.
-    ``seen`` (8, N) receives, from column ``first_seen`` on, the residual's slope by the point in
-    the rig's frame, the camera's z there over the depth (none for depths), the residual times
-    `fall_of_weight`, and the derivative by the log focal length.
+    The ``chosen`` sightings belong to one pose. Rows of ``rows`` (6 + b + 4, C) are derivatives by
+    this pose and the border, the residual, and derivatives by the point's displacement; columns are
+    equations. ``seen`` (8, N) receives, from column ``first_seen`` on, the residual's slope by the
+    point (3) and the camera's z axis over the depth (3, 0 for a residual of depth), both in the
+    rig's frame; the residual times `weight_slope`; and the derivative by the log focal length.
     """
     shape, sightings, rig = evidence.shape, evidence.sightings, evidence.rig
     rows[:] = 0.0
     first = 6 + evidence.focals.low.shape[0]
     last = first + 3 + shape.modes.shape[0]
-    scale = exp_of(state.log_scales)
+    scale = exp_triple(state.log_scales)
     cost = 0.0
     column = 0
     for n in chosen:
@@ -188,14 +189,14 @@ def write_rows(
         point = stretched_point(shape, state, scale, i)
         turned = turn(motion, point)
         in_camera, axis = shift(camera, turn(camera, shift(motion, turned))), triple(rig.axes[v])
-        place = see(in_camera)
+        place = ray_of(in_camera)
         u, w, depth = place
         if not depth > 0:
             return np.inf
         group = evidence.focals.group[v]
         log_ratio = state.log_focals[group] if group >= 0 else 0.0
         ratio = np.exp(log_ratio)
-        # In pixels over the reference focal length; by its logarithm.
+        # Rays for the reference focal length, also their derivatives by the log focal length.
         by_log_u, by_log_w = ratio * u, ratio * w
         du, dw = by_log_u - sightings.rays[n, 0], by_log_w - sightings.rays[n, 1]
         loss, loss_scale = sightings.loss[n], sightings.loss_scale[n]
@@ -211,10 +212,10 @@ def write_rows(
         cost += error.cost + depth_part
         by_u, by_w = ray_slopes(place, (ratio * a, ratio * b, ratio * c))
         counts = True, c > 0.0, weight > 0.0
-        slopes = by_u, by_w, scaled(axis, depth_root * weight)
+        slopes = by_u, by_w, multiply(axis, depth_root * weight)
         residuals = error.u, error.v, depth_root * rz
-        fall = fall_of_weight(loss, loss_scale, error.root, error.u**2 + error.v**2)
-        depth_fall = fall_of_weight(depth_loss, depth_scale, depth_root, residuals[2] ** 2)
+        fall = weight_slope(loss, loss_scale, error.root, error.u**2 + error.v**2)
+        depth_fall = weight_slope(depth_loss, depth_scale, depth_root, residuals[2] ** 2)
         falls = fall, fall, depth_fall
         by_focal = a * by_log_u + b * by_log_w, c * by_log_w, 0.0
         for q in range(3):
@@ -231,7 +232,7 @@ def write_rows(
                 rows[first + k, column] = by_model[k] * point[k] * evidence.scales.free[k]
                 rows[last + 1 + k, column] = by_model[k] * scale[k]
                 seen[k, first_seen + column] = by_rig[k]
-                # What lies farther is seen smaller; a depth is not.
+                # Rays shrink with the depth; a residual of depth does not.
                 seen[3 + k, first_seen + column] = camera[6 + k] / depth if q < 2 else 0.0
             for k in range(shape.modes.shape[0]):
                 rows[first + 3 + k, column] = (
@@ -246,7 +247,7 @@ def write_rows(
 
 @kernel
 def add_blocks(evidence: Evidence, state: State, arrow: Arrow, products: FloatArray) -> float:
-    """Add all evidence but sightings; returns its cost. ``products`` are as of `add_rows`."""
+    """Add priors and blocks; returns their cost. For ``products`` see `add_rows`."""
     cost = _add_priors(evidence.focals, evidence.scales, state, arrow)
     column = np.empty(products.shape[0])
     row, rows, still = column[:-1], column.reshape((-1, 1)), remove_displacements(state)
@@ -261,7 +262,7 @@ def add_blocks(evidence: Evidence, state: State, arrow: Arrow, products: FloatAr
 
 @kernel
 def bounded_scales(free: FloatArray) -> FloatArray:
-    """Rows (3, 3) by which log scales, those ``free`` (3,) 1, give what their bound is on."""
+    """Matrix (3, 3) from log scales to bounded values; without their mean if all are free."""
     rows = np.zeros((3, 3))
     mean = np.floor((free[0] + free[1] + free[2]) / 3.0) / 3.0
     for a in range(3):
@@ -293,7 +294,7 @@ def _add_priors(focals: Focals, scales: ScalePriors, state: State, arrow: Arrow)
         for b in range(3):
             bounded += rows[a, b] * state.log_scales[b]
         if abs(bounded) >= bound.width:
-            excess = beyond(bounded, bound.width)
+            excess = excess_of(bounded, bound.width)
             cost += bound.weight * excess * excess
             for b in range(3):
                 gradient[first + b] += bound.weight * excess * rows[a, b]

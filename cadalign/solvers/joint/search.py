@@ -1,4 +1,4 @@
-"""Starts, search and refinement of joint estimates, in the modes that the evidence tells apart."""
+"""Starts, search and refinement of joint estimates, in a reduced basis of modes."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from cadalign.solvers.starts import widen_by_shape
 
 _PROBE_ITERATIONS = 8
 _MAX_ITERATIONS = 200
-_UNLIKELY = 40.0  # excess cost, after the probe, at which a start is given up
+_UNLIKELY = 40.0  # excess cost, after the probe, at which a start is dropped
 MOST_PER_VIEW = 8
 _EVALUATION = Effort(0, 0, 0, np.inf)
-_UNLIKELY_POSE = 60.0  # excess cost of a pose of the mean shape that is still a start
-_LEAST_SHARE = 1e-7  # of a direction that the evidence tells apart, over the longest
+_UNLIKELY_POSE = 60.0  # largest excess cost of a start, with the mean shape
+_LEAST_SHARE = 1e-7  # least relative singular value of a direction in the reduced basis
 
 
 class JointMinima(NamedTuple):
-    """Minima of a joint estimate, the best score first: their states, costs and scores (M,)."""
+    """States, costs (M,) and scores (M,) of the minima of a joint estimate, best score first."""
 
     states: list[State]
     costs: FloatArray
@@ -36,7 +36,7 @@ class JointMinima(NamedTuple):
 def search_joint(
     evidence: Evidence, poses: FloatArray, log_focals: FloatArray, log_scales: FloatArray
 ) -> tuple[JointMinima, int]:
-    """Minima from starts (S, P, 12), (S, F), (S, 3), and the number of iterations."""
+    """Minima from starts (S, P, 12), (S, F), (S, 3) of the mean shape, and iterations."""
     reduction, count = reduce_modes(evidence), len(poses)
     fewer = reduction.evidence
     if not count:
@@ -46,7 +46,7 @@ def search_joint(
     effort = Effort(count, _PROBE_ITERATIONS, _MAX_ITERATIONS, unlikely)
     minima, _ = run_joint(joint_system(fewer, integrates=integrates), starts, effort)
     found, iterations = minima.counts.tolist()
-    states = [reduction.state_of(row) for row in minima.states[:found]]
+    states = [reduction.expand_state(row) for row in minima.states[:found]]
     return JointMinima(states, minima.costs[:found], minima.scores[:found]), iterations
 
 
@@ -62,14 +62,14 @@ def _mean_rows(
 def costs_at(
     evidence: Evidence, poses: FloatArray, log_focals: FloatArray, log_scales: FloatArray
 ) -> FloatArray:
-    """Costs (S,) of the mean shape at starts as those of `search_joint`."""
+    """Costs (S,) of the mean shape at starts; parameters as for `search_joint`."""
     rows = _mean_rows(evidence, poses, log_focals, log_scales)
     minima, _ = run_joint(joint_system(evidence, integrates=False), rows, _EVALUATION)
     return minima.costs
 
 
 def _excess(evidence: Evidence, start: FloatArray) -> float:
-    """Excess cost at which starts are given up; it grows with the residuals of the best (D,)."""
+    """Excess cost at which starts are dropped; it grows with the residuals at ``start`` (D,)."""
     variance = equations_at(evidence, start)[0] / max(2 * len(evidence.sightings.point), 1)
     return _UNLIKELY * max(1.0, variance) if variance < np.inf else _UNLIKELY
 
@@ -82,43 +82,43 @@ def _has_latent(evidence: Evidence) -> bool:
 def refine_joint(
     evidence: Evidence, max_iterations: int, state: State
 ) -> tuple[float, float, State]:
-    """Improve a state; returns cost and score, infinite behind a camera, and the state."""
-    reduction, row = reduced_row(evidence, state)
+    """Improve a state; returns cost, score (both infinite behind a camera) and state."""
+    reduction, row = pack_reduced(evidence, state)
     fewer, effort = reduction.evidence, Effort(1, max_iterations, 0, np.inf)
     system = joint_system(fewer, integrates=_has_latent(fewer))
     minima, _ = run_joint(system, row[None], effort)
     if not minima.counts[0]:
         return np.inf, np.inf, state
-    return float(minima.costs[0]), float(minima.scores[0]), reduction.state_of(minima.states[0])
+    return float(minima.costs[0]), float(minima.scores[0]), reduction.expand_state(minima.states[0])
 
 
 def objective_of(evidence: Evidence, state: State) -> float:
-    """Objective of `refine_joint`: the cost, with the log determinant of what is integrated out."""
-    reduction, row = reduced_row(evidence, state)
+    """Objective of `refine_joint`: the cost, plus the log determinant of integrated unknowns."""
+    reduction, row = pack_reduced(evidence, state)
     return equations_at(reduction.evidence, row, integrates=_has_latent(reduction.evidence))[0]
 
 
 def cost_of(evidence: Evidence, state: State) -> float:
-    """The cost at a state, without what is integrated out."""
+    """Cost at a state, without the log determinant of integrated unknowns."""
     return equations_at(evidence, packed(state))[0]
 
 
 def score_state(evidence: Evidence, state: State) -> float:
-    """-2 log of the evidence by Laplace's approximation; infinite where it is not determined."""
+    """-2 log evidence by Laplace's approximation; infinite if unknowns are not determined."""
     return refine_joint(evidence, 0, state)[1]
 
 
 def equations_at(
     evidence: Evidence, row: FloatArray, *, integrates: bool = False
 ) -> tuple[float, JointEquations]:
-    """The objective at a state that is a row of numbers, and the normal equations there."""
+    """Objective and normal equations at a packed state."""
     system = joint_system(evidence, integrates=integrates)
     minima, equations = run_joint(system, row[None], _EVALUATION)
     return float(minima.costs[0]), equations
 
 
 def keypoints_of(evidence: Evidence, view: int) -> KeypointEvidence:
-    """One view's keypoints of the mean shape, whose uncertainty is in their whitening."""
+    """One view's keypoints on the mean shape; their whitening includes the shape's variance."""
     sightings, shape = evidence.sightings, evidence.shape
     rows = np.flatnonzero((sightings.image == view) & (sightings.whitening[:, 2] > 0))
     point = sightings.point[rows]
@@ -132,12 +132,11 @@ def keypoints_of(evidence: Evidence, view: int) -> KeypointEvidence:
 
 
 def view_starts(evidence: Evidence, view: int) -> tuple[FloatArray, FloatArray]:
-    """Camera poses (S, 12) and log scales (S, 3) from one view's keypoints, the likeliest first."""
+    """Camera poses (S, 12) and log scales (S, 3) from one view's keypoints, likeliest first."""
     given, scales = keypoints_of(evidence, view), evidence.scales
     if len(given.points) < LEAST_POINTS:
         return np.empty((0, 12)), np.empty((0, 3))
-    # The solvers' first axis is one whose scale is known; the order of the others is cyclic, since
-    # it must not be a reflection.
+    # The solver needs a fixed scale of the first axis. The order is cyclic to avoid a reflection.
     order = (np.argmin(scales.free) + np.arange(3)) % 3
     weight = scales.precision[order[1], order[1]]
     prior = ScalePrior(weight, 0.0) if weight > 0 else scales.bound
@@ -164,42 +163,42 @@ def view_starts(evidence: Evidence, view: int) -> tuple[FloatArray, FloatArray]:
 
 
 class Reduction(NamedTuple):
-    """Evidence with fewer modes, those that it tells apart, and their basis in its own.
+    """Evidence in a reduced basis of modes.
 
-    Modes move the s points that the evidence names in at most 3 s directions: in an orthonormal
-    ``basis`` (K + 3 u, r), ``c = basis @ reduced`` plus a rest that moves none of them and keeps
-    its standard normal prior, as the reduced ones have. With several poses, displacements of
-    sighted points are modes, too: rows K + 3 j + a are axis a of ``displaced[j]`` (u,). ``whole``
-    is all the shape.
+    Modes move the s points of the evidence in at most 3 s directions. With an orthonormal ``basis``
+    (K + 3 u, r), the coefficients are ``basis @ reduced`` plus a remainder that moves none of these
+    points; both keep a standard normal prior. With several poses, the displacements of sighted
+    points become modes: row K + 3 j + a of the basis is axis a of point ``displaced[j]`` (u,).
+    ``full_shape`` is the shape before the reduction.
     """
 
     evidence: Evidence
     basis: FloatArray
     displaced: IntArray
-    whole: Shape
+    full_shape: Shape
 
-    def reduced(self, state: State) -> State:
-        moved = state.displacements[self.displaced] / self.whole.spread[self.displaced, None]
+    def reduce_state(self, state: State) -> State:
+        moved = state.displacements[self.displaced] / self.full_shape.spread[self.displaced, None]
         displacements = state.displacements.copy()
         displacements[self.displaced] = 0.0
         given = np.concatenate([state.coefficients, moved.ravel()])
         return state._replace(coefficients=given @ self.basis, displacements=displacements)
 
-    def state_of(self, row: FloatArray) -> State:
-        """The state in all coefficients and displacements, of one in reduced ones as a row."""
+    def expand_state(self, row: FloatArray) -> State:
+        """Expand a packed reduced state to all coefficients and displacements."""
         focals, reduced = len(self.evidence.focals.low), self.basis.shape[1]
-        modes, points = len(self.whole.modes), len(self.whole.mean)
+        modes, points = len(self.full_shape.modes), len(self.full_shape.mean)
         sizes = focals, 3, reduced, 3 * points
         ends = np.cumsum([len(row) - sum(sizes), *sizes[:-1]])
         poses, log_focals, log_scales, fewer, moved = np.split(row, ends)
         given, displacements = self.basis @ fewer, moved.reshape(-1, 3).copy()
         own = given[modes:].reshape(-1, 3)
-        displacements[self.displaced] = own * self.whole.spread[self.displaced, None]
+        displacements[self.displaced] = own * self.full_shape.spread[self.displaced, None]
         return State(poses.reshape(-1, 12), log_focals, log_scales, given[:modes], displacements)
 
 
 def reduce_modes(evidence: Evidence) -> Reduction:
-    """The evidence with modes in the directions that it tells apart."""
+    """Reduce the modes of evidence to the directions that it determines."""
     shape, modes = evidence.shape, len(evidence.shape.modes)
     sighted = sighted_points(evidence)
     displaced = np.empty(0, dtype=np.int64)
@@ -222,7 +221,7 @@ def reduce_modes(evidence: Evidence) -> Reduction:
 
 
 def displaced_modes(shape: Shape, displaced: IntArray) -> FloatArray:
-    """Modes (K + 3 u, m, 3): those of the shape, then displacements of some points (u,) by axes."""
+    """Modes (K + 3 u, m, 3): the shape's, then displacements of points (u,) along each axis."""
     rows, axes = np.repeat(displaced, 3), np.tile(np.arange(3), len(displaced))
     own = np.zeros((len(rows), *shape.mean.shape))
     own[np.arange(len(rows)), rows, axes] = shape.spread[rows]
@@ -230,26 +229,26 @@ def displaced_modes(shape: Shape, displaced: IntArray) -> FloatArray:
 
 
 def reduced(evidence: Evidence, state: State) -> tuple[Evidence, State]:
-    """The evidence in reduced modes, and a state of it."""
+    """Reduced evidence, and the reduced state."""
     reduction = reduce_modes(evidence)
-    return reduction.evidence, reduction.reduced(state)
+    return reduction.evidence, reduction.reduce_state(state)
 
 
-def reduced_row(evidence: Evidence, state: State) -> tuple[Reduction, FloatArray]:
-    """The reduction of evidence, and a state in it as a row of numbers."""
+def pack_reduced(evidence: Evidence, state: State) -> tuple[Reduction, FloatArray]:
+    """Reduction of evidence, and the packed reduced state."""
     reduction = reduce_modes(evidence)
-    return reduction, packed(reduction.reduced(state))
+    return reduction, packed(reduction.reduce_state(state))
 
 
 def used_points(evidence: Evidence) -> BoolArray:
-    """True for the points (m,) that a piece of evidence names."""
+    """True for the points (m,) with any evidence."""
     used, ends = sighted_points(evidence), evidence.offsets.ends
     used[ends[ends >= 0]] = True
     return used
 
 
 def sighted_points(evidence: Evidence) -> BoolArray:
-    """True for the points (m,) that are sighted."""
+    """True for the points (m,) with a sighting."""
     sighted = np.zeros(len(evidence.shape.mean), dtype=bool)
     sighted[evidence.sightings.point] = True
     return sighted

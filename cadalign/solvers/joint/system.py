@@ -1,9 +1,8 @@
-"""The system of all unknowns: poses, focal lengths, scales and shape from all evidence.
+"""The joint system: poses, focal lengths, scales and shape from all evidence.
 
-With one pose, displacements of points are eliminated (see `cadalign.solvers.joint.equations`); with
-several, they are modes (see `cadalign.solvers.joint.search`), so that poses have no products
-with each other. What is integrated out, coefficients and displacements, leaves its log determinant
-in the objective (see `cadalign.solvers.joint.equations`).
+With one pose, `cadalign.solvers.joint.equations` eliminates displacements. With several, they are
+modes (`cadalign.solvers.joint.search`), so that different poses have no products with each other.
+Integrating out coefficients and displacements adds their log determinant to the objective.
 """
 
 from __future__ import annotations
@@ -19,27 +18,27 @@ from cadalign.solvers.joint.arrow import (
     add_rows,
     border_start,
     clear,
-    decide_on_undetermined,
     factorize_arrow,
-    hold,
+    fix_unknown,
     log_determinant,
+    perturb_diagonal,
     solve_arrow,
 )
 from cadalign.solvers.joint.equations import (
     JointEquations,
     Layout,
     add_log_determinant,
-    eliminate,
-    follow,
-    joint_room,
+    eliminate_displacements,
+    empty_joint_equations,
     layout_of,
     shift_means,
+    update_displacements,
 )
 from cadalign.solvers.joint.evidence import (
     Evidence,
     ScalePriors,
     State,
-    exp_of,
+    exp_triple,
     stretched_point,
     unpack_state,
 )
@@ -49,13 +48,13 @@ from cadalign.solvers.projection import shift, turn
 from cadalign.solvers.search import (
     Effort,
     Minima,
+    allocate,
     are_same,
     cost_at,
-    descend,
+    empty_minima,
     evaluate,
     move,
-    room_for_minima,
-    room_of,
+    refine_integrated,
     score_of,
     search,
     solve,
@@ -64,13 +63,13 @@ from cadalign.solvers.unknowns import move_rigid, orthonormalize
 
 _LARGEST_LOG_STEP = 1.0
 _SAME_CHORD = 1e-3
-_AT_BOUND = 1e-9  # of a log focal length
-_FEW_ITERATIONS = 3  # of a start, before the shape is integrated out
-_LESS_LIKELY = 20.0  # excess score of a start that is refined no further
+_AT_BOUND = 1e-9  # distance of a log focal length to its bound
+_FEW_ITERATIONS = 3  # on the plain cost, before the shape is integrated out
+_LESS_LIKELY = 20.0  # excess score at which a start is dropped
 
 
 class Joint(NamedTuple):
-    """All evidence; with ``integrates`` the shape is integrated out of the objective."""
+    """All evidence; ``integrates`` is True if the objective has the shape integrated out."""
 
     evidence: Evidence
     layout: Layout
@@ -81,10 +80,11 @@ def joint_system(evidence: Evidence, *, integrates: bool) -> Joint:
     return Joint(evidence, layout_of(evidence), integrates)
 
 
-@room_of.of(Joint)
+@allocate.of(Joint)
 @kernel
-def _room_of(system: Joint) -> tuple[JointEquations, JointEquations]:
-    return joint_room(system.evidence, system.layout), joint_room(system.evidence, system.layout)
+def _allocate(system: Joint) -> tuple[JointEquations, JointEquations]:
+    evidence, layout = system.evidence, system.layout
+    return empty_joint_equations(evidence, layout), empty_joint_equations(evidence, layout)
 
 
 @evaluate.of(Joint)
@@ -111,7 +111,7 @@ def evaluate_joint(system: Joint, row: FloatArray, equations: JointEquations) ->
             columns += layout.widths[n]
         seen += columns
         if poses == 1:
-            cost += eliminate(evidence.shape.spread, state.displacements, equations)
+            cost += eliminate_displacements(evidence.shape.spread, state.displacements, equations)
         add_rows(arrow, p, equations.rows, columns, equations.products)
     cost += add_blocks(evidence, state, arrow, equations.products)
     if system.integrates:
@@ -123,21 +123,21 @@ def evaluate_joint(system: Joint, row: FloatArray, equations: JointEquations) ->
             shift_means(evidence.shape.spread, equations)
     for a in range(3):
         if evidence.scales.free[a] == 0.0:
-            hold(arrow, first + a)
+            fix_unknown(arrow, first + a)
     focals = evidence.focals
     for f in range(focals.low.shape[0]):
         slope = arrow.gradient[border_start(arrow) + f]
         is_low = state.log_focals[f] <= focals.low[f] + _AT_BOUND
         is_high = state.log_focals[f] >= focals.high[f] - _AT_BOUND
         if (is_low and slope > 0.0) or (is_high and slope < 0.0):
-            hold(arrow, f)
+            fix_unknown(arrow, f)
     return cost
 
 
 @cost_at.of(Joint)
 @kernel
 def _cost_at(system: Joint, row: FloatArray) -> float:
-    return evaluate_joint(system, row, joint_room(system.evidence, system.layout))
+    return evaluate_joint(system, row, empty_joint_equations(system.evidence, system.layout))
 
 
 @solve.of(Joint)
@@ -186,12 +186,12 @@ def _move(
         for a in range(3):
             moved.displacements[i, a] = state.displacements[i, a]
     if poses == 1:
-        follow(evidence.shape.spread, equations, step, moved.displacements)
+        update_displacements(evidence.shape.spread, equations, step, moved.displacements)
 
 
 @inlined
 def _follow_focals(evidence: Evidence, state: State, log_steps: FloatArray, moved: State) -> None:
-    """Let distances follow focal lengths, along which the cost hardly changes."""
+    """Scale distances with focal lengths: the cost hardly changes along this direction."""
     for v in range(evidence.rig.pose.shape[0]):
         p, f = evidence.rig.pose[v], evidence.focals.group[v]
         if f >= 0:
@@ -209,11 +209,11 @@ def _bound_step(log_step: float) -> float:
 @kernel
 def _score_of(system: Joint, row: FloatArray, cost: float) -> float:
     evidence, layout = system.evidence, system.layout
-    equations = joint_room(evidence, layout)
+    equations = empty_joint_equations(evidence, layout)
     cost, arrow = evaluate_joint(Joint(evidence, layout, False), row, equations), equations.arrow
     if not cost < np.inf:
         return np.inf
-    decide_on_undetermined(arrow, arrow.blocks.shape[0] > 1)
+    perturb_diagonal(arrow, arrow.blocks.shape[0] > 1)
     first = evidence.focals.low.shape[0]
     _bound_volume(evidence.scales, arrow.border[first:, first:])
     if not factorize_arrow(arrow):
@@ -224,7 +224,7 @@ def _score_of(system: Joint, row: FloatArray, cost: float) -> float:
 
 @kernel
 def _bound_volume(scales: ScalePriors, information: FloatArray) -> None:
-    """Add the information of a prior that is flat at the estimate: no volume exceeds its own."""
+    """Add the information of the whole bound, so that no volume exceeds the prior's."""
     if scales.bound.weight > 0.0:
         rows, whole = bounded_scales(scales.free), whole_information(scales.bound)
         for a in range(3):
@@ -235,8 +235,8 @@ def _bound_volume(scales: ScalePriors, information: FloatArray) -> None:
 
 @kernel
 def _score_of_distances(evidence: Evidence, state: State) -> float:
-    """-2 log of the prior of the translations: `score_of_distance` of the sightings' mean one."""
-    sightings, rig, scale = evidence.sightings, evidence.rig, exp_of(state.log_scales)
+    """-2 log prior of the translations: `score_of_distance` at the mean depth of sightings."""
+    sightings, rig, scale = evidence.sightings, evidence.rig, exp_triple(state.log_scales)
     poses = state.poses.shape[0]
     totals, counts = np.zeros(poses), np.zeros(poses)
     for n in range(sightings.point.shape[0]):
@@ -271,24 +271,24 @@ def _are_same(system: Joint, first_row: FloatArray, second_row: FloatArray) -> b
 
 @kernel
 def run_joint(system: Joint, starts: FloatArray, effort: Effort) -> tuple[Minima, JointEquations]:
-    """Search from starts (S, D); with ``effort.starts`` 0, write their costs and last equations.
+    """Search from starts (S, D); with ``effort.starts`` 0, evaluate costs and the last equations.
 
-    A single kernel does both, since each would compile the equations anew. Where the shape is
-    integrated out, few steps tell promising starts first; ``costs`` of minima never have it so.
+    One kernel does both, to compile the equations only once. If the shape is integrated out, a few
+    steps on the plain cost select promising starts; ``costs`` of the minima are plain ones.
     """
     plain = Joint(system.evidence, system.layout, False)
     integrates, size = system.integrates, starts.shape[1]
-    equations = joint_room(system.evidence, system.layout)
-    minima = room_for_minima(effort.starts if effort.starts > 0 else starts.shape[0], size)
+    equations = empty_joint_equations(system.evidence, system.layout)
+    minima = empty_minima(effort.starts if effort.starts > 0 else starts.shape[0], size)
     if effort.starts == 0:
         for s in range(starts.shape[0]):
             minima.costs[s] = evaluate_joint(system, starts[s], equations)
     elif integrates and effort.iterations > 0:
-        likely = room_for_minima(effort.starts, size)
+        likely = empty_minima(effort.starts, size)
         few = Effort(effort.starts, _FEW_ITERATIONS, 0, effort.unlikely)
         search(plain, starts, few, 0, 0.0, likely)
         minima.counts[1] = likely.counts[1]
-        descend(plain, system, likely, effort.iterations, _LESS_LIKELY, 0, 0.0, minima)
+        refine_integrated(plain, system, likely, effort.iterations, _LESS_LIKELY, 0, 0.0, minima)
     else:
         search(system, starts, effort, 0, 0.0, minima)
         for k in range(minima.counts[0] if integrates else 0):

@@ -1,1 +1,1 @@
-"""Kernels that align one view's keypoints to Gaussian shapes: pose alone is searched for."""
+"""Alignment of one view's keypoints to Gaussian shapes, with the shape integrated out."""

@@ -1,19 +1,19 @@
-"""The system of one view's pose, the shape integrated out.
+"""Pose of one view's keypoints (6 unknowns), with a Gaussian shape integrated out.
 
-About a state, the residuals of the keypoints are ``r + J dp + A (x - offset)``, with steps dp of
-the pose and a shape whose offsets x have the covariance S. Without x they are ``e = r - A offset``
-with the covariance ``M = I + A S A'``; whitening by the Cholesky factor of M leaves least squares
-in dp, and ``x = -S A' M^-1 (e + J dp)`` follows.
+**Elimination.** Near a state, the residuals of the keypoints are ``r + J dp + A (x - offset)``,
+with a step dp of the pose and offsets x of covariance S. Without x they are ``e = r - A offset``,
+of covariance ``M = I + A S A'``. Whitening by the Cholesky factor of M leaves least squares in dp.
+Then ``x = -S A' M^-1 (e + J dp)``.
 
-What is integrated out leaves its determinant, so that the objective is
+**Objective.** Integrating out the shape adds a determinant:
 
-    F = r' r + x' S^-1 x + log det M,
+    F = r' r + x' S^-1 x + log det M.
 
-where M depends on the pose and on the shape, through the points that A is taken at. Half its
-derivative by point i is h_i, a sum of `cadalign.solvers.projection.slope_of_row` in the model's
-frame with the responses ``y_q = (P A')_iq``; that by a turn is ``sum_i x_i x h_i + sum_q y_q x
-a_q``, and that by the translation the sum of h_i. A slope ``h' x`` of the objective moves the
-prior's mean by -S h. The Hessian is that of the least squares alone.
+M depends on the pose and on the points at which A is evaluated. Half the derivative of log det M by
+point i is h_i, a sum of `cadalign.solvers.projection.slope_of_row` in the model's frame, with the
+responses ``y_q = (P A')_iq``. Half the derivative by a rotation is
+``sum_i x_i x h_i + sum_q y_q x a_q``; by the translation it is the sum of h_i. A slope ``h' x`` of
+the objective moves the prior's mean by -S h. The Hessian neglects log det M.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import borrowing, fast_sums, inlined, kernel
-from cadalign.solvers.alignment import Equations, room_for, solve_damped
+from cadalign.solvers.alignment import Equations, empty_equations, solve_damped
 from cadalign.solvers.constants import POSE_SIZE
 from cadalign.solvers.evidence import (
     KeypointEvidence,
-    fall_of_weight,
     keypoint_cost,
     score_of_distance,
     weigh_error,
+    weight_slope,
 )
 from cadalign.solvers.linalg import (
+    add,
     add_products,
     cholesky,
     copy_into,
     cross,
     dot,
     mirror_upper,
-    plus,
     triple,
 )
 from cadalign.solvers.marginal.problem import (
@@ -54,28 +54,28 @@ from cadalign.solvers.marginal.problem import (
 )
 from cadalign.solvers.projection import (
     motion_of,
+    ray_of,
     ray_slopes,
-    see,
     shift,
     slope_of_row,
     turn,
     turn_back,
     write_motion,
 )
-from cadalign.solvers.search import are_same, cost_at, evaluate, move, room_of, score_of, solve
+from cadalign.solvers.search import allocate, are_same, cost_at, evaluate, move, score_of, solve
 from cadalign.solvers.unknowns import move_rigid, orthonormalize
 
 POSE_UNKNOWNS = 6
-POSE = 12  # numbers of a pose at the start of a state
+POSE = 12  # length of the pose at the start of a state
 _RESIDUAL = 6
 _SAME_CHORD = 0.05
-_LEAST_INFORMATION = 25.0  # about a turn [1 / rad^2]; beyond, the posterior is no Gaussian
+_LEAST_INFORMATION = 25.0  # added about rotations [1 / rad^2]: large angles are not Gaussian
 
 
 class Posed(NamedTuple):
-    """One view's keypoints of one Gaussian; without ``integrates`` the cost is F less log det M.
+    """One view's keypoints under one Gaussian; without ``integrates`` the cost omits log det M.
 
-    A state is the pose (12,), rotation row by row and translation; the offsets x (3 n,) of the
+    A state is the pose (12,), rotation row by row and translation; offsets x (3 n,) of the
     keypoints from the mean; and w (3 n,), with ``S w = x``.
     """
 
@@ -85,15 +85,15 @@ class Posed(NamedTuple):
 
 
 class PosedEquations(NamedTuple):
-    """Equations of 2 n coordinates, whitened, and scratch space.
+    """Whitened equations of 2 n coordinates, and scratch space.
 
-    ``normal`` are those of the pose, ``gradient`` is theirs. ``rows`` (7, 2 n) are the derivatives
-    by the pose and the residuals e, less A S h where the shape is integrated out; ``by_shape``
-    (2 n, 3) those by the own point, not whitened; ``factor`` (2 n, 2 n) the upper Cholesky factor
-    of M, with the inverse of its diagonal. ``slope`` (3 n,) is h and ``turned`` (6,) half the
-    derivative of log det M by the pose, with the shape held. ``sums`` (2,) holds the decrease of F
-    that the least squares of the rows are subtracted from, and log det M. ``points`` (n, 3) hold
-    the depths and the derivatives of the loss's weight over those of the residuals.
+    ``normal`` are the normal equations of the pose, ``gradient`` is their gradient. ``rows``
+    (7, 2 n) are derivatives by the pose, then the residuals e, minus A S h if the shape is
+    integrated out. ``by_shape`` (2 n, 3) are derivatives by the own point, not whitened. ``factor``
+    (2 n, 2 n) is the upper Cholesky factor of M with an inverted diagonal. ``slope`` (3 n,) is h;
+    ``pose_slope`` (6,) is half the derivative of log det M by the pose, for a constant shape.
+    ``sums`` (2,) are the constant of the predicted decrease of F, and log det M. The columns of
+    ``points`` (n, 3) are the depth and, for u and v, the residual times `weight_slope`.
     """
 
     normal: Equations
@@ -102,7 +102,7 @@ class PosedEquations(NamedTuple):
     by_shape: FloatArray
     factor: FloatArray
     slope: FloatArray
-    turned: FloatArray
+    pose_slope: FloatArray
     sums: FloatArray
     points: FloatArray
     right: FloatArray
@@ -112,11 +112,10 @@ class PosedEquations(NamedTuple):
 
 
 @kernel
-def posed_room(system: Posed) -> PosedEquations:
-    """Room for the equations."""
+def empty_posed_equations(system: Posed) -> PosedEquations:
     n = system.seen.points.shape[0]
     size = 2 * n if system.integrates else 0
-    normal = room_for(POSE_UNKNOWNS)
+    normal = empty_equations(POSE_UNKNOWNS)
     return PosedEquations(
         normal,
         normal.gradient,
@@ -134,10 +133,10 @@ def posed_room(system: Posed) -> PosedEquations:
     )
 
 
-@room_of.of(Posed)
+@allocate.of(Posed)
 @kernel
-def _room_of(system: Posed) -> tuple[PosedEquations, PosedEquations]:
-    return posed_room(system), posed_room(system)
+def _allocate(system: Posed) -> tuple[PosedEquations, PosedEquations]:
+    return empty_posed_equations(system), empty_posed_equations(system)
 
 
 @evaluate.of(Posed)
@@ -164,7 +163,7 @@ def evaluate_posed(system: Posed, state: FloatArray, equations: PosedEquations) 
     mirror_upper(hessian)
     if system.integrates:
         for k in range(POSE_UNKNOWNS):
-            gradient[k] += equations.turned[k]
+            gradient[k] += equations.pose_slope[k]
     return cost
 
 
@@ -185,7 +184,7 @@ def _write_rows(system: Posed, state: FloatArray, equations: PosedEquations) -> 
         turned = turn(
             motion, (mean[i, 0] + offset[0], mean[i, 1] + offset[1], mean[i, 2] + offset[2])
         )
-        place = see(shift(motion, turned))
+        place = ray_of(shift(motion, turned))
         if not place[2] > 0:
             return np.inf
         du, dv = place[0] - seen.rays[i, 0], place[1] - seen.rays[i, 1]
@@ -194,7 +193,7 @@ def _write_rows(system: Posed, state: FloatArray, equations: PosedEquations) -> 
         own = error.u * error.u + error.v * error.v
         square += own
         points[i, 0] = place[2]
-        fall = fall_of_weight(seen.loss, seen.loss_scale, error.root, own)
+        fall = weight_slope(seen.loss, seen.loss_scale, error.root, own)
         points[i, 1], points[i, 2] = fall * error.u, fall * error.v
         slopes = ray_slopes(place, error.whitening)
         residuals = error.u, error.v
@@ -210,13 +209,13 @@ def _write_rows(system: Posed, state: FloatArray, equations: PosedEquations) -> 
 
 @fast_sums
 def _write_slopes(system: Posed, state: FloatArray, equations: PosedEquations) -> None:
-    """Write half the derivatives of log det M by shape and pose."""
+    """Write half the derivatives of log det M by points and pose."""
     points, square, lever = equations.points, equations.square, equations.lever
     covariance, mean = system.target.covariance, system.target.mean
-    by_shape, slope, turned = equations.by_shape, equations.slope, equations.turned
+    by_shape, slope, turned = equations.by_shape, equations.slope, equations.pose_slope
     size = by_shape.shape[0]
     forced = np.empty(3 * mean.shape[0])
-    for q in range(size):  # y_q = S A' M^-1, of the own point
+    for q in range(size):  # y_q: rows of S A' M^-1 for the own point
         for c in range(size // 2):
             one, two = square[q, 2 * c], square[q, 2 * c + 1]
             for a in range(3):
@@ -237,10 +236,10 @@ def _write_slopes(system: Posed, state: FloatArray, equations: PosedEquations) -
         for q in range(2):
             row, response = triple(by_shape[2 * i + q]), triple(lever[2 * i + q])
             fall = rest * points[i, 1 + q]
-            own = plus(own, slope_of_row(row, dot(row, response), response, nearer, fall))
-            total_turn = plus(total_turn, cross(response, row))
-        total_turn = plus(total_turn, cross(place, own))
-        total_slope = plus(total_slope, own)
+            own = add(own, slope_of_row(row, dot(row, response), response, nearer, fall))
+            total_turn = add(total_turn, cross(response, row))
+        total_turn = add(total_turn, cross(place, own))
+        total_slope = add(total_slope, own)
         slope[3 * i], slope[3 * i + 1], slope[3 * i + 2] = own
     turned[0], turned[1], turned[2] = turn(motion, total_turn)
     turned[3], turned[4], turned[5] = turn(motion, total_slope)
@@ -248,7 +247,7 @@ def _write_slopes(system: Posed, state: FloatArray, equations: PosedEquations) -
 
 @fast_sums
 def _shift_mean(system: Posed, state: FloatArray, equations: PosedEquations) -> None:
-    """Subtract A S h from the residuals, and what it changes from the decrease."""
+    """Subtract A S h from the residuals, and update the constant of the predicted decrease."""
     covariance, slope, by_shape = system.target.covariance, equations.slope, equations.by_shape
     for i in range(slope.shape[0] // 3):
         for a in range(3):
@@ -263,9 +262,8 @@ def _shift_mean(system: Posed, state: FloatArray, equations: PosedEquations) -> 
 @cost_at.of(Posed)
 @kernel
 def posed_cost(system: Posed, state: FloatArray) -> float:
-    """The cost at a state."""
     if system.integrates:
-        return evaluate_posed(system, state, posed_room(system))
+        return evaluate_posed(system, state, empty_posed_equations(system))
     seen, points = system.seen, system.target.mean.copy()
     size = 3 * points.shape[0]
     prior = 0.0
@@ -288,7 +286,7 @@ def _solve(system: Posed, equations: PosedEquations, damping: float, step: Float
     expected = float(equations.sums[0])
     if system.integrates:
         for k in range(POSE_UNKNOWNS):
-            expected -= 2.0 * equations.turned[k] * step[k]
+            expected -= 2.0 * equations.pose_slope[k] * step[k]
     for c in range(rows.shape[1]):
         total = rows[_RESIDUAL, c]
         for k in range(POSE_UNKNOWNS):
@@ -336,7 +334,7 @@ def _move(
 def _score_of(system: Posed, state: FloatArray, cost: float) -> float:
     if not system.integrates:
         return cost
-    equations = posed_room(system)
+    equations = empty_posed_equations(system)
     score = evaluate_posed(system, state, equations)
     factor = equations.normal.hessian
     for k in range(3):

@@ -1,13 +1,12 @@
-"""One view's keypoints, the Gaussian shapes that they may belong to, and how these correlate them.
+"""One view's keypoints, Gaussian shapes, and the residual covariance that shapes cause.
 
-The points x of a shape have a mean and a covariance S. What one view's keypoints tell about them
-enters through ``w``, in which the shape is ``x = mean + S w`` and costs ``w' S w``: only the rows
-of S that belong to keypoints count, and normal equations have the size of the keypoints, however
-many modes the shape has.
+A shape is ``x = mean + S w``, with the covariance S and the cost ``w' S w``. Only the rows of S
+that belong to keypoints matter, so the normal equations have the size of the keypoints for any
+number of modes.
 
-Residuals of n keypoints, two of each, move with the keypoints by A. Row q of A touches only the
-point that it is of, and is kept as its three numbers: ``by_shape`` (2 n, 3). The residuals'
-covariance is ``M = I + A S A'``, by whose factor they are whitened.
+The 2 n residuals of n keypoints have the derivatives A by the shape. Row q of A depends on one
+point only, and is stored as three numbers: ``by_shape`` (2 n, 3). The residuals have the covariance
+``M = I + A S A'``, and are whitened by its Cholesky factor.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from cadalign.compile import fast_sums, kernel
 
 
 class Mixture(NamedTuple):
-    """Gaussians: means (G, m, 3), covariances (G, 3 m, 3 m), ``penalties`` (G,) -2 log weight."""
+    """G Gaussians: means (G, m, 3), covariances (G, 3 m, 3 m), penalties (G,) = -2 log weight."""
 
     means: FloatArray
     covariances: FloatArray
@@ -29,7 +28,7 @@ class Mixture(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """Keypoints of a view: their ``points`` (n,), rays (n, 2), whitening (n, 3), and the loss."""
+    """Keypoints of a view: indices ``points`` (n,), rays (n, 2), whitening (n, 3), and the loss."""
 
     points: IntArray
     rays: FloatArray
@@ -39,14 +38,14 @@ class Seen(NamedTuple):
 
 
 class GaussianTarget(NamedTuple):
-    """One Gaussian at the keypoints: mean (n, 3) and covariance (3 n, 3 n)."""
+    """One Gaussian restricted to the keypoints: mean (n, 3) and covariance (3 n, 3 n)."""
 
     mean: FloatArray
     covariance: FloatArray
 
 
 def mixture_at(mixture: Mixture, seen: Seen) -> Mixture:
-    """The Gaussians at the keypoints: means (G, n, 3), covariances (G, 3 n, 3 n)."""
+    """Restrict Gaussians to the keypoints: means (G, n, 3), covariances (G, 3 n, 3 n)."""
     rows = coordinates_of(seen)
     covariances = np.ascontiguousarray(mixture.covariances[:, rows[:, None], rows])
     return Mixture(mixture.means[:, seen.points], covariances, mixture.penalties)
@@ -58,7 +57,7 @@ def target_of(mixture: Mixture, component: int) -> GaussianTarget:
 
 
 def coordinates_of(seen: Seen) -> IntArray:
-    """Numbers (3 n,) of the keypoints' coordinates among those of all points."""
+    """Indices (3 n,) of the keypoints' coordinates among the coordinates of all points."""
     return np.asarray((3 * seen.points[:, None] + np.arange(3)).ravel())
 
 
@@ -93,7 +92,10 @@ def write_covariance(covariance: FloatArray, by_shape: FloatArray, matrix: Float
 
 @fast_sums
 def factorize_upper(matrix: FloatArray) -> float:
-    """Replace an upper triangle by its Cholesky factor, diagonal inverted; log det, or infinite."""
+    """Replace an upper triangle by its Cholesky factor with an inverted diagonal.
+
+    Returns the log determinant, infinite if the matrix is not positive definite.
+    """
     size = matrix.shape[0]
     log_determinant = 0.0
     for k in range(0, size, 2):

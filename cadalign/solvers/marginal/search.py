@@ -1,7 +1,7 @@
 """Search for the poses of one view's keypoints under a mixture of Gaussian shapes.
 
-It starts from poses that the keypoints suggest for the means. Few steps on the plain cost tell the
-promising ones; from these it descends on the objective that the shape is integrated out of.
+Starts are poses of the mean shapes. A few steps on the plain cost select promising starts, which
+are then refined on the objective with the shape integrated out.
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ from cadalign.solvers.evidence import KeypointEvidence
 from cadalign.solvers.linalg import copy_into, eigenvectors_4, factorize, solve_factor
 from cadalign.solvers.marginal.equations import POSE, Posed
 from cadalign.solvers.marginal.problem import GaussianTarget, Mixture, Seen, mixture_at, target_of
-from cadalign.solvers.search import Effort, Minima, descend, room_for_minima, search
+from cadalign.solvers.search import Effort, Minima, empty_minima, refine_integrated, search
 from cadalign.solvers.starts import rotation_starts, widen_by_shape
 from cadalign.solvers.unknowns import orthonormalize, uncenter
 
 _PROBE_ITERATIONS = 2
 _MAX_ITERATIONS = 120
-_SAME_START = 0.45  # chord of rotations of starts that lead to one minimum
-_UNLIKELY = 40.0  # excess cost, after the probe, at which a start is given up
-_LESS_LIKELY = 20.0  # excess score at which a start is given up, refined no further
+_SAME_START = 0.45  # distance of rotation matrices below which starts are equal
+_UNLIKELY = 40.0  # excess cost, after the probe, at which a start is dropped
+_LESS_LIKELY = 20.0  # excess score at which a start is dropped
 _MOST_STARTS = 64
 _MOST = 32
 _ROTATIONS = 96
 _REFINED = 16
 _ITERATIONS = 4
 _SAME_CHORD = 0.3
-_UNLIKELY_SHAPE = 60.0  # squared distance of a start from the mean, in deviations
-_FLATNESS = 0.01  # displacement that no image shows, relative to the extent
+_UNLIKELY_SHAPE = 60.0  # squared Mahalanobis distance at which a half turn is dropped
+_FLATNESS = 0.01  # tolerated displacement, relative to the extent
 
 
 def search_view(mixture: Mixture, seen: Seen, given: FloatArray) -> tuple[Minima, int]:
-    """Minima of F from all starts, ``given`` poses (k, 12) among them, and their number.
+    """Minima of F from all starts, including ``given`` poses (k, 12); and the number of starts.
 
-    Their ``label`` is the component, ``costs`` are without log det M. Components share starts: what
-    the mean of one suggests may be the best of another.
+    ``label`` is the component, ``costs`` omit log det M. Components share their starts, since a
+    start from one mean may be the best for another component.
     """
     own = mixture_at(mixture, seen)
     variances = own.covariances.diagonal(axis1=1, axis2=2).reshape(own.means.shape).mean(axis=2)
@@ -51,7 +51,7 @@ def search_view(mixture: Mixture, seen: Seen, given: FloatArray) -> tuple[Minima
 def _search_mixture(
     mixture: Mixture, seen: Seen, widened: FloatArray, given: FloatArray
 ) -> tuple[Minima, int]:
-    """As `search_view`, of a mixture at the keypoints, and their whitening (G, n, 3) about it."""
+    """`search_view` for a mixture at the keypoints; ``widened`` is the whitening (G, n, 3)."""
     components, n = mixture.means.shape[0], mixture.means.shape[1]
     starts = np.empty((_MOST_STARTS, POSE))
     firsts = np.zeros(components + 1, dtype=np.int64)
@@ -62,7 +62,7 @@ def _search_mixture(
         firsts[g] = count
         count = _add_starts(target_of(mixture, g), seen, widened[g], starts, count)
     firsts[components] = count
-    likely = room_for_minima(_MOST, POSE + 6 * n)
+    likely = empty_minima(_MOST, POSE + 6 * n)
     for g in range(components):
         chosen = _select_starts(starts[:count], given.shape[0], firsts[g], firsts[g + 1])
         states = np.zeros((chosen.shape[0], POSE + 6 * n))
@@ -72,7 +72,7 @@ def _search_mixture(
         plain = Posed(target_of(mixture, g), seen, False)
         search(plain, states, effort, g, mixture.penalties[g], likely)
     found = likely.counts[0]
-    minima = room_for_minima(max(found, 1), POSE + 6 * n)
+    minima = empty_minima(max(found, 1), POSE + 6 * n)
     minima.counts[1] = likely.counts[1]
     is_left = np.ones(components, dtype=np.bool_)
     for k in range(found):  # the most promising component first
@@ -81,7 +81,9 @@ def _search_mixture(
             is_left[g] = False
             target, penalty = target_of(mixture, g), mixture.penalties[g]
             plain, whole = Posed(target, seen, False), Posed(target, seen, True)
-            descend(plain, whole, likely, _MAX_ITERATIONS, _LESS_LIKELY, g, penalty, minima)
+            refine_integrated(
+                plain, whole, likely, _MAX_ITERATIONS, _LESS_LIKELY, g, penalty, minima
+            )
     return minima, count
 
 
@@ -89,7 +91,7 @@ def _search_mixture(
 def _add_starts(
     target: GaussianTarget, seen: Seen, whitening: FloatArray, starts: FloatArray, count: int
 ) -> int:
-    """Append the starts of one component, and those half a turn away; returns the new number."""
+    """Append starts of one component, and their half turns; returns the new number."""
     own = _mean_starts(target, seen, whitening)
     motions = half_turns(target)
     for m in range(motions.shape[0] + 1):
@@ -104,7 +106,7 @@ def _add_starts(
 
 @kernel
 def _select_starts(starts: FloatArray, given: int, first: int, end: int) -> IntArray:
-    """Numbers of a component's starts: given ones, its own, and of the others what these lack."""
+    """Indices of a component's starts: given ones, its own, and distinct ones of the others."""
     count = starts.shape[0]
     chosen = np.empty(count, dtype=np.int64)
     kept = np.empty((count, 12))
@@ -123,7 +125,7 @@ def _select_starts(starts: FloatArray, given: int, first: int, end: int) -> IntA
 
 @kernel
 def _mean_starts(target: GaussianTarget, seen: Seen, whitening: FloatArray) -> FloatArray:
-    """Poses (S, 12) of the mean, the likeliest first: the best of a grid after a few steps."""
+    """Poses (S, 12) of the mean, likeliest first, from a grid of rotations and a few steps."""
     center, unit = center_and_unit(target.mean)
     if not unit > 0:
         return np.empty((0, 12))
@@ -134,7 +136,7 @@ def _mean_starts(target: GaussianTarget, seen: Seen, whitening: FloatArray) -> F
     objective = Objective(free, keypoints, ScalePrior(0.0, 0.0))
     grid = np.empty((_ROTATIONS, POSE_SIZE))
     count = rotation_starts(points, seen.rays, grid)
-    minima = room_for_minima(_REFINED, POSE_SIZE)
+    minima = empty_minima(_REFINED, POSE_SIZE)
     search(objective, grid[:count], Effort(_REFINED, _ITERATIONS, 0, np.inf), 0, 0.0, minima)
     poses = np.empty((_REFINED, 12))
     found = 0
@@ -150,7 +152,7 @@ def _mean_starts(target: GaussianTarget, seen: Seen, whitening: FloatArray) -> F
 
 @kernel
 def is_among(pose: FloatArray, poses: FloatArray, chord: float) -> bool:
-    """True if the rotation of a pose is close to that of one of some poses (k, 12)."""
+    """True if the rotation of a pose is close to a rotation of ``poses`` (k, 12)."""
     for k in range(poses.shape[0]):
         square = 0.0
         for i in range(9):
@@ -162,10 +164,10 @@ def is_among(pose: FloatArray, poses: FloatArray, chord: float) -> bool:
 
 @kernel
 def half_turns(target: GaussianTarget) -> FloatArray:
-    """Motions (T, 12) of the model by half a turn that leave the keypoints a likely shape.
+    """Half turns (T, 12) of the model after which the keypoints are still a likely shape.
 
-    The mean does not show such an ambiguity: a blade whose width varies more than it measures looks
-    much the same from behind, with its edge and its back exchanged.
+    The mean shape does not show this ambiguity. Example: a blade whose width varies by more than
+    its mean looks similar from behind, with edge and back exchanged.
     """
     n = target.mean.shape[0]
     center = np.zeros(3)
@@ -219,7 +221,7 @@ def half_turns(target: GaussianTarget) -> FloatArray:
 
 @kernel
 def after_motion(pose: FloatArray, motion: FloatArray) -> FloatArray:
-    """The pose (12,) of a model that was moved first."""
+    """Compose a pose (12,) with a motion of the model that comes first."""
     moved = np.empty(12)
     for a in range(3):
         moved[9 + a] = pose[9 + a]

@@ -34,7 +34,7 @@ from cadalign.estimation.problems import each_of, pack_one
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import LEAST_LIKELIHOOD, NO_NOTES, FitStats
 from cadalign.estimation.results import Results
-from cadalign.estimation.search import search, widened_by_noise
+from cadalign.estimation.search import search, widen_by_noise
 from cadalign.estimation.view import View, number_views
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import turned_alignment
@@ -73,8 +73,8 @@ def align(
     views : View or sequence of View
         Evidence of each image. Views with ``cam_from_rig`` share one pose and determine the
         object's size. Views without it have one pose each, and share the stretch and the shape.
-        Views may have a mask and no keypoints: in a rig with any model, otherwise only with an
-        exact model that has a mesh.
+        In a rig, views with masks need no keypoints. Without keypoints and ``init``, a single mask
+        needs an exact model with a mesh.
     size : Size, optional
         Known lengths of the object.
     init : Alignment or sequence of Alignment or None, optional
@@ -173,7 +173,7 @@ def _estimate(problem: Problem, start: float) -> Result:
 
         minima, notes = refine(problem, found)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
-    likely = widened_by_noise(problem, minima)
+    likely = widen_by_noise(problem, minima)
     return result_of_minima(problem, likely, stats, notes=notes)
 
 

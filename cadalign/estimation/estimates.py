@@ -16,7 +16,11 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.problem import Problem
-from cadalign.estimation.symmetry import distinct_ones, remove_free_turns, transform_covariance
+from cadalign.estimation.symmetry import (
+    distinct_alignments,
+    remove_free_turns,
+    transform_covariance,
+)
 from cadalign.estimation.uncertainty.residuals import loss_weights, whitening_matrices
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, turned_alignment, turned_covariance
@@ -110,7 +114,7 @@ def estimate_box(evidence: Evidence, state: State, prior: ShapePrior) -> tuple[E
     if len(evidence.offsets.value) or not len(shape.modes) or not len(seen):
         return evidence, state
     points = points_of(shape, state) / np.exp(state.log_scales)
-    bounds, own = placed_box(points, keypoints, seen, prior)
+    bounds, own = place_box(points, keypoints, seen, prior)
     axes = np.arange(3)
     mean, modes = shape.mean.copy(), shape.modes.copy()
     displacements = state.displacements.copy()
@@ -121,7 +125,7 @@ def estimate_box(evidence: Evidence, state: State, prior: ShapePrior) -> tuple[E
     return placed, state._replace(displacements=displacements)
 
 
-def placed_box(
+def place_box(
     points: FloatArray, keypoints: int, seen: IntArray, model: ShapePrior | ShapeModel
 ) -> tuple[FloatArray, IntArray]:
     """Corners (2, 3) of the box of points (m, 3), and the points (2, 3) that its faces vary with.
@@ -140,7 +144,7 @@ def placed_box(
     return bounds, np.where(bounds != linear, extreme, own)
 
 
-def widened_boxes(points: FloatArray, rows: IntArray) -> FloatArray:
+def enlarge_boxes(points: FloatArray, rows: IntArray) -> FloatArray:
     """Points (..., m, 3), whose last two are a box, with one that holds those of ``rows``."""
     widened, seen = points.copy(), points[..., rows, :]
     widened[..., -2, :] = np.minimum(points[..., -2, :], seen.min(axis=-2, initial=np.inf))
@@ -215,14 +219,14 @@ def second_moments(
     return np.tensordot(weights / weights.sum(), np.array(covariances) + squares, axes=1)
 
 
-def one_of_equals(
+def canonical_estimates(
     likely: Sequence[Estimate], symmetry: Symmetry | None, held: _Held
 ) -> Sequence[Estimate]:
     """Canonical estimates, without those equal to the first; ``held`` are axes of held scale."""
     if symmetry is None or symmetry.is_trivial:
         return likely
     poses, covariance = [each.poses[0] for each in likely], likely[0].covariances[0]
-    found = distinct_ones(poses, covariance, symmetry, held)
+    found = distinct_alignments(poses, covariance, symmetry, held)
     return [_transform(likely[k], equal) for k, equal in found]
 
 
@@ -286,10 +290,10 @@ def single_posterior(
     points = shape_at(mixture, component, seen, state)
     prior, columns = inflation**2 * mixture.covariances[component], coordinates_of(seen)
     if model is not None:
-        points[-2:], faces = placed_box(points, len(model.ids), seen.points, model)
+        points[-2:], faces = place_box(points, len(model.ids), seen.points, model)
         own = np.append(np.arange(3 * m - 6), 3 * faces + np.arange(3))
         prior = prior[np.ix_(own, own)]
-    boxed, still = widened_boxes(points, seen.points), np.ones(3)
+    boxed, still = enlarge_boxes(points, seen.points), np.ones(3)
     _, rows, jacobian = linearise(points[seen.points], pose, seen)
     # Behind the points, the difference of the box's corners.
     prior = np.concatenate([prior, prior[-3:] - prior[-6:-3]])

@@ -192,7 +192,7 @@ class Result:
         For other evidence it is the inverse information of all evidence and priors, calibrated for
         learned shapes. Where other estimates are likely too, it includes their distance.
 
-        Rotations about the axes of a rotational symmetry have no variance.
+        Turns about an axis of continuous symmetry have no variance.
         """
         return self.posterior.covariance
 

@@ -290,7 +290,7 @@ def keypoint_summary(
     return EvidenceSummary("keypoints", number, len(kept), in_sigmas, rms, "px")
 
 
-def listed(clauses: Sequence[str]) -> str:
+def join_or(clauses: Sequence[str]) -> str:
     """Join names or clauses by commas and "or"."""
     *some, last = clauses
     return f"{', '.join(some)} or {last}" if some else last

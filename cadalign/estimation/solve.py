@@ -56,7 +56,7 @@ def solve(problems: Problems, options: FitOptions) -> Solutions:
     if options.method == "optimal":
         found = _optima(problems, options, points, rays, whitening)
     elif options.method == "aepnp":
-        found = _one_guess(*aepnp_batch(points, rays, problems.offsets))
+        found = _single_solutions(*aepnp_batch(points, rays, problems.offsets))
     else:
         found = _baseline(options.method, points, rays)
     residuals, statuses = _residuals(problems, points, facing, found)
@@ -137,10 +137,10 @@ def _baseline(method: str, points: FloatArray, rays: FloatArray) -> Solutions:
 
     rotation, translation, scale = (epnp if method == "epnp" else aepnp_paper)(points, rays)
     pose = np.concatenate([rotation.ravel(), translation, scale])
-    return _one_guess(pose[None, None], np.zeros(1, dtype=np.int64))
+    return _single_solutions(pose[None, None], np.zeros(1, dtype=np.int64))
 
 
-def _one_guess(poses: FloatArray, statuses: IntArray) -> Solutions:
+def _single_solutions(poses: FloatArray, statuses: IntArray) -> Solutions:
     """The solutions of a method that supports neither noise nor alternatives."""
     count = len(poses)  # NumPy's tile takes as long as the linear solver
     return Solutions(

@@ -75,7 +75,7 @@ def _propose(evidence: Evidence, init: Start | None) -> list[_Start]:
     for view, camera in enumerate(rig.cam_from_rig):
         is_weak = is_several and 2 * counts[view] <= unknowns
         found, logs = view_starts(held if is_weak else evidence, view)
-        turned = _half_turned(evidence, view, found)
+        turned = _half_turns(evidence, view, found)
         moved = [(rig_pose(pose, camera), scales) for pose, scales in zip(found, logs, strict=True)]
         moved += [(rig_pose(pose, camera), np.zeros(3)) for pose in turned]
         per_pose[rig.pose[view]].extend(moved)
@@ -148,7 +148,7 @@ def _keypoint_counts(evidence: Evidence) -> IntArray:
     return np.bincount(sightings.image[is_keypoint], minlength=len(evidence.rig.pose))
 
 
-def _half_turned(evidence: Evidence, view: int, poses: FloatArray) -> list[FloatArray]:
+def _half_turns(evidence: Evidence, view: int, poses: FloatArray) -> list[FloatArray]:
     """Turn poses (12,) of the mean by half a turn, about each axis that its shape allows."""
     sightings, shape = evidence.sightings, evidence.shape
     names = np.unique(sightings.point[(sightings.image == view) & (sightings.whitening[:, 2] > 0)])

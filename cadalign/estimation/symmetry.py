@@ -53,7 +53,7 @@ def remove_free_turns(covariance: FloatArray, best: Equal) -> FloatArray:
     return np.asarray(left @ covariance @ left.T)
 
 
-def distinct_ones(
+def distinct_alignments(
     poses: Sequence[Alignment],
     covariance: FloatArray | None,
     symmetry: Symmetry,

@@ -70,7 +70,7 @@ class Contour(NamedTuple):
         same = self.curve[lag:] == self.curve[:-lag]
         return np.asarray(kept[lag:] & kept[:-lag] & same)
 
-    def taken(self, chosen: BoolArray | IntArray) -> Contour:
+    def select(self, chosen: BoolArray | IntArray) -> Contour:
         return Contour(self.points[chosen], self.normals[chosen], self.curve[chosen])
 
 
@@ -91,7 +91,7 @@ def contour_of(probability: FloatArray | BoolArray) -> Contour:
         places, outwards = _level_line(chain, level, slope_x, slope_y)
         if len(places) < 3:
             continue
-        for piece, directions in _inside(*_resample(places, outwards), image.shape):
+        for piece, directions in _clip_to_image(*_resample(places, outwards), image.shape):
             points.append(piece)
             normals.append(directions)
             curves.append(np.full(len(piece), count))
@@ -99,7 +99,7 @@ def contour_of(probability: FloatArray | BoolArray) -> Contour:
     return Contour(np.concatenate(points), np.concatenate(normals), np.concatenate(curves))
 
 
-def sampled(image: Image, points: FloatArray) -> FloatArray:
+def interpolate(image: Image, points: FloatArray) -> FloatArray:
     """Values (n,) of an image (h, w) at points (n, 2), bilinear; outside those of the border.
 
     `cv2.remap` rounds places to 1/32 px, which moves contours by more than the precision sought.
@@ -136,14 +136,14 @@ def _level_line(
     chain: FloatArray, level: Image, slope_x: Image, slope_y: Image
 ) -> tuple[FloatArray, FloatArray]:
     """Points (n, 2) of the level line next to boundary pixels (n, 2), and outward normals."""
-    normals = -np.column_stack([sampled(slope_x, chain), sampled(slope_y, chain)])
+    normals = -np.column_stack([interpolate(slope_x, chain), interpolate(slope_y, chain)])
     length = np.linalg.norm(normals, axis=1)
     kept = length > 1e-6
     chain, normals = chain[kept], normals[kept] / length[kept, None]
     places = crossings(level, chain, normals, np.zeros(len(chain)), -_STEP)
     known = np.isfinite(places)
     points = chain[known] + places[known, None] * normals[known]
-    outwards = -np.column_stack([sampled(slope_x, points), sampled(slope_y, points)])
+    outwards = -np.column_stack([interpolate(slope_x, points), interpolate(slope_y, points)])
     return points, _unit_rows(outwards)
 
 
@@ -163,7 +163,7 @@ def crossings(
     steps = np.arange(first, REACH + _STEP / 2, _STEP)
     places = offsets + steps[:, None]
     along = points + places[..., None] * normals
-    values = sampled(level, along.reshape(-1, 2)).reshape(places.shape)
+    values = interpolate(level, along.reshape(-1, 2)).reshape(places.shape)
     nearest, is_left = _nearest_exits(values >= 0.5, steps)
     every = np.arange(len(offsets))
     before, after = values[nearest, every], values[nearest + 1, every]
@@ -192,7 +192,7 @@ def _resample(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, Floa
     return samples[:, :2], _unit_rows(samples[:, 2:])
 
 
-def _inside(
+def _clip_to_image(
     points: FloatArray, normals: FloatArray, shape: tuple[int, ...]
 ) -> list[tuple[FloatArray, FloatArray]]:
     size = np.array([shape[1], shape[0]]) - 1
@@ -276,7 +276,7 @@ def find_rims(sight: Sight, contour: Contour, reach: float) -> Rims:
     steps = np.linspace(-reach, reach, intervals + 1)
     first, found = _rim_intervals(sight, contour, steps)
     rows = np.flatnonzero(found)
-    some = contour.taken(rows)
+    some = contour.select(rows)
     inner, outer = steps[first[rows]], steps[first[rows] + 1]
     for _ in range(int(np.ceil(np.log2((steps[1] - steps[0]) / _PRECISION)))):
         half = (inner + outer) / 2
@@ -304,7 +304,7 @@ def _rim_intervals(sight: Sight, contour: Contour, steps: FloatArray) -> tuple[I
     near = len(steps) // 2 - 1
     first, found = exits(contour, steps[near : near + 3])
     first, rest = first + near, np.flatnonzero(~found)
-    first[rest], found[rest] = exits(contour.taken(rest), steps)
+    first[rest], found[rest] = exits(contour.select(rest), steps)
     return first, found
 
 
@@ -362,7 +362,7 @@ def extraction_bias(sight: Sight, mask: MaskImage, contour: Contour, rims: Rims)
     bias = np.zeros(len(rims.found))
     if not len(rows):
         return bias
-    some, offsets = contour.taken(rows), rims.offset[rows]
+    some, offsets = contour.select(rows), rims.offset[rows]
     inside, places = mask
     corner, rendered = _render_band(sight, inside, some.at(offsets))
     own = crossings(smooth(rendered), some.points - corner, some.normals, offsets)

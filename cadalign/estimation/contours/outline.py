@@ -60,11 +60,11 @@ class WarpedSurface:
         points = points_of(shape, state) / np.exp(state.log_scales)
         vertices = self._warp.apply(points[self._rows], np.sort(points[-2:], axis=0))
         mesh = Mesh(vertices, _hull_faces(vertices) if self._is_hull else self.mesh.faces)
-        return Warped(mesh, self._warp, self._rows, shape.modes, state.coefficients)
+        return WarpedMesh(mesh, self._warp, self._rows, shape.modes, state.coefficients)
 
 
 @dataclass(frozen=True, eq=False)
-class Warped:
+class WarpedMesh:
     """A mesh at one state, its vertices warped; ``modes`` and ``coefficients`` of the shape."""
 
     mesh: Mesh
@@ -92,7 +92,7 @@ class Warped:
 rigid_surface = lru_cache(maxsize=32)(RigidSurface)
 """The surface of a mesh that is met again, its rays prepared once."""
 
-PosedSurface = RigidSurface | Warped
+PosedSurface = RigidSurface | WarpedMesh
 """A surface at one state of the shape, before its stretch."""
 Surface = RigidSurface | WarpedSurface
 """A mesh that follows the shape."""

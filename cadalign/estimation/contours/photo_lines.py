@@ -233,7 +233,7 @@ def silhouette_of(sight: Sight, cells: int) -> Silhouette | None:
     kept = rims.found & within.all(axis=1)
     if not kept.any():
         return None
-    found = on_rim.taken(kept), across[kept], rims.points[kept], rims.face[kept]
+    found = on_rim.select(kept), across[kept], rims.points[kept], rims.face[kept]
     return Silhouette(inside, corner, cell, *found)
 
 
@@ -268,7 +268,7 @@ def _box_in_image(sight: Sight) -> tuple[FloatArray, FloatArray] | None:
 def outline_of(photo: PhotoPyramid, silhouette: Silhouette, reach: float) -> Outline | None:
     """The photo's contour on lines that reach so far [px]; None where there are no colours."""
     step = reach / STEPS
-    inside, outside = _colors_beside(photo, silhouette, reach, step)
+    inside, outside = _side_colors(photo, silhouette, reach, step)
     if min(len(inside), len(outside)) < _LEAST_PIXELS:
         return None
     odds, contrast = regions_of(inside, outside)
@@ -300,7 +300,7 @@ def outline_of(photo: PhotoPyramid, silhouette: Silhouette, reach: float) -> Out
     )
 
 
-def _colors_beside(
+def _side_colors(
     photo: PhotoPyramid, silhouette: Silhouette, reach: float, step: float
 ) -> tuple[IntArray, IntArray]:
     """Bins of the colours well inside, and outside near the outline."""

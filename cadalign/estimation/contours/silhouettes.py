@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
-from cadalign.estimation.contours.contour import Image, sampled
+from cadalign.estimation.contours.contour import Image, interpolate
 from cadalign.estimation.contours.outline import rigid_surface
 from cadalign.estimation.model import Model
 from cadalign.estimation.problem import Inits, Problem
@@ -114,7 +114,7 @@ def resembling_poses(
 
     Overlaps are intersections over unions; ``free`` (3,) marks the unknown scales.
     """
-    view = FacedMask.of(mask, camera)
+    view = CentredMask.of(mask, camera)
     atlas = atlas_of(mesh, _eye_of(mesh, view.outline))
     poses = _poses_of(*_affine_cameras(atlas, view.outline), atlas, free)
     found = [(pose, view.overlap(atlas.caster, pose)) for pose in poses]
@@ -177,12 +177,12 @@ def _whiten(image: Image, corner: FloatArray, cell: float) -> WhitenedSilhouette
     variances, axes = np.linalg.eigh(covariance)
     spread = (axes * np.sqrt(variances)) @ axes.T
     rays = (_RADII[:, None, None] * _AROUND).reshape(-1, 2)
-    covered = sampled(np.pad(image, 1), mean + rays @ spread + 1)
+    covered = interpolate(np.pad(image, 1), mean + rays @ spread + 1)
     rings = np.rint(255 * covered).astype(np.uint8).reshape(1, _RINGS, _TURNS)
     return WhitenedSilhouettes((corner + cell * mean)[None], cell * spread[None], rings)
 
 
-class FacedMask(NamedTuple):
+class CentredMask(NamedTuple):
     """A mask as a camera sees it that looks at its middle.
 
     The ``outline`` is its silhouette. Cells on the plane at depth 1 have values ``inside`` (m,),
@@ -196,7 +196,7 @@ class FacedMask(NamedTuple):
     camera_from_facing: FloatArray
 
     @classmethod
-    def of(cls, mask: FloatArray | BoolArray, camera: Camera) -> FacedMask:
+    def of(cls, mask: FloatArray | BoolArray, camera: Camera) -> CentredMask:
         inside: BoolArray = np.asarray(mask, dtype=np.float64) >= 0.5
         pixels = np.argwhere(inside)[:, ::-1].astype(float)
         found, valid = camera.rays_where_valid(pixels[:: max(1, len(pixels) // 20_000)])
@@ -220,7 +220,7 @@ class FacedMask(NamedTuple):
         # Averages over a cell, where it holds several pixels.
         blur = max(cell * camera.fx / 3, 0.3)
         soft = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), blur)
-        image = sampled(np.pad(soft, 1), pixels + 1).reshape(_CELLS, _CELLS).astype(np.float32)
+        image = interpolate(np.pad(soft, 1), pixels + 1).reshape(_CELLS, _CELLS).astype(np.float32)
         some = np.arange(_CELLS**2).reshape(_CELLS, _CELLS)[::2, ::2].ravel()
         compared = image.ravel()[some].astype(float), rays[some], camera.contains(pixels)[some]
         return cls(_whiten(image, corner, cell), *compared, turn)

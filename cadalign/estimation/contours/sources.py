@@ -94,9 +94,9 @@ class MaskSource(OutlineSource):
         contour = mask_contour(mask, f"views[{view.number}].mask")
         rays, valid = camera.normalize_where_valid(contour.points)
         slopes = np.array([[camera.fx], [camera.fy]]) * camera.distortion_jacobian(rays[valid])
-        contour = contour.taken(valid)
+        contour = contour.select(valid)
         given = contour, slopes, view.mask_sigma, mask_image(mask, contour), view.has_mask_alone
-        return cls(image, view.number, camera, is_exact, *given, _off_mask(view.pixels, mask))
+        return cls(image, view.number, camera, is_exact, *given, _inversion_hint(view.pixels, mask))
 
     def first(self) -> Track:
         """Noise and reach at the start."""
@@ -107,7 +107,7 @@ class MaskSource(OutlineSource):
 
     def last(self, track: Track) -> Track:
         """Noise and reach of the last rounds."""
-        return self._narrowed(self.first()._replace(noise=track.noise, is_fine=self.is_exact))
+        return self._narrow(self.first()._replace(noise=track.noise, is_fine=self.is_exact))
 
     def outline(self, sight: Sight, track: Track) -> Outline:
         """The outline of a posed surface; a fine one is free of the bias of extraction."""
@@ -128,7 +128,7 @@ class MaskSource(OutlineSource):
             track.reach,
         )
 
-    def learned(self, outline: Outline, offset: float, track: Track) -> Track:
+    def learn(self, outline: Outline, offset: float, track: Track) -> Track:
         """The track with the noise that residuals show before a step.
 
         Edges lie unevenly by a share of their common offset. Where the surface is only similar,
@@ -141,11 +141,11 @@ class MaskSource(OutlineSource):
         least = Noise(self.sigma or _LEAST_SIGMA, pixels, track.noise.offset)
         noise = outline.noise(residuals, least, LEAST_LOSS_SCALE)
         if self.is_exact and not track.is_fine:
-            return self._narrowed(track._replace(noise=noise._replace(correlation=1.0)))
+            return self._narrow(track._replace(noise=noise._replace(correlation=1.0)))
         uneven = _EDGE * (_UNEVEN * noise.offset / noise.sigma) ** 2 * self.is_exact
         return track._replace(noise=noise._replace(correlation=noise.correlation + uneven))
 
-    def _narrowed(self, track: Track) -> Track:
+    def _narrow(self, track: Track) -> Track:
         """The track with a reach as small as its noise allows."""
         least = max(_LEAST_REACH, _OFFSETS * track.noise.offset)
         return track._replace(reach=min(track.reach, max(_REACH * track.noise.sigma, least)))
@@ -207,7 +207,7 @@ def _leaves_image(inside: BoolArray) -> bool:
     return bool(inside.sum() > middle.sum())
 
 
-def _off_mask(pixels: FloatArray, mask: FloatArray | BoolArray) -> str:
+def _inversion_hint(pixels: FloatArray, mask: FloatArray | BoolArray) -> str:
     """A hint that most keypoints lie off a mask, as they do where it is inverted; or nothing."""
     places = np.round(pixels).astype(int)
     u, v = places[((places >= 0) & (places < mask.shape[::-1])).all(axis=1)].T
@@ -263,7 +263,7 @@ class PhotoSource(OutlineSource):
         found = outline_of(self.photo, silhouette, max(track.reach * silhouette.size, _LEAST_REACH))
         return found if found is not None and found.found.any() else None
 
-    def learned(self, outline: Outline, offset: float, track: Track) -> Track:
+    def learn(self, outline: Outline, offset: float, track: Track) -> Track:
         """The track with the noise of the residuals, at the last level."""
         if not track.is_fine or track.levels:
             return track

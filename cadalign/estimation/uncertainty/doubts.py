@@ -41,13 +41,13 @@ def keypoint_warnings(
     fitted: FittedKeypoints, covariance: FloatArray | None, diagnosis: Diagnosis | None
 ) -> Warnings:
     """Warnings about the cause of a misfit, and what deviations do not say."""
-    cause = None if diagnosis is None or _fit(fitted) else diagnosis(fitted)
+    cause = None if diagnosis is None or _fits(fitted) else diagnosis(fitted)
     counted, residuals = fitted.is_counted, fitted.residuals
     observed = fitted.observed[np.isfinite(residuals).all(axis=1) & counted]
     is_mistake = cause is not None and cause.kind == "mistake"
     sigma = fitted.options.sigma
     placed = outside_image(observed, fitted.camera, cause=cause, sigma=sigma)
-    found = first_of_camera(placed, cause)
+    found = order_warnings(placed, cause)
     for row, first in fitted.repeats:
         text = f"keypoint {row} is keypoint {first} again, and counts once"
         found.append(EstimateWarning("left-out", text, 0, (row,)))
@@ -75,7 +75,7 @@ def keypoint_warnings(
     # Likelihoods tell nothing where keypoints do not fit, or others than these were rejected.
     if cause is None and fitted.search is None:
         poses = [(each.alignment, each.relative_likelihood) for each in fitted.alternatives]
-        found += another_pose(fitted.alignment, poses, covariance)
+        found += pose_doubts(fitted.alignment, poses, covariance)
     return tuple(found)
 
 
@@ -92,13 +92,13 @@ def focal_doubt(camera: Camera, prior: PriorOption) -> EstimateWarning | None:
     )
 
 
-def first_of_camera(placed: Warnings, cause: EstimateWarning | None) -> list[EstimateWarning]:
+def order_warnings(placed: Warnings, cause: EstimateWarning | None) -> list[EstimateWarning]:
     """Warnings of `outside_image` and the cause of a misfit; doubts of the camera come first."""
     doubts = [each for each in placed if each.kind == "camera"]
     return [*doubts, *(() if cause is None else (cause,)), *placed[len(doubts) :]]
 
 
-def _fit(fitted: FittedKeypoints) -> bool:
+def _fits(fitted: FittedKeypoints) -> bool:
     if fitted.search is not None or fitted.cost is None:
         return fitted.search is None
     if fitted.options.sigma is None:
@@ -111,7 +111,7 @@ def percent(fraction: float) -> str:
     return f"{100 * fraction:.0f} %" if fraction < 100 else "more than 10000 %"
 
 
-def another_pose(
+def pose_doubts(
     best: Alignment,
     others: Sequence[tuple[Alignment, float]],
     covariance: FloatArray,

@@ -18,8 +18,8 @@ from cadalign.estimation.contours.contour import (
     contour_of,
     crossings,
     find_rims,
+    interpolate,
     mask_contour,
-    sampled,
 )
 from cadalign.estimation.contours.outline import Noise, OutlineSupport, correlation_length
 from cadalign.estimation.contours.rounds import likeliest_offset
@@ -37,9 +37,9 @@ def test_images_are_read_at_exact_places_and_beyond_them_at_their_border() -> No
     rows, columns = np.mgrid[:3, :4000]
     inside = np.random.default_rng(0).uniform([0, 0], [3999, 2], (1000, 2))
     ramp = (columns + 7 * rows).astype(np.float32)
-    assert np.abs(sampled(ramp, inside) - inside @ [1, 7]).max() < 1e-9
+    assert np.abs(interpolate(ramp, inside) - inside @ [1, 7]).max() < 1e-9
     outside = np.array([[-5.0, 1.25], [4100.0, -np.inf], [12.5, np.inf], [np.nan, 9.0]])
-    assert sampled(ramp, outside).tolist() == [8.75, 3999.0, 26.5, 14.0]
+    assert interpolate(ramp, outside).tolist() == [8.75, 3999.0, 26.5, 14.0]
 
 
 def disc(center: tuple[float, float], radius: float) -> np.ndarray:

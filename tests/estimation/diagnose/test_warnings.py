@@ -9,7 +9,7 @@ from support.problems import problem_of
 
 from cadalign import Alignment, Camera, Model, Result, View, align, fit
 from cadalign.estimation.result_parts import Warnings
-from cadalign.estimation.uncertainty.doubts import another_pose
+from cadalign.estimation.uncertainty.doubts import pose_doubts
 from cadalign.geometry.rotations import angles_between, rotation_from_vector
 
 CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
@@ -22,7 +22,7 @@ def with_other(angle_deg: float, share: float, own_deg: float = 2.0) -> Warnings
     other = Alignment(rotation_from_vector(turn), POSE.translation, np.ones(3))
     covariance = np.zeros((9, 9))
     covariance[:3, :3] = np.radians(own_deg) ** 2 * np.eye(3) + share * np.outer(turn, turn)
-    return another_pose(POSE, [(other, share / (1 - share))], covariance)
+    return pose_doubts(POSE, [(other, share / (1 - share))], covariance)
 
 
 def test_a_warning_prints_as_its_text_and_is_stored_with_its_kind() -> None:
@@ -56,7 +56,7 @@ def test_poses_that_are_concealed_together_are_one_warning() -> None:
         Alignment(rotation_from_vector(np.radians(turn)), POSE.translation, np.ones(3))
         for turn in turns
     ]
-    (found,) = another_pose(POSE, [(poses[0], 0.04), (poses[1], 0.04)], covariance)
+    (found,) = pose_doubts(POSE, [(poses[0], 0.04), (poses[1], 0.04)], covariance)
     assert found.text.startswith("other poses, the likeliest 1")
     assert "7 %" in found.text
 

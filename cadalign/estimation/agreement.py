@@ -105,7 +105,7 @@ def _posture(result: Result, axis: str | None) -> tuple[str, bool]:
     along = -float(ray @ (right, down, away)) / max(float(np.linalg.norm(ray)), 1e-300)
     elevation, across = math.degrees(math.asin(max(-1.0, min(along, 1.0)))), math.hypot(right, down)
     if across > _SEEN_ALONG and -down < _UPRIGHT * across:
-        return f"{'stands on its head' if down > _UPRIGHT * across else 'lies on its side'}", True
+        return "stands on its head" if down > _UPRIGHT * across else "lies on its side", True
     return "is seen from below the ground" * (elevation < _BELOW_DEG), elevation < _LOW_DEG
 
 
@@ -305,15 +305,15 @@ _WORST = 3  # keypoints that are named if no cause is found
 
 UNIT = "in another unit (millimetres for metres)?"
 _TEXTS = {
-    "mistake": "{posture}{named}{asked} corrected, {compared}",
+    "mistake": "{posture}{named}: corrected, {compared}",
     "unit": "{named}: is it " + UNIT + " Corrected, {compared}",
     "contradiction": "{named} contradicts the other evidence: without it, {compared}",
     "stretch": "the keypoints contradict the constraint on the stretch: without it they fit "
     "better, with the scale ({scale})",
-    "camera": "the keypoints contradict the camera: they fit one better that has a focal length "
+    "camera": "the keypoints contradict the camera: they fit better with a focal length "
     "of {best.result.camera.fx:.4g} px",
     "outlier": "the residuals are {given.ratio:.2g} times as large as sigma explains: {wrong} "
-    "{do} not fit the others (with the distance from where those put it)",
+    "{do} not fit the others (with the distance to the predicted position)",
     "misfit": "the residuals are {given.ratio:.2g} times as large as sigma and the spread of "
     "shapes explain: keypoints, sigma, the camera or the model are wrong; the worst are {wrong}",
 }
@@ -323,14 +323,14 @@ def warning_of(
     case: DiagnosisCase, rule: Rule, best: Agreement, given: Agreement, *, clauses: str = ""
 ) -> EstimateWarning:
     scale = ", ".join(f"{value:.3g}" for value in best.result.alignment.scale.tolist())
-    posture, asked = "", ":"
+    posture = ""
     if given.posture and not (best.posture or case.is_exact):
-        posture, asked = f"the object {given.posture}: is it so, or is it that ", "?"
+        posture = f"the object {given.posture}; if that is wrong, perhaps "
     wrong, view, keypoints = "", None, tuple[int, ...]()
     if rule.kind in ("outlier", "misfit"):
         wrong, view, keypoints = _wrong_keypoints(case, best, all_agree=rule.kind == "misfit")
     words = {"named": clauses, "compared": _comparison(best, given), "scale": scale, "wrong": wrong}
-    words |= {"posture": posture, "asked": asked, "do": "does" if len(keypoints) == 1 else "do"}
+    words |= {"posture": posture, "do": "does" if len(keypoints) == 1 else "do"}
     text = _TEXTS[rule.kind].format(best=best, given=given, **words)
     return EstimateWarning(rule.kind, text, 0 if rule.kind == "camera" else view, keypoints)
 

@@ -148,9 +148,9 @@ def no_pose_error(problem: Problem) -> DegenerateError:
         field = "image" if shown[0].mask is None else "mask"
         surface_of(problem.model, keypoints, f"views[{shown[0].number}].{field}")
     return DegenerateError(
-        "no pose with the keypoints in front of the camera follows from the evidence",
+        "the evidence gives no pose with the keypoints in front of the camera",
         where="views",
-        fix="give at least 3 keypoints in one view, or `init`, and check which is which",
+        fix="give at least 3 keypoints in one view, or `init`, and check the correspondences",
     )
 
 

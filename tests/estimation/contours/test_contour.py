@@ -94,7 +94,7 @@ def test_small_pieces_and_holes_are_dropped() -> None:
         (disc((80, 60), 1.0), "larger than a few pixels"),
         (
             np.random.default_rng(0).uniform(size=(480, 640)) < 0.5,  # of which a fit takes minutes
-            r"has a contour of 56,\d\d\d px, longer than any object's, as of noise; clear it",
+            r"has a contour of 56,\d\d\d px, longer than an object's: the mask is noisy; remove",
         ),
     ],
 )

@@ -78,7 +78,7 @@ def test_mistakes_are_named_of_shapes_that_bend(
 def test_an_unlikely_posture_is_a_question(real_data: Path) -> None:
     category, given = of_category(real_data, 0)
     (found,) = of_shape(real_data, category, given.upside_down()).warnings
-    assert found.text.startswith("the object stands on its head: is it so, or is it that ")
+    assert found.text.startswith("the object stands on its head; if that is wrong, perhaps ")
 
 
 @pytest.mark.long

@@ -35,20 +35,20 @@ AnyModel = Model | ShapeModel
 
 LEAST_GAIN = 12.0
 """Least gain of -2 log likelihood by the correction of a cause."""
-_OF_UNCERTAIN = 0.5  # share of it for a mistake if shape or noise are uncertain
-_UNLIKELY = 8.0  # -2 log probability that an object is not upright, or seen from below
-_AS_EXPECTED = 1.3  # ratio of squares to expected squares that an uncertain shape may have
-_LEFT = 0.8  # least ratio of squares to their expectation for correct data
-_TWICE = 2.0  # least ratio of squares with a mistake to squares without, at unknown noise
+_UNCERTAIN_SHARE = 0.5  # share of it for a mistake if shape or noise are uncertain
+_UNLIKELY_POSE_COST = 8.0  # -2 log probability that an object is not upright, or seen from below
+_MOST_EXCESS = 1.3  # ratio of squares to expected squares that an uncertain shape may have
+_LEAST_FIT = 0.8  # least ratio of squares to their expectation for correct data
+_GAIN_RATIO = 2.0  # least ratio of squares with a mistake to squares without, at unknown noise
 _MOST_CORRECTED = 1.6  # largest corrected residuals of an uncertain shape [sigma]
 _LEAST_RATIO = 1.7  # of residuals before and after the correction
-_MUCH_LESS = 5.0  # the same if sigma is wrong
-_MORE_AGREE = 2.0  # gain of -2 log likelihood if more keypoints agree
-_AS_MANY_ARE_FOUND = 2 * math.log(100)  # the same if as many agree, after a robust search
+_LARGE_RATIO = 5.0  # the same if sigma is wrong
+_MORE_INLIERS_GAIN = 2.0  # gain of -2 log likelihood if more keypoints agree
+_SAME_INLIERS_GAIN = 2 * math.log(100)  # the same if as many agree, after a robust search
 _FEW_REJECTED = 0.1  # share of the keypoints that raises no doubt in an uncertain shape
 _MOST_REJECTED = 1 / 3  # share of the keypoints that can be outliers
-_UNUSUAL = 0.05  # probability of the squares of one piece of evidence, below which it may be wrong
-_CHANCE_OF_RATIO = 1e-3  # probability that two estimates of the noise differ as much
+_LEAST_CHANCE = 0.05  # probability of the squares of one piece of evidence that may be correct
+_RATIO_CHANCE = 1e-3  # probability that two estimates of the noise differ as much
 _UPRIGHT = 0.5  # least cosine between the model's up axis and the photo's
 _SEEN_ALONG = 0.3  # length of the projected up axis, below which it is seen end-on
 _BELOW_DEG, _LOW_DEG = -7.0, 0.0  # elevations of cameras below the ground, and near it
@@ -203,7 +203,7 @@ class DiagnosisCase:
         noise = result.sigma if any(view.sigma is None for view in views) else None
         posture, is_low = _posture(result, self.model.up_axis)
         if posture and not self.is_exact:
-            score += _UNLIKELY
+            score += _UNLIKELY_POSE_COST
         integrated = None
         if ransac is None and inliers == count and result.posterior.score is not None:
             integrated = score + result.posterior.score
@@ -224,7 +224,7 @@ class DiagnosisCase:
         """
         pieces = found.result.evidence
         if not self.is_exact and found.sigma is None:
-            most = found.chi_square - _LEFT * found.redundancy  # largest possible gain of a removal
+            most = found.chi_square - _LEAST_FIT * found.redundancy  # gain of a removal, at most
             return most > LEAST_GAIN * self.inflation**2
         counts = [_equations_of(each) for each in pieces]
         return len(pieces) > 1 and any(
@@ -244,7 +244,7 @@ class DiagnosisCase:
             return True
         if given.sigma is None:
             is_odd = bool(given.posture or given.is_low)
-            is_odd |= given.chi_square > _AS_EXPECTED * given.redundancy > 0
+            is_odd |= given.chi_square > _MOST_EXCESS * given.redundancy > 0
             return (
                 (is_odd and not self.is_exact)
                 or not self.has_chance(given)
@@ -267,7 +267,7 @@ class DiagnosisCase:
         """True if a piece of evidence adds implausibly many squares."""
         fewer, noise = given.redundancy - found.redundancy, self.inflation * max(found.ratio, 1.0)
         squares, freedom = given.chi_square - found.chi_square, found.result.degrees_of_freedom
-        return chance_of(squares / noise**2, max(fewer, 1), freedom) < _UNUSUAL
+        return chance_of(squares / noise**2, max(fewer, 1), freedom) < _LEAST_CHANCE
 
     def explains(self, rule: Rule, found: Agreement, given: Agreement) -> bool:
         """True if the corrected data fit, and much better than the ``given`` data."""
@@ -277,25 +277,25 @@ class DiagnosisCase:
         is_robust = self.ransac is not None and not is_piece
         if is_robust and (self.is_exact or given.inliers < given.keypoints):
             more = found.inliers > given.inliers or found.inliers == found.keypoints
-            return more and gain > _MORE_AGREE
+            return more and gain > _MORE_INLIERS_GAIN
         rejected = found.keypoints - found.inliers
-        least = (_AS_MANY_ARE_FOUND if is_robust else rule.gain) * self.inflation**2
+        least = (_SAME_INLIERS_GAIN if is_robust else rule.gain) * self.inflation**2
         is_correction = rule.kind == "mistake" and rule.gain <= LEAST_GAIN
         if is_correction and not (self.is_exact and given.sigma is None):
-            least = _OF_UNCERTAIN * rule.gain
+            least = _UNCERTAIN_SHARE * rule.gain
         if not gain > least * (max(rejected, 1) if "ransac" in rule.changes else 1):
             return False
         if found.sigma is not None and given.sigma is not None:
             if is_correction:
                 squares = (given.sigma / found.sigma) ** 2
-                return squares > _TWICE and found.redundancy * math.log(squares) > least
-            ratio = f_quantile(found.redundancy, found.redundancy, _CHANCE_OF_RATIO)
+                return squares > _GAIN_RATIO and found.redundancy * math.log(squares) > least
+            ratio = f_quantile(found.redundancy, found.redundancy, _RATIO_CHANCE)
             return found.sigma < given.sigma / math.sqrt(ratio)
         fits = self.has_chance(found)
         if rejected or "ransac" in rule.changes:
             return fits and 0 < rejected <= _MOST_REJECTED * found.keypoints
         is_small = found.ratio < min(_MOST_CORRECTED, given.ratio / _LEAST_RATIO)
-        return fits or is_small or found.ratio < given.ratio / _MUCH_LESS
+        return fits or is_small or found.ratio < given.ratio / _LARGE_RATIO
 
 
 # Texts of causes, for users -----------------------------------------------------------------------

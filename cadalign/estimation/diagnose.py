@@ -44,12 +44,12 @@ from cadalign.io.evidence import LENGTHS, Size
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
 
-_AS_LIKELY = 6.0  # largest difference of -2 log likelihoods of mistakes named together
-_MOST_INSIDE = 0.8  # share of the keypoints that must lie in the image
+_EQUAL_LIKELIHOOD = 6.0  # largest difference of -2 log likelihoods of mistakes named together
+_LEAST_INSIDE = 0.8  # share of the keypoints that must lie in the image
 _CAMERA_GAIN = 19.5  # of -2 log likelihood, exceeded by chance in one of 100,000
-_PER_EQUATION = 3.0  # gain required for each equation that is left out
+_EQUATION_PRICE = 3.0  # gain required for each equation that is left out
 _MOST_VIEWS = 10  # with the largest residuals, each left out in turn
-_APART = 5.0  # distance between pixels of one point, beyond noise [px]
+_LEAST_DISTANCE = 5.0  # distance between pixels of one point, beyond noise [px]
 _WRONG_UNIT = 100.0  # factor between an object's size and its model's
 
 
@@ -74,10 +74,10 @@ def diagnose(case: DiagnosisCase, *, result: Result | None = None) -> EstimateWa
         first = case.correct(MIRRORED)
         if first is None or not case.explains(MIRRORED, first, given):
             return None
-    return _estimate_noise(case, given)
+    return _likeliest_cause(case, given)
 
 
-def _estimate_noise(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
+def _likeliest_cause(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
     rules = list(_mistakes_in(case)) if case.is_tolerant else list(_rules_for(case, given))
     found = [(rule, each) for rule in rules if (each := case.correct(rule)) is not None]
     explaining = [each for each in found if case.explains(*each, given)]
@@ -88,7 +88,7 @@ def _estimate_noise(case: DiagnosisCase, given: Agreement) -> EstimateWarning | 
             else warning_of(case, MISFIT, given, given)
         )
     rule, best = max(explaining, key=lambda each: case.gain(each[0], each[1], given))
-    least = case.gain(rule, best, given) - _AS_LIKELY
+    least = case.gain(rule, best, given) - _EQUAL_LIKELIHOOD
     alike = [each for each in found if each[0].kind == rule.kind]
     likely = [each for each in alike if case.gain(*each, given) >= least]
     return warning_of(case, rule, best, given, clauses=name_rules(likely))
@@ -155,7 +155,7 @@ def diagnose_refusal(case: DiagnosisCase, *, with_keypoints: bool = True) -> str
     if not found:
         return None
     best = min((each for _, each in found), key=lambda each: each.score)
-    likely = [each for each in found if each[1].score <= best.score + _AS_LIKELY]
+    likely = [each for each in found if each[1].score <= best.score + _EQUAL_LIKELIHOOD]
     return f"{name_rules(likely)}: corrected, {best.inliers} of {best.keypoints} keypoints agree"
 
 
@@ -274,7 +274,7 @@ MISFIT = Rule("misfit")
 def _rules_for(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
     model, fails = case.model, not case.has_chance(given)
     yield from _mistakes_in(case)
-    yield from _pairs_apart(case)
+    yield from _conflicting_pairs(case)
     yield from _other_sizes(case) if case.is_exact or fails else ()
     if case.is_plain and isinstance(model, Model) and fails:
         if model.stretch is not None or model.stretch_sigma is not None:
@@ -310,7 +310,7 @@ def _mistakes_in(case: DiagnosisCase) -> Iterator[Rule]:
             yield Rule("unit", f"`{name}`", undo, changes=changes)
 
 
-def _pairs_apart(case: DiagnosisCase) -> Iterator[Rule]:
+def _conflicting_pairs(case: DiagnosisCase) -> Iterator[Rule]:
     """Rules for points of the model that are paired with two pixels."""
     if not isinstance(case.model, Model):
         return
@@ -319,7 +319,7 @@ def _pairs_apart(case: DiagnosisCase) -> Iterator[Rule]:
         names, places = view.keypoint_ids, [points[name] for name in view.keypoint_ids]
         for a, b in combinations(range(len(names)), 2):
             apart = float(np.linalg.norm(view.pixels[a] - view.pixels[b]))
-            if apart > _APART and np.array_equal(places[a], places[b]):
+            if apart > _LEAST_DISTANCE and np.array_equal(places[a], places[b]):
                 clause = f"keypoints {quote(names[a])} and {quote(names[b])} are one point of the "
                 clause += f"model and lie {apart:.3g} px apart"
                 undo = partial(_remove_rows, number=view.number, rows=(a, b))
@@ -342,7 +342,7 @@ def _other_sizes(case: DiagnosisCase) -> Iterator[Rule]:
 
     def holds_most(factor: float) -> bool:
         inside = camera.contains(rescaled_pixels(points, 1 / factor))
-        return bool(inside.sum() > _MOST_INSIDE * len(points))
+        return bool(inside.sum() > _LEAST_INSIDE * len(points))
 
     own, is_inside = f"{camera.width} x {camera.height} px", holds_most(1.0)
     lie_inside = bool(camera.contains(points).all())
@@ -371,7 +371,7 @@ def _contradicts(case: DiagnosisCase, given: Agreement) -> bool:
 def _pieces_of(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
     """Rules that leave out one piece of evidence, or one of several views."""
     is_rig = case.views[0].cam_from_rig is not None
-    piece = partial(Rule, "contradiction", price=_PER_EQUATION)
+    piece = partial(Rule, "contradiction", price=_EQUATION_PRICE)
     for place in np.argsort(-np.array(given.squares), kind="stable")[:_MOST_VIEWS].tolist():
         view = case.views[place]
         fields = ("up", "depth", "camera_height")

@@ -148,16 +148,14 @@ def _robust_minima(
     for state in minima.states[:_KEPT]:
         displaced = _WIDENING * _spread(evidence, state) * (ransac.max_reproj_error is None)
         rounds = _INLIER_ROUNDS if ransac.refine else 1
-        settled = _refine_inliers(
-            whole._replace(state=state), np.hypot(threshold, displaced), rounds
-        )
+        settled = _refit(whole._replace(state=state), np.hypot(threshold, displaced), rounds)
         if settled is not None:
             found.append(settled)
     found.sort(key=lambda minimum: minimum.score)
     return found, iterations
 
 
-def _refine_inliers(whole: Minimum, threshold: FloatArray, rounds: int) -> Minimum | None:
+def _refit(whole: Minimum, threshold: FloatArray, rounds: int) -> Minimum | None:
     """Refine on inliers, with whitened residuals below thresholds (N,), until these are stable."""
     best: Minimum | None = None
     state = whole.state

@@ -184,7 +184,7 @@ def _metric_starts(evidence: Evidence, own: Sequence[_Start]) -> list[_Start]:
     by_scale = (rows.normals @ rotations) * rows.points
     same = np.broadcast_to(rows.normals, by_scale.shape)
     left = np.concatenate([same, by_scale @ basis], axis=2)
-    extra_left, extra_right = _other_rows(evidence, rotations, basis)
+    extra_left, extra_right = _distance_rows(evidence, rotations, basis)
     weights = np.broadcast_to(rows.weights, left.shape[:2])
     for _ in range(_ROUNDS):
         weighted = np.concatenate([left * weights[:, :, None], extra_left], axis=1)
@@ -235,7 +235,7 @@ def _rows_of(evidence: Evidence) -> _Rows:
     )
 
 
-def _other_rows(
+def _distance_rows(
     evidence: Evidence, rotations: FloatArray, basis: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Whitened equations (S, L, 3 + k) of known distances in translation and scales."""

@@ -112,7 +112,7 @@ def refine(problem: Problem, minima: Sequence[Minimum]) -> tuple[list[Minimum], 
     wrong: tuple[Source, str] | None = None
     while left:
         best = _candidates(likely, left, surface, keypoints, is_open=is_open)
-        wrong = _find_contradiction(best, left)
+        wrong = _contradiction(best, left)
         if wrong is None:
             break
         source, reason = wrong
@@ -239,9 +239,7 @@ def _are_same(one: State, other: State) -> bool:
     return bool(angles_between(turn, other_turn) < _SAME_TURN_DEG and stretch < _SAME_STRETCH)
 
 
-def _find_contradiction(
-    best: list[Candidate], sources: Sequence[Source]
-) -> tuple[Source, str] | None:
+def _contradiction(best: list[Candidate], sources: Sequence[Source]) -> tuple[Source, str] | None:
     supports = best[0].supports if best else [OutlineSupport()]
     worst = min(range(len(supports)), key=lambda number: supports[number].share)
     if supports[worst].share < _LEAST_SUPPORT:

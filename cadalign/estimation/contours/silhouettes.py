@@ -53,7 +53,7 @@ _PRIOR = 0.05  # weight of the logarithms of scales
 _MOST_LOG = 1.3
 _DISTINCT_DEG = 10.0
 _DISTINCT_STRETCH = 0.2
-_RESEMBLING = 12  # starts from a mask alone
+_MOST_SIMILAR = 12  # starts from a mask alone
 _LARGEST_FOCAL_SIGMA = 0.25  # relative: the search uses the mean focal length of the prior
 
 
@@ -89,18 +89,18 @@ def starts_of_mask(problem: Problem) -> list[Inits]:
             fix="give a calibrated camera, a focal_prior whose relative_sigma is at most "
             f"{_LARGEST_FOCAL_SIGMA}, or keypoints",
         )
-    poses = resembling_poses(
+    poses = similar_poses(
         cast(Mesh, model.mesh),
         cast(FloatArray, view.mask_image),
         camera,
         free=np.asarray(problem.prior.scales.free > 0),
-        count=_RESEMBLING,
+        count=_MOST_SIMILAR,
         symmetry=model.symmetry,
     )
     return [[turned_alignment(pose, problem.turns[0])] for pose, _ in poses]
 
 
-def resembling_poses(
+def similar_poses(
     mesh: Mesh,
     mask: FloatArray | BoolArray,
     camera: Camera,
@@ -118,7 +118,7 @@ def resembling_poses(
     poses = _poses_of(*_affine_cameras(atlas, view.outline), atlas, free)
     found = [(pose, view.overlap(atlas.caster, pose)) for pose in poses]
     found.sort(key=lambda each: -each[1])
-    kept = distinct(found, count, symmetry)
+    kept = select_distinct(found, count, symmetry)
     turn = view.camera_from_facing
     return [(turned_alignment(pose, turn), overlap) for pose, overlap in kept]
 
@@ -299,7 +299,7 @@ def _stretches_of(matrices: FloatArray, free: BoolArray) -> FloatArray:
     return np.asarray(np.exp(logs))
 
 
-def distinct(
+def select_distinct(
     found: list[tuple[Alignment, float]], count: int, symmetry: Symmetry | None
 ) -> list[tuple[Alignment, float]]:
     """The first ``count`` alignments that differ, up to symmetry."""

@@ -1,4 +1,4 @@
-"""Contours of masks: sub-pixel places, outward normals, borders, small pieces."""
+"""Contours of masks: sub-pixel positions, outward normals, borders, small pieces."""
 
 from __future__ import annotations
 
@@ -118,14 +118,14 @@ def test_correlated_residuals_count_less() -> None:
 
 @pytest.mark.parametrize("place", [2.0, 0.7, 0.5, 0.0])
 def test_an_offset_has_the_deviation_that_its_own_place_shows(place: float) -> None:
-    """A contour lies ``place`` before a prior of 1 px, with a variance of .36 px^2."""
+    """The likeliest offset of a contour at ``place``, for a prior of 1 px and a variance."""
     offset = likeliest_offset(place / (1 + 0.36), 1 / (1 / 0.36 + 1), Noise(1.0, 1.0, 1.0))
     assert offset == pytest.approx(max(np.sqrt(max(place**2 - 0.36, 0.0)), 0.1))
 
 
 @pytest.mark.parametrize("shift", [-0.3, -0.1, 0.1, 0.3])
 def test_the_nearest_of_two_lines_is_taken_on_either_side(shift: float) -> None:
-    """Lines at which the level falls along the normal, beside an offset from the point."""
+    """Places where the level falls along the normal, nearest to an offset."""
     columns = np.where(np.isin(np.arange(40), [*range(20), 21]), 1.0, 0.0)
     level = np.tile(columns.astype(np.float32), (5, 1))  # falls at 19.5 and 21.5
     place, normal = np.array([[18.5 + shift, 2.0]]), np.array([[1.0, 0.0]])
@@ -134,7 +134,7 @@ def test_the_nearest_of_two_lines_is_taken_on_either_side(shift: float) -> None:
 
 
 class Stripes(NamedTuple):
-    """A sight of stripes that are parallel to the y axis, between pairs of ``edges`` [px]."""
+    """A sight of stripes parallel to the y axis, between pairs of ``edges`` [px]."""
 
     edges: list[float]
 

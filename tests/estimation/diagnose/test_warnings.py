@@ -1,4 +1,4 @@
-"""Warnings tell what the standard deviations do not: right problems seldom have one."""
+"""Warnings about problems that deviations do not show; correct problems rarely have one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ POSE = Alignment(np.eye(3), [0.0, 0.0, 4.0], np.ones(3))
 
 
 def with_other(angle_deg: float, share: float, own_deg: float = 2.0) -> Warnings:
-    """Warnings of two poses, one with that share of the probability, and of their moments."""
+    """Warnings about a second pose with a share of the probability, from the moments of both."""
     turn = np.radians([angle_deg, 0.0, 0.0])
     other = Alignment(rotation_from_vector(turn), POSE.translation, np.ones(3))
     covariance = np.zeros((9, 9))
@@ -62,7 +62,7 @@ def test_poses_that_are_concealed_together_are_one_warning() -> None:
 
 
 def test_keypoints_beyond_their_sigma_are_warned_of_beside_other_evidence() -> None:
-    """By a number, where no piece contradicts the others; not where their sigma is right."""
+    """Residuals are stated if no evidence contradicts the rest, but not at the correct sigma."""
     for noise, sigma in ((4.0, 1.0), (1.0, 1.0), (4.0, 4.0)):
         problem = problem_of(4, points=14, noise_px=noise)
         up = problem.alignment.rotation[:, 1]

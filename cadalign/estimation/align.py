@@ -356,7 +356,7 @@ def _checked_views(given: object) -> list[View]:
         raise InputError(what, where="views", fix="give the model first, then the views")
     views = list(given)
     if not views:
-        raise InputError("none is given", where="views")
+        raise InputError("no views are given", where="views")
     for number, view in enumerate(views):
         require_kind(view, View, f"views[{number}]")
     return views

@@ -142,8 +142,8 @@ def _samples(count: int, size: int, ransac: RansacOptions, scores: FloatArray | 
     wanted = min(max(math.ceil(without), ransac.min_iterations), ransac.max_iterations)
     if math.comb(count, size) <= wanted:
         return np.array(list(combinations(range(count), size)))
-    told = None if scores is None or not scores.sum() > 0 else tuple(scores.tolist())
-    return _random_samples(count, size, wanted, ransac.seed, told)
+    weights = None if scores is None or not scores.sum() > 0 else tuple(scores.tolist())
+    return _random_samples(count, size, wanted, ransac.seed, weights)
 
 
 @lru_cache(maxsize=16)  # reused at every focal length and in every diagnosis

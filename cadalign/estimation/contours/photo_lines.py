@@ -63,8 +63,8 @@ def _histogram(bins: IntArray) -> FloatArray:
 def regions_of(inside: IntArray, outside: IntArray) -> tuple[FloatArray, float]:
     """Odds by bins, and contrast, from the bins of the colours inside and outside.
 
-    Odds are the probability of the object minus that of the background; the contrast is the mutual
-    information of side and colour [nats], log 2 at most.
+    Odds are P(object) - P(background); the contrast is the mutual information of side and colour
+    [nats], log 2 at most.
     """
     own, other = _histogram(inside), _histogram(outside)
     both = (own + other) / 2

@@ -1,7 +1,7 @@
-"""Pose, stretch and shape of an object from all that is known about it, and their uncertainty.
+"""Estimation of pose, stretch and shape of an object, with their uncertainty.
 
-Options, models and views go in, a `Result` comes out. `cadalign.fit` and `cadalign.align` stand in
-the modules of their names.
+Inputs are models, views and options; the output is a `Result`. `cadalign.fit` and `cadalign.align`
+are in the modules with their names.
 """
 
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""The agreement of data with an estimate, also with something undone, and texts of causes."""
+"""Agreement of data with an estimate, also after a correction, and texts of warnings."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from cadalign.errors import CadalignError, quote
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import RansacOptions, Sigma, pixel_information
-from cadalign.estimation.result_parts import EstimateWarning, Kind, listed
+from cadalign.estimation.result_parts import EstimateWarning, Kind, join_or
 from cadalign.estimation.uncertainty.doubts import FALSE_ALARMS, is_large_sigma
 from cadalign.estimation.uncertainty.residuals import (
     area_of,
@@ -33,32 +33,32 @@ if TYPE_CHECKING:
 
 AnyModel = Model | ShapeModel
 
-AS_MANY_AGREE = 12.0
-"""Gain of -2 log likelihood without a cause, at least."""
-_OF_UNCERTAIN = 0.5  # share of it that suffices for a mistake, where shape or noise are uncertain
-_UNLIKELY = 8.0  # -2 log of the share of objects that are not upright, or seen from below
-_AS_EXPECTED = 1.3  # squares of uncertain shapes, over those expected, up to which none is doubted
-_LEFT = 0.8  # of the squares that are expected, that right data leave at least
-_TWICE = 2.0  # squares with a mistake, over those without, where the noise is unknown
-_MOST_CORRECTED = 1.6  # residuals of uncertain shapes without a mistake, over their deviations
-_LEAST_RATIO = 1.7  # of the residuals with and without it
-_MUCH_LESS = 5.0  # the same, where those without it are of a wrong sigma
-_MORE_AGREE = 2.0  # of -2 log likelihood, that is gained where more keypoints agree
-_AS_MANY_ARE_FOUND = 2 * math.log(100)  # the same after a robust search, where as many do
-_FEW_REJECTED = 0.1  # share of the keypoints, up to which an uncertain shape is not doubted
-_MOST_REJECTED = 1 / 3  # share of the keypoints that are outliers; more are none
-_UNUSUAL = 0.05  # probability by chance of the squares that a piece of evidence adds
-_CHANCE_OF_RATIO = 1e-3  # that residuals of an unknown noise differ by as much
-_UPRIGHT = 0.5  # cosine between the model's up axis and the photo's upwards, at least
-_SEEN_ALONG = 0.3  # of the up axis in the photo, which is seen end-on
-_BELOW_DEG, _LOW_DEG = -7.0, 0.0  # elevations of cameras below the ground, and on it
+LEAST_GAIN = 12.0
+"""Least gain of -2 log likelihood by the correction of a cause."""
+_UNCERTAIN_SHARE = 0.5  # share of it for a mistake if shape or noise are uncertain
+_UNLIKELY_POSE_COST = 8.0  # -2 log probability that an object is not upright, or seen from below
+_MOST_EXCESS = 1.3  # ratio of squares to expected squares that an uncertain shape may have
+_LEAST_FIT = 0.8  # least ratio of squares to their expectation for correct data
+_GAIN_RATIO = 2.0  # least ratio of squares with a mistake to squares without, at unknown noise
+_MOST_CORRECTED = 1.6  # largest corrected residuals of an uncertain shape [sigma]
+_LEAST_RATIO = 1.7  # of residuals before and after the correction
+_LARGE_RATIO = 5.0  # the same if sigma is wrong
+_MORE_INLIERS_GAIN = 2.0  # gain of -2 log likelihood if more keypoints agree
+_SAME_INLIERS_GAIN = 2 * math.log(100)  # the same if as many agree, after a robust search
+_FEW_REJECTED = 0.1  # share of the keypoints that raises no doubt in an uncertain shape
+_MOST_REJECTED = 1 / 3  # share of the keypoints that can be outliers
+_LEAST_CHANCE = 0.05  # probability of the squares of one piece of evidence that may be correct
+_RATIO_CHANCE = 1e-3  # probability that two estimates of the noise differ as much
+_UPRIGHT = 0.5  # least cosine between the model's up axis and the photo's
+_SEEN_ALONG = 0.3  # length of the projected up axis, below which it is seen end-on
+_BELOW_DEG, _LOW_DEG = -7.0, 0.0  # elevations of cameras below the ground, and near it
 
 
 class Rule(NamedTuple):
-    """A cause of residuals that are too large, and the text of its kind that has the ``clause``.
+    """A cause of large residuals, how to correct it, and the ``clause`` of its text.
 
-    A view that is undone to None is left out. An estimate must explain so much ``gain`` of -2 log
-    likelihood, and a ``price`` of each equation that it lacks.
+    A view corrected to None is left out. The corrected estimate must gain ``gain`` of -2 log
+    likelihood, and ``price`` for each equation that it lacks.
     """
 
     kind: Kind
@@ -66,15 +66,15 @@ class Rule(NamedTuple):
     undo_view: Callable[[View], View | None] = lambda view: view
     undo_model: Callable[[Model], Model] = lambda model: model
     changes: Mapping[str, Any] = {}
-    gain: float = AS_MANY_AGREE
+    gain: float = LEAST_GAIN
     price: float = 0.0
 
 
 class Agreement(NamedTuple):
     """Agreement of all evidence with an estimate.
 
-    The ``score`` is -2 log likelihood of all keypoints, of which outliers lie anywhere; that of
-    ``integrated`` shapes is known where none are. Both are known but for constants.
+    ``score`` is -2 log likelihood of all keypoints, with outliers uniformly distributed;
+    ``integrated`` has the shape integrated out, and is None with outliers; both up to a constant.
     """
 
     result: Result
@@ -85,18 +85,18 @@ class Agreement(NamedTuple):
     keypoints: int
     sigma: float | None  # estimated [px]
     squares: Sequence[float]
-    posture: str  # what is unlikely of the object's pose; empty if nothing is
-    is_low: bool  # the camera is hardly above the ground, if at all
+    posture: str  # an unlikely pose as text; empty for a likely one
+    is_low: bool  # the camera is near or below the ground
     integrated: float | None
 
     @property
     def ratio(self) -> float:
-        """Residuals over their standard deviations; 0 where nothing is redundant."""
+        """Root mean square residual [sigma]; 0 without redundancy."""
         return math.sqrt(self.chi_square / self.redundancy) if self.redundancy > 0 else 0.0
 
 
 def _posture(result: Result, axis: str | None) -> tuple[str, bool]:
-    """Posture of an object with an up axis in a photo that was taken upright; `Agreement`."""
+    """``posture`` and ``is_low`` of `Agreement`, for a photo that was taken upright."""
     if axis is None:
         return "", False
     pose = result.alignment
@@ -105,32 +105,32 @@ def _posture(result: Result, axis: str | None) -> tuple[str, bool]:
     along = -float(ray @ (right, down, away)) / max(float(np.linalg.norm(ray)), 1e-300)
     elevation, across = math.degrees(math.asin(max(-1.0, min(along, 1.0)))), math.hypot(right, down)
     if across > _SEEN_ALONG and -down < _UPRIGHT * across:
-        return f"{'stands on its head' if down > _UPRIGHT * across else 'lies on its side'}", True
+        return "stands on its head" if down > _UPRIGHT * across else "lies on its side", True
     return "is seen from below the ground" * (elevation < _BELOW_DEG), elevation < _LOW_DEG
 
 
 def _equations_of(piece: EvidenceSummary) -> int:
-    """Number of equations of a piece of evidence; 0 for outlines, whose pixels are no such."""
+    """Number of equations of a piece of evidence; 0 for outlines, whose pixels correlate."""
     each = {"keypoints": 2, "gravity": 2, "mask": 0, "photo": 0}
     return each.get(piece.kind, 1) * piece.count
 
 
 @dataclass(frozen=True, eq=False)
 class DiagnosisCase:
-    """The data of an estimate, the estimate ``again`` as a function of these, and the search.
+    """The data of an estimate, and the function ``estimate`` to repeat it.
 
-    ``again`` takes a model, views and changed options; it raises CadalignError if there is none.
+    ``estimate`` takes a model, views and changed options, and raises CadalignError if it fails.
     """
 
     model: AnyModel
     views: Sequence[View]
-    again: Callable[..., Result]
+    estimate: Callable[..., Result]
     ransac: RansacOptions | None = None
     size: Size | None = None
     has_rows: bool = False  # the ids of keypoints are their rows
-    labels: Sequence[Hashable] = ()  # what the user calls the keypoints of these rows
+    labels: Sequence[Hashable] = ()  # names of the keypoints by row
     photo: str | os.PathLike[str] | None = None  # of the first view
-    is_tolerant: bool = False  # a robust loss leaves large residuals out of account
+    is_tolerant: bool = False  # a robust loss tolerates large residuals
 
     @property
     def inflation(self) -> float:
@@ -146,14 +146,14 @@ class DiagnosisCase:
 
     @property
     def is_plain(self) -> bool:
-        """True where keypoints of known noise in one view and an exact model are all."""
+        """True for keypoints of known noise in one view, and an exact model, without ransac."""
         first, *others = self.views
         is_alone = not (others or first.sources or self.size or self.ransac)
         return is_alone and self.is_exact and first.sigma is not None
 
-    @np.errstate(all="ignore")  # what is not finite is refused
-    def without(self, rule: Rule | None) -> Agreement | None:
-        """The agreement after a cause is undone; None where there is no estimate."""
+    @np.errstate(all="ignore")  # non-finite results are refused
+    def correct(self, rule: Rule | None) -> Agreement | None:
+        """The agreement after a rule's correction; None if there is no estimate."""
         model, views, changes = self.model, list(self.views), {} if rule is None else rule.changes
         try:
             if isinstance(model, Model):
@@ -163,12 +163,12 @@ class DiagnosisCase:
                 undone = map(rule.undo_view, views)
                 views = [each for each in undone if each is not None and each.has_evidence]
             views = number_views(views)
-            result = self.again(model, views, **changes)
+            result = self.estimate(model, views, **changes)
             return replace(self, model=model, views=views).agreement(result)
         except CadalignError:
             return None
 
-    @np.errstate(all="ignore")  # residuals that overflow are outliers'
+    @np.errstate(all="ignore")  # overflows are residuals of outliers
     def agreement(self, result: Result) -> Agreement:
         """The agreement of views that take part in a result."""
         views, ransac = self.views, self.ransac
@@ -189,7 +189,7 @@ class DiagnosisCase:
                 score += 2 * math.log(area) * int((~kept).sum())
         chi_square, redundancy = sum(squares), result.posterior.redundancy
         if any(view.has_outline or view.depth_image is not None for view in views):
-            # Of outlines nothing is tested, and of an image's depths those that are the object's.
+            # Outlines are not tested, and depth images only at the object.
             poses = 1 if views[0].cam_from_rig is not None else len(views)
             counted = [each for each in result.evidence if _equations_of(each)]
             redundancy = sum(map(_equations_of, counted))
@@ -203,7 +203,7 @@ class DiagnosisCase:
         noise = result.sigma if any(view.sigma is None for view in views) else None
         posture, is_low = _posture(result, self.model.up_axis)
         if posture and not self.is_exact:
-            score += _UNLIKELY
+            score += _UNLIKELY_POSE_COST
         integrated = None
         if ransac is None and inliers == count and result.posterior.score is not None:
             integrated = score + result.posterior.score
@@ -211,21 +211,21 @@ class DiagnosisCase:
         return Agreement(result, score + chi_square, chi_square, redundancy, *agreed)
 
     def has_chance(self, found: Agreement) -> bool:
-        """True if noise, unless it is estimated, and the spread of shapes may leave this."""
+        """True if noise and the spread of shapes explain the residuals, or sigma is estimated."""
         if found.sigma is not None:
             return True
         squares, freedom = found.chi_square / self.inflation**2, found.result.degrees_of_freedom
         return chance_of(squares, found.redundancy, freedom) >= FALSE_ALARMS
 
     def has_contradiction(self, found: Agreement) -> bool:
-        """True if a piece of evidence may be wrong: alone, it has residuals beyond its noise.
+        """True if the residuals of one piece of evidence exceed its noise.
 
-        An uncertain shape bends to what is wrong, and has more residuals in all.
+        An uncertain shape bends to wrong evidence, so that its residuals are tested together.
         """
         pieces = found.result.evidence
         if not self.is_exact and found.sigma is None:
-            most = found.chi_square - _LEFT * found.redundancy  # that its removal could gain
-            return most > AS_MANY_AGREE * self.inflation**2
+            most = found.chi_square - _LEAST_FIT * found.redundancy  # gain of a removal, at most
+            return most > LEAST_GAIN * self.inflation**2
         counts = [_equations_of(each) for each in pieces]
         return len(pieces) > 1 and any(
             chance_of(count * each.rms_sigmas**2, count) * len(pieces) < FALSE_ALARMS
@@ -235,7 +235,7 @@ class DiagnosisCase:
     def is_doubtful(self, given: Agreement) -> bool:
         """True if the residuals fail the test for mistakes.
 
-        An uncertain shape follows keypoints that a robust search would reject of an exact one.
+        An uncertain shape fits keypoints that a robust search with an exact shape rejects.
         """
         rejected = given.keypoints - given.inliers
         if rejected > (0 if self.is_exact else _FEW_REJECTED * given.keypoints):
@@ -244,7 +244,7 @@ class DiagnosisCase:
             return True
         if given.sigma is None:
             is_odd = bool(given.posture or given.is_low)
-            is_odd |= given.chi_square > _AS_EXPECTED * given.redundancy > 0
+            is_odd |= given.chi_square > _MOST_EXCESS * given.redundancy > 0
             return (
                 (is_odd and not self.is_exact)
                 or not self.has_chance(given)
@@ -254,66 +254,66 @@ class DiagnosisCase:
         return given.redundancy > 0 and is_large_sigma(given.sigma, pixels)
 
     def gain(self, rule: Rule, found: Agreement, given: Agreement) -> float:
-        """Fall of -2 log likelihood without a cause, less the price of what was left out."""
+        """Decrease of -2 log likelihood by a correction, less the price of omitted equations."""
         fall = given.score - found.score
         if not self.is_exact and given.integrated is not None and found.integrated is not None:
             fall = given.integrated - found.integrated
         elif rule.price:
             fall = given.chi_square - found.chi_square
         fewer = max(given.redundancy - found.redundancy, 0)
-        return fall - rule.price * max(found.ratio, 1.0) ** 2 * fewer  # where sigma is too small
+        return fall - rule.price * max(found.ratio, 1.0) ** 2 * fewer  # if sigma is too small
 
     def _may_be_wrong(self, found: Agreement, given: Agreement) -> bool:
-        """True if a piece of evidence adds more squares than right ones do."""
+        """True if a piece of evidence adds implausibly many squares."""
         fewer, noise = given.redundancy - found.redundancy, self.inflation * max(found.ratio, 1.0)
         squares, freedom = given.chi_square - found.chi_square, found.result.degrees_of_freedom
-        return chance_of(squares / noise**2, max(fewer, 1), freedom) < _UNUSUAL
+        return chance_of(squares / noise**2, max(fewer, 1), freedom) < _LEAST_CHANCE
 
     def explains(self, rule: Rule, found: Agreement, given: Agreement) -> bool:
-        """True if the data without a cause fit, and much better than as they were ``given``."""
+        """True if the corrected data fit, and much better than the ``given`` data."""
         gain, is_piece = self.gain(rule, found, given), rule.price > 0
         if is_piece and not self.is_exact and not self._may_be_wrong(found, given):
             return False
         is_robust = self.ransac is not None and not is_piece
         if is_robust and (self.is_exact or given.inliers < given.keypoints):
             more = found.inliers > given.inliers or found.inliers == found.keypoints
-            return more and gain > _MORE_AGREE
+            return more and gain > _MORE_INLIERS_GAIN
         rejected = found.keypoints - found.inliers
-        least = (_AS_MANY_ARE_FOUND if is_robust else rule.gain) * self.inflation**2
-        is_correction = rule.kind == "mistake" and rule.gain <= AS_MANY_AGREE
+        least = (_SAME_INLIERS_GAIN if is_robust else rule.gain) * self.inflation**2
+        is_correction = rule.kind == "mistake" and rule.gain <= LEAST_GAIN
         if is_correction and not (self.is_exact and given.sigma is None):
-            least = _OF_UNCERTAIN * rule.gain
+            least = _UNCERTAIN_SHARE * rule.gain
         if not gain > least * (max(rejected, 1) if "ransac" in rule.changes else 1):
             return False
         if found.sigma is not None and given.sigma is not None:
             if is_correction:
                 squares = (given.sigma / found.sigma) ** 2
-                return squares > _TWICE and found.redundancy * math.log(squares) > least
-            ratio = f_quantile(found.redundancy, found.redundancy, _CHANCE_OF_RATIO)
+                return squares > _GAIN_RATIO and found.redundancy * math.log(squares) > least
+            ratio = f_quantile(found.redundancy, found.redundancy, _RATIO_CHANCE)
             return found.sigma < given.sigma / math.sqrt(ratio)
         fits = self.has_chance(found)
         if rejected or "ransac" in rule.changes:
             return fits and 0 < rejected <= _MOST_REJECTED * found.keypoints
         is_small = found.ratio < min(_MOST_CORRECTED, given.ratio / _LEAST_RATIO)
-        return fits or is_small or found.ratio < given.ratio / _MUCH_LESS
+        return fits or is_small or found.ratio < given.ratio / _LARGE_RATIO
 
 
 # Texts of causes, for users -----------------------------------------------------------------------
 
 
-_WORST = 3  # keypoints that are named where nothing explains the residuals
+_WORST = 3  # keypoints that are named if no cause is found
 
 UNIT = "in another unit (millimetres for metres)?"
 _TEXTS = {
-    "mistake": "{posture}{named}{asked} corrected, {compared}",
+    "mistake": "{posture}{named}: corrected, {compared}",
     "unit": "{named}: is it " + UNIT + " Corrected, {compared}",
     "contradiction": "{named} contradicts the other evidence: without it, {compared}",
     "stretch": "the keypoints contradict the constraint on the stretch: without it they fit "
     "better, with the scale ({scale})",
-    "camera": "the keypoints contradict the camera: they fit one better that has a focal length "
+    "camera": "the keypoints contradict the camera: they fit better with a focal length "
     "of {best.result.camera.fx:.4g} px",
     "outlier": "the residuals are {given.ratio:.2g} times as large as sigma explains: {wrong} "
-    "{do} not fit the others (with the distance from where those put it)",
+    "{do} not fit the others (with the distance to the predicted position)",
     "misfit": "the residuals are {given.ratio:.2g} times as large as sigma and the spread of "
     "shapes explain: keypoints, sigma, the camera or the model are wrong; the worst are {wrong}",
 }
@@ -323,14 +323,14 @@ def warning_of(
     case: DiagnosisCase, rule: Rule, best: Agreement, given: Agreement, *, clauses: str = ""
 ) -> EstimateWarning:
     scale = ", ".join(f"{value:.3g}" for value in best.result.alignment.scale.tolist())
-    posture, asked = "", ":"
+    posture = ""
     if given.posture and not (best.posture or case.is_exact):
-        posture, asked = f"the object {given.posture}: is it so, or is it that ", "?"
+        posture = f"the object {given.posture}; if that is wrong, perhaps "
     wrong, view, keypoints = "", None, tuple[int, ...]()
     if rule.kind in ("outlier", "misfit"):
         wrong, view, keypoints = _wrong_keypoints(case, best, all_agree=rule.kind == "misfit")
     words = {"named": clauses, "compared": _comparison(best, given), "scale": scale, "wrong": wrong}
-    words |= {"posture": posture, "asked": asked, "do": "does" if len(keypoints) == 1 else "do"}
+    words |= {"posture": posture, "do": "does" if len(keypoints) == 1 else "do"}
     text = _TEXTS[rule.kind].format(best=best, given=given, **words)
     return EstimateWarning(rule.kind, text, 0 if rule.kind == "camera" else view, keypoints)
 
@@ -338,9 +338,9 @@ def warning_of(
 def _wrong_keypoints(
     case: DiagnosisCase, best: Agreement, *, all_agree: bool
 ) -> tuple[str, int | None, tuple[int, ...]]:
-    """Names of outliers with their errors, and the view and the rows of those in one view.
+    """Names of outliers with their errors, and their view and rows if all are in one view.
 
-    Where ``all_agree`` those with the largest errors are named, and none is said to be wrong.
+    With ``all_agree``, the keypoints with the largest errors are named, without view and rows.
     """
     texts, wrong = [], dict[int, tuple[int, ...]]()
     lengths = [np.linalg.norm(own.residuals, axis=1) for own in best.result.views]
@@ -362,13 +362,13 @@ def _wrong_keypoints(
     return (text, None, ()) if all_agree or len(wrong) > 1 else (text, *next(iter(wrong.items())))
 
 
-def named(likely: Sequence[tuple[Rule, Agreement]]) -> str:
-    """Names of rules that are as likely; first those of an upright object."""
+def name_rules(likely: Sequence[tuple[Rule, Agreement]]) -> str:
+    """Join the clauses of equally likely rules; rules with an upright object come first."""
     upright = {rule.clause: None for rule, each in likely if not each.posture}
     others = {rule.clause: None for rule, each in likely if rule.clause not in upright}
-    clauses = listed(list(upright or others)) if likely else ""
+    clauses = join_or(list(upright or others)) if likely else ""
     if upright and others:
-        clauses += f" (or, if y is not up in the photo, {listed(list(others))})"
+        clauses += f" (or, if y is not up in the photo, {join_or(list(others))})"
     return clauses
 
 

@@ -1,4 +1,4 @@
-"""`align`: the object's pose, stretch and shape from all that is known about it."""
+"""Estimate an object's pose, stretch and shape from all evidence: `align` and `align_batch`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from cadalign.estimation.problems import each_of, pack_one
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import LEAST_LIKELIHOOD, NO_NOTES, FitStats
 from cadalign.estimation.results import Results
-from cadalign.estimation.search import search, widened_by_noise
+from cadalign.estimation.search import search, widen_by_noise
 from cadalign.estimation.view import View, number_views
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import turned_alignment
@@ -50,7 +50,7 @@ from cadalign.solvers.marginal.search import search_view
 T = TypeVar("T")
 
 
-@np.errstate(all="ignore")  # what is not finite is refused
+@np.errstate(all="ignore")  # non-finite results are refused
 def align(
     model: Model | ShapeModel,
     views: View | Sequence[View],
@@ -68,30 +68,30 @@ def align(
     Parameters
     ----------
     model : Model or ShapeModel
-        One CAD model, exact, stretched, or only similar (``shape_sigma``); or the learned shape of
-        a category.
+        One CAD model, exact up to a stretch or only similar (``shape_sigma``); or the learned shape
+        of a category.
     views : View or sequence of View
-        Evidence of the images. Views with ``cam_from_rig`` share one pose and determine the
-        object's size; views without it have a pose each and share the stretch and the shape. Where
-        few views have keypoints, the masks of the others count with them: of a rig for every model,
-        else for an exact one with a mesh.
+        Evidence of each image. Views with ``cam_from_rig`` share one pose and determine the
+        object's size. Views without it have one pose each, and share the stretch and the shape.
+        In a rig, views with masks need no keypoints. Without keypoints and ``init``, a single mask
+        needs an exact model with a mesh.
     size : Size, optional
         Known lengths of the object.
     init : Alignment or sequence of Alignment or None, optional
-        A start beside those that the keypoints suggest, needed where these are too few: the
-        alignment in the rig's frame or, where the views have no ``cam_from_rig``, in the first
-        camera's, or one or None for each view.
+        Additional start of the search, needed if there are too few keypoints to find one: the
+        alignment in the rig's frame or, without ``cam_from_rig``, in the first camera's frame. A
+        sequence has one start, or None, for each view.
     loss, loss_scale
         As for `cadalign.fit`.
     ransac : RansacOptions, optional
-        Search for the keypoints that agree, for views with outliers. Where the shape is not exact,
-        or the focal length is unknown, ``minimal`` names the size of the samples, of which at most
-        ``max_iterations`` are drawn, and ``refine=False`` refines only once on the inliers.
+        Robust search, for keypoints with outliers. If the shape is not exact or the focal length is
+        unknown, ``minimal`` sets the size of the samples, ``max_iterations`` their largest number,
+        and ``refine=False`` refines only once on the inliers.
     focal : {"known", "estimate"}
-        Take the focal lengths of the views' cameras as right, or estimate them: views of equal
-        cameras share one. ``result.cameras`` have the estimates.
+        Use the cameras' focal lengths, or estimate them. Views with equal cameras share one focal
+        length. ``result.cameras`` have the estimates.
     focal_prior : FocalPrior, "usual" or None
-        Prior on focal lengths to be estimated, as for `cadalign.fit`.
+        Prior on the estimated focal lengths, as for `cadalign.fit`.
 
     Returns
     -------
@@ -102,13 +102,13 @@ def align(
     InputError
         If an argument is invalid, or a view names a keypoint that the model lacks.
     DegenerateError
-        If the keypoints are too few, or no estimate has them all in front of the cameras.
+        If there are too few keypoints, or no estimate has all of them in front of the cameras.
     NoConsensusError
-        With ``ransac``: if no estimate has more support by keypoints than chance gives.
+        With ``ransac``: if no estimate has more inliers than chance explains.
 
     Examples
     --------
-    A box of which the model's proportions are known to some 5 % of its size:
+    A box whose shape is known to about 5 % of its size:
 
     >>> from cadalign import Alignment, Camera
     >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
@@ -132,7 +132,7 @@ def align(
         return _align_plain(exact, given[0], options=options, ransac=ransac)
     problem = compile_problem(model, given, size, inits, options, ransac)
 
-    def again(
+    def estimate(
         model: Model | ShapeModel,
         views: Sequence[View],
         /,
@@ -145,7 +145,7 @@ def align(
 
     seen = [given[number] for number in problem.numbers]
     photo, is_tolerant = given[0].photo, loss != FitOptions.loss
-    case = DiagnosisCase(model, seen, again, ransac, size, photo=photo, is_tolerant=is_tolerant)
+    case = DiagnosisCase(model, seen, estimate, ransac, size, photo=photo, is_tolerant=is_tolerant)
     try:
         result = _estimate(problem, start)
     except (NoConsensusError, DegenerateError) as error:
@@ -156,7 +156,7 @@ def align(
 
 
 def _estimate(problem: Problem, start: float) -> Result:
-    """All stages of an estimate that was begun at ``start`` [s]."""
+    """Run all stages of an estimate; the time starts at ``start`` [s]."""
     if _is_single(problem):
         return _align_single(problem, start)
     starts = [problem.inits]
@@ -173,17 +173,17 @@ def _estimate(problem: Problem, start: float) -> Result:
 
         minima, notes = refine(problem, found)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
-    likely = widened_by_noise(problem, minima)
+    likely = widen_by_noise(problem, minima)
     return result_of_minima(problem, likely, stats, notes=notes)
 
 
 def _is_plain(model: object, views: Sequence[View]) -> bool:
-    """True where nothing but the keypoints of one view and an exact model is given."""
+    """True if the only evidence is one view's keypoints, and the model is exact."""
     return is_exact_model(model) and len(views) == 1 and not views[0].sources
 
 
 def _is_single(problem: Problem) -> bool:
-    """True where nothing but the keypoints of one view and a learned shape is given."""
+    """True if the only evidence is one view's keypoints, and the model is a learned shape."""
     if problem.numbers != [0] or not isinstance(problem.model, ShapeModel):
         return False
     view = problem.views[0]
@@ -208,7 +208,7 @@ def _align_plain(
 
 
 def _align_single(problem: Problem, start: float) -> Result:
-    """The result of `cadalign.align` where `_is_single` holds, which was begun at ``start`` [s]."""
+    """Align a learned shape to one view's keypoints; the time starts at ``start`` [s]."""
     model, view, options = cast(ShapeModel, problem.model), problem.views[0], problem.options
     prior, init = problem.prior, problem.inits[0]
     if init is not None:
@@ -268,7 +268,7 @@ def align_batch(
     focal_prior: PriorOption = FitOptions.focal_prior,
     workers: int = 1,
 ) -> Results:
-    """Align many objects of one kind; each as `align` does, bit for bit.
+    """Align many objects of one kind, with the same results as `align`, bit for bit.
 
     Parameters
     ----------
@@ -277,20 +277,19 @@ def align_batch(
     objects : sequence of View or of sequences of View
         The views of every object.
     size, init
-        As for `align`: one for all objects, or a sequence of one or None for each.
+        As for `align`: one for all objects, or a sequence with one or None for each.
     workers : int
         Number of threads that share the objects; -1 for all cores.
 
     Returns
     -------
     Results
-        A `Result` for each object; the error takes its place where an object has none. Its
-        ``to_dataframe`` makes a table of them.
+        A `Result`, or the error, for each object; ``to_dataframe`` makes a table of them.
 
     Raises
     ------
     InputError
-        If workers is invalid, or there are more or fewer sizes or starts than objects.
+        If workers is invalid, or the number of sizes or starts is not the number of objects.
 
     Examples
     --------
@@ -305,8 +304,8 @@ def align_batch(
     """
     threads = worker_count(workers)
     objects = each_of(objects, "objects", None, "views")
-    sizes = _one_each(size, len(objects), "size", Size, "objects")
-    starts = _one_each(init, len(objects), "init", Alignment, "objects")
+    sizes = _repeat(size, len(objects), "size", Size, "objects")
+    starts = _repeat(init, len(objects), "init", Alignment, "objects")
 
     options: dict[str, Any] = {
         "loss": loss,
@@ -330,18 +329,18 @@ def align_batch(
         return Results(list(pool.map(one, objects, sizes, starts)))
 
 
-def _one_each(
+def _repeat(
     given: T | Sequence[T | None] | None, count: int, where: str, kind: type[T], of: str
 ) -> list[T | None]:
-    """An argument given for each of so many objects or views, or for all."""
+    """A list of ``count`` arguments, from one for all or a sequence."""
     if given is None or isinstance(given, kind):
         return [given] * count
     if not isinstance(given, Sequence):
         what = f"expected a cadalign.{kind.__name__} or a sequence of them"
         raise InputError(f"{what}, got {type(given).__name__}", where=where)
     if len(given) != count:
-        fix = "give one for all, or one or None for each"
-        raise InputError(f"{len(given)} for {count} {of}", where=where, fix=fix)
+        fix = "give one for all, or a list with one or None for each"
+        raise InputError(f"{len(given)} given for {count} {of}", where=where, fix=fix)
     for number, each in enumerate(given):
         if each is not None and not isinstance(each, kind):
             what = f"expected a cadalign.{kind.__name__} or None, got {type(each).__name__}"
@@ -357,14 +356,14 @@ def _checked_views(given: object) -> list[View]:
         raise InputError(what, where="views", fix="give the model first, then the views")
     views = list(given)
     if not views:
-        raise InputError("none is given", where="views")
+        raise InputError("no views are given", where="views")
     for number, view in enumerate(views):
         require_kind(view, View, f"views[{number}]")
     return views
 
 
 def _check_numbers(model: object, views: Sequence[View]) -> None:
-    """Refuse views without ids that are not of all keypoints of a model, called 0, 1, 2, ..."""
+    """Refuse views without ids unless they show all keypoints, with ids 0, 1, 2, ..."""
     known = model.ids if isinstance(model, Model | ShapeModel) else ()
     for number, view in enumerate(views):
         count = len(view.keypoint_ids)
@@ -379,8 +378,8 @@ def _check_numbers(model: object, views: Sequence[View]) -> None:
 
 
 def _checked_inits(init: Any, views: Sequence[View]) -> list[Alignment | None]:
-    """A start or None for each view; for the first one where a single start is given."""
-    given = _one_each(init, len(views), "init", Alignment, "views")
+    """A start or None for each view; a single start is the first view's."""
+    given = _repeat(init, len(views), "init", Alignment, "views")
     if init is None or isinstance(init, Alignment) or views[0].cam_from_rig is not None:
         known = next((each for each in given if each is not None), None)  # a rig has one pose
         return [known, *[None] * (len(views) - 1)]

@@ -1,4 +1,4 @@
-"""From the solution of an exact or stretched model's keypoints in one view to their result."""
+"""Assemble the result of an exact model's keypoints in one view."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class KeypointPosterior(Posterior):
-    """Posterior of keypoints of one view, computed when it is asked for."""
+    """A posterior of keypoints in one view, computed on access."""
 
     keypoints: FittedKeypoints
     diagnosis: Diagnosis | None
@@ -84,7 +84,7 @@ def result_of_keypoints(
         "camera": fitted.camera,
         "alignment": fitted.alignment,
         "ids": rows if view is None else view.keypoint_ids,
-        "points_2d": points_2d.copy(),  # the caller may go on to change theirs
+        "points_2d": points_2d.copy(),  # the caller may change the array
         "residuals": fitted.residuals,
         "inliers": fitted.inliers,
         "posterior": posterior,
@@ -113,16 +113,16 @@ def result_of_keypoints(
 def _canonical(
     fitted: FittedKeypoints, points: FloatArray, symmetry: Symmetry
 ) -> tuple[FittedKeypoints, FloatArray]:
-    """Keypoints as the canonical one of equal alignments has them, and so points (m, 3)."""
-    from cadalign.estimation.symmetry import (  # few have one
-        distinct_ones,
+    """Move keypoints and points (m, 3) to the canonical alignment."""
+    from cadalign.estimation.symmetry import (  # most models have none
+        distinct_alignments,
         held_axes,
         transform_covariance,
     )
 
     held, covariance = held_axes(fitted.options.stretched_axes), fitted.fisher_covariance
     poses = [fitted.alignment, *(each.alignment for each in fitted.alternatives)]
-    (_, best), *others = distinct_ones(poses, covariance, symmetry, held)
+    (_, best), *others = distinct_alignments(poses, covariance, symmetry, held)
     if covariance is not None:
         covariance = transform_covariance(covariance, fitted.alignment, best, held)
     alternatives = tuple(

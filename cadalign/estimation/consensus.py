@@ -1,4 +1,4 @@
-"""Consensus of one view's keypoints: LO-RANSAC over the minimal solver, and its inliers' fit."""
+"""Fit one view's keypoints with outliers: LO-RANSAC, then a fit to the inliers."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ from cadalign.solvers.constants import LINEAR, POSE_SIZE, SAMPLE_SIZES
 from cadalign.solvers.evidence import KeypointEvidence
 from cadalign.solvers.ransac import Settings, ransac_kernel
 
-_MOST_EXHAUSTIVE = 1000  # subsets that are all tried rather than drawn from
-_CHANCE = 0.2  # bound on the expected number of models; 1 in 50 such problems has one
+_MOST_EXHAUSTIVE = 1000  # subsets, up to which all are tried
+_CHANCE = 0.2  # largest expected number of alignments by chance
 _INLIER_ROUNDS = 5
-_LEAST_CONFIDENCE = 0.01  # over the largest: none is never drawn
-_FIRST, _FACTOR = 4.0, 2.0  # thresholds [px] that are tried where the noise is unknown
-_WIDEST = 0.25  # threshold, over the keypoints' extent
+_LEAST_CONFIDENCE = 0.01  # relative to the largest, so that every keypoint can be drawn
+_FIRST, _FACTOR = 4.0, 2.0  # first threshold [px], and ratio of the next ones, at unknown noise
+_WIDEST = 0.25  # largest threshold, relative to the keypoints' extent
 
 
 @dataclass(frozen=True, eq=False)
 class RobustSearch:
-    """The only problem, and how to search for the keypoints that agree."""
+    """One problem with the options of its robust search."""
 
     problems: Problems
     options: FitOptions
@@ -53,7 +53,7 @@ class RobustSearch:
 
     @property
     def sample_size(self) -> int:
-        """Keypoints that determine an alignment; a focal length takes half of one."""
+        """Least number of keypoints that determine an alignment, and an unknown focal length."""
         size = SAMPLE_SIZES[MINIMAL_SOLVERS[self.ransac.minimal]]
         return size + (self.options.focal == "estimate")
 
@@ -63,17 +63,17 @@ class RobustSearch:
         return self.problems.camera.project_where_ahead(in_camera) - self.problems.points_2d
 
     def support(self, residuals: FloatArray, inliers: BoolArray) -> Support:
-        """The inliers (n,) that support an estimate with residuals (n, 2) [px]."""
+        """Support of an estimate with residuals (n, 2) [px] by inliers (n,)."""
         area = area_of(self.problems.points_2d, self.problems.camera, self.threshold)
         return Support(np.linalg.norm(residuals[inliers], axis=1), len(inliers), area)
 
     def log_chance(self, residuals: FloatArray, inliers: BoolArray) -> float:
-        """Log of the number of alignments that chance supports as well."""
+        """Log of the expected number of alignments with the same support by chance."""
         support = self.support(residuals, inliers)
         return log_expected_by_chance(support, self.sample_size, SOLUTIONS_OF_FOUR)
 
     def doubt(self, residuals: FloatArray, inliers: BoolArray) -> EstimateWarning | None:
-        """Warn where chance supports as many, and a moderate stretch alone speaks for them."""
+        """Warn if chance gives as many inliers, so that only a moderate stretch confirms them."""
         if self.log_chance(residuals, inliers) <= math.log(_CHANCE):
             return None
         return EstimateWarning(
@@ -90,11 +90,11 @@ def fit_robustly(
     scores: npt.ArrayLike | None,
     start: float,
 ) -> FittedKeypoints:
-    """Fit the only problem to the keypoints that support its best alignment.
+    """Fit one problem to the inliers of its best alignment.
 
-    Where neither noise nor threshold is known, the inliers of several that chance explains least
-    win. Raises NoConsensusError if chance gives as much support; InputError of too few keypoints or
-    wrong options; DegenerateError if all keypoints lie in one plane.
+    If neither noise nor threshold is known, several thresholds are tried, and the inliers that are
+    least likely by chance win. Raises NoConsensusError if chance explains the inliers; InputError
+    for too few keypoints or wrong options; DegenerateError if all keypoints lie in one plane.
     """
     if options.method != "optimal":
         raise InputError(
@@ -102,7 +102,7 @@ def fit_robustly(
             where="method",
             fix="leave it at 'optimal'; RansacOptions(minimal=...) names the minimal solver",
         )
-    given = replace(  # the caller may go on to change theirs
+    given = replace(  # the caller may change the arrays
         problems, points_3d=problems.points_3d.copy(), points_2d=problems.points_2d.copy()
     )
     trusted = None if scores is None else np.array(scores)
@@ -129,17 +129,17 @@ def fit_robustly(
 
 
 def _fit_to_inliers(search: RobustSearch, start: float) -> FittedKeypoints:
-    """Fit the keypoints within the threshold of the best hypothesis, until these don't change."""
+    """Fit the inliers of the best hypothesis until these don't change."""
     options, ransac, problems = search.options, search.ransac, search.problems
     if options.focal == "estimate":
-        # Only here: most cameras are calibrated, and its kernels take time to import.
+        # Imported here: most cameras are calibrated, and the kernels import slowly.
         from cadalign.estimation.joint import fit_jointly
 
         found = fit_jointly(problems, options, ransac, search.scores, start)
         return replace(found, search=search)
     alignment, inliers, iterations, hypotheses, score = _best_hypothesis(search)
     residuals = search.residuals_of(alignment)
-    share = 1.0  # of alignments by chance that are stretched as little
+    share = 1.0  # of alignments by chance with as little stretch
     if not options.prior_weight and options.stretched_axes:
         share = share_as_moderate(alignment.scale, len(options.stretched_axes))
     check_support(
@@ -160,13 +160,13 @@ def _fit_to_inliers(search: RobustSearch, start: float) -> FittedKeypoints:
         found,
         method=f"ransac-{found.method if ransac.refine else ransac.minimal}",
         stats=FitStats(iterations, hypotheses, time.perf_counter() - start),
-        # As many samples would find the support that a corrected mistake gives, which is more.
+        # A corrected mistake has more inliers, so that as many samples suffice for it.
         search=replace(search, ransac=replace(ransac, max_iterations=iterations)),
     )
 
 
 def _refine(search: RobustSearch, inliers: BoolArray) -> FittedKeypoints:
-    """The optimum of the inliers (n,), until these don't change; CadalignError if there is none."""
+    """Fit the inliers (n,) until these don't change; raises CadalignError without an optimum."""
     problems, sigma = search.problems, search.options.sigma
     points, pixels = problems.points_3d, problems.points_2d
     for last in range(_INLIER_ROUNDS + 1):
@@ -191,7 +191,7 @@ def _refine(search: RobustSearch, inliers: BoolArray) -> FittedKeypoints:
 
 
 def _best_hypothesis(search: RobustSearch) -> tuple[Alignment, BoolArray, int, int, float]:
-    """LO-RANSAC's best hypothesis, inliers (n,), samples, hypotheses and score [px^2]."""
+    """LO-RANSAC's best hypothesis, inliers (n,), numbers of samples and hypotheses, and score."""
     problems, options, ransac = search.problems, search.options, search.ransac
     camera, points = problems.camera, problems.points_3d
     count, minimal = len(points), MINIMAL_SOLVERS[ransac.minimal]
@@ -232,9 +232,9 @@ def _best_hypothesis(search: RobustSearch) -> tuple[Alignment, BoolArray, int, i
     )
     if not hypotheses and (plane := describe_plane(problems.points_3d)):
         raise DegenerateError(
-            f"{plane}: the samples of ransac determine nothing",
+            f"{plane}: samples of ransac do not determine an alignment",
             where="points_3d",
-            fix="leave ransac away: use loss='cauchy', with stretch= or stretch_sigma=",
+            fix="omit ransac: use loss='cauchy', with stretch= or stretch_sigma=",
         )
     pose = turned_poses(pose, facing.lens_from_camera)
     kept = np.empty(count, dtype=bool)
@@ -243,7 +243,7 @@ def _best_hypothesis(search: RobustSearch) -> tuple[Alignment, BoolArray, int, i
 
 
 def _confidence(scores: npt.ArrayLike | None, count: int) -> FloatArray:
-    """Shares of samples by scores (n,), empty where there are none, or all are alike."""
+    """Probabilities of keypoints (n,) in a sample, from scores; empty if these are equal."""
     if scores is None:
         return np.empty(0)
     values = as_floats(scores, name="scores", shape=(count,))

@@ -1,8 +1,8 @@
-"""Causes of residuals that fail their test, such as swapped coordinates or a wrong focal length.
+"""Diagnosis of large residuals: find their cause, such as swapped coordinates.
 
-Each cause is a `Rule`: what is undone in the data, what the estimate without it must explain, and
-what is said. Of the rules that explain the residuals the likeliest is named. To add one, list it in
-`_rules_for`, or in `_mistakes_in` if it is a usual mistake.
+A `Rule` describes a cause: how to correct the data, how much the corrected estimate must gain, and
+the text of its warning. The warning names the likeliest rule that explains the residuals. New rules
+are listed in `_rules_for`, or in `_mistakes_in` for common mistakes.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import DataError, quote
 from cadalign.estimation.agreement import (
-    AS_MANY_AGREE,
+    LEAST_GAIN,
     UNIT,
     Agreement,
     AnyModel,
     DiagnosisCase,
     Rule,
-    named,
+    name_rules,
     warning_of,
 )
 from cadalign.estimation.assemble import result_of_keypoints
@@ -34,7 +34,7 @@ from cadalign.estimation.fit import fit_once
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.problems import pack_one
-from cadalign.estimation.result_parts import EstimateWarning, FittedKeypoints, listed
+from cadalign.estimation.result_parts import EstimateWarning, FittedKeypoints, join_or
 from cadalign.estimation.view import View
 from cadalign.geometry.calibration import OTHER_SIZES
 from cadalign.geometry.camera import Camera
@@ -44,21 +44,20 @@ from cadalign.io.evidence import LENGTHS, Size
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
 
-_AS_LIKELY = 6.0  # difference of -2 log likelihoods of mistakes that are both named
-_MOST_INSIDE = 0.8  # share of the keypoints that lie in their image
-_CAMERA_GAIN = 19.5  # by a focal length of its own, by chance in one of 100,000
-_PER_EQUATION = 3.0  # gain that a piece of evidence must leave, without which there are fewer
-_MOST_VIEWS = 10  # those with the largest residuals, of which each is left out
-_APART = 5.0  # distance of pixels of one point, that is no noise [px]
+_EQUAL_LIKELIHOOD = 6.0  # largest difference of -2 log likelihoods of mistakes named together
+_LEAST_INSIDE = 0.8  # share of the keypoints that must lie in the image
+_CAMERA_GAIN = 19.5  # of -2 log likelihood, exceeded by chance in one of 100,000
+_EQUATION_PRICE = 3.0  # gain required for each equation that is left out
+_MOST_VIEWS = 10  # with the largest residuals, each left out in turn
+_LEAST_DISTANCE = 5.0  # distance between pixels of one point, beyond noise [px]
 _WRONG_UNIT = 100.0  # factor between an object's size and its model's
 
 
 @np.errstate(all="ignore")
 def diagnose(case: DiagnosisCase, *, result: Result | None = None) -> EstimateWarning | None:
-    """Name the likeliest cause without which all data agree, where the residuals fail their test.
+    """Name the likeliest cause of residuals that fail their test, or None.
 
-    ``case`` has the views that take part; the estimate is made again where it is not the
-    ``result``.
+    ``case`` has the views that take part. Without a ``result``, the estimate is computed.
     """
     if not any(len(view.keypoint_ids) for view in case.views):
         return None
@@ -67,20 +66,20 @@ def diagnose(case: DiagnosisCase, *, result: Result | None = None) -> EstimateWa
         return _size_warning(case, given)
     if given is None or any(view.has_outline for view in case.views):
         case = replace(case, views=_remove_outlines(case.views))
-        given = case.without(None)
+        given = case.correct(None)
     if given is None or not case.is_doubtful(given):
         return None
     if case.ransac is not None and given.inliers == given.keypoints and case.is_exact:
-        # Where perspective is weak, all keypoints agree with a mirrored model if with any.
-        first = case.without(MIRRORED)
+        # With weak perspective, a mirrored model fits as well.
+        first = case.correct(MIRRORED)
         if first is None or not case.explains(MIRRORED, first, given):
             return None
-    return _likeliest(case, given)
+    return _likeliest_cause(case, given)
 
 
-def _likeliest(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
+def _likeliest_cause(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
     rules = list(_mistakes_in(case)) if case.is_tolerant else list(_rules_for(case, given))
-    found = [(rule, each) for rule in rules if (each := case.without(rule)) is not None]
+    found = [(rule, each) for rule in rules if (each := case.correct(rule)) is not None]
     explaining = [each for each in found if case.explains(*each, given)]
     if not explaining:
         return (
@@ -89,10 +88,10 @@ def _likeliest(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
             else warning_of(case, MISFIT, given, given)
         )
     rule, best = max(explaining, key=lambda each: case.gain(each[0], each[1], given))
-    least = case.gain(rule, best, given) - _AS_LIKELY
+    least = case.gain(rule, best, given) - _EQUAL_LIKELIHOOD
     alike = [each for each in found if each[0].kind == rule.kind]
     likely = [each for each in alike if case.gain(*each, given) >= least]
-    return warning_of(case, rule, best, given, clauses=named(likely))
+    return warning_of(case, rule, best, given, clauses=name_rules(likely))
 
 
 def _remove_outlines(views: Sequence[View]) -> tuple[View, ...]:
@@ -104,9 +103,9 @@ def _remove_outlines(views: Sequence[View]) -> tuple[View, ...]:
 
 
 def _size_warning(case: DiagnosisCase, given: Agreement) -> EstimateWarning | None:
-    """The warning about measured lengths that make the object larger than any of its kind."""
+    """Warn of measured lengths that make the object implausibly large or small."""
     size = float(np.exp(np.log(given.result.alignment.scale).mean()))
-    fields = listed([f"`{name}`" for name in _measures_of(case)] or [""])
+    fields = join_or([f"`{name}`" for name in _measures_of(case)] or [""])
     if not fields or 1 / _WRONG_UNIT < size < _WRONG_UNIT:
         return None
     text = f"{fields}: the object is {size:.2g} times as large as the model, is it {UNIT}"
@@ -122,9 +121,9 @@ def _measures_of(case: DiagnosisCase) -> list[str]:
 def diagnose_fit(
     fitted: FittedKeypoints, *, labels: Sequence[Hashable] = (), **of_case: Any
 ) -> EstimateWarning | None:
-    """As `diagnose`, of keypoints in one view; after a robust search also of its inliers.
+    """Diagnose keypoints in one view; after a robust search also its inliers alone.
 
-    Messages name keypoints by their ``labels``, by default their rows.
+    Messages name keypoints by ``labels``, by default their rows.
     """
     search, options, counted = fitted.search, fitted.options, fitted.is_counted
     first = None if search is None else search.ransac
@@ -132,7 +131,7 @@ def diagnose_fit(
     if search and options.sigma is not None and fitted.fisher_covariance is not None:
         passes.append((fitted.inliers, None))
     for kept, ransac in passes:
-        # Samples need not be drawn where all agree.
+        # No samples are needed if all keypoints agree.
         drawn = None if fitted.inliers[counted].all() else ransac
         seen = fitted.points_3d, fitted.observed, fitted.camera
         case = case_of_fit(*seen, options, drawn, np.flatnonzero(kept).tolist())
@@ -143,7 +142,7 @@ def diagnose_fit(
 
 @np.errstate(all="ignore")
 def diagnose_refusal(case: DiagnosisCase, *, with_keypoints: bool = True) -> str | None:
-    """Name the mistake (in keypoints if ``with_keypoints``) without which there is an estimate."""
+    """Name the mistake (in keypoints if ``with_keypoints``) whose correction has an estimate."""
     shown = replace(case, views=_remove_outlines(case.views))
     if not shown.views:
         return None
@@ -151,13 +150,13 @@ def diagnose_refusal(case: DiagnosisCase, *, with_keypoints: bool = True) -> str
         (mistake, each)
         for mistake in (*_mistakes_in(shown), *_other_sizes(shown))
         if (with_keypoints or mistake in (INVERTED, DOWNWARD))
-        and (each := shown.without(mistake)) is not None
+        and (each := shown.correct(mistake)) is not None
     ]
     if not found:
         return None
     best = min((each for _, each in found), key=lambda each: each.score)
-    likely = [each for each in found if each[1].score <= best.score + _AS_LIKELY]
-    return f"{named(likely)}: corrected, {best.inliers} of {best.keypoints} keypoints agree"
+    likely = [each for each in found if each[1].score <= best.score + _EQUAL_LIKELIHOOD]
+    return f"{name_rules(likely)}: corrected, {best.inliers} of {best.keypoints} keypoints agree"
 
 
 def case_of_fit(
@@ -168,13 +167,13 @@ def case_of_fit(
     ransac: RansacOptions | None,
     rows: list[int] | None = None,
 ) -> DiagnosisCase:
-    """The case of a fit of a model's keypoints (n, 3) to those of an image, or of some rows."""
+    """The case of a fit of keypoints (n, 3) to pixels (n, 2), or of some rows of these."""
     if rows is not None:
         points_2d, options = points_2d[rows], options.for_keypoints(rows)
     seen = View(camera, points_2d, ids=rows, sigma=options.sigma)
     shape = {name: getattr(options, name) for name in ("stretch", "stretch_sigma")}
 
-    def again(model: AnyModel, views: Sequence[View], /, **changes: Any) -> Result:
+    def estimate(model: AnyModel, views: Sequence[View], /, **changes: Any) -> Result:
         exact, (view,) = cast(Model, model), views
         points = cast(FloatArray, exact.points_3d)[list(cast("tuple[int, ...]", view.keypoint_ids))]
         of_model = {"stretch": exact.stretch, "stretch_sigma": exact.stretch_sigma}
@@ -183,10 +182,12 @@ def case_of_fit(
         fitted = fit_once(pack_one(points, view.pixels, view.camera), own, search, None, 0.0)
         return result_of_keypoints(view.pixels, fitted, view=view)
 
-    return DiagnosisCase(Model(points_3d=points_3d, **shape), (seen,), again, ransac, has_rows=True)
+    return DiagnosisCase(
+        Model(points_3d=points_3d, **shape), (seen,), estimate, ransac, has_rows=True
+    )
 
 
-# Undone ------------------------------------------------------------------------------------------
+# Corrections -------------------------------------------------------------------------------------
 
 
 def _mirror(model: Model) -> Model:
@@ -203,7 +204,7 @@ def _flip(view: View, *, axis: int) -> View:
 
 
 def _resize(view: View, *, size: tuple[int, int], noise: float) -> View:
-    """The view of images of another size, with keypoints whose noise is larger by a factor."""
+    """Resize the view's camera, and scale the noise of its keypoints."""
     sigma, power = view.sigma, 2 if np.ndim(cast(FloatArray, view.sigma)) == 3 else 1
     if sigma is not None:
         sigma = np.asarray(sigma) * noise**power
@@ -237,7 +238,7 @@ def _remove_rows(view: View, *, number: int, rows: tuple[int, ...]) -> View:
 
 
 def _remove_field(view: View, *, number: int, name: str | None) -> View | None:
-    """The view without a field, or None for the whole view, if it has the number."""
+    """Remove a field of the view with a number; None removes the view."""
     if view.number != number:
         return view
     nothing: dict[str, Any] = {str(name): None}
@@ -273,7 +274,7 @@ MISFIT = Rule("misfit")
 def _rules_for(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
     model, fails = case.model, not case.has_chance(given)
     yield from _mistakes_in(case)
-    yield from _pairs_apart(case)
+    yield from _conflicting_pairs(case)
     yield from _other_sizes(case) if case.is_exact or fails else ()
     if case.is_plain and isinstance(model, Model) and fails:
         if model.stretch is not None or model.stretch_sigma is not None:
@@ -281,7 +282,7 @@ def _rules_for(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
         if given.result.focal == "known":
             yield ANOTHER_FOCAL
     if fails or case.has_contradiction(given):
-        least = OUTLIERS.gain if case.is_exact else AS_MANY_AGREE
+        least = OUTLIERS.gain if case.is_exact else LEAST_GAIN
         yield from () if case.ransac else (OUTLIERS._replace(gain=least),)
     if fails or not case.is_exact or case.has_contradiction(given):
         yield from _pieces_of(case, given)
@@ -309,8 +310,8 @@ def _mistakes_in(case: DiagnosisCase) -> Iterator[Rule]:
             yield Rule("unit", f"`{name}`", undo, changes=changes)
 
 
-def _pairs_apart(case: DiagnosisCase) -> Iterator[Rule]:
-    """One point of the model that is paired with two pixels."""
+def _conflicting_pairs(case: DiagnosisCase) -> Iterator[Rule]:
+    """Rules for points of the model that are paired with two pixels."""
     if not isinstance(case.model, Model):
         return
     points = dict(zip(case.model.ids or (), cast(FloatArray, case.model.points_3d), strict=True))
@@ -318,7 +319,7 @@ def _pairs_apart(case: DiagnosisCase) -> Iterator[Rule]:
         names, places = view.keypoint_ids, [points[name] for name in view.keypoint_ids]
         for a, b in combinations(range(len(names)), 2):
             apart = float(np.linalg.norm(view.pixels[a] - view.pixels[b]))
-            if apart > _APART and np.array_equal(places[a], places[b]):
+            if apart > _LEAST_DISTANCE and np.array_equal(places[a], places[b]):
                 clause = f"keypoints {quote(names[a])} and {quote(names[b])} are one point of the "
                 clause += f"model and lie {apart:.3g} px apart"
                 undo = partial(_remove_rows, number=view.number, rows=(a, b))
@@ -326,10 +327,10 @@ def _pairs_apart(case: DiagnosisCase) -> Iterator[Rule]:
 
 
 def _other_sizes(case: DiagnosisCase) -> Iterator[Rule]:
-    """Mistakes in the resolution of keypoints, whose noise may grow with it."""
+    """Rules for keypoints from an image of another size, whose noise may scale with it."""
     camera, points = case.views[0].camera, np.concatenate([view.pixels for view in case.views])
     sizes = {(view.camera.width, view.camera.height) for view in case.views}
-    # Another size leaves much open, so that other evidence which is wrong would pass for it.
+    # Another size fits so flexibly that it would explain errors in other evidence.
     if len(sizes) > 1 or any(view.sources for view in case.views):
         return
     if case.photo is not None:
@@ -341,13 +342,13 @@ def _other_sizes(case: DiagnosisCase) -> Iterator[Rule]:
 
     def holds_most(factor: float) -> bool:
         inside = camera.contains(rescaled_pixels(points, 1 / factor))
-        return bool(inside.sum() > _MOST_INSIDE * len(points))
+        return bool(inside.sum() > _LEAST_INSIDE * len(points))
 
     own, is_inside = f"{camera.width} x {camera.height} px", holds_most(1.0)
     lie_inside = bool(camera.contains(points).all())
     for factor in OTHER_SIZES:
         is_usual = (factor > 1) != is_inside and (factor > 1 or case.ransac is None)
-        if not holds_most(factor) or (factor > 1 and lie_inside):  # a contradiction
+        if not holds_most(factor) or (factor > 1 and lie_inside):  # inside already
             continue
         if not case.is_plain and not is_usual:
             continue
@@ -359,18 +360,18 @@ def _other_sizes(case: DiagnosisCase) -> Iterator[Rule]:
 
 
 def _contradicts(case: DiagnosisCase, given: Agreement) -> bool:
-    """True if a shape that bends to a piece of evidence is much likelier without it."""
+    """True if an uncertain shape fits much better without one piece of evidence."""
     return not case.is_exact and any(
         found is not None and case.explains(piece, found, given)
         for piece in _pieces_of(case, given)
-        for found in [case.without(piece)]
+        for found in [case.correct(piece)]
     )
 
 
 def _pieces_of(case: DiagnosisCase, given: Agreement) -> Iterator[Rule]:
-    """Each piece of evidence beside others, and each of several views, is left out."""
+    """Rules that leave out one piece of evidence, or one of several views."""
     is_rig = case.views[0].cam_from_rig is not None
-    piece = partial(Rule, "contradiction", price=_PER_EQUATION)
+    piece = partial(Rule, "contradiction", price=_EQUATION_PRICE)
     for place in np.argsort(-np.array(given.squares), kind="stable")[:_MOST_VIEWS].tolist():
         view = case.views[place]
         fields = ("up", "depth", "camera_height")

@@ -1,7 +1,6 @@
-"""The JSON form of a result, as `fit.json` holds it.
+"""The JSON form of a result, as in `fit.json`.
 
-A class of this module declares the fields of a class of the estimator, of equal names: it is read
-against them and written by them.
+A class of this module declares the fields of an estimator's class, for reading and for writing.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ from cadalign.io.focal import FocalPrior
 Matrix = list[list[Finite]]
 Matrix3 = tuple[Point3, Point3, Point3]
 _REPEATED = ("rms", "std", "covariance")
-"""Properties of a result that a file holds for other readers, beside the first view's."""
+"""Properties of the first view that a file repeats at the top level for other readers."""
 _OF_POINTS = ("points_covariance", "points_cam_covariance")
 _OF_POSTERIOR = (*("fisher_covariance", *_OF_POINTS, "degrees_of_freedom", "warnings", "evidence"),)
 
@@ -73,7 +72,7 @@ class _View(ForeignDocument):
 
 
 class _Summary(ForeignDocument):
-    """The fields of `EvidenceSummary`; null for the residual of a mask that was left out."""
+    """The fields of `EvidenceSummary`; the residual of an omitted mask is null."""
 
     kind: str
     view: int | None
@@ -132,7 +131,7 @@ _FORMS: Mapping[type, type[ForeignDocument]] = {
 
 
 def write_result(result: Any) -> dict[str, Any]:
-    """A result as plain lists and numbers; its model is not part of it."""
+    """Convert a result, without its model, to plain lists and numbers."""
     posterior = {name: getattr(result.posterior, name) for name in _OF_POSTERIOR}
     others = {"version": 1, **posterior, "own_stretch": result.stretch}
     written = _fields(result, _Result, others)
@@ -141,7 +140,7 @@ def write_result(result: Any) -> dict[str, Any]:
 
 
 def _fields(value: Any, form: type[ForeignDocument], others: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of a value, and ``others``, that a form declares, by its names in files."""
+    """The fields that a form declares, from a value or ``others``, by their names in files."""
     names = zip(form.__struct_fields__, form.__struct_encode_fields__, strict=True)
     return {
         written: _plain(others[name] if name in others else getattr(value, name))
@@ -153,7 +152,7 @@ _SCALARS = {int, str, bool, type(None)}
 
 
 def _plain(value: Any) -> Any:
-    """A value as lists, mappings and numbers; null for a number or a row that is not finite."""
+    """Convert to lists, mappings and numbers; numbers and rows that are not finite are null."""
     kind = type(value)
     if kind in _SCALARS:
         return value
@@ -190,11 +189,11 @@ _VALUES: Mapping[str, Callable[[Any], Any]] = {
     **dict.fromkeys(("own_bounds", "own_stretch"), np.array),
     **dict.fromkeys(_OF_POINTS, lambda rows: np.array(rows).reshape(-1, 3, 3)),
 }
-"""What makes a field's value of its form in a file, where that is another one."""
+"""Functions that convert a field's value from its form in a file."""
 
 
 def read_result(data: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of a `cadalign.Result` from its parsed form; InputError if one is invalid."""
+    """The fields of a `cadalign.Result` from its parsed form; raises InputError if invalid."""
     try:
         with np.errstate(over="ignore", invalid="ignore"):
             return _result(convert(data, _Result))

@@ -1,7 +1,7 @@
-"""Likely estimates in the terms of the result: covariances, boxes, and moments of their mixture.
+"""Likely estimates in terms of the result: covariances, boxes, and moments of their mixture.
 
-A face of the box that an outermost keypoint determines moves with it: its row of the shape becomes
-that of the keypoint, shifted by the margin.
+If an outermost keypoint determines a face of the box, the face moves with it: the face's row of the
+shape is the keypoint's row, shifted by the margin.
 """
 
 from __future__ import annotations
@@ -16,7 +16,11 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.problem import Problem
-from cadalign.estimation.symmetry import distinct_ones, remove_free_turns, transform_covariance
+from cadalign.estimation.symmetry import (
+    distinct_alignments,
+    remove_free_turns,
+    transform_covariance,
+)
 from cadalign.estimation.uncertainty.residuals import loss_weights, whitening_matrices
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, turned_alignment, turned_covariance
@@ -30,7 +34,7 @@ from cadalign.solvers.marginal.problem import Mixture, Seen, coordinates_of, sha
 from cadalign.solvers.projection import ray_derivatives
 
 _Held = tuple[bool, bool, bool]
-_ALONG_AXES = 1e-6  # of a rotation's entries, that are 0 or 1 where it takes axes to axes
+_ALONG_AXES = 1e-6  # of a rotation's entries from 0 or 1, if it maps axes to axes
 
 
 def mean_state(evidence: Evidence, poses: FloatArray, log_scales: FloatArray) -> State:
@@ -45,7 +49,7 @@ def pose_and_lengths(
 ) -> FloatArray:
     """Covariance (9, 9) of a camera's pose and log lengths; (10, 10) with the log focal length.
 
-    ``unknowns`` is that of `cadalign.solvers.joint.covariance.pose_and_border`.
+    ``unknowns`` is the covariance from `cadalign.solvers.joint.covariance.pose_and_border`.
     """
     shape, rig = evidence.shape, evidence.rig
     rotation = rig.cam_from_rig[view][:9].reshape(3, 3)
@@ -61,8 +65,8 @@ def pose_and_lengths(
     safe = np.where(extent > 0, extent, np.inf)
     rows[6:9, first : first + 3] = np.eye(3)
     rows[6:9, first + 3 :] = (modes / safe).T
-    # Of a measured length's residual the corners' own displacements explain a share: the weight of
-    # a length counts these, of variance ``own``, as part of its noise.
+    # The weight of a measured length includes the variance ``own`` of the corners' displacements as
+    # noise. So these explain a share of the length's residual.
     own = (shape.spread[-2:] ** 2).sum()
     offsets, explained = evidence.offsets, np.zeros(3)
     of_box = (offsets.ends == [len(shape.mean) - 2, len(shape.mean) - 1]).all(1)
@@ -88,11 +92,11 @@ def poses_of(evidence: Evidence, state: State) -> list[Alignment]:
 
 
 def curvature_of_rotations(covariance: FloatArray) -> FloatArray:
-    """Covariance (3, 3) that a linearisation leaves out of large rotation errors [rad squared].
+    """Second-order covariance (3, 3) of large rotation errors [rad squared].
 
-    Of rotation vectors a and b, exp(a) exp(b) has the vector a + b + a x b / 2 + ... (Baker,
-    Campbell, Hausdorff): for independent a and b of covariance C, the second-order term has adj(C)
-    / 2. It matters beyond some 20 degrees, for slender objects, which may roll and tilt.
+    For rotation vectors a and b, exp(a) exp(b) has the vector a + b + a x b / 2 + ... (Baker,
+    Campbell, Hausdorff). For independent a and b of covariance C, the second-order term has the
+    covariance adj(C) / 2. It matters beyond about 20 degrees.
     """
     variances, axes = np.linalg.eigh(covariance)
     x, y, z = np.maximum(variances, 0.0)
@@ -100,9 +104,9 @@ def curvature_of_rotations(covariance: FloatArray) -> FloatArray:
 
 
 def estimate_box(evidence: Evidence, state: State, prior: ShapePrior) -> tuple[Evidence, State]:
-    """Evidence and state whose box has those faces that outermost keypoints determine at these.
+    """Move the box's faces to the outermost keypoints that determine them.
 
-    Where measured distances determine the box, it remains the linear one.
+    Measured distances determine the linear box, which then stays.
     """
     shape, keypoints = evidence.shape, len(prior.ids)
     seen = np.unique(evidence.sightings.point)
@@ -110,7 +114,7 @@ def estimate_box(evidence: Evidence, state: State, prior: ShapePrior) -> tuple[E
     if len(evidence.offsets.value) or not len(shape.modes) or not len(seen):
         return evidence, state
     points = points_of(shape, state) / np.exp(state.log_scales)
-    bounds, own = placed_box(points, keypoints, seen, prior)
+    bounds, own = place_box(points, keypoints, seen, prior)
     axes = np.arange(3)
     mean, modes = shape.mean.copy(), shape.modes.copy()
     displacements = state.displacements.copy()
@@ -121,13 +125,13 @@ def estimate_box(evidence: Evidence, state: State, prior: ShapePrior) -> tuple[E
     return placed, state._replace(displacements=displacements)
 
 
-def placed_box(
+def place_box(
     points: FloatArray, keypoints: int, seen: IntArray, model: ShapePrior | ShapeModel
 ) -> tuple[FloatArray, IntArray]:
-    """Corners (2, 3) of the box of points (m, 3), and the points (2, 3) that its faces vary with.
+    """Corners (2, 3) of the box of points (m, 3), and rows (2, 3) of points that determine it.
 
-    The last two points are the linear box. Without a box in the ``model`` it is the keypoints'
-    extent; otherwise margins tell where keypoints that are ``seen`` determine it.
+    The last two points are the linear box. A ``model`` without a box has the keypoints' extent;
+    otherwise margins select faces that ``seen`` keypoints determine.
     """
     linear, rows = points[-2:], seen if model.has_box else np.arange(keypoints)
     extreme = rows[np.array([points[rows].argmin(axis=0), points[rows].argmax(axis=0)])]
@@ -140,8 +144,8 @@ def placed_box(
     return bounds, np.where(bounds != linear, extreme, own)
 
 
-def widened_boxes(points: FloatArray, rows: IntArray) -> FloatArray:
-    """Points (..., m, 3), whose last two are a box, with one that holds those of ``rows``."""
+def enlarge_boxes(points: FloatArray, rows: IntArray) -> FloatArray:
+    """Enlarge the box, the last two of points (..., m, 3), to contain the points ``rows``."""
     widened, seen = points.copy(), points[..., rows, :]
     widened[..., -2, :] = np.minimum(points[..., -2, :], seen.min(axis=-2, initial=np.inf))
     widened[..., -1, :] = np.maximum(points[..., -1, :], seen.max(axis=-2, initial=-np.inf))
@@ -151,9 +155,9 @@ def widened_boxes(points: FloatArray, rows: IntArray) -> FloatArray:
 class Estimate(NamedTuple):
     """An estimate: points (m, 3), the box's corners last, poses, and covariances.
 
-    Poses, covariances (9, 9) and cameras are those of every view that takes part, in the frames of
-    the given cameras; ``of_points`` (m, 3, 3) are in the model's frame, ``of_seen``, with the pose,
-    in the first camera's.
+    Poses, covariances (9, 9) and cameras are given for each view that takes part, in the frames of
+    the given cameras. ``of_points`` (m, 3, 3) are covariances of the points in the model's frame,
+    ``of_seen`` in the first camera's frame, including the pose.
     """
 
     points: FloatArray
@@ -172,7 +176,7 @@ class Estimate(NamedTuple):
 
 
 def undo_turns(estimate: Estimate, problem: Problem) -> Estimate:
-    """An estimate in the frames of turned lenses as that in the frames that were given."""
+    """Transform an estimate from turned cameras to the given cameras."""
     numbers = problem.numbers
     turns = [problem.turns[number] for number in numbers]
     first = turns[0]
@@ -191,7 +195,7 @@ def undo_turns(estimate: Estimate, problem: Problem) -> Estimate:
 
 
 def steps_between(estimates: Sequence[Estimate], view: int) -> FloatArray:
-    """Steps (L, k) from the first estimate, in a view's camera, in the order of covariances."""
+    """Steps (L, k) from the first estimate in a view's camera, with a covariance's unknowns."""
     best, *others = estimates
     steps: list[list[float]] = [[0.0] * 10]
     start, before = best.poses[view], [*best.lengths.tolist(), best.cameras[view].fx]
@@ -206,7 +210,7 @@ def steps_between(estimates: Sequence[Estimate], view: int) -> FloatArray:
 def second_moments(
     estimates: Sequence[Estimate], covariances: Sequence[FloatArray], places: FloatArray
 ) -> FloatArray:
-    """Second moments (..., k, k) about the first of estimates at ``places`` (L, ..., k)."""
+    """Second moments (..., k, k) of estimates at ``places`` (L, ..., k) about the first."""
     if len(estimates) == 1:
         return covariances[0].copy()
     weights = np.array([each.likelihood for each in estimates])
@@ -215,14 +219,14 @@ def second_moments(
     return np.tensordot(weights / weights.sum(), np.array(covariances) + squares, axes=1)
 
 
-def one_of_equals(
+def canonical_estimates(
     likely: Sequence[Estimate], symmetry: Symmetry | None, held: _Held
 ) -> Sequence[Estimate]:
-    """Canonical estimates, without those equal to the first; ``held`` are axes of held scale."""
+    """Canonical estimates without duplicates of the first; ``held`` axes have a fixed scale."""
     if symmetry is None or symmetry.is_trivial:
         return likely
     poses, covariance = [each.poses[0] for each in likely], likely[0].covariances[0]
-    found = distinct_ones(poses, covariance, symmetry, held)
+    found = distinct_alignments(poses, covariance, symmetry, held)
     return [_transform(likely[k], equal) for k, equal in found]
 
 
@@ -238,7 +242,7 @@ def _transform(estimate: Estimate, best: Equal) -> Estimate:
     points = best.relabelled(estimate.points)
     entries = np.abs(turn)
     if (np.minimum(entries, 1 - entries) > _ALONG_AXES).any():
-        points[-2:] = estimate.points[-2:]  # a box that leaves the axes stays as the symmetric is
+        points[-2:] = estimate.points[-2:]  # a turned box would not be axis-aligned
     else:
         points[-2:] = np.sort(points[-2:], axis=0)
     return estimate._replace(
@@ -261,7 +265,7 @@ def linearise(
     weights = loss_weights((errors**2).sum(axis=1), seen.loss, seen.loss_scale)
     roots = np.sqrt(weights)[:, None]
     by_pose *= roots[..., None]
-    blocks = np.zeros((count, 2, count, 3))  # a translation moves every point alike
+    blocks = np.zeros((count, 2, count, 3))  # a translation moves all points equally
     np.einsum("iaib->iab", blocks)[:] = by_pose[..., 3:] @ pose.linear
     rows = blocks.reshape(2 * count, 3 * count)
     return (roots * errors).ravel(), rows, by_pose.reshape(2 * count, POSE_UNKNOWNS)
@@ -275,10 +279,9 @@ def single_posterior(
     inflation: float,
     model: ShapeModel | None = None,
 ) -> Estimate:
-    """The estimate at a state (D,) of a component, with its posterior; infinite without a pose.
+    """The posterior at a state (D,) of a component; infinite if the pose is undetermined.
 
-    The prior's deviations are widened by the ``inflation``. The box holds the keypoints that are
-    seen.
+    ``inflation`` scales the prior's deviations. The box contains the seen keypoints.
     """
     count, m = len(seen.points), mixture.means.shape[1]
     rotation = state[:9].reshape(3, 3)
@@ -286,12 +289,12 @@ def single_posterior(
     points = shape_at(mixture, component, seen, state)
     prior, columns = inflation**2 * mixture.covariances[component], coordinates_of(seen)
     if model is not None:
-        points[-2:], faces = placed_box(points, len(model.ids), seen.points, model)
+        points[-2:], faces = place_box(points, len(model.ids), seen.points, model)
         own = np.append(np.arange(3 * m - 6), 3 * faces + np.arange(3))
         prior = prior[np.ix_(own, own)]
-    boxed, still = widened_boxes(points, seen.points), np.ones(3)
+    boxed, still = enlarge_boxes(points, seen.points), np.ones(3)
     _, rows, jacobian = linearise(points[seen.points], pose, seen)
-    # Behind the points, the difference of the box's corners.
+    # The last row is the difference of the box's corners.
     prior = np.concatenate([prior, prior[-3:] - prior[-6:-3]])
     prior = np.concatenate([prior, prior[:, -3:] - prior[:, -6:-3]], axis=1)
     across = prior[:, columns] @ rows.T  # covariance of points with residuals

@@ -1,4 +1,4 @@
-"""`fit` and `fit_batch`: from keypoints on models and in images to the models' alignments."""
+"""Estimate alignments from matched 3D and 2D keypoints: `fit` and `fit_batch`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from cadalign.io.focal import PriorOption
 from cadalign.solvers.constants import POSE_SIZE
 
 
-@np.errstate(all="ignore")  # what is not finite is refused
+@np.errstate(all="ignore")  # non-finite results are refused
 def fit(
     points_3d: npt.ArrayLike,
     points_2d: npt.ArrayLike,
@@ -58,53 +58,53 @@ def fit(
     Parameters
     ----------
     points_3d : (n, 3) float
-        Keypoints on the model, in the model's own coordinates.
+        Keypoints on the model, in the model's coordinates.
     points_2d : (n, 2) float
         The same keypoints in the image [px]; integers are pixel centres.
     camera : Camera
-        The calibrated camera. Lens distortion is honoured. Where the focal length is estimated,
-        that of the camera counts for nothing: `Camera.without_focal` has none.
+        The calibrated camera, with its lens distortion. With ``focal="estimate"`` its focal length
+        is ignored: `Camera.without_focal` has none.
     method : {"optimal", "aepnp", "aepnp-paper", "epnp"}
-        - ``optimal``: the maximum-likelihood alignment, searched for globally. From 5 points up;
-          4 points give every alignment that reprojects exactly, that with the least stretch
-          first.
+        - ``optimal``: global search for the maximum-likelihood alignment; at least 5 points. With
+          4 points, all alignments that reproject exactly, the least stretched first.
         - ``aepnp``: the linear solver, see `cadalign.solvers.aepnp`; at least 6 points.
         - ``aepnp-paper``: the solver of the AEPnP paper, as published; at least 6 points.
         - ``epnp``: OpenCV's EPnP, which does not stretch the model; at least 4 points.
     sigma : float, (n,) float, (n, 2, 2) float or None
-        Standard deviation of the keypoints, of each keypoint, or covariance of each [px]. None
-        estimates it from the residuals: the choice for a model that is only similar to the object,
-        where shapes differ by more than the pixels' noise.
+        Standard deviation of all keypoints or of each [px], or covariance of each [px^2]. None
+        estimates it from the residuals. Use None for a model that is only similar to the object:
+        the shapes then differ by more than the pixel noise.
     loss : {"linear", "huber", "cauchy"}
-        Loss on the length of a residual: its square, or less once it exceeds ``loss_scale``.
+        Loss function of a residual's length: its square, or a robust loss.
     loss_scale : float
-        Length at which a robust loss begins to bend [sigma].
+        Scale of a robust loss [sigma].
     stretch : str, optional
-        The axes whose scale is estimated: ``"yz"`` (the default), ``"y"``, ``"z"`` or ``"none"``.
-        The others keep the scale 1; x always does, since one image leaves size and distance open.
+        Axes whose scale is estimated: ``"yz"`` (the default), ``"y"``, ``"z"`` or ``"none"``. All
+        other scales are 1. The scale of x is always 1, since one image does not separate size from
+        distance.
     stretch_sigma : float, optional
         Standard deviation of a Gaussian prior on the logarithm of each scale, about the scale 1.
-        It keeps keypoints in one plane, or seen end-on, solvable. By default the prior is flat from
-        1/5 to 5 and falls off beyond: it bounds what keypoints leave open, and moves nothing else.
+        Needed for keypoints in one plane or seen end-on. The default prior is flat from 1/5 to 5
+        and falls off beyond: it only bounds scales that the keypoints do not determine.
     focal : {"known", "estimate"}
-        Take the camera's focal length as right, or estimate it too: a ninth unknown, for which
-        5 points are needed. ``result.camera`` has the estimate. Principal point and shape of the
-        pixels are the camera's.
+        Use the camera's focal length, or estimate it as a ninth unknown, which needs 5 points.
+        ``result.camera`` has the estimate. Principal point and pixel aspect ratio are never
+        estimated.
     focal_prior : FocalPrior, "usual" or None
-        Prior on a focal length to be estimated, for example from `FocalPrior.from_exif`; by default
-        that of usual lenses, `FocalPrior.of_usual_lenses`; None for none.
+        Prior on the estimated focal length, for example from `FocalPrior.from_exif`. The default
+        covers usual lenses, see `FocalPrior.of_usual_lenses`. None for no prior.
     ransac : RansacOptions, optional
-        Search for the alignment with the most inliers, and fit to these: for keypoints with
-        outliers. ``result.inliers`` marks the inliers. With an unknown focal length as for
-        `cadalign.align`.
+        Robust search, for keypoints with outliers: find the alignment with the most inliers, then
+        fit to these. ``result.inliers`` marks them. With an unknown focal length the options have
+        the meaning stated for `cadalign.align`.
     scores : (n,) float, optional
-        Confidences of the keypoints, for ``ransac``: every other sample is drawn by them.
+        Confidences of the keypoints, for ``ransac``: the weights of every second sample.
     symmetry : Symmetry, optional
-        Motions that take the model to itself. The result is, among the alignments that are equal
-        under it, the one nearest to upright, y up, with the model's z axis towards the camera, and
-        no other is an alternative; ``points_3d`` are the keypoints as this one has them. A stretch
-        that differs across an axis leaves half turns of its rotations; ``stretch="y"`` keeps round
-        what is round about y. See `cadalign.geometry.symmetry`.
+        Motions that map the model to itself. Of all equivalent alignments, the result is the
+        canonical one: nearest to upright (y up), with the model's z axis towards the camera.
+        The others are no alternatives. ``result.points_3d`` are the keypoints of the canonical
+        alignment. If the stretch differs across an axis, only half turns about it stay symmetries;
+        ``stretch="y"`` keeps rotational symmetry about y. See `cadalign.geometry.symmetry`.
 
     Returns
     -------
@@ -115,10 +115,10 @@ def fit(
     InputError
         If shapes don't match, a value is NaN or infinite, or an option is invalid.
     DegenerateError
-        If the points are too few or don't determine the alignment (the message says which part of
-        it), or no solution has them all in front of the camera.
+        If there are too few points, they don't determine the alignment (the message names the
+        part), or no solution has all points in front of the camera.
     NoConsensusError
-        With ``ransac``: if no alignment has more support than chance gives.
+        With ``ransac``: if no alignment has more inliers than chance explains.
 
     Examples
     --------
@@ -172,17 +172,17 @@ def fit_one(
     start: float,
     labels: Sequence[Hashable] = (),
     photo: str | os.PathLike[str] | None = None,
-    **seen: Any,
+    **fields: Any,
 ) -> Result:
-    """Fit the only problem, begun at ``start`` [s]; ``seen`` as of `result_of_keypoints`.
+    """Fit one problem; the time starts at ``start`` [s].
 
-    Warnings name the keypoints by their ``labels``, by default their rows, and suppose no other
-    size of images where the ``photo`` has the camera's.
+    Warnings name keypoints by ``labels``, by default their rows. If the ``photo`` has the camera's
+    size, no warning suggests another size. `result_of_keypoints` takes ``fields``.
     """
     try:
         fitted = fit_once(problems, options, ransac, scores, start)
     except NoConsensusError as error:
-        from cadalign.estimation.diagnose import case_of_fit, diagnose_refusal  # makes fits anew
+        from cadalign.estimation.diagnose import case_of_fit, diagnose_refusal  # needs fit itself
 
         given = problems.points_3d, problems.points_2d, problems.camera
         case = case_of_fit(*given, options, ransac, sorted(set(first_rows(problems))) or None)
@@ -193,7 +193,7 @@ def fit_one(
         fitted,
         diagnosis=partial(diagnosis_of_fit, labels=tuple(labels), photo=photo),
         symmetry=symmetry,
-        **seen,
+        **fields,
     )
 
 
@@ -210,13 +210,13 @@ def fit_once(
     scores: npt.ArrayLike | None,
     start: float,
 ) -> FittedKeypoints:
-    """Fit the only problem, without a diagnosis of keypoints that no alignment explains."""
+    """Fit one problem, without a diagnosis of its residuals."""
     if firsts := first_rows(problems):
         return _fit_distinct(firsts, problems, options, ransac, scores, start)
     options = options.for_camera(problems.camera)
     if ransac is None:
         return fit_keypoints(problems, options, start)
-    # Only here: most programs never search for outliers, and its kernels take time to import.
+    # Imported here: most programs never search for outliers, and its kernels import slowly.
     from cadalign.estimation.consensus import fit_robustly
 
     return fit_robustly(problems, options, ransac, scores, start)
@@ -230,7 +230,7 @@ def _fit_distinct(
     scores: npt.ArrayLike | None,
     start: float,
 ) -> FittedKeypoints:
-    """Fit the first rows; the others, which repeat them, are no inliers and have residuals."""
+    """Fit the rows ``firsts``; repeated keypoints have residuals, but are no inliers."""
     rows, points, pixels = sorted(set(firsts)), problems.points_3d.copy(), problems.points_2d
     own = options.for_keypoints(rows)
     scores = None if scores is None else np.asarray(scores)[rows]
@@ -249,7 +249,7 @@ def _fit_distinct(
     )
 
 
-# Checking options takes as long as solving a small problem linearly, and calls repeat them.
+# Checking options takes as long as a linear solver, and calls often repeat the options.
 _checked_options = lru_cache(maxsize=64, typed=True)(FitOptions)
 
 
@@ -271,7 +271,7 @@ def fit_batch(
     symmetry: Symmetry | None = None,
     workers: int = 1,
 ) -> Results:
-    """Solve many independent problems in one call; each as `fit` does, bit for bit.
+    """Solve many independent problems in one call, with the same results as `fit`, bit for bit.
 
     Parameters
     ----------
@@ -297,8 +297,8 @@ def fit_batch(
     Returns
     -------
     Results
-        Arrays over the problems, and a sequence of their `Result`; a problem without solution has
-        its error there, and does not stop the others.
+        Arrays over the problems, and a sequence of one `Result` or error each. A problem without
+        solution does not stop the others.
 
     Raises
     ------
@@ -358,7 +358,7 @@ def fit_batch(
 
 
 def _solve_at_once(each: Sequence[Problems], options: FitOptions) -> tuple[list[Entry], FloatArray]:
-    """The entries of `Results`, each made when it is asked for, and their table (B, 17)."""
+    """Entries of `Results`, computed on access, and their table (B, 17)."""
     problems = join_problems(each)
     solutions = solve(problems, options)
     squares = np.append((solutions.residuals**2).sum(axis=1), 0.0)
@@ -369,12 +369,12 @@ def _solve_at_once(each: Sequence[Problems], options: FitOptions) -> tuple[list[
     errors = solutions.errors
     table[list(errors)] = np.nan
     return [
-        errors.get(b) or partial(_single, problems, b, options) for b in range(len(each))
+        errors.get(b) or partial(_fit_row, problems, b, options) for b in range(len(each))
     ], table
 
 
-def _single(problems: Problems, b: int, options: FitOptions) -> Result:
-    """The result of problem ``b``, which has a solution: that of `cadalign.fit`."""
+def _fit_row(problems: Problems, b: int, options: FitOptions) -> Result:
+    """The result of `cadalign.fit` for problem ``b``, which has a solution."""
     start, rows = time.perf_counter(), problems.rows(b)
     one = pack_one(problems.points_3d[rows], problems.points_2d[rows], problems.camera)
     return fit_one(one, options, None, None, None, start)

@@ -1,7 +1,7 @@
-"""From likely estimates of all evidence to their result, by whatever search they were found.
+"""Last stage of an estimate: combine likely estimates to a result.
 
-Together they are a mixture of Gaussians; of those that are equal under the model's symmetry one
-stands for all. Keypoints of one exact model have their own form, for `cadalign.fit`.
+The estimates form a mixture of Gaussians; equivalent ones under the model's symmetry count once.
+`fit_jointly` returns `FittedKeypoints` instead, for `cadalign.fit`.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from cadalign.arrays import BoolArray, is_number
 from cadalign.errors import DegenerateError
 from cadalign.estimation.estimates import (
     Estimate,
+    canonical_estimates,
     curvature_of_rotations,
+    enlarge_boxes,
     estimate_box,
-    one_of_equals,
     pose_and_lengths,
     poses_of,
     second_moments,
     steps_between,
     undo_turns,
-    widened_boxes,
 )
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
@@ -54,10 +54,10 @@ from cadalign.estimation.result_parts import (
 from cadalign.estimation.search import Minimum, search
 from cadalign.estimation.symmetry import SAME_SQUARES, stretched_axes
 from cadalign.estimation.uncertainty.doubts import (
-    another_pose,
-    first_of_camera,
     noise_doubts,
+    order_warnings,
     outside_image,
+    pose_doubts,
     rejections,
     stretch_doubts,
 )
@@ -85,8 +85,8 @@ def result_of(
 ) -> Result:
     """The result of likely estimates, the best first.
 
-    Its covariance is the second moment, about the best estimate, of their mixture of Gaussians,
-    with `curvature_of_rotations` where it ``is_curved``; ``of_result`` are further fields.
+    Its covariance is the second moment of their mixture about the best estimate, plus
+    `curvature_of_rotations` if it ``is_curved``; ``of_result`` are further fields.
     """
     prior, views, numbers = problem.prior, problem.given, problem.numbers
     best = estimates[0]
@@ -119,7 +119,7 @@ def result_of(
     known = dict(zip((views[k].camera for k in numbers), best.cameras, strict=True))
     for number, view in enumerate(views):
         rows, observed = prior.rows_of(view.keypoint_ids, "ids"), view.pixels
-        # Of a view without evidence a pose as good as any.
+        # A view without evidence gets an arbitrary pose.
         camera, alignment, own = camera_like(view.camera, known), best.poses[0], Posterior()
         kept = np.zeros(len(rows), dtype=bool)
         if number in numbers:
@@ -140,7 +140,7 @@ def result_of(
         points_covariance=of_points[:-2],
         points_cam_covariance=of_seen[:-2],
         warnings=(
-            *another_pose(
+            *pose_doubts(
                 pose,
                 others,
                 covariances[0],
@@ -190,14 +190,14 @@ def result_of_minima(
     *,
     notes: OutlineNotes = NO_NOTES,
 ) -> Result:
-    """The result of minima, with a widened prior of the shape; DegenerateError if all are open."""
+    """The result of minima at the calibrated prior; raises DegenerateError if undetermined."""
     prior, views, model = problem.prior, problem.views, problem.model
     minima = [each for each in minima if np.isfinite(each.score)]
     if not minima:
         raise _undetermined_error()
     minimum = minima[0]
     inflation = prior.inflation
-    if all(view.mask is None for view in views):  # a contour is worth as much as many keypoints
+    if all(view.mask is None for view in views):  # a contour counts as many keypoints
         given = len(minimum.evidence.sightings.point)
         inflation = inflation_with(given, inflation, prior.few_keypoints)
     likely: Sequence[Estimate] = ()
@@ -215,7 +215,7 @@ def result_of_minima(
     symmetry = getattr(model, "symmetry", None)
     x, y, z = (minimum.evidence.scales.free == 0).tolist()
     held = x, y, z
-    likely = one_of_equals(likely, symmetry, held)
+    likely = canonical_estimates(likely, symmetry, held)
     best, in_rig = likely[0], None
     if views[0].cam_from_rig is not None:
         camera, pose = np.asarray(problem.given[0].cam_from_rig), best.poses[0]
@@ -244,7 +244,7 @@ def result_of_minima(
 
 
 class DiagnosedPosterior(Posterior):
-    """Posterior whose causes of a misfit are sought when its warnings are asked for."""
+    """A posterior that runs the diagnosis when its warnings are first read."""
 
     stated: Warnings
     causes: Callable[[], Warnings]
@@ -254,7 +254,7 @@ class DiagnosedPosterior(Posterior):
         return (*self.causes(), *self.stated)
 
     def __getstate__(self) -> dict[str, Any]:
-        """The fields to store, without the function that seeks."""
+        """The fields to pickle, with computed warnings."""
         own = vars(self) | {"warnings": self.warnings}
         return {name: own[name] for name in own if name != "causes"}
 
@@ -265,7 +265,7 @@ def add_diagnosis(
     views: Sequence[View],
     ransac: RansacOptions | None,
 ) -> Result:
-    """The result with the cause of a misfit, and warnings about noise and keypoints' places."""
+    """Add the diagnosis, and warnings about noise and positions of keypoints, to a result."""
     causes = partial(_causes, result, diagnosis, views, ransac)
     known = vars(result.posterior) | {"causes": causes, "stated": result.warnings}
     known.pop("warnings")
@@ -295,7 +295,7 @@ def _causes(
             where=f"views[{view.number}]: " if len(views) > 1 else "",
         )
     )
-    found = (*causes, *first_of_camera(placed, cause))
+    found = (*causes, *order_warnings(placed, cause))
     if cause is None and result.std is not None and isinstance(result.model, Model):
         found += stretch_doubts(result.alignment, result.std, result.model.fit_options())
     if ransac is None or (cause is not None and cause.kind == "mistake"):
@@ -304,7 +304,7 @@ def _causes(
 
 
 def common_sigma(views: Sequence[View]) -> float | None:
-    """The standard deviation of all keypoints [px]; None where they do not share one."""
+    """The standard deviation [px] that all keypoints share; None if they share none."""
     given = [view.sigma for view in views if len(view.keypoint_ids)]
     first, *others = given or [None]
     is_one = is_number(first) and all(is_number(each) and each == first for each in others)
@@ -321,11 +321,11 @@ def _estimate_at(minimum: Minimum, likelihood: float, problem: Problem) -> Estim
     keypoints = len(prior.ids)
     evidence, state = estimate_box(evidence, state, prior)
     scale = np.exp(state.log_scales)
-    rows = np.r_[:keypoints, -2:0]  # without what stands between keypoints and box
+    rows = np.r_[:keypoints, -2:0]  # without points of outlines
     stretched = points_of(evidence.shape, state)[rows]
-    if len(evidence.shape.modes):  # a box whose corners were estimated holds what is seen
+    if len(evidence.shape.modes):  # an estimated box contains the seen keypoints
         sighted = np.unique(evidence.sightings.point)
-        stretched = widened_boxes(stretched, sighted[sighted < keypoints])
+        stretched = enlarge_boxes(stretched, sighted[sighted < keypoints])
     found, poses = joint_covariance(evidence, state), poses_of(evidence, state)
     cameras = minimum.lenses.cameras_at(state.log_focals)
     estimate = Estimate(
@@ -347,7 +347,7 @@ def _estimate_at(minimum: Minimum, likelihood: float, problem: Problem) -> Estim
 
 
 def _inliers(problem: Problem, minimum: Minimum) -> list[BoolArray]:
-    """The inliers of every view that takes part, in its own order of keypoints."""
+    """The inliers of each view that takes part, in the view's order of keypoints."""
     views = [problem.views[number] for number in problem.numbers]
     names = np.concatenate([problem.prior.rows_of(view.keypoint_ids, "ids") for view in views])
     kept = np.empty(len(names), dtype=bool)
@@ -363,7 +363,7 @@ def fit_jointly(
     scores: npt.ArrayLike | None,
     start: float,
 ) -> FittedKeypoints:
-    """Fit the only problem, with ``ransac`` its inliers, which was begun at ``start`` [s].
+    """Fit one problem with the joint solver; the time starts at ``start`` [s].
 
     Raises DegenerateError if no minimum is determined; NoConsensusError as `search`.
     """
@@ -374,7 +374,7 @@ def fit_jointly(
     view = View(problems.camera, pixels, sigma=options.sigma, scores=scores)
     compiled = compile_problem(model, [view], None, [None], options, ransac)
     problem, minima, iterations, hypotheses = search(compiled, [[None]])
-    if ransac is None:  # the optimum comes first, whatever its volume
+    if ransac is None:  # sorted by cost alone, without the volume
         minima = sorted((each._replace(score=each.cost) for each in minima), key=lambda m: m.score)
     if not minima:
         raise no_alignment_error()

@@ -1,4 +1,4 @@
-"""A CAD model with known keypoints, for `align` where no category was learned; known lengths."""
+"""A CAD model with keypoints, for `align` without a learned category."""
 
 from __future__ import annotations
 
@@ -26,28 +26,27 @@ class Model:
     Parameters
     ----------
     points_3d : (n, 3) float
-        Keypoints, in the model's own coordinates; a model with a mesh needs none for masks.
+        Keypoints, in the model's coordinates. A model with a mesh needs none if views have masks.
     ids : sequence of n int or str, optional
-        Their semantic ids or names; by default their numbers 0 to n - 1.
+        Their semantic ids or names; default: 0 to n - 1.
     bounds : (2, 3) float, optional
-        Least and greatest coordinates of the model; by default the mesh's, else the keypoints'.
+        Minimum and maximum coordinates; default: bounds of the mesh, otherwise of the keypoints.
     mesh : Mesh, optional
-        The model's surface, for `Result.mesh`.
+        The model's surface, for masks, photos and `Result.mesh`.
     shape_sigma : float, optional
-        Standard deviation of the keypoints' positions about the model's, along each axis, before
-        the stretch [model units]: for an object that is only similar. None for the exact,
-        stretched model.
+        For an object that is only similar: standard deviation of its keypoints from the model's,
+        along each axis, before the stretch [model units]. None if the object is the stretched
+        model.
     stretch : str, optional
         As for `cadalign.fit`.
     stretch_sigma : float, optional
-        As for `cadalign.fit`; 0.2 by default where ``shape_sigma`` is given: an object that is only
-        similar has similar proportions, and its keypoints alone would say otherwise.
+        As for `cadalign.fit`. With ``shape_sigma`` the default is 0.2, since similar objects have
+        similar proportions.
     up_axis : {"y", "x", "z"} or None
-        The model's axis that points up, as `View.up` and camera heights take it; None where no axis
-        does.
+        The model's axis that points up, for `View.up` and camera heights; None if no axis does.
     symmetry : Symmetry, optional
-        As for `cadalign.fit`: motions that take the model to itself. Where the object's size is
-        estimated, a quarter turn that exchanges two stretches is an equal alignment, too.
+        As for `cadalign.fit`. If the object's size is estimated, a quarter turn that swaps two
+        stretches is an equivalent alignment too.
 
     Raises
     ------
@@ -80,7 +79,7 @@ class Model:
         given_points = np.empty((0, 3)) if np.size(self.points_3d) == 0 else self.points_3d
         points = as_points(given_points, name="points_3d", dimension=3)
         if not len(points) and self.mesh is None:
-            raise InputError("a model needs keypoints", where="points_3d", fix="or give a mesh")
+            raise InputError("no keypoints given", where="points_3d", fix="give some, or a mesh")
         object.__setattr__(self, "points_3d", read_only(points))
         object.__setattr__(self, "ids", checked_ids(self.ids, len(points)))
         if self.mesh is not None:
@@ -88,7 +87,7 @@ class Model:
             check_near(points, self.mesh.bounds, where="points_3d")
         if self.shape_sigma is not None:
             if not len(points):
-                fix = "give points_3d, whose positions it is about, or leave it away"
+                fix = "give points_3d, or omit shape_sigma"
                 raise InputError("the model has no keypoints", where="shape_sigma", fix=fix)
             sigma = as_positive(self.shape_sigma, name="shape_sigma")
             object.__setattr__(self, "shape_sigma", sigma)
@@ -97,7 +96,7 @@ class Model:
             given = self.mesh.bounds if self.mesh is not None else extent(points)
         bounds = as_floats(given, name="bounds", shape=(2, 3))
         if (bounds[1] < bounds[0]).any():
-            raise InputError("the first row must hold the least coordinates", where="bounds")
+            raise InputError("the first row must hold the minimum coordinates", where="bounds")
         object.__setattr__(self, "bounds", read_only(bounds))
         if self.symmetry is not None:
             check_symmetry(self.symmetry)
@@ -114,12 +113,12 @@ class Model:
 
 
 def is_exact_model(model: object) -> bool:
-    """True for a CAD model whose object has its shape, but for the stretch."""
+    """True for a CAD model whose shape is exact up to the stretch."""
     return isinstance(model, Model) and model.shape_sigma is None
 
 
 def checked_ids(ids: Iterable[Any] | None, count: int) -> tuple[Hashable, ...]:
-    """Ids of ``count`` keypoints, by default their numbers; InputError if these are no such."""
+    """Checked ids of ``count`` keypoints, by default 0, 1, ...; raises InputError."""
     if ids is None:
         return tuple(range(count))
     if isinstance(ids, str | bytes) or not isinstance(ids, Iterable):

@@ -1,6 +1,6 @@
-"""Options of `fit` and `fit_batch`: names, defaults, units and meaning, in this one place.
+"""Options of `fit` and of the robust search: names, defaults, units and meaning.
 
-The command line nests these dataclasses, and shows the text below each field as its help.
+The command line shows the text below each field as its help.
 """
 
 from __future__ import annotations
@@ -25,16 +25,15 @@ STRETCHES = ("yz", "y", "z", "none")
 SIMILAR_SCALE_SIGMA = 0.2
 """Default standard deviation of the log scales of an object that is only similar to its model."""
 USUAL_STRETCH = 5.0
-"""Factor up to which no stretch is less likely than another, where no prior is given."""
+"""Factor up to which the default prior on the stretch is flat."""
 BOUNDING_PRIOR = ScalePrior(0.5**-2, math.log(USUAL_STRETCH))
-"""Prior on the log scales where none is given: flat over usual stretches, so that it leaves what
-keypoints determine as it is, and proper, so that what they leave open has an optimum and a
-volume."""
+"""Default prior on the log scales: flat over usual stretches, so that it does not bias scales that
+keypoints determine, and proper, so that undetermined scales have an optimum and a volume."""
 LOSSES = {"linear": LINEAR, "huber": HUBER, "cauchy": CAUCHY}
 MINIMAL_SOLVERS = {"ap4p": AP4P, "aepnp": AEPNP}
 
 INLIER_SIGMAS = 4.0
-"""Standard deviations of a keypoint within which the robust search takes it for an inlier."""
+"""Largest residual of an inlier in the robust search [sigma]."""
 
 Sigma = float | npt.ArrayLike
 
@@ -54,24 +53,23 @@ class FitOptions:
     aepnp (linear) or aepnp-paper (linear, as published)."""
     sigma: Sigma | None = 1.0
     """Standard deviation of the keypoints [px], one per keypoint, or a 2 x 2 covariance per
-    keypoint; None estimates it from the residuals: the choice for a model that is only
-    similar to the object."""
+    keypoint; None estimates it from the residuals, for a model that is only similar to the
+    object."""
     loss: str = "linear"
     """Loss on the length of a whitened residual: linear (squared), huber or cauchy; the robust ones
     tolerate outliers."""
     loss_scale: float = 2.0
-    """Length at which a robust loss begins to bend [sigma]."""
+    """Scale of a robust loss [sigma]."""
     stretch: str | None = None
-    """Axes whose scale is estimated: by default both unknown ones; one of them, such as "y"; or
-    "none"."""
+    """Axes whose scale is estimated: yz (the default), y, z or none."""
     stretch_sigma: float | None = None
-    """Standard deviation of a Gaussian prior on the logarithm of each scale, about scale 1; by
-    default one that is flat from 1/5 to 5, and falls off beyond."""
+    """Standard deviation of a Gaussian prior on the logarithm of each scale, about scale 1; the
+    default prior is flat from 1/5 to 5, and falls off beyond."""
     focal: str = "known"
     """Focal length: known (the camera's) or estimate."""
     focal_prior: PriorOption = USUAL
-    """Prior on a focal length to be estimated: that of usual lenses, a `FocalPrior`, from EXIF data
-    for example, or None."""
+    """Prior on the estimated focal length: usual (of usual lenses), a `FocalPrior`, for example
+    from EXIF data, or None."""
 
     def __post_init__(self) -> None:
         _check_known("method", self.method, METHODS)
@@ -84,7 +82,7 @@ class FitOptions:
             try:
                 np.ndim(self.sigma)
             except ValueError:
-                raise InputError("its entries are not of one shape", where="sigma") from None
+                raise InputError("its entries differ in shape", where="sigma") from None
         if self.stretch is not None:
             _check_known("stretch", self.stretch, STRETCHES)
         check_prior(self.focal_prior, focal=self.focal)
@@ -132,31 +130,31 @@ class FitOptions:
 
     @property
     def prior_weight(self) -> float:
-        """Inverse variance of the prior on the log scales that is given; 0 for none."""
+        """Inverse variance of the Gaussian prior on the log scales; 0 without one."""
         return 0.0 if self.stretch_sigma is None else float(self.stretch_sigma) ** -2
 
     @property
     def scale_prior(self) -> ScalePrior:
-        """The prior on the log scales; without one that is given it only bounds them."""
+        """The prior on the log scales; the default only bounds them."""
         if self.stretch_sigma is None:
             return BOUNDING_PRIOR
         return ScalePrior(self.prior_weight, 0.0)
 
     @property
     def unknowns(self) -> int:
-        """The number of unknowns that are estimated."""
+        """Number of estimated unknowns."""
         return 6 + len(self.stretched_axes) + (self.focal == "estimate")
 
     @property
     def estimated_unknowns(self) -> IntArray:
-        """Rows of a result's covariance that belong to unknowns that are estimated."""
+        """Rows of the estimated unknowns in a result's covariance."""
         stretched = [6 + "xyz".index(axis) for axis in self.stretched_axes]
         return np.array([*range(6), *stretched, *[9][: self.focal == "estimate"]])
 
     def prior_equations(self, scale: FloatArray) -> int:
-        """The number of equations of the priors on the focal length and the scale (3,) found.
+        """Number of equations from priors on the focal length and the estimated ``scale`` (3,).
 
-        A scale that the keypoints leave to the bounding prior has its equation there.
+        A scale beyond the flat part of the default prior counts as one equation.
         """
         count = int(self.focal_prior is not None)
         if self.stretch_sigma is not None:
@@ -165,7 +163,7 @@ class FitOptions:
 
     @property
     def min_points(self) -> int:
-        """The number of keypoints that the method needs."""
+        """Least number of keypoints for the method."""
         if self.method == "optimal":
             prior = len(self.stretched_axes) if self.stretch_sigma is not None else 0
             prior += self.focal_prior is not None
@@ -184,22 +182,22 @@ class RansacOptions:
     """
 
     max_reproj_error: float | None = None
-    """Largest reprojection error of an inlier [px]: by default 4 sigma and as much as the model's
-    own uncertainty projects to; where sigma is estimated, what the residuals suggest."""
+    """Largest reprojection error of an inlier [px]; default: 4 sigma plus the projected uncertainty
+    of the model, or, if sigma is estimated, a value from the residuals."""
     max_iterations: int = 10_000
-    """Largest number of samples. With few points all subsets are tried once instead."""
+    """Largest number of samples. With few points, each subset is tried once instead."""
     min_iterations: int = 100
     """Least number of samples."""
     success_prob: float = 0.9999
-    """Probability of drawing a sample without outliers before the search ends."""
+    """Probability that the search draws a sample without outliers before it ends."""
     seed: int = 0
     """Seed of the samples; the same seed gives the same result, bit for bit."""
     minimal: str = "ap4p"
     """Minimal solver: ap4p on 4 points, or the linear aepnp on 6 as in the AEPnP paper.
-    Neither finds anything where all keypoints lie in one plane."""
+    Both fail if all keypoints lie in one plane."""
     refine: bool = True
-    """Optimise new best hypotheses locally, and the last one on all its inliers; otherwise return
-    the best hypothesis as the minimal solver left it."""
+    """Optimise each new best hypothesis locally, and the last one on all its inliers; otherwise
+    return the best hypothesis of the minimal solver."""
 
     def __post_init__(self) -> None:
         if self.max_reproj_error is not None:
@@ -207,7 +205,7 @@ class RansacOptions:
         for name, least in (("max_iterations", 1), ("min_iterations", 0), ("seed", 0)):
             value = getattr(self, name)
             if not is_whole(value) or not least <= value < 2**63:
-                raise InputError(f"{quote(value)} is not a number of at least {least}", where=name)
+                raise InputError(f"{quote(value)} is not an integer >= {least}", where=name)
             object.__setattr__(self, name, int(value))
         if not isinstance(self.refine, bool | np.bool_):
             raise InputError(f"{quote(self.refine)} is neither True nor False", where="refine")
@@ -243,14 +241,14 @@ SIGMA_HELP = (
 
 
 def pixel_information(sigma: Any, count: int) -> FloatArray:
-    """Inverse covariances (n, 2, 2) of the pixels of n keypoints; checks sigma."""
+    """Inverse covariances (n, 2, 2) of n keypoints [px^-2]; checks sigma."""
     dimensions = np.ndim(sigma)
     if dimensions < 2:
         shape: tuple[int | None, ...] = () if dimensions == 0 else (count,)
         deviations = as_floats(sigma, name="sigma", shape=shape)
         if not (deviations > 0).all():
             raise InputError("has values that are not positive", where="sigma", fix=SIGMA_HELP)
-        with np.errstate(over="ignore", divide="ignore"):  # of a tiny sigma: infinite
+        with np.errstate(over="ignore", divide="ignore"):  # infinite for a tiny sigma
             weights = np.broadcast_to((1.0 / deviations) ** 2, (count,))
         return np.asarray(weights[:, None, None] * np.eye(2))
     covariances = as_floats(sigma, name="sigma", shape=(count, 2, 2))

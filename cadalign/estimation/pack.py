@@ -1,7 +1,7 @@
-"""From views to the evidence that the kernels take.
+"""Convert views to evidence in the form of the kernels.
 
-Depth images are sampled at keypoints; gravity, camera heights and lengths are known directions and
-distances.
+Depth images are sampled at keypoints; gravity, camera heights and lengths become known directions
+and distances.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from cadalign.solvers.joint.evidence import (
 )
 from cadalign.solvers.marginal.problem import Seen
 
-_DEPTH_LOSS_SCALE = 3.0  # [sigma], of depths in an image: what hides a keypoint has another
-_RADIUS = 2  # of the window about a keypoint [px]
+_DEPTH_LOSS_SCALE = 3.0  # [sigma], of depths in an image, for occluded keypoints
+_RADIUS = 2  # of the window around a keypoint [px]
 _GAP = 4.0  # between surfaces in a window [sigma]
 _LEAST_PIXELS = 3  # of a surface in a window
 
@@ -48,17 +48,16 @@ def evidence_of(
     turns: Sequence[FloatArray],
     noise: float,
 ) -> Evidence:
-    """Evidence of the views, of the size and of one component of the prior.
+    """Evidence of the views, the size and one component of the prior.
 
-    ``turns`` (3, 3) are those of lenses, ``noise`` [px] is that of keypoints without a sigma.
-    Raises InputError of keypoints or an up axis that the model lacks, and if only some views have a
-    pose.
+    ``turns`` (3, 3) turn wide lenses; ``noise`` [px] is the sigma of keypoints without one. Raises
+    InputError if the model lacks a keypoint or an up axis, or if only some views have a pose.
     """
     rows = [prior.rows_of(view.keypoint_ids, f"views[{view.number}].ids") for view in views]
     offsets = known_distances(prior, views, size)
     directions = known_directions(prior, views)
     sightings = _sightings(rows, views, lenses.cameras, noise, options)
-    # What is known in the lenses' frames, in those of cameras that are turned.
+    # Directions from the lenses' frames to the frames of turned cameras.
     of_lenses = np.array([camera.lens_from_camera for camera in lenses.cameras])
     turned = of_lenses[directions.image]
     directions = directions._replace(
@@ -105,7 +104,7 @@ def _sightings(
 
 
 def _keypoint_depths(view: View, count: int) -> FloatArray:
-    """Depths (n, 3) as of `Sightings`; a keypoint in a depth image may be hidden."""
+    """Depths (n, 3) for `Sightings`; keypoints in a depth image may be occluded."""
     found = np.zeros((count, 3))
     if view.depth is None:
         return found
@@ -123,11 +122,11 @@ def _keypoint_depths(view: View, count: int) -> FloatArray:
 def sample_depth(
     image: FloatArray, points_2d: FloatArray, *, sigma: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Depths (n,) of keypoints in a depth image, and their deviations; NaN where it holds none.
+    """Depths (n,) of keypoints in a depth image, and their deviations (n,); NaN if unknown.
 
-    At a silhouette, a window about the keypoint shows what is behind the object, too: it is split
-    at gaps of some ``sigma`` (relative), and the nearest surface counts, with its spread where
-    steep.
+    At a silhouette, the window around a keypoint also shows the background. It is split at gaps of
+    several ``sigma`` (relative), and the nearest surface is used; a steep one has a larger
+    deviation.
     """
     height, width = image.shape
     found, deviations = np.full((2, len(points_2d)), np.nan)
@@ -146,7 +145,7 @@ def sample_depth(
 
 
 def _rig(views: Sequence[View], turns: Sequence[FloatArray], axes: FloatArray) -> Rig:
-    """Motions and axes of cameras, and the pose of each; -1 of one without evidence."""
+    """Motions and axes of cameras, and the index of each camera's pose, -1 without evidence."""
     posed = [view.cam_from_rig is not None for view in views]
     if any(posed) != all(posed):
         raise InputError(
@@ -166,7 +165,7 @@ def _rig(views: Sequence[View], turns: Sequence[FloatArray], axes: FloatArray) -
 
 
 def seen_keypoints(view: View, pixels: FloatArray, rows: list[int], options: FitOptions) -> Seen:
-    """Keypoints of a view at pixels (n, 2), as the kernels of one view take them."""
+    """Keypoints of a view at pixels (n, 2), in the form of the single-view kernels."""
     rays = rays_of(np.require(pixels, requirements="W"), view.camera)
     whitening = np.empty((len(rows), 3))
     whitening[:] = whitening_of(view.sigma, rays, view.camera)
@@ -178,23 +177,23 @@ _CAMERA = -1  # in the place of a point's row
 
 
 def known_directions(prior: ShapePrior, views: Sequence[View]) -> Directions:
-    """Gravity in the views; InputError if a view has some and the model no up axis."""
-    told = [number for number, view in enumerate(views) if view.up is not None]
-    ups = [cast(FloatArray, views[number].up) for number in told]
+    """Gravity in the views; raises InputError if the model has no up axis."""
+    numbers = [number for number, view in enumerate(views) if view.up is not None]
+    ups = [cast(FloatArray, views[number].up) for number in numbers]
     whitening = [
-        _whitening(up, views[number].up_sigma_deg) for number, up in zip(told, ups, strict=True)
+        _whitening(up, views[number].up_sigma_deg) for number, up in zip(numbers, ups, strict=True)
     ]
-    axes = [_upward("up", prior, views[number]) for number in told]
+    axes = [_upward("up", prior, views[number]) for number in numbers]
     return Directions(
         np.array(axes, dtype=float).reshape(-1, 3),
         np.array(ups, dtype=float).reshape(-1, 3),
-        np.array(told, dtype=np.int64),
+        np.array(numbers, dtype=np.int64),
         np.array(whitening).reshape(-1, 3, 3),
     )
 
 
 def _whitening(direction: FloatArray, sigma_deg: Any) -> FloatArray:
-    """Whitening (3, 3) of a unit vector [1/rad], by a deviation or covariance (3, 3) [degrees]."""
+    """Whitening (3, 3) of a unit vector [1/rad], from its deviation or covariance [degrees]."""
     sigma = np.asarray(sigma_deg, dtype=np.float64)
     if not sigma.ndim:
         return np.asarray(np.eye(3) / np.radians(sigma))
@@ -210,11 +209,11 @@ def known_distances(prior: ShapePrior, views: Sequence[View], size: Size | None)
     shape = prior.components[0]
     corners, rows = len(shape.mean) - 2, []
     if size is not None:
-        own = (shape.spread[-2:] ** 2).sum()  # corners move by themselves
+        own = (shape.spread[-2:] ** 2).sum()  # displacements of the corners
         for axis in np.flatnonzero(np.isfinite(size.lengths)).tolist():
             if not prior.lengths[axis] > 0:
                 what = f"the model has no extent along its {'xyz'[axis]}"
-                raise InputError(what, where=f"size.{LENGTHS[axis]}", fix="leave it away")
+                raise InputError(what, where=f"size.{LENGTHS[axis]}", fix="omit it")
             sigma = float(np.sqrt(size.deviations[axis] ** 2 + own))
             rows.append(((corners, corners + 1), -1, np.eye(3)[axis], size.lengths[axis], sigma))
     for number, view in enumerate(views):
@@ -236,8 +235,8 @@ def known_distances(prior: ShapePrior, views: Sequence[View], size: Size | None)
 
 
 def _upward(field: str, prior: ShapePrior, view: View) -> FloatArray:
-    """The model's up axis (3,); without one an InputError names the ``field`` that asks for it."""
+    """The model's up axis (3,), which ``field`` needs; raises InputError without one."""
     if prior.up is None:
-        fix = f"learn it with an up axis, or leave `{field}` away"
+        fix = f"learn it with an up axis, or omit `{field}`"
         raise InputError("the model has no up axis", where=f"views[{view.number}].{field}", fix=fix)
     return prior.up

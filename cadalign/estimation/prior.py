@@ -1,4 +1,4 @@
-"""Prior knowledge of an object's shape and scales and of focal lengths, as the kernels take it."""
+"""Priors on shape, scales and focal lengths, in the form of the kernels."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from cadalign.shapes.parts import BoxMargins, FewKeypoints
 from cadalign.solvers.constants import ScalePrior
 from cadalign.solvers.joint.evidence import Evidence, Focals, ScalePriors, Shape, State
 
-_COMMON_SCALE_SIGMA = 3.0  # of the log of a size that other evidence determines
+_COMMON_SCALE_SIGMA = 3.0  # of the log of the common scale
 _SAME_SCALE_SIGMA = 1e-4
-_PROPORTION_SIGMA = 3.0  # of free log scales about their mean, lest an unseen axis collapses
+_PROPORTION_SIGMA = 3.0  # of free log scales about their mean, for axes that are not seen
 _NO_BOUND = ScalePrior(0.0, 0.0)
 # Focal lengths from which a search starts [longer sides of the image].
 _FOCAL_GRID = (0.15, 0.22, 0.3, 0.4, 0.55, 0.72, 0.95, 1.25, 1.65, 2.3, 3.3, 5.0, 10.0, 30.0)
@@ -31,10 +31,10 @@ _FOCAL_GRID = (0.15, 0.22, 0.3, 0.4, 0.55, 0.72, 0.95, 1.25, 1.65, 2.3, 3.3, 5.0
 
 @dataclass(frozen=True, eq=False)
 class ShapePrior:
-    """Gaussian components of a shape, and what is known of its scales.
+    """Gaussian components of a shape, and priors on its scales.
 
-    Rows are the keypoints ``ids`` (m,), then the box's least and greatest corner; fields with
-    defaults are those of `cadalign.ShapeModel`.
+    Rows are the keypoints ``ids`` (m,), then the box's minimum and maximum corner. Fields with
+    defaults are from `cadalign.ShapeModel`.
     """
 
     ids: tuple[Hashable, ...]
@@ -55,7 +55,7 @@ class ShapePrior:
         return np.asarray(sum(weight * (each.mean[-1] - each.mean[-2]) for weight, each in pairs))
 
     def rows_of(self, ids: tuple[Hashable, ...], where: str) -> list[int]:
-        """Row numbers of keypoints; InputError if the model has no such keypoint."""
+        """Rows of keypoints; raises InputError if the model lacks one."""
         place = {name: row for row, name in enumerate(self.ids)}
         missing = [name for name in ids if name not in place]
         if missing:
@@ -68,7 +68,7 @@ class ShapePrior:
 
 
 def prior_of(model: object) -> ShapePrior:
-    """The prior of an exact, a stretched or a learned model; InputError of none of these."""
+    """The prior of a Model or a ShapeModel; raises InputError for other types."""
     if isinstance(model, Model):
         return _model_prior(model)
     if isinstance(model, ShapeModel):
@@ -113,7 +113,7 @@ def axis_vector(axis: str | None) -> FloatArray | None:
 
 
 def scale_priors(prior: ShapePrior, metric: bool) -> ScalePriors:
-    """Free the size where it is told; what was held to x is then held to the common scale."""
+    """Free the size if evidence determines it; fixed scales are then tied to the common scale."""
     if not metric:
         return prior.scales
     if prior.scales.free.sum() == 2 and not prior.scales.precision.any():
@@ -129,14 +129,14 @@ def scale_priors(prior: ShapePrior, metric: bool) -> ScalePriors:
 
 
 def has_scale_prior(scales: ScalePriors) -> bool:
-    """True where a prior ties the scales together more than any plausible proportions do."""
+    """True if a prior ties the scales together beyond plausible proportions."""
     return bool((scales.precision > 2 / _PROPORTION_SIGMA**2).any())
 
 
 def redundancy_of(evidence: Evidence) -> int:
-    """Equations, those of priors on the lengths included, minus unknowns; what is exact is none."""
+    """Number of equations, including priors on the scales, minus number of unknowns."""
     whitening, depths = evidence.sightings.whitening, evidence.sightings.depths
-    # Two of a keypoint's ray, one of a ray along a contour's normal.
+    # Two for a keypoint, one for a sample of a contour.
     count = int(
         (whitening[:, 2] > 0).sum() + whitening.any(axis=1).sum() + (depths[:, 1] > 0).sum()
     )
@@ -147,7 +147,7 @@ def redundancy_of(evidence: Evidence) -> int:
 
 
 def widen_prior(evidence: Evidence, state: State, factor: float) -> tuple[Evidence, State]:
-    """The same points under a prior of wider standard deviations."""
+    """Multiply the prior's standard deviations by a factor, for the same points."""
     if factor == 1:
         return evidence, state
     shape = evidence.shape
@@ -156,14 +156,14 @@ def widen_prior(evidence: Evidence, state: State, factor: float) -> tuple[Eviden
 
 
 def is_exact(evidence: Evidence) -> bool:
-    """True if the shape is known but for its scales."""
+    """True if the shape is known up to its scales."""
     return not (len(evidence.shape.modes) or evidence.shape.spread.any())
 
 
 def log_focal_range(
     camera: Camera, prior: PriorOption, unit: float = 1.0
 ) -> tuple[float, float, float, float]:
-    """Bounds of a log focal length, over ``unit`` [px], and its prior's mean and weight."""
+    """Bounds of the log focal length [log of ``unit`` px], and its prior's mean and weight."""
     prior = prior_of_camera(prior, camera)
     side = max(camera.width, camera.height) / unit
     low, high = math.log(SHORTEST * side), math.log(LONGEST * side)
@@ -174,7 +174,7 @@ def log_focal_range(
 
 
 def focal_grid(camera: Camera, prior: PriorOption) -> FloatArray:
-    """Focal lengths from which the search starts [px]; with a prior those near it, and it."""
+    """Focal lengths [px] to start from; with a prior, its mean and the grid near it."""
     prior = prior_of_camera(prior, camera)
     grid = np.array(_FOCAL_GRID) * max(camera.width, camera.height)
     if prior is None:
@@ -185,15 +185,15 @@ def focal_grid(camera: Camera, prior: PriorOption) -> FloatArray:
 
 @dataclass(frozen=True)
 class Lenses:
-    """Cameras of views (V,), with focal lengths that are to be estimated."""
+    """Cameras of views (V,), with focal lengths that may be estimated."""
 
-    cameras: tuple[Camera, ...]  # the estimate is a multiple of the focal length of each view's
-    groups: tuple[int, ...]  # number of each view's focal length; -1 where it is known
+    cameras: tuple[Camera, ...]  # with reference focal lengths, which estimates are relative to
+    groups: tuple[int, ...]  # index of each view's unknown focal length; -1 if known
     prior: PriorOption = None
 
     @classmethod
     def of(cls, views: Sequence[View], focal: str, prior: PriorOption) -> Lenses:
-        """Cameras with focal lengths known or estimated; those of views with evidence alone."""
+        """The views' lenses; only focal lengths of views with evidence are estimated."""
         cameras = tuple(view.camera for view in views)
         if focal == "known":
             for camera in cameras:
@@ -219,7 +219,7 @@ class Lenses:
 
     @property
     def focal_lengths(self) -> FloatArray:
-        """The references (F,) of unknown focal lengths [px]."""
+        """Reference values (F,) of the unknown focal lengths [px]."""
         return np.array([camera.fx for camera in self._firsts])
 
     @property
@@ -233,24 +233,24 @@ class Lenses:
         return Focals(np.array(self.groups, dtype=np.int64), *columns)
 
     def cameras_at(self, log_focals: FloatArray) -> list[Camera]:
-        """The cameras of all views at focal lengths (F,), logarithms relative to the references."""
+        """The cameras of all views at log focal lengths (F,), relative to the references."""
         return [
             camera if group < 0 else camera.with_focal(camera.fx * math.exp(log_focals[group]))
             for camera, group in zip(self.cameras, self.groups, strict=True)
         ]
 
     def at(self, log_focals: FloatArray) -> Lenses:
-        """The lenses with references at focal lengths (F,), relative to those before."""
+        """Lenses with new references at log focal lengths (F,), relative to the old ones."""
         return replace(self, cameras=tuple(self.cameras_at(log_focals)))
 
     def grid(self) -> list[FloatArray]:
-        """Focal lengths to start from: (F,) logarithms relative to the references, each."""
+        """Starts: log focal lengths (F,) relative to the references."""
         grids = [np.log(focal_grid(camera, self.prior) / camera.fx) for camera in self._firsts]
         return list(np.array(grids).T) if grids else [np.zeros(0)]
 
 
 def camera_like(camera: Camera, estimated: Mapping[Camera, Camera]) -> Camera:
-    """A camera with the focal length of an equal one, or that of the first for its size."""
+    """The camera with its estimated focal length or, if it has none, the first one's by size."""
     if camera in estimated or camera.focal_known:
         return estimated.get(camera, camera)
     first = next(iter(estimated.values()))

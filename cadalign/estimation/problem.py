@@ -1,10 +1,10 @@
-"""An estimate's problem: the model, the views that take part, known lengths, and options.
+"""The problem of an estimate: the model, the views that take part, known lengths, and options.
 
-A wide lens is turned to what its view shows, so that this lies in front of the camera. The turn is
-part of the rig: poses are those of the cameras as they were given.
+The camera of a wide lens is turned towards the object, so that the object is in front of it. The
+rig contains the turn, and results have the poses of the given cameras.
 
-A view of unknown motion whose keypoints determine no pose does not take part: it has no evidence
-and no pose, and keeps its number.
+Without a rig, a view whose keypoints do not determine its pose is left out: it keeps its number,
+but has neither evidence nor a pose.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from cadalign.solvers.constants import LEAST_POINTS
 from cadalign.solvers.joint.evidence import Evidence, Shape
 
 Inits = Sequence[Alignment | None]
-"""Given starts: one for each view of unknown motion, or one in the frame that the views share."""
+"""Given starts: one for each view or, with a rig, one in the rig's frame."""
 
-_ON_A_LINE = 1e-3  # second over first extent of keypoints that determine no rotation about it
-_MOST_PIXELS = 500  # of a mask, amid which a wide lens is turned
+_ON_A_LINE = 1e-3  # largest ratio of second to first extent of keypoints on a line
+_MOST_PIXELS = 500  # of a mask, towards which a wide lens is turned
 
 
 class Problem(NamedTuple):
     """Model, views, known lengths and options of an estimate.
 
-    The ``views`` are those ``given``, with lenses turned by ``turns`` (3, 3), and without evidence
-    where one has no pose. Keypoints without sigma have the deviation ``noise`` [px].
+    ``views`` are the ``given`` ones with cameras turned by ``turns`` (3, 3); a view without a pose
+    has no evidence. Keypoints without sigma have the standard deviation ``noise`` [px].
     """
 
     model: Model | ShapeModel
@@ -75,20 +75,20 @@ class Problem(NamedTuple):
 
     @property
     def is_mask_alone(self) -> bool:
-        """True if the mask of the only view is all evidence of the pose of a model with a mesh."""
+        """True for one view with a mask, without keypoints or start, of an exact model's mesh."""
         if len(self.views) > 1 or any(self.inits) or not is_exact_model(self.model):
             return False
         return self.views[0].has_mask_alone and getattr(self.model, "mesh", None) is not None
 
     def threshold(self, ransac: RansacOptions) -> float:
-        """Largest reprojection error of an inlier [px], by the noise alone."""
+        """Largest reprojection error of an inlier [px], for an exact shape."""
         seen = [view for view in self.views if len(view.keypoint_ids)]
         sigmas = [self.noise if view.sigma is None else view.sigma for view in seen]
         limits = [ransac.threshold(sigma) for sigma in sigmas] or [ransac.threshold(None)]
         return float(np.sqrt(np.mean(np.square(limits))))
 
     def evidence(self, shape: Shape, lenses: Lenses) -> Evidence:
-        """The evidence about one component of the shape, with rays of ``lenses``."""
+        """The evidence for one component of the shape, with the focal lengths of ``lenses``."""
         return evidence_of(
             self.prior,
             shape,
@@ -109,18 +109,18 @@ def compile_problem(
     options: FitOptions,
     ransac: RansacOptions | None,
 ) -> Problem:
-    """The problem of checked arguments.
+    """Compile the problem from arguments of the right types.
 
-    Raises InputError if a view has no evidence, or keypoints that the model lacks or, without
-    ``ransac``, all around a wide lens; DegenerateError if the first view has no pose.
+    Raises InputError if a view has no evidence, has keypoints that the model lacks, or, without
+    ``ransac``, has keypoints all around a wide lens; DegenerateError if the first view has no pose.
     """
     prior = prior_of(model)
     for view in views:
         if not view.has_evidence:
             raise InputError(
-                "tells nothing about the object",
+                "has no evidence about the object",
                 where=f"views[{view.number}]",
-                fix="give keypoints, a mask or a direction, or leave the view away",
+                fix="give keypoints, a mask or a direction, or omit the view",
             )
     facing = [_facing_view(view) for view in views]
     if ransac is None:
@@ -139,7 +139,7 @@ def compile_problem(
 
 
 def no_pose_error(problem: Problem) -> DegenerateError:
-    """The error where no start leads to a pose; InputError of outlines without meshes."""
+    """The error if no start leads to a pose; raises InputError if an outline lacks its mesh."""
     shown = [view for view in problem.views if view.has_outline]
     if shown:
         from cadalign.estimation.contours.outline import surface_of  # imports this package
@@ -148,16 +148,16 @@ def no_pose_error(problem: Problem) -> DegenerateError:
         field = "image" if shown[0].mask is None else "mask"
         surface_of(problem.model, keypoints, f"views[{shown[0].number}].{field}")
     return DegenerateError(
-        "no pose with the keypoints in front of the camera follows from the evidence",
+        "the evidence gives no pose with the keypoints in front of the camera",
         where="views",
-        fix="give at least 3 keypoints in one view, or `init`, and check which is which",
+        fix="give at least 3 keypoints in one view, or `init`, and check the correspondences",
     )
 
 
 def _drop_views_without_pose(problem: Problem) -> Problem:
-    """The problem without views of unknown motion, without a start, that determine no pose.
+    """Without a rig, drop views that have no start and too few keypoints for a pose.
 
-    Raises DegenerateError if the first is one of these.
+    Raises DegenerateError if the first view is dropped.
     """
     views, prior = list(problem.views), problem.prior
     if len(views) < 2 or any(view.cam_from_rig is not None for view in views):
@@ -179,14 +179,14 @@ def _drop_views_without_pose(problem: Problem) -> Problem:
 
 
 def _facing_view(view: View) -> View:
-    """The view of a wide lens turned to what it shows; ``up`` and depths stay the lens's."""
+    """Turn the camera of a wide lens to the object; ``up`` and depths stay in the lens's frame."""
     if not needs_facing([view.camera]):
         return view
     return replace(view, camera=faced(view.camera, _pixels_of_object(view)))
 
 
 def _pixels_of_object(view: View) -> FloatArray:
-    """Pixels (n, 2) where a view shows the object: its keypoints or, without any, its mask."""
+    """Pixels (n, 2) of the object: keypoints or, without these, a sample of the mask."""
     if not view.has_mask_alone:
         return view.pixels
     inside = np.argwhere(np.asarray(view.mask) > 0.5)[:, ::-1]

@@ -1,7 +1,4 @@
-"""Problems for the solvers, and their solutions: checked and packed correspondences, and weights.
-
-Pixels become rays, and the keypoints' uncertainties the weights of the residuals.
-"""
+"""Problems for the solvers: checked and packed correspondences, rays and weights; solutions."""
 
 from __future__ import annotations
 
@@ -26,13 +23,13 @@ from cadalign.solvers.projection import all_finite, pinhole_rays
 
 T = TypeVar("T")
 
-_SAME_DIGITS = 6  # decimals of keypoints that are the same
-_MOST_COMPARED = 64  # keypoints: one of more that counts twice changes little
+_SAME_DIGITS = 6  # decimals that equal keypoints share
+_MOST_COMPARED = 64  # keypoints: among more, a duplicate changes little
 
 
 @dataclass(frozen=True, eq=False)
 class Problems:
-    """Correspondences of problems of one camera, points (n, 3) and (n, 2) [px].
+    """Correspondences of problems with one camera, points (n, 3) and (n, 2) [px].
 
     Problem b has the rows ``offsets[b]`` to ``offsets[b + 1]``.
     """
@@ -64,21 +61,21 @@ def join_problems(problems: Sequence[Problems]) -> Problems:
 
 
 def first_rows(problem: Problems) -> list[int]:
-    """The first row with the same point and pixel, for each; none where none is to be left out."""
-    u = problem.points_2d[:_MOST_COMPARED, 0].tolist()  # most are told apart by these
+    """For each row, the first row with the same point and pixel; empty without duplicates."""
+    u = problem.points_2d[:_MOST_COMPARED, 0].tolist()  # these differ in most problems
     if len(set(u)) == len(u) or len(problem.points_2d) > _MOST_COMPARED:
         return []
-    with np.errstate(over="ignore"):  # of numbers that have no such digits
+    with np.errstate(over="ignore"):  # of large numbers
         pairs = np.concatenate([problem.points_3d, problem.points_2d], axis=1).round(_SAME_DIGITS)
     first: dict[tuple[float, ...], int] = {}
     firsts = [first.setdefault(tuple(row), number) for number, row in enumerate(pairs.tolist())]
-    return firsts if LEAST_POINTS < len(first) < len(firsts) else []  # of fewer, errors say why
+    return firsts if LEAST_POINTS < len(first) < len(firsts) else []  # fewer raise an error
 
 
 def pack_one(
     points_3d: npt.ArrayLike, points_2d: npt.ArrayLike, camera: Camera, place: str = ""
 ) -> Problems:
-    """Check one problem's arguments, which messages name with its ``place`` among others."""
+    """Check and pack one problem; messages append its ``place`` to the names of arguments."""
     model, image = cast(FloatArray, points_3d), cast(FloatArray, points_2d)
     name_2d = f"points_2d{place}"
     if not (_is_kernel_array(model, 3) and _is_kernel_array(image, 2) and all_finite(model, image)):
@@ -101,7 +98,7 @@ def pack_many(
     points_2d: Sequence[npt.ArrayLike] | FloatArray,
     camera: Camera | Sequence[Camera],
 ) -> list[Problems]:
-    """Check the arguments of many problems, of the same or of different sizes."""
+    """Check and pack many problems, of equal or different sizes."""
     points_3d = each_of(points_3d, "points_3d", None, "")
     count = len(points_3d)
     points_2d = each_of(points_2d, "points_2d", count, "sets of image points")
@@ -113,7 +110,7 @@ def pack_many(
 
 
 def each_of(value: Any, name: str, count: int | None, entries: str) -> Any:
-    """A sequence of one entry for each of ``count`` problems, which messages name ``entries``."""
+    """A sequence with one entry per problem; messages call them ``entries``."""
     try:
         each = value if isinstance(value, np.ndarray) and value.ndim else list(value)
     except TypeError:
@@ -125,7 +122,7 @@ def each_of(value: Any, name: str, count: int | None, entries: str) -> Any:
 
 
 def in_threads(run: Callable[[int, int], T], count: int, workers: int) -> list[T]:
-    """Results of ``run(first, last)`` over parts of so many problems, shared among threads."""
+    """Run ``run(first, last)`` over parts of ``count`` problems in threads."""
     bounds = np.linspace(0, count, min(worker_count(workers), max(count, 1)) + 1).astype(int)
     parts = list(pairwise(bounds.tolist()))
     if len(parts) == 1:
@@ -137,7 +134,7 @@ def in_threads(run: Callable[[int, int], T], count: int, workers: int) -> list[T
 
 
 def _is_kernel_array(points: npt.ArrayLike, dimension: int) -> bool:
-    """True for a writable array of the right form: frozen ones would compile the kernels again."""
+    """True for an array in the kernels' layout; a read-only one would compile them again."""
     return (
         type(points) is np.ndarray
         and points.dtype == np.float64
@@ -157,10 +154,10 @@ def rays_of(points_2d: FloatArray, camera: Camera, *, clips: bool = False) -> Fl
 
 
 def whitening_of(sigma: Sigma | None, rays: FloatArray, camera: Camera) -> FloatArray:
-    """Weights (1 or n, 3) that turn errors of the rays (n, 2) into errors of unit covariance.
+    """Weights (1 or n, 3) that whiten errors (du, dv) of rays (n, 2).
 
-    A row (a, b, c) is the upper Cholesky factor of the information of a ray: (a du + b dv, c dv) is
-    the whitened error. A sigma of None counts as 1 px.
+    A row (a, b, c) is the upper Cholesky factor of a ray's information: the whitened error is
+    (a du + b dv, c dv). A sigma of None counts as 1 px.
     """
     if sigma is None:
         sigma = 1.0
@@ -176,7 +173,7 @@ def whitening_of(sigma: Sigma | None, rays: FloatArray, camera: Camera) -> Float
 
 
 def whitening_by(information: FloatArray) -> FloatArray:
-    """Weights (n, 3) of `whitening_of` by the information (n, 2, 2) of the rays."""
+    """Weights (n, 3) as in `whitening_of`, from the information (n, 2, 2) of rays."""
     a = np.sqrt(information[:, 0, 0])
     b = information[:, 0, 1] / a
     return np.stack([a, b, np.sqrt(information[:, 1, 1] - b * b)], axis=1)
@@ -185,9 +182,9 @@ def whitening_by(information: FloatArray) -> FloatArray:
 class Solutions(NamedTuple):
     """Minima of every problem, the best first.
 
-    ``poses`` (B, k, 15) are packed, ``costs`` (B, k) whitened squares; ``covariances`` (B, 8, 8)
-    and ``residuals`` (n, 2) [px] are the best's. ``info`` (B, 4) has the numbers of minima,
-    iterations and hypotheses, and an undetermined unknown or -1.
+    ``poses`` (B, k, 15) are packed; ``costs`` (B, k) are whitened squares. ``covariances``
+    (B, 8, 8) and ``residuals`` (n, 2) [px] belong to the best minimum. ``info`` (B, 4) has the
+    numbers of minima, iterations and hypotheses, and an undetermined unknown or -1.
     """
 
     poses: FloatArray
@@ -202,7 +199,7 @@ class Solutions(NamedTuple):
 def solver_error(
     status: int, undetermined: int, points_3d: FloatArray, options: FitOptions
 ) -> DegenerateError:
-    """Convert a solver's status to an exception; ``undetermined`` is an unknown's number, or -1."""
+    """Convert a solver's status to an exception; ``undetermined`` is an unknown's index, or -1."""
     if status == TOO_FEW:
         return too_few_error(len(points_3d), options)
     if status == OUT_OF_RANGE:
@@ -220,7 +217,7 @@ def solver_error(
         missing = f"the scale s_{'yz'[undetermined - 6]}"
     fix = "add keypoints elsewhere, hold scales fixed with stretch=, or give stretch_sigma"
     return DegenerateError(
-        f"{missing} is not determined: {reason or 'seen from there, the keypoints leave it open'}",
+        f"{missing} is not determined: {reason or 'the keypoints do not fix it in this view'}",
         where="points_3d",
         fix=fix,
     )
@@ -245,7 +242,7 @@ def no_alignment_error() -> DegenerateError:
 
 
 def no_redundancy_error(count: int) -> DegenerateError:
-    """The error for a noise that is to be estimated from keypoints that always fit."""
+    """The error if sigma is unknown and the keypoints fit exactly."""
     return DegenerateError(
         f"{count} keypoints fit exactly, so their noise cannot be estimated",
         where="sigma",

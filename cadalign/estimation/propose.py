@@ -1,4 +1,4 @@
-"""The first stage of an estimate: starts, of known focal lengths or of a grid, robust ones too."""
+"""First stage of an estimate: propose starts at known focal lengths, or at a grid of them."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from cadalign.solvers.joint.evidence import Evidence, Shape
 from cadalign.solvers.joint.search import costs_at, keypoints_of
 from cadalign.solvers.ransac import rigid_hypotheses
 
-_MOST_PER_FOCAL = 8  # starts of one pose, at each focal length of the grid
-_MOST_PER_FOCAL_OF_SEVERAL = 3
-_SAME_BRANCH = 0.6  # chord between rotations of one minimum at neighbouring focal lengths
+_MOST_PER_FOCAL = 8  # starts at each focal length of the grid, for one pose
+_MOST_PER_FOCAL_OF_SEVERAL = 3  # the same for several poses
+_SAME_BRANCH = 0.6  # largest chord between rotations of one minimum at neighbouring focal lengths
 _INLIER_RATIO = 0.4
-_LEAST_CONFIDENCE = 0.01  # over the largest: none is never drawn
-_LIMIT = 9.0  # squared whitened residual of a keypoint that speaks for a hypothesis
+_LEAST_CONFIDENCE = 0.01  # relative to the largest, so that every keypoint can be drawn
+_LIMIT = 9.0  # squared whitened residual of a keypoint that supports a hypothesis
 _REFINED = 8
 
 
-class _AtFocals(NamedTuple):
+class _FocalStarts(NamedTuple):
     """Starts at one focal length of each lens, with their costs (S,) there."""
 
     lenses: Lenses
@@ -37,11 +37,11 @@ class _AtFocals(NamedTuple):
 
 
 def propose(problem: Problem, shape: Shape, init: Inits) -> tuple[Lenses, Starts]:
-    """Starts for one component of the shape, and the lenses that their focal lengths refer to."""
+    """Starts for one component of the shape, and the lenses that their log focals refer to."""
     lenses = problem.lenses
     if not lenses.count:
         return lenses, _starts_at(problem, problem.evidence(shape, lenses), init)
-    found: list[_AtFocals] = []
+    found: list[_FocalStarts] = []
     for log_focals in lenses.grid():
         there = lenses.at(log_focals)
         evidence = problem.evidence(shape, there)
@@ -49,7 +49,7 @@ def propose(problem: Problem, shape: Shape, init: Inits) -> tuple[Lenses, Starts
         one = starts.poses.shape[1] == 1
         most = _MOST_PER_FOCAL if one else _MOST_PER_FOCAL_OF_SEVERAL
         starts = Starts(*(column[:most] for column in starts))
-        found.append(_AtFocals(there, starts, costs_at(evidence, *starts)))
+        found.append(_FocalStarts(there, starts, costs_at(evidence, *starts)))
     leaves_out = problem.ransac is None and is_exact(evidence)
     return lenses, _merge(found, lenses, leaves_out=leaves_out)
 
@@ -77,8 +77,8 @@ def _starts_at(problem: Problem, evidence: Evidence, init: Inits) -> Starts:
     )
 
 
-def _merge(found: list[_AtFocals], lenses: Lenses, *, leaves_out: bool) -> Starts:
-    """All starts by cost, relative to ``lenses``, or those that `_local_minima` leaves."""
+def _merge(found: list[_FocalStarts], lenses: Lenses, *, leaves_out: bool) -> Starts:
+    """Sort starts by cost, relative to ``lenses``; ``leaves_out`` keeps `_local_minima` only."""
     number = np.repeat(np.arange(len(found)), [len(each.costs) for each in found])
     costs = np.concatenate([each.costs for each in found])
     poses = np.concatenate([each.starts.poses for each in found])
@@ -91,7 +91,7 @@ def _merge(found: list[_AtFocals], lenses: Lenses, *, leaves_out: bool) -> Start
 
 
 def _local_minima(poses: FloatArray, costs: FloatArray, number: IntArray) -> BoolArray:
-    """True for starts (S,) that none on the same way, at a neighbouring focal length, betters."""
+    """True (S,) for starts that cost no more than similar ones at neighbouring focal lengths."""
     turns = poses[:, None, :, :9] - poses[None, :, :, :9]
     is_one = (np.linalg.norm(turns, axis=-1) < _SAME_BRANCH).all(axis=-1)
     is_next = np.abs(number[:, None] - number) == 1
@@ -99,7 +99,7 @@ def _local_minima(poses: FloatArray, costs: FloatArray, number: IntArray) -> Boo
 
 
 def _start(init: Inits, evidence: Evidence) -> Start | None:
-    """Given alignments as a start; where the size is held, they shrink about their cameras."""
+    """Given alignments as a start; a fixed size scales them about their cameras."""
     given = [each for each in init if each is not None]
     if not given:
         return None
@@ -137,16 +137,16 @@ def _hypotheses(
 
 
 def _samples(count: int, size: int, ransac: RansacOptions, scores: FloatArray | None) -> IntArray:
-    """Samples (S, size): all, or so many that of 40 % inliers one is pure; half drawn by scores."""
+    """Samples (S, size): all, or enough for 40 % inliers, half of them weighted by scores."""
     without = math.log(1 - ransac.success_prob) / math.log1p(-(_INLIER_RATIO**size))
     wanted = min(max(math.ceil(without), ransac.min_iterations), ransac.max_iterations)
     if math.comb(count, size) <= wanted:
         return np.array(list(combinations(range(count), size)))
-    told = None if scores is None or not scores.sum() > 0 else tuple(scores.tolist())
-    return _random_samples(count, size, wanted, ransac.seed, told)
+    weights = None if scores is None or not scores.sum() > 0 else tuple(scores.tolist())
+    return _random_samples(count, size, wanted, ransac.seed, weights)
 
 
-@lru_cache(maxsize=16)  # the same at every focal length, and with every mistake undone
+@lru_cache(maxsize=16)  # reused at every focal length and in every diagnosis
 def _random_samples(
     count: int, size: int, wanted: int, seed: int, scores: tuple[float, ...] | None
 ) -> IntArray:

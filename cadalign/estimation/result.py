@@ -1,4 +1,4 @@
-"""The result of every estimate: its values, pictures, files and exports."""
+"""The result of an estimate: values, uncertainty, plots, files and exports."""
 
 from __future__ import annotations
 
@@ -51,51 +51,50 @@ if TYPE_CHECKING:
 class Result:
     """Pose, stretch and shape of an object, with their uncertainty.
 
-    What `cadalign.fit`, `cadalign.align`, batches, retrieval and the annotator return.
+    Returned by `cadalign.fit`, `cadalign.align`, batches, retrieval and the annotator.
 
     Parameters
     ----------
     views : tuple of ViewResult
         Camera, pose, residuals and inliers of every view.
     ids : tuple of int or str
-        Ids or names of the m keypoints; of `cadalign.fit`, their rows.
+        Ids or names of the m keypoints; for `cadalign.fit`, their rows.
     points_3d : (m, 3) float
-        All keypoints of the model as they are on the object, also those that no view shows, in the
-        model's frame and before its stretch: of an exact model, as given; with a symmetry, turned
-        by the one that leads to this alignment.
+        All keypoints of the estimated shape, visible or not, in the model's frame before the
+        stretch. For an exact model these are the given keypoints; with a symmetry, moved by the
+        motion that leads to this alignment.
     method : str
-        The method that found it: that of `cadalign.fit`, "align" where all evidence was estimated
-        together.
+        Method of `cadalign.fit`, or "align" for a joint estimate from all evidence.
     posterior : Posterior
-        The uncertainty, and warnings about it.
+        Uncertainty of the estimate, and warnings.
     stretched_axes : str
-        The axes whose scale was estimated.
+        Axes whose scale was estimated.
     focal : {"known", "estimate"}
-        The cameras' focal length was taken as right, or estimated.
+        Whether the cameras' focal lengths were known or estimated.
     focal_prior : FocalPrior, optional
         Prior on the estimated focal length.
     sigma : float, optional
         Standard deviation of the keypoints [px], given or estimated; None where each keypoint has
         its own.
     cost : float, optional
-        -2 log likelihood of the evidence, with its priors, but for constants: the sum of whitened
-        squares, or of losses. None for methods that are not statistical.
+        -2 log likelihood of evidence and priors, up to a constant: the sum of squared whitened
+        residuals, or of their losses. None for methods that are not statistical.
     alternatives : tuple of Alternative
         Other estimates that explain the evidence as well: with 4 points all other exact solutions,
-        otherwise minima whose likelihood is at least 1/1000 of the best one's.
+        otherwise minima with at least 1/1000 of the best likelihood.
     stats : FitStats
     options : FitOptions, optional
         As for `cadalign.fit`.
     symmetry : Symmetry, optional
-        The model's, as given: of all equal alignments this is the canonical one.
+        The model's symmetry, as given. The result is the canonical of all equivalent alignments.
     model : Model or ShapeModel, optional
         The model of `cadalign.align`; None for a result that was read from a file.
     component : int
-        Number of the mixture's component that the object belongs to.
+        Index of the mixture component that the object belongs to.
     rig_from_model : Alignment, optional
-        The alignment in the frame that views with ``cam_from_rig`` share; None without them.
+        The alignment in the rig's frame; None for views without ``cam_from_rig``.
     own_bounds, own_stretch : optional
-        ``bounds`` and ``stretch`` where they do not follow.
+        ``bounds`` and ``stretch`` if they differ from the keypoints' bounds and the scale.
     """
 
     views: tuple[ViewResult, ...]
@@ -136,13 +135,13 @@ class Result:
     def alignment(self) -> Alignment:
         """Pose in the first view's camera, and scale.
 
-        ``alignment.apply(points_3d)`` are the object's keypoints in that camera's frame.
+        ``alignment.apply(points_3d)`` are the object's keypoints in the camera's frame.
         """
         return self.views[0].alignment
 
     @property
     def camera(self) -> Camera:
-        """The first view's camera; with the estimated focal length, where that was unknown."""
+        """The first view's camera, with the estimated focal length if it was unknown."""
         return self.views[0].camera
 
     @property
@@ -157,15 +156,15 @@ class Result:
 
     @property
     def residuals(self) -> FloatArray:
-        """Projected minus observed keypoints (n, 2) of all views, one after the other [px].
+        """Projected minus observed keypoints (n, 2) of all views, concatenated [px].
 
-        Infinite for keypoints that were rejected and lie behind the camera.
+        Infinite for outliers behind the camera.
         """
         return np.concatenate([view.residuals for view in self.views])
 
     @property
     def inliers(self) -> BoolArray:
-        """Marks the keypoints (n,) of all views that the estimate rests on."""
+        """Keypoints (n,) bool of all views that the estimate uses."""
         return np.concatenate([view.inliers for view in self.views])
 
     @property
@@ -177,32 +176,32 @@ class Result:
 
     @property
     def covariance(self) -> FloatArray | None:
-        """Covariance (9, 9) or (10, 10) of the errors, calibrated.
+        """Calibrated covariance (9, 9) or (10, 10) of the estimate's errors.
 
         The unknowns are the rotation vector in the first camera's frame [rad], the translation
-        [model units], the logarithms of the object's lengths along x, y, z and, where it was
-        estimated, of the focal length; zero for what is held. None for methods that are not
+        [model units], the logarithms of the object's lengths along x, y, z and, if estimated, of
+        the focal length. Rows of fixed unknowns are zero. None for methods that are not
         statistical.
 
-        For keypoints of an exact model in one view it is the second moments of the posterior
-        about the alignment, from some thousand draws (always the same), scaled such that the 95 %
-        ellipsoid holds what the likelihood ratio does not reject at 5 %. Where sigma was estimated,
-        it is widened for the few degrees of freedom of that estimate. It does not reach to the
-        ``alternatives``. Beyond 100 keypoints it is ``fisher_covariance`` but for that widening.
+        For keypoints of an exact model in one view, it is the posterior's second moment about the
+        alignment, from some thousand draws (always the same). It is scaled so that the 95 %
+        ellipsoid covers what the likelihood ratio test does not reject at 5 %. If sigma was
+        estimated, it is widened for the few degrees of freedom of that estimate. It excludes the
+        ``alternatives``. Beyond 100 keypoints it is ``fisher_covariance``, widened likewise.
 
         For other evidence it is the inverse information of all evidence and priors, calibrated for
-        learned shapes, and where other estimates are likely too, it holds their distance.
+        learned shapes. Where other estimates are likely too, it includes their distance.
 
-        With a symmetry, rotations about its axes count nothing.
+        Turns about an axis of continuous symmetry have no variance.
         """
         return self.posterior.covariance
 
     @property
     def fisher_covariance(self) -> FloatArray | None:
-        """Inverse of the Fisher information at the optimum, in the form of ``covariance``.
+        """Inverse Fisher information at the optimum (Cramer-Rao bound), laid out as ``covariance``.
 
-        The Cramer-Rao bound there: with few keypoints errors are larger. None for methods that are
-        not statistical, and where a file does not hold it.
+        With few keypoints the errors are larger. None for methods that are not statistical, and if
+        the result's file lacks it.
         """
         return self.posterior.fisher_covariance
 
@@ -213,44 +212,45 @@ class Result:
 
     @property
     def uncertain(self) -> tuple[str, ...]:
-        """Names of what has a standard deviation beyond 25 %, or 30 degrees; they are no warnings.
+        """Names of quantities with a standard deviation beyond 25 %, or 30 degrees.
 
-        Of "s_x", "s_y", "s_z", "distance" (to the model's origin), "focal length", "rotation".
+        Any of "s_x", "s_y", "s_z", "distance" (to the model's origin), "focal length", "rotation".
+        None of them is a warning.
         """
         return () if self.covariance is None else uncertain_of(self.alignment, self.covariance)
 
     @property
     def degrees_of_freedom(self) -> float | None:
-        """Tails of the t distribution of the errors, whose covariance the stated ones are.
+        """Degrees of freedom of the errors' t distribution; None if the errors are Gaussian.
 
-        None if they are Gaussian. `radius` depends on it.
+        All covariances are covariances of this distribution. `radius` depends on it.
         """
         return self.posterior.degrees_of_freedom
 
     @cached_property
-    def _of_points(self) -> tuple[FloatArray, FloatArray] | None:
+    def _propagated(self) -> tuple[FloatArray, FloatArray] | None:
         if self.covariance is None:
             return None
         return points_covariances(self.points_3d, self.alignment, self.covariance)
 
     @property
     def points_covariance(self) -> FloatArray | None:
-        """Covariance (m, 3, 3) of each keypoint in the model's frame, with its stretch."""
+        """Covariance (m, 3, 3) of each keypoint in the model's frame, after the stretch."""
         stated = self.posterior.points_covariance
-        return stated if stated is not None or self._of_points is None else self._of_points[0]
+        return stated if stated is not None or self._propagated is None else self._propagated[0]
 
     @property
     def points_cam_covariance(self) -> FloatArray | None:
         """Covariance (m, 3, 3) of each keypoint in the first camera's frame."""
         stated = self.posterior.points_cam_covariance
-        return stated if stated is not None or self._of_points is None else self._of_points[1]
+        return stated if stated is not None or self._propagated is None else self._propagated[1]
 
     @property
     def warnings(self) -> tuple[EstimateWarning, ...]:
-        """Warnings about what `std` does not say: contradictions, other poses, nothing to test.
+        """Warnings about problems that `std` does not show, such as contradictions or other poses.
 
-        What is merely ``uncertain`` has none. Each has a ``kind``, a ``text``, and the ``view`` and
-        ``keypoints`` that it is about.
+        Quantities that are merely ``uncertain`` have none. Each warning has a ``kind``, a ``text``,
+        and the ``view`` and ``keypoints`` that it concerns.
         """
         return self.posterior.warnings
 
@@ -261,9 +261,9 @@ class Result:
 
     @property
     def bounds(self) -> FloatArray:
-        """Least and greatest coordinates (2, 3) of the object in the model's frame.
+        """Minimum and maximum coordinates (2, 3) of the object in the model's frame.
 
-        The keypoints' bounds where the model has no others.
+        Bounds of the keypoints if the model has no others.
         """
         return extent(self.points_3d) if self.own_bounds is None else self.own_bounds
 
@@ -274,20 +274,20 @@ class Result:
 
     @property
     def stretch(self) -> FloatArray:
-        """Lengths (3,) of the object over the model's or, for a learned shape, the mean's."""
+        """Lengths (3,) of the object relative to the model or, for a learned shape, to the mean."""
         return self.alignment.scale if self.own_stretch is None else self.own_stretch
 
     def radius(self, probability: float, *, dimension: int = 1) -> float:
-        """Radius, in standard deviations, of the region that holds the truth with a probability.
+        """Radius, in standard deviations, of the region with a probability to contain the truth.
 
         Parameters
         ----------
         probability : float
             Between 0 and 1.
         dimension : int
-            Number of coordinates that the region has: 1 for the interval of one number, 3 for the
-            ellipsoid of a rotation, translation or keypoint, along the principal axes of its
-            covariance. ``std.rotation_deg`` is a total over three axes and takes neither.
+            Dimension of the region: 1 for an interval, 3 for the ellipsoid of a rotation,
+            translation or keypoint, along the principal axes of its covariance. Neither applies to
+            ``std.rotation_deg``, a total over three axes.
 
         Raises
         ------
@@ -303,13 +303,13 @@ class Result:
         return radius_of(probability, dimension, self.degrees_of_freedom)
 
     def mesh(self, mesh: Mesh | str | os.PathLike[str] | None = None) -> Mesh:
-        """A model's mesh, warped so that its keypoints are the object's.
+        """Warp a mesh so that its keypoints are the object's keypoints.
 
         Parameters
         ----------
         mesh : Mesh or path, optional
-            By default that of the `Model` or, for a learned shape, of the nearest training model.
-            Where the model is not known, it is taken for the object's own.
+            Default: the mesh of the `Model` or, for a learned shape, of the nearest training model.
+            For an exact or unknown model it is not warped.
 
         Returns
         -------
@@ -357,12 +357,12 @@ class Result:
         image : (h, w, 3) uint8 or path, optional
             The photo; grey by default.
         mesh : Mesh, optional
-            As for `mesh`, drawn shaded with its outline; by default that of the model, if it has
-            one. Without any the box is the object's, or the keypoints'.
+            As for `mesh`, drawn shaded with its outline; default: the model's mesh, if it has one.
+            Without a mesh the box shows ``bounds``.
         view : int
             Number of the view to draw.
         axes : matplotlib.axes.Axes, optional
-            The axes to draw on; those of a new figure by default.
+            Axes to draw on; default: the axes of a new figure.
 
         Returns
         -------
@@ -372,7 +372,7 @@ class Result:
         Raises
         ------
         InputError
-            If there is no such view, or the photo is not of its camera's size.
+            If there is no such view, or the photo's size is not the camera's.
 
         Examples
         --------
@@ -392,15 +392,15 @@ class Result:
     def export(
         self,
         path: str | os.PathLike[str],
-        **of_the_object: Any,
+        **options: Any,
     ) -> Path:
         """Write the aligned object for another tool; see `cadalign.export.export_object`.
 
         Parameters
         ----------
         path : path-like
-            Its ending chooses the format: ``.glb``, ``.obj`` or ``.ply``.
-        **of_the_object
+            The extension chooses the format: ``.glb``, ``.obj`` or ``.ply``.
+        **options
             ``mesh``, ``photos`` and ``name`` of `cadalign.export.object_of`.
 
         Examples
@@ -409,7 +409,7 @@ class Result:
         """
         from cadalign.export import export_object, object_of
 
-        return export_object(path, object_of(self, **of_the_object))
+        return export_object(path, object_of(self, **options))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result as JSON, as `cadalign fit` does.
@@ -423,7 +423,7 @@ class Result:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Result:
-        """Read what `save` or `cadalign fit` wrote.
+        """Read a file written by `save` or `cadalign fit`.
 
         Raises
         ------
@@ -439,14 +439,14 @@ class Result:
             return cls.from_dict(data)
 
     def to_dict(self) -> dict[str, Any]:
-        """Write the result as plain lists and numbers, for JSON, without the model."""
-        from cadalign.estimation.document import write_result  # takes the validation library along
+        """Convert the result, without the model, to plain lists and numbers for JSON."""
+        from cadalign.estimation.document import write_result  # imports the validation library
 
         return write_result(self)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Result:
-        """Read what `to_dict` wrote.
+        """Read a dict written by `to_dict`.
 
         Raises
         ------

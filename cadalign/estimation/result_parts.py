@@ -1,7 +1,7 @@
 """Parts of a result: warnings, views, alternatives, evidence, the posterior, fitted keypoints.
 
-Covariances are those of the rotation vector in the camera frame [rad], the translation, the
-logarithms of the lengths along x, y, z, and, where it was estimated, of the focal length.
+Rows of a covariance: rotation vector in the camera frame [rad], translation, logarithms of the
+lengths along x, y, z and, if estimated, of the focal length.
 """
 
 from __future__ import annotations
@@ -45,35 +45,35 @@ Kind = Literal[
 class EstimateWarning:
     """A warning about an estimate.
 
-    ``str(warning)`` is its text, and warnings are printed as their texts.
+    ``str`` and ``repr`` show only its text.
 
     Parameters
     ----------
     kind : str
         What is doubtful:
 
-        - "mistake": a usual mistake in the data explains them better, a mirrored model for example;
+        - "mistake": a common mistake in the data, such as a mirrored model, explains them better;
         - "outlier": keypoints do not fit the others;
-        - "misfit": residuals are larger than the stated noise explains, and no few keypoints are to
-          blame;
+        - "misfit": residuals are larger than the stated noise explains, and not because of a few
+          outliers;
         - "noise": the estimated noise is as large as the keypoints' spread;
-        - "chance": keypoints at random would agree as well;
-        - "untested": no equation is left that tests the estimate;
-        - "outside-image": keypoints lie outside of the image;
-        - "camera": the focal length is contradicted, or the camera is implausible;
-        - "stretch": the constraint on the stretch is contradicted, or the stretch implausible;
+        - "chance": random keypoints would agree as well;
+        - "untested": there are no redundant equations to test the estimate;
+        - "outside-image": keypoints lie outside the image;
+        - "camera": the keypoints contradict the focal length, or the camera is implausible;
+        - "stretch": the keypoints contradict the limit on the stretch, or it is implausible;
         - "contradiction": a piece of evidence contradicts the rest;
-        - "unit": depths or distances are in another unit, or keypoints are no pixels;
-        - "mask", "photo": it is left out, or agrees in part;
-        - "left-out": a view is, or a keypoint that was not found or given twice;
+        - "unit": depths or distances have another unit, or keypoints are not in pixels;
+        - "mask", "photo": the mask or photo is left out, or agrees only in part;
+        - "left-out": a view is left out, or a keypoint that was not found or given twice;
         - "focal": the estimated focal length contradicts its prior;
-        - "alternative": another pose is likely, too.
+        - "alternative": another pose is likely too.
     text : str
         A sentence for the user.
     view : int, optional
-        Number of the view that it is about; None for all of them together.
+        Index of the view that it concerns; None for all views.
     keypoints : tuple of int
-        Rows, among the view's keypoints, of those that it is about; empty where it is about no few.
+        Rows, within the view, of the keypoints that it concerns; empty if it concerns all.
 
     Examples
     --------
@@ -115,20 +115,20 @@ _FIELDS = {
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """Another estimate that the evidence cannot tell from the best one.
+    """Another estimate that explains the evidence almost as well as the best one.
 
     Parameters
     ----------
     alignment : Alignment
         In the first view's camera.
     relative_likelihood : float
-        Its likelihood over that of the best one, 1 for an equally good one.
+        Likelihood relative to the best estimate; 1 for an equally good one.
     camera : Camera
-        The camera that goes with it; the best one's, unless the focal length was estimated.
+        Its camera: the best estimate's, unless the focal length was estimated.
     points_3d : (m, 3) float
         Its keypoints in the model's frame.
     own_bounds : (2, 3) float, optional
-        Its box in the model's frame; None for that of the keypoints.
+        Its bounds in the model's frame; None for the keypoints' bounds.
     """
 
     alignment: Alignment
@@ -139,7 +139,7 @@ class Alternative:
 
     @property
     def bounds(self) -> FloatArray:
-        """Its box (2, 3) in the model's frame."""
+        """Its bounds (2, 3) in the model's frame."""
         return extent(self.points_3d) if self.own_bounds is None else self.own_bounds
 
 
@@ -149,7 +149,7 @@ def alternatives_of(
     cameras: Sequence[Camera],
     costs: Sequence[float],
 ) -> tuple[Alternative, ...]:
-    """The minima beside the first, of points (n, 3), that are likely enough."""
+    """Alternatives with points (n, 3) among all minima but the first, where likely enough."""
     ratios = [math.exp(min(0.0, costs[0] - cost) / 2) for cost in costs]
     return tuple(
         Alternative(pose, ratio, camera, points)
@@ -165,9 +165,9 @@ class FitStats:
     Parameters
     ----------
     iterations : int
-        Refinement steps over all starts; samples, where inliers were searched for.
+        Number of refinement steps over all starts; with ``ransac``, of samples.
     hypotheses : int
-        Alignments from which a refinement could start.
+        Number of alignments that a refinement could start from.
     seconds : float
     """
 
@@ -180,7 +180,7 @@ NO_STATS = FitStats(0, 0, 0.0)
 
 
 class KeypointSearch(Protocol):
-    """The search for inliers, by which those that were found may be doubted."""
+    """A robust search that can doubt the inliers it found."""
 
     @property
     def ransac(self) -> RansacOptions: ...
@@ -189,9 +189,9 @@ class KeypointSearch(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class FittedKeypoints:
-    """Keypoints of an exact model in one view, with their alignment; fields as of `Result`."""
+    """Keypoints of an exact model in one view, with their alignment; fields as in `Result`."""
 
-    points_3d: FloatArray  # (n, 3) on the model, of the keypoints that the view shows
+    points_3d: FloatArray  # (n, 3), only the keypoints that the view shows
     residuals: FloatArray
     inliers: BoolArray
     alignment: Alignment
@@ -204,8 +204,8 @@ class FittedKeypoints:
     cost: float | None = None
     alternatives: tuple[Alternative, ...] = ()
     stats: FitStats = NO_STATS
-    search: KeypointSearch | None = None  # for the inliers, where they were searched for
-    repeats: tuple[tuple[int, int], ...] = ()  # rows left out, and those that they repeat
+    search: KeypointSearch | None = None  # with ransac
+    repeats: tuple[tuple[int, int], ...] = ()  # (row left out, row that it repeats)
 
     @property
     def is_counted(self) -> BoolArray:
@@ -216,14 +216,14 @@ class FittedKeypoints:
 
     @property
     def observed(self) -> FloatArray:
-        """The keypoints (n, 2) [px] as they were given; NaN for those behind the camera."""
+        """The given keypoints (n, 2) [px]; NaN behind the camera."""
         projected = self.camera.project_where_ahead(self.alignment.apply(self.points_3d))
         with np.errstate(invalid="ignore"):  # infinite residuals
             return np.asarray(projected - self.residuals)
 
     @property
     def redundancy(self) -> int:
-        """Number of equations, those of priors included, beyond the unknowns."""
+        """Number of equations, including priors, minus the number of unknowns."""
         equations = 2 * int(self.inliers.sum()) + self.options.prior_equations(self.alignment.scale)
         return equations - self.options.unknowns
 
@@ -254,11 +254,11 @@ class EvidenceSummary:
     unit: str
     """One of "px", "deg", "" (the unit of lengths). A camera's motion has no residual."""
     share: float | None = None
-    """Share of the model's outline that was found in a photo, 0 where the photo was left out."""
+    """Share of the model's outline that was found in a photo; 0 if the photo was left out."""
 
     @property
     def name(self) -> str:
-        """The argument that gave it.
+        """The argument with this evidence.
 
         Examples
         --------
@@ -276,12 +276,12 @@ class EvidenceSummary:
 def keypoint_summary(
     number: int, residuals: FloatArray, inliers: BoolArray, sigma: Any
 ) -> EvidenceSummary:
-    """The summary of a view's inliers (n,), with residuals (n, 2) [px] of a standard deviation."""
+    """Summary of a view's inliers (n,) with residuals (n, 2) [px] and ``sigma``."""
     kept, unit = residuals[inliers], 1.0 if sigma is None else sigma
     count = max(len(kept), 1)
     rms = math.sqrt((kept * kept).sum() / count)
     if np.ndim(unit) == 0:
-        # The least positive number is a sigma, too.
+        # The smallest positive float is a valid sigma.
         in_sigmas = min(rms / math.sqrt(2.0) / float(unit), sys.float_info.max)
     else:
         information = pixel_information(unit, len(residuals))[inliers]
@@ -290,14 +290,14 @@ def keypoint_summary(
     return EvidenceSummary("keypoints", number, len(kept), in_sigmas, rms, "px")
 
 
-def listed(clauses: Sequence[str]) -> str:
-    """Names or clauses of which one is meant."""
+def join_or(clauses: Sequence[str]) -> str:
+    """Join names or clauses by commas and "or"."""
     *some, last = clauses
     return f"{', '.join(some)} or {last}" if some else last
 
 
 def quickly(kind: type[T], fields: dict[str, Any]) -> T:
-    """A frozen dataclass of fields, unchecked: setting them takes longer than a linear solver."""
+    """Create a frozen dataclass without its slow constructor and checks."""
     made = object.__new__(kind)
     made.__dict__.update(fields)
     return made
@@ -316,11 +316,11 @@ class Posterior:
     warnings: Warnings = ()
     evidence: tuple[EvidenceSummary, ...] = ()
     score: float | None = None
-    """-2 log probability, its shape integrated out, but for constants; None of exact models."""
+    """-2 log probability up to a constant, without the shape; None for exact models."""
 
 
 class OutlineNotes(NamedTuple):
-    """Additions of masks and photos to a result."""
+    """Evidence and warnings from masks and photos."""
 
     evidence: tuple[EvidenceSummary, ...] = ()
     warnings: Warnings = ()
@@ -341,7 +341,7 @@ def points_covariances(
 
 
 def point_slopes(points: FloatArray, alignment: Alignment) -> FloatArray:
-    """Derivatives (m, 3, 9) of points in the camera's frame by the unknowns of a covariance."""
+    """Derivatives (m, 3, 9) of points in the camera's frame by a covariance's unknowns."""
     stretched = points * alignment.scale
     by_logs = alignment.rotation * stretched[:, None]
     shifts = np.broadcast_to(np.eye(3), by_logs.shape)
@@ -356,7 +356,7 @@ class ViewResult:
     Parameters
     ----------
     camera : Camera
-        Its camera; with the estimated focal length, where that was unknown.
+        The camera, with the estimated focal length if it was unknown.
     alignment : Alignment
         Pose in that camera, and scale.
     ids : sequence of int or str
@@ -364,12 +364,12 @@ class ViewResult:
     points_2d : (n, 2) float
         Observed keypoints [px].
     residuals : (n, 2) float
-        Projected minus observed keypoints [px]; infinite, and null in JSON, for one that was
-        rejected and lies behind the camera.
+        Projected minus observed keypoints [px]; infinite (null in JSON) for outliers behind the
+        camera.
     inliers : (n,) bool
-        The keypoints that the estimate rests on.
+        Keypoints that the estimate uses.
     posterior : Posterior
-        Has the ``covariance``.
+        Uncertainty in this camera's frame.
     """
 
     camera: Camera
@@ -397,6 +397,6 @@ class ViewResult:
 
 
 def rms_of(residuals: FloatArray, inliers: BoolArray) -> float:
-    """Root mean square length of residuals (n, 2), of the inliers (n,) alone."""
+    """Root mean square length of the residuals (n, 2) of inliers (n,)."""
     kept = residuals[inliers]
     return math.sqrt((kept * kept).sum() / max(len(kept), 1))

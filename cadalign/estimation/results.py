@@ -1,4 +1,4 @@
-"""Results of many problems or objects: a sequence of single results, their arrays, a table."""
+"""Results of many problems or objects, as a sequence, as arrays and as a table."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ Entry = Result | CadalignError | Callable[[], Result]
 class Results(Sequence[Result | CadalignError]):
     """Results of B independent problems or objects.
 
-    As a sequence it has a `Result`, or the error in its place, for each of them; ``results[k]`` is
-    what a single call returns. Its arrays have a row for each: those of a problem without solution
-    are NaN, ``errors`` has the reason. Poses and focal lengths of several views are the first's.
+    A sequence with one `Result` or error per problem; ``results[k]`` is what a single call returns.
+    The arrays have one row per problem, with NaN for a problem without solution; ``errors`` has the
+    reason. With several views, pose and focal length are the first view's.
 
     Parameters
     ----------
     entries : iterable of Result or CadalignError
-        Results of single calls, or functions that make them when they are asked for.
+        Results of single calls, or functions that compute them on access.
     table : (B, 17) float, optional
-        Packed alignments, rms and focal lengths, where they are known before the single results.
+        Packed alignments, rms and focal lengths, if known before the single results.
     """
 
     def __init__(self, entries: Iterable[Entry], table: FloatArray | None = None) -> None:
@@ -66,13 +66,13 @@ class Results(Sequence[Result | CadalignError]):
 
     @property
     def errors(self) -> dict[int, CadalignError]:
-        """Reasons why problems have no solution, by problem."""
+        """Errors of problems without solution, by index."""
         entries = enumerate(self._entries)
         return {k: entry for k, entry in entries if isinstance(entry, CadalignError)}
 
     @property
     def solved(self) -> BoolArray:
-        """Marks the problems that have a solution, (B,) bool."""
+        """Problems with a solution, (B,) bool."""
         return np.array([not isinstance(each, CadalignError) for each in self._entries], dtype=bool)
 
     @cached_property
@@ -107,7 +107,7 @@ class Results(Sequence[Result | CadalignError]):
 
     @property
     def focal_length(self) -> FloatArray:
-        """Horizontal focal length (B,) of the cameras [px], estimated where it was unknown."""
+        """Horizontal focal length (B,) of the cameras [px], given or estimated."""
         return self._table[:, 16]
 
     def alignment(self, problem: int) -> Alignment:
@@ -116,7 +116,7 @@ class Results(Sequence[Result | CadalignError]):
         Raises
         ------
         CadalignError
-            The reason why the problem has none.
+            If the problem has no solution.
         """
         entry = self._entries[problem]
         if isinstance(entry, CadalignError):
@@ -126,9 +126,9 @@ class Results(Sequence[Result | CadalignError]):
     def to_dataframe(self) -> pd.DataFrame:
         """One row for each problem, as a pandas DataFrame with the columns of ``results.csv``.
 
-        docs/how_to/many_photos.md describes them; those that name files are left out. Pose, camera
-        and their deviations are the first view's. A problem without solution has the ``status``
-        "failed", and the ``reason``.
+        docs/how_to/many_photos.md describes the columns; columns with file names are left out.
+        Pose, camera and their standard deviations are the first view's. A problem without solution
+        has the ``status`` "failed" and a ``reason``.
 
         Examples
         --------
@@ -181,7 +181,7 @@ class Results(Sequence[Result | CadalignError]):
         if not (path / _TABLE).is_file():
             is_run = (path / "run.json").is_file()
             what = "the run is not finished" if is_run else "not the folder of a run of fits"
-            fix = "start the command that made it again: it goes on" if is_run else _FIX
+            fix = "run the same command again: it resumes" if is_run else _FIX
             raise DataError(what, where=str(path), fix=fix)
         try:
             cells = pq.read_table(path / _TABLE, columns=["status", "reason"], use_threads=False)

@@ -1,4 +1,4 @@
-"""The second stage of an estimate: minima over components of the shape, focal lengths and noise."""
+"""Second stage of an estimate: search minima over shape components, focal lengths and noise."""
 
 from __future__ import annotations
 
@@ -29,25 +29,25 @@ from cadalign.solvers.joint.evidence import (
 )
 from cadalign.solvers.joint.search import refine_joint, score_state, search_joint
 
-_MOST_FREE = 2  # scales that keypoints determine; the size follows from other evidence
-_OUTLIER_COST = 5.0  # of a keypoint left out, beyond the square of its threshold
-_WIDENING = 3.0  # standard deviations of a displacement that a threshold allows for
-_NEAREST = 1e-9  # depth
+_MOST_FREE = 2  # scales that keypoints determine, not the size
+_OUTLIER_COST = 5.0  # of an outlier, beyond its squared threshold
+_WIDENING = 3.0  # of a threshold, in standard deviations of a displacement
+_NEAREST = 1e-9  # least depth
 _INLIER_ROUNDS = 5
-_KEPT = 4  # minima of the robust search that are settled on their inliers
+_KEPT = 4  # minima of the robust search that are refined on their inliers
 _LEAST_INLIERS = 3
 
 _NOISES = np.geomspace(0.1, 100.0, 10)  # [px]
-_USUAL, _USUAL_LOG_SIGMA = 2.0, 1.5  # [px], prior: few keypoints fit any noise by the shape
-_NOISE_ROUNDS = 3  # of a search with the noise of the last
-_NOISE_TOLERANCE = 0.2  # change of the log noise that asks for another search
+_USUAL, _USUAL_LOG_SIGMA = 2.0, 1.5  # [px], prior: with few keypoints, a free shape fits any noise
+_NOISE_ROUNDS = 3  # of search and noise estimate
+_NOISE_TOLERANCE = 0.2  # change of the log noise that requires another search
 _NOISE_PRECISION = 0.01  # of the log noise
 _NOISE_ITERATIONS = 30
 _GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 class Minimum(NamedTuple):
-    """An estimate under one component, relative to ``lenses``; ``score`` is -2 log probability."""
+    """A minimum for one component, relative to ``lenses``; ``score`` is -2 log probability."""
 
     component: int
     inliers: BoolArray
@@ -59,7 +59,7 @@ class Minimum(NamedTuple):
 
     @property
     def prior_score(self) -> float:
-        """The score of the component's weight and of what was left out; 0 where it is infinite."""
+        """The part of the score from the component's weight and outliers; 0 if infinite."""
         own = self.score - score_state(self.evidence, self.state)
         return own if np.isfinite(own) else 0.0
 
@@ -69,7 +69,7 @@ class Minimum(NamedTuple):
 
 
 class SearchResult(NamedTuple):
-    """A problem with its noise, its minima, and the numbers of iterations and of starts."""
+    """The problem at its estimated noise, its minima, and numbers of iterations and starts."""
 
     problem: Problem
     minima: list[Minimum]
@@ -85,9 +85,9 @@ def search_at_noise(problem: Problem, init: Inits) -> SearchResult:
         hypotheses += len(starts.poses)
         if not len(starts.poses):
             continue
-        whole = _whole(problem.evidence(shape, lenses), number, lenses)
-        if any(init) and _is_left_to_outlines(problem, whole.evidence):
-            found, used = _states_of(whole, starts), 0
+        whole = _initial_minimum(problem.evidence(shape, lenses), number, lenses)
+        if any(init) and _needs_outlines(problem, whole.evidence):
+            found, used = _score_starts(whole, starts), 0
         else:
             found, used = _find_minima(problem, whole, starts)
         iterations += used
@@ -100,19 +100,19 @@ def search_at_noise(problem: Problem, init: Inits) -> SearchResult:
     return SearchResult(problem, minima, iterations, hypotheses)
 
 
-def _whole(evidence: Evidence, component: int, lenses: Lenses) -> Minimum:
-    """An estimate from all sightings that has no state yet."""
+def _initial_minimum(evidence: Evidence, component: int, lenses: Lenses) -> Minimum:
+    """A minimum from all sightings, without a state yet."""
     every, no_state = np.ones(len(evidence.sightings.point), dtype=bool), cast(State, None)
     return Minimum(component, every, evidence, no_state, 0.0, np.inf, lenses)
 
 
-def _is_left_to_outlines(problem: Problem, evidence: Evidence) -> bool:
-    """True where outlines determine what else is open: that would lead a start astray."""
+def _needs_outlines(problem: Problem, evidence: Evidence) -> bool:
+    """True if only outlines determine all unknowns: a search without them would drift."""
     return problem.uses_outlines and redundancy_of(evidence) < 0
 
 
-def _states_of(whole: Minimum, starts: Starts) -> list[Minimum]:
-    """Starts as they are, with the score of the evidence there."""
+def _score_starts(whole: Minimum, starts: Starts) -> list[Minimum]:
+    """The unrefined starts, with their scores."""
     states = [
         mean_state(whole.evidence, poses, log_scales)._replace(log_focals=log_focals)
         for poses, log_focals, log_scales in zip(*starts, strict=True)
@@ -121,7 +121,7 @@ def _states_of(whole: Minimum, starts: Starts) -> list[Minimum]:
 
 
 def _find_minima(problem: Problem, whole: Minimum, starts: Starts) -> tuple[list[Minimum], int]:
-    """Minima of the evidence of ``whole`` from starts, the best first, and the iterations."""
+    """Minima of ``whole.evidence`` from starts, the best first, and the number of iterations."""
     if problem.ransac is not None:
         return _robust_minima(problem.ransac, problem.threshold(problem.ransac), whole, starts)
     minima, used = search_joint(whole.evidence, *starts)
@@ -135,11 +135,11 @@ def _find_minima(problem: Problem, whole: Minimum, starts: Starts) -> tuple[list
 def _robust_minima(
     ransac: RansacOptions, limit: float, whole: Minimum, starts: Starts
 ) -> tuple[list[Minimum], int]:
-    """Estimates that most keypoints support, the best first, with the iterations they took.
+    """Minima with the most inliers, the best first, and the number of iterations.
 
-    A keypoint that is left out costs as much as one at its threshold, and the logarithm that one
-    more would add. Thresholds that are not given are widened by what a point's displacement
-    projects to: the residual of one that is left out has all of it.
+    An outlier costs its squared threshold, plus the log term of one more inlier. Default thresholds
+    are widened by the projected displacement of a point, which an outlier's residual contains in
+    full.
     """
     evidence = whole.evidence
     threshold = thresholds(evidence, whole.lenses, limit)
@@ -148,15 +148,15 @@ def _robust_minima(
     for state in minima.states[:_KEPT]:
         displaced = _WIDENING * _spread(evidence, state) * (ransac.max_reproj_error is None)
         rounds = _INLIER_ROUNDS if ransac.refine else 1
-        settled = _settle(whole._replace(state=state), np.hypot(threshold, displaced), rounds)
+        settled = _refit(whole._replace(state=state), np.hypot(threshold, displaced), rounds)
         if settled is not None:
             found.append(settled)
     found.sort(key=lambda minimum: minimum.score)
     return found, iterations
 
 
-def _settle(whole: Minimum, threshold: FloatArray, rounds: int) -> Minimum | None:
-    """The best estimate on inliers alone, whose whitened residuals are below thresholds (N,)."""
+def _refit(whole: Minimum, threshold: FloatArray, rounds: int) -> Minimum | None:
+    """Refine on inliers, with whitened residuals below thresholds (N,), until these are stable."""
     best: Minimum | None = None
     state = whole.state
     inliers = whitened_lengths(whole.evidence, state) < threshold
@@ -184,11 +184,11 @@ def _settle(whole: Minimum, threshold: FloatArray, rounds: int) -> Minimum | Non
 
 
 def _check_support(problem: Problem, best: Minimum, max_reproj_error: float) -> None:
-    """Refuse a minimum that chance gives as well; few keypoints leave that to other evidence."""
+    """Raise NoConsensusError if chance explains the inliers; skipped for few keypoints."""
     views, rig, sightings = problem.views, best.evidence.rig, best.evidence.sightings
     limits = thresholds(best.evidence, best.lenses, 1.0)
     errors = whitened_lengths(best.evidence, best.state) / limits
-    areas = np.array(  # [px^2] over which outliers are scattered
+    areas = np.array(  # of outliers [px^2]
         [
             area_of(view.pixels, view.camera, max_reproj_error) if len(view.keypoint_ids) else 1.0
             for view in views
@@ -220,11 +220,11 @@ def thresholds(evidence: Evidence, lenses: Lenses, max_reproj_error: float) -> F
 
 
 def search(problem: Problem, starts: Sequence[Inits]) -> SearchResult:
-    """Minima from each of the given ``starts``, at the likeliest noise of keypoints without sigma.
+    """Minima from each of ``starts``, at the most likely noise of keypoints without sigma.
 
-    The shape is integrated out, and so is the pose by Laplace's approximation, so that the noise is
-    free of the bias that fitted unknowns cause. Raises DegenerateError if keypoints of unknown
-    noise always fit; NoConsensusError, with ``problem.ransac``, if chance gives as much support.
+    The shape, and by Laplace's approximation the pose, are integrated out, so that fitted unknowns
+    do not bias the noise. Raises DegenerateError if keypoints of unknown noise always fit exactly;
+    NoConsensusError, with ``problem.ransac``, if chance explains the inliers.
     """
     if problem.lacks_sigma:
         counts = [len(view.keypoint_ids) for view in problem.views if view.sigma is None]
@@ -237,7 +237,7 @@ def search(problem: Problem, starts: Sequence[Inits]) -> SearchResult:
         _, found, *spent = search_at_noise(problem, init)
         effort += spent
         while rounds and found:
-            noise = _likeliest(problem, found[0])
+            noise = _estimate_noise(problem, found[0])
             change = abs(math.log(noise / problem.noise))
             problem = problem._replace(noise=noise)
             rounds = 0 if change < _NOISE_TOLERANCE else rounds - 1
@@ -248,8 +248,8 @@ def search(problem: Problem, starts: Sequence[Inits]) -> SearchResult:
     return SearchResult(problem, minima, int(effort[0]), int(effort[1]))
 
 
-def widened_by_noise(problem: Problem, minima: Sequence[Minimum]) -> Sequence[Minimum]:
-    """The minima with less information, where the noise itself is uncertain."""
+def widen_by_noise(problem: Problem, minima: Sequence[Minimum]) -> Sequence[Minimum]:
+    """Reduce the information of the minima if the noise was estimated."""
     if not problem.lacks_sigma:
         return minima
     unknown = _unknown_noise(problem.views, minima[0])
@@ -259,8 +259,8 @@ def widened_by_noise(problem: Problem, minima: Sequence[Minimum]) -> Sequence[Mi
     return [_scale_noise(each, _unknown_noise(problem.views, each), factor) for each in minima]
 
 
-def _likeliest(problem: Problem, minimum: Minimum) -> float:
-    """The noise [px] with the best score of one minimum."""
+def _estimate_noise(problem: Problem, minimum: Minimum) -> float:
+    """The noise [px] that maximises the probability of one minimum."""
     unknown = _unknown_noise(problem.views, minimum)
     count = int(unknown.sum())
 
@@ -284,7 +284,7 @@ def _likeliest(problem: Problem, minimum: Minimum) -> float:
 
 
 def _unknown_noise(views: Sequence[View], minimum: Minimum) -> BoolArray:
-    """Marks the sightings (N,) of views whose keypoints have no sigma."""
+    """True (N,) for keypoint sightings of views without sigma."""
     lacking = np.array([view.sigma is None for view in views])
     sightings = minimum.evidence.sightings
     return np.asarray(lacking[sightings.image] & (sightings.whitening[:, 2] > 0))
@@ -295,7 +295,7 @@ def _scale_noise(minimum: Minimum, chosen: BoolArray, factor: float) -> Minimum:
 
 
 def whitened_lengths(evidence: Evidence, state: State) -> FloatArray:
-    """Lengths (N,) of whitened residuals in the image; infinite behind a camera."""
+    """Lengths (N,) of whitened image residuals; infinite behind a camera."""
     sightings = evidence.sightings
     points = points_of(evidence.shape, state)[sightings.point]
     seen = seen_in_cameras(evidence, state.poses, points, sightings.image)
@@ -307,7 +307,7 @@ def whitened_lengths(evidence: Evidence, state: State) -> FloatArray:
 
 
 def _spread(evidence: Evidence, state: State) -> FloatArray:
-    """Whitened standard deviations (N,) that the points' displacements project to."""
+    """Whitened standard deviations (N,) of the points' projected displacements."""
     sightings, shape = evidence.sightings, evidence.shape
     points = points_of(shape, state)[sightings.point]
     depths = seen_in_cameras(evidence, state.poses, points, sightings.image)[:, 2]
@@ -317,7 +317,7 @@ def _spread(evidence: Evidence, state: State) -> FloatArray:
 
 
 def scale_whitening(factor: float, chosen: BoolArray, evidence: Evidence) -> Evidence:
-    """The evidence with the whitening of ``chosen`` sightings (N,) times a factor."""
+    """Multiply the whitening of ``chosen`` sightings (N,) by a factor."""
     old = evidence.sightings
     whitening = np.where(chosen[:, None], factor, 1.0) * old.whitening
     return evidence._replace(sightings=old._replace(whitening=whitening))

@@ -1,6 +1,6 @@
-"""The fast lane: packed keypoints of one calibrated camera straight into the solvers' kernels.
+"""Fast path: solve packed keypoints of one camera with the solvers' kernels.
 
-The noise is the one that is given, or that the residuals tell.
+The noise is given, or estimated from the residuals.
 """
 
 from __future__ import annotations
@@ -33,30 +33,29 @@ from cadalign.solvers.projection import reproject_batch
 
 _ROUNDS = 20
 _TOLERANCE = 1e-3
-# No keypoint is known better, over the keypoints' spread in the image: keeps a perfect fit from
-# claiming to be certain of everything.
+# Least estimated sigma, relative to the keypoints' spread in the image, for perfect fits.
 _LEAST_SIGMA = 1e-6
-_HIGHEST_QUANTILE = 0.95  # of the residuals' lengths that a robust sigma is taken from
+_HIGHEST_QUANTILE = 0.95  # of the residuals' lengths, for a robust sigma
 _TINY = 1e-100
 _EXACT_COST = 1e-6
-# Minima, iterations, hypotheses, undetermined unknown of a method that makes one guess.
+# Minima, iterations, hypotheses and undetermined unknown of a linear method.
 _ONE_MINIMUM = read_only(np.array([[1, 0, 1, -1]]))
-_UNKNOWNS = read_only(np.array([0, 1, 2, 3, 4, 5, 7, 8]))  # of the solvers, among a result's
+_UNKNOWNS = read_only(np.array([0, 1, 2, 3, 4, 5, 7, 8]))  # rows of a covariance
 _NO_COST = read_only(np.array([[np.inf]]))
 
 
 def solve(problems: Problems, options: FitOptions) -> Solutions:
-    """Solve every problem; one through a lens must be alone. CadalignError of lens or sigma."""
+    """Solve all problems; a camera with distortion takes one. Raises CadalignError."""
     camera = problems.camera
     camera.require_focal()
     facing = faced(camera, problems.points_2d) if camera.is_wide else camera
     points = problems.points_3d
     rays = rays_of(problems.points_2d, facing)
-    whitening = whitening_of(options.sigma, rays, facing)  # which checks sigma
+    whitening = whitening_of(options.sigma, rays, facing)  # checks sigma
     if options.method == "optimal":
         found = _optima(problems, options, points, rays, whitening)
     elif options.method == "aepnp":
-        found = _one_guess(*aepnp_batch(points, rays, problems.offsets))
+        found = _single_solutions(*aepnp_batch(points, rays, problems.offsets))
     else:
         found = _baseline(options.method, points, rays)
     residuals, statuses = _residuals(problems, points, facing, found)
@@ -77,7 +76,7 @@ def solve(problems: Problems, options: FitOptions) -> Solutions:
 
 
 def are_solved_at_once(problems: Sequence[Problems], options: FitOptions) -> bool:
-    """True for problems that `solve` takes at once, whose camera and noise are the same."""
+    """True if `solve` can take all problems in one call: equal cameras without distortion."""
     is_quick = options.focal == "known" and options.method in ("optimal", "aepnp")
     cameras = {each.camera for each in problems}
     has_lens = any(camera.is_wide or camera.distortion for camera in cameras)
@@ -91,7 +90,7 @@ def _optima(
     rays: FloatArray,
     whitening: FloatArray,
 ) -> Solutions:
-    """The likeliest solutions; where any keypoints are fitted exactly, all that do so."""
+    """The likeliest solutions, or all exact solutions of minimal problems."""
     loss, free, count = LOSSES[options.loss], options.free, len(problems)
     prior, bends = options.scale_prior, np.full(count, options.loss_scale)
     given = points, rays, whitening, problems.offsets, loss, bends, np.full(count, prior.weight)
@@ -101,7 +100,7 @@ def _optima(
     if not exact.any():
         return found
     if not options.prior_weight:
-        # Where none fits exactly without a bound, this keeps the optimum from running off.
+        # The bound is only needed if no unbounded solution fits exactly.
         unbounded = Solutions(*optimal_batch(*given[:-1], np.zeros(count), 0.0, *others))
         chosen = exact & (unbounded.costs[:, 0] < _EXACT_COST)
         for name in ("poses", "costs", "covariances", "statuses", "info"):
@@ -119,12 +118,12 @@ def _optima(
 def _residuals(
     problems: Problems, points: FloatArray, camera: Camera, found: Solutions
 ) -> tuple[FloatArray, IntArray]:
-    """Projected minus observed keypoints (n, 2) [px], and the statuses (B,) that follow."""
+    """Projected minus observed keypoints (n, 2) [px], and updated statuses (B,)."""
     pixels, offsets = problems.points_2d, problems.offsets
     pinhole = np.array([[camera.fx, camera.fy, camera.cx, camera.cy]])
     given = points, pixels, offsets, found.poses, pinhole
     residuals, statuses = reproject_batch(*given, found.statuses)
-    if camera.distortion:  # of the only problem
+    if camera.distortion:  # one problem only
         rays = (pixels + residuals - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
         residuals = camera.pixels_from_normalized(rays) - pixels
         if statuses[0] == OK and not np.isfinite(residuals).all():
@@ -137,12 +136,12 @@ def _baseline(method: str, points: FloatArray, rays: FloatArray) -> Solutions:
 
     rotation, translation, scale = (epnp if method == "epnp" else aepnp_paper)(points, rays)
     pose = np.concatenate([rotation.ravel(), translation, scale])
-    return _one_guess(pose[None, None], np.zeros(1, dtype=np.int64))
+    return _single_solutions(pose[None, None], np.zeros(1, dtype=np.int64))
 
 
-def _one_guess(poses: FloatArray, statuses: IntArray) -> Solutions:
-    """The solutions of a method that supports neither noise nor alternatives."""
-    count = len(poses)  # NumPy's tile takes as long as the linear solver
+def _single_solutions(poses: FloatArray, statuses: IntArray) -> Solutions:
+    """Solutions of a method without noise and alternatives."""
+    count = len(poses)  # np.tile takes as long as the linear solver
     return Solutions(
         poses, _NO_COST.repeat(count, 0), None, statuses, _ONE_MINIMUM.repeat(count, 0)
     )
@@ -151,9 +150,9 @@ def _one_guess(poses: FloatArray, statuses: IntArray) -> Solutions:
 def keypoints_of_solution(
     problems: Problems, solutions: Solutions, options: FitOptions, seconds: float
 ) -> FittedKeypoints:
-    """The fitted keypoints of the only problem, which has a solution."""
+    """The fitted keypoints of one problem with a solution."""
     minima, iterations, hypotheses, _ = solutions.info[0].tolist()
-    points = problems.points_3d.copy()  # the caller may go on to change theirs
+    points = problems.points_3d.copy()  # the caller may change the array
     is_one = options.method == "optimal" and isinstance(options.sigma, int | float)
     inliers = np.empty(len(points), dtype=bool)
     inliers.fill(True)
@@ -182,12 +181,11 @@ def keypoints_of_solution(
 
 
 def fit_keypoints(problems: Problems, options: FitOptions, start: float) -> FittedKeypoints:
-    """Fit all keypoints of the only problem, which was begun at ``start`` [s].
+    """Fit all keypoints of one problem; the time starts at ``start`` [s].
 
-    An unknown sigma is the residuals'. Rounds end where they converge, or go in circles: of two
-    optima each may be the better one at the other's noise. Keypoints that are given repeatedly
-    count once for the redundancy. Raises DegenerateError if they always fit, so that the noise is
-    open.
+    An unknown sigma is estimated from the residuals in rounds, until these converge or cycle
+    between optima. Repeated keypoints count once for the redundancy. Raises DegenerateError
+    without redundancy, since sigma is then undetermined.
     """
     if options.sigma is not None or options.method != "optimal":
         return _fit_at_noise(problems, options, start)
@@ -217,7 +215,7 @@ def _fit_at_noise(problems: Problems, options: FitOptions, start: float) -> Fitt
         if solutions.errors:
             raise solutions.errors[0]
         return keypoints_of_solution(problems, solutions, options, time.perf_counter() - start)
-    # Only here: most cameras are calibrated, and its kernels take time to import.
+    # Imported here: most cameras are calibrated, and the kernels import slowly.
     from cadalign.estimation.joint import fit_jointly
 
     return fit_jointly(problems, options, None, None, start)
@@ -226,7 +224,7 @@ def _fit_at_noise(problems: Problems, options: FitOptions, start: float) -> Fitt
 def _robust_sigma(squares: FloatArray, redundancy: int) -> float:
     """Standard deviation [px] from a quantile of the squared lengths (n,) of residuals.
 
-    As many keypoints as have the unknowns' equations may fit exactly: it is the others' median.
+    The unknowns may fit as many equations exactly: it is the median of the other keypoints.
     """
     count = len(squares)
     place = math.ceil(count - redundancy / 4)

@@ -1,12 +1,12 @@
-"""Starts of a joint estimate: poses that the keypoints of each view suggest for the mean shape.
+"""Starts of a joint estimate, from each view's keypoints and the mean shape.
 
-Views whose few keypoints leave the stretch open start at that of the view with the most. Where a
-flat object's shape leaves open which side is seen, starts half a turn away are added.
+A view with too few keypoints for the stretch takes it from the view with the most keypoints. If a
+flat object may be seen from either side, starts half a turn away are added.
 
-An estimate that determines the object's size is linear in all but the rotation. For a camera (C, c)
-of a rig, a point of the model is seen at ``X = C (R diag(s) x + t) + c``. Its ray says
-``X_x = u X_z`` and ``X_y = v X_z``, its depth ``X_z = z``, and known lengths and heights of cameras
-are linear in s and t, too. None is homogeneous, so that views with one keypoint count.
+If the evidence determines the size, all unknowns but the rotation are linear. In a camera (C, c) of
+a rig, a model point is at ``X = C (R diag(s) x + t) + c``. Its ray gives ``X_x = u X_z`` and
+``X_y = v X_z``, its depth ``X_z = z``; known lengths and camera heights are linear in s and t too.
+All views share one system, so that views with one keypoint contribute.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ _MOST_SIZED = 3
 
 _GRID = 400  # rotations
 _MOST_METRIC = 16
-_ROUNDS = 2  # of weighting by the depths of the last
+_ROUNDS = 2  # of weighting by depth
 _RIDGE = 1e-14  # of normal equations with a diagonal of 1
 _LEAST_SIZE = 1e-300
 _LEAST_SCALE = 1e-6
 
-_Start = tuple[FloatArray, FloatArray]  # a pose (12,), or those (P, 12) of all, and log scales (3,)
+_Start = tuple[FloatArray, FloatArray]  # a pose (12,) or all poses (P, 12), and log scales (3,)
 
 
 class Starts(NamedTuple):
@@ -51,10 +51,10 @@ Start = tuple[Sequence[FloatArray | None], FloatArray]
 
 
 def starts_of(evidence: Evidence, init: Start | None = None) -> Starts:
-    """Starts at the focal lengths of the rays; none where every view has too few keypoints.
+    """Starts at the focal lengths of the rays; none if every view has too few keypoints.
 
-    Of several poses the likeliest are taken together, then one of them replaced by the next. A
-    given start comes first, poses half a turn away come last.
+    With several poses, the first start has the likeliest of each; the next ones replace one pose at
+    a time. A given start comes first, poses half a turn away come last.
     """
     found = _propose(evidence, init)
     return Starts(
@@ -75,7 +75,7 @@ def _propose(evidence: Evidence, init: Start | None) -> list[_Start]:
     for view, camera in enumerate(rig.cam_from_rig):
         is_weak = is_several and 2 * counts[view] <= unknowns
         found, logs = view_starts(held if is_weak else evidence, view)
-        turned = _half_turned(evidence, view, found)
+        turned = _half_turns(evidence, view, found)
         moved = [(rig_pose(pose, camera), scales) for pose, scales in zip(found, logs, strict=True)]
         moved += [(rig_pose(pose, camera), np.zeros(3)) for pose in turned]
         per_pose[rig.pose[view]].extend(moved)
@@ -85,17 +85,17 @@ def _propose(evidence: Evidence, init: Start | None) -> list[_Start]:
         for given, found_of_pose in zip(init[0], per_pose, strict=True):
             if given is None:
                 continue
-            if is_open:  # what the keypoints alone suggest is arbitrary
+            if is_open:  # the keypoints alone give arbitrary poses
                 found_of_pose.clear()
             found_of_pose.insert(0, (given, init[1]))
     elif is_metric and poses == 1:
         placed = _metric_starts(evidence, per_pose[0])
         if placed:
-            # Of points nearly in a plane, the scales that a rotation leaves to linear equations
-            # are noise: the likeliest poses that keypoints alone suggest come after them.
+            # Linear scales of nearly planar points are noise, so the likeliest poses from the
+            # keypoints alone are added.
             first = [(pose[None], logs) for pose, logs in per_pose[0][:_MOST_SIZED]]
             return placed + [_match_size(evidence, *each) for each in first]
-        if rig.is_shared.any():  # nothing tells the size
+        if rig.is_shared.any():  # the size is undetermined
             return []
     if not all(per_pose):
         return []
@@ -107,13 +107,13 @@ def _propose(evidence: Evidence, init: Start | None) -> list[_Start]:
         if rank < len(per_pose[p])
     ]
     chosen = [likeliest, *others][:_MOST_STARTS]
-    told = rig.pose[int(np.argmax(counts))] if init is None else 0  # the pose whose stretch counts
-    starts = [(np.array([pose for pose, _ in each]), each[told][1]) for each in chosen]
+    best = rig.pose[int(np.argmax(counts))] if init is None else 0  # the pose with the best stretch
+    starts = [(np.array([pose for pose, _ in each]), each[best][1]) for each in chosen]
     return [_match_size(evidence, *each) for each in starts] if is_metric else starts
 
 
 def _match_size(evidence: Evidence, poses: FloatArray, log_scales: FloatArray) -> _Start:
-    """A start enlarged about each view's camera such that depths and distances agree."""
+    """Scale a start about the cameras to match measured depths and distances."""
     factor = _size_factor(evidence, poses, np.exp(log_scales))
     if not np.isfinite(factor) or not factor > 0:
         return poses, log_scales
@@ -122,7 +122,7 @@ def _match_size(evidence: Evidence, poses: FloatArray, log_scales: FloatArray) -
 
 
 def _size_factor(evidence: Evidence, poses: FloatArray, scale: FloatArray) -> float:
-    """Median of measured over predicted lengths; NaN where nothing is measured."""
+    """Median ratio of measured to predicted lengths; NaN without measurements."""
     sightings, mean = evidence.sightings, evidence.shape.mean
     has_depth, offsets = sightings.depths[:, 1] > 0, evidence.offsets
     points, image = mean[sightings.point[has_depth]] * scale, sightings.image[has_depth]
@@ -131,12 +131,12 @@ def _size_factor(evidence: Evidence, poses: FloatArray, scale: FloatArray) -> fl
         sightings.depths[has_depth, 0] / depths,
         offsets.value / distances_of(evidence, poses, mean * scale),
     ]
-    told = np.concatenate(ratios)
-    return float(np.median(told)) if len(told) else float("nan")
+    known = np.concatenate(ratios)
+    return float(np.median(known)) if len(known) else float("nan")
 
 
 def rig_pose(pose: FloatArray, camera: FloatArray) -> FloatArray:
-    """A camera's pose (12,) of the model as the rig's."""
+    """Transform a pose (12,) from a camera's frame to the rig's."""
     rotation, translation = camera[:9].reshape(3, 3), camera[9:]
     turned = rotation.T @ pose[:9].reshape(3, 3)
     return np.concatenate([turned.ravel(), rotation.T @ (pose[9:] - translation)])
@@ -148,8 +148,8 @@ def _keypoint_counts(evidence: Evidence) -> IntArray:
     return np.bincount(sightings.image[is_keypoint], minlength=len(evidence.rig.pose))
 
 
-def _half_turned(evidence: Evidence, view: int, poses: FloatArray) -> list[FloatArray]:
-    """Turn poses (12,) of the mean by half a turn, about each axis that its shape allows."""
+def _half_turns(evidence: Evidence, view: int, poses: FloatArray) -> list[FloatArray]:
+    """Turn poses (12,) by half a turn about each axis that the mean shape allows."""
     sightings, shape = evidence.sightings, evidence.shape
     names = np.unique(sightings.point[(sightings.image == view) & (sightings.whitening[:, 2] > 0)])
     if len(names) < LEAST_POINTS or evidence.scales.free.any():
@@ -161,9 +161,9 @@ def _half_turned(evidence: Evidence, view: int, poses: FloatArray) -> list[Float
 
 
 class _Rows(NamedTuple):
-    """Equations of the model's ``points`` (N, 3) in a rig's cameras, of ``weights`` (N,).
+    """Weighted linear equations of the model's ``points`` (N, 3) in a rig's cameras.
 
-    ``is_ray`` (N,) is 1 where the standard deviation is that of a ray: it grows with the depth.
+    ``is_ray`` (N,) is 1 for equations of rays, whose standard deviation grows with the depth.
     """
 
     points: FloatArray
@@ -176,15 +176,15 @@ class _Rows(NamedTuple):
 
 
 def _metric_starts(evidence: Evidence, own: Sequence[_Start]) -> list[_Start]:
-    """Likeliest poses (1, 12) and log scales, linear at rotations of ``own`` or of a grid."""
+    """Likeliest poses (1, 12) and log scales, at rotations of ``own`` or of a grid."""
     rows, is_tied = _rows_of(evidence), has_scale_prior(evidence.scales)
-    basis = np.ones((3, 1)) if is_tied else np.eye(3)  # of scales that a prior holds together
+    basis = np.ones((3, 1)) if is_tied else np.eye(3)  # of scales; one if a prior ties them
     given = [pose[:9].reshape(3, 3) for pose, _ in own]
     rotations = np.array(given) if given else spread_rotations(_GRID)
     by_scale = (rows.normals @ rotations) * rows.points
     same = np.broadcast_to(rows.normals, by_scale.shape)
     left = np.concatenate([same, by_scale @ basis], axis=2)
-    extra_left, extra_right = _other_rows(evidence, rotations, basis)
+    extra_left, extra_right = _distance_rows(evidence, rotations, basis)
     weights = np.broadcast_to(rows.weights, left.shape[:2])
     for _ in range(_ROUNDS):
         weighted = np.concatenate([left * weights[:, :, None], extra_left], axis=1)
@@ -235,10 +235,10 @@ def _rows_of(evidence: Evidence) -> _Rows:
     )
 
 
-def _other_rows(
+def _distance_rows(
     evidence: Evidence, rotations: FloatArray, basis: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Whitened equations (S, L, 3 + k) of known distances, in translation and scales."""
+    """Whitened equations (S, L, 3 + k) of known distances in translation and scales."""
     offsets, mean, count = evidence.offsets, evidence.shape.mean, len(rotations)
     left = np.zeros((count, len(offsets.value), 6))
     right = np.tile(offsets.value, (count, 1))

@@ -1,11 +1,10 @@
-"""Results in terms of a model's symmetry: one of all equal alignments, and its uncertainty.
+"""Canonical alignments of symmetric models, and their uncertainty.
 
-A model that a symmetry g takes to itself is placed by A g as by A. A result has the canonical one
-of all such alignments (`Symmetry.canonical`), together with the keypoints as that one has
-them, g^-1 x: the result is that of keypoints labelled so. To first order, a step (w, dt, ds) of A's
-rotation vector in the camera frame, translation and log scales is one of A g by a linear map, which
-carries the covariance. How far the object is turned about an axis of the symmetry means nothing:
-standard deviations are stated without that step, such that points on the axis keep theirs.
+If a symmetry g maps the model to itself, the alignments A and A g are equivalent. A result has the
+canonical one (`Symmetry.canonical`), with the keypoints g^-1 x. To first order, a step (w, dt, ds)
+of A's rotation vector in the camera frame, translation and log scales is a linear function of the
+step of A g, which transforms the covariance. Turns about an axis of continuous symmetry have no
+meaning: they are removed from the covariance, which does not change it for points on the axis.
 """
 
 from __future__ import annotations
@@ -21,28 +20,28 @@ from cadalign.geometry.rotations import angles_between, by_rotation, vector_from
 from cadalign.geometry.symmetry import Equal, Symmetry
 
 SAME_SQUARES = 9.0
-"""Squared distance of rotations, in the best one's deviations, of equal estimates."""
-_SAME_DEG = 0.01  # of rotations where there are no deviations, or they are tiny
+"""Largest squared distance [sigma^2] between rotations of equal estimates."""
+_SAME_DEG = 0.01  # between equal rotations, without or with tiny deviations
 
 
 def check_symmetry(symmetry: Symmetry) -> None:
-    """Raise InputError for what is no symmetry."""
+    """Raise InputError unless it is a Symmetry."""
     require_kind(symmetry, Symmetry, "symmetry", fix="see cadalign.Symmetry.from_dict")
 
 
 def held_axes(stretched: str) -> tuple[bool, bool, bool]:
-    """The axes whose scale is held, where the others are estimated."""
+    """True for each axis with a fixed scale."""
     x, y, z = (axis not in stretched for axis in "xyz")
     return x, y, z
 
 
 def stretched_axes(held: tuple[bool, bool, bool]) -> str:
-    """The axes whose scale is estimated, where those of others are held."""
+    """Names of the axes whose scale is not ``held``."""
     return "".join(axis for axis, is_held in zip("xyz", held, strict=True) if not is_held)
 
 
 def remove_free_turns(covariance: FloatArray, best: Equal) -> FloatArray:
-    """A covariance of pose and others without turns about the symmetry's axes."""
+    """Remove turns about axes of continuous symmetry from a covariance."""
     size = len(covariance)
     arm, left = best.alignment.linear @ best.center, np.eye(size)
     for axis in best.free:
@@ -53,13 +52,13 @@ def remove_free_turns(covariance: FloatArray, best: Equal) -> FloatArray:
     return np.asarray(left @ covariance @ left.T)
 
 
-def distinct_ones(
+def distinct_alignments(
     poses: Sequence[Alignment],
     covariance: FloatArray | None,
     symmetry: Symmetry,
     held: tuple[bool, bool, bool],
 ) -> list[tuple[int, Equal]]:
-    """Canonical alignments with their numbers, without those as near the first as errors."""
+    """Canonical alignments with their indices, without those within errors of the first."""
     first, *others = enumerate(symmetry.canonical(each, held=held) for each in poses)
     best = first[1].alignment
     information = None
@@ -82,7 +81,7 @@ def transform_covariance(
     best: Equal,
     held: tuple[bool, bool, bool] = (False, False, False),
 ) -> FloatArray:
-    """The covariance (9, 9) or (10, 10) of an equal alignment; zero for scales that are held."""
+    """The covariance (9, 9) or (10, 10) of an equal alignment; zero for ``held`` scales."""
     turn, shift = best.motion[:3, :3], best.motion[:3, 3]
     step = np.eye(len(covariance))
     step[3:6, :3] = by_rotation(given.linear @ shift)

@@ -1,4 +1,4 @@
-"""A view: the evidence of one image about an object, with checked depths, masks and directions."""
+"""A view: the evidence of one image about an object, with checks of its inputs."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _DEFAULTS = {"depth_sigma": 0.01, "up_sigma_deg": 1.0, "camera_height_sigma": 0.
 
 
 class _Numbers(tuple[int, ...]):
-    """Ids of keypoints that none are given for: so they are known in changed copies of a view."""
+    """Default ids of keypoints; changed copies of a view know them by this type."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,55 +52,55 @@ class View:
     points_2d : (n, 2) float
         Keypoints in the image [px]; integers are pixel centres.
     ids : sequence of n int or str, optional
-        The model's ids or names of these keypoints; by default all of the model's, in its order.
+        Ids or names of these keypoints in the model; default: all of the model's, in its order.
     sigma : float, (n,) float, (n, 2, 2) float, or None
-        Standard deviation of the keypoints, of each, or covariance of each [px]. None estimates one
-        for all views that have none, by its likelihood under a weak prior about 2 px.
+        Standard deviation of all keypoints or of each [px], or covariance of each [px^2]. None
+        estimates one value for all views with None, under a weak prior centred at 2 px.
     scores : (n,) float, optional
         Confidences of the keypoints, for a robust search.
     depth : (n,) or (h, w) float, or path, optional
-        Depths of the keypoints, their z in the camera's frame, also of a wide lens, or an image of
-        such depths that is registered to the photo, as an array or as a 16-bit PNG [model units, or
-        the unit in which the object's size is wanted]; NaN where unknown, in an image also 0. An
-        image is sampled robustly at the keypoints. One or two of eight that something else hides
-        hardly count, by Cauchy's loss; give NaN for keypoints on the object's far side.
+        Depths of the keypoints, or a depth image registered to the photo, as an array or a 16-bit
+        PNG [model units, or the desired unit of the object's size]. A depth is z in the camera's
+        frame, also for a wide lens. NaN means unknown, in an image 0 too. An image is sampled
+        robustly at the keypoints. Cauchy's loss tolerates one or two occluded keypoints of eight;
+        give NaN for keypoints on the object's far side.
     depth_sigma : float or (n,) float
-        Standard deviation of the depths, relative; by default 0.01, 1 %.
+        Relative standard deviation of the depths; default: 0.01 (1 %).
     depth_scale : float, optional
-        Units per count of a depth image; by default 0.001 for a file (millimetres to metres), 1 for
+        Units per count of a depth image; default: 0.001 for a file (millimetres to metres), 1 for
         an array of floats.
     up : (3,) float, optional
         The direction of the model's up axis in the camera's frame (OpenCV's: y points down), of any
         length.
     up_sigma_deg : float or (3, 3) float
-        Its standard deviation about each axis across it [degrees], or the covariance of the
-        direction [degrees squared].
+        Standard deviation of the direction about each perpendicular axis [degrees], or its
+        covariance [degrees squared].
     camera_height : float, optional
-        Height of the camera above the plane that the object stands on with its lowest face [the
-        unit in which the object's size is wanted]. ``up`` says how the plane lies.
+        Height of the camera above the plane below the object's lowest face [the desired unit of
+        the object's size]. ``up`` gives the plane's normal.
     camera_height_sigma : float
-        Its standard deviation, relative.
+        Relative standard deviation of the height.
     cam_from_rig : (4, 4) float, optional
-        The camera's known pose in a frame that several views share. Where no view has one, the
-        cameras moved in an unknown way between them.
+        Known pose of the camera in a frame that several views share. Without it, the motion between
+        views is unknown.
     mask : (h, w) bool or float, or path, optional
-        Pixels of the object in an image of the camera's size: True, or their probabilities in
-        [0, 1], or an 8-bit grey PNG that is not zero there.
+        Mask of the object, of the camera's size: bool, probabilities in [0, 1], or the path of an
+        8-bit grey PNG that is nonzero on the object.
     mask_sigma : float, optional
         Standard deviation of the mask's contour along its normal [px]; None estimates it.
     image : (h, w, 3) uint8, or path, optional
-        The photo in RGB, as evidence: the model's outline is sought in it, from the estimate by
-        everything else; the model needs a mesh. It does not count beside a mask of the same view.
+        The RGB photo as evidence: the model's outline is searched for in it, near the estimate from
+        all other evidence. The model needs a mesh. Ignored if the view has a mask.
     photo : path, optional
-        The photo, which is no evidence: of the camera's size, no warning supposes another one.
+        The photo, not used as evidence. If it has the camera's size, no warning suggests another.
     number : int
-        Its place among the views, which errors, warnings and evidence name; `align` counts them.
+        Index of the view in errors, warnings and evidence; set by `align`.
 
     Raises
     ------
     InputError
-        If shapes don't match, ids repeat, a value is NaN or infinite, a pose is no rigid motion, or
-        an image has another size than the camera.
+        If shapes don't match, ids repeat, a value is NaN or infinite, a pose is not a rigid motion,
+        or an image's size is not the camera's.
     DataError
         If a file cannot be read.
 
@@ -150,7 +150,7 @@ class View:
             self._keep("depth", _depths(self.depth, camera, len(points), self.depth_scale))
             object.__setattr__(self, "depth_scale", None)  # a changed copy is not scaled again
         if self.up is not None:
-            self._keep("up", _upwards(self.up, self.up_sigma_deg))
+            self._keep("up", _up_direction(self.up, self.up_sigma_deg))
         if self.cam_from_rig is not None:
             self._keep("cam_from_rig", nearest_rigid(self.cam_from_rig, where="cam_from_rig"))
         if self.mask is not None:
@@ -160,7 +160,7 @@ class View:
         if self.depth_image is not None:
             as_positive(self.depth_sigma, name="depth_sigma")
             if not len(points):
-                what, fix = "counts at keypoints, and there are none", "give some, or leave it away"
+                what, fix = "a depth image needs keypoints", "give points_2d, or omit depth"
                 raise InputError(what, where="depth", fix=fix)
         else:
             as_one_or_each(
@@ -178,12 +178,12 @@ class View:
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Names of the fields beside keypoints that are evidence by themselves."""
+        """Names of the given evidence other than keypoints."""
         return tuple(name for name in _SOURCES if getattr(self, name) is not None)
 
     @property
     def is_numbered(self) -> bool:
-        """True where no ids are given."""
+        """True if the ids are the default."""
         return isinstance(self.ids, _Numbers)
 
     @property
@@ -198,23 +198,23 @@ class View:
 
     @property
     def depth_image(self) -> FloatArray | None:
-        """The depth image (h, w), NaN where unknown; None where ``depth`` is none."""
+        """The depth image (h, w), NaN where unknown; None if ``depth`` is not an image."""
         is_image = self.depth is not None and np.ndim(cast(FloatArray, self.depth)) == 2
         return cast(FloatArray, self.depth) if is_image else None
 
     @property
     def has_mask_alone(self) -> bool:
-        """True if a mask, and no keypoint, says where the object is."""
+        """True if the view has a mask, and no keypoints."""
         return self.mask is not None and not len(self.keypoint_ids)
 
     @property
     def has_outline(self) -> bool:
-        """True if a mask or a photo may show the outline."""
+        """True if the view has a mask or a photo as evidence."""
         return self.mask is not None or self.image is not None
 
     @property
     def has_evidence(self) -> bool:
-        """True if the view says anything about the object."""
+        """True if the view has evidence about the object by itself."""
         return bool(len(self.keypoint_ids)) or bool({*self.sources} - {"cam_from_rig", "depth"})
 
     @property
@@ -224,11 +224,11 @@ class View:
 
 
 def number_views(views: Iterable[View]) -> list[View]:
-    """The views, each with its place among them."""
-    same = list(map(copy, views))  # what was checked need not be checked again
-    for place, view in enumerate(same):
-        object.__setattr__(view, "number", place)
-    return same
+    """Copies of the views, each with its ``number``."""
+    copies = list(map(copy, views))  # without checking them again
+    for number, view in enumerate(copies):
+        object.__setattr__(view, "number", number)
+    return copies
 
 
 def _depths(given: Any, camera: Camera, count: int, scale: float | None) -> FloatArray:
@@ -240,8 +240,8 @@ def _depths(given: Any, camera: Camera, count: int, scale: float | None) -> Floa
     else:
         depth = np.asarray(given)
         if depth.ndim == 2 and depth.dtype.kind in "iu" and factor is None:
-            fix = "give `depth_scale`, 0.001 for millimetres where metres are wanted"
-            raise InputError("whole numbers have no unit", where="depth", fix=fix)
+            fix = "give `depth_scale`, for example 0.001 to convert millimetres to metres"
+            raise InputError("the unit of the integers is unknown", where="depth", fix=fix)
         shape = (None,) if depth.ndim == 1 else (None, None)
         depth = as_floats(depth, name="depth", shape=shape, finite=False)
     wanted = (count,) if depth.ndim == 1 else (camera.height, camera.width)
@@ -253,7 +253,7 @@ def _depths(given: Any, camera: Camera, count: int, scale: float | None) -> Floa
     if depth.ndim == 2:
         known &= depth != 0
     if (depth[known] <= 0).any():
-        fix = "give NaN where it is unknown"
+        fix = "give NaN for unknown depths"
         raise InputError("has values that are not positive", where="depth", fix=fix)
     return np.where(known, depth * (1.0 if factor is None else factor), np.nan)
 
@@ -272,8 +272,8 @@ def _mask(given: Any, camera: Camera) -> FloatArray | BoolArray:
         return mask
     probabilities = as_floats(mask, name="mask", shape=(None, None))
     if probabilities.min() < 0 or probabilities.max() > 1:
-        fix = "give a bool array, or probabilities; of an image of bytes give `image > 0`"
-        raise InputError("has values outside of [0, 1]", where="mask", fix=fix)
+        fix = "give a bool array or probabilities; for an 8-bit image give `image > 0`"
+        raise InputError("has values outside [0, 1]", where="mask", fix=fix)
     return probabilities
 
 
@@ -290,16 +290,16 @@ def _photo(given: Any, camera: Camera) -> ByteImage:
     if pixels.shape[:2] != (camera.height, camera.width):
         size = f"{pixels.shape[1]} x {pixels.shape[0]}"
         what = f"the photo is {size}, the camera {camera.width} x {camera.height}{note}"
-        raise InputError(what, where="image", fix="give the photo that the camera is of")
+        raise InputError(what, where="image", fix="give the photo that belongs to the camera")
     return pixels
 
 
-def _upwards(given: Any, sigma: Any) -> FloatArray:
-    """The unit vector (3,) of a direction with a standard deviation, or a covariance (3, 3)."""
+def _up_direction(given: Any, sigma: Any) -> FloatArray:
+    """The unit vector (3,) of ``up``; checks its standard deviation or covariance (3, 3)."""
     up = as_floats(given, name="up", shape=(3,))
     length = float(np.linalg.norm(up))
     if not length > 0:
-        raise InputError("a direction must not be zero", where="up")
+        raise InputError("the direction must not be zero", where="up")
     if np.ndim(sigma) == 0:
         if not is_number(sigma) or not sigma > 0:
             raise InputError(f"{quote(sigma)} is not positive", where="up_sigma_deg")

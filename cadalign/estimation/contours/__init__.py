@@ -1,1 +1,1 @@
-"""Silhouettes, rims and contours: masks and photos as evidence, with OpenCV and embree."""
+"""Masks and photos as evidence: silhouettes, rims and contours, with OpenCV and embree."""

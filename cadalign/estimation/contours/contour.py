@@ -1,8 +1,8 @@
-"""Contours of masks, and rims: where a model's silhouette ends on a contour's normals.
+"""Contours of masks, and rims: points on a contour's normals where a model's silhouette ends.
 
-Smoothing rounds corners off, and pixels quantise a contour. The silhouette that the model has in
-the same pixels, extracted as the mask's contour was, is displaced in the same way, so that the
-difference of the two contours is free of both.
+Smoothing rounds corners off, and pixels quantise a contour. To remove this bias, the model's
+silhouette is rendered in the same pixels, and its contour is extracted likewise: the difference of
+the two contours has no bias.
 """
 
 from __future__ import annotations
@@ -21,26 +21,24 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.raycaster import RayCaster
 
 SPACING = 2.0
-"""Distance of neighbouring samples along the contour [px]."""
+"""Distance between neighbouring samples along the contour [px]."""
 
 _SMOOTHING = 1.0  # [px], of the image whose level line is the contour
 _NORMAL_SMOOTHING = 2.0  # [px], of the image whose gradient is the normal
-_BORDER = 3.0  # [px], within which the image's border shapes the contour
+_BORDER = 3.0  # [px], distance from the image's border without samples
 _LEAST_AREA = 0.003  # of a piece or hole, relative to the largest piece
 _LEAST_PIXELS = 12
-# Longer contours are of noise: in pixels, and in diagonals of what they span. A chair's has 7, in
-# 12 megapixels 20,000 px. At 40 diagonals a mask alone takes half a minute in 640 x 480 px, at 70
-# more than one; keypoints with a contour of 108,000 px take 16 s, of 380,000 px 5 minutes.
+# A longer contour is noise, and slow: in pixels, and in diagonals of its bounding box.
 _LONGEST, _MOST_DIAGONALS = 80_000.0, 45.0
 REACH = 2.0
-"""Farthest that a level line is sought from a boundary pixel, or from a rim [px]."""
+"""Largest distance of a level line from a boundary pixel, or from a rim [px]."""
 _STEP = 0.25
-_LONGEST_STEP = 1.5  # [px], between rays on a normal: a thinner part may be missed
+_LONGEST_STEP = 1.5  # [px], between rays on a normal: thinner parts may be missed
 _MOST_STEPS = 24  # to either side
 _PRECISION = 0.05  # [px], of a rim
 _STEEPEST = 1.2  # tangent of the angle between rim and contour above which these don't match
-_BAND = 5  # width [px] of the band about a rim where pixels may differ from the mask's
-_MARGIN = 8  # [px], about the rims: their reach, and that of smoothing
+_BAND = 5  # width [px] of the band about a rim that is rendered
+_MARGIN = 8  # [px], about the rims, for reach and smoothing
 _LEAST_COSINE = 0.3  # between rim and contour
 
 
@@ -50,7 +48,7 @@ Image = npt.NDArray[np.float32]
 class Contour(NamedTuple):
     """Samples ``points`` (S, 2) [px] of a mask's contour, `SPACING` apart on each ``curve`` (S,).
 
-    The unit ``normals`` (S, 2) point outwards of the object.
+    The unit ``normals`` (S, 2) point away from the object.
     """
 
     points: FloatArray
@@ -70,15 +68,15 @@ class Contour(NamedTuple):
         same = self.curve[lag:] == self.curve[:-lag]
         return np.asarray(kept[lag:] & kept[:-lag] & same)
 
-    def taken(self, chosen: BoolArray | IntArray) -> Contour:
+    def select(self, chosen: BoolArray | IntArray) -> Contour:
         return Contour(self.points[chosen], self.normals[chosen], self.curve[chosen])
 
 
 def contour_of(probability: FloatArray | BoolArray) -> Contour:
     """Samples of the level line 0.5 of a smoothed mask (h, w) of probabilities.
 
-    Small pieces and holes are dropped, and samples near the image's border, where the object may go
-    on.
+    Small pieces, small holes, and samples near the image's border are dropped: the object may
+    extend beyond it.
     """
     image = np.ascontiguousarray(probability, dtype=np.float32)
     level = smooth(image)
@@ -91,7 +89,7 @@ def contour_of(probability: FloatArray | BoolArray) -> Contour:
         places, outwards = _level_line(chain, level, slope_x, slope_y)
         if len(places) < 3:
             continue
-        for piece, directions in _inside(*_resample(places, outwards), image.shape):
+        for piece, directions in _clip_to_image(*_resample(places, outwards), image.shape):
             points.append(piece)
             normals.append(directions)
             curves.append(np.full(len(piece), count))
@@ -99,10 +97,10 @@ def contour_of(probability: FloatArray | BoolArray) -> Contour:
     return Contour(np.concatenate(points), np.concatenate(normals), np.concatenate(curves))
 
 
-def sampled(image: Image, points: FloatArray) -> FloatArray:
-    """Values (n,) of an image (h, w) at points (n, 2), bilinear; outside those of the border.
+def interpolate(image: Image, points: FloatArray) -> FloatArray:
+    """Interpolate an image (h, w) at points (n, 2) bilinearly; extend its border.
 
-    `cv2.remap` rounds places to 1/32 px, which moves contours by more than the precision sought.
+    `cv2.remap` rounds to 1/32 px, which is too coarse for contours.
     """
     places = np.fmin(np.fmax(points, 0.0), np.subtract(image.shape[::-1], 1))  # 0 for NaN
     values = map_coordinates(image, places.T[::-1], order=1, mode="nearest", output=np.float64)
@@ -110,14 +108,14 @@ def sampled(image: Image, points: FloatArray) -> FloatArray:
 
 
 def smooth(image: Image, sigma: float = _SMOOTHING) -> Image:
-    """The image (h, w) whose level line 0.5 is the contour of a mask."""
+    """Smooth a mask (h, w); the level line 0.5 is its contour."""
     return np.asarray(
         cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE), dtype=np.float32
     )
 
 
 def _chains(level: Image) -> list[FloatArray]:
-    """Boundary pixels (n, 2) of all pieces and holes that are large enough, in their order."""
+    """Ordered boundary pixels (n, 2) of all pieces and holes that are large enough."""
     found, _ = cv2.findContours(
         (level >= 0.5).astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE
     )
@@ -136,14 +134,14 @@ def _level_line(
     chain: FloatArray, level: Image, slope_x: Image, slope_y: Image
 ) -> tuple[FloatArray, FloatArray]:
     """Points (n, 2) of the level line next to boundary pixels (n, 2), and outward normals."""
-    normals = -np.column_stack([sampled(slope_x, chain), sampled(slope_y, chain)])
+    normals = -np.column_stack([interpolate(slope_x, chain), interpolate(slope_y, chain)])
     length = np.linalg.norm(normals, axis=1)
     kept = length > 1e-6
     chain, normals = chain[kept], normals[kept] / length[kept, None]
     places = crossings(level, chain, normals, np.zeros(len(chain)), -_STEP)
     known = np.isfinite(places)
     points = chain[known] + places[known, None] * normals[known]
-    outwards = -np.column_stack([sampled(slope_x, points), sampled(slope_y, points)])
+    outwards = -np.column_stack([interpolate(slope_x, points), interpolate(slope_y, points)])
     return points, _unit_rows(outwards)
 
 
@@ -159,11 +157,11 @@ def crossings(
     offsets: FloatArray,
     first: float = -REACH,
 ) -> FloatArray:
-    """Places (S,) on normals where a level line is left, nearest to ``offsets`` (S,); or NaN."""
+    """Places (S,) of exits from a level line on normals, nearest to ``offsets`` (S,); or NaN."""
     steps = np.arange(first, REACH + _STEP / 2, _STEP)
     places = offsets + steps[:, None]
     along = points + places[..., None] * normals
-    values = sampled(level, along.reshape(-1, 2)).reshape(places.shape)
+    values = interpolate(level, along.reshape(-1, 2)).reshape(places.shape)
     nearest, is_left = _nearest_exits(values >= 0.5, steps)
     every = np.arange(len(offsets))
     before, after = values[nearest, every], values[nearest + 1, every]
@@ -173,7 +171,7 @@ def crossings(
 
 
 def _nearest_exits(inside: BoolArray, steps: FloatArray) -> tuple[IntArray, BoolArray]:
-    """Numbers (S,) of the last step inside, before the exit nearest to 0, and which have one."""
+    """Index (S,) of the last step inside before the exit nearest to 0, and True if there is one."""
     exits = inside[:-1] & ~inside[1:]
     middles = np.abs(steps[:-1] + steps[1:])
     nearest = np.where(exits, middles[:, None], np.inf).argmin(axis=0)
@@ -192,7 +190,7 @@ def _resample(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, Floa
     return samples[:, :2], _unit_rows(samples[:, 2:])
 
 
-def _inside(
+def _clip_to_image(
     points: FloatArray, normals: FloatArray, shape: tuple[int, ...]
 ) -> list[tuple[FloatArray, FloatArray]]:
     size = np.array([shape[1], shape[0]]) - 1
@@ -200,14 +198,14 @@ def _inside(
     kept: BoolArray = np.asarray(off_border.all(axis=1))
     if kept.all():
         return [(points, normals)]
-    shift = -int(np.argmin(kept))  # begin outside, so that no stretch is cut in two
+    shift = -int(np.argmin(kept))  # begin outside, so that no part is cut in two
     order = np.roll(np.arange(len(points)), shift)
     ends = np.flatnonzero(np.diff(kept[order].astype(int))) + 1
     return [(points[part], normals[part]) for part in np.split(order, ends) if kept[part[0]]]
 
 
 def mask_contour(mask: FloatArray | BoolArray, where: str) -> Contour:
-    """The contour of a checked mask (h, w); InputError if there is none, or as long as noise's."""
+    """The contour of a mask (h, w); raises InputError if it has none, or one of noise."""
     contour = contour_of(mask)
     if not len(contour.points):
         what = "no part of its contour is larger than a few pixels and off the image's border"
@@ -218,8 +216,8 @@ def mask_contour(mask: FloatArray | BoolArray, where: str) -> Contour:
     length = SPACING * len(contour.points)
     diagonal = float(np.linalg.norm(np.ptp(contour.points, axis=0)))
     if length > max(SPACING, min(_LONGEST, _MOST_DIAGONALS * diagonal)):
-        what = f"has a contour of {length:,.0f} px, longer than any object's, as of noise"
-        fix = "clear it of specks and holes, or give a smaller image"
+        what = f"has a contour of {length:,.0f} px, longer than an object's: the mask is noisy"
+        fix = "remove specks and holes, or give a smaller image"
         raise InputError(what, where=where, fix=fix)
     return contour
 
@@ -227,8 +225,8 @@ def mask_contour(mask: FloatArray | BoolArray, where: str) -> Contour:
 class Rims(NamedTuple):
     """Rims on the normals of S samples, where ``found`` (S,).
 
-    The ``offset`` (S,) [px] is outwards of the contour; ``points`` (S, 3) in the model's frame
-    before its stretch lie on triangles ``face`` (S,).
+    ``offset`` (S,) [px] is the distance outwards of the contour; ``points`` (S, 3) are in the
+    model's frame before its stretch, on triangles ``face`` (S,).
     """
 
     found: BoolArray
@@ -238,21 +236,21 @@ class Rims(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """A posed surface as a camera sees it."""
+    """A surface at a pose in front of a camera."""
 
     caster: RayCaster
     camera: Camera
     pose: Alignment
 
     def covers(self, pixels: FloatArray) -> BoolArray:
-        """Tell if the object is seen at pixels (..., 2)."""
+        """True (...) where pixels (..., 2) show the object."""
         origin, directions, valid = self._rays(pixels)
         covered = self.caster.covered(origin, directions)
         covered &= valid
         return np.asarray(covered.reshape(pixels.shape[:-1]))
 
     def hits(self, pixels: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Triangles (S,), -1 for none, and points (S, 3) that are seen at pixels (S, 2)."""
+        """Triangles (S,), -1 for none, and surface points (S, 3) at pixels (S, 2)."""
         origin, directions, valid = self._rays(pixels)
         face, depth = self.caster.first_hits(origin, directions)
         seen = valid & (face >= 0)
@@ -270,13 +268,13 @@ class Sight(NamedTuple):
 
 
 def find_rims(sight: Sight, contour: Contour, reach: float) -> Rims:
-    """Changes from object to background on normals, nearest to the contour within ``reach``."""
+    """Exits from the object on normals, nearest to the contour within ``reach`` [px]."""
     count = len(contour.points)
     intervals = 2 * min(int(np.ceil(reach / _LONGEST_STEP)), _MOST_STEPS)
     steps = np.linspace(-reach, reach, intervals + 1)
     first, found = _rim_intervals(sight, contour, steps)
     rows = np.flatnonzero(found)
-    some = contour.taken(rows)
+    some = contour.select(rows)
     inner, outer = steps[first[rows]], steps[first[rows] + 1]
     for _ in range(int(np.ceil(np.log2((steps[1] - steps[0]) / _PRECISION)))):
         half = (inner + outer) / 2
@@ -295,7 +293,7 @@ def find_rims(sight: Sight, contour: Contour, reach: float) -> Rims:
 
 
 def _rim_intervals(sight: Sight, contour: Contour, steps: FloatArray) -> tuple[IntArray, BoolArray]:
-    """`_nearest_exits` of the object at steps along normals; most rims are beside the contour."""
+    """`_nearest_exits` at steps along normals; steps next to the contour are tried first."""
 
     def exits(some: Contour, places: FloatArray) -> tuple[IntArray, BoolArray]:
         along = np.repeat(places[:, None], len(some.points), axis=1)
@@ -304,14 +302,14 @@ def _rim_intervals(sight: Sight, contour: Contour, steps: FloatArray) -> tuple[I
     near = len(steps) // 2 - 1
     first, found = exits(contour, steps[near : near + 3])
     first, rest = first + near, np.flatnonzero(~found)
-    first[rest], found[rest] = exits(contour.taken(rest), steps)
+    first[rest], found[rest] = exits(contour.select(rest), steps)
     return first, found
 
 
 def remove_steep(contour: Contour, rims: Rims, bias: FloatArray | float = 0.0) -> Rims:
-    """The rims without those that run at a steep angle to the contour: the two don't match.
+    """Remove rims at a steep angle to the contour, which do not match it.
 
-    The ``bias`` (S,) of the contour's extraction counts: it rounds corners of the rim off.
+    ``bias`` (S,) is the bias of the contour's extraction, which rounds corners off.
     """
     distances = rims.offset - bias
     steep = contour.neighbours(rims.found) & (np.abs(np.diff(distances)) > _STEEPEST * SPACING)
@@ -322,10 +320,10 @@ def remove_steep(contour: Contour, rims: Rims, bias: FloatArray | float = 0.0) -
 
 
 def rim_normals(contour: Contour, rims: Rims) -> FloatArray:
-    """Directions (S, 2) across the rims, of length 1 along the contour's normals.
+    """Normals (S, 2) of the rims, of length 1 along the contour's normals.
 
-    A point of the rim that moves along it does not change the rim's distance from the contour.
-    They are the normals where no neighbour has a rim.
+    Motion along the rim does not change its distance from the contour. Without a neighbouring rim,
+    the contour's normals.
     """
     places = contour.at(rims.offset)
     gaps = np.diff(places, axis=0)
@@ -341,28 +339,28 @@ def rim_normals(contour: Contour, rims: Rims) -> FloatArray:
 
 
 MaskImage = tuple[Image, FloatArray]
-"""A mask (h, w) of probabilities, and where each sample of its contour lies on it, (S,) [px].
+"""A mask (h, w) of probabilities, and distances (S,) [px] along normals to its smoothed contour.
 
-These places are distances along the samples' normals, NaN where there is none."""
+A distance is NaN if the contour was not found."""
 
 
 def mask_image(mask: FloatArray | BoolArray, contour: Contour) -> MaskImage:
-    """A mask with the places of its contour's samples."""
+    """A mask, and the distances of its smoothed contour from the samples."""
     inside = np.ascontiguousarray(mask, dtype=np.float32)
     none = np.zeros(len(contour.points))
     return inside, crossings(smooth(inside), contour.points, contour.normals, none)
 
 
 def extraction_bias(sight: Sight, mask: MaskImage, contour: Contour, rims: Rims) -> FloatArray:
-    """Distances (S,) [px] by which rims lie outside of the contour that extraction makes of them.
+    """Distances (S,) [px] from the contour extracted from rendered rims outwards to the rims.
 
-    Zero where there is no rim, or no such contour near it.
+    Zero without a rim, or without a contour near it.
     """
     rows = np.flatnonzero(rims.found)
     bias = np.zeros(len(rims.found))
     if not len(rows):
         return bias
-    some, offsets = contour.taken(rows), rims.offset[rows]
+    some, offsets = contour.select(rows), rims.offset[rows]
     inside, places = mask
     corner, rendered = _render_band(sight, inside, some.at(offsets))
     own = crossings(smooth(rendered), some.points - corner, some.normals, offsets)
@@ -371,7 +369,7 @@ def extraction_bias(sight: Sight, mask: MaskImage, contour: Contour, rims: Rims)
 
 
 def _render_band(sight: Sight, mask: Image, rims: FloatArray) -> tuple[IntArray, Image]:
-    """The silhouette near rims (S, 2) [px], the mask about them; first the corner (2,) of it."""
+    """Render the silhouette near rims (S, 2) [px] into the mask; its corner (2,), and the image."""
     height, width = mask.shape
     places = np.clip(np.rint(rims).astype(int), 0, [width - 1, height - 1])
     corner = np.maximum(places.min(axis=0) - _MARGIN, 0)

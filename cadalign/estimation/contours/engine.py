@@ -1,7 +1,7 @@
-"""Refine the minima of the other evidence with masks and photos.
+"""Third stage of an estimate: refine minima with masks and photos.
 
-Likely minima, and states beside the best one where it is poorly known, are brought to the outlines.
-Masks and photos that contradict the rest are left out.
+The starts are the likely minima of the other evidence and, if the best one is poorly determined,
+neighbouring states. Masks and photos that contradict the other evidence are left out.
 """
 
 from __future__ import annotations
@@ -43,18 +43,18 @@ from cadalign.solvers.joint.evidence import State
 from cadalign.solvers.joint.search import cost_of, reduced, score_state
 
 _MOST_STARTS = 4
-_MOST_OPEN_STARTS = 12  # where nothing but masks determines the estimate
+_MOST_OPEN_STARTS = 12  # where only masks determine the estimate
 _MOST_FINISHED = 4
 _LEAST_EIGENVALUE = 1e-12
 _UNLIKELY = 60.0  # excess score of a minimum that is still a start
-_LEAST_INFORMATION = 1e-9  # about the worst known direction of the unknowns, relative
-# Of further starts: directions of which an estimate knows least, standard deviations along these,
-# and turns and logarithms of scales of one standard deviation that are worth a start.
+_LEAST_INFORMATION = 1e-9  # relative, in the least determined direction
+# Neighbouring starts: number of least determined directions, steps along these [sigma], and limits
+# of the turn and of the log scales at one standard deviation.
 _WEAKEST, _SIDEWAYS = 2, (-1.5, 1.5)
 _LEAST_TURN, _MOST_TURN, _LEAST_STRETCH = np.radians(1.3), np.radians(40.0), 0.05
 _SAME_TURN_DEG, _SAME_STRETCH = 1.0, 0.2  # logarithms of scales
 _LEAST_SUPPORT = 0.5  # share of a source's samples that must agree with the outline
-_LEAST_PROBABILITY = 1e-5  # of such a rise of the other residuals by chance
+_LEAST_PROBABILITY = 1e-5  # that chance raises the other residuals as much
 _NO_OUTLINE = (
     "give an init nearer to it, or keypoints, and check that a mask is nonzero on the object, not "
     "around it, and that the model is the object's"
@@ -63,7 +63,7 @@ _NO_OUTLINE = (
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A start, the estimate to which it led, and the noise at which candidates compare."""
+    """A start, its refined estimate, and the noise at which candidates are compared."""
 
     start: Minimum
     fit: OutlineFit
@@ -78,14 +78,14 @@ class Candidate:
 
     @cached_property
     def rank(self) -> float:
-        """-2 log of its probability by the other evidence and by the outlines, up to a constant."""
+        """-2 log probability from the other evidence and the outlines, up to a constant."""
         rest = cost_of(self.fit.problem.evidence, self.fit.state) + self.start.prior_score
         return rest + sum(source.rank(each) for source, each in self.fit.measured if each)
 
     @cached_property
     def minimum(self) -> Minimum:
-        """The minimum, its score with the `rank` in the place of the cost."""
-        evidence, state = self.fit.with_outlines
+        """The minimum; its score contains the `rank` instead of the cost."""
+        evidence, state = self.fit.whole
         cost = cost_of(evidence, state)
         at_common = self.fit.evidence_at(self.tracks)
         score = score_state(at_common, state) - cost_of(at_common, state) + self.rank
@@ -93,15 +93,15 @@ class Candidate:
 
 
 def refine(problem: Problem, minima: Sequence[Minimum]) -> tuple[list[Minimum], OutlineNotes]:
-    """Refine likely minima with masks, or else photos, the likeliest first.
+    """Refine likely minima with masks or, in views without masks, photos; the likeliest first.
 
-    Raises InputError if a mask has no contour, or the model no mesh; DegenerateError if outlines
-    alone determine the estimate, and there is none near them.
+    Raises InputError if a mask has no contour or the model no mesh; DegenerateError if only the
+    outlines determine the estimate, and no start comes near them.
     """
     model, views, keypoints = problem.model, problem.views, len(problem.prior.ids)
     first, is_exact = minima[0], is_exact_model(model)
     is_open = not _is_determined(first)
-    hulls = [] if is_exact else _hulls_of(views)
+    hulls = [] if is_exact else _convex_views(views)
     sources = left = sources_of(hulls or views, first, is_exact=is_exact)
     points, where = first.points[:keypoints], min(source.where for source in sources)
     surface = surface_of(model, points, where, is_hull=bool(hulls))
@@ -112,7 +112,7 @@ def refine(problem: Problem, minima: Sequence[Minimum]) -> tuple[list[Minimum], 
     wrong: tuple[Source, str] | None = None
     while left:
         best = _candidates(likely, left, surface, keypoints, is_open=is_open)
-        wrong = _contradicting(best, left)
+        wrong = _contradiction(best, left)
         if wrong is None:
             break
         source, reason = wrong
@@ -161,11 +161,11 @@ def _candidates(
     return sorted(alike, key=lambda each: each.minimum.score)
 
 
-def _hulls_of(views: Sequence[View]) -> list[View]:
-    """Views with the convex hulls of their masks; none where a mask leaves the image, or lacks.
+def _convex_views(views: Sequence[View]) -> list[View]:
+    """Replace masks by their convex hulls; no views if a mask is missing or leaves the image.
 
-    Between legs, or in holes, objects differ more than in their outermost points, which keypoints
-    and box describe. The silhouette of a convex hull is the convex hull of the silhouette.
+    Similar objects differ more between legs or in holes than in their outermost points, which
+    keypoints and box describe. The silhouette of a convex hull is the hull of the silhouette.
     """
     found = []
     for view in views:
@@ -196,7 +196,7 @@ def _is_determined(minimum: Minimum) -> bool:
 
 
 def _neighbouring_starts(start: Minimum, *, is_exact: bool) -> list[tuple[Minimum, State]]:
-    """States beside an estimate, along its weakest directions if these change it by much."""
+    """States beside an estimate, along its least determined directions if these are wide."""
     _, information = information_of(*reduced(start.evidence, start.state))
     poses, rest = 6 * len(start.state.poses), len(start.state.log_focals) + 3
     count = poses + rest * is_exact
@@ -214,7 +214,7 @@ def _neighbouring_starts(start: Minimum, *, is_exact: bool) -> list[tuple[Minimu
 
 
 def _move(state: State, step: FloatArray) -> State:
-    """The state after a step (U,) of poses, log focals and log scales."""
+    """Apply a step (U,) of poses, log focals and log scales to a state."""
     poses, focals = state.poses.copy(), len(state.log_focals)
     turns, by_focal, by_scale = np.split(step, 6 * len(poses) + np.array([0, focals]))
     for pose, part in zip(poses, turns.reshape(-1, 6), strict=True):
@@ -225,21 +225,21 @@ def _move(state: State, step: FloatArray) -> State:
 
 
 def _distinct_candidates(candidates: list[Candidate]) -> list[Candidate]:
-    """Candidates without those that equal a likelier one, the likeliest first."""
+    """Sort candidates by probability, and drop duplicates."""
     kept: list[Candidate] = []
     for each in sorted(candidates, key=lambda candidate: candidate.rank):
-        if not any(_are_alike(each.fit.state, other.fit.state) for other in kept):
+        if not any(_are_same(each.fit.state, other.fit.state) for other in kept):
             kept.append(each)
     return kept
 
 
-def _are_alike(one: State, other: State) -> bool:
+def _are_same(one: State, other: State) -> bool:
     turn, other_turn = (each.poses[0, :9].reshape(3, 3) for each in (one, other))
     stretch = np.abs(one.log_scales - other.log_scales).max()
     return bool(angles_between(turn, other_turn) < _SAME_TURN_DEG and stretch < _SAME_STRETCH)
 
 
-def _contradicting(best: list[Candidate], sources: Sequence[Source]) -> tuple[Source, str] | None:
+def _contradiction(best: list[Candidate], sources: Sequence[Source]) -> tuple[Source, str] | None:
     supports = best[0].supports if best else [OutlineSupport()]
     worst = min(range(len(supports)), key=lambda number: supports[number].share)
     if supports[worst].share < _LEAST_SUPPORT:
@@ -249,7 +249,7 @@ def _contradicting(best: list[Candidate], sources: Sequence[Source]) -> tuple[So
 
 
 def _tension(candidate: Candidate) -> str | None:
-    """Report other residuals that rise by more than chance, noise and registration explain."""
+    """The reason if outlines raise the other residuals by more than chance explains; else None."""
     start, problem, state = candidate.start, candidate.fit.problem, candidate.fit.state
     evidence = start.evidence
     equations = 2 * int((evidence.sightings.whitening[:, 2] > 0).sum())

@@ -1,4 +1,4 @@
-"""Outlines: surfaces whose rims are sought, measurements of these, and their noise."""
+"""Surfaces, measurements of their outlines, and the noise of these."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.warp import LinearWarp, linear_warp
 from cadalign.solvers.joint.evidence import Shape, State, points_of
 
-_QHULL = "QJ Pp"  # joggled, for a flat mesh has a hull, too
+_QHULL = "QJ Pp"  # joggled, for flat meshes
 
 
 class RigidSurface:
-    """The surface of an exact or stretched model, the same at all states; it ``is_exact``."""
+    """The surface of an exact or stretched model, the same at all states."""
 
     is_exact = True
 
@@ -45,7 +45,7 @@ class RigidSurface:
 
 
 class WarpedSurface:
-    """A mesh, or hull, warped from keypoints ``source`` (n, 3) to ``rows`` (n,) of the shape."""
+    """A mesh or hull that is warped from keypoints ``source`` (n, 3) to ``rows`` of a shape."""
 
     is_exact = False
 
@@ -60,12 +60,12 @@ class WarpedSurface:
         points = points_of(shape, state) / np.exp(state.log_scales)
         vertices = self._warp.apply(points[self._rows], np.sort(points[-2:], axis=0))
         mesh = Mesh(vertices, _hull_faces(vertices) if self._is_hull else self.mesh.faces)
-        return Warped(mesh, self._warp, self._rows, shape.modes, state.coefficients)
+        return WarpedMesh(mesh, self._warp, self._rows, shape.modes, state.coefficients)
 
 
 @dataclass(frozen=True, eq=False)
-class Warped:
-    """A mesh at one state, its vertices warped; ``modes`` and ``coefficients`` of the shape."""
+class WarpedMesh:
+    """A mesh warped to one state, with ``modes`` and ``coefficients`` of the shape."""
 
     mesh: Mesh
     warp: LinearWarp
@@ -85,14 +85,14 @@ class Warped:
         modes = np.zeros((len(self.modes), len(points), 3))
         for k, mode in enumerate(self.modes):
             modes[k] = here.derivative(mode[self.keypoints], mode[-2:])
-        # What the keypoints' own displacements move is part of the mean.
+        # The mean includes the keypoints' independent displacements.
         return points - np.tensordot(self.coefficients, modes, axes=1), modes
 
 
 rigid_surface = lru_cache(maxsize=32)(RigidSurface)
-"""The surface of a mesh that is met again, its rays prepared once."""
+"""The cached surface of a mesh."""
 
-PosedSurface = RigidSurface | Warped
+PosedSurface = RigidSurface | WarpedMesh
 """A surface at one state of the shape, before its stretch."""
 Surface = RigidSurface | WarpedSurface
 """A mesh that follows the shape."""
@@ -112,10 +112,10 @@ def _hull_faces(vertices: FloatArray) -> IntArray:
 def surface_of(
     model: Model | ShapeModel, points_3d: FloatArray, where: str, *, is_hull: bool = False
 ) -> Surface:
-    """The surface of a shape whose keypoints are about ``points_3d`` (m, 3).
+    """The surface of a shape with keypoints near ``points_3d`` (m, 3).
 
-    A learned shape has the mesh of the nearest training model. Raises InputError where there is no
-    mesh, which the mask or photo ``where`` needs; DataError if it cannot be read.
+    A learned shape has the mesh of the nearest training model. Raises InputError, at the mask or
+    photo ``where``, if there is no mesh; DataError if it cannot be read.
     """
     wanting = "a photo" if where.endswith("image") else "a mask"
     if isinstance(model, ShapeModel):
@@ -149,26 +149,26 @@ def _nearest_with_mesh(
 
 
 LOSS_SCALE = 2.4
-"""Scale of Cauchy's loss, in standard deviations: it then keeps 95 % of the information."""
+"""Scale of Cauchy's loss [sigma], for 95 % efficiency."""
 LEAST_LOSS_SCALE = 1.0
-"""Least scale of Cauchy's loss [px]: where pixels end, they displace a contour by up to that."""
+"""Least scale of Cauchy's loss [px]: quantisation displaces a contour by up to one pixel."""
 LEAST_OFFSET = 0.1
-"""Least standard deviation of the offset that all of a contour has in common [px]."""
+"""Least standard deviation of a contour's common offset [px]."""
 REGISTRATION = 0.3
 """Standard deviation of a contour's registration along x and y [px]."""
 INLIER = 3.5
-"""Largest residual of an inlier, in standard deviations."""
+"""Largest residual of an inlier [sigma]."""
 _TO_SIGMA = 1.4826  # from the median of absolute values to the standard deviation of a Gaussian
 _MOST_LAGS = 100
 _LEAST_PAIRS = 20
-_ALIKE, _ALIKE_OFFSETS = 0.2, 0.8  # changes of logarithms of variances
+_ALIKE, _ALIKE_OFFSETS = 0.2, 0.8  # largest changes of log variances
 
 
 class Noise(NamedTuple):
     """Noise of a contour's samples.
 
-    Their deviation ``sigma`` [px], or its factor where samples have their own, the number of
-    neighbours that count as one, and the deviation of the ``offset`` [px] that all have in common.
+    ``sigma`` is their standard deviation [px], or a factor on the samples' own; ``correlation`` the
+    number of neighbours that count as one; ``offset`` the deviation of their common offset [px].
     """
 
     sigma: float
@@ -177,12 +177,12 @@ class Noise(NamedTuple):
 
     @property
     def loss_scale(self) -> float:
-        """Scale of Cauchy's loss, in standard deviations of a sample."""
+        """Scale of Cauchy's loss, in standard deviations ``sigma``."""
         return max(LOSS_SCALE, LEAST_LOSS_SCALE / self.sigma)
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of a sample that is independent of its neighbours [px]."""
+        """Standard deviation of an independent sample with the same information [px]."""
         return self.sigma * float(np.sqrt(self.correlation))
 
     def costs(self, residuals: FloatArray) -> FloatArray:
@@ -193,7 +193,7 @@ class Noise(NamedTuple):
 
 
 def trimmed_deviation(residuals: FloatArray, least: float) -> float:
-    """Root mean square of residuals (n,) without outliers, which exceed ``least``; 0 of none."""
+    """Root mean square of residuals (n,) without outliers beyond ``least``; 0 if empty."""
     if not len(residuals):
         return 0.0
     robust = _TO_SIGMA * float(np.median(np.abs(residuals)))
@@ -210,10 +210,10 @@ def correlation_length(
 ) -> float:
     """Number of neighbouring samples that count as one, at least 1.
 
-    The integrated autocorrelation ``1 + 2 sum of rho`` of the influence under Cauchy's loss of a
-    ``scale`` that the residuals (S,) have which are ``kept``, up to the first lag without positive
-    correlation (Geyer, "Practical Markov chain Monte Carlo", 1992). Runs of outliers have it, too.
-    Of a variance below the square of ``least`` the rest is free of correlation.
+    The integrated autocorrelation ``1 + 2 sum of rho`` of the ``kept`` residuals (S,), weighted by
+    Cauchy's loss of ``scale``, up to the first lag without positive correlation (Geyer, "Practical
+    Markov chain Monte Carlo", 1992). A variance below the square of ``least`` is filled up with
+    uncorrelated noise.
     """
     values = np.where(kept, residuals / (1 + (residuals / scale) ** 2), 0.0)
     variance = max(float((values**2).sum() / max(kept.sum(), 1)), least**2)
@@ -235,11 +235,11 @@ def correlation_length(
 class Outline(NamedTuple):
     """Measurements at S samples of a model's outline in one view.
 
-    ``points`` (S, 3) in the model's frame before the stretch lie on its rim, on triangles ``face``
-    (S,). The source's ``contour`` is ``places`` (S,) [px] outwards of it where ``found`` (S,), with
-    relative deviations ``sigmas`` (S,). Rays that move by ``across`` (S, 2) [1/px] over its square
-    move the image by one pixel outwards. Contours are sought within the ``reach`` [px]; the
-    ``contrast`` is that of the colours inside and outside [nats].
+    ``points`` (S, 3) lie on the rim, in the model's frame before the stretch, on triangles ``face``
+    (S,). Where ``found`` (S,), the source's ``contour`` lies ``places`` (S,) [px] outwards of it,
+    with relative deviations ``sigmas`` (S,). A change of a ray (2,) times ``across`` (S, 2) is the
+    motion outwards [px]. ``reach`` [px] is the largest distance of a contour, ``contrast`` [nats]
+    the difference of the colours inside and outside.
     """
 
     contour: Contour
@@ -253,11 +253,11 @@ class Outline(NamedTuple):
     contrast: float = 0.0
 
     def residuals(self, offset: float) -> FloatArray:
-        """Places (S,) [px] without an ``offset`` that all have in common; NaN where none is."""
+        """Places (S,) [px] minus the common ``offset``; NaN where not found."""
         return np.where(self.found, self.places - offset, np.nan)
 
     def noise(self, residuals: FloatArray, least: Noise, outlying: float) -> Noise:
-        """The noise of residuals (S,), NaN for none; outliers exceed ``outlying`` deviations."""
+        """Estimate the noise of residuals (S,), NaN if unknown; outliers exceed ``outlying``."""
         kept = np.isfinite(residuals)
         relative = np.where(kept, residuals, 0.0) / self.sigmas
         sigma = max(trimmed_deviation(relative[kept], outlying), least.sigma)
@@ -267,7 +267,7 @@ class Outline(NamedTuple):
 
 
 class MeasuredOutline(NamedTuple):
-    """An outline at an estimate, the offset [px] that all of it has in common, and its noise."""
+    """An outline at an estimate, its common offset [px], and its noise."""
 
     outline: Outline
     offset: float
@@ -279,16 +279,16 @@ class MeasuredOutline(NamedTuple):
 
     @property
     def inliers(self) -> BoolArray:
-        """Samples (S,) that agree with the rest."""
+        """True (S,) for samples within the noise."""
         sizes = np.abs(np.nan_to_num(self.residuals, nan=np.inf))
         return np.asarray(sizes < INLIER * self.noise.sigma * self.outline.sigmas)
 
 
 class Track(NamedTuple):
-    """Noise and reach of a source on the way to its outline.
+    """Noise and reach of a source in a round.
 
-    The reach of a mask is in pixels, that of a photo relative to the silhouette's size; ``levels``
-    are those of the next rounds.
+    The reach is in pixels for a mask, and relative to the silhouette's size for a photo; ``levels``
+    are the reaches of the next rounds.
     """
 
     noise: Noise
@@ -297,7 +297,7 @@ class Track(NamedTuple):
     is_fine: bool = False
 
     def is_like(self, other: Track) -> bool:
-        """True if samples weigh about the same, and the prior of their common offset."""
+        """True if the weights of samples and of the common offset are about the same."""
         one, two = self.noise, other.noise
         changes = 2 * np.log([one.deviation / two.deviation, one.offset / two.offset])
         return bool((np.abs(changes) < (_ALIKE, _ALIKE_OFFSETS)).all())
@@ -313,8 +313,8 @@ class Track(NamedTuple):
 class OutlineSupport(NamedTuple):
     """Agreement of a source with a model's outline.
 
-    The ``share`` of its samples near it, 0 where nothing is known; the number of inliers and their
-    root mean square ``rms`` [px] and ``rms_sigmas``.
+    ``share`` is the share of samples near the outline, 0 if unknown; ``agreeing`` the number of
+    inliers; ``rms`` [px] and ``rms_sigmas`` the root mean square of their residuals.
     """
 
     share: float = 0.0
@@ -325,20 +325,19 @@ class OutlineSupport(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class OutlineSource:
-    """The part that masks and photos share, of the view ``image``, the user's ``number``.
+    """Base class of masks and photos; ``image`` and ``number`` are indices of the view.
 
-    The ``camera`` is that of the evidence's rays. The surface ``is_exact``, or similar to the
-    object's.
+    The evidence's rays are in ``camera``. ``is_exact`` is False for a surface that is only similar.
     """
 
     kind: ClassVar[Literal["mask", "photo"]]
     field: ClassVar[str]
     learns_sigma: ClassVar[bool]
-    """True if one unknown standard deviation is that of all samples."""
+    """True if all samples share one unknown standard deviation."""
     good_share: ClassVar[float]
-    """Share of the outline that agrees, below which a warning says so."""
+    """Share of the outline that must agree, to raise no warning."""
     tolerances: ClassVar[tuple[float, float, float]]
-    """Of a sample that agrees: [px], and relative to the size of exact and of similar surfaces."""
+    """Largest residual of a near sample: [px], and relative to exact and to similar surfaces."""
 
     image: int
     number: int
@@ -365,7 +364,7 @@ class OutlineSource:
         return EstimateWarning(self.kind, text, self.number)
 
     def summary(self, support: OutlineSupport) -> EvidenceSummary:
-        """The line of the result's evidence."""
+        """The entry in the result's evidence."""
         figures = support.agreeing, support.rms_sigmas, support.rms
         share = None if self.learns_sigma else support.share
         return EvidenceSummary(self.kind, self.number, *figures, "px", share)

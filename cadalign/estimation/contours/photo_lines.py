@@ -1,10 +1,10 @@
-"""Lines across a model's outline in a photo, and the places where they leave the object.
+"""Detect a model's outline in a photo on lines across the predicted outline.
 
 The statistics of region-based tracking: M. Stoiber, M. Pfanne, K. H. Strobl, R. Triebel,
 A. Albu-Schaeffer, "SRT3D: A sparse region-based 3D object tracking approach for the real world",
 IJCV 130, 2022 (arXiv 2110.12715). Histograms of the colours on both sides of the predicted outline
-give the probability that a pixel is the object's; along a line, those of its pixels together with a
-smoothed step give the posterior of the place where the line leaves the object.
+give each pixel's probability to show the object. Together with a smoothed step function, the pixels
+of a line give the posterior of the place where the line leaves the object.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from cadalign.geometry.pixels import PIXEL_CENTRE, rescaled_pixels
 from cadalign.io.images import ByteImage
 
 _BINS = 16  # of a channel
-_FLOOR = 1e-4  # share of the colours that were never seen
-_AMPLITUDE = 0.43  # of the step: the rest of 0.5 is noise that no histogram knows
+_FLOOR = 1e-4  # share of unseen colours
+_AMPLITUDE = 0.43  # of the step; the rest of 0.5 is unmodelled noise
 _SLOPE = 0.6  # half width of the step, in steps along the line
-_LEAST_PRECISION = 0.1  # of a line that has a place, over that of the prior
+_LEAST_PRECISION = 0.1  # of a usable line, relative to the prior
 _OF_STEPS = 1 / 12  # variance of a place within a step
 _LEAST_SIDE = 2.0  # steps on either side of an edge
-_QUANTUM = 3.0  # variance of three channels by their quantisation and a little noise
+_QUANTUM = 3.0  # variance of three channels from quantisation and noise
 _NEIGHBOUR = 0.45  # weight of a neighbour's log likelihoods
-_STRAY = 1e-3  # probability of a crossing anywhere on a line, beside its colours
+_STRAY = 1e-3  # probability of a crossing anywhere on a line, whatever its colours
 
 
 def bins_of(colors: ByteImage) -> IntArray:
-    """Numbers (...) of the histogram's bins of colours (..., 3)."""
+    """Bin indices (...) of colours (..., 3)."""
     cells = (colors // (256 // _BINS)).astype(np.int64)
     return np.asarray((cells[..., 0] * _BINS + cells[..., 1]) * _BINS + cells[..., 2])
 
@@ -54,7 +54,7 @@ _SMOOTHING = (_PADDED[:-2] + 2 * _PADDED[1:-1] + _PADDED[2:]) / 4  # of bins, by
 
 def _histogram(bins: IntArray) -> FloatArray:
     counts = np.bincount(bins, minlength=_BINS**3).astype(np.float64)
-    for _ in range(3):  # of red, green, and blue: each is the last axis once
+    for _ in range(3):  # smooth red, green and blue in turn
         counts = (_SMOOTHING @ counts.reshape(_BINS, -1)).T
     shares = counts.ravel() / max(counts.sum(), 1.0)
     return np.asarray((1 - _FLOOR) * shares + _FLOOR / _BINS**3)
@@ -63,8 +63,8 @@ def _histogram(bins: IntArray) -> FloatArray:
 def regions_of(inside: IntArray, outside: IntArray) -> tuple[FloatArray, float]:
     """Odds by bins, and contrast, from the bins of the colours inside and outside.
 
-    Odds are the probability of the object minus that of the background; the contrast is the mutual
-    information of side and colour [nats], log 2 at most.
+    Odds are P(object) - P(background); the contrast is the mutual information of side and colour
+    [nats], log 2 at most.
     """
     own, other = _histogram(inside), _histogram(outside)
     both = (own + other) / 2
@@ -82,10 +82,10 @@ def changes_of(odds: FloatArray, valid: BoolArray) -> FloatArray:
 
 
 def add_neighbours(logs: FloatArray, are_neighbours: BoolArray) -> FloatArray:
-    """Add a share of the log likelihoods (S, 2 K + 1) of the next lines along the outline.
+    """Add a share of the log likelihoods (S, 2 K + 1) of the neighbouring lines.
 
-    These are displaced by nearly the same, and help to choose between crossings. Their colours are
-    independent in part: the sum counts by the root of its weights.
+    Neighbours have nearly the same displacement, and help to choose between crossings. Since their
+    colours are correlated, the sum is divided by the root of its weights.
     """
     total = np.logaddexp.reduce(logs, axis=1, keepdims=True)
     bounded = np.logaddexp(logs - total, np.log(_STRAY / logs.shape[1]))
@@ -98,10 +98,9 @@ def add_neighbours(logs: FloatArray, are_neighbours: BoolArray) -> FloatArray:
 
 
 def crossings_of(logs: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Places (S,), in steps outwards, and variances, by log likelihoods (S, 2 K + 1).
+    """Places (S,) [steps outwards] and variances (S,) from log likelihoods (S, 2 K + 1).
 
-    The posterior is relative to the uniform prior: a line without contrast has an infinite
-    variance.
+    The uniform prior is divided out: a line without contrast has an infinite variance.
     """
     count = logs.shape[1]
     steps = np.arange(count) - count // 2
@@ -111,19 +110,18 @@ def crossings_of(logs: FloatArray) -> tuple[FloatArray, FloatArray]:
     variance = likely @ steps**2 - mean**2 + _OF_STEPS
     prior = 1 / float((steps**2).mean())
     precision = 1 / variance - prior
-    is_told = precision > _LEAST_PRECISION * prior
-    safe = np.where(is_told, precision, 1.0)
+    is_usable = precision > _LEAST_PRECISION * prior
+    safe = np.where(is_usable, precision, 1.0)
     places = mean / variance / safe
-    is_told &= np.abs(places) < count / 2
-    return np.where(is_told, places, 0.0), np.where(is_told, 1 / safe, np.inf)
+    is_usable &= np.abs(places) < count / 2
+    return np.where(is_usable, places, 0.0), np.where(is_usable, 1 / safe, np.inf)
 
 
 def edges_of(colors: FloatArray, valid: BoolArray, step: float) -> FloatArray:
     """Log likelihoods (S, 2 K + 1) of a change of the colours (S, 2 K + 1, c) at each step.
 
-    With constant colours on both sides but for noise of unknown level, and the sum E of squares
-    about both means, the likelihood is E to the power of -n / 2 for n pixels. A step has ``step``
-    pixels.
+    For constant colours on both sides with noise of unknown level, the likelihood of n pixels is
+    E^(-n / 2), with the sum of squares E about both means. A step is ``step`` pixels long.
     """
     weights = valid.astype(np.float64)
     values = weights[..., None] * colors
@@ -134,7 +132,7 @@ def edges_of(colors: FloatArray, valid: BoolArray, step: float) -> FloatArray:
     between = (first**2).sum(axis=2) / np.where(usable, before, 1.0)
     between += (second**2).sum(axis=2) / np.where(usable, after, 1.0)
     squares = (values * colors).sum(axis=(1, 2))
-    # A line of which one side is unknown has no edge.
+    # A line with an unknown side has no edge.
     error = squares[:, None] - np.where(usable, between, np.inf).min(axis=1, keepdims=True)
     error = np.where(usable, squares[:, None] - between, error) + _QUANTUM * total
     found = -total * min(step, 1.0) / 2 * np.log(np.maximum(error, 1e-9))
@@ -142,28 +140,28 @@ def edges_of(colors: FloatArray, valid: BoolArray, step: float) -> FloatArray:
 
 
 def _sums_before(values: FloatArray) -> FloatArray:
-    """Sums along lines (S, 2 K + 1, ...) before each step, which itself counts half."""
+    """Sums along lines (S, 2 K + 1, ...) before each step; the step itself counts half."""
     return np.asarray(np.cumsum(values, axis=1) - values / 2)
 
 
 STEPS = 10
 """Steps of a line to either side."""
-_BAND = 2.5  # width of the background that colours are learned from, in reaches
+_BAND = 2.5  # width of the sampled background, in reaches
 _LEAST_PIXELS = 30
 _RIM_REACH = 2.0  # cells
 _BORDER = 2.0  # [px]
-_EDGE_STEP = 1.0  # [px], of lines that are long enough for edges of other things
-_SMALLEST = 64  # [px], of a side of the smallest copy of a photo
+_EDGE_STEP = 1.0  # [px], longest step at which edges are used
+_SMALLEST = 64  # [px], side of the smallest level of the pyramid
 
 
 class PhotoPyramid(NamedTuple):
-    """A photo, and copies of it, each half as wide as the last."""
+    """An image pyramid of a photo; each level is half as wide as the last."""
 
     camera: Camera
     levels: tuple[ByteImage, ...]
 
     def colors(self, points: FloatArray, step: float) -> ByteImage:
-        """Colours (h, w, 3) at pixels (h, w, 2), of details larger than a step [px]."""
+        """Colours (h, w, 3) at pixels (h, w, 2), averaged over about a ``step`` [px]."""
         level = min(int(np.log2(max(step, 1.0))), len(self.levels) - 1)
         x, y = np.moveaxis(rescaled_pixels(points, 0.5**level), -1, 0).astype(np.float32)
         border = cv2.BORDER_REPLICATE
@@ -183,11 +181,10 @@ def photo_of(camera: Camera, pixels: ByteImage) -> PhotoPyramid:
 
 
 class Silhouette(NamedTuple):
-    """The silhouette of a posed surface in cells of the image, and its rims.
+    """The silhouette of a posed surface on a grid of the image, and its rims.
 
-    The cell (0, 0) of ``inside`` (h, w) lies at the pixel ``corner``, neighbours ``cell`` [px]
-    apart. Samples of the ``contour`` are on the rims, whose ``points`` (S, 3) are on triangles
-    ``face`` (S,).
+    The cell (0, 0) of ``inside`` (h, w) lies at the pixel ``corner``; cells are ``cell`` px apart.
+    Samples of the ``contour`` lie on the rims; ``points`` (S, 3) are on triangles ``face`` (S,).
     """
 
     inside: BoolArray
@@ -204,19 +201,19 @@ class Silhouette(NamedTuple):
         return float(np.sqrt(self.inside.sum()) * self.cell)
 
     def at(self, points: FloatArray) -> BoolArray:
-        """Tell if pixels (..., 2) lie inside."""
+        """True (...) for pixels (..., 2) inside."""
         columns, rows = np.moveaxis(np.rint((points - self.corner) / self.cell), -1, 0)
         return np.asarray(map_coordinates(self.inside, [rows, columns], order=0))
 
 
 def silhouette_of(sight: Sight, cells: int) -> Silhouette | None:
-    """The silhouette, so many ``cells`` long, and its rims; None where no rim is seen."""
+    """The silhouette with ``cells`` cells along its longer side; None without visible rims."""
     box = _box_in_image(sight)
     if box is None:
         return None
     low, high = box
     cell = max(1.0, float((high - low).max()) / cells)
-    # Room for the contour's smoothing, and for colours of the background.
+    # A margin for smoothing, and for colours of the background.
     corner = low - 4 * cell
     width, height = (np.ceil((high - low) / cell).astype(int) + 9).tolist()
     inside = _covered_cells(sight, corner, cell, (height, width))
@@ -233,14 +230,14 @@ def silhouette_of(sight: Sight, cells: int) -> Silhouette | None:
     kept = rims.found & within.all(axis=1)
     if not kept.any():
         return None
-    found = on_rim.taken(kept), across[kept], rims.points[kept], rims.face[kept]
+    found = on_rim.select(kept), across[kept], rims.points[kept], rims.face[kept]
     return Silhouette(inside, corner, cell, *found)
 
 
 def _covered_cells(
     sight: Sight, corner: FloatArray, cell: float, shape: tuple[int, int]
 ) -> BoolArray:
-    """Cells (h, w) that the object covers: of every second row and column, and near the outline."""
+    """Cells (h, w) that the object covers, rendered at half resolution except near the outline."""
     height, width = shape
     every_second = np.stack(np.meshgrid(np.arange(0, width, 2), np.arange(0, height, 2)), axis=-1)
     coarse = sight.covers(corner + cell * every_second).astype(np.uint8)
@@ -255,7 +252,7 @@ def _covered_cells(
 
 
 def _box_in_image(sight: Sight) -> tuple[FloatArray, FloatArray] | None:
-    """Corners of the object's box in the image; None where it is not there."""
+    """Corners of the object's bounding box in the image; None if it is outside."""
     camera, seen = sight.camera, sight.pose.apply(bounds_corners(*sight.caster.bounds))
     size = np.array([camera.width, camera.height]) - 1.0
     if (seen[:, 2] <= 0).any():
@@ -266,9 +263,9 @@ def _box_in_image(sight: Sight) -> tuple[FloatArray, FloatArray] | None:
 
 
 def outline_of(photo: PhotoPyramid, silhouette: Silhouette, reach: float) -> Outline | None:
-    """The photo's contour on lines that reach so far [px]; None where there are no colours."""
+    """The outline on lines of length ``reach`` [px] to each side; None with too few pixels."""
     step = reach / STEPS
-    inside, outside = _colors_beside(photo, silhouette, reach, step)
+    inside, outside = _side_colors(photo, silhouette, reach, step)
     if min(len(inside), len(outside)) < _LEAST_PIXELS:
         return None
     odds, contrast = regions_of(inside, outside)
@@ -300,10 +297,10 @@ def outline_of(photo: PhotoPyramid, silhouette: Silhouette, reach: float) -> Out
     )
 
 
-def _colors_beside(
+def _side_colors(
     photo: PhotoPyramid, silhouette: Silhouette, reach: float, step: float
 ) -> tuple[IntArray, IntArray]:
-    """Bins of the colours well inside, and outside near the outline."""
+    """Colour bins well inside the silhouette, and outside near the outline."""
     cell = silhouette.cell
     room = int(np.ceil(_BAND * reach / cell))
     inside = np.pad(silhouette.inside, room).astype(np.uint8)
@@ -322,7 +319,7 @@ def _colors_beside(
 
 
 def _visible_pixels(photo: PhotoPyramid, silhouette: Silhouette, pixels: FloatArray) -> BoolArray:
-    """Pixels (S, 2 K + 1, 2) of lines, up to where a line leaves the image or enters again."""
+    """True for pixels (S, 2 K + 1, 2) until a line leaves the image or re-enters the object."""
     kept = silhouette.at(pixels) == (np.arange(2 * STEPS + 1) < STEPS)
     kept &= photo.camera.contains(pixels, margin=PIXEL_CENTRE)
     kept[:, STEPS - 1 : STEPS + 2] = True  # cells are coarser than the rim

@@ -1,10 +1,10 @@
-"""Bring a model's outline to that of masks and photos, together with all other evidence.
+"""Fit a model's outline to masks and photos, together with all other evidence.
 
-Every round measures the outlines at a state, learns from the residuals how accurate these are, and
-takes steps that hold every rim's point on the surface: that the rim moves along the surface as the
-pose changes does not count to first order, and the next round finds it anew. What is measured at
-points of a surface is evidence as any other: these points stand between the keypoints and the box's
-corners. The contours' own modes are the shape's last.
+Each round measures the outlines at a state, estimates their noise from the residuals, and refines
+the state with the rim's points fixed on the surface. A rim moves along the surface as the pose
+changes. To first order, this does not change its distance from the contour, and the next round
+detects the rim again. The points of the rims are rows of the shape, between the keypoints and the
+box's corners. The last modes of the shape are the contours' offsets and registrations.
 """
 
 from __future__ import annotations
@@ -45,16 +45,16 @@ from cadalign.solvers.joint.search import displaced_modes, objective_of, refine_
 Source = MaskSource | PhotoSource
 """A mask or a photo of a view."""
 _OWN_MODES = 3
-"""Unknowns of a contour: its offset outwards, its registration along x and along y."""
-_MOST_ROUNDS, _MOST_LAST_ROUNDS = 16, 8  # the last ones begin at an estimate
-_ITERATIONS = 4  # of a round, whose rims are not those of its end
+"""Unknowns of a contour: its offset outwards, and its registration along x and y."""
+_MOST_ROUNDS, _MOST_LAST_ROUNDS = 16, 8  # of the first and of the last fit
+_ITERATIONS = 4  # of a round: rims change with the state
 _LEAST_GAIN = 2.0  # of the objective, -2 log likelihood, in a round
-_LEAST_FREEDOM = 0.1  # share of the residuals' degrees of freedom that the unknowns leave
-_LEAST_INFORMATION = 1e-12  # about a direction of the unknowns, relative
+_LEAST_FREEDOM = 0.1  # least share of the residuals' degrees of freedom after the fit
+_LEAST_INFORMATION = 1e-12  # relative, in every direction
 
 
 class OutlineProblem(NamedTuple):
-    """Evidence of so many ``keypoints``, and the surface whose outline ``sources`` measure."""
+    """Evidence with a number of ``keypoints``, the surface, and the ``sources`` of its outline."""
 
     evidence: Evidence
     keypoints: int
@@ -71,7 +71,7 @@ class OutlineProblem(NamedTuple):
         return [each * track.noise.offset for each, track in zip(own, tracks, strict=True)]
 
     def sights(self, state: State, posed: PosedSurface) -> list[Sight]:
-        """The posed surface as the sources see it, with focal lengths and registrations."""
+        """The posed surface in each source's camera, with its focal length and registration."""
         ratios = np.exp(log_focals_of(self.evidence, state)).tolist()
         poses, found = poses_of(self.evidence, state), []
         for source, own in zip(self.sources, self.own_of(state), strict=True):
@@ -83,7 +83,7 @@ class OutlineProblem(NamedTuple):
             found.append(Sight(posed.caster, camera, poses[source.image]))
         return found
 
-    def with_outlines(
+    def add_outlines(
         self,
         state: State,
         posed: PosedSurface,
@@ -91,7 +91,7 @@ class OutlineProblem(NamedTuple):
         outlines: Sequence[Outline | None],
         tracks: Sequence[Track],
     ) -> tuple[Evidence, State] | None:
-        """The evidence and its state with what was measured; None where there is nothing."""
+        """Add measured outlines to the evidence and the state; None without any."""
         rows = [
             self._rows_of(number, outline, track.noise, posed, sight)
             for number, (outline, track, sight) in enumerate(
@@ -115,7 +115,7 @@ class OutlineProblem(NamedTuple):
         return evidence, state._replace(displacements=np.zeros_like(mean))
 
     def _shift_points(self, count: int) -> Evidence:
-        """The evidence with the numbers that points have behind so many more of outlines."""
+        """The evidence with point indices shifted for ``count`` points of outlines."""
 
         def moved(points: IntArray) -> IntArray:
             return np.where(points >= self.keypoints, points + count, points)
@@ -128,10 +128,9 @@ class OutlineProblem(NamedTuple):
     def _rows_of(
         self, number: int, outline: Outline, noise: Noise, surface: PosedSurface, sight: Sight
     ) -> tuple[FloatArray, FloatArray, Sightings]:
-        """Mean (n, 3), modes (K, n, 3) and sightings of the samples that a source found.
+        """Mean (n, 3), modes (K, n, 3) and sightings of a source's found samples.
 
-        At the state of the ``sight`` the residuals are the distances that were found, whatever the
-        normals.
+        At the state of the ``sight``, the residuals are the measured distances along the normals.
         """
         source = self.sources[number]
         kept = np.flatnonzero(outline.found)
@@ -167,7 +166,7 @@ class OutlineProblem(NamedTuple):
 
 
 def add_displacement_modes(evidence: Evidence, state: State) -> tuple[Evidence, State]:
-    """The same with the points' own displacements as modes, which a warped surface follows."""
+    """Convert the points' independent displacements to modes, which a warped surface follows."""
     shape, rows = evidence.shape, np.flatnonzero(evidence.shape.spread > 0)
     modes = displaced_modes(shape, rows)
     moved = state.displacements[rows] / shape.spread[rows, None]
@@ -181,20 +180,20 @@ def add_displacement_modes(evidence: Evidence, state: State) -> tuple[Evidence, 
 
 
 class OutlineFit(NamedTuple):
-    """An estimate, and the ``outlines`` from which the last round led there.
+    """An estimate, and the ``outlines`` of its last round.
 
-    Evidence and state are those ``with_outlines``, the ``state`` that without their points.
+    ``whole`` is the evidence and the state with the outlines' points, ``state`` is without these.
     """
 
     problem: OutlineProblem
-    with_outlines: tuple[Evidence, State]
+    whole: tuple[Evidence, State]
     state: State
     outlines: list[Outline | None]
     tracks: list[Track]
 
     @property
     def measured(self) -> list[tuple[Source, MeasuredOutline | None]]:
-        """The outline that each source measures, and its noise."""
+        """Each source with its measured outline."""
         sources, offsets = self.problem.sources, self.problem.offsets(self.state, self.tracks)
         return [
             (source, outline and MeasuredOutline(outline, offset, track.noise))
@@ -204,11 +203,11 @@ class OutlineFit(NamedTuple):
         ]
 
     def evidence_at(self, tracks: Sequence[Track]) -> Evidence:
-        """The evidence at the noise of other tracks, its residuals relative to the loss."""
+        """The evidence with the noise of other tracks; the loss scales likewise."""
         counts = [0 if each is None else int(each.found.sum()) for each in self.outlines]
         pairs = zip(self.tracks, tracks, strict=True)
         ratios = [own.noise.deviation / other.noise.deviation for own, other in pairs]
-        evidence, factors = self.with_outlines[0], np.repeat(ratios, counts)
+        evidence, factors = self.whole[0], np.repeat(ratios, counts)
         old = evidence.sightings
         factors = np.append(np.ones(len(old.point) - len(factors)), factors)
         whitening, scale = factors[:, None] * old.whitening, factors * old.loss_scale
@@ -218,7 +217,7 @@ class OutlineFit(NamedTuple):
 def first_fit(
     evidence: Evidence, state: State, keypoints: int, sources: Sequence[Source], surface: Surface
 ) -> OutlineFit | None:
-    """The estimate that rounds lead to, of evidence and a state without outlines; or None."""
+    """Run the first rounds from evidence and a state without outlines; None without an outline."""
     evidence, state = add_displacement_modes(evidence, state)
     shape, own = evidence.shape, np.zeros(_OWN_MODES * len(sources))
     modes = np.concatenate([shape.modes, np.zeros((len(own), *shape.mean.shape))])
@@ -229,7 +228,7 @@ def first_fit(
 
 
 def last_fit(fit: OutlineFit) -> OutlineFit | None:
-    """The end near another estimate; None without an outline."""
+    """Run the last rounds from an estimate; None without an outline."""
     begun = zip(fit.problem.sources, fit.tracks, strict=True)
     tracks = [source.last(track) for source, track in begun]
     end = _run_rounds(fit.problem, fit.state, tracks, _MOST_LAST_ROUNDS)
@@ -239,7 +238,7 @@ def last_fit(fit: OutlineFit) -> OutlineFit | None:
 def _run_rounds(
     problem: OutlineProblem, state: State, tracks: Sequence[Track], rounds: int
 ) -> OutlineFit | None:
-    """The last of at most so many rounds, at the last level where noise and objective stay."""
+    """Run rounds until, at the last level, noise and objective converge; at most ``rounds``."""
     fit: OutlineFit | None = None
     for _ in range(rounds):
         posed = problem.surface.at(problem.evidence.shape, state)
@@ -249,12 +248,12 @@ def _run_rounds(
             for source, sight, track in zip(problem.sources, sights, tracks, strict=True)
         ]
         learned = [
-            track if outline is None else source.learned(outline, offset, track)
+            track if outline is None else source.learn(outline, offset, track)
             for source, outline, offset, track in zip(
                 problem.sources, outlines, offsets, tracks, strict=True
             )
         ]
-        here = problem.with_outlines(state, posed, sights, outlines, learned)
+        here = problem.add_outlines(state, posed, sights, outlines, learned)
         if here is None:
             return None
         evidence, before = here
@@ -275,7 +274,7 @@ def _run_rounds(
 def _update_offsets(
     problem: OutlineProblem, evidence: Evidence, state: State, tracks: Sequence[Track]
 ) -> tuple[list[Track], State]:
-    """Tracks whose offsets have the likeliest deviations, and the bare state in terms of these."""
+    """Tracks with the likeliest deviations of offsets, and the bare state rescaled to these."""
     still = np.zeros_like(problem.evidence.shape.mean)
     bare = state._replace(coefficients=state.coefficients.copy(), displacements=still)
     learned = list(tracks)
@@ -295,7 +294,7 @@ def _update_offsets(
 
 
 def likeliest_offset(own: float, variance: float, noise: Noise) -> float:
-    """Likeliest deviation [px] of an offset, by its coefficient and the variance of that."""
+    """Likeliest deviation [px] of an offset with a coefficient ``own`` and its variance."""
     without_prior = 1 / max(1 / min(variance, 1.0) - 1, 1e-6)  # in squares of the offset
     free = own * (1 + without_prior)
     square = noise.offset**2 * max(free**2 - without_prior, 0.0)
@@ -303,8 +302,8 @@ def likeliest_offset(own: float, variance: float, noise: Noise) -> float:
 
 
 def _widen_noise(fit: OutlineFit) -> OutlineFit:
-    """The same, its outlines' noise widened by the degrees of freedom that they determine."""
-    evidence, state = fit.with_outlines
+    """Widen the outlines' noise for the degrees of freedom that the outlines determine."""
+    evidence, state = fit.whole
     rows = np.arange(len(evidence.sightings.point))
     is_outline = rows >= len(fit.problem.evidence.sightings.point)
     (_, whole), (_, rest) = (
@@ -318,11 +317,11 @@ def _widen_noise(fit: OutlineFit) -> OutlineFit:
     )
     factor = np.sqrt(max(1 - fitted / max(independent, 1.0), _LEAST_FREEDOM))
     wider = scale_whitening(factor, is_outline, evidence)
-    return fit._replace(with_outlines=(wider, state))
+    return fit._replace(whole=(wider, state))
 
 
 def _solve_information(information: FloatArray, right: FloatArray) -> FloatArray:
-    """The covariance times columns (U, k), of unknowns of which next to nothing may be known."""
+    """Multiply the regularised covariance by columns (U, k)."""
     matrix, sizes = scaled_information(information)
     matrix = matrix + _LEAST_INFORMATION * np.eye(len(sizes))
     return np.asarray(np.linalg.solve(matrix, right / sizes[:, None]) / sizes[:, None])

@@ -1,15 +1,14 @@
-"""Poses and stretches of a model whose silhouette resembles a mask's, without any start.
+"""Find poses and stretches of a model from a mask alone, without a start.
 
-Seen from afar, a stretched model under any pose is an affine image of the model, and silhouettes
-along one direction of the model differ by an affine map of the plane: whitened by their second
-moments, by a turn. So silhouettes along directions all around are rendered once for a model, and
-compared with a mask's at all turns. Near objects look larger where they are nearer, by an amount
-that a stretch changes little: silhouettes are rendered from about as far as the mask's size says,
-for there are few classes of distances.
+From afar, the image of a stretched model is affine. Silhouettes from one direction therefore differ
+by an affine map of the plane; after whitening by their second moments, by a rotation. The model's
+silhouettes from all directions are rendered once, and compared with the mask's at all rotations.
+Perspective depends little on the stretch: silhouettes are rendered from a few distances, and the
+mask's size selects one.
 
-Each silhouette that resembles the mask's at some turn gives an affine camera ``M = R[:2] S / Z``.
-The rows of ``M S^-1`` are orthogonal and of one length, so that the stretch follows by two linear
-equations in the inverse squares of its scales.
+Each similar silhouette gives an affine camera ``M = R[:2] S / Z``. The rows of ``M S^-1`` are
+orthogonal and of equal length, which gives two linear equations in the inverse squares of the
+scales.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
-from cadalign.estimation.contours.contour import Image, sampled
+from cadalign.estimation.contours.contour import Image, interpolate
 from cadalign.estimation.contours.outline import rigid_surface
 from cadalign.estimation.model import Model
 from cadalign.estimation.problem import Inits, Problem
@@ -35,34 +34,34 @@ from cadalign.geometry.rotations import angles_between
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.focal import prior_of_camera
 
-_CELLS = 80  # rows and columns of a silhouette's or a mask's image
-_TURNS = 64  # at which silhouettes are compared
+_CELLS = 80  # rows and columns of a silhouette's image
+_TURNS = 64  # rotations at which silhouettes are compared
 _DIRECTIONS = 800  # all around, 7 degrees apart
-_AFAR = 60.0  # distance of an eye whose rays are almost parallel, relative to half a box's diagonal
+_AFAR = 60.0  # distance with almost parallel rays, relative to half the box's diagonal
 _EYES = (5.0, 12.0, _AFAR)  # distances from which silhouettes are rendered
 _RINGS = 24
 _ANGLES = 2 * np.pi * np.arange(_TURNS) / _TURNS
 _AROUND = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 _RADII = 3.0 * (np.arange(_RINGS) + 0.5) / _RINGS  # [standard deviations]
 _LEAST_CELLS = 4
-_CELL_VARIANCE = 1e-3  # that every silhouette has at least
-_MARGIN = 1.5  # of the image in which silhouettes are compared, relative to the mask's
-_LEAST_OF_BEST = 0.97  # overlap of another turn, relative to the best one of the same direction
-_MOST_AFFINE = 200  # cameras of which the silhouettes are rendered
+_CELL_VARIANCE = 1e-3  # least variance of a silhouette
+_MARGIN = 1.5  # size of the compared image, relative to the mask
+_LEAST_OF_BEST = 0.97  # overlap at another rotation, relative to the best of the same direction
+_MOST_AFFINE = 200  # affine cameras that are tested
 _ITERATIONS = 8
 _PRIOR = 0.05  # weight of the logarithms of scales
 _MOST_LOG = 1.3
 _DISTINCT_DEG = 10.0
 _DISTINCT_STRETCH = 0.2
-_RESEMBLING = 12  # silhouettes from which a mask alone starts
-_LARGEST_FOCAL_SIGMA = 0.25  # relative: poses are sought at the focal length of the prior
+_MOST_SIMILAR = 12  # starts from a mask alone
+_LARGEST_FOCAL_SIGMA = 0.25  # relative: the search uses the mean focal length of the prior
 
 
 class WhitenedSilhouettes(NamedTuple):
-    """Silhouettes by their first and second moments, N of them.
+    """N silhouettes, whitened by their first and second moments.
 
-    ``mean`` (N, 2), ``spread`` (N, 2, 2), the square root of the covariance, and ``rings`` (N,
-    `_RINGS`, `_TURNS`), shares in 255ths that are covered after both are removed.
+    ``mean`` (N, 2); ``spread`` (N, 2, 2), the square root of the covariance; and ``rings`` (N,
+    `_RINGS`, `_TURNS`), the whitened coverage on polar rings, in 255ths.
     """
 
     mean: FloatArray
@@ -71,7 +70,7 @@ class WhitenedSilhouettes(NamedTuple):
 
 
 class Atlas(NamedTuple):
-    """A model's silhouettes; of each one the ``base`` (N, 2, 3), the axes of its image."""
+    """A model's silhouettes, and the axes ``bases`` (N, 2, 3) of their images."""
 
     caster: RayCaster
     corners: FloatArray
@@ -80,28 +79,28 @@ class Atlas(NamedTuple):
 
 
 def starts_of_mask(problem: Problem) -> list[Inits]:
-    """Alignments that resemble the only mask; InputError without a prior on the focal length."""
+    """Starts from a single mask; raises InputError without a prior on the focal length."""
     (view,), camera, model = problem.views, problem.lenses.cameras[0], cast(Model, problem.model)
     known = prior_of_camera(problem.lenses.prior, camera)
     if problem.lenses.count and (known is None or known.relative_sigma > _LARGEST_FOCAL_SIGMA):
         raise InputError(
-            "a mask alone does not tell the focal length",
+            "a mask alone does not determine the focal length",
             where=f"views[{view.number}].camera",
             fix="give a calibrated camera, a focal_prior whose relative_sigma is at most "
             f"{_LARGEST_FOCAL_SIGMA}, or keypoints",
         )
-    poses = resembling_poses(
+    poses = similar_poses(
         cast(Mesh, model.mesh),
         cast(FloatArray, view.mask_image),
         camera,
         free=np.asarray(problem.prior.scales.free > 0),
-        count=_RESEMBLING,
+        count=_MOST_SIMILAR,
         symmetry=model.symmetry,
     )
     return [[turned_alignment(pose, problem.turns[0])] for pose, _ in poses]
 
 
-def resembling_poses(
+def similar_poses(
     mesh: Mesh,
     mask: FloatArray | BoolArray,
     camera: Camera,
@@ -110,23 +109,23 @@ def resembling_poses(
     count: int,
     symmetry: Symmetry | None = None,
 ) -> list[tuple[Alignment, float]]:
-    """Distinct alignments whose silhouettes resemble a mask (h, w), and overlaps, the best first.
+    """Distinct alignments with silhouettes similar to a mask (h, w), the best first.
 
-    Overlaps are intersections over unions; ``free`` (3,) marks the unknown scales.
+    Each has its overlap (intersection over union); ``free`` (3,) marks the unknown scales.
     """
-    view = FacedMask.of(mask, camera)
+    view = CentredMask.of(mask, camera)
     atlas = atlas_of(mesh, _eye_of(mesh, view.outline))
     poses = _poses_of(*_affine_cameras(atlas, view.outline), atlas, free)
     found = [(pose, view.overlap(atlas.caster, pose)) for pose in poses]
     found.sort(key=lambda each: -each[1])
-    kept = distinct(found, count, symmetry)
+    kept = select_distinct(found, count, symmetry)
     turn = view.camera_from_facing
     return [(turned_alignment(pose, turn), overlap) for pose, overlap in kept]
 
 
 @lru_cache(maxsize=32)
 def atlas_of(mesh: Mesh, eye: float) -> Atlas:
-    """Silhouettes of a mesh, from so far an ``eye``, relative to half of the box's diagonal."""
+    """Silhouettes of a mesh from distance ``eye``, relative to half the box's diagonal."""
     caster, corners = rigid_surface(mesh).caster, bounds_corners(*mesh.bounds)
     middle = corners.mean(axis=0)
     far = eye * float(np.linalg.norm(corners - middle, axis=1).max())
@@ -151,7 +150,7 @@ def atlas_of(mesh: Mesh, eye: float) -> Atlas:
 
 
 def _directions() -> FloatArray:
-    """Directions (n, 3) spread evenly: a Fibonacci lattice, and the opposite ones."""
+    """Evenly spread directions (n, 3): half a Fibonacci lattice, and the opposite directions."""
     k = np.arange(_DIRECTIONS // 2) + 0.5
     z = 1 - 2 * k / _DIRECTIONS
     angle = np.pi * (1 + 5**0.5) * k
@@ -161,7 +160,7 @@ def _directions() -> FloatArray:
 
 
 def _eye_of(mesh: Mesh, query: WhitenedSilhouettes) -> float:
-    """One of `_EYES` from which a box of the mesh's size looks as large as a silhouette."""
+    """One of `_EYES` from which the mesh's box looks about as large as a silhouette."""
     sides = np.ptp(mesh.bounds, axis=0)
     area = float((sides * np.roll(sides, 1)).sum()) / 2  # a quarter of the surface (Cauchy)
     angle = 4 * np.pi * float(np.linalg.det(query.spread[0]))  # of a disc of this variance
@@ -170,23 +169,23 @@ def _eye_of(mesh: Mesh, query: WhitenedSilhouettes) -> float:
 
 
 def _whiten(image: Image, corner: FloatArray, cell: float) -> WhitenedSilhouettes:
-    """The silhouette of an image whose cells lie ``cell`` apart from the ``corner`` (2,) on."""
+    """Whiten the silhouette in an image with its first cell at ``corner`` (2,)."""
     points = np.argwhere(image > 0.5)[:, ::-1].astype(float)
     mean = points.mean(axis=0)
     covariance = np.cov(points.T, bias=True) + _CELL_VARIANCE * np.eye(2)
     variances, axes = np.linalg.eigh(covariance)
     spread = (axes * np.sqrt(variances)) @ axes.T
     rays = (_RADII[:, None, None] * _AROUND).reshape(-1, 2)
-    covered = sampled(np.pad(image, 1), mean + rays @ spread + 1)
+    covered = interpolate(np.pad(image, 1), mean + rays @ spread + 1)
     rings = np.rint(255 * covered).astype(np.uint8).reshape(1, _RINGS, _TURNS)
     return WhitenedSilhouettes((corner + cell * mean)[None], cell * spread[None], rings)
 
 
-class FacedMask(NamedTuple):
-    """A mask as a camera sees it that looks at its middle.
+class CentredMask(NamedTuple):
+    """A mask in a camera that looks at its centre.
 
-    The ``outline`` is its silhouette. Cells on the plane at depth 1 have values ``inside`` (m,),
-    ``rays`` (m, 3) through them, and lie in the photo where ``is_seen`` (m,).
+    ``outline`` is its whitened silhouette. Cells on the plane at depth 1 have values ``inside``
+    (m,), ``rays`` (m, 3), and are inside the photo where ``is_seen`` (m,).
     """
 
     outline: WhitenedSilhouettes
@@ -196,7 +195,7 @@ class FacedMask(NamedTuple):
     camera_from_facing: FloatArray
 
     @classmethod
-    def of(cls, mask: FloatArray | BoolArray, camera: Camera) -> FacedMask:
+    def of(cls, mask: FloatArray | BoolArray, camera: Camera) -> CentredMask:
         inside: BoolArray = np.asarray(mask, dtype=np.float64) >= 0.5
         pixels = np.argwhere(inside)[:, ::-1].astype(float)
         found, valid = camera.rays_where_valid(pixels[:: max(1, len(pixels) // 20_000)])
@@ -217,16 +216,16 @@ class FacedMask(NamedTuple):
         in_camera = rays @ turn.T
         is_ahead = camera.is_wide | (in_camera[:, 2:] > 1e-6)
         pixels = camera.project(np.where(is_ahead, in_camera, [0, 0, 1]))
-        # Averages over a cell, where it holds several pixels.
+        # Averages over a cell of several pixels.
         blur = max(cell * camera.fx / 3, 0.3)
         soft = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), blur)
-        image = sampled(np.pad(soft, 1), pixels + 1).reshape(_CELLS, _CELLS).astype(np.float32)
+        image = interpolate(np.pad(soft, 1), pixels + 1).reshape(_CELLS, _CELLS).astype(np.float32)
         some = np.arange(_CELLS**2).reshape(_CELLS, _CELLS)[::2, ::2].ravel()
         compared = image.ravel()[some].astype(float), rays[some], camera.contains(pixels)[some]
         return cls(_whiten(image, corner, cell), *compared, turn)
 
     def overlap(self, caster: RayCaster, pose: Alignment) -> float:
-        """Intersection over union of the mask and the silhouette of a pose in this view."""
+        """Intersection over union of the mask and the silhouette at a pose in this view."""
         origin, model_from_ray = model_rays(pose)
         seen = caster.covered(origin, self.rays @ model_from_ray.T) & self.is_seen
         common = float(self.inside[seen].sum())
@@ -234,7 +233,7 @@ class FacedMask(NamedTuple):
 
 
 def _overlaps(views: WhitenedSilhouettes, query: WhitenedSilhouettes) -> FloatArray:
-    """Intersections over unions (N, turns) of silhouettes and one that is turned."""
+    """Intersections over unions (N, turns) of silhouettes and a turned query."""
     rings = query.rings[0].astype(np.float32) / 255
     weights = np.repeat(_RADII, _TURNS).astype(np.float32)
     turns = (np.arange(_TURNS)[:, None] + np.arange(_TURNS)) % _TURNS
@@ -246,9 +245,9 @@ def _overlaps(views: WhitenedSilhouettes, query: WhitenedSilhouettes) -> FloatAr
 
 
 def _affine_cameras(atlas: Atlas, query: WhitenedSilhouettes) -> tuple[FloatArray, FloatArray]:
-    """Maps (n, 2, 3), (n, 2) ``M x + b`` of the model to the query's plane of the best overlaps."""
+    """Affine cameras ``M x + b`` (n, 2, 3), (n, 2) with the best overlaps."""
     overlap = _overlaps(atlas.views, query)
-    # A whitened silhouette may fit at several turns.
+    # A whitened silhouette may fit at several rotations.
     is_peak = (overlap >= np.roll(overlap, 1, 1)) & (overlap >= np.roll(overlap, -1, 1))
     is_peak &= overlap > _LEAST_OF_BEST * overlap.max(axis=1, keepdims=True)
     peaks = np.nonzero(is_peak)
@@ -278,9 +277,9 @@ def _poses_of(
 
 
 def _stretches_of(matrices: FloatArray, free: BoolArray) -> FloatArray:
-    """Scales (n, 3) that make the rows of ``matrix / scale`` orthogonal and of one length.
+    """Scales (n, 3) that make the rows of ``matrix / scale`` orthogonal and of equal length.
 
-    Least squares, with a weak prior on the logarithms: some views leave a stretch open.
+    Least squares, with a weak prior on the logarithms for undetermined stretches.
     """
     first, second = matrices[:, 0], matrices[:, 1]
     terms = np.stack([first * second, (first**2 - second**2) / 2], axis=1)
@@ -300,10 +299,10 @@ def _stretches_of(matrices: FloatArray, free: BoolArray) -> FloatArray:
     return np.asarray(np.exp(logs))
 
 
-def distinct(
+def select_distinct(
     found: list[tuple[Alignment, float]], count: int, symmetry: Symmetry | None
 ) -> list[tuple[Alignment, float]]:
-    """The first ones whose alignments, apart from symmetry, are too far apart for one minimum."""
+    """The first ``count`` alignments that differ, up to symmetry."""
     poses: list[Alignment] = []
     kept = []
     for each in found:

@@ -1,13 +1,12 @@
 """Sources of the outline: a view's mask, and its photo.
 
-A mask's contour lies beside the rim by an offset that all of it has in common, of a mask that is
-dilated say, and by its registration: programs place pixels' centres half a pixel apart, and
-annotators click no better. Both are unknown, and integrated out with the rest of the shape.
+A mask's contour differs from the rim by a common offset, for example of a dilated mask, and by a
+registration, since conventions for pixel centres differ by half a pixel. Both are unknown, and are
+integrated out together with the shape.
 
-Each look at a photo learns the colours on both sides of the predicted outline, and takes the places
-where lines across it leave the object (`photo_lines.py`). Rounds begin with long lines of blurred
-colours and end with short ones at full resolution; lengths far above the last step are left out.
-The last rounds count with the noise that the residuals show.
+In a photo, the colours on both sides of the predicted outline are learned, and the outline is
+detected on lines across it (`photo_lines.py`). The first rounds use long lines and blurred colours,
+the last ones short lines at full resolution. The last rounds estimate the noise from the residuals.
 """
 
 from __future__ import annotations
@@ -44,34 +43,33 @@ from cadalign.estimation.contours.photo_lines import PhotoPyramid, outline_of, s
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
 
-_LARGEST = 24.0  # [px], distance of a sample without a rim, where estimates are compared
-# Of the samples where estimates are compared: their least and largest deviation, and neighbours
-# that count as one.
+_LARGEST = 24.0  # [px], distance of a sample without a rim in the rank
+# In the rank: least and largest deviation of samples, and number of neighbours that count as one.
 _RANKED, _RANKED_CORRELATION = (0.2, 1.0), 10.0
 _LEAST_SIGMA = 0.1  # [px]
-_FIRST_OFFSET = 1.0  # [px], standard deviation of the offset that all of a contour has in common
-_UNEVEN = 0.05  # share of the offset by which it differs from edge to edge
+_FIRST_OFFSET = 1.0  # [px], standard deviation of the common offset
+_UNEVEN = 0.05  # variation of the offset between edges, relative
 _EDGE = 30.0  # samples of an edge
-_OF_PIXELS = 3.0  # samples that count as one where pixels alone displace them
+_OF_PIXELS = 3.0  # samples that count as one with quantisation alone
 _FIRST_REACH = 24.0  # [px], and the same relative to the contour's size
 _RELATIVE_REACH = 0.04
 _WIDE_REACH = 0.15  # without keypoints
 _LEAST_REACH = 4.0
-_REACH = 6.0  # in standard deviations of the residuals
-_OFFSETS = 2.0  # in standard deviations of the offset that all of a contour has in common
-_UNEVEN_RMS = 1.0  # [px], of an exact model's contour that meets its outline
+_REACH = 6.0  # of the residuals [sigma]
+_OFFSETS = 2.0  # least reach, in standard deviations of the common offset
+_UNEVEN_RMS = 1.0  # [px], largest for the contour of an exact model
 _INSIDE = 0.5  # probability of a mask's pixel
-_OPEN_BORDER = 3  # [px], within which a mask may go on outside of the image
+_OPEN_BORDER = 3  # [px], within which a mask may leave the image
 _LEAST_PIECE = 0.003  # of a piece of the mask, relative to the largest
-_LEAST_KEYPOINTS = 4  # that tell whether a mask is inverted
+_LEAST_KEYPOINTS = 4  # needed to recognise an inverted mask
 
 
 @dataclass(frozen=True, eq=False)
 class MaskSource(OutlineSource):
     """The contour of a mask.
 
-    ``slopes`` (S, 2, 2) are derivatives of its samples' places [px] by their rays; ``sigma`` [px]
-    is None to estimate it. It ``is_wide`` without keypoints, for the start may be far off.
+    ``slopes`` (S, 2, 2) are derivatives of its samples [px] by their rays; ``sigma`` [px] is None
+    to estimate it. ``is_wide`` without keypoints: the start may be far off.
     """
 
     kind = "mask"
@@ -89,14 +87,14 @@ class MaskSource(OutlineSource):
 
     @classmethod
     def of(cls, image: int, view: View, camera: Camera, *, is_exact: bool = True) -> MaskSource:
-        """The contour of a view's mask inside of its lens; InputError if it has none."""
+        """The contour of a view's mask where the lens is valid; raises InputError without one."""
         mask = cast("FloatArray | BoolArray", view.mask_image)
         contour = mask_contour(mask, f"views[{view.number}].mask")
         rays, valid = camera.normalize_where_valid(contour.points)
         slopes = np.array([[camera.fx], [camera.fy]]) * camera.distortion_jacobian(rays[valid])
-        contour = contour.taken(valid)
+        contour = contour.select(valid)
         given = contour, slopes, view.mask_sigma, mask_image(mask, contour), view.has_mask_alone
-        return cls(image, view.number, camera, is_exact, *given, _off_mask(view.pixels, mask))
+        return cls(image, view.number, camera, is_exact, *given, _inversion_hint(view.pixels, mask))
 
     def first(self) -> Track:
         """Noise and reach at the start."""
@@ -107,10 +105,10 @@ class MaskSource(OutlineSource):
 
     def last(self, track: Track) -> Track:
         """Noise and reach of the last rounds."""
-        return self._narrowed(self.first()._replace(noise=track.noise, is_fine=self.is_exact))
+        return self._narrow(self.first()._replace(noise=track.noise, is_fine=self.is_exact))
 
     def outline(self, sight: Sight, track: Track) -> Outline:
-        """The outline of a posed surface; a fine one is free of the bias of extraction."""
+        """Measure the outline of a posed surface; a fine track corrects the extraction bias."""
         rims = find_rims(sight, self.contour, track.reach)
         bias = np.zeros(len(rims.found))
         if track.is_fine:
@@ -128,11 +126,11 @@ class MaskSource(OutlineSource):
             track.reach,
         )
 
-    def learned(self, outline: Outline, offset: float, track: Track) -> Track:
-        """The track with the noise that residuals show before a step.
+    def learn(self, outline: Outline, offset: float, track: Track) -> Track:
+        """Update the track's noise from the residuals before a step.
 
-        Edges lie unevenly by a share of their common offset. Where the surface is only similar,
-        samples without a rim count as the farthest.
+        Offsets of edges vary by a share of the common offset. On a similar surface, samples without
+        a rim count with the largest residual.
         """
         residuals = outline.residuals(offset)
         if not self.is_exact:
@@ -141,34 +139,33 @@ class MaskSource(OutlineSource):
         least = Noise(self.sigma or _LEAST_SIGMA, pixels, track.noise.offset)
         noise = outline.noise(residuals, least, LEAST_LOSS_SCALE)
         if self.is_exact and not track.is_fine:
-            return self._narrowed(track._replace(noise=noise._replace(correlation=1.0)))
+            return self._narrow(track._replace(noise=noise._replace(correlation=1.0)))
         uneven = _EDGE * (_UNEVEN * noise.offset / noise.sigma) ** 2 * self.is_exact
         return track._replace(noise=noise._replace(correlation=noise.correlation + uneven))
 
-    def _narrowed(self, track: Track) -> Track:
-        """The track with a reach as small as its noise allows."""
+    def _narrow(self, track: Track) -> Track:
+        """Reduce the track's reach as far as its noise allows."""
         least = max(_LEAST_REACH, _OFFSETS * track.noise.offset)
         return track._replace(reach=min(track.reach, max(_REACH * track.noise.sigma, least)))
 
     def rank(self, found: MeasuredOutline) -> float:
-        """-2 log of its probability, to compare estimates, by their noise within bounds."""
+        """-2 log probability for the comparison of estimates, with bounded noise."""
         residuals = np.nan_to_num(found.residuals, nan=_LARGEST)
         noise = Noise(float(np.clip(found.noise.sigma, *_RANKED)), _RANKED_CORRELATION, 0.0)
         normalization = 2 * len(residuals) / _RANKED_CORRELATION * float(np.log(noise.sigma))
         return float(noise.costs(residuals).sum()) + normalization
 
     def refusal(self, support: OutlineSupport) -> str:
-        """The reason to leave the source out, for its support is too low."""
+        """The reason to leave the source out."""
         if not support.share:
             return f"no part of the model's outline comes near its contour{self.hint}"
         share = f"{100 * support.share:.0f} % of its contour"
         return f"only {share} can be the model's outline{self.hint}"
 
     def doubt(self, support: OutlineSupport) -> str | None:
-        """A warning about an estimate that little but the outlines determines.
+        """The text of a warning about low support, or None.
 
-        Beside keypoints, it is of an uneven contour that is met in parts alone. Sharp parts alone
-        are those of an object that is partly hidden.
+        With keypoints, only an uneven contour raises it: an occluded object has sharp parts.
         """
         if support.share >= self.good_share:
             if not (self.is_wide and _leaves_image(self.mask[0] >= _INSIDE)):
@@ -187,7 +184,7 @@ class MaskSource(OutlineSource):
 
 
 def convex_hull(mask: FloatArray | BoolArray) -> BoolArray | None:
-    """The convex hull of a mask (h, w) without small pieces; None where it leaves the image."""
+    """The convex hull of a mask (h, w) without small pieces; None if it leaves the image."""
     inside = mask >= _INSIDE
     if _leaves_image(inside):
         return None
@@ -207,8 +204,8 @@ def _leaves_image(inside: BoolArray) -> bool:
     return bool(inside.sum() > middle.sum())
 
 
-def _off_mask(pixels: FloatArray, mask: FloatArray | BoolArray) -> str:
-    """A hint that most keypoints lie off a mask, as they do where it is inverted; or nothing."""
+def _inversion_hint(pixels: FloatArray, mask: FloatArray | BoolArray) -> str:
+    """A hint if most keypoints lie off the mask, which may be inverted; otherwise empty."""
     places = np.round(pixels).astype(int)
     u, v = places[((places >= 0) & (places < mask.shape[::-1])).all(axis=1)].T
     count, off = len(u), int((mask[v, u] < _INSIDE).sum())
@@ -220,21 +217,20 @@ def _off_mask(pixels: FloatArray, mask: FloatArray | BoolArray) -> str:
 # The photo ----------------------------------------------------------------------------------------
 
 
-# Reaches of the lines of every round, relative to the silhouette's size.
+# Reaches of the lines in each round, relative to the silhouette's size.
 _COARSE, _FINE = (0.16, 0.08), (0.04, 0.02, 0.02)
 _LEAST_REACH = 5.0  # [px]
-_REACH_CELLS = 6.4  # of a silhouette in which lines are sought, that these reach across
+_REACH_CELLS = 6.4  # per reach, of a silhouette's grid
 _FEWEST_CELLS, _MOST_CELLS = 80, 220  # along the longer side of a silhouette
 _LEAST_OUTLIER = 2.0  # in standard deviations
-# Standard deviation [px] of the offset outwards that all of an outline has in common, where light
-# and blur differ from side to side.
+# Standard deviation [px] of the common offset, from light and blur.
 _OFFSET = 0.4
-_FIRST = Noise(1.0, 4.0, _OFFSET)  # by lines
-_LEAST = Noise(0.5, 16.0, _OFFSET)  # pixels and blur displace neighbours alike
-_STRAY = 0.2  # share of the lines whose places are of other things
-_LINES_OF_PATCH = 5.0  # of which the colours count as independent
-_LEAST_CONTRAST = 2.0  # [nats], that colours must give the silhouette: noise gives one
-_MOST_RMS = 1.4  # of the lines found, in standard deviations, above which a warning says so
+_FIRST = Noise(1.0, 4.0, _OFFSET)
+_LEAST = Noise(0.5, 16.0, _OFFSET)  # pixels and blur correlate neighbours
+_STRAY = 0.2  # share of the lines that detect other edges
+_LINES_OF_PATCH = 5.0  # number of lines with independent colours
+_LEAST_CONTRAST = 2.0  # [nats], of the silhouette; noise gives one
+_MOST_RMS = 1.4  # [sigma], of the found lines, that raises no warning
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,25 +259,25 @@ class PhotoSource(OutlineSource):
         found = outline_of(self.photo, silhouette, max(track.reach * silhouette.size, _LEAST_REACH))
         return found if found is not None and found.found.any() else None
 
-    def learned(self, outline: Outline, offset: float, track: Track) -> Track:
-        """The track with the noise of the residuals, at the last level."""
+    def learn(self, outline: Outline, offset: float, track: Track) -> Track:
+        """Update the track's noise from the residuals, at the last level only."""
         if not track.is_fine or track.levels:
             return track
         return track._replace(noise=_noise_of(outline, outline.residuals(offset)))
 
     def rank(self, found: MeasuredOutline) -> float:
-        """-2 log of its probability over a silhouette, and places on lines, anywhere."""
+        """-2 log probability relative to uniform places, and to a silhouette anywhere."""
         outline, residuals = found.outline, found.residuals
         noise = _noise_of(outline, residuals)
         sigmas = noise.sigma * outline.sigmas[outline.found]
         squares = (residuals[outline.found] / sigmas) ** 2
         density = np.exp(-squares / 2) / np.sqrt(2 * np.pi) / sigmas
-        # Some places are those of other things.
+        # Some lines detect other edges.
         gains = np.log((1 - _STRAY) * density * 2 * outline.reach + _STRAY)
         return -2 * (float(gains.sum() / noise.correlation) + _contrast(outline))
 
     def support(self, found: MeasuredOutline) -> OutlineSupport:
-        """Agreement with the outline, none by colours that are the same on both sides."""
+        """Agreement with the outline; none if both sides have the same colours."""
         if _contrast(found.outline) < _LEAST_CONTRAST:
             return OutlineSupport()
         return super().support(found)
@@ -301,7 +297,7 @@ class PhotoSource(OutlineSource):
 
 
 def _contrast(outline: Outline) -> float:
-    """Log likelihood [nats] that the colours give the silhouette over one anywhere."""
+    """Log likelihood [nats] of the colours, relative to a silhouette anywhere."""
     return 2 * len(outline.found) / _LINES_OF_PATCH * outline.contrast
 
 

@@ -1,1 +1,1 @@
-"""Uncertainty of an estimate, contradictions, and which evidence to add."""
+"""Uncertainty of an estimate: posterior, residuals and warnings."""

@@ -1,4 +1,4 @@
-"""Warnings of an estimate: nothing that tests it, other poses, keypoints off the image."""
+"""Warnings about an estimate: no redundancy, other poses, keypoints outside the image."""
 
 from __future__ import annotations
 
@@ -22,36 +22,36 @@ from cadalign.shapes.parts import probability_within
 from cadalign.solvers.constants import LEAST_POINTS
 
 FALSE_ALARMS = 0.004
-"""Probability of residuals by chance, below which they fail their test."""
-_LARGE = 0.005  # estimated sigma, over the keypoints' extent, that is large
-_LARGEST_SHARE = 0.45  # of the keypoints' spread, of an estimated sigma
+"""Significance level of the test of residuals."""
+_LARGE = 0.005  # of a large estimated sigma, relative to the keypoints' extent
+_LARGEST_SHARE = 0.45  # of an estimated sigma in the keypoints' spread
 _LEAST_EXTENT = 5.0  # of keypoints [sigma]
-_MOST_REJECTED = 0.3  # share of the keypoints that a robust search rejects without a word
-_NEAR = 3.0  # errors of rejected keypoints, over the largest of inliers, that tell of sigma
+_MOST_REJECTED = 0.3  # share of the keypoints that a robust search rejects without a warning
+_NEAR = 3.0  # largest error of a near outlier, relative to the threshold
 _CONTRADICTING_SIGMAS = 3.0  # of an estimated focal length from its prior
 _BEYOND_PRIOR = 3.5  # stretch, in standard deviations of its prior
-_LEAST_GAIN = 0.9  # of a standard deviation, relative to that of any rotation
+_LEAST_GAIN = 0.9  # of a standard deviation, relative to uniform rotations
 _ANY_ROTATION = math.sqrt(math.pi**2 / 3 + 2)  # standard deviation of uniform rotations [rad]
 _ANOTHER_DEG = 10.0
 _LEAST_TURN = 1e-12  # [rad], and of a relative variance
-_REGION = 0.95  # probability of the stated region, which alternatives outside of it contradict
+_REGION = 0.95  # probability of the confidence region, which excludes alternatives outside
 
 
 def keypoint_warnings(
     fitted: FittedKeypoints, covariance: FloatArray | None, diagnosis: Diagnosis | None
 ) -> Warnings:
-    """Warnings about the cause of a misfit, and what deviations do not say."""
-    cause = None if diagnosis is None or _fit(fitted) else diagnosis(fitted)
+    """Warnings about a misfit, and about problems that deviations do not show."""
+    cause = None if diagnosis is None or _fits(fitted) else diagnosis(fitted)
     counted, residuals = fitted.is_counted, fitted.residuals
     observed = fitted.observed[np.isfinite(residuals).all(axis=1) & counted]
     is_mistake = cause is not None and cause.kind == "mistake"
     sigma = fitted.options.sigma
     placed = outside_image(observed, fitted.camera, cause=cause, sigma=sigma)
-    found = first_of_camera(placed, cause)
+    found = order_warnings(placed, cause)
     for row, first in fitted.repeats:
         text = f"keypoint {row} is keypoint {first} again, and counts once"
         found.append(EstimateWarning("left-out", text, 0, (row,)))
-    if covariance is None or is_mistake:  # of the alignment nothing else can be said
+    if covariance is None or is_mistake:  # the alignment is meaningless
         return tuple(found)
     options, kept = fitted.options, fitted.points_3d[fitted.inliers]
     if fitted.sigma is not None and options.sigma is None:
@@ -63,7 +63,7 @@ def keypoint_warnings(
         found += rejections(*agreeing, fitted.search.ransac, sigma)
     if 2 * len(kept) <= options.unknowns:
         text = (
-            f"{len(kept)} keypoints fit exactly whatever they are: "
+            f"{len(kept)} keypoints always fit exactly: "
             "the residuals say nothing about the quality of the fit"
         )
         found.append(EstimateWarning("untested", text))
@@ -72,15 +72,15 @@ def keypoint_warnings(
         found += () if doubt is None else (doubt,)
     if cause is None:
         found += stretch_doubts(fitted.alignment, uncertainty_of(covariance), options)
-    # Likelihoods tell nothing where keypoints do not fit, or others than these were rejected.
+    # Likelihoods are meaningless after a misfit, or with different outliers.
     if cause is None and fitted.search is None:
         poses = [(each.alignment, each.relative_likelihood) for each in fitted.alternatives]
-        found += another_pose(fitted.alignment, poses, covariance)
+        found += pose_doubts(fitted.alignment, poses, covariance)
     return tuple(found)
 
 
 def focal_doubt(camera: Camera, prior: PriorOption) -> EstimateWarning | None:
-    """Warning about a camera whose estimated focal length contradicts its prior, or None."""
+    """Warn if the estimated focal length contradicts its prior."""
     prior = prior_of_camera(prior, camera)
     if prior is None:
         return None
@@ -92,13 +92,13 @@ def focal_doubt(camera: Camera, prior: PriorOption) -> EstimateWarning | None:
     )
 
 
-def first_of_camera(placed: Warnings, cause: EstimateWarning | None) -> list[EstimateWarning]:
-    """Warnings of `outside_image` and the cause of a misfit; doubts of the camera come first."""
+def order_warnings(placed: Warnings, cause: EstimateWarning | None) -> list[EstimateWarning]:
+    """Join warnings of `outside_image` and the cause of a misfit; camera warnings come first."""
     doubts = [each for each in placed if each.kind == "camera"]
     return [*doubts, *(() if cause is None else (cause,)), *placed[len(doubts) :]]
 
 
-def _fit(fitted: FittedKeypoints) -> bool:
+def _fits(fitted: FittedKeypoints) -> bool:
     if fitted.search is not None or fitted.cost is None:
         return fitted.search is None
     if fitted.options.sigma is None:
@@ -111,7 +111,7 @@ def percent(fraction: float) -> str:
     return f"{100 * fraction:.0f} %" if fraction < 100 else "more than 10000 %"
 
 
-def another_pose(
+def pose_doubts(
     best: Alignment,
     others: Sequence[tuple[Alignment, float]],
     covariance: FloatArray,
@@ -119,11 +119,11 @@ def another_pose(
     *,
     near: float = 0.0,
 ) -> Warnings:
-    """Warn about other poses, with likelihoods relative to the best, that the deviations conceal.
+    """Warn about other poses, with relative likelihoods, that the deviations do not cover.
 
-    Those outside of the 95 % interval of the turn to them, where they have more than the 5 % that
-    it leaves them together; any, where the deviations leave every rotation open. ``near`` is the
-    likelihood of further estimates of hardly another pose.
+    These lie outside the 95 % interval of the turn to them, and have more than 5 % probability
+    together. If the rotation is undetermined, all other poses count. ``near`` is the total
+    likelihood of further estimates near the best pose.
     """
     total = 1 + near + sum(likelihood for _, likelihood in others)
     is_open = covariance[:3, :3].trace() > (_LEAST_GAIN * _ANY_ROTATION) ** 2
@@ -147,25 +147,25 @@ def another_pose(
 
 
 def stretch_doubts(alignment: Alignment, std: Uncertainty, options: FitOptions) -> Warnings:
-    """Warn about scales that the prior, or the bounds where none is given, makes implausible."""
+    """Warn about scales that are implausible under the prior or its default bounds."""
     found, prior = [], options.stretch_sigma
     most = math.log(USUAL_STRETCH) if prior is None else _BEYOND_PRIOR * prior
     for axis in range(3):
         scale = float(alignment.scale[axis] / alignment.scale[0])
         if abs(math.log(scale)) - std.scale[axis] > most:
             text = (
-                f"the object is {scale:.3g} times as long along {'xyz'[axis]} as the model, beside "
-                "its x: are the model's axes and keypoints right?"
+                f"the object is {scale:.3g} times as long along {'xyz'[axis]} as the model, "
+                "relative to x: are the model's axes and keypoints right?"
             )
             found.append(EstimateWarning("stretch", text))
     return tuple(found)
 
 
-@np.errstate(over="ignore")  # of errors that are any numbers
+@np.errstate(over="ignore")  # errors can be huge
 def rejections(
     residuals: FloatArray, inliers: BoolArray, ransac: RansacOptions, sigma: Sigma | None
 ) -> Warnings:
-    """Warn about a large share of rejected keypoints, and about many just beyond the threshold."""
+    """Warn about many rejected keypoints, or many just beyond the threshold."""
     errors = np.linalg.norm(residuals[~inliers], axis=1)
     limit, share = ransac.threshold(sigma), len(errors) / max(len(inliers), 1)
     near = int((errors < _NEAR * limit).sum())
@@ -178,7 +178,7 @@ def rejections(
     return (EstimateWarning("outlier", text),)
 
 
-@np.errstate(over="ignore")  # sizes of images are any numbers
+@np.errstate(over="ignore")  # image sizes can be huge
 def outside_image(
     points_2d: FloatArray,
     camera: Camera,
@@ -188,10 +188,10 @@ def outside_image(
     view: int = 0,
     where: str = "",
 ) -> Warnings:
-    """Warn about an implausible camera, and about keypoints (n, 2) that are none of the image's.
+    """Warn about an implausible camera, and about keypoints (n, 2) that are not in the image.
 
-    All keypoints lie beyond one side or, where they do not agree, by some ``cause``, most outside;
-    or they span hardly more than ``sigma`` [px]. ``where`` begins the texts.
+    They lie beyond one side of it; or, if there is a ``cause`` of a misfit, most lie outside; or
+    they span hardly more than ``sigma`` [px]. ``where`` begins the texts.
     """
     agree, confirm = cause is None or cause.kind == "mistake", len(points_2d) > LEAST_POINTS
     confirm &= cause is None or cause.kind not in ("misfit", "camera", "noise")
@@ -217,21 +217,20 @@ def outside_image(
 
 
 def noise_doubts(sigma: float, points_2d: Sequence[FloatArray]) -> Warnings:
-    """Warn of an estimated sigma [px] that is nearly the spread of the keypoints of views (n, 2).
+    """Warn if an estimated sigma [px] is nearly the spread of the views' keypoints (n, 2).
 
-    It is a smaller share in 98 % of pairs of a category's models, in 2 % of keypoints in random
-    order.
+    The limit accepts 98 % of pairs of a category's models, and 2 % of random correspondences.
     """
-    with np.errstate(over="ignore"):  # of keypoints beyond all images
+    with np.errstate(over="ignore"):  # keypoints can be far outside
         spread = max(float(points.std(axis=0).max()) for points in points_2d if len(points))
     if sigma <= _LARGEST_SHARE * spread:
         return ()
     share = f"{sigma:.3g} px, {100 * sigma / spread:.0f} % of the keypoints' standard deviation"
-    text = f"sigma is {share}: the model explains next to nothing of them, check which is which"
+    text = f"sigma is {share}: the model explains almost nothing, check the correspondences"
     return (EstimateWarning("noise", text),)
 
 
 def is_large_sigma(sigma: float, points_2d: Sequence[FloatArray]) -> bool:
-    """True for an estimated sigma [px] that is large beside the extent of keypoints (n, 2)."""
+    """True if an estimated sigma [px] is large relative to the extent of keypoints (n, 2)."""
     extents = [float(np.ptp(points, axis=0).max()) for points in points_2d if len(points)]
     return sigma > _LARGE * max(extents, default=0.0)

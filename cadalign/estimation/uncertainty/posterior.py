@@ -1,7 +1,7 @@
-"""Posterior covariance of an alignment, where the inverse Fisher information is too optimistic.
+"""Posterior covariance of an alignment with few keypoints.
 
-With few keypoints the reprojection error is no parabola over the range that the noise leaves open:
-at 6 keypoints and 1 px of noise the first-order 95 % ellipsoid holds the truth in 3 cases of 4.
+With few keypoints, the inverse Fisher information is too optimistic: with 6 keypoints and 1 px of
+noise, its 95 % ellipsoid contains the truth in 3 of 4 cases.
 The posterior under flat priors is integrated by adaptive importance sampling with Student proposals
 (Cappe et al., "Adaptive importance sampling in general mixture classes", 2008), in coordinates in
 which it is nearly Gaussian: the rotation vector, the direction and log distance of the keypoints'
@@ -35,22 +35,22 @@ from cadalign.io.focal import FocalPrior
 from cadalign.solvers.draws import CentredAlignment, LogPriors, WhitenedPixels, weigh_draws
 
 MOST_POINTS = 100
-"""Keypoints beyond which the inverse Fisher information is accurate, and sampling is slow."""
+"""Largest number of keypoints for sampling; with more, the Fisher information is accurate."""
 _DRAWS = (500, 500, 1000, 2000, 4000)
-_ENOUGH_EFFECTIVE = 300.0  # effective draws of a round that end the sampling
+_ENOUGH_EFFECTIVE = 300.0  # effective draws that end the sampling
 _FREEDOM = 5.0  # degrees of freedom of the Student proposals
-_FIRST_INFLATION = 1.5  # of the inverse Fisher information, for the first proposal
+_FIRST_INFLATION = 1.5  # of the inverse Fisher information in the first proposal
 _INFLATION = 1.3
 _FEW_EFFECTIVE = 60.0  # effective draws below which the weights are tempered
 _COVERAGE = 0.95
-_NOISE_OF_DRAWS = 1.25  # ratio of variances that the draws cannot tell from 1
+_NOISE_OF_DRAWS = 1.25  # ratio of variances within the noise of the draws
 _SEED = 0
-# Of an estimated sigma: that from an order statistic varies more than that from a sum of squares.
+# Of an estimated sigma; an order statistic varies more than a sum of squares.
 _EFFICIENCY = {"linear": 1.0, "huber": 0.7, "cauchy": 0.7}
 
 
 def keypoint_covariance(fitted: FittedKeypoints) -> FloatArray | None:
-    """The covariance (9, 9) or (10, 10) by the posterior; None without a Fisher information."""
+    """The posterior covariance (9, 9) or (10, 10); None without a Fisher information."""
     if fitted.fisher_covariance is None:
         return None
     if needs_facing([fitted.camera]):
@@ -68,7 +68,7 @@ def keypoint_covariance(fitted: FittedKeypoints) -> FloatArray | None:
         covariance = _posterior_covariance(fitted)
     if fitted.symmetry is None:
         return covariance
-    from cadalign.estimation.symmetry import held_axes, remove_free_turns  # few have one
+    from cadalign.estimation.symmetry import held_axes, remove_free_turns  # most models have none
 
     held = held_axes(fitted.options.stretched_axes)
     best = fitted.symmetry.canonical(fitted.alignment, held=held)
@@ -82,12 +82,12 @@ def _posterior_covariance(fitted: FittedKeypoints) -> FloatArray:
         pairs = len({*map(bytes, np.hstack([points, fitted.residuals[fitted.inliers]]))})
         redundancy = max(2 * pairs - options.unknowns, 1)
         widening = widening_of(options.unknowns, redundancy * _EFFICIENCY[options.loss])
-        # The noise is that of the keypoints, which leaves priors as they are.
+        # Sigma belongs to the keypoints: the priors are not widened.
         excess = (widening - 1) * _prior_information(options, len(covariance))
         more = np.eye(len(covariance)) + excess[:, None] * covariance
         covariance = np.asarray(widening * np.linalg.solve(more.T, covariance))
     if len(points) <= MOST_POINTS:
-        # Coordinates may come near the range of numbers.
+        # Coordinates may overflow.
         with suppress(np.linalg.LinAlgError, InputError):
             sampled = _sample(fitted, covariance, widening)
             covariance = covariance if sampled is None else sampled
@@ -95,10 +95,10 @@ def _posterior_covariance(fitted: FittedKeypoints) -> FloatArray:
 
 
 def _limit_to_prior(covariance: FloatArray, result: FittedKeypoints) -> FloatArray:
-    """The covariance (m, m), with log scales that vary no more than their prior does by itself.
+    """Limit the variance of log scales in a covariance (m, m) to their prior's.
 
-    A parabola, or an ellipsoid about a curved region, reaches past the ends of the prior, whose
-    mean square about the estimate bounds the variance. Ratios of scales that are known better stay.
+    An ellipsoid about a curved region may reach beyond the prior, whose mean square about the
+    estimate bounds the variance. Well-determined ratios of scales keep their variance.
     """
     weight, width = result.options.scale_prior
     if not weight:
@@ -107,15 +107,15 @@ def _limit_to_prior(covariance: FloatArray, result: FittedKeypoints) -> FloatArr
         most = log_scale**2 + width**2 / 3 + 1 / weight
         variance, own = covariance[axis, axis], covariance[axis]
         if variance > most:
-            left = own * (most / variance)  # exact, where the difference below is of large numbers
+            left = own * (most / variance)  # exact; the difference below loses digits
             covariance = covariance - np.outer(own / variance, own) * (1 - most / variance)
             covariance[axis], covariance[:, axis] = left, left
-            np.fill_diagonal(covariance, np.maximum(covariance.diagonal(), 0.0))  # but for rounding
+            np.fill_diagonal(covariance, np.maximum(covariance.diagonal(), 0.0))  # rounding errors
     return covariance
 
 
 def widening_of(unknowns: int, redundancy: float) -> float:
-    """Variance of the F distribution's 95 % ellipsoid over that of a known sigma's."""
+    """Ratio of squared 95 % radii for an estimated and a known sigma."""
     quantile = unknowns * f_quantile(unknowns, redundancy, 1 - _COVERAGE)
     return quantile / chi_square_quantile(unknowns, 1 - _COVERAGE)
 
@@ -129,7 +129,7 @@ class Chart(NamedTuple):
 
     @classmethod
     def of(cls, fitted: FittedKeypoints, widening: float) -> Chart:
-        """The chart of a fit, at ``widening`` times its variance; a loss counts by its weights."""
+        """The chart of a fit with ``widening`` times its variance; a loss enters by its weights."""
         camera, options, alignment = fitted.camera, fitted.options, fitted.alignment
         kept, points = fitted.inliers, fitted.points_3d[fitted.inliers]
         residuals = fitted.residuals[kept]
@@ -157,7 +157,7 @@ class Chart(NamedTuple):
         return cls(centred, keypoints, LogPriors(*options.scale_prior, *of_focal))
 
     def jacobian(self) -> FloatArray:
-        """Derivatives (10, 10) of the coordinates by the unknowns of a covariance."""
+        """Derivatives (10, 10) of the coordinates by a covariance's unknowns."""
         pose, center, _ = self.centred
         of_axes = pose[:9].reshape(3, 3) * (pose[12:] * center)
         of_center = np.zeros((3, 10))
@@ -182,14 +182,14 @@ def _prior_information(options: FitOptions, size: int) -> FloatArray:
 
 @np.errstate(all="ignore")  # draws that overflow have no weight
 def _sample(fitted: FittedKeypoints, first: FloatArray, widening: float) -> FloatArray | None:
-    """A covariance (m, m) by draws from the posterior, or None where the proposals miss it.
+    """A covariance (m, m) from draws of the posterior; None if the proposals miss it.
 
-    It is the inverse Fisher information, widened where the posterior is wider, and where the region
-    that the likelihood ratio does not reject at 5 % reaches farther: it covers the truth as stated.
+    It is the inverse Fisher information, widened to the posterior and to the region that the
+    likelihood ratio test does not reject at 5 %, so that its ellipsoid has the stated coverage.
     """
     chart, free = Chart.of(fitted, widening), fitted.options.estimated_unknowns
     scales = np.flatnonzero((free >= 6) & (free < 9))
-    # An order that does not follow the axes' names, of which the same draws tell the same then.
+    # Sorted by variance, so that the draws do not depend on the order of the axes.
     free[scales] = free[scales][np.argsort(first.diagonal()[free[scales]], kind="stable")]
     size = len(first)
     jacobian = chart.jacobian()[:size, :size]
@@ -245,10 +245,10 @@ def _widen(
     likely: BoolArray,
     limit: float,
 ) -> FloatArray:
-    """The covariance (m, m), widened along the directions in which the draws (k, m) reach farther.
+    """Widen a covariance (m, m) along directions in which the draws (k, m) reach farther.
 
-    Along principal axes of the second moments the variance is that of the draws, or that whose
-    ellipsoid reaches as far as the ``likely`` ones; it stays where both agree within their noise.
+    Along principal axes of the second moments, the variance is increased to the draws' variance, or
+    until the ellipsoid contains the ``likely`` draws; differences within their noise are ignored.
     """
     factor = np.linalg.cholesky(variance)
     used = (weights > 0) | likely
@@ -262,11 +262,11 @@ def _widen(
     factors = np.maximum(spread, squares.max(axis=1, initial=0.0))
     wide = factors > _NOISE_OF_DRAWS
     factors[~wide] = 1.0
-    # The ellipsoid through the ends of the axes still cuts corners of the region off.
+    # The ellipsoid through the ends of the axes may cut off corners of the region.
     factors[wide] *= (squares[wide] / factors[wide, None]).sum(axis=0).max(initial=1.0)
     widened = factor @ axes * np.sqrt(factors)
     covariance = widened @ widened.T
-    # Curved regions tilt the axes, which must not spread to unknowns that a prior determines.
+    # Tilted axes of curved regions must not widen unknowns that a prior determines.
     known = variance.diagonal()
     shrunk = np.where(known * prior > 0.5, np.sqrt(known / covariance.diagonal()), 1.0)
     return np.asarray(covariance * shrunk * shrunk[:, None])

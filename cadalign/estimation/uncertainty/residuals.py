@@ -1,4 +1,4 @@
-"""Residuals: losses, distributions of sums of their squares, support by chance."""
+"""Residuals: losses, distributions of their squares, support by chance, summaries."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from cadalign.solvers.joint.evidence import (
 from cadalign.solvers.minimal import MAX_SOLUTIONS
 
 SOLUTIONS_OF_FOUR = 2.3
-"""Valid alignments to 4 points, in the mean."""
+"""Mean number of valid alignments to 4 points."""
 LEAST_ERROR = 0.1
-"""No keypoint is taken to be better than that [px]."""
+"""Least error of a keypoint [px]."""
 _CHANCE_STRETCH = 3.2  # standard deviation of log scales of alignments by chance
-_LEAST_SHARE = 0.01  # of alignments by chance that are as moderate, at a factor of 1.5
+_LEAST_SHARE = 0.01  # of alignments by chance with a moderate stretch
 _MOST_NAMED = 5  # keypoints, in a message
-_OUTLIER = 8.0  # [sigma], of a depth: it is that of something else
+_OUTLIER = 8.0  # [sigma], of a depth of another object
 
 
 def whitening_matrices(whitening: FloatArray) -> FloatArray:
@@ -44,7 +44,7 @@ def whitening_matrices(whitening: FloatArray) -> FloatArray:
 
 
 def loss_weights(squares: FloatArray, loss: int, bend: float) -> FloatArray:
-    """Derivatives of a loss by the squared lengths."""
+    """Derivatives of a loss by squared lengths."""
     if loss == HUBER:
         return np.asarray(bend / np.sqrt(np.maximum(squares, bend**2)))
     return 1.0 / (1.0 + squares / bend**2) if loss == CAUCHY else np.ones_like(squares)
@@ -53,7 +53,7 @@ def loss_weights(squares: FloatArray, loss: int, bend: float) -> FloatArray:
 def chi_square_tail(value: float, freedom: int) -> float:
     """Probability that a chi-squared variable exceeds a value.
 
-    Abramowitz and Stegun, 26.4.4 and 26.4.5: importing SciPy's takes longer than a fit.
+    Abramowitz and Stegun, 26.4.4 and 26.4.5; SciPy would import slowly.
     """
     if value <= 0 or value == math.inf:
         return float(value <= 0)
@@ -66,7 +66,7 @@ def chi_square_tail(value: float, freedom: int) -> float:
 
 
 def chance_of(squares: float, redundancy: int, degrees_of_freedom: float | None = None) -> float:
-    """Probability of a larger sum of squares by chance; of learned shapes with their tails."""
+    """Probability of a larger sum of squares; learned shapes have t-distributed tails."""
     if redundancy <= 0 or squares <= redundancy:
         return 1.0
     if degrees_of_freedom is None:
@@ -89,14 +89,14 @@ def chi_square_quantile(freedom: int, probability: float) -> float:
 
 
 def f_quantile(first: float, second: float, probability: float) -> float:
-    """The value that an F variable of these degrees of freedom exceeds with a probability."""
+    """The value that an F-distributed variable exceeds with a probability."""
     from scipy.special import fdtri  # only where sigma is estimated
 
     return float(fdtri(first, second, 1 - probability))
 
 
 class Support(NamedTuple):
-    """Inliers' ``errors`` (k,) [px], of so many ``given``, and the ``area`` [px^2] of outliers."""
+    """Inliers' ``errors`` (k,) [px] among ``given`` keypoints, and ``area`` [px^2] of outliers."""
 
     errors: FloatArray
     given: int
@@ -104,8 +104,8 @@ class Support(NamedTuple):
 
 
 def area_of(points_2d: FloatArray, camera: Camera, max_reproj_error: float) -> float:
-    """The area [px^2] over which the outliers among keypoints (n, 2) are scattered."""
-    with np.errstate(over="ignore"):  # an infinite extent is more than the image's, too
+    """The area [px^2] of outliers among keypoints (n, 2)."""
+    with np.errstate(over="ignore"):  # an infinite extent is larger than the image
         extent = np.ptp(points_2d, axis=0) + 2 * max_reproj_error
         return min(float(np.prod(extent)), float(camera.width) * float(camera.height))
 
@@ -121,14 +121,14 @@ def check_support(
     chance: float = 0.1,
     share: float = 1.0,
 ) -> None:
-    """Raise NoConsensusError for poses that have no more support together than chance gives.
+    """Raise NoConsensusError if chance explains the support of all poses together.
 
-    ``size`` keypoints have so many ``solutions``; ``score`` is the truncated sum of squares [px^2].
-    ``chance`` bounds the expected number of models as well supported, a ``share`` of them as
-    moderate.
+    ``size`` keypoints have ``solutions`` alignments; ``score`` is the truncated sum of squares
+    [px^2]. ``chance`` bounds the expected number of random alignments with equal support, of which
+    a ``share`` has as moderate a stretch.
     """
     logarithm = sum(min(0.0, log_expected_by_chance(each, size, solutions)) for each in supports)
-    if logarithm < 0 and share < 1:  # the distribution of the product of both
+    if logarithm < 0 and share < 1:  # for the product of both
         logarithm += math.log(share)
         logarithm += math.log1p(-logarithm)
     if np.isfinite(score) and logarithm <= math.log(chance):
@@ -136,7 +136,7 @@ def check_support(
     inliers, count = sum(len(each.errors) for each in supports), sum(n for _, n, _ in supports)
     raise NoConsensusError(
         f"no alignment is supported: the best has {inliers} of {count} keypoints within "
-        f"{max_reproj_error:g} px, which chance gives as well (score {score:.4g} px^2)",
+        f"{max_reproj_error:g} px, no more than by chance (score {score:.4g} px^2)",
         where=where,
         fix="check the correspondences and the camera, raise max_reproj_error or max_iterations, "
         'or use loss="cauchy" for a model that is only similar',
@@ -144,17 +144,17 @@ def check_support(
 
 
 def share_as_moderate(scale: FloatArray, free: int) -> float:
-    """The share of alignments by chance whose stretch is at most that of ``scale`` (3,).
+    """The share of alignments by chance with at most the stretch of ``scale`` (3,).
 
-    Alignments that keypoints scattered at random support are stretched by factors of 25 and more,
-    in ``free`` axes.
+    Random keypoints support alignments that are stretched by factors of 25 and more in ``free``
+    axes.
     """
     largest = float(np.abs(np.log(scale)).max())
     return max(math.erf(largest / (math.sqrt(2) * _CHANCE_STRETCH)) ** free, _LEAST_SHARE)
 
 
 def named_keypoints(errors: Mapping[Any, float]) -> str:
-    """Keypoints with their errors [px], the largest first; an infinite one is left out."""
+    """Names of keypoints with finite errors [px], the largest first."""
     worst = sorted(errors, key=lambda row: -errors[row])
     listed = ", ".join(
         f"{row} ({errors[row]:.3g} px)" if np.isfinite(errors[row]) else f"{row}"
@@ -165,12 +165,12 @@ def named_keypoints(errors: Mapping[Any, float]) -> str:
 
 
 def log_expected_by_chance(support: Support, size: int, solutions: float) -> float:
-    """Log of the expected number of models as well supported among keypoints scattered at random.
+    """Log of the expected number of equally supported alignments of random keypoints.
 
     Moisan, Stival, "A probabilistic criterion to detect rigid point matches between two images and
-    estimate the fundamental matrix", 2004: for the k best keypoints all choices of these and of a
-    sample are counted, and the chance that the others lie within the largest error; the least
-    number over k (over the smallest dozen and all of them, which is where it lies).
+    estimate the fundamental matrix", 2004. For the k best keypoints, count all choices of these and
+    of a sample, times the probability that the others lie within the largest error. The result is
+    the minimum over small k and the largest k, where it is attained.
     """
     errors, count, area = support
     if len(errors) <= size:
@@ -191,7 +191,7 @@ def _log_choose(n: int, k: int) -> float:
 
 
 def summaries_of(evidence: Evidence, state: State) -> list[EvidenceSummary]:
-    """Root mean square residuals of all but keypoints and outlines, kind by kind."""
+    """Summaries of depths, gravity, camera heights and lengths."""
     points, poses = points_of(evidence.shape, state), state.poses
     some = kept_rows(evidence.sightings, evidence.sightings.depths[:, 1] > 0)
     depths = depths_along_axes(evidence, poses, points[some.point], some.image) - some.depths[:, 0]

@@ -1,4 +1,4 @@
-"""Contours of masks: sub-pixel places, outward normals, borders, small pieces."""
+"""Contours of masks: sub-pixel positions, outward normals, borders, small pieces."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from cadalign.estimation.contours.contour import (
     contour_of,
     crossings,
     find_rims,
+    interpolate,
     mask_contour,
-    sampled,
 )
 from cadalign.estimation.contours.outline import Noise, OutlineSupport, correlation_length
 from cadalign.estimation.contours.rounds import likeliest_offset
@@ -37,9 +37,9 @@ def test_images_are_read_at_exact_places_and_beyond_them_at_their_border() -> No
     rows, columns = np.mgrid[:3, :4000]
     inside = np.random.default_rng(0).uniform([0, 0], [3999, 2], (1000, 2))
     ramp = (columns + 7 * rows).astype(np.float32)
-    assert np.abs(sampled(ramp, inside) - inside @ [1, 7]).max() < 1e-9
+    assert np.abs(interpolate(ramp, inside) - inside @ [1, 7]).max() < 1e-9
     outside = np.array([[-5.0, 1.25], [4100.0, -np.inf], [12.5, np.inf], [np.nan, 9.0]])
-    assert sampled(ramp, outside).tolist() == [8.75, 3999.0, 26.5, 14.0]
+    assert interpolate(ramp, outside).tolist() == [8.75, 3999.0, 26.5, 14.0]
 
 
 def disc(center: tuple[float, float], radius: float) -> np.ndarray:
@@ -94,7 +94,7 @@ def test_small_pieces_and_holes_are_dropped() -> None:
         (disc((80, 60), 1.0), "larger than a few pixels"),
         (
             np.random.default_rng(0).uniform(size=(480, 640)) < 0.5,  # of which a fit takes minutes
-            r"has a contour of 56,\d\d\d px, longer than any object's, as of noise; clear it",
+            r"has a contour of 56,\d\d\d px, longer than an object's: the mask is noisy; remove",
         ),
     ],
 )
@@ -118,14 +118,14 @@ def test_correlated_residuals_count_less() -> None:
 
 @pytest.mark.parametrize("place", [2.0, 0.7, 0.5, 0.0])
 def test_an_offset_has_the_deviation_that_its_own_place_shows(place: float) -> None:
-    """A contour lies ``place`` before a prior of 1 px, with a variance of .36 px^2."""
+    """The likeliest offset of a contour at ``place``, for a prior of 1 px and a variance."""
     offset = likeliest_offset(place / (1 + 0.36), 1 / (1 / 0.36 + 1), Noise(1.0, 1.0, 1.0))
     assert offset == pytest.approx(max(np.sqrt(max(place**2 - 0.36, 0.0)), 0.1))
 
 
 @pytest.mark.parametrize("shift", [-0.3, -0.1, 0.1, 0.3])
 def test_the_nearest_of_two_lines_is_taken_on_either_side(shift: float) -> None:
-    """Lines at which the level falls along the normal, beside an offset from the point."""
+    """Places where the level falls along the normal, nearest to an offset."""
     columns = np.where(np.isin(np.arange(40), [*range(20), 21]), 1.0, 0.0)
     level = np.tile(columns.astype(np.float32), (5, 1))  # falls at 19.5 and 21.5
     place, normal = np.array([[18.5 + shift, 2.0]]), np.array([[1.0, 0.0]])
@@ -134,7 +134,7 @@ def test_the_nearest_of_two_lines_is_taken_on_either_side(shift: float) -> None:
 
 
 class Stripes(NamedTuple):
-    """A sight of stripes that are parallel to the y axis, between pairs of ``edges`` [px]."""
+    """A sight of stripes parallel to the y axis, between pairs of ``edges`` [px]."""
 
     edges: list[float]
 

@@ -1,4 +1,4 @@
-"""The bias of a contour's extraction: what pixels and smoothing do to the silhouette's outline."""
+"""Bias of contour extraction by pixels and smoothing."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TRUTH = truth_of((0.6, 0.4, 0.8))
 
 
 def offsets_and_bias(mask: np.ndarray, pose: Alignment) -> tuple[np.ndarray, np.ndarray]:
-    """How far the rims of a pose lie outside of a mask's contour, and the bias of these."""
+    """Distances of a pose's rims from a mask's contour, and their bias."""
     contour, sight = contour_of(mask), Sight(RayCaster(BOX), CAMERA, pose)
     rims = find_rims(sight, contour, 8.0)
     bias = extraction_bias(sight, mask_image(mask, contour), contour, rims)

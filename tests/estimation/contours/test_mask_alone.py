@@ -1,4 +1,4 @@
-"""`align` with nothing but a mask: pose and stretch of the own model."""
+"""`align` with a mask alone: pose and stretch of an exact model."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cadalign import Alignment, Camera, FocalPrior, Mesh, Model, Size, Symmetry, View, align
-from cadalign.estimation.contours.silhouettes import distinct
+from cadalign.estimation.contours.silhouettes import select_distinct
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import nearest_truth, rotation_error
 from cadalign.render import Scene, cast_geometry
@@ -57,9 +57,9 @@ def test_of_equal_poses_one_is_a_start() -> None:
     other = rotation_from_vector([0.6, 0, 0]) @ posed(0).rotation
     poses = [Alignment(turn, [0, 0, 3], np.ones(3)) for turn in (*turns, other)]
     found = [(pose, 0.5) for pose in poses]
-    assert distinct(found, 4, None) == found
-    assert distinct(found, 4, about) == [found[0], found[3]]
-    assert distinct(found, 2, None) == found[:2]
+    assert select_distinct(found, 4, None) == found
+    assert select_distinct(found, 4, about) == [found[0], found[3]]
+    assert select_distinct(found, 2, None) == found[:2]
 
 
 def test_a_prior_on_the_focal_length_is_enough() -> None:
@@ -124,7 +124,7 @@ class TestOwnModel:
         assert rotation_error(est=found.alignment, gt=truth) < 0.5
 
     def test_mask_that_is_cut_out_generously(self) -> None:
-        """Its contour lies farther from the rims than noise alone would take it."""
+        """The contour's distance from the rims exceeds the noise."""
         truth, camera = posed(0, (1.0, 0.8, 1.2)), CAMERA.resized(640, 480)
         mask = cast_geometry(Scene(body()), camera, truth).mask.astype(np.uint8)
         wide = cv2.dilate(mask, np.ones((13, 13), np.uint8)) > 0
@@ -143,7 +143,7 @@ class TestOwnModel:
         assert rotation_error(est=found.alignment, gt=truth) < 1.0
 
     def test_probabilities_of_a_large_photo(self) -> None:
-        """Starts are followed in a smaller copy of the mask, the end in the mask itself."""
+        """Starts use a smaller copy of the mask, the last rounds the mask itself."""
         truth, camera = posed(0, (1.0, 1.2, 0.8)), CAMERA.resized(1280, 960)
         mask = cast_geometry(Scene(body()), camera, truth).mask.astype(np.float32)
         soft = np.clip(cv2.GaussianBlur(mask, (0, 0), 3.0), 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""`align` with masks: accuracy, damages, other objects' masks, starts without keypoints."""
+"""`align` with masks: accuracy, damaged masks, masks of other objects, starts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`align` with the photo itself: accuracy, honesty, the statistics of its lines."""
+"""`align` with a photo as evidence: accuracy, calibration, statistics of lines."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def drawn(
     place: list[float],
     scale: tuple[float, float, float],
 ) -> PhotoScene:
-    """A red body before a patterned background, blurred and noisy, with rough clicks."""
+    """A red body on a patterned background, blurred and noisy, with inaccurate keypoints."""
     mesh, shape = wedge(), (CAMERA.height, CAMERA.width)
     truth = Alignment(turn, place, np.array(scale))
     mask = cast_geometry(Scene(mesh), CAMERA, truth).mask

@@ -1,4 +1,4 @@
-"""Rounds of steps to masks' contours: where they end, and what is stated of it."""
+"""Rounds of the fit to masks' contours: convergence and calibration."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ UNKNOWN = [0, 1, 2, 3, 4, 5, 7, 8]  # of a result's covariance, where x is known
 
 
 def squared_distance(result: Result, truth: Alignment) -> float:
-    """Error of pose and stretch in units of the stated covariance, squared."""
+    """Squared Mahalanobis distance of the error of pose and stretch."""
     found = result.alignment
     error = np.concatenate(
         [
@@ -78,8 +78,8 @@ def test_far_objects_of_open_stretch_end_within_the_stated_uncertainty(
     model = next(m for m in KeypointNet(real_data / "keypointnet")["bottle"] if m.mesh_path)
     given, view, truth = seen_from_anywhere(model, seed, fill=(0.12, 0.25))
     found = align(given, view)
-    # Stretch and distance are open together by a factor of 2: along so far a way the unknowns that
-    # are well known bend off their joint ellipsoid, and each one's own interval is what is stated.
+    # Stretch and distance are jointly uncertain by a factor of 2. So the joint region is curved,
+    # and only the interval of each unknown is tested.
     pose, gt = found.alignment, truth
     logs = np.log(pose.scale[1:] / gt.scale[1:]), np.log(pose.translation[2] / gt.translation[2])
     stated = found.std.scale[1:], found.std.translation[2] / pose.translation[2]
@@ -107,7 +107,7 @@ def test_a_mask_of_the_other_pixel_convention_is_within_the_stated_uncertainty(
 
 
 def test_directions_across_rims_are_the_rims_own() -> None:
-    """A contour of stairs beside a straight rim: its normals waver, the rim's does not."""
+    """The normals of a stepped contour vary, the normals of its straight rim do not."""
     rng = np.random.default_rng(2)
     count, slope = 40, 0.3
     rim = np.column_stack([2.0 * np.arange(count), 2.0 * slope * np.arange(count)])

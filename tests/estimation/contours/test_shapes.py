@@ -1,4 +1,4 @@
-"""`align` with masks of objects whose mesh is not known: learned shapes and similar models."""
+"""`align` with masks of objects without a mesh: learned shapes and similar models."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def bottles(tmp_path_factory: pytest.TempPathFactory) -> tuple[AnnotatedModel, .
 
 @pytest.fixture(scope="module")
 def shape(bottles: tuple[AnnotatedModel, ...]) -> ShapeModel:
-    """The shape of all bottles but the first four."""
+    """The shape learned from all bottles but the first four."""
     examples = examples_of(bottles[4:], meshes=True)
     return ShapeModel.learn(examples, category="bottle", components=1)
 

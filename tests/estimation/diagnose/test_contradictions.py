@@ -29,7 +29,7 @@ Case = tuple[list[View], Size | None]
 
 
 def wrong_motion(points: np.ndarray, rng: np.random.Generator) -> Case:
-    """Four views, the third of which was taken from elsewhere than its pose says."""
+    """Four views; the pose of the third is wrong."""
     angles = [-30, -10, 10, 30]
     views = rig(points, truth_of(), angles, rng)
     error = np.eye(4)
@@ -106,7 +106,7 @@ def test_the_wrong_piece_is_named(
 ) -> None:
     found = warnings_of(build, range(SEEDS))
     named = [any(some.text.startswith(f"{name} contradicts") for some in each) for each in found]
-    # If one of 5 were missed, all 12 would be named no more often than 19 of 20.
+    # If one of 5 were missed, all 12 would be named in 7 % of cases.
     assert all(named)
 
 

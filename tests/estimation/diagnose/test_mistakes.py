@@ -71,7 +71,7 @@ class Seen:
         return fit(self.points_3d, self.points_2d, self.camera, ransac=RansacOptions())
 
     def complaint(self) -> str:
-        """What the fit says beside uncertainties: a warning, an error, or nothing."""
+        """The warning or the error of the fit; empty without either."""
         try:
             found = self.fit()
         except CadalignError as error:
@@ -104,7 +104,7 @@ def seen(
 
 
 def spoiled(problem: Seen, seed: int) -> Seen:
-    """The problem with up to 30 % outliers, as many as are rejected without a warning."""
+    """Add up to 30 % outliers, which raise no warning."""
     rng = np.random.default_rng([seed, 1])
     count = len(problem.points_2d)
     wrong = rng.choice(count, int(0.3 * count), replace=False)
@@ -155,7 +155,7 @@ def test_outliers_raise_no_alarm() -> None:
 
 
 def test_moderate_alignments_of_few_keypoints_are_no_chance() -> None:
-    """Chance stretches by more: 2 outliers of 7 keypoints are found, scattered ones refused."""
+    """2 outliers of 7 keypoints are found, and random keypoints are refused by their stretch."""
     refused = doubted = accepted = 0
     for seed in range(100):
         problem = seen(seed, BOTTLE, count=7)
@@ -190,7 +190,7 @@ def test_the_share_of_chance_rises_with_the_stretch() -> None:
 
 
 def test_a_flip_about_another_point_than_the_middle_is_named() -> None:
-    """There it is no mirrored model's."""
+    """The mirrored model is not named there."""
     for seed in range(10):
         problem = seen(seed, camera=OFF_CENTRE).mistaken("flipped")
         found = fit(problem.points_3d, problem.points_2d, problem.camera)
@@ -272,7 +272,7 @@ def test_likelihoods_tell_mistakes_that_a_similar_model_follows(mistake: str) ->
     ids=["1 px", "3 px", "unknown noise", "similar model", "robust"],
 )
 def test_an_up_that_points_down_is_told_to_be_the_opposite(view: dict[str, Any]) -> None:
-    """And not where gravity is right, or wrong by another angle."""
+    """It is not named if gravity is correct, or wrong by another angle."""
     view = dict(view)
     spread, noise = view.pop("spread", None), view.get("sigma", 3.0)
     more = {"ransac": RansacOptions()} if view.pop("ransac", False) else {}

@@ -57,7 +57,7 @@ NAMES = (
 
 @dataclass(frozen=True)
 class Made:
-    """A mistake: what an estimate or a command says of it, given the data and a folder."""
+    """A mistake: a function of data and folder that returns the message, and its expected text."""
 
     words: str
     say: Callable[[Path, Path], str]
@@ -123,7 +123,7 @@ def two_views(root: Path, folder: Path) -> str:
 
 
 def inverted_rig(root: Path, folder: Path, *, is_inverted: bool = True, **options: Any) -> str:
-    """Two cameras 40 degrees apart, the poses of which are given, or their inverses."""
+    """Two cameras 40 degrees apart, with their poses or the inverses."""
     model = examples(root, "chair")[5]
     given = sighting(model.points_3d, tuple(model.ids), np.random.default_rng(0), distance=NEAR)
     in_rig, motion = given.pose.apply(given.points_3d), np.eye(4)
@@ -177,7 +177,7 @@ def written(given: Sighting, folder: Path, **more: Any) -> Path:
 
 
 def in_file(words: str, mistake: Callable[[Sighting], Sighting], *options: str) -> Made:
-    """What `cadalign fit` says of an observation file."""
+    """The output of `cadalign fit` for an observation file."""
 
     def say(root: Path, folder: Path) -> str:
         path = written(mistake(seen(root, "chair", 1, distance=NEAR)), folder)
@@ -218,7 +218,7 @@ def photo_of_another_size(root: Path, folder: Path) -> str:
 
 
 def detected(words: str, *, normalised: bool = False, twice: bool = False) -> Made:
-    """What pairing a detector's CSV file with a model's keypoints says."""
+    """The message when a detector's CSV file is paired with a model's keypoints."""
 
     def say(root: Path, folder: Path) -> str:
         given = seen(root, "bottle", 1)
@@ -308,7 +308,7 @@ def test_mistakes_are_named(name: str, real_data: Path, tmp_path: Path) -> None:
 
 
 def right(root: Path, kind: str, category: str, seed: int) -> str:
-    """What is said of a right problem of one kind."""
+    """The warnings about a correct problem of one kind."""
     rng = np.random.default_rng([seed, 7])
     if kind == "noise of 3 px":
         return fitted(seen(root, category, seed, noise_px=3.0), sigma=3.0)
@@ -357,6 +357,6 @@ KINDS = (
 @pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_right_problems_are_no_mistakes(kind: str, real_data: Path) -> None:
-    """28 of each category, 112 of each kind: 1,008, where 1 alarm in 200 is noticed at 99 %."""
+    """1,008 problems, 112 of each kind, detect a rate of 1 false alarm in 200 at 99 %."""
     texts = [right(real_data, kind, each, seed) for each in CATEGORIES for seed in range(28)]
     assert [text for text in texts if any(name in text for name in NAMES)] == []

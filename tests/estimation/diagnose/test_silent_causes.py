@@ -1,4 +1,4 @@
-"""Causes are named, too, where shapes that bend or an unknown noise leave small residuals."""
+"""Causes are named even if uncertain shapes or unknown noise make the residuals small."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SEEDS = range(12)
 
 
 def of_category(root: Path, seed: int) -> tuple[str, Sighting]:
-    """A model that the learned shape does not know, from above the ground."""
+    """A model that is not a training model, seen from above the ground."""
     category = CATEGORIES[seed % len(CATEGORIES)]
     models, rng = examples(root, category)[1::2], np.random.default_rng([seed, 5])
     while True:
@@ -63,7 +63,7 @@ def of_similar(given: Sighting, *, seed: int, **options: Any) -> Result:
 def test_mistakes_are_named_of_shapes_that_bend(
     real_data: Path, mistake: Callable[[Sighting], Sighting], words: str
 ) -> None:
-    """A pose with its depth reversed explains them: its likelihood and posture speak against it."""
+    """A depth-reversed pose fits too, but its likelihood and posture are implausible."""
     texts = []
     for seed in SEEDS:
         category, given = of_category(real_data, seed)
@@ -78,7 +78,7 @@ def test_mistakes_are_named_of_shapes_that_bend(
 def test_an_unlikely_posture_is_a_question(real_data: Path) -> None:
     category, given = of_category(real_data, 0)
     (found,) = of_shape(real_data, category, given.upside_down()).warnings
-    assert found.text.startswith("the object stands on its head: is it so, or is it that ")
+    assert found.text.startswith("the object stands on its head; if that is wrong, perhaps ")
 
 
 @pytest.mark.long
@@ -217,7 +217,7 @@ def test_pairs_that_are_given_twice_change_no_other_warning(
 
 @pytest.mark.long
 def test_no_hypothesis_contradicts_where_the_keypoints_lie(real_data: Path) -> None:
-    """Wrong keypoints inside of the image are not those of a larger one."""
+    """Wrong keypoints inside the image are not attributed to a larger image."""
     for seed in range(40):
         given = seen(real_data, "airplane", seed, distance=(1.5, 2.5))
         pixels = np.random.default_rng(seed).permutation(given.points_2d)

@@ -1,4 +1,4 @@
-"""Warnings tell what the standard deviations do not: right problems seldom have one."""
+"""Warnings about problems that deviations do not show; correct problems rarely have one."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from support.problems import problem_of
 
 from cadalign import Alignment, Camera, Model, Result, View, align, fit
 from cadalign.estimation.result_parts import Warnings
-from cadalign.estimation.uncertainty.doubts import another_pose
+from cadalign.estimation.uncertainty.doubts import pose_doubts
 from cadalign.geometry.rotations import angles_between, rotation_from_vector
 
 CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
@@ -17,12 +17,12 @@ POSE = Alignment(np.eye(3), [0.0, 0.0, 4.0], np.ones(3))
 
 
 def with_other(angle_deg: float, share: float, own_deg: float = 2.0) -> Warnings:
-    """Warnings of two poses, one with that share of the probability, and of their moments."""
+    """Warnings about a second pose with a share of the probability, from the moments of both."""
     turn = np.radians([angle_deg, 0.0, 0.0])
     other = Alignment(rotation_from_vector(turn), POSE.translation, np.ones(3))
     covariance = np.zeros((9, 9))
     covariance[:3, :3] = np.radians(own_deg) ** 2 * np.eye(3) + share * np.outer(turn, turn)
-    return another_pose(POSE, [(other, share / (1 - share))], covariance)
+    return pose_doubts(POSE, [(other, share / (1 - share))], covariance)
 
 
 def test_a_warning_prints_as_its_text_and_is_stored_with_its_kind() -> None:
@@ -56,13 +56,13 @@ def test_poses_that_are_concealed_together_are_one_warning() -> None:
         Alignment(rotation_from_vector(np.radians(turn)), POSE.translation, np.ones(3))
         for turn in turns
     ]
-    (found,) = another_pose(POSE, [(poses[0], 0.04), (poses[1], 0.04)], covariance)
+    (found,) = pose_doubts(POSE, [(poses[0], 0.04), (poses[1], 0.04)], covariance)
     assert found.text.startswith("other poses, the likeliest 1")
     assert "7 %" in found.text
 
 
 def test_keypoints_beyond_their_sigma_are_warned_of_beside_other_evidence() -> None:
-    """By a number, where no piece contradicts the others; not where their sigma is right."""
+    """Residuals are stated if no evidence contradicts the rest, but not at the correct sigma."""
     for noise, sigma in ((4.0, 1.0), (1.0, 1.0), (4.0, 4.0)):
         problem = problem_of(4, points=14, noise_px=noise)
         up = problem.alignment.rotation[:, 1]

@@ -18,7 +18,7 @@ COUNT = 30
 
 
 def fitted(seed: int, *, factor: float = 1.0, focal: float = 1.0, points: int = 20) -> Result:
-    """Fit keypoints of an image of ``factor`` times the camera's size."""
+    """Fit keypoints from an image of ``factor`` times the camera's size."""
     rng = np.random.default_rng(seed)
     model = rng.uniform(-0.3, 0.3, (points, 3))
     place = [rng.uniform(-0.3, 0.3), rng.uniform(-0.2, 0.2), rng.uniform(1.5, 2.5)]
@@ -59,7 +59,7 @@ def _right(count: int) -> list[str]:
 
 
 def test_few_right_keypoints_are_fitted_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their residuals are too small for what another camera could lower them by."""
+    """Their residuals are too small for another camera to improve them."""
     results = [fitted(seed, points=7) for seed in range(30)]
     fits = []
 

@@ -1,4 +1,4 @@
-"""Coordinates in which a posterior is sampled: where they lead, and what it costs there."""
+"""Coordinates in which a posterior is sampled: alignments and costs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def chart_of(result: cadalign.Result, widening: float = 1.0) -> Chart:
 
 
 def moved(result: cadalign.Result, deviation: np.ndarray) -> tuple[Alignment, Camera]:
-    """The alignment and camera that deviations (10,) of the unknowns lead to."""
+    """The alignment and camera at deviations (10,) of the unknowns."""
     own, camera = result.alignment, result.camera
     alignment = Alignment(
         rotation_from_vector(deviation[:3]) @ own.rotation,

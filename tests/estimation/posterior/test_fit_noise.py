@@ -1,4 +1,4 @@
-"""`fit` and noise: how it weighs keypoints, and what it says about its own accuracy."""
+"""`fit` and noise: weights of keypoints, and calibration of its uncertainty."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_unknown_sigma_is_estimated_from_the_residuals() -> None:
 
 
 def said_of(problem: SimulatedProblem, points_2d: np.ndarray) -> list[bool]:
-    """Whether a fit and an estimate from two views say that keypoints explain nothing."""
+    """True for a fit, and for an estimate from two views, with a warning about large noise."""
     view = View(problem.camera, points_2d, sigma=None)
     views = [view, replace(view, points_2d=points_2d + 1.0)]
     try:
@@ -189,7 +189,7 @@ def test_robust_loss_with_a_large_scale_is_the_linear_one(loss: str) -> None:
     assert_same(robust.alignment, fit_problem(problem).alignment, 1e-6)
 
 
-# --- how well it is known ---------------------------------------------------------------------
+# --- uncertainty -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("camera", "shift"), [(SIMULATION_CAMERA, 30.0), (LENS, 0.0)])
@@ -229,7 +229,7 @@ def test_methods_without_statistics_say_so(method: str) -> None:
 
 
 def flattened(axis: int, thickness: float) -> SimulatedProblem:
-    """A problem with its keypoints near the plane that an axis has 0.25 in, exactly seen."""
+    """A problem with keypoints near the plane where an axis is 0.25, without noise."""
     problem = problem_of(3, points=10, noise_px=0.0)
     factor = np.ones(3)
     factor[axis] = thickness
@@ -259,8 +259,7 @@ def test_text_names_the_axis_that_is_seen_end_on() -> None:
 def test_warning_says_that_four_points_always_fit() -> None:
     result = fit_problem(problem_of(3, points=4, noise_px=0.0))
     assert result.warnings[0].text == (
-        "4 keypoints fit exactly whatever they are: "
-        "the residuals say nothing about the quality of the fit"
+        "4 keypoints always fit exactly: the residuals say nothing about the quality of the fit"
     )
 
 
@@ -282,7 +281,7 @@ ALARMING["ransac"] = {"ransac": RansacOptions(max_iterations=200)}
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ALARMING)
 def test_right_data_raise_no_alarm(kind: str) -> None:
-    """Of 40, four false alarms have a chance of a thousandth at the allowed rate of 1 %."""
+    """At the allowed rate of 1 %, 4 false alarms of 40 have a probability of 0.001."""
     options = dict(ALARMING[kind])
     camera, alarms = options.pop("camera", SIMULATION_CAMERA), 0
     for seed in range(40):
@@ -311,7 +310,7 @@ def test_many_keypoints_leave_the_inverse_fisher_information() -> None:
 def test_estimated_noise_widens_the_covariance_as_the_f_distribution_does(
     loss: str, least: float
 ) -> None:
-    """Of 95 % ellipsoids; a robust loss leaves fewer keypoints to tell the noise."""
+    """Coverage of 95 % ellipsoids; a robust loss has fewer keypoints to estimate the noise."""
     problem = problem_of(1, points=150, noise_px=1.0)
     result = fit_problem(problem, sigma=None, loss=loss)
     usual = 8 * fdtri(8, 2 * 150 - 8, 0.95) / chdtri(8, 0.05)

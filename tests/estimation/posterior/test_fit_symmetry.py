@@ -1,4 +1,4 @@
-"""Fits of symmetric models: one canonical result, whichever way the keypoints were labelled."""
+"""Fits of symmetric models: one canonical result for all labellings of the keypoints."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def observed(angle, *, fold, noise_px=0.5, scale=(1.0, 1.3, 1.0)):
 
 
 def labelled_after(points, angle):
-    """The same points under the names that a rotation about the axis gives them."""
+    """The same points, relabelled by a rotation about the axis."""
     return (points - OFFSET) @ rotation_from_vector(angle * UP).T + OFFSET
 
 
@@ -90,7 +90,7 @@ def test_it_is_the_fit_of_keypoints_labelled_as_it_says(fold):
 
 
 def test_rotations_about_the_axis_count_for_nothing():
-    """Deviations are those of the axis; a bottle's keypoints leave its rotation certain."""
+    """Deviations concern the axis only; a bottle's rotation about it has none."""
     symmetry = Symmetry.around(UP, fold=None, offset=OFFSET)
     points, pixels = observed(1.0, fold=None)
     slim = (points - OFFSET) * [0.015, 1, 0.015] + OFFSET  # its rotation is hardly seen
@@ -102,7 +102,7 @@ def test_rotations_about_the_axis_count_for_nothing():
     assert "rotation" in plain.uncertain
     assert result.std.rotation_deg < 0.5 * plain.std.rotation_deg
     assert "rotation" not in result.uncertain
-    # The axis' own deviation stays: that of the direction of y in the camera frame.
+    # The deviation of the axis' direction stays.
     axis = plain.alignment.rotation @ UP
     across = np.eye(3) - np.outer(axis, axis)
     deviation = np.sqrt(np.trace(across @ plain.covariance[:3, :3] @ across))
@@ -122,10 +122,10 @@ def test_a_stretch_across_the_axis_leaves_half_turns():
 
 
 def test_an_equal_minimum_is_no_alternative():
-    """A square's corners from their centroids: with four points a turn explains them as well."""
+    """Four corners of a square, which a turn explains as well."""
     symmetry = Symmetry.around(UP, fold=2)
     flat = np.array([[x, y, 0.0] for x in (-1, 0, 1) for y in (-1, 1)])
-    # In the plane of the axis, a half turn mirrors the points: as far off as the pixels allow.
+    # In the plane of the axis, a half turn mirrors the points.
     pixels = CAMERA.project(Alignment(FACING, [0, 0, 900.0], np.ones(3)).apply(flat))
     plain = fit(flat, pixels, CAMERA, stretch="none")
     merged = fit(flat, pixels, CAMERA, stretch="none", symmetry=symmetry)

@@ -1,4 +1,4 @@
-"""Nearly flat models: what keypoints leave open is bounded, and costs no more than the truth."""
+"""Nearly flat models: undetermined scales are bounded, at no higher cost than the truth."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ THICKNESS = 0.02
 def flat_problem(
     seed: int, *, axis: int, points: int, noise_px: float, thickness: float = THICKNESS
 ) -> SimulatedProblem:
-    """Points of a slab that is thin along an axis, seen from 2.5 of its stretched diagonals."""
+    """Points of a slab, thin along an axis, at a distance of 2.5 stretched diagonals."""
     rng = np.random.default_rng([seed, axis, points])
     points_3d = rng.uniform(-0.5, 0.5, (points, 3))
     points_3d[:, axis] *= thickness
@@ -86,7 +86,7 @@ def test_no_result_costs_more_than_the_truth(points: int, noise_px: float) -> No
 @pytest.mark.long
 @pytest.mark.parametrize(("points", "noise_px"), [(5, 1.0), (12, 4.0)])
 def test_regions_hold_the_truth(points: int, noise_px: float) -> None:
-    """Of 180, a region of 95 % holds less than 0.87 with a chance of 1e-5.
+    """A 95 % region contains fewer than 87 % of 180 truths with a probability of 1e-5.
 
     With five keypoints and more noise the truth is another minimum in some, see `alternatives`.
     """
@@ -183,7 +183,7 @@ def test_noise_is_estimated_at_the_optimum_where_the_bound_counts() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("thickness", [THICKNESS, 1.0])
 def test_the_fit_is_among_the_alternatives_beside_a_start(thickness: float) -> None:
-    """A given start leads the same keypoints to the joint system, which ranks by evidence."""
+    """With a given start, the joint solver takes the same keypoints, and ranks by evidence."""
     for seed in range(30):
         problem = flat_problem(seed, axis=2, points=5, noise_px=2.0, thickness=thickness)
         optimum = fit_problem(problem, sigma=2.0).alignment

@@ -33,7 +33,7 @@ def pixels_of(truth, camera_pose=None, *, points=CORNERS):
 
 
 def models(**options):
-    """The model, and the same with its keypoints named a quarter turn farther on."""
+    """The model, and a copy relabelled by a quarter turn."""
     turned = CORNERS @ QUARTER.T
     return [Model(points_3d=each, symmetry=FOUR, **options) for each in (CORNERS, turned)]
 
@@ -70,7 +70,7 @@ def test_labels_that_are_turned_give_the_same_result(options):
 
 
 def test_with_its_size_known_a_quarter_turn_exchanges_stretches():
-    """The object is long along z, or along x of the model that is named a quarter turn on."""
+    """The object is long along z, or along x of the relabelled model."""
     truth = truth_of((1, 1.3, 1.6))
     view = View(CAMERA, pixels_of(truth), sigma=0.3)
     sized = [align(model, view, size=Size(height=1.1 * 1.3, sigma=0.001)) for model in models()]
@@ -112,5 +112,5 @@ def test_of_a_round_model_rotations_about_its_axis_count_for_nothing():
     across = np.eye(3) - np.outer(axis, axis)
     variance = np.trace(across @ plain.covariance[:3, :3] @ across)
     assert result.std.rotation_deg == pytest.approx(np.degrees(np.sqrt(variance)), rel=0.05)
-    # What the order of two tilts turns about the axis is left.
+    # Two tilts in different order differ by a turn about the axis.
     assert axis @ result.covariance[:3, :3] @ axis < 0.03 * variance

@@ -1,4 +1,4 @@
-"""Depths of keypoints in a depth image: the window about them, and what hides them."""
+"""Depths of keypoints in a depth image: windows and occlusion."""
 
 from __future__ import annotations
 

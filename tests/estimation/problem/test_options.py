@@ -1,4 +1,4 @@
-"""Options stand in one place: `FitOptions` and `RansacOptions`."""
+"""Options of `fit`: `FitOptions` and `RansacOptions`."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_importing_the_options_compiles_nothing() -> None:
 def test_fits_take_as_many_keypoints_as_determine_their_unknowns(
     given: dict[str, Any], fewest: int
 ) -> None:
-    """Two equations each; a prior on an unknown is one. Fewer are refused with their number."""
+    """A keypoint has two equations, a prior has one; fewer than the unknowns are refused."""
     camera = Camera(640, 480, 600.0, 600.0, 319.5, 239.5)
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (fewest, 3))
     pixels = camera.project(points + [0.0, 0.0, 4.0])

@@ -1,4 +1,4 @@
-"""What estimates refuse, word for word: `refusals.json` has the messages of all calls."""
+"""Exact messages of refused calls, listed in `refusals.json`."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def first(count: int, **options: Any) -> Callable[[], object]:
 
 
 def imaged(points_3d: np.ndarray, **options: Any) -> Callable[[], object]:
-    """A fit of points in their own places in the image."""
+    """A fit of points to their own projections."""
     return fitted(points_3d, GOOD.camera.project(GOOD.alignment.apply(points_3d)), **options)
 
 
@@ -254,7 +254,7 @@ POSE = truth_of()
 
 @cache
 def result() -> Result:
-    """A result, made when a test asks for it."""
+    """A result, computed on demand."""
     return align(PLAIN, SHOWN)
 
 

@@ -1,4 +1,4 @@
-"""Views of unknown motion with few keypoints: carried by others, or left out and named."""
+"""Views of unknown motion with few keypoints: supported by other views, or left out."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ _FREE = [0, 1, 2, 3, 4, 5, 7, 8]
 
 
 def towards(angle: float, *, distance: float = 5.0, about: float = 1.0) -> np.ndarray:
-    """The place at an angle off the optical axis [degrees]."""
+    """The position at an angle from the optical axis [degrees]."""
     theta = np.radians(angle)
     across = np.sin(theta) * np.array([np.cos(about), np.sin(about)])
     return distance * np.append(across, np.cos(theta))
@@ -55,7 +55,7 @@ def points_of(seed: int, count: int = 20) -> np.ndarray:
 
 
 def errors_of(result: Result, truth: Alignment) -> np.ndarray:
-    """Errors (9,) in the terms of a result's covariance."""
+    """Errors (9,) in the order of a result's covariance."""
     turn = vector_from_rotation(result.alignment.rotation @ truth.rotation.T)
     shift = result.alignment.translation - truth.translation
     return np.concatenate([turn, shift, np.log(result.alignment.scale / truth.scale)])
@@ -78,7 +78,7 @@ def test_fit_recovers_exact_keypoints(camera: Camera, angle: float) -> None:
 
 
 def test_the_projection_of_a_fisheye_with_a_narrow_field_is_a_pinholes_estimate() -> None:
-    """The same noise in the same rays: a pinhole and a fisheye state the same."""
+    """With equal noise of rays, pinhole and fisheye have equal covariances."""
     points, truth = points_of(2), placed(10)
     pinhole = Camera(1000, 1000, 280, 280, 499.5, 499.5)
     wide = Camera(1000, 1000, 280, 280, 499.5, 499.5, lens="fisheye")
@@ -248,7 +248,7 @@ class TestPictures:
     CAMERA = Camera(480, 480, 140.0, 140.0, 239.5, 239.5, (0.01, -0.003, 0.0, 0.0), lens="fisheye")
 
     def seen(self, angle: float, *names: str, keypoints: bool = True) -> tuple[View, Alignment]:
-        """A view of the body, with that evidence of it, and its pose."""
+        """A view of the body with one kind of evidence, and its pose."""
         rng = np.random.default_rng(3)
         truth = Alignment(placed(angle, 4).rotation, towards(angle, distance=2.5), (1, 1.2, 0.8))
         frame = cast_geometry(Scene(self.mesh()), self.CAMERA, truth)

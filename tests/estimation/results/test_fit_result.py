@@ -1,4 +1,4 @@
-"""What a fit returns, as text and as JSON."""
+"""The result of a fit, as text and as JSON."""
 
 from __future__ import annotations
 

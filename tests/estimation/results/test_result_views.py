@@ -88,7 +88,7 @@ def test_batch_as_data_frame_has_a_row_for_each_problem() -> None:
 
 
 def test_data_frame_states_deviations_and_what_is_warned_of() -> None:
-    """Of 4 keypoints nothing tests the fit; of a plane across the ray a stretch is open."""
+    """4 keypoints do not test the fit; a plane across the ray does not determine a stretch."""
     flat = CORNERS * [1, 1, 1e-3]
     seen = CAMERA.project(POSE.apply(flat))
     results = cadalign.fit_batch([CORNERS[[0, 1, 2, 4]], flat], [SEEN[[0, 1, 2, 4]], seen], CAMERA)
@@ -141,7 +141,7 @@ def test_of_several_views_a_row_has_the_first() -> None:
 
 
 def test_poses_of_all_views_have_their_covariance() -> None:
-    """Of a rig, a pose in a second camera is the first's, turned."""
+    """In a rig, the second camera's pose follows from the first's."""
     angle = np.radians(20)
     turn = np.array(
         [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]

@@ -124,7 +124,7 @@ class TestSimilarModel:
 
     @pytest.mark.parametrize("views", [1, 2])
     def test_a_box_that_is_not_given_is_the_extent_of_all_keypoints(self, views: int) -> None:
-        """Its stated standard deviations are those of the errors; a linear box was 20 off."""
+        """Standard deviations of the box agree with its errors."""
         model, errors = spreads(0.05), []
         component = model.components[0]
         for seed in range(40):
@@ -226,7 +226,7 @@ class TestUnknowns:
         assert result.std.focal == pytest.approx(np.sqrt(result.covariance[9, 9]))
 
     def test_noise_that_is_not_given_is_that_of_the_residuals(self) -> None:
-        """Over the equations beyond the unknowns: those of each pose, and of two stretches."""
+        """The redundancy counts the unknowns of each pose and of two stretches."""
         points, rng = keypoints(), np.random.default_rng(4)
         views = [
             seen(points, truth_of(), around(angle), noise=rng.normal(0, 3, (10, 2)), sigma=None)

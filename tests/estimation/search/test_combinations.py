@@ -1,4 +1,4 @@
-"""Models, evidence, focal lengths, noise and outliers align in all pairs of their values."""
+"""`align` with all pairs of models, evidence, focal lengths, noise and outliers."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_all_pairs_align_within_their_own_deviations(cell: Cell, folder: Path) -
 def assert_covers(
     cell: Cell, covariance: np.ndarray, error: float, found: Alignment, truth: Alignment
 ) -> None:
-    """The covariance has its shape, is one, and explains the errors of rotation and translation."""
+    """The covariance is valid, and explains the errors of rotation and translation."""
     size = 9 if cell.focal == "known" else 10
     assert covariance.shape == (size, size)
     assert np.isfinite(covariance).all()

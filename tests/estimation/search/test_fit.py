@@ -1,4 +1,4 @@
-"""`fit`: what it finds, with all unknowns or fewer, and the other explanations."""
+"""`fit`: estimates with all unknowns or fewer, and alternatives."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from cadalign.estimation.options import BOUNDING_PRIOR
 from cadalign.evaluation.simulation import SIMULATION_CAMERA, SimulatedProblem
 from cadalign.metrics import rotation_error
 
-# --- what it finds ----------------------------------------------------------------------------
+# --- estimates --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("method", ["optimal", "aepnp", "aepnp-paper"])
@@ -55,7 +55,7 @@ def test_optimum_agrees_with_an_independent_least_squares_fit(camera: Camera, po
 
     found = least_squares(errors, np.zeros(8), x_scale="jac", ftol=1e-14, xtol=1e-14, gtol=1e-14)
     result = fit_problem(problem)
-    # Errors behind a lens are taken to first order, which moves the optimum a little.
+    # Errors behind a lens are linearised, which moves the optimum slightly.
     exact = camera is SIMULATION_CAMERA
     assert np.sum(result.residuals**2) <= 2 * found.cost * (1 + (1e-10 if exact else 1e-5))
     expected = moved(problem.alignment, found.x)
@@ -163,7 +163,7 @@ def test_prior_makes_keypoints_in_one_plane_solvable(axis: int) -> None:
     points_2d += 0.2 * rng.standard_normal(points_2d.shape)
     result = fit(points_3d, points_2d, problem.camera, stretch_sigma=0.5)
     assert result.rms < 1.0
-    # Nothing but the prior knows this scale.
+    # Only the prior determines this scale.
     assert result.std.scale[axis] == pytest.approx(0.5, rel=0.25)
     assert f"in the plane {'xyz'[axis]} = 0.1" in str(result)
 
@@ -177,7 +177,7 @@ def test_exchanging_the_axes_that_stretch_exchanges_their_deviations() -> None:
     assert other.std.rotation_deg == pytest.approx(base.std.rotation_deg, rel=1e-3)
 
 
-# --- other explanations -----------------------------------------------------------------------
+# --- alternatives -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", range(4))

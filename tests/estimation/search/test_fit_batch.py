@@ -1,4 +1,4 @@
-"""`fit_batch`: bit for bit what single fits give, and no problem spoils another."""
+"""`fit_batch`: equal to single fits, bit for bit, and independent of failed problems."""
 
 from __future__ import annotations
 

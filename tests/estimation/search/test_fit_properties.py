@@ -31,7 +31,7 @@ def assert_aligned(result: Result, expected: Alignment, tolerance: float = 1e-6)
 
 
 def assert_explains(result: Result, problem: SimulatedProblem, tolerance_px: float = 1e-5) -> None:
-    """No residual is larger than that: where several alignments fit, each is as good."""
+    """No residual exceeds the limit; any of several exact alignments passes."""
     assert np.abs(result.residuals).max() < tolerance_px
     assert (result.alignment.apply(problem.points_3d)[:, 2] > 0).all()
 
@@ -45,7 +45,7 @@ def assert_explains(result: Result, problem: SimulatedProblem, tolerance_px: flo
     [
         (SIMULATION_CAMERA, (4.0, 8.0), 1e-5, 1e-6),
         (Camera(640, 480, 6000.0, 6000.0, 319.5, 239.5), (60.0, 100.0), 1e-6, 1e-5),
-        # A thousand sizes away: depths differ by a thousandth, and pixels are exact to 1e-13.
+        # At a thousand sizes, depths differ by a thousandth, and pixels are exact to 1e-13.
         (Camera(640, 480, 1e5, 1e5, 319.5, 239.5), (900.0, 1100.0), 1e-5, 1e-4),
         (Camera.from_fov(640, 480, fov_x=120.0), (2.0, 3.0), 1e-5, 1e-6),
     ],

@@ -1,4 +1,4 @@
-"""`fit` with an unknown focal length: accuracy, what it says of itself, and what it refuses."""
+"""`fit` with an unknown focal length: accuracy, calibration and refusals."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ LONG = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 
 
 def fit_unknown(problem: SimulatedProblem, camera: Camera = UNKNOWN, **options: Any) -> Result:
-    """Fit what keypoints alone say of the focal length."""
+    """Fit the focal length without a prior."""
     chosen = {"focal": "estimate", "focal_prior": None, **options}
     return fit(problem.points_3d, problem.points_2d, camera, **chosen)
 
@@ -48,7 +48,7 @@ def whitened(
 
 
 def spoiled(problem: SimulatedProblem, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Image points of which some were moved by 15 px or more, and which these are."""
+    """Image points, some moved by 15 px or more, and the indices of these."""
     rng = np.random.default_rng(0)
     count = len(problem.points_2d)
     wrong = rng.permutation(count) < round(share * count)
@@ -136,7 +136,7 @@ def test_held_scales_are_honoured(stretch: str | None) -> None:
     assert (where_known == (known.fisher_covariance.diagonal() == 0)).all()
 
 
-# --- what it says of itself -------------------------------------------------------------------
+# --- calibration ------------------------------------------------------------------------------
 
 
 def test_covariance_is_that_of_the_nine_unknowns() -> None:
@@ -266,7 +266,7 @@ def test_usual_lenses_of_a_batch_are_those_of_each_image() -> None:
 
 @pytest.mark.long
 def test_focal_lengths_with_the_usual_prior_are_as_uncertain_as_stated() -> None:
-    """Photos whose lenses are those of the distribution that the prior's docstring names."""
+    """Photos with lenses from the distribution in the prior's docstring."""
     rng = np.random.default_rng(5)
     inside = []
     for seed in range(80):

@@ -1,4 +1,4 @@
-"""Robust fitting finds the keypoints that agree, and says so where none do."""
+"""Robust fits find the inliers, and refuse keypoints without any."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)
 
 
 def spoiled(seed: int, *, points: int, outliers: int, noise_px: float = 1.0) -> tuple[Any, ...]:
-    """A problem of which some image points were moved by 15 px or more, and which these are."""
+    """A problem with some image points moved by 15 px or more, and the indices of these."""
     rng = np.random.default_rng(seed)
     problem = simulate_problem(
         rng, points=points, noise_px=noise_px, camera=CAMERA, depth=(6.0, 9.0)

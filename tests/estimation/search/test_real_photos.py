@@ -26,7 +26,7 @@ def test_chairs_that_are_only_similar_to_their_models(real_data: Path, name: str
     rotation, shift = truth["cam_from_model_rotation"], truth["translation_in_model_x_units"]
     gt = Alignment(np.array(rotation), shift, truth["stretch"])
     chair = Observation.load(folder / "observations" / f"{name}.json")
-    # Annotators click to about 8 px there, and chair and model differ by about 5 cm of 80.
+    # Annotations have errors of about 8 px; chair and model differ by about 5 cm of 80.
     view = View(chair.camera, chair.points_2d, sigma=8.0)
     result = align(Model(points_3d=chair.points_3d, shape_sigma=0.05), view)
     assert rotation_error(est=result.alignment, gt=gt) < min(5, 2 * result.std.rotation_deg)

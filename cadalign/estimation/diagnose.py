@@ -12,7 +12,7 @@ from collections.abc import Hashable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from itertools import combinations
+from itertools import chain, combinations
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -50,6 +50,7 @@ _CAMERA_GAIN = 19.5  # of -2 log likelihood, exceeded by chance in one of 100,00
 _EQUATION_PRICE = 3.0  # gain required for each equation that is left out
 _MOST_VIEWS = 10  # with the largest residuals, each left out in turn
 _LEAST_DISTANCE = 5.0  # distance between pixels of one point, beyond noise [px]
+_MOST_ROWS = 6  # of keypoints at one point of the model, of which pairs are corrected
 _WRONG_UNIT = 100.0  # factor between an object's size and its model's
 
 
@@ -316,10 +317,13 @@ def _conflicting_pairs(case: DiagnosisCase) -> Iterator[Rule]:
         return
     points = dict(zip(case.model.ids or (), cast(FloatArray, case.model.points_3d), strict=True))
     for view in case.views:
-        names, places = view.keypoint_ids, [points[name] for name in view.keypoint_ids]
-        for a, b in combinations(range(len(names)), 2):
+        names, rows_at = view.keypoint_ids, dict[tuple[float, ...], list[int]]()
+        for row, name in enumerate(names):
+            rows_at.setdefault(tuple(points[name].tolist()), []).append(row)
+        pairs = (combinations(rows[:_MOST_ROWS], 2) for rows in rows_at.values())
+        for a, b in chain.from_iterable(pairs):
             apart = float(np.linalg.norm(view.pixels[a] - view.pixels[b]))
-            if apart > _LEAST_DISTANCE and np.array_equal(places[a], places[b]):
+            if apart > _LEAST_DISTANCE:
                 clause = f"keypoints {quote(names[a])} and {quote(names[b])} are one point of the "
                 clause += f"model and lie {apart:.3g} px apart"
                 undo = partial(_remove_rows, number=view.number, rows=(a, b))

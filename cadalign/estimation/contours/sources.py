@@ -54,7 +54,6 @@ _OF_PIXELS = 3.0  # samples that count as one with quantisation alone
 _FIRST_REACH = 24.0  # [px], and the same relative to the contour's size
 _RELATIVE_REACH = 0.04
 _WIDE_REACH = 0.15  # without keypoints
-_LEAST_REACH = 4.0
 _REACH = 6.0  # of the residuals [sigma]
 _OFFSETS = 2.0  # least reach, in standard deviations of the common offset
 _UNEVEN_RMS = 1.0  # [px], largest for the contour of an exact model

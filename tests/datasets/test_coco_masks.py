@@ -65,8 +65,8 @@ def test_a_polygon_may_leave_the_image() -> None:
     [
         (7, "segmentation: 7 is not a list"),
         ([[1.0, 2.0]], "segmentation[0]: [1.0, 2.0] is not a polygon of three or more points"),
-        ([[1.0] * 7], "segmentation[0]: 7 numbers are not x, y of points; "),
-        ([[0.0, 0, 1e9, 0, 1e9, 9]], "segmentation[0]: has points far outside of the image; "),
+        ([[1.0] * 7], "segmentation[0]: expected x, y of each point, got 7 numbers; "),
+        ([[0.0, 0, 1e9, 0, 1e9, 9]], "segmentation[0]: has points far outside the image; "),
         ([[0.0, 0, 1, float("nan"), 3, 4]], "segmentation[0][3]: nan is not a finite number"),
         ([], "segmentation: the mask is empty; "),
         ({"size": [23, 37]}, "segmentation.counts: missing"),
@@ -76,11 +76,11 @@ def test_a_polygon_may_leave_the_image() -> None:
         ),
         (
             {"size": [23, 37], "counts": [1, 2]},
-            "segmentation.counts: the runs have 3 pixels, the image 851; ",
+            "segmentation.counts: the runs have 3 pixels, the image has 851; ",
         ),
         ({"size": [23, 37], "counts": [851]}, "segmentation: the mask is empty; "),
         *(
-            ({"size": [23, 37], "counts": text}, "segmentation.counts: is not the text of a whole")
+            ({"size": [23, 37], "counts": text}, "segmentation.counts: the compressed run")
             for text in ("b\x00", "o", "o" * 99, "", "22", "22o")
         ),
     ],
@@ -106,4 +106,4 @@ def test_a_polygon_of_two_points_is_left_out(caplog: pytest.LogCaptureFixture) -
     square = [1.0, 0.0, 3.0, 0.0, 3.0, 2.0, 1.0, 2.0]
     mask = decode_segmentation([[1, 1, 2, 2], square], width=4, height=2)
     assert mask.tolist() == decode_segmentation([square], width=4, height=2).tolist()
-    assert "1 of 2 polygons have fewer than three points; left out" in caplog.text
+    assert "1 of 2 polygons have fewer than three points; ignored" in caplog.text

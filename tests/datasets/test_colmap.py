@@ -186,7 +186,7 @@ def test_a_text_file_cut_short_names_the_image(tmp_path):
     file.write_text("\n".join([*lines[:-1], lines[-1].rsplit(maxsplit=1)[0]]))
     images = Colmap(tmp_path)
     assert images[1].id == "1.jpg"
-    with pytest.raises(DataError, match=r"image 0.jpg: the observations are 77 values"):
+    with pytest.raises(DataError, match=r"image 0.jpg: the observations have 77 values"):
         images[0]
     file.write_text("\n".join(lines[:-1]) + "\n")
     with pytest.raises(DataError, match=r"image 0.jpg: the file ends before its observations"):

@@ -177,7 +177,7 @@ def test_half_characters_are_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / "a.json"
     path.write_text(f'{{"keypoints": [], "image": "{name}"}}')
     for read in (Observation.load, read_json):
-        with pytest.raises(DataError, match="half of a character"):
+        with pytest.raises(DataError, match="unpaired surrogate"):
             read(path)
     path.write_text(r'{"image": "\ud83e\ude91"}')
     assert read_json(path) == {"image": "\N{CHAIR}"}

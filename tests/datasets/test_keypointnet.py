@@ -176,7 +176,7 @@ def test_mesh_that_does_not_belong_to_the_annotation_is_refused(root):
     path = root / f"models/{CHAIR}/a/models/model_normalized.obj"
     model = KeypointNet(root)["chair", "a"]
     path.write_text(TETRAHEDRON.replace("v 0 0 1", "v 0 0 2"))
-    with pytest.raises(DataError, match=r"model a: keypoints\[\d\] lies 0\.5 off"):
+    with pytest.raises(DataError, match=r"model a: keypoints\[\d\] lies 0\.5 from"):
         model.load_mesh()
     assert model.load_mesh(check=False).bounds[1, 2] == 2
     path.write_text("\n".join(TETRAHEDRON.splitlines()[:-1]))
@@ -195,7 +195,7 @@ def test_annotations_may_be_a_thousandth_of_the_diagonal_off(tmp_path, off, is_r
     path.write_text("\n".join([*rows, *(r for r in TETRAHEDRON.splitlines() if r[0] == "f")]))
     model = KeypointNet(tmp_path)["chair", "a"]
     if is_refused:
-        with pytest.raises(DataError, match=r"keypoints\[2\] lies 0\.003 off"):
+        with pytest.raises(DataError, match=r"keypoints\[2\] lies 0\.003 from"):
             model.load_mesh()
     else:
         assert len(model.load_mesh().faces) == 4
@@ -217,11 +217,15 @@ def test_annotations_may_be_a_thousandth_of_the_diagonal_off(tmp_path, off, is_r
         (
             "symmetries.reflection.0.kp_indexes",
             [0, 4],
-            "reflection[0].kp_indexes: 4 is not the row",
+            "reflection[0].kp_indexes: there is no row 4",
         ),
         ("symmetries.reflection.0.kp_indexes", [0], "[0].kp_indexes: [0] is not a list of 2"),
         ("symmetries.rotation.0.circle", {}, "rotation[0].circle.center: missing"),
-        ("symmetries.rotation.0.circle.normal", [0, 0, 0], "circle.normal: has no length"),
+        (
+            "symmetries.rotation.0.circle.normal",
+            [0, 0, 0],
+            "circle.normal: the vector has length 0",
+        ),
         ("class_id", "../../etc", "class_id: '../../etc' is not an id"),
     ],
 )

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from cadalign.datasets.pascal3d import read_structs, structs_of
+from cadalign.datasets.pascal3d import list_structs, read_structs
 from cadalign.errors import DataError
 
 TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
@@ -45,12 +45,12 @@ def test_fields_are_as_they_were_written(tmp_path: Path, compressed: bool) -> No
     assert (record["filename"], record["names"]) == ("2008_000001.jpg", ["a", "bc"])
     for kind in TYPES:
         np.testing.assert_array_equal(record[kind], [[1, 2], [3, 4]])
-    assert structs_of(record["size"]) == [{"width": 500.0, "height": 375.0}]
-    chair, sofa = structs_of(record["objects"])
+    assert list_structs(record["size"]) == [{"width": 500.0, "height": 375.0}]
+    chair, sofa = list_structs(record["objects"])
     assert (chair["class"], sofa["class"]) == ("chair", "sofa \u00e9")
     assert chair["difficult"] == 0.0
     assert sofa["bbox"] is sofa["view"] is None
-    assert structs_of(record["names"]) == structs_of(None) == []
+    assert list_structs(record["names"]) == list_structs(None) == []
 
 
 @pytest.mark.filterwarnings("error")

@@ -101,7 +101,7 @@ def test_one_placeholder_of_a_detector_is_enough() -> None:
 
 
 def test_half_of_a_pixel_is_refused() -> None:
-    with pytest.raises(DataError, match=r"keypoint 1 is at \[nan, 4\.0\]"):
+    with pytest.raises(DataError, match=r"keypoint 1 has the invalid pixel \[nan, 4\.0\]"):
         ImageKeypoints(np.array([[1.0, 2], [np.nan, 4]]))
 
 

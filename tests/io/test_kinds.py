@@ -67,7 +67,7 @@ def test_readers_name_what_a_file_is(tmp_path: Path, kind: str, wanted: str) -> 
 
 def test_a_field_that_stands_twice_is_named() -> None:
     text = '{"keypoints": [{}, {"uv": [1, 2], "uv": [3, 4]}]}'
-    wanted = "o.json: the field 'uv' stands twice in one object; leave one of the two out"
+    wanted = "o.json: the field 'uv' occurs twice in one object; remove one of them"
     assert refusal_text(lambda: parse_json(text, "o.json")) == wanted
     assert refusal_text(lambda: parse_json(text.encode(), "o.json")) == wanted  # a line of a file
     assert parse_json(b'{"a": {"b": "x\\":"}, "c" : 1}', "") == {"a": {"b": 'x":'}, "c": 1}

@@ -180,7 +180,7 @@ def test_missing_materials_are_warned_of_and_become_plain(write, caplog, library
         (f"{SQUARE}f 1 2 -5\n", "names vertex -5"),
         (f"{SQUARE}vt 0 0\nf 1/1 2/2 3/1\n", "names texture coordinate 2"),
         (f"{SQUARE}f 1/1 2/1 3/1\n", "names texture coordinate 1, but there are 0"),
-        (f"{SQUARE}l 1 2\n", "no faces; 4 vertices"),
+        (f"{SQUARE}l 1 2\n", "4 vertices, but no faces"),
         ("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "NaN or infinite"),
         (f"{SQUARE}f 1 2 3\n\0\0\0\0\n", "line 6: holds binary data"),
         ("", "is empty"),
@@ -324,7 +324,7 @@ def test_polygons_of_off_keep_their_number(write):
 
 
 def test_faces_without_area_are_refused(write):
-    with pytest.raises(DataError, match="no face of the mesh has an area"):
+    with pytest.raises(DataError, match="all faces of the mesh have zero area"):
         load_mesh(write(f"{SQUARE}f 1 2 2\n"))
 
 
@@ -376,10 +376,10 @@ def test_forms_of_off_give_the_same_cube(write, header, vertex, face):
     [
         ("OFF\n8 13 0\n", "the header announces 13 faces, but only 12 are there; the file is cut"),
         ("OFF\n30 1 0\n", "the header announces 30 vertices, but only 20 are there; the file is"),
-        ("OFF\n7 13 0\n", "face 0 is '0.5 0.5 0.5', behind the 7 vertices announced; the file is"),
+        ("OFF\n7 13 0\n", "face 0 is '0.5 0.5 0.5', after the announced 7 vertices; the file is"),
         ("OFF\n-8 12 0\n", "the header announces -8 vertices and 12 faces; the file is cut short"),
-        ("4OFF\n8 12 0\n", "not an OFF file of text and of three dimensions; does it begin"),
-        ("OFF BINARY\n8 12 0\n", "not an OFF file of text and of three dimensions; does it begin"),
+        ("4OFF\n8 12 0\n", "not an OFF file of text with three dimensions; give a file"),
+        ("OFF BINARY\n8 12 0\n", "not an OFF file of text with three dimensions; give a file"),
     ],
 )
 def test_counts_of_off_that_lie_are_named(write, text, message):
@@ -394,7 +394,7 @@ def test_surplus_behind_a_mesh_is_warned_of(write, kind, caplog):
     surplus = {"off": b"\n3 0 1 2\n", "stl_ascii": b"\nmore\n"}.get(kind, b"\n")
     mesh = load_mesh(write(content + surplus, f"a.{kind.removesuffix('_ascii')}"))
     np.testing.assert_allclose(mesh.triangles, CUBE.triangles)
-    assert "bytes behind its data are left out" in caplog.text
+    assert "bytes after its data are ignored" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -171,13 +171,13 @@ def test_views_need_no_xyz_where_a_shape_has_them(tmp_path: Path) -> None:
         (SEVERAL | {"views": []}, "{path}: views: [] is not a list of at least 1"),
         (
             SEVERAL | {"camera": CAMERA},
-            "{path}: camera: given beside `views`; give it in each of the views",
+            "{path}: camera: not allowed beside `views`; give it in each of the views",
         ),
         (replaced(SEVERAL, "views.1.camera", ...), "{path}: views[1].camera: missing"),
         (
             replaced(SEVERAL, "views.2.mask", ...) | {"fit": {"sigma": [1.0]}},
             "{path}: fit.sigma: a list, but there are several views; "
-            "give one for all, or `sigma` of every keypoint",
+            "give one number for all, or `sigma` of every keypoint",
         ),
         (
             replaced(SEVERAL, "views.1.up_sigma_deg", 3),

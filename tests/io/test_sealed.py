@@ -39,4 +39,4 @@ def test_lengths_are_checked(tmp_path: Path, caplog: pytest.LogCaptureFixture) -
     with pytest.raises(DataError, match="announces 12 bytes, but only 11 are there"):
         SEAL.unwrap(content[:-1], "sealed")
     assert bytes(SEAL.unwrap(content + b"x", "sealed")) == b"some payload"
-    assert caplog.messages == ["sealed: 1 bytes behind its data are left out"]
+    assert caplog.messages == ["sealed: 1 bytes after its data are ignored"]

@@ -99,10 +99,7 @@ def read_coco_keypoints(path: Path, problems: dict[str, DataError] | None) -> li
     data, objects = read_json(path, DETECTOR), []
     with in_file(path):
         file = _parse_file(data)
-        images, categories = (
-            _index_by_id(file.images, "images"),
-            _index_by_id(file.categories, "categories"),
-        )
+        images, categories = _by_id(file.images, "images"), _by_id(file.categories, "categories")
     for row, entry in enumerate(file.annotations):
         where = f"[{row}]" if isinstance(data, list) else f"annotations[{row}]"
         with collect_error(f"{path}: {where}", problems), in_file(path):
@@ -131,7 +128,7 @@ def _parse_file(data: Any) -> _File:
     return found
 
 
-def _index_by_id(entries: Sequence[_Entry] | None, where: str) -> dict[_Id, _Entry]:
+def _by_id(entries: Sequence[_Entry] | None, where: str) -> dict[_Id, _Entry]:
     """Map ids to images or categories; raises DataError if two of them share an id."""
     found: dict[_Id, _Entry] = {}
     for row, entry in enumerate(entries or ()):

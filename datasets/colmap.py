@@ -148,9 +148,7 @@ def _read_cameras(path: Path) -> dict[int, dict[str, Any]]:
             camera_id, width, height = (int(words[k]) for k in (0, 2, 3))
             params = [float(word) for word in words[4:]]
         except (IndexError, ValueError):
-            raise _format_error(
-                path, number, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"
-            ) from None
+            raise _malformed(path, number, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]") from None
         if camera_id in cameras:
             raise DataError(f"camera {camera_id} occurs twice", where=f"{path}, line {number}")
         cameras[camera_id] = {"model": words[1], "width": width, "height": height, "params": params}
@@ -166,9 +164,7 @@ def _read_points(path: Path) -> tuple[IntArray, FloatArray]:
             ids.append(np.int64(int(words[0])))
             xyz.append((float(words[1]), float(words[2]), float(words[3])))
         except (IndexError, ValueError, OverflowError):
-            raise _format_error(
-                path, number, line, "POINT3D_ID X Y Z R G B ERROR TRACK[]"
-            ) from None
+            raise _malformed(path, number, line, "POINT3D_ID X Y Z R G B ERROR TRACK[]") from None
     return np.array(ids, dtype=np.int64), np.reshape(xyz, (-1, 3))
 
 
@@ -181,7 +177,7 @@ def _read_images(path: Path) -> list[_Image]:
             continue
         if len(words) <= _POSE_FIELDS:
             wanted = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of observations"
-            raise _format_error(path, number, line, wanted)
+            raise _malformed(path, number, line, wanted)
         # The next line has the observations, also if it is empty.
         _, observations = next(lines, (0, None))
         images.append(_Image(words[-1].strip(), words[1:-1], observations))
@@ -194,8 +190,7 @@ def _parse_observations(observations: str | None, where: str) -> tuple[FloatArra
         raise damaged("the file ends before its observations", where)
     words = observations.split()
     if len(words) % 3:
-        what = f"the observations have {len(words)} values, not a multiple of 3"
-        raise damaged(what, where)
+        raise damaged(f"the observations have {len(words)} values, not three per point", where)
     try:
         x, y = (np.array([float(word) for word in words[k::3]], dtype=float) for k in (0, 1))
         point_ids = np.array([int(word) for word in words[2::3]], dtype=np.int64)
@@ -218,6 +213,6 @@ def _lines(path: Path) -> list[str]:
     return lines[:-1] if lines[-1] == "" else lines
 
 
-def _format_error(path: Path, number: int, line: str, wanted: str) -> DataError:
+def _malformed(path: Path, number: int, line: str, wanted: str) -> DataError:
     where = f"{path}, line {number}"
     return DataError(f"{quote(line)} is malformed", where=where, fix=f"expected {wanted}")

@@ -1,4 +1,4 @@
-"""Blind PnP's pickles arrive as correspondences."""
+"""Correspondences from blind PnP's pickles."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Samples:
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_matches_arrive(tmp_path, dtype):
+def test_matches_are_read(tmp_path, dtype):
     samples = Samples(dtype)
     loaded = BlindPnP(samples.write(tmp_path / "nyu_train"))
     assert loaded.names == ("0", "1", "2", "3")
@@ -69,7 +69,7 @@ def test_matches_arrive(tmp_path, dtype):
     assert loaded["2"].id == loaded[2].id == "2"
 
 
-def test_inlier_matches_say_what_belongs_together(tmp_path):
+def test_inlier_matches_pair_points(tmp_path):
     samples = Samples()
     data = samples.matches()
     data["inlier_matches"] = []
@@ -117,7 +117,7 @@ def test_focal_lengths_come_from_the_file_or_the_default(tmp_path):
     assert [(c.fx, c.fy) for c in cameras] == [(525, 525), (300, 300), (500, 510), (400, 400)]
 
 
-def test_the_virtual_image_just_holds_the_points(tmp_path):
+def test_the_virtual_image_has_the_smallest_size_that_holds_the_points(tmp_path):
     for sample in BlindPnP(Samples().write(tmp_path)):
         assert sample.camera.contains(sample.points_2d).all()
         centred = np.abs(sample.points_2d - (sample.camera.cx, sample.camera.cy)).max(axis=0)

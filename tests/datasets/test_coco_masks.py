@@ -1,4 +1,4 @@
-"""Masks beside COCO keypoints: polygons and run lengths, against pycocotools."""
+"""Masks of COCO annotations, as polygons and run lengths, compared with pycocotools."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def random_mask(seed: int) -> np.ndarray:
 
 @pytest.mark.long
 @given(st.integers(0, 10**6))
-def test_run_lengths_are_those_of_pycocotools(seed: int) -> None:
+def test_run_lengths_agree_with_pycocotools(seed: int) -> None:
     mask = random_mask(seed)
     compressed: Any = coco.encode(np.asfortranarray(mask.astype(np.uint8)))
     text = {"size": compressed["size"], "counts": compressed["counts"].decode()}
@@ -85,7 +85,7 @@ def test_a_polygon_may_leave_the_image() -> None:
         ),
     ],
 )
-def test_what_is_no_mask_is_refused(segmentation: Any, text: str) -> None:
+def test_invalid_masks_are_refused(segmentation: Any, text: str) -> None:
     assert refusal_text(
         lambda: decode_segmentation(segmentation, width=WIDTH, height=HEIGHT)
     ).startswith(text)
@@ -102,7 +102,7 @@ def test_any_text_is_decoded_or_refused(text: str) -> None:
     assert mask.shape == (2, 3)
 
 
-def test_a_polygon_of_two_points_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_polygon_of_two_points_is_ignored(caplog: pytest.LogCaptureFixture) -> None:
     square = [1.0, 0.0, 3.0, 0.0, 3.0, 2.0, 1.0, 2.0]
     mask = decode_segmentation([[1, 1, 2, 2], square], width=4, height=2)
     assert mask.tolist() == decode_segmentation([square], width=4, height=2).tolist()

@@ -1,4 +1,4 @@
-"""Keypoints from detectors: what is read, how it is paired with a model, what is refused."""
+"""Detectors' keypoints: supported files, pairing with a model, errors."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_detectors_files_are_read(tmp_path: Path, entry: Any, score: float | Non
         ([0.5, 1.0, 2.0], [0.5, 1.0, 2.0]),
     ],
 )
-def test_flags_are_told_from_scores(
+def test_flags_are_distinguished_from_scores(
     tmp_path: Path, third: list[float], scores: list[float]
 ) -> None:
     (found,) = read(tmp_path, [{"keypoints": flat(third)}])
@@ -174,7 +174,7 @@ def test_malformed_json_is_refused_by_file_and_field(tmp_path: Path, data: Any, 
 # --- CSV --------------------------------------------------------------------------------------
 
 
-def test_csv_columns_arrive(tmp_path: Path) -> None:
+def test_csv_columns_are_read(tmp_path: Path) -> None:
     (found,) = read(tmp_path, CSV, "keypoints.csv")
     assert found.names == ("nose", "left ear")
     assert found.points_2d.tolist() == POINTS[:2]
@@ -260,7 +260,7 @@ def test_object_is_chosen_by_image_number_and_score() -> None:
     assert choose_object([seen(None)], image="other.jpg").image is None
 
 
-def test_photos_of_one_name_in_several_folders_are_told_apart(tmp_path: Path) -> None:
+def test_photos_of_one_name_in_several_folders_are_distinguished(tmp_path: Path) -> None:
     objects = [seen("left/1.jpg", 0.9), seen("right/1.jpg", 0.5)]
     assert choose_object(objects, image="photos/right/1.jpg") is objects[1]
     (tmp_path / "right").mkdir()
@@ -308,7 +308,7 @@ def test_photos_of_one_name_in_several_folders_are_told_apart(tmp_path: Path) ->
         ),
     ],
 )
-def test_choices_that_are_none_are_refused(
+def test_invalid_choices_are_refused(
     objects: list[ImageKeypoints], options: dict[str, Any], text: str
 ) -> None:
     with pytest.raises(InputError) as caught:
@@ -427,13 +427,13 @@ def test_fields_that_do_not_match_are_refused(fields: dict[str, Any], text: str)
 # --- what does not belong together ------------------------------------------------------------
 
 
-def test_photo_without_keypoints_does_not_get_those_of_another(tmp_path: Path) -> None:
+def test_photo_without_keypoints_does_not_get_keypoints_of_another(tmp_path: Path) -> None:
     data = changed("annotations.2", ...)
     with pytest.raises(InputError, match=r"2 images, but no keypoints in 'b\.jpg'.*cats/a\.jpg"):
         choose_object(read(tmp_path, data), image="b.jpg")
 
 
-def test_whole_numbers_beyond_all_floats_are_refused(tmp_path: Path) -> None:
+def test_integers_too_large_for_a_float_are_refused(tmp_path: Path) -> None:
     huge = changed("annotations.0.keypoints.0", 10**400)
     with pytest.raises(CadalignError, match=r"keypoints\[0\]: 10+\.\.\.0+ is not a finite"):
         read(tmp_path, huge)
@@ -441,7 +441,7 @@ def test_whole_numbers_beyond_all_floats_are_refused(tmp_path: Path) -> None:
         read(tmp_path, '{"annotations": ' + "1" * 5000 + "}")
 
 
-def test_a_wrong_score_or_size_leaves_itself_out(
+def test_an_invalid_score_or_size_is_ignored(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     found = {"image_id": 1, "keypoints": [10, 20, 2, 30, 40, 2], "score": "high"}

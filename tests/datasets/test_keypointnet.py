@@ -1,4 +1,4 @@
-"""KeypointNet: what the files say arrives, and one bad model spoils no other."""
+"""KeypointNet: content of its files; a malformed model does not affect others."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_models_come_sorted_by_category_and_in_file_order(root):
     assert dataset["03001627", "a"] is dataset["chair", "a"]
 
 
-def test_keypoints_and_symmetries_arrive(root):
+def test_keypoints_and_symmetries_are_read(root):
     model = KeypointNet(root)["chair", "a"]
     assert model.class_id == CHAIR
     keypoints = model.keypoints
@@ -268,7 +268,7 @@ def test_file_that_is_no_annotation_is_named(root, text):
     assert len(dataset["mug"]) == 1
 
 
-def test_wrong_roots_are_told(root, tmp_path):
+def test_wrong_roots_are_refused(root, tmp_path):
     with pytest.raises(DataError, match="no such folder"):
         KeypointNet(tmp_path / "gone")
     with pytest.raises(DataError, match=r"no annotations/\*\.json"):
@@ -299,7 +299,7 @@ def test_real_annotations_load_whole(real):
 
 
 @pytest.mark.long
-def test_real_keypoints_lie_where_their_faces_say(real):
+def test_real_keypoints_lie_on_their_faces(real):
     checked = set()
     for root in (None, real.root / "models"):
         for model in KeypointNet(real.root, shapenet_root=root).subset(with_mesh=True):

@@ -1,4 +1,4 @@
-"""MATLAB's files: numbers and texts as they were written; damaged files are refused by name."""
+"""MATLAB's files: numbers and texts as written; errors name damaged files."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def assert_refused_or_whole(path: Path) -> None:
         (lambda data: data[:128] + bomb(), "a variable is cut short, or has more than"),
     ],
 )
-def test_files_that_are_none_are_refused(tmp_path: Path, change: Any, reason: str) -> None:
+def test_other_files_are_refused(tmp_path: Path, change: Any, reason: str) -> None:
     path = tmp_path / "a.mat"
     path.write_bytes(change(write(path)))
     with pytest.raises(DataError, match=rf"not a MATLAB file that can be read \({reason}") as error:

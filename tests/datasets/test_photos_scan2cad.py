@@ -163,14 +163,14 @@ def test_folders_of_frames_and_models_may_be_links(root, tmp_path):
 
 
 @pytest.mark.parametrize("content", ["", "[{", "{}", '[{"id_scan": "scene0000_00"', "\x00", "nul"])
-def test_annotations_cut_short_are_told(root, content):
+def test_annotations_cut_short_are_reported(root, content):
     path = root / "full_annotations.json"
     path.write_text(content)
     with pytest.raises(DataError, match=r"full_annotations\.json"):
         Scan2CAD(root)
 
 
-def test_damaged_files_are_told(tmp_path):
+def test_damaged_files_are_reported(tmp_path):
     write_scan2cad(tmp_path, frames=1)
     assert_damage_is_told(tmp_path)
 

@@ -132,7 +132,7 @@ def test_a_pickle_that_would_run_a_command_is_refused_and_does_not(tmp_path, pro
         *("copyreg._reconstructor", "subprocess.Popen", "operator.attrgetter", "no_such.anything"),
     ],
 )
-def test_everything_else_is_refused_by_name(tmp_path, name):
+def test_other_imports_are_refused_by_name(tmp_path, name):
     module, _, attribute = name.rpartition(".")
     if name == "numpy.ndarray.tofile":
         module, attribute = "numpy", "ndarray.tofile"  # protocol 4 looks attributes up by dots

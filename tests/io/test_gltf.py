@@ -149,11 +149,11 @@ def test_files_that_are_wrong_are_refused_by_the_place(
     assert refusal(tmp_path, **changes) == f"FILE: {message}"
 
 
-def test_extension_that_is_used_but_not_required_is_passed_over(tmp_path: Path) -> None:
+def test_optional_extensions_are_ignored(tmp_path: Path) -> None:
     assert len(read(tmp_path, extensionsUsed=["KHR_draco_mesh_compression"]).faces) == 2
 
 
-def test_buffers_that_are_no_files_are_refused(tmp_path: Path) -> None:
+def test_invalid_buffers_are_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for uri, reason in (
         ("pipe", "not a regular file; give a regular file, not a pipe or device"),

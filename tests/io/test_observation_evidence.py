@@ -62,7 +62,7 @@ _SHARED: dict[str, Any] = {
 SEVERAL = json.loads(json.dumps(_SHARED))  # in which no two views share a list
 
 
-def test_evidence_of_one_image_arrives(tmp_path: Path) -> None:
+def test_evidence_of_one_image_is_read(tmp_path: Path) -> None:
     observation = Observation.load(write_json(tmp_path / "a.json", ONE))
     evidence = observation.evidence
     assert (evidence.mask, evidence.mask_sigma) == (tmp_path / "masks/a.png", 1.5)
@@ -74,7 +74,7 @@ def test_evidence_of_one_image_arrives(tmp_path: Path) -> None:
     assert not observation.is_plain
 
 
-def test_views_arrive(tmp_path: Path) -> None:
+def test_views_are_read(tmp_path: Path) -> None:
     observation = Observation.load(write_json(tmp_path / "a.json", SEVERAL))
     assert [len(view.points_2d) for view in observation.views] == [4, 1, 0]
     assert observation.model == tmp_path / "chair.obj"
@@ -83,7 +83,7 @@ def test_views_arrive(tmp_path: Path) -> None:
         np.testing.assert_array_equal(view.evidence.cam_from_rig, np.eye(4))
 
 
-def test_start_arrives_and_needs_no_keypoints() -> None:
+def test_init_is_read_and_needs_no_keypoints() -> None:
     data = ONE | {"keypoints": []}
     for given in (data, replaced(data, "keypoints", ...)):
         observation = Observation.from_dict(given)

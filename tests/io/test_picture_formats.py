@@ -1,4 +1,4 @@
-"""Pictures are decoded by one reader, of plain raster formats: none starts a program."""
+"""One reader decodes all pictures; it supports only raster formats and starts no program."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_formats_that_are_promised_are_read(tmp_path: Path, ending: str) -> None
     assert read_photo(path)[3, 3, 0] > 200
 
 
-def test_a_photo_is_no_mask(tmp_path: Path) -> None:
+def test_photos_are_refused_as_masks(tmp_path: Path) -> None:
     Image.new("RGB", (64, 48)).save(tmp_path / "a.png")
     with pytest.raises(DataError, match=r"the image is a PNG of mode RGB; give a PNG of one grey"):
         read_mask(tmp_path / "a.png")

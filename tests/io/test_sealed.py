@@ -1,4 +1,4 @@
-"""Sealed files are given back whole, or refused with what is wrong with them."""
+"""Sealed files: round trip, and errors for damaged files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def written(folder: Path, payload: bytes = b"some payload") -> bytes:
 
 
 @pytest.mark.parametrize("payload", [b"", b"some payload", bytes(range(256))])
-def test_payloads_come_back(tmp_path: Path, payload: bytes) -> None:
+def test_payloads_round_trip(tmp_path: Path, payload: bytes) -> None:
     assert bytes(SEAL.unwrap(written(tmp_path, payload), "sealed")) == payload
 
 

@@ -40,8 +40,6 @@ class _AxisKeypoints(ForeignDocument):
 
 
 class _Object(ForeignDocument):
-    """One object in any supported form."""
-
     keypoints: list[Any] | _AxisKeypoints | None = None
     score: Any = None
     confidence: Any = None
@@ -84,8 +82,6 @@ _Entry = TypeVar("_Entry", _Image, _Category)
 
 
 class _File(ForeignDocument):
-    """An annotation file."""
-
     annotations: list[Any]
     images: list[_Image] | None = None
     categories: list[_Category] | None = None

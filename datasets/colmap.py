@@ -136,7 +136,7 @@ class Colmap(CorrespondenceSet):
 
     def _mismatch(self, what: str, file: Path, name: str) -> DataError:
         where = f"{self.root}, {brief(name)}"
-        return DataError(what, where=where, fix=f"does {file.name} belong to the same model?")
+        return DataError(what, where=where, fix=f"give the {file.name} of this model")
 
 
 def _read_cameras(path: Path) -> dict[int, dict[str, Any]]:

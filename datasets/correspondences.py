@@ -177,7 +177,7 @@ class BlindPnP(CorrespondenceSet):
         count = len(self._data["t"])
         for file in files:
             if len(self._data[file.stem]) != count:
-                what = f"holds {len(self._data[file.stem])} samples, t.pkl {count}"
+                what = f"holds {len(self._data[file.stem])} samples, but t.pkl has {count}"
                 fix = "the files must be of one split; get them again"
                 raise DataError(what, where=str(file), fix=fix)
         super().__init__(folder, [str(position) for position in range(count)])

@@ -147,8 +147,6 @@ class _Symmetries(ForeignDocument):
 
 
 class _Entry(ForeignDocument):
-    """One model's entry in an annotation file."""
-
     class_id: Id
     model_id: Id
     keypoints: Annotated[list[_Keypoint], Meta(min_length=1)]

@@ -38,16 +38,12 @@ _WANTED = "give a file of model keypoints; see cadalign.datasets.ModelKeypoints"
 
 
 class _Entry(Document, kw_only=True):
-    """One keypoint in the file."""
-
     semantic_id: Index | None = None
     name: Text
     xyz: Point3
 
 
 class _File(Document):
-    """The file's content."""
-
     format: Literal["cadalign model keypoints"]
     version: Literal[1]
     keypoints: list[_Entry]
@@ -107,7 +103,7 @@ class ModelKeypoints:
 
     @property
     def ids(self) -> tuple[int | None, ...]:
-        """Semantic ids of the keypoints; None where there is none."""
+        """Semantic ids of the keypoints; None if it has none."""
         return tuple(keypoint.semantic_id for keypoint in self.keypoints)
 
     @property

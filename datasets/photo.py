@@ -100,7 +100,7 @@ class Truth:
     """The object's oriented box in the camera frame."""
     camera: Camera | None = None
     """The camera that the pose was annotated with, if it is not the photo's. The pose fits the
-    photo under this camera; its translation and the focal length are conventions."""
+    photo under this camera, but its translation and this focal length are only conventions."""
     metres: float | None = None
     """Length of one unit of the camera frame [m]; None if the size is unknown."""
 

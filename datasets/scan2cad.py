@@ -72,7 +72,7 @@ class _Points(ForeignDocument):
 
     def xyz(self) -> FloatArray:
         if len(self.position) % 3:
-            raise InputError(f"{len(self.position)} numbers are not x, y, z of points")
+            raise InputError(f"expected x, y, z of each point, got {len(self.position)} numbers")
         return np.reshape(self.position, (-1, 3)).astype(float)
 
 
@@ -243,7 +243,7 @@ def _rectangle(box: Box, camera: Camera) -> FloatArray | None:
 
 
 def _compose(second: Alignment, first: Alignment) -> Alignment:
-    """Compose two alignments; the second must scale all axes equally."""
+    """Compose ``second`` after ``first``; ``second`` must scale all axes equally."""
     (moved,) = second.apply(first.translation[None])
     return Alignment(second.rotation @ first.rotation, moved, second.scale * first.scale)
 
@@ -266,8 +266,6 @@ _IMAGES = (".jpg", ".jpeg", ".png")
 
 @dataclass(frozen=True)
 class _Frame:
-    """One frame of a ScanNet scene."""
-
     frame_id: str  # its number in the file's name
     image_path: Path
     pose_path: Path  # (4, 4), scan from camera

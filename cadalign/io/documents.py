@@ -202,7 +202,6 @@ _PATTERN_WORDS = {repr(_PATH): "a path", repr(_FILE_NAME): "an id"}
 
 
 def _to_builtin(value: Any) -> Any:
-    """Convert a NumPy array or number to Python's types."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     raise TypeError(type(value))

@@ -170,7 +170,7 @@ def test_shuffled_points_are_refused(tmp_path):
 def test_files_of_different_length_are_refused(tmp_path):
     samples = Samples()
     folder = samples.write(tmp_path, samples.matches() | {"R": samples.R[:3]})
-    with pytest.raises(DataError, match=r"R.pkl: holds 3 samples, t.pkl 4"):
+    with pytest.raises(DataError, match=r"R.pkl: holds 3 samples, but t.pkl has 4"):
         BlindPnP(folder)
 
 

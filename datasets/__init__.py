@@ -1,4 +1,4 @@
-"""Loaders: annotated CAD models (KeypointNet, ShapeNet, mesh files), photos, correspondences."""
+"""Loaders of annotated CAD models (KeypointNet, ShapeNet, mesh files), photos, correspondences."""
 
 from typing import TYPE_CHECKING
 

@@ -1,6 +1,6 @@
-"""COLMAP's sparse models in text form: photos with known poses and the points they see.
+"""Read COLMAP's sparse models in text form: photos with known poses and observed points.
 
-Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016. The files are described at
+Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016. The format is described at
 https://colmap.github.io/format.html.
 """
 
@@ -29,41 +29,41 @@ from cadalign.io.documents import in_file
 from cadalign.io.files import as_path, damaged, read_text
 
 _FILES = ("cameras.txt", "images.txt", "points3D.txt")
-_BELOW = "sparse/0"
-_TO_TEXT = "colmap model_converter --output_type TXT writes them from .bin files"
-_INVALID_POINT = -1  # of an observation that belongs to no point
-_MOST_BYTES = 2**37  # of one file: models of cities have billions of observations
-# Before an image's name: its number, wxyz, translation, and its camera's number.
+_SUBFOLDER = "sparse/0"
+_CONVERT = "colmap model_converter --output_type TXT writes them from .bin files"
+_INVALID_POINT = -1  # the point id of an observation without a point
+_MOST_BYTES = 2**37  # size limit of a file: models of cities have billions of observations
+# Fields before an image's name: its id, quaternion wxyz, translation, camera id.
 _POSE_FIELDS = 9
 
 
 class _Image(NamedTuple):
-    """One image's entry, whose numbers are read when they are asked for."""
+    """One image's entry; its numbers are parsed on access."""
 
     name: str
-    pose: list[str]  # the words of `_POSE_FIELDS`
-    observations: str | None  # None where the file ends before them
+    pose: list[str]  # the words after the image's id and before its name
+    observations: str | None  # None if the file ends before them
 
 
 class Colmap(CorrespondenceSet):
     """The photos of a COLMAP model in text form, sorted by name.
 
-    Binary models become text by ``colmap model_converter --output_type TXT``. Observations that
-    belong to no point are left out. Poses and observations are checked image by image, when they
-    are asked for; see `CorrespondenceSet`.
+    Convert binary models with ``colmap model_converter --output_type TXT``. Observations without a
+    point are left out. An image's pose and observations are checked on access; see
+    `CorrespondenceSet`.
 
     Parameters
     ----------
     path : str or path-like
-        The folder with ``cameras.txt``, ``images.txt`` and ``points3D.txt``, or one that holds
-        them in ``sparse/0``.
+        A folder with ``cameras.txt``, ``images.txt`` and ``points3D.txt``, in it or in its
+        ``sparse/0``.
 
     Raises
     ------
     DataError
-        If files are missing, cut short or malformed, or a name or number occurs twice. Asking for
-        an image raises it if the image observes points that don't exist, or its camera's model is
-        none that `cadalign.Camera.from_dict` reads.
+        If files are missing, cut short or malformed, or a name or id occurs twice. Access to an
+        image raises it if the image observes points that don't exist, or
+        `cadalign.Camera.from_dict` does not support its camera's model.
 
     Examples
     --------
@@ -76,14 +76,14 @@ class Colmap(CorrespondenceSet):
     """
 
     kind = "COLMAP"
-    marks = (*_FILES, *(f"{_BELOW}/{name}" for name in _FILES))
-    signature = f"cameras.txt, images.txt and points3D.txt, also in {_BELOW} ({_TO_TEXT})"
+    marks = (*_FILES, *(f"{_SUBFOLDER}/{name}" for name in _FILES))
+    signature = f"cameras.txt, images.txt and points3D.txt, also in {_SUBFOLDER} ({_CONVERT})"
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         root = as_path(path)
-        below = root / _BELOW
+        below = root / _SUBFOLDER
         folder = below if below.is_dir() and not (root / "images.txt").is_file() else root
-        files = require_files(folder, _FILES, fix=f"give the folder of COLMAP's text; {_TO_TEXT}")
+        files = require_files(folder, _FILES, fix=f"give the folder of COLMAP's text; {_CONVERT}")
         self._camera_file, image_file, self._point_file = files
         self._cameras = _read_cameras(self._camera_file)
         ids, xyz = _read_points(self._point_file)
@@ -101,14 +101,14 @@ class Colmap(CorrespondenceSet):
         super().__init__(image_file, names)
 
     def read(self, position: int) -> Correspondences:
-        """Read the image of a number from 0."""
+        """Read the image at a position, counted from 0."""
         image = self._images[position]
         where = f"{self.root}, image {brief(image.name)}"
         try:
             pose, camera_id = np.array(image.pose[:-1], dtype=float), int(image.pose[-1])
         except ValueError as error:
             raise DataError(f"the pose is malformed ({brief(error)})", where=where) from None
-        points_2d, point_ids = _observed(image.observations, where)
+        points_2d, point_ids = _parse_observations(image.observations, where)
         rows = point_ids != _INVALID_POINT
         return Correspondences(
             id=image.name,
@@ -125,22 +125,22 @@ class Colmap(CorrespondenceSet):
         missing = np.unique(point_ids[~known])
         if len(missing):
             what = f"{len(missing)} of the points that it observes do not exist, the first is point"
-            raise self._of_another_model(f"{what} {missing[0]}", self._point_file, name)
+            raise self._mismatch(f"{what} {missing[0]}", self._point_file, name)
         return rows
 
     def _camera(self, camera_id: int, name: str) -> Camera:
         if camera_id not in self._cameras:
-            raise self._of_another_model(f"there is no camera {camera_id}", self._camera_file, name)
+            raise self._mismatch(f"there is no camera {camera_id}", self._camera_file, name)
         with in_file(f"{self._camera_file}, camera {camera_id}"):
             return Camera.from_dict(self._cameras[camera_id])
 
-    def _of_another_model(self, what: str, file: Path, name: str) -> DataError:
+    def _mismatch(self, what: str, file: Path, name: str) -> DataError:
         where = f"{self.root}, {brief(name)}"
-        return DataError(what, where=where, fix=f"does {file.name} belong to the same model?")
+        return DataError(what, where=where, fix=f"give the {file.name} of this model")
 
 
 def _read_cameras(path: Path) -> dict[int, dict[str, Any]]:
-    """The cameras by number, in the form that `Camera.from_dict` reads."""
+    """Read the cameras by id, in the form for `Camera.from_dict`."""
     cameras: dict[int, dict[str, Any]] = {}
     for number, line in _entries(path):
         words = line.split()
@@ -156,7 +156,7 @@ def _read_cameras(path: Path) -> dict[int, dict[str, Any]]:
 
 
 def _read_points(path: Path) -> tuple[IntArray, FloatArray]:
-    """Numbers (m,) and coordinates (m, 3) of all points, in file order."""
+    """Read ids (m,) and coordinates (m, 3) of all points, in file order."""
     ids, xyz = [], []
     for number, line in _entries(path):
         words = line.split(maxsplit=4)
@@ -178,19 +178,19 @@ def _read_images(path: Path) -> list[_Image]:
         if len(words) <= _POSE_FIELDS:
             wanted = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of observations"
             raise _malformed(path, number, line, wanted)
-        # The observations' line follows in any case; it is empty where there are none.
+        # The next line has the observations, also if it is empty.
         _, observations = next(lines, (0, None))
         images.append(_Image(words[-1].strip(), words[1:-1], observations))
     return images
 
 
-def _observed(observations: str | None, where: str) -> tuple[FloatArray, IntArray]:
-    """COLMAP's pixels (n, 2), whose centres are at (0.5, 0.5), and the numbers of their points."""
+def _parse_observations(observations: str | None, where: str) -> tuple[FloatArray, IntArray]:
+    """Parse COLMAP's pixels (n, 2), with centres at (0.5, 0.5), and their point ids (n,)."""
     if observations is None:
         raise damaged("the file ends before its observations", where)
     words = observations.split()
     if len(words) % 3:
-        raise damaged(f"the observations are {len(words)} values, not X Y POINT3D_ID each", where)
+        raise damaged(f"the observations have {len(words)} values, not three per point", where)
     try:
         x, y = (np.array([float(word) for word in words[k::3]], dtype=float) for k in (0, 1))
         point_ids = np.array([int(word) for word in words[2::3]], dtype=np.int64)
@@ -200,7 +200,7 @@ def _observed(observations: str | None, where: str) -> tuple[FloatArray, IntArra
 
 
 def _entries(path: Path) -> Iterator[tuple[int, str]]:
-    """The lines that are neither empty nor comments, with their numbers from 1."""
+    """Yield lines with their numbers from 1, without empty lines and comments."""
     for number, line in enumerate(_lines(path), start=1):
         stripped = line.strip()
         if stripped and not stripped.startswith("#"):
@@ -208,7 +208,7 @@ def _entries(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _lines(path: Path) -> list[str]:
-    # Not splitlines, which would also split names at exotic separators.
+    # splitlines would also split names at Unicode separators.
     lines = read_text(path, most=_MOST_BYTES, errors="replace").split("\n")
     return lines[:-1] if lines[-1] == "" else lines
 

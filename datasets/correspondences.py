@@ -1,8 +1,8 @@
-"""Points of a scene, seen in an image with a known pose: what all correspondence loaders yield.
+"""2D-3D correspondences of an image with a known pose, and a loader of blind PnP's.
 
-And the NYU-RGBD and MegaDepth correspondences that blind PnP was trained on: Liu, Campbell, Li,
-Zhou, Song and Yang, "Learning 2D-3D Correspondences To Solve The Blind Perspective-n-Point
-Problem", 2020 (github.com/Liumouliu/Deep_blind_PnP).
+The loader reads the NYU-RGBD and MegaDepth correspondences of Liu, Campbell, Li, Zhou, Song and
+Yang, "Learning 2D-3D Correspondences To Solve The Blind Perspective-n-Point Problem", 2020
+(github.com/Liumouliu/Deep_blind_PnP).
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.io.files import as_path
 
-# The virtual camera's focal length [px] where the files don't say one.
+# The virtual camera's focal length [px] if there is no focal.pkl.
 _FOCAL = np.array([800.0])
 _LARGEST_IMAGE = 2**30
-# Pairs whose median distance under the true pose [normalised] is larger don't belong together.
-_PAIRED = 0.05
+# Largest median distance of matched points under the true pose [normalised].
+_MAX_DISTANCE = 0.05
 _REQUIRED, _OPTIONAL = ("matches", "R", "t"), ("inlier_matches", "focal")
 
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """Points of a scene and where one image shows them.
+    """Points of a scene and their pixels in one image.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class Correspondences:
     points_3d : (n, 3) float
         Points [units of the scene].
     points_2d : (n, 2) float
-        Where the image shows them [px]; integers are pixel centres.
+        Pixels of the points [px]; integers are pixel centres.
     camera : Camera
         The calibrated camera.
     cam_from_world : Alignment
@@ -87,26 +87,26 @@ class Correspondences:
         return len(self.points_3d)
 
     def residuals(self) -> FloatArray:
-        """Projected minus observed points [px] under the true pose, (n, 2) float.
+        """Compute projected minus observed points [px] under the true pose, (n, 2) float.
 
-        Raises InputError if the true pose has points behind the camera.
+        Raises InputError if points lie behind the camera.
         """
         projected = self.camera.project(self.cam_from_world.apply(self.points_3d))
         return np.asarray(projected - self.points_2d)
 
 
 class CorrespondenceSet(RecordSet[Correspondences]):
-    """The images of a file, each with its correspondences, read one by one.
+    """Images with their correspondences, read one by one.
 
-    ``images["00.jpg"]`` and ``images[0]`` give one image's `Correspondences`, and ``images.names``
-    names them in order; see `cadalign.datasets.records.RecordSet`.
+    ``images["00.jpg"]`` and ``images[0]`` return one image's `Correspondences`. ``images.names``
+    lists the names in order; see `cadalign.datasets.records.RecordSet`.
     """
 
     noun = "image"
 
 
 def require_files(folder: Path, names: Iterable[str], *, fix: str) -> tuple[Path, ...]:
-    """Return the files of some names in a folder; raises DataError that names those missing."""
+    """Return the paths of named files in a folder; raises DataError if any is missing."""
     if not folder.is_dir():
         raise DataError("no such folder", where=str(folder), fix=fix)
     files = tuple(folder / name for name in names)
@@ -118,7 +118,7 @@ def require_files(folder: Path, names: Iterable[str], *, fix: str) -> tuple[Path
 
 
 def rigid_pose(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Alignment:
-    """Make a true pose out of a rotation (3, 3) written with few digits: the nearest one.
+    """Build a pose of scale 1; a rotation (3, 3) of few digits becomes the nearest rotation.
 
     ``translation`` is 3 values of any shape.
     """
@@ -130,20 +130,20 @@ def rigid_pose(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Alignment
 class BlindPnP(CorrespondenceSet):
     """Samples of one split, such as ``nyu_train`` or ``megaDepth_valid``, named "0", "1", ...
 
-    A split is a folder of pickles, each pickle a list with an entry per sample, those in brackets
+    A split is a folder of pickles, each a list with one entry per sample; files in brackets are
     optional::
 
         matches.pkl  R.pkl  t.pkl  [inlier_matches.pkl  focal.pkl]
 
-    ``matches`` (n, 5) has an image point and a scene point in each row. Where there is
-    ``inlier_matches`` (m, 2), its rows say which belong together: (row of the scene point, row of
-    the image point).
+    Each row of ``matches`` (n, 5) has an image point and a scene point. The rows of
+    ``inlier_matches`` (m, 2) are the matching pairs: (row of the scene point, row of the image
+    point). Without this file, the points of each row match.
 
-    Image points are stored with the calibration taken out. They are given in the pixels of a
-    virtual camera of the sample's focal length, by default 800 px, whose image is just large
-    enough for them.
+    Image points are stored in normalised coordinates. They are converted to pixels of a virtual
+    camera with the sample's focal length (by default 800 px) and the smallest image that holds
+    them.
 
-    No pickle can run code; see `cadalign.datasets.unpickling`.
+    Pickles cannot run code; see `cadalign.datasets.unpickling`.
 
     Parameters
     ----------
@@ -153,9 +153,9 @@ class BlindPnP(CorrespondenceSet):
     Raises
     ------
     DataError
-        If files are missing, no pickles, ask for code, or differ in their number of samples.
-        Asking for a sample raises it if its arrays are malformed, or if its points don't belong
-        together under the true pose.
+        If files are missing, are no pickles, import code, or differ in their number of samples.
+        Access to a sample raises it if its arrays are malformed, or its points don't match under
+        the true pose.
 
     Examples
     --------
@@ -177,15 +177,15 @@ class BlindPnP(CorrespondenceSet):
         count = len(self._data["t"])
         for file in files:
             if len(self._data[file.stem]) != count:
-                what = f"holds {len(self._data[file.stem])} samples, t.pkl {count}"
+                what = f"holds {len(self._data[file.stem])} samples, but t.pkl has {count}"
                 fix = "the files must be of one split; get them again"
                 raise DataError(what, where=str(file), fix=fix)
         super().__init__(folder, [str(position) for position in range(count)])
 
     def read(self, position: int) -> Correspondences:
-        """Read the sample of a number from 0."""
+        """Read the sample at a position, counted from 0."""
         pose = rigid_pose(self._array("R", position, (3, 3)), self._numbers("t", position))
-        rays, points_3d = self._matched(position)
+        rays, points_3d = self._matches(position)
         if not len(rays):
             raise InputError("there are no correspondences", where="matches")
         focal_lengths = self._numbers("focal", position) if "focal" in self._data else _FOCAL
@@ -193,17 +193,17 @@ class BlindPnP(CorrespondenceSet):
         pixels = camera.pixels_from_normalized(rays)
         gaps = camera.project_where_ahead(pose.apply(points_3d)) - pixels
         distance = np.median(np.linalg.norm(gaps / (camera.fx, camera.fy), axis=1))
-        if not distance <= _PAIRED:
+        if not distance <= _MAX_DISTANCE:
             raise InputError(
-                f"under the true pose the {len(rays)} pairs of points are {distance:.2g} apart, "
-                "in normalised coordinates and the median",
+                f"the {len(rays)} point pairs are {distance:.2g} apart under the true pose "
+                "(median, normalised coordinates)",
                 where="true pose",
-                fix="is inlier_matches.pkl, which says what belongs together, missing?",
+                fix="is inlier_matches.pkl missing? it says which points match",
             )
         return Correspondences(self.names[position], points_3d, pixels, camera, pose)
 
-    def _matched(self, position: int) -> tuple[FloatArray, FloatArray]:
-        """Image points (n, 2) and scene points (n, 3) that belong together."""
+    def _matches(self, position: int) -> tuple[FloatArray, FloatArray]:
+        """Read matched image points (n, 2) and scene points (n, 3)."""
         rows = self._array("matches", position, (None, 5))
         rays, points_3d = rows[:, :2], rows[:, 2:]
         if "inlier_matches" not in self._data:
@@ -211,7 +211,7 @@ class BlindPnP(CorrespondenceSet):
         numbers = self._array("inlier_matches", position, (None, 2))
         bad = numbers[(numbers < 0) | (numbers >= len(rows))]
         if len(bad):
-            what = f"names row {bad[0]:g} of {len(rows)} in matches"
+            what = f"names row {bad[0]:g}, but matches has {len(rows)}"
             raise InputError(what, where="inlier_matches")
         scene_rows, image_rows = numbers.astype(np.int64).T
         return rays[image_rows], points_3d[scene_rows]
@@ -220,7 +220,7 @@ class BlindPnP(CorrespondenceSet):
         return as_floats(self._data[name][position], name=name, shape=shape)
 
     def _numbers(self, name: str, position: int) -> FloatArray:
-        """A sample's few numbers, whatever shape they were stored in; (k,) float."""
+        """Read a sample's numbers, stored in any shape, as (k,) float."""
         try:
             values = np.ravel(self._data[name][position])
         except ValueError:
@@ -236,12 +236,12 @@ def _load_samples(file: Path) -> Any:
 
 
 def _virtual_camera(focal_lengths: FloatArray, rays: FloatArray) -> Camera:
-    """A camera that looks along its principal point and just has all rays in its image.
+    """Build a camera with a central principal point and the smallest image that holds all rays.
 
-    It has one focal length [px], or one along x and one along y.
+    ``focal_lengths`` [px] has one value, or one for x and one for y.
     """
     if len(focal_lengths) not in (1, 2) or (focal_lengths <= 0).any():
-        raise InputError(f"{focal_lengths.tolist()} are no focal lengths", where="focal")
+        raise InputError(f"{focal_lengths.tolist()} are not focal lengths", where="focal")
     fx, fy = float(focal_lengths[0]), float(focal_lengths[-1])
     with np.errstate(over="ignore"):
         reach = np.ceil(np.abs(rays).max(axis=0) * (fx, fy))

@@ -1,4 +1,4 @@
-"""Formats of photos and of correspondences: which one lies in a folder, and opening it."""
+"""Recognise the format of a data set of photos or correspondences, and open it."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from cadalign.errors import DataError
 from cadalign.io.files import as_path
 
 PHOTO_FORMATS = (Scan2CAD, Pix3D, Pascal3D)
-"""The known formats of photos, in the order in which they are looked for."""
+"""Formats of photos, in the order in which they are tried."""
 CORRESPONDENCE_FORMATS = (Colmap, BlindPnP)
-"""The known formats of correspondences, in the order in which they are looked for."""
+"""Formats of correspondences, in the order in which they are tried."""
 
 
 def open_photos(path: str | os.PathLike[str]) -> PhotoDataset:
-    """Open the data set of photos that lies in a folder, whichever format it has.
+    """Open a data set of photos; the format is recognised by its files.
 
     Parameters
     ----------
     path : str or path-like
-        The folder; see the classes for what may lie in it: `Scan2CAD`, `Pix3D`, `Pascal3D`.
+        The data set's folder; `Scan2CAD`, `Pix3D` and `Pascal3D` describe its layout.
 
     Returns
     -------
     PhotoDataset
-        Its `PhotoDataset.kind` names the format.
+        The data set; `PhotoDataset.kind` names its format.
 
     Raises
     ------
     DataError
-        If there is no such folder, no known format in it, or it cannot be read.
+        If the folder is missing, has no known format, or cannot be read.
 
     Examples
     --------
@@ -45,33 +45,33 @@ def open_photos(path: str | os.PathLike[str]) -> PhotoDataset:
     >>> dataset  # doctest: +SKIP
     Pix3D('pix3d'): 10069 photos
     """
-    found: PhotoDataset = _opened(path, PHOTO_FORMATS, "photos")
+    found: PhotoDataset = _open_folder(path, PHOTO_FORMATS, "photos")
     return found
 
 
 def open_correspondences(path: str | os.PathLike[str]) -> CorrespondenceSet:
-    """Open correspondences of any format.
+    """Open a set of correspondences; the format is recognised by its files.
 
     Parameters
     ----------
     path : str or path-like
-        A folder, as `Colmap` or `BlindPnP` takes it.
+        The folder; `Colmap` and `BlindPnP` describe its layout.
 
     Raises
     ------
     DataError
-        If there is no such folder, no known format in it, or it cannot be read.
+        If the folder is missing, has no known format, or cannot be read.
 
     Examples
     --------
     >>> open_correspondences("reconstruction")  # doctest: +SKIP
     Colmap('reconstruction/images.txt'): 4 images
     """
-    found: CorrespondenceSet = _opened(path, CORRESPONDENCE_FORMATS, "correspondences")
+    found: CorrespondenceSet = _open_folder(path, CORRESPONDENCE_FORMATS, "correspondences")
     return found
 
 
-def _opened(path: str | os.PathLike[str], formats: Sequence[Any], content: str) -> Any:
+def _open_folder(path: str | os.PathLike[str], formats: Sequence[Any], content: str) -> Any:
     folder = as_path(path)
     if not folder.is_dir():
         raise DataError("no such folder", where=repr(str(path)), fix="give a data set's folder")
@@ -79,5 +79,5 @@ def _opened(path: str | os.PathLike[str], formats: Sequence[Any], content: str) 
         if each.is_here(folder):
             return each(folder)
     what = f"no data set of {content} is recognised in this folder"
-    fix = f"known are: {'; '.join(each.signature for each in formats)}"
+    fix = f"known formats: {'; '.join(each.signature for each in formats)}"
     raise DataError(what, where=str(folder), fix=fix)

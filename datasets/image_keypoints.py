@@ -1,4 +1,4 @@
-"""Keypoints in an image, as detectors and annotation tools write them, joined with a model's."""
+"""Keypoints of detectors and annotation tools in an image, and their pairing with a model's."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class ImageKeypoints:
     points_2d: FloatArray
     """(k, 2), pixels; integers are pixel centres. NaN for a keypoint that was not found."""
     scores: FloatArray | None = None
-    """(k,), how sure the detector is of each, 0 for a keypoint that was not found. Visibility flags
-    are scores of 0 (not labelled), 0.5 (hidden) and 1 (visible)."""
+    """(k,), the detector's confidence in each keypoint, 0 for a keypoint that was not found.
+    Visibility flags become 0 (not labelled), 0.5 (hidden) and 1 (visible)."""
     names: tuple[str, ...] | None = None
-    """(k,), what each keypoint is called."""
+    """(k,), name of each keypoint."""
     ids: tuple[int, ...] | None = None
-    """(k,), what each keypoint means."""
+    """(k,), semantic id of each keypoint."""
     sigma: FloatArray | None = None
     """(k,), standard deviation of each [px]."""
     image: str | None = None
@@ -41,16 +41,16 @@ class ImageKeypoints:
     size: tuple[int, int] | None = None
     """The image's width and height [px]."""
     images: int = 1
-    """How many images the file lists, with keypoints or without."""
+    """Number of images that the file lists, with or without keypoints."""
     score: float | None = None
-    """How sure the detector is of the whole object."""
+    """The detector's confidence in the whole object."""
     source: str = "keypoints"
     """The file and the place in it, for messages."""
     measured: BoolArray = field(init=False, repr=False)
-    """Which keypoints (k,) have a pixel that is a measurement, whatever their score; see
+    """Mask (k,) of the keypoints whose pixel is a measurement, whatever their score; see
     `cadalign.geometry.pixels.unmeasured`."""
     segmentation: Any = field(default=None, kw_only=True)
-    """The object's mask as COCO writes it, unchecked; see
+    """The object's mask in COCO's form, unchecked; see
     `cadalign.datasets.coco.decode_segmentation`."""
 
     def __post_init__(self) -> None:
@@ -59,8 +59,9 @@ class ImageKeypoints:
         bad = np.isinf(points).any(axis=1) | (np.isnan(points).sum(axis=1) == 1)
         if bad.any():
             row = int(bad.argmax())
-            what = f"keypoint {row} is at {quote(points[row].tolist())}"
-            raise DataError(what, where=where, fix="give NaN for both, where it was not found")
+            what = f"keypoint {row} has the invalid pixel {quote(points[row].tolist())}"
+            fix = "give two finite numbers, or two NaN if it was not found"
+            raise DataError(what, where=where, fix=fix)
         object.__setattr__(self, "points_2d", points)
         measured = ~unmeasured(points, least=1)
         for name in ("scores", "sigma"):
@@ -92,11 +93,11 @@ class ImageKeypoints:
 
     @property
     def is_found(self) -> BoolArray:
-        """Marks the keypoints (k,) that were found: with a measured pixel, and no score of 0."""
+        """Mask (k,) of the keypoints that were found: with a measured pixel and a score over 0."""
         return self.measured if self.scores is None else np.asarray(self.scores > 0)
 
     def is_of(self, photo: str) -> bool:
-        """True if the image's name, or its id, is that of the photo's file."""
+        """True if the image's name or id matches the photo's file name."""
         path = Path(photo)
         return self.image is not None and (
             self.image in (photo, path.stem) or Path(self.image).name == path.name
@@ -104,13 +105,13 @@ class ImageKeypoints:
 
 
 def photo_in(folder: Path, image: str) -> Path | None:
-    """The photo of an image or id in a folder, by as much of its path as is there; or None.
+    """Find the photo of an image name or id in a folder, or None.
 
-    COCO's photos are named by their ids in twelve digits.
+    Leading folders of the name may be missing. COCO's photos are named by ids of twelve digits.
     """
     parts = [part for part in Path(image).parts if part not in (Path(image).anchor, "..")]
     paths = [folder.joinpath(*parts[first:]) for first in range(len(parts))]
-    if not Path(image).suffix:  # detectors' results have ids, a photo's name without ending
+    if not Path(image).suffix:  # an id in a detector's result
         stems = (image, image.zfill(_COCO_DIGITS)) if image.isdecimal() else (image,)
         paths += [folder / f"{stem}{ending}" for stem in stems for ending in PHOTO_ENDINGS]
     return next(filter(Path.is_file, paths), None)
@@ -119,54 +120,55 @@ def photo_in(folder: Path, image: str) -> Path | None:
 def choose_object(
     objects: Sequence[ImageKeypoints], *, image: str | None = None, number: int | None = None
 ) -> ImageKeypoints:
-    """Choose one object out of those of a file.
+    """Choose one of a file's objects.
 
     Parameters
     ----------
     objects : sequence of ImageKeypoints
     image : str, optional
-        The image's file name, also with its folders, or id; needed where the file has several
-        images. A file of one image may call it otherwise.
+        The image's id, file name or path; required if the file has several images. It is not
+        compared if the file has only one image.
     number : int, optional
-        Which of the image's objects, from 0; by default that of the highest score, or the only one.
+        Position among the image's objects, from 0; by default the object of the highest score, or
+        the only one.
 
     Raises
     ------
     InputError
-        If there is no such image or object, or no telling which is meant.
+        If the image or object does not exist, or the choice is ambiguous.
     """
     images = list(dict.fromkeys(found.image for found in objects))
     wanted = [found for found in objects if image is not None and found.is_of(image)]
-    shares = {found.image: _shared_end(image, found.image) for found in wanted}
+    shares = {found.image: _count_shared_parts(image, found.image) for found in wanted}
     wanted = [found for found in wanted if shares[found.image] == max(shares.values())]
     named = list(dict.fromkeys(found.image for found in wanted))
     if len(named) > 1:
-        fix = f"give its path, one that ends with one of {', '.join(map(str, named[:5]))}"
+        fix = f"give a path that ends with one of {', '.join(map(str, named[:5]))}"
         raise InputError(f"{len(named)} images are called {image!r}", where="image", fix=fix)
     if not wanted:
         listed_images = max((found.images for found in objects), default=0)
         if image is not None and listed_images > 1 and len(images) == 1:
-            what = f"{listed_images} images, and no keypoints in {image!r}"
-            raise InputError(what, where="image", fix=f"there are some in {images[0]}")
+            what = f"the file lists {listed_images} images, but no keypoints in {image!r}"
+            raise InputError(what, where="image", fix=f"it has keypoints only in {images[0]}")
         if len(images) != 1:
             listed = ", ".join(str(name) for name in images[:5])
             fix = f"choose one of {listed}" + (", ..." if len(images) > 5 else "")
-            missing = "" if image is None else f", none of which is {image!r}"
-            raise InputError(f"{len(images)} images{missing}", where="image", fix=fix)
+            missing = "" if image is None else f", none is called {image!r}"
+            raise InputError(f"the file has {len(images)} images{missing}", where="image", fix=fix)
         wanted = list(objects)
     if number is not None:
         if not 0 <= number < len(wanted):
-            what = f"object {number} of {len(wanted)}"
+            what = f"there is no object {number} of {len(wanted)}"
             raise InputError(what, where="number", fix="count from 0")
         return wanted[number]
     if len(wanted) > 1 and any(found.score is None for found in wanted):
-        what = f"{len(wanted)} objects in the image, and no scores to choose by"
+        what = f"the image has {len(wanted)} objects, and no scores to choose by"
         raise InputError(what, where="number", fix=f"choose one, 0 to {len(wanted) - 1}")
     return max(wanted, key=lambda found: found.score or 0.0)
 
 
-def _shared_end(photo: str | None, image: str | None) -> int:
-    """Number of the names in an image's path, where these are the end of a photo's; else 0."""
+def _count_shared_parts(photo: str | None, image: str | None) -> int:
+    """Number of parts in an image's path, if the photo's path ends with it; else 0."""
     own = Path(image or "").parts
     return len(own) if own and Path(photo or "").parts[-len(own) :] == own else 0
 
@@ -182,21 +184,21 @@ def join_keypoints(
 ) -> Observation:
     """Pair an image's keypoints with the model's.
 
-    By name where the image's have names (capitals, and spaces for ``_`` and ``-``, don't count),
-    otherwise by semantic id, otherwise by their order, if there are as many.
+    Keypoints are paired by name if the image's have names; case, ``_``, ``-`` and spaces are not
+    compared. Otherwise they are paired by semantic id, or else by order if the numbers are equal.
 
     Parameters
     ----------
     found : ImageKeypoints
     model : ModelKeypoints
     camera : Camera
-        May be one `Camera.without_focal`.
+        The photo's camera; `Camera.without_focal` if its focal length is unknown.
     image : Path, optional
         The photo.
     min_score : float
-        Keypoints of a lower score are left out; those of score 0 always are.
+        Keypoints of a lower score, and of score 0, are left out.
     ignore_unknown : bool
-        Leave out keypoints that the model does not have, instead of refusing them.
+        Leave out keypoints that the model does not have, instead of raising an error.
 
     Returns
     -------
@@ -205,23 +207,23 @@ def join_keypoints(
     Raises
     ------
     DataError
-        If a keypoint is unknown, two are the same, none is left, or the camera is of another size.
+        If a keypoint is unknown or occurs twice, none is left, or the camera's size differs.
     """
     if found.size not in (None, (camera.width, camera.height)):
         what = "the image has {} x {} pixels".format(*found.size)
-        what += f", that of the camera {camera.width} x {camera.height}"
+        what += f", the camera has {camera.width} x {camera.height}"
         raise DataError(what, where=found.source, fix="give the camera of these images")
     pixels = found.points_2d[found.measured]
     check_pixels(pixels, camera.width, camera.height, where=found.source)
     kept = np.flatnonzero(found.is_found).tolist()
     if found.scores is not None:
         kept = [row for row in kept if found.scores[row] >= min_score]
-    places = _places(found, model)
+    places = _match_rows(found, model)
     unknown = [row for row in kept if places[row] is None]
     if unknown and not ignore_unknown:
         labels = found.names or found.ids or range(len(found))
         what = f"the model has no keypoint {labels[unknown[0]]!r}"
-        fix = f"it has {some_of(model.names)}; ignore_unknown leaves out what it has not"
+        fix = f"it has {some_of(model.names)}; ignore_unknown leaves out unknown keypoints"
         raise DataError(what, where=found.source, fix=fix)
     pairs = [(row, place) for row in kept if (place := places[row]) is not None]
     first: dict[int, int] = {}
@@ -256,13 +258,13 @@ def observed_in(
     image: Path | None = None,
     **how: Any,
 ) -> Observation:
-    """Pair an image's keypoints with the model's, with the camera of ``changes``.
+    """Pair an image's keypoints with the model's, using the camera of ``changes``.
 
-    Without a camera it is one of the photo's size, whose focal length is unknown. ``how`` are
+    Without a camera, one of the photo's size and of unknown focal length is used. ``how`` are
     further arguments of `join_keypoints`.
 
-    Raises CadalignError as that does; and if files cannot be read, or photo, camera and keypoints
-    are of images of several sizes, or of none that is known.
+    Raises CadalignError as `join_keypoints` does, if a file cannot be read, if the image's size is
+    unknown, or if photo, camera and keypoints differ in size.
     """
     sizes = {} if image is None else {str(image): photo_size(image)}
     if found.size is not None:
@@ -280,8 +282,8 @@ def observed_in(
     )
 
 
-def _places(found: ImageKeypoints, model: ModelKeypoints) -> list[int | None]:
-    """For each of the image's keypoints the model's row; None where the model has it not."""
+def _match_rows(found: ImageKeypoints, model: ModelKeypoints) -> list[int | None]:
+    """The model's row for each of the image's keypoints; None if the model lacks it."""
     if found.names is not None:
         rows = {plain_name(name): row for row, name in enumerate(model.names)}
         return [rows.get(plain_name(name)) for name in found.names]
@@ -290,16 +292,16 @@ def _places(found: ImageKeypoints, model: ModelKeypoints) -> list[int | None]:
         return [by_id.get(number) for number in found.ids]
     if len(found) != len(model):
         what = f"{len(found)} keypoints without names, but the model has {len(model)}"
-        fix = "give names, or as many keypoints as the model has, in its order"
+        fix = "give names, or all of the model's keypoints in its order"
         raise DataError(what, where=found.source, fix=fix)
     return list(range(len(found)))
 
 
 def plain_name(name: str) -> str:
-    """A keypoint's name without what does not count: capitals, and spaces for ``_`` and ``-``."""
+    """Normalise a keypoint's name for comparison: lower case, spaces for ``_`` and ``-``."""
     return " ".join(name.casefold().replace("_", " ").replace("-", " ").split())
 
 
 def some_of(names: Sequence[str]) -> str:
-    """The first of some names, for a message."""
+    """List the first five names, for a message."""
     return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")

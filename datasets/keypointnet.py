@@ -42,9 +42,9 @@ logger = logging.getLogger("cadalign")
 ModelKey = tuple[str, str]
 """A category's name and a model's id."""
 
-# Folders of meshes below the root: KeypointNet's own, as PLY, and those in ShapeNet's layout.
+# Folders of meshes below the root: KeypointNet's PLY files, and folders in ShapeNet's layout.
 _PLY_FOLDER, _SHAPENET_FOLDERS = "ShapeNetCore.v2.ply", ("models", "ShapeNetCore.v2")
-# KeypointNet's file of all categories, beside those of each.
+# KeypointNet's file of all categories, beside the files per category.
 _ALL = "all"
 # Real annotations match their meshes to 1e-6 of a model with the diagonal 1.
 _MATCH_TOLERANCE = 1e-3
@@ -57,15 +57,15 @@ class AnnotatedModel:
     category: str
     """The category's name, such as "chair"."""
     class_id: str
-    """Its synset id, such as "03001627"."""
+    """The category's synset id, such as "03001627"."""
     model_id: str
     """The model's id."""
     keypoints: Keypoints
     """The annotated points."""
     symmetries: Symmetries
-    """Which of them trade places under reflections and rotations."""
+    """The annotated symmetries of the points."""
     mesh_path: Path | None
-    """The mesh file, None where there is none."""
+    """The mesh file, or None."""
 
     @property
     def key(self) -> ModelKey:
@@ -74,7 +74,7 @@ class AnnotatedModel:
 
     @property
     def symmetry(self) -> Symmetry:
-        """The rotations that map the model onto itself, as far as its annotation shows them."""
+        """The rotations that map the model onto itself, derived from its annotation."""
         return annotated_symmetry(self.keypoints.xyz, self.symmetries)
 
     def load_mesh(self, *, check: bool = True) -> Mesh:
@@ -83,13 +83,13 @@ class AnnotatedModel:
         Parameters
         ----------
         check : bool
-            Whether the keypoints must lie on it where the annotation says, to 1e-3 of its
-            diagonal. Meshes of another version of ShapeNet fail this.
+            Whether to check that the keypoints lie at their annotated places on the mesh, within
+            1e-3 of its diagonal. Meshes of another version of ShapeNet fail this check.
 
         Raises
         ------
         DataError
-            If there is no mesh, it cannot be read, or the keypoints do not lie on it.
+            If the mesh is missing, cannot be read, or fails the check.
         """
         where = f"{self.category}, model {self.model_id}"
         if self.mesh_path is None:
@@ -98,7 +98,7 @@ class AnnotatedModel:
         mesh = load_mesh(self.mesh_path)
         if not check:
             return mesh
-        fix = "is the mesh ShapeNetCore.v2's? check=False loads it all the same"
+        fix = "give the mesh of ShapeNetCore.v2, or load this one with check=False"
         try:
             rebuilt = self.keypoints.on_mesh(mesh)
         except InputError as error:
@@ -106,18 +106,18 @@ class AnnotatedModel:
         gaps = np.linalg.norm(rebuilt - self.keypoints.xyz, axis=1)
         worst = int(np.argmax(gaps))
         low, high = mesh.bounds
-        # Not <=, so that NaN, which a face index on a damaged mesh can give, does not pass.
+        # "not <=" also refuses NaN, which a damaged mesh can give.
         if not gaps[worst] <= _MATCH_TOLERANCE * np.linalg.norm(high - low):
             raise DataError(
-                f"keypoints[{worst}] lies {gaps[worst]:.3g} off the place that its face and "
-                f"barycentric coordinates name in {mesh.source}",
+                f"keypoints[{worst}] lies {gaps[worst]:.3g} from the point that its face and "
+                f"barycentric coordinates give in {mesh.source}",
                 where=where,
                 fix=fix,
             )
         return mesh
 
 
-# One category's models, or why one could not be read, by id in file order.
+# A category's models by id, in file order; an error for each that could not be read.
 _Models = dict[str, AnnotatedModel | DataError]
 
 
@@ -131,26 +131,25 @@ class KeypointNet:
         ShapeNetCore.v2.ply/<synset>/<model id>.ply                          meshes, either here
         models/<synset>/<model id>/models/model_normalized.obj               or here
 
-    A category is read when it is first asked for, a mesh when `AnnotatedModel.load_mesh` is
-    called. Categories come sorted, models in file order.
+    A category is read on first access, a mesh when `AnnotatedModel.load_mesh` is called.
+    Categories are sorted, models are in file order.
 
-    A model whose annotation is malformed does not stop the others. Iterating, ``len`` and
-    ``dataset["chair"]`` give the readable models only, with a warning for each of the others
-    (logger "cadalign"); `problems` holds the reasons. `ids` names all models, and asking for a
-    malformed one by its id raises the reason.
+    Models with a malformed annotation are skipped with a warning (logger "cadalign") by iteration,
+    ``len`` and ``dataset["chair"]``. `problems` holds their errors, and `ids` includes them.
+    Access by id raises the error.
 
     Parameters
     ----------
     root : str or path-like
         The folder.
     shapenet_root : str or path-like, optional
-        ShapeNetCore, for the meshes; comes before the meshes below ``root``. KeypointNet was
-        annotated on version 2, whose faces and coordinates are not version 1's.
+        ShapeNetCore's folder; its meshes take precedence over those below ``root``. KeypointNet
+        was annotated on version 2; version 1 has other faces and coordinates.
 
     Raises
     ------
     DataError
-        If there is no such folder, or no annotations in it.
+        If the folder is missing or has no annotations.
 
     Examples
     --------
@@ -168,7 +167,7 @@ class KeypointNet:
             raise DataError("no such folder", where=str(self.root), fix="give KeypointNet's root")
         given = [] if shapenet_root is None else [ShapeNet(shapenet_root).root]
         below = (self.root / name for name in _SHAPENET_FOLDERS)
-        # Where a model's mesh may be, as what stands before and after <synset>/<model id>.
+        # Possible paths of a mesh: the parts before and after <synset>/<model id>.
         self._mesh_places = [
             *((folder, f"/{file}") for folder in given for file in MESH_FILES),
             (self.root / _PLY_FOLDER, ".ply"),
@@ -187,22 +186,22 @@ class KeypointNet:
 
     @property
     def splits(self) -> tuple[str, ...]:
-        """The names of the splits there are, sorted."""
+        """Names of the splits, sorted."""
         return tuple(path.stem for path in listed(self.root / "splits", "*.txt"))
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The files of annotations and splits."""
+        """Paths of the annotation and split files."""
         folders = (self.root / "annotations", "*.json"), (self.root / "splits", "*.txt")
         return tuple(path for folder, ending in folders for path in folder.glob(ending))
 
     def split(self, name: str) -> frozenset[ModelKey]:
-        """The (category, model id) that a split names, annotated or not.
+        """Read the (category, model id) listed in a split, with or without annotation.
 
         Raises
         ------
         InputError
-            If there is no such split.
+            If the split does not exist.
         DataError
             If a line of its file is not ``<synset>-<model id>``.
         """
@@ -225,16 +224,16 @@ class KeypointNet:
         split: str | None = None,
         with_mesh: bool = False,
     ) -> KeypointNet:
-        """A dataset of some of the models, which shares what has been read.
+        """Select some of the models; the subset shares the data already read.
 
         Parameters
         ----------
         categories : iterable of str, optional
-            Names or synset ids; by default all.
+            Names or synset ids; by default all categories.
         split : str, optional
             A split's name; by default all models.
         with_mesh : bool
-            Whether to leave out models without a mesh file.
+            Whether to select only models with a mesh file.
 
         Raises
         ------
@@ -252,9 +251,9 @@ class KeypointNet:
         return chosen
 
     def ids(self, category: str | None = None) -> tuple[ModelKey, ...]:
-        """(category, model id) of all models, also of malformed ones; of one category or all.
+        """List the (category, model id) of one category or all, with malformed models.
 
-        An entry without a model id goes by its position: ``("chair", "#17")``.
+        An entry without a model id is named by its position: ``("chair", "#17")``.
         """
         names = self.categories if category is None else (self._require(category),)
         return tuple((name, model_id) for name in names for model_id in self._models(name))
@@ -279,9 +278,9 @@ class KeypointNet:
         Raises
         ------
         InputError
-            If there is no such category or model.
+            If the category or model does not exist.
         DataError
-            If the category's file, or that model's annotation, is malformed.
+            If the category's file or the model's annotation is malformed.
         """
         if not isinstance(key, tuple):
             models = self._models(self._require(key)).values()
@@ -289,7 +288,7 @@ class KeypointNet:
         name, model_id = self._require(key[0]), key[1]
         found = self._load(name).get(model_id)
         if isinstance(found, DataError):
-            # A copy: the raised one keeps the frames that it passes through alive.
+            # A copy: a raised error keeps its stack frames alive.
             raise copy.copy(found)
         if found is None or not self._has(name, model_id):
             raise InputError(f"no model {model_id!r} of {name!r}", where=str(self.root))
@@ -327,7 +326,7 @@ class KeypointNet:
         return next((Path(path) for path in paths if os.path.isfile(path)), None)
 
     def _load(self, category: str) -> _Models:
-        """All models of a category, whose file is read once, also for subsets."""
+        """Read all models of a category, once for the data set and its subsets."""
         if category in self._loaded:
             return self._loaded[category]
         path, models = self._files[category], dict[str, AnnotatedModel | DataError]()

@@ -1,6 +1,6 @@
-"""Keypoints and symmetries of a model, and KeypointNet's annotation files, which hold them.
+"""Keypoints and symmetries of a model, and their entries in KeypointNet's annotation files.
 
-Files are read model by model, so that one bad model spoils no other.
+Each model's entry is parsed alone, so a malformed entry does not affect other models.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from cadalign.io.documents import (
 _FIX = "repair or remove this model's annotation"
 # Real barycentric coordinates sum to 0.999 ... 1.001.
 _SUM_TOLERANCE = 0.01
-_EQUIVALENT = 0.03  # of the keypoints' extent: how well people place equivalent keypoints
-_OF_WAY = 0.2  # the same, of how far the rotation takes a keypoint
-_STILL = 1e-12  # square of a way that is none
+_TOLERANCE = 0.03  # accuracy of annotated keypoints [their extent]
+_MOTION_TOLERANCE = 0.2  # the same [distance that the rotation moves the keypoint]
+_NO_MOTION = 1e-12  # squared distance below which a keypoint does not move
 _FOLDS = (2, 3, 4, 5, 6, 8)
 _AXIS_TOLERANCE_DEG = 10.0
-# Whose powers are numbers, also in single precision.
+# Powers of these stay finite, also in single precision.
 _Coordinate = Annotated[float, Meta(ge=-1e30, le=1e30)]
 _Place = tuple[_Coordinate, _Coordinate, _Coordinate]
 
@@ -47,58 +47,58 @@ class Keypoints:
     xyz: FloatArray
     """(k, 3), positions [model units]."""
     ids: IntArray
-    """(k,), which keypoint of its category each one is; no id occurs twice."""
+    """(k,), semantic id of each keypoint within its category; no id occurs twice."""
     face_index: IntArray
-    """(k,), the face that each one lies on, numbered as in the mesh file."""
+    """(k,), the face that each keypoint lies on, numbered as in the mesh file."""
     barycentric: FloatArray
-    """(k, 3), where on that face: weights of its corners in file order, of sum 1."""
+    """(k, 3), place on the face: weights of its corners in file order, with sum 1."""
 
     def __len__(self) -> int:
         return len(self.xyz)
 
     def __iter__(self) -> Iterator[tuple[int, FloatArray]]:
-        """The id and the position (3,) of each keypoint."""
+        """Iterate over the (id, position (3,)) of each keypoint."""
         return zip(self.ids.tolist(), self.xyz, strict=True)
 
     def on_mesh(self, mesh: Mesh) -> FloatArray:
-        """The same points rebuilt from faces and barycentric coordinates, (k, 3) float.
+        """Compute the positions from faces and barycentric coordinates, (k, 3) float.
 
-        Raises InputError if the mesh has fewer faces than the annotation names.
+        Raises InputError if a face index is not a face of the mesh.
         """
         return mesh.surface_points(self.face_index, self.barycentric)
 
 
 @dataclass(frozen=True, eq=False)
 class Circle:
-    """A circle that keypoints of equal rank lie on, such as a bottle's rim."""
+    """A circle of equivalent keypoints, such as a bottle's rim."""
 
     center: FloatArray
-    """(3,), [model units]."""
+    """(3,), the centre [model units]."""
     radius: float
-    """[model units]."""
+    """The radius [model units]."""
     normal: FloatArray
-    """(3,), the axis, of length 1."""
+    """(3,), unit vector along the axis."""
 
 
 @dataclass(frozen=True)
 class RotationalSymmetry:
-    """Keypoints that a rotation of the object takes to one another."""
+    """Keypoints that a rotation of the object permutes."""
 
     keypoints: tuple[int, ...]
-    """Their rows in `Keypoints` (not their semantic ids)."""
+    """Rows of the keypoints in `Keypoints` (not semantic ids)."""
     circle: Circle | None = None
-    """Where the object looks the same under any rotation about the circle's axis; None where only
-    some rotations take it to itself, as the five feet of an office chair."""
+    """The keypoints' circle, if the object is symmetric under any rotation about its axis. None if
+    only some rotations are symmetries, as with the five feet of an office chair."""
 
 
 @dataclass(frozen=True)
 class Symmetries:
-    """The symmetries of a model as far as its keypoints show them."""
+    """The annotated symmetries of a model's keypoints."""
 
     reflections: tuple[tuple[int, int], ...] = ()
-    """Keypoints that mirror each other, as rows in `Keypoints` (not semantic ids)."""
+    """Pairs of keypoints that a reflection exchanges, as rows in `Keypoints` (not semantic ids)."""
     rotations: tuple[RotationalSymmetry, ...] = ()
-    """Keypoints that a rotation takes to one another."""
+    """Groups of keypoints that a rotation permutes."""
 
 
 # Annotation files -------------------------------------------------------------------------------
@@ -128,7 +128,7 @@ class _Circle(ForeignDocument):
 
     def __post_init__(self) -> None:
         if not any(self.normal):
-            raise InputError("has no length", where="normal")
+            raise InputError("the vector has length 0", where="normal")
 
 
 class _Reflection(ForeignDocument):
@@ -147,8 +147,6 @@ class _Symmetries(ForeignDocument):
 
 
 class _Entry(ForeignDocument):
-    """One model's object in an annotation file."""
-
     class_id: Id
     model_id: Id
     keypoints: Annotated[list[_Keypoint], Meta(min_length=1)]
@@ -161,21 +159,21 @@ class _Entry(ForeignDocument):
                 beyond = [row for row in item.kp_indexes if row >= len(self.keypoints)]
                 if beyond:
                     raise InputError(
-                        f"{beyond[0]} is not the row of one of the {len(self.keypoints)} keypoints",
+                        f"there is no row {beyond[0]} of {len(self.keypoints)} keypoints",
                         where=f"symmetries.{kind}[{position}].kp_indexes",
                     )
 
 
 def entry_id(entry: Any, position: int) -> str:
-    """An entry's model id, or ``#position`` where it has none."""
+    """Return an entry's model id, or ``#position`` if it has none."""
     model_id = entry.get("model_id") if isinstance(entry, dict) else None
     return model_id if isinstance(model_id, str) and model_id else f"#{position}"
 
 
 def parse_entry(entry: Any, *, where: str) -> tuple[str, str, Keypoints, Symmetries]:
-    """Class id, model id, keypoints and symmetries of a model's entry, parsed JSON.
+    """Parse a model's entry: class id, model id, keypoints and symmetries.
 
-    ``where`` is file and model id, for messages.
+    ``entry`` is parsed JSON; ``where`` names file and model in messages.
     """
     try:
         read: _Entry = convert(entry, _Entry)
@@ -189,10 +187,10 @@ def parse_entry(entry: Any, *, where: str) -> tuple[str, str, Keypoints, Symmetr
 def _keypoints(entries: list[_Keypoint]) -> Keypoints:
     weights = np.array([entry.mesh_info.face_uv for entry in entries])
     return Keypoints(
-        xyz=_frozen([entry.xyz for entry in entries]),
-        ids=_frozen([entry.semantic_id for entry in entries]),
-        face_index=_frozen([entry.mesh_info.face_index for entry in entries]),
-        barycentric=_frozen(weights / weights.sum(axis=1, keepdims=True)),
+        xyz=_freeze([entry.xyz for entry in entries]),
+        ids=_freeze([entry.semantic_id for entry in entries]),
+        face_index=_freeze([entry.mesh_info.face_index for entry in entries]),
+        barycentric=_freeze(weights / weights.sum(axis=1, keepdims=True)),
     )
 
 
@@ -203,69 +201,67 @@ def _symmetries(read: _Symmetries) -> Symmetries:
         if item.is_circle:
             found = convert(item.circle, _Circle, where=f"symmetries.rotation[{row}].circle")
             normal = np.array(found.normal)
-            normal /= np.abs(normal).max()  # whose square is finite
-            normal = _frozen(normal / np.linalg.norm(normal))
-            circle = Circle(_frozen(found.center), found.radius, normal)
+            normal /= np.abs(normal).max()  # so that its square is finite
+            normal = _freeze(normal / np.linalg.norm(normal))
+            circle = Circle(_freeze(found.center), found.radius, normal)
         rotations.append(RotationalSymmetry(keypoints=tuple(item.kp_indexes), circle=circle))
     return Symmetries(tuple(item.kp_indexes for item in read.reflection), tuple(rotations))
 
 
-def _frozen(values: Any) -> Any:
+def _freeze(values: Any) -> Any:
     return read_only(np.array(values))
 
 
 def annotated_symmetry(xyz: FloatArray, symmetries: Symmetries) -> Symmetry:
-    """The symmetry of a model with the keypoints (k, 3): the rotations that map it onto itself.
+    """Find the rotations that map a model with the keypoints (k, 3) onto itself.
 
-    By this rule:
+    The axis of a circle (`RotationalSymmetry.circle`) is an axis of revolution if every keypoint
+    lies on the axis or on an annotated circle about it. A handle or a spout rules this out.
 
-    - A circle (`RotationalSymmetry.circle`) makes its axis an axis of revolution if every keypoint
-      lies on that axis or is on an annotated circle about it. A handle or a spout therefore rules
-      it out.
-    - Otherwise a rotation about one of the model's coordinate axes, through the mean of the
-      keypoints, by 180, 120, 90, 72, 60 or 45 degrees or a multiple of it, is a symmetry if it
-      takes every keypoint to an equivalent one or to itself, to within 3 % of the keypoints'
-      extent, and some to another.
-      Keypoints are equivalent that stand in one annotated rotation, or that a chain of two or more
-      annotated reflections joins. The five feet of an office chair make no symmetry of the chair:
-      its back is not mapped onto itself.
+    Without such an axis, candidates are rotations about the model's coordinate axes through the
+    mean of the keypoints, by multiples of 180, 120, 90, 72, 60 or 45 degrees. A candidate is a
+    symmetry if it maps every keypoint to an equivalent keypoint or to itself, within 3 % of the
+    keypoints' extent, and moves at least one to another. Two keypoints are equivalent if they
+    belong to one annotated rotation, or if two or more annotated reflections connect them. The
+    five feet of an office chair do not make it symmetric: its back is not mapped onto itself.
 
-    A reflection alone is no rotation, and an alignment never mirrors a model, so no two alignments
-    differ by one. Two reflections make a rotation, which the rule finds.
+    A single reflection gives no symmetry, because an alignment never mirrors a model. The product
+    of two reflections is a rotation and is found.
     """
     if not symmetries.reflections and not symmetries.rotations:
         return Symmetry.none()
-    tolerance = _EQUIVALENT * float(np.linalg.norm(np.ptp(xyz, axis=0)))
+    tolerance = _TOLERANCE * float(np.linalg.norm(np.ptp(xyz, axis=0)))
     revolution = _axis_of_revolution(xyz, symmetries, tolerance)
     if revolution is not None:
         center, axis = revolution
         return Symmetry.around(axis, fold=None, offset=center)
-    equivalent = _equivalent(len(xyz), symmetries)
-    if equivalent.sum() == len(xyz):  # each to itself alone, as with a single reflection
+    equivalent = _equivalence(len(xyz), symmetries)
+    if equivalent.sum() == len(xyz):  # each only to itself, as with a single reflection
         return Symmetry.none()
-    center, rotations = xyz.mean(axis=0), _candidates()
-    kept = _onto_themselves(xyz - center, equivalent, rotations, tolerance)
+    center, rotations = xyz.mean(axis=0), _candidate_rotations()
+    kept = _find_symmetries(xyz - center, equivalent, rotations, tolerance)
     return Symmetry(center, rotations[kept])
 
 
-def _onto_themselves(
+def _find_symmetries(
     points: FloatArray, equivalent: BoolArray, rotations: FloatArray, tolerance: float
 ) -> BoolArray:
-    """Mask (g,) of the rotations (g, 3, 3) that map the centred points (k, 3) onto one another.
+    """Find the rotations (g, 3, 3) that permute the centred points (k, 3); returns a mask (g,).
 
-    A rotation takes each point to the nearest that is ``equivalent`` (k, k) to it: to within the
-    tolerance and, as on a thin model a wrong angle is within that, to within a share of the way
-    between the two points. No two points go to the same, and not all stay where they are.
+    A rotation maps each point to the nearest point that is ``equivalent`` (k, k) to it. Their gap
+    must be within the tolerance, and within a share of the distance between the two points: on a
+    thin model, a wrong angle can be within the tolerance. At least one point must move, and no two
+    points may map to the same point.
     """
     rows = np.arange(len(points))
     squares = (points**2).sum(axis=1)
     lengths = squares[:, None] + squares
-    # Rotations keep lengths: squares of distances follow from products alone.
+    # Rotations keep lengths, so squared distances follow from dot products.
     gaps = lengths - 2 * (points @ rotations.transpose(0, 2, 1)) @ points.T
     gaps = np.where(equivalent, gaps, np.inf)
     nearest = gaps.argmin(axis=2)
     gap, way = gaps.min(axis=2), (lengths - 2 * points @ points.T)[rows, nearest]
-    is_near = (gap <= tolerance**2) & ((gap <= _OF_WAY**2 * way) | (way < _STILL))
+    is_near = (gap <= tolerance**2) & ((gap <= _MOTION_TOLERANCE**2 * way) | (way < _NO_MOTION))
     is_reached_once = (np.diff(np.sort(nearest, axis=1), axis=1) > 0).all(axis=1)
     moves = (nearest != rows).any(axis=1)
     return np.asarray(is_near.all(axis=1) & is_reached_once & moves)
@@ -274,7 +270,7 @@ def _onto_themselves(
 def _axis_of_revolution(
     xyz: FloatArray, symmetries: Symmetries, tolerance: float
 ) -> tuple[FloatArray, FloatArray] | None:
-    """A point on the axis and the axis' direction, or None."""
+    """Find the axis of revolution: a point on it and its direction, or None."""
     circles = [(r.keypoints, r.circle) for r in symmetries.rotations if r.circle is not None]
     if not circles:
         return None
@@ -301,14 +297,14 @@ def _axis_of_revolution(
     return center, axis
 
 
-def _equivalent(count: int, symmetries: Symmetries) -> BoolArray:
-    """Mask (k, k) of the keypoints that a rotation may take to one another."""
+def _equivalence(count: int, symmetries: Symmetries) -> BoolArray:
+    """Mask (k, k) of the pairs of keypoints that a rotation may map onto each other."""
     orbits = list(range(count))
     for first, second in symmetries.reflections:
         joined, left = orbits[first], orbits[second]
         orbits = [joined if orbit == left else orbit for orbit in orbits]
     labels = np.array(orbits)
-    # A pair that mirrors each other joins with no third keypoint: that is one reflection only.
+    # A group of two is a single reflection, which is not a rotation.
     equivalent = (labels[:, None] == labels) & (np.bincount(labels, minlength=count)[labels] > 2)
     for rotation in symmetries.rotations:
         rows = np.array(rotation.keypoints, dtype=np.int64)
@@ -317,8 +313,8 @@ def _equivalent(count: int, symmetries: Symmetries) -> BoolArray:
 
 
 @cache
-def _candidates() -> FloatArray:
-    """Rotations (g, 3, 3) about the coordinate axes, but for the identity."""
+def _candidate_rotations() -> FloatArray:
+    """Rotations (g, 3, 3) about the coordinate axes, without the identity."""
     turns = sorted({k / fold for fold in _FOLDS for k in range(1, fold)})
     return np.array(
         [rotation_from_vector(2 * np.pi * t * axis) for axis in np.eye(3) for t in turns]

@@ -1,6 +1,6 @@
-"""A model's keypoints with their names, as a file beside the model: `chair.keypoints.json`.
+"""Named keypoints of a model and their file beside the model, `chair.keypoints.json`.
 
-The file is described in docs/formats/files.md.
+docs/formats/files.md describes the file.
 """
 
 from __future__ import annotations
@@ -32,22 +32,18 @@ from cadalign.io.files import as_path, write_json
 from cadalign.io.kinds import MESH_ENDINGS, MODEL_KEYPOINTS
 
 SUFFIX = ".keypoints.json"
-"""What the file of ``chair.obj`` ends in: ``chair.keypoints.json``."""
+"""Ending of a keypoint file: ``chair.obj`` has ``chair.keypoints.json``."""
 
 _WANTED = "give a file of model keypoints; see cadalign.datasets.ModelKeypoints"
 
 
 class _Entry(Document, kw_only=True):
-    """One keypoint of the file, as the module's documentation describes it."""
-
     semantic_id: Index | None = None
     name: Text
     xyz: Point3
 
 
 class _File(Document):
-    """The file's only object."""
-
     format: Literal["cadalign model keypoints"]
     version: Literal[1]
     keypoints: list[_Entry]
@@ -59,11 +55,11 @@ class ModelKeypoint:
     """One named point on a model."""
 
     name: str
-    """What the point is called."""
+    """Name of the point."""
     xyz: tuple[float, float, float]
-    """(3,), where it lies [model units]."""
+    """(3,), its position [model units]."""
     semantic_id: int | None = None
-    """Its number within the model's category."""
+    """Its semantic id within the model's category."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +103,7 @@ class ModelKeypoints:
 
     @property
     def ids(self) -> tuple[int | None, ...]:
-        """The keypoints' numbers within the category."""
+        """Semantic ids of the keypoints; None if it has none."""
         return tuple(keypoint.semantic_id for keypoint in self.keypoints)
 
     @property
@@ -117,7 +113,7 @@ class ModelKeypoints:
 
     @classmethod
     def of_model(cls, model: AnnotatedModel) -> ModelKeypoints:
-        """The keypoints of a model of KeypointNet, named by their ids, such as "keypoint 3"."""
+        """Name the keypoints of a KeypointNet model by their ids, such as "keypoint 3"."""
         rows = zip(model.keypoints.ids.tolist(), model.keypoints.xyz.tolist(), strict=True)
         keypoints = (ModelKeypoint(f"keypoint {k}", tuple(xyz), k) for k, xyz in rows)
         return cls(tuple(keypoints), model.mesh_path)
@@ -129,13 +125,13 @@ class ModelKeypoints:
         Parameters
         ----------
         path : str or path-like
-            A file as described in docs/formats/files.md; or a mesh, beside which such a
-            file lies.
+            A file as described in docs/formats/files.md, or a mesh with such a file beside
+            it.
 
         Raises
         ------
         DataError
-            If the file is missing, is not JSON, of another format or version, or a field is
+            If the file is missing, is not JSON, has another format or version, or a field is
             missing, unknown or invalid; the message names file and field.
         """
         path = as_path(path)
@@ -153,12 +149,12 @@ class ModelKeypoints:
             return cls(tuple(keypoints), model)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a file of model keypoints; the model's path is written relative to it.
+        """Write a file of model keypoints, with the model's path relative to it.
 
         Raises
         ------
         DataError
-            If it cannot be written.
+            If the file cannot be written.
         """
         path = as_path(path)
         data: dict[str, Any] = {"format": "cadalign model keypoints", "version": 1}

@@ -25,7 +25,7 @@ from cadalign.datasets.photo import (
     PhotoKeypoints,
     PhotoObject,
     Truth,
-    first_existing,
+    find_first_file,
     read_each,
 )
 from cadalign.errors import DataError, InputError, brief
@@ -50,7 +50,7 @@ _FILES = f"{ANNOTATIONS}/*/*.mat"
 _MOST_VERTICES = 2**31
 # MATLAB counts pixels from 1.
 _FIRST_PIXEL = 1.0
-# The focal length, in pixels, that annotations without one were made with.
+# Default focal length of annotations [px].
 _VIEWPORT = 3000.0
 _VISIBLE = 1
 _CAD_FOLDERS = ("CAD", "cad")
@@ -90,11 +90,11 @@ class Pascal3D(PhotoDataset):
         Images/<category>_<source>/<image>.jpg         or .JPEG
         CAD/<category>.mat
 
-    The focal length of the photos is not known. Viewpoints were annotated under a conventional one
-    (3000 px) and with the principal point at the object: `Truth.camera` is that camera, under
-    which `Truth.cam_from_model` fits the photo. Its rotation counts; lengths have no unit. Objects
-    without a continuous viewpoint (distance 0) have no pose. Anchors that are visible are the
-    keypoints. Only the objects of the folder's category are taken.
+    The photos' focal lengths are unknown. Viewpoints were annotated with a conventional focal
+    length of 3000 px and the principal point at the object. `Truth.camera` is this camera, and
+    `Truth.cam_from_model` fits the photo under it. The rotation is meaningful; lengths have no
+    unit. Objects without a continuous viewpoint (distance 0) have no pose. Keypoints are the
+    visible anchors. Objects of other categories than the folder's are left out.
 
     Raises DataError if there are no annotations.
     """
@@ -115,11 +115,11 @@ class Pascal3D(PhotoDataset):
         super().__init__(folder, names)
 
     def read(self, index: int) -> Photo:
-        """Read the photo of a number from 0."""
+        """Read the photo at a position, counted from 0."""
         path = self._files[index]
         record = read_structs(path, "record")[0]
         name = self.names[index]
-        image = first_existing(self.root / _IMAGES / f"{name}{end}" for end in _ENDINGS)
+        image = find_first_file(self.root / _IMAGES / f"{name}{end}" for end in _ENDINGS)
         if image is None:
             raise DataError(f"its image is not in {_IMAGES}", where=str(path))
         camera = Camera.without_focal(*photo_size(image))
@@ -130,14 +130,14 @@ class Pascal3D(PhotoDataset):
             return _object(number, shown, camera, self.root) if is_of_folder else None
 
         objects, problems = read_each(
-            structs_of(record.get("objects")), read_object, where=str(path)
+            list_structs(record.get("objects")), read_object, where=str(path)
         )
         return Photo(name, image, camera, objects, problems=problems)
 
 
 def cad_model(root: Path, category: str, index: int) -> CadModel | None:
-    """The CAD model of a number from 1; None where the category has no file."""
-    path = first_existing(root / folder / f"{category}.mat" for folder in _CAD_FOLDERS)
+    """The CAD model of an index from 1; None if the category has no file."""
+    path = find_first_file(root / folder / f"{category}.mat" for folder in _CAD_FOLDERS)
     if path is None:
         return None
     which = path, category, index
@@ -170,10 +170,10 @@ def _anchors(anchors: dict[str, _Anchor | None]) -> PhotoKeypoints | None:
 
 
 def _truth(viewpoint: dict[str, Any], camera: Camera) -> Truth:
-    """The pose, as PASCAL3D+'s ``project_3d.m`` projects the model.
+    """Compute the pose as in PASCAL3D+'s ``project_3d.m``.
 
-    The camera stands at azimuth, elevation and distance around the model, looks at its origin along
-    -z with y up, and is then turned by theta about its axis.
+    The camera's position is given by azimuth, elevation and distance from the model's origin. The
+    camera looks at the origin along -z with y up, and is then turned by theta about its axis.
     """
     if not viewpoint.get("distance"):
         return Truth()
@@ -197,9 +197,9 @@ def _truth(viewpoint: dict[str, Any], camera: Camera) -> Truth:
 # CAD models -------------------------------------------------------------------------------------
 
 
-# A category's file has a variable of the category's name: a struct array with ``vertices``,
+# A category's file has a variable with the category's name: a struct array with ``vertices``,
 # ``faces`` (from 1), ``pnames`` and one field per named anchor. x is lateral, y along the length,
-# z up. Models have numbers from 1, as in the annotations.
+# z up. Models are counted from 1, as in the annotations.
 
 
 def _load_mesh(path: Path, category: str, index: int) -> Mesh:
@@ -208,7 +208,7 @@ def _load_mesh(path: Path, category: str, index: int) -> Mesh:
     with in_file(where):
         vertices, faces = _rows(found, "vertices"), _rows(found, "faces")
         if not (np.abs(faces) < _MOST_VERTICES).all():
-            raise InputError("has entries that are no numbers of vertices", where="faces")
+            raise InputError("vertex indices are out of range", where="faces")
         return Mesh(vertices, faces.astype(np.int64) - 1, source=where)
 
 
@@ -223,7 +223,7 @@ def _load_keypoints(path: Path, category: str, index: int) -> NamedPoints | None
 
 
 def _rows(found: dict[str, Any], name: str) -> FloatArray:
-    """A field of points or triangles (k, 3); MATLAB's only row has one dimension."""
+    """A field of points or triangles (k, 3); a single row is read as one-dimensional."""
     rows = np.array(found.get(name), dtype=object)
     return as_floats(rows.reshape(1, -1) if rows.ndim < 2 else rows, name=name, shape=(None, 3))
 
@@ -239,17 +239,17 @@ def _find_cad(path: Path, category: str, index: int) -> dict[str, Any]:
 
 _HEADER = 128
 _COMPRESSED = 15
-# Of the largest variable when it is uncompressed, and beyond that for each byte of the file.
+# Size limit of an uncompressed variable: a constant, plus a multiple of the file's size.
 _FREE_BYTES, _EXPANSION = 2**26, 32
-_FIX = "get the file again; save one of MATLAB's version 7.3 with the option -v7"
+_FIX = "get the file again; if it has version 7.3, save it in MATLAB with -v7"
 
 
 def read_structs(path: Path, name: str) -> list[dict[str, Any]]:
-    """Read the struct, or the array of structs, that a .mat file holds under a name.
+    """Read a named struct or array of structs from a .mat file.
 
-    Structs are dictionaries, arrays of them and of texts are lists; what is empty is None.
+    Structs become dictionaries, arrays of structs or texts become lists, empty values become None.
 
-    Raises DataError if the file cannot be read, is none of MATLAB's up to version 7, or holds no
+    Raises DataError if the file cannot be read, is not a MATLAB file up to version 7, or has no
     such structs.
     """
     from scipy.io import loadmat, matlab  # takes a while to import
@@ -257,35 +257,35 @@ def read_structs(path: Path, name: str) -> list[dict[str, Any]]:
     data = read_bytes(path)
     try:
         if matlab.matfile_version(io.BytesIO(data))[0] == 1:
-            data = _uncompressed(data)
+            data = _decompress(data)
         found = loadmat(io.BytesIO(data), variable_names=[name], simplify_cells=True)
-    except Exception as error:  # damaged files make SciPy raise what it likes
+    except Exception as error:  # SciPy raises errors of any type on damaged files
         what = f"not a MATLAB file that can be read ({brief(error)})"
         raise DataError(what, where=str(path), fix=_FIX) from None
-    structs = structs_of(_plain(found.get(name)))
+    structs = list_structs(_simplify(found.get(name)))
     if not structs:
         raise DataError(f"there are no structs named {name} in this file", where=str(path))
     return structs
 
 
-def structs_of(value: Any) -> list[dict[str, Any]]:
-    """The structs of a field: one is no list."""
+def list_structs(value: Any) -> list[dict[str, Any]]:
+    """The structs of a field as a list; a single struct is not stored as a list."""
     values = value if isinstance(value, list) else [value]
     return [each for each in values if isinstance(each, dict)]
 
 
-def _plain(value: Any) -> Any:
+def _simplify(value: Any) -> Any:
     if isinstance(value, dict):
-        return {name: _plain(each) for name, each in value.items()}
+        return {name: _simplify(each) for name, each in value.items()}
     if isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype == object):
-        return [_plain(each) for each in value] or None
+        return [_simplify(each) for each in value] or None
     return None if np.size(value) == 0 else value
 
 
-def _uncompressed(data: bytes) -> bytes:
-    """A file of version 5 to 7 whose variables are uncompressed, and their checksums compared.
+def _decompress(data: bytes) -> bytes:
+    """Decompress the variables of a file of version 5 to 7, and check their checksums.
 
-    SciPy compares them after it has read a variable, and what is damaged can crash it before.
+    SciPy compares checksums only after it has read a variable; damaged data can crash it before.
     """
     tag = "<II" if data[_HEADER - 2 : _HEADER] == b"IM" else ">II"
     most = _FREE_BYTES + _EXPANSION * len(data)
@@ -307,5 +307,5 @@ def _uncompressed(data: bytes) -> bytes:
     return b"".join(parts)
 
 
-# A category's file takes a second to read, and all of a category's objects need it.
+# A category's file takes a second to read, and all objects of the category need it.
 _models = lru_cache(maxsize=4)(read_structs)

@@ -1,4 +1,4 @@
-"""Photos of a data set: image, camera, and the objects in each with their truth."""
+"""Photos of a data set: image, camera, and objects with ground truth."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _Record = TypeVar("_Record")
 
 @dataclass(frozen=True, eq=False)
 class PhotoKeypoints:
-    """The keypoints of an object that are marked in a photo.
+    """Annotated keypoints of an object in a photo.
 
     Raises DataError if lengths don't match, InputError if a value is not finite.
     """
@@ -36,7 +36,7 @@ class PhotoKeypoints:
     points_2d: FloatArray
     """(k, 2), pixels; integers are pixel centres."""
     names: tuple[str, ...]
-    """(k,), what each one is called: the model's keypoint of the same name is the same point."""
+    """(k,), name of each keypoint; the model's keypoint of the same name is the same point."""
 
     def __post_init__(self) -> None:
         points = as_points(self.points_2d, name="keypoints", dimension=2)
@@ -52,8 +52,8 @@ class PhotoKeypoints:
 class NamedPoints:
     """Keypoints of a model."""
 
-    names: tuple[str, ...]  # (k,), what each one is called; no name occurs twice
-    xyz: FloatArray  # (k, 3), where they lie [model units]
+    names: tuple[str, ...]  # (k,), no name occurs twice
+    xyz: FloatArray  # (k, 3), positions [model units]
 
     def __len__(self) -> int:
         return len(self.names)
@@ -61,53 +61,52 @@ class NamedPoints:
 
 @dataclass(frozen=True, eq=False)
 class CadModel:
-    """The CAD model that an object is aligned with, read when it is asked for."""
+    """The CAD model annotated for an object; mesh and keypoints are read on access."""
 
     model_id: str
     """The model's id in its data set."""
     mesh: Mesh | Path | Callable[[], Mesh | None] | None = None
-    """The mesh, its file, or the function that reads it; None where there is none."""
+    """The mesh, its file, or a function that reads it; None if there is none."""
     keypoints: NamedPoints | Callable[[], NamedPoints | None] | None = None
-    """The named keypoints, or the function that reads them; None where there are none."""
+    """The named keypoints, or a function that reads them; None if there are none."""
     bounds: FloatArray | None = None
-    """(2, 3), the bounding box's lowest and highest corner, where the annotation gives it [model
-    units]."""
+    """(2, 3), lowest and highest corner of the annotated bounding box [model units], or None."""
 
     def find_mesh(self) -> Mesh | None:
-        """Read the mesh; None where there is none. Raises DataError if it cannot be read."""
+        """Read the mesh; None if there is none. Raises DataError if it cannot be read."""
         if isinstance(self.mesh, Path):
             return load_mesh(self.mesh)
         return self.mesh() if callable(self.mesh) else self.mesh
 
     def load_mesh(self) -> Mesh:
-        """Read the mesh; raises DataError if there is none, or it cannot be read."""
+        """Read the mesh; raises DataError if it is missing or cannot be read."""
         mesh = self.find_mesh()
         if mesh is None:
             raise DataError("there is no mesh of this model", where=f"model {self.model_id}")
         return mesh
 
     def load_keypoints(self) -> NamedPoints | None:
-        """Read the named keypoints; None where there are none. Raises DataError as `load_mesh`."""
+        """Read the named keypoints; None if there are none. Raises DataError as `find_mesh`."""
         return self.keypoints() if callable(self.keypoints) else self.keypoints
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The known parts of an object's pose; anything may be missing."""
+    """The annotated parts of an object's pose; any part may be missing."""
 
     cam_from_model: Alignment | None = None
-    """Pose and stretch of the CAD model in the camera frame, where all of it is annotated."""
+    """Pose and stretch of the CAD model in the camera frame; None unless all are annotated."""
     box: Box | None = None
     """The object's oriented box in the camera frame."""
     camera: Camera | None = None
-    """The camera that the pose was annotated with, where it is not the photo's: the pose fits the
-    photo under this camera, and its translation and focal length are conventions."""
+    """The camera that the pose was annotated with, if it is not the photo's. The pose fits the
+    photo under this camera, but its translation and this focal length are only conventions."""
     metres: float | None = None
-    """Length of one unit of the camera frame [m]; None where the size is not known."""
+    """Length of one unit of the camera frame [m]; None if the size is unknown."""
 
     @property
     def rotation(self) -> FloatArray | None:
-        """The rotation from model to camera, (3, 3) float; None where it is not known."""
+        """The rotation from model to camera, (3, 3) float; None if unknown."""
         return None if self.cam_from_model is None else self.cam_from_model.rotation
 
 
@@ -123,20 +122,20 @@ class PhotoObject:
     category: str
     """The data set's name of its category."""
     truth: Truth = field(default_factory=Truth)
-    """What is known of its pose."""
+    """The annotated pose."""
     keypoints: PhotoKeypoints | None = None
-    """Keypoints marked in the photo."""
+    """Keypoints annotated in the photo."""
     model: CadModel | None = None
     """The CAD model annotated for it."""
     symmetry: Symmetry = field(default_factory=_no_symmetry)
-    """Motions that take the model to itself."""
+    """Symmetry of the model."""
     mask_path: Path | None = None
-    """An image of the object's pixels; see `read_mask`."""
+    """Image file of the object's mask; see `read_mask`."""
     bbox: FloatArray | None = None
-    """(4,), left, top, right and bottom of its rectangle in the photo [px]."""
+    """(4,), left, top, right and bottom of its bounding box in the photo [px]."""
 
     def read_mask(self) -> BoolArray:
-        """Read the object's pixels, (h, w) bool; raises DataError if there are none."""
+        """Read the object's mask, (h, w) bool; raises DataError if there is none."""
         if self.mask_path is None:
             raise DataError("this object has no mask", where=f"object {self.object_id}")
         with open_photo(self.mask_path) as image:
@@ -148,31 +147,30 @@ class Photo:
     """One photo with the objects in it."""
 
     name: str
-    """The photo's name within its data set; no other has it."""
+    """The photo's unique name within its data set."""
     image: Path | None
-    """The image's file; None where it is not there."""
+    """The image file; None if it is missing."""
     camera: Camera | None
-    """Its camera, `Camera.without_focal` where the focal length is unknown; None where not even the
-    image's size is."""
+    """The camera, `Camera.without_focal` if the focal length is unknown; None if the image's size
+    is unknown, too."""
     objects: tuple[PhotoObject, ...]
     """The objects whose annotation could be read."""
     up: FloatArray | None = None
-    """(3,), the direction against gravity in the camera's frame, as a sensor or the rig
-    has it."""
+    """(3,), measured direction against gravity in the camera frame; None if unknown."""
     problems: tuple[DataError, ...] = ()
-    """Why further objects of this photo could not be read."""
+    """Errors of the photo's objects that could not be read."""
 
     def read_image(self) -> ByteImage:
-        """Read the photo's pixels, (h, w, 3) uint8; raises DataError if there are none."""
+        """Read the photo's pixels, (h, w, 3) uint8; raises DataError if the image is missing."""
         if self.image is None:
-            raise DataError("the image of this photo is not there", where=self.name)
+            raise DataError("the image file of this photo is missing", where=self.name)
         return read_photo(self.image)
 
 
 class PhotoDataset(RecordSet[Photo]):
     """A data set of photos; see `cadalign.datasets.records.RecordSet`.
 
-    Objects that could not be read in a photo are among the `problems`, too.
+    `problems` also holds the errors of single objects in a photo.
 
     Examples
     --------
@@ -184,16 +182,16 @@ class PhotoDataset(RecordSet[Photo]):
     kind = "photos"
     noun = "photo"
     patterns: tuple[str, ...] = ("*.json",)
-    """Patterns of the annotations' files, below the folder."""
+    """Patterns of the annotation files below the folder."""
 
     def __iter__(self) -> Iterator[Photo]:
         for photo in super().__iter__():
             for number, problem in enumerate(photo.problems):
-                self._tell(f"{photo.name}, problem {number + 1}", problem)
+                self._log_problem(f"{photo.name}, problem {number + 1}", problem)
             yield photo
 
     def annotation_files(self) -> list[Path]:
-        """List the files of the annotations, by which a run knows those that it began with."""
+        """List the annotation files; a run compares them to detect changes."""
         found = (path for pattern in self.patterns for path in self.root.glob(pattern))
         return sorted({path for path in found if path.is_file()})
 
@@ -201,10 +199,10 @@ class PhotoDataset(RecordSet[Photo]):
 def read_each(
     records: Iterable[_Record], read: Callable[[int, _Record], PhotoObject | None], *, where: str
 ) -> tuple[tuple[PhotoObject, ...], tuple[DataError, ...]]:
-    """Read a photo's objects, and the reasons why some could not be read.
+    """Read a photo's objects; returns the objects and the errors of those that failed.
 
-    ``read`` makes the object of a number and a record, None for one that is left out on purpose;
-    ``where`` is the place of the records, for messages.
+    ``read`` converts the record at a position to an object, or to None to leave it out. ``where``
+    is the place of the records, for messages.
     """
     found: list[PhotoObject] = []
     problems: list[DataError] = []
@@ -224,9 +222,9 @@ def read_each(
 
 
 def read_matrix(path: Path, shape: tuple[int | None, int]) -> FloatArray:
-    """Read a text file of a matrix, a row on each line; None for any number of rows.
+    """Read a text file of a matrix, one row per line; None allows any number of rows.
 
-    Raises DataError if it cannot be read, or is not a matrix of finite numbers of this shape.
+    Raises DataError if the file cannot be read, or is not a finite matrix of this shape.
     """
     rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
     try:
@@ -238,10 +236,10 @@ def read_matrix(path: Path, shape: tuple[int | None, int]) -> FloatArray:
 
 
 def existing(path: Path) -> Path | None:
-    """The path if there is such a file, else None; also of a name that no file can have."""
+    """Return the path if it is a file, else None, also for an invalid file name."""
     return path if os.path.isfile(path) else None
 
 
-def first_existing(paths: Iterable[Path]) -> Path | None:
-    """The first of the paths that is a file; None where none is."""
+def find_first_file(paths: Iterable[Path]) -> Path | None:
+    """Return the first path that is a file, or None."""
     return next((path for path in paths if existing(path)), None)

@@ -1,4 +1,4 @@
-"""Pix3D: furniture in photos with its exact models, poses, masks and keypoints.
+"""Pix3D: photos of furniture with exact CAD models, poses, masks and keypoints.
 
 Sun et al., "Pix3D: Dataset and Methods for Single-Image 3D Shape Modeling", CVPR 2018.
 """
@@ -47,7 +47,7 @@ from cadalign.io.meshes.files import load_mesh
 
 T = TypeVar("T")
 ANNOTATIONS = "pix3d.json"
-# The width of the sensor that focal lengths are for [mm].
+# Sensor width of the annotated focal lengths [mm].
 _SENSOR = 32.0
 # Pix3D's camera has x to the left, y up and z forward.
 _PIX3D_AXES = np.array([-1.0, -1.0, 1.0])
@@ -68,13 +68,13 @@ class _Entry(ForeignDocument):
 
 
 class Pix3D(PhotoDataset):
-    """Photos with one annotated object each, as ``pix3d.json`` lists them.
+    """Photos with one annotated object each, listed in ``pix3d.json``.
 
-    The pose is complete, but its unit is the model's own. The camera's focal length is the
-    annotation's estimate, on a sensor of 32 mm across the image; its principal point is the
-    image's middle. Pix3D's camera has x to the left, y up and z forward. Keypoints are named by
-    their numbers: of several annotators' the mean of those who marked them. Pixels are counted
-    from the corner of the image there, from the corner pixel's centre here.
+    The pose is complete, in model units. The focal length is the annotation's estimate, on a
+    sensor 32 mm wide; the principal point is the image's centre. Keypoints are named by their
+    numbers; a keypoint's pixel is the mean over the annotators who marked it. Poses are converted
+    from Pix3D's camera frame (x left, y up, z forward). Pixels are converted from Pix3D's origin at
+    the image corner to pixel centres at integers.
 
     Raises DataError if ``pix3d.json`` in the folder ``root`` is missing or cannot be read.
     """
@@ -90,7 +90,7 @@ class Pix3D(PhotoDataset):
         super().__init__(folder, (str(number) for number in range(len(self._entries))))
 
     def read(self, index: int) -> Photo:
-        """Read the photo of a number from 0."""
+        """Read the photo at a position, counted from 0."""
         path = self.root / ANNOTATIONS
         with in_file(path):
             entry: _Entry = convert(self._entries[index], _Entry, f"[{index}]")
@@ -115,7 +115,7 @@ class Pix3D(PhotoDataset):
 
 
 def _load(path: Path, read: Callable[[Path], T]) -> T | None:
-    """Read a file of a model; None where it is missing, which is looked for only then."""
+    """Read a model's file; None if it is missing."""
     return read(path) if existing(path) else None
 
 
@@ -126,7 +126,7 @@ def _read_keypoints(path: Path) -> NamedPoints:
 
 @lru_cache(maxsize=64)
 def _camera(width: int, height: int, focal_length: float) -> Camera:
-    """The camera of an image of this size, and of a focal length [mm]."""
+    """The camera for an image size [px] and a focal length [mm]."""
     return Camera.without_focal(width, height).with_focal(focal_length / _SENSOR * width)
 
 

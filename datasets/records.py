@@ -1,4 +1,4 @@
-"""Records of a data set, read one at a time when they are asked for: no bad one stops the rest."""
+"""Data sets whose records are read one by one; a malformed record does not stop the others."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from cadalign.io.files import damaged
 logger = logging.getLogger("cadalign")
 
 T = TypeVar("T")
-# Warnings of one data set that are logged; `problems` has all.
+# Maximum number of logged warnings per data set; `problems` holds all errors.
 _LOGGED = 20
 
 
 class RecordSet(ABC, Generic[T]):
     """A data set of named records, such as photos.
 
-    ``len`` counts the records listed; iterating gives the readable ones, with a warning (logger
-    "cadalign") for each of the others. `problems` holds the reasons met so far, by name. Asking
-    for one record by its number or name raises the reason.
+    ``len`` counts all records. Iteration yields the readable ones and logs a warning (logger
+    "cadalign") for each of the others. `problems` holds the errors so far, by name. Access to a
+    record by position or name raises its error.
 
     Parameters
     ----------
@@ -36,17 +36,17 @@ class RecordSet(ABC, Generic[T]):
     names : iterable of str
         The records' names.
     problems : dict of str to DataError, optional
-        Why parts of the data set could not be listed; the first is raised where nothing could.
+        Errors of parts that could not be listed; the first is raised if there are no records.
     """
 
     kind: str = "data set"
     """Name of the format."""
     noun: str = "record"
-    """What a record is, for messages."""
+    """Noun for a record, for messages."""
     signature: str = ""
-    """What the format is recognised by, for messages."""
+    """Files by which the format is recognised, for messages."""
     marks: tuple[str, ...] = ()
-    """Patterns of files or folders of which a folder of this format has one."""
+    """Patterns of files; a folder of this format has a file that matches one of them."""
 
     def __init__(
         self, root: Path, names: Iterable[str], problems: dict[str, DataError] | None = None
@@ -55,34 +55,34 @@ class RecordSet(ABC, Generic[T]):
         self.names = tuple(names)
         """The records' names, in order."""
         self.problems = problems or {}
-        """Why records or parts of them could not be read, of those read so far, by name."""
+        """Errors of the records, or parts of them, that could not be read so far, by name."""
         if self.problems and not self.names:
             raise next(iter(self.problems.values()))
 
     @classmethod
     def is_here(cls, folder: Path) -> bool:
-        """True for a folder that holds this format."""
+        """True if a folder has this format."""
         return any(next(folder.glob(pattern), None) is not None for pattern in cls.marks)
 
     @abstractmethod
     def read(self, index: int) -> T:
-        """Read the record of a number from 0; raises `DataError` if it is bad."""
+        """Read the record at a position, counted from 0; raises `DataError` if it is malformed."""
 
     def __len__(self) -> int:
         return len(self.names)
 
     def __getitem__(self, key: int | str) -> T:
-        """The record of a number or name.
+        """Read the record at a position or of a name.
 
-        Raises DataError if it is bad or none has this name, IndexError if the number is out of
-        range.
+        Raises DataError if the record is malformed or the name is unknown, IndexError if the
+        position is out of range.
         """
         if isinstance(key, str):
             if key not in self.names:
                 raise DataError(f"no {self.noun} {key!r}", where=str(self.root))
             key = self.names.index(key)
         if not -len(self) <= key < len(self):
-            raise IndexError(f"{len(self)} {self.noun}s, asked for number {key}")
+            raise IndexError(f"there is no {self.noun} {key} of {len(self)}")
         return self._read(key % len(self))
 
     def __iter__(self) -> Iterator[T]:
@@ -90,7 +90,7 @@ class RecordSet(ABC, Generic[T]):
             try:
                 record = self._read(index)
             except DataError as error:
-                self._tell(name, error)
+                self._log_problem(name, error)
                 continue
             yield record
 
@@ -99,7 +99,7 @@ class RecordSet(ABC, Generic[T]):
 
     def _read(self, index: int) -> T:
         try:
-            with np.errstate(all="ignore"):  # what is not finite in the end is refused by name
+            with np.errstate(all="ignore"):  # values that are not finite are refused by name
                 return self.read(index)
         except DataError:
             raise
@@ -108,19 +108,16 @@ class RecordSet(ABC, Generic[T]):
             where += f": {error.where}" if error.where else ""
             raise DataError(error.what, where=where, fix=error.fix) from None
 
-    def _tell(self, name: str, error: DataError) -> None:
+    def _log_problem(self, name: str, error: DataError) -> None:
         if name not in self.problems and len(self.problems) <= _LOGGED:
-            more = " (further problems are counted only)" if len(self.problems) == _LOGGED else ""
+            more = " (further problems are not logged)" if len(self.problems) == _LOGGED else ""
             logger.warning("%s: left out: %s%s", self.kind, error, more)
         self.problems[name] = error.with_traceback(None)
 
 
 @contextmanager
-def leaving_out(name: str, problems: dict[str, DataError] | None) -> Iterator[None]:
-    """Leave out a record that cannot be read, and keep the reason why in ``problems``.
-
-    Without problems the reason is raised.
-    """
+def collect_error(name: str, problems: dict[str, DataError] | None) -> Iterator[None]:
+    """Store the error of a record that cannot be read in ``problems``, or raise it if None."""
     try:
         yield
     except DataError as error:
@@ -132,7 +129,7 @@ def leaving_out(name: str, problems: dict[str, DataError] | None) -> Iterator[No
 def read_list(path: Path) -> list[Any]:
     """Read a JSON file that holds a list.
 
-    Raises DataError if it cannot be read, is no valid JSON (cut short, say), or holds no list.
+    Raises DataError if the file cannot be read, is not valid JSON, or does not hold a list.
     """
     try:
         found = read_json(path)

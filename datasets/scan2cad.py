@@ -1,4 +1,4 @@
-"""Scan2CAD: ShapeNet models aligned, with nine degrees of freedom, to objects in ScanNet scenes.
+"""Scan2CAD: ShapeNet models aligned to objects in ScanNet scenes with nine degrees of freedom.
 
 Avetisyan et al., "Scan2CAD: Learning CAD Model Alignment in RGB-D Scans", CVPR 2019.
 """
@@ -24,11 +24,11 @@ from cadalign.datasets.photo import (
     PhotoObject,
     Truth,
     existing,
-    first_existing,
+    find_first_file,
     read_each,
     read_matrix,
 )
-from cadalign.datasets.records import leaving_out, read_list
+from cadalign.datasets.records import collect_error, read_list
 from cadalign.datasets.shapenet import MESH_FILES, name_of_synset
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.alignment import Alignment, Box
@@ -40,7 +40,7 @@ from cadalign.io.files import as_path, listed
 from cadalign.io.images import photo_size
 
 FULL = "full_annotations.json"
-# One scan's annotations, as in the repository and its derivatives.
+# Files with the annotations of one scan, in Scan2CAD's repository and its derivatives.
 _SAMPLES = ("example_annotation.json", "annot.json", "samples/annot.json")
 _FRAME_FOLDERS = (".", "scans", "scannet", "ScanNet", "ScanNet/scans", "samples")
 _MODEL_FOLDERS = ("ShapeNetCore.v2", "shapenet", "ShapeNet", "Meshes", "samples/Meshes", ".")
@@ -51,8 +51,8 @@ _FOLDS: dict[str, int | None] = {
     "__SYM_ROTATE_UP_4": 4,
     "__SYM_ROTATE_UP_INF": None,
 }
-"""Numbers of rotations about y by Scan2CAD's names; None for any angle."""
-# Corners nearer than this are as good as behind the camera [m].
+"""Order of the rotational symmetry about y by Scan2CAD's name; None for any angle."""
+# Nearest depth at which a corner counts as in front of the camera [m].
 _NEAR = 0.05
 _FARTHEST = 1000.0  # distance of an object in a scan of rooms [m]
 
@@ -72,7 +72,7 @@ class _Points(ForeignDocument):
 
     def xyz(self) -> FloatArray:
         if len(self.position) % 3:
-            raise InputError(f"{len(self.position)} numbers are not x, y, z of points")
+            raise InputError(f"expected x, y, z of each point, got {len(self.position)} numbers")
         return np.reshape(self.position, (-1, 3)).astype(float)
 
 
@@ -96,19 +96,19 @@ class _Scan(ForeignDocument):
 class Scan2CAD(PhotoDataset):
     """Frames of ScanNet scenes with the CAD models that annotators aligned.
 
-    Read are, below one folder, into which the parts may be linked::
+    The files lie below one folder, which may hold links to them::
 
         full_annotations.json, or one scan's: [samples/]annot.json, example_annotation.json
         scans/<scene>/color/<frame>.jpg, pose/<frame>.txt, intrinsic/intrinsic_color.txt
         samples/scannet_<scene's number>_<frame>.jpg, ..._<frame>_pose.txt, scannet_..._intr.txt
         ShapeNetCore.v2/<synset>/<id>/models/model_normalized.obj, with or without the synset
 
-    The folders may have other usual names, such as ``ScanNet`` and ``Meshes``.
+    Other common folder names, such as ``ScanNet`` and ``Meshes``, are found, too.
 
-    The truth is complete: pose and stretch along each axis, in metres. Keypoints are the pairs
-    of the annotators: on the CAD model, and on the scan, projected into the photo. Whether
-    something hides them is not known. A photo holds the objects whose box reaches into the
-    image. A model's symmetry axis runs through the centre of its box.
+    The truth is complete: pose and stretch along each axis, in metres. Keypoints are the
+    annotators' point pairs: one on the CAD model, one on the scan, projected into the photo.
+    Occlusion of keypoints is unknown. A photo has the objects whose box overlaps the image. A
+    model's symmetry axis passes through the centre of its box.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ class Scan2CAD(PhotoDataset):
     Raises
     ------
     DataError
-        If there are no annotations, they cannot be read, or there is no frame of any scan.
+        If annotations are missing or cannot be read, or there is no frame of any scan.
     """
 
     kind = "Scan2CAD"
@@ -133,9 +133,9 @@ class Scan2CAD(PhotoDataset):
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
         folder = as_path(root, "root")
-        annotations = first_existing(folder / name for name in self.marks)
+        annotations = find_first_file(folder / name for name in self.marks)
         if annotations is None:
-            what = f"neither {' nor '.join(self.marks)} is here"
+            what = f"there is no {', '.join(self.marks[:-1])} or {self.marks[-1]}"
             raise DataError(what, where=str(folder), fix="give the folder of the annotations")
         self._file = annotations
         self._models = [folder / name for name in _MODEL_FOLDERS]
@@ -143,22 +143,22 @@ class Scan2CAD(PhotoDataset):
         names: list[str] = []
         bad: dict[str, DataError] = {}
         for number, entry in enumerate(entries := read_list(annotations)):
-            with leaving_out(f"[{number}]", bad), in_file(annotations):
+            with collect_error(f"[{number}]", bad), in_file(annotations):
                 scan: _Scan = convert(entry, _Scan, f"[{number}]")
-                for frame in _frames_of(scan.id_scan, [folder / name for name in _FRAME_FOLDERS]):
+                for frame in _find_frames(scan.id_scan, [folder / name for name in _FRAME_FOLDERS]):
                     self._records.append((scan, frame))
                     names.append(f"{scan.id_scan}/{frame.frame_id}")
         if not names:
-            what = f"no frame of the {len(entries) - len(bad)} annotated scans is here"
-            fix = "link the folder of ScanNet's scenes to scans, beside this file"
+            what = f"there are no frames of the {len(entries) - len(bad)} annotated scans"
+            fix = "copy or link the folder of ScanNet's scenes to scans/, beside this file"
             raise DataError(what, where=str(annotations), fix=fix)
         super().__init__(folder, names, bad)
 
     def read(self, index: int) -> Photo:
-        """Read the photo of a number from 0."""
+        """Read the photo at a position, counted from 0."""
         scan, frame = self._records[index]
         camera, cam_from_scan = frame.camera(), frame.cam_from_scan()
-        cam_from_world = _composed(cam_from_scan, _inverse(scan.trs.alignment()))
+        cam_from_world = _compose(cam_from_scan, _invert(scan.trs.alignment()))
 
         def read_object(number: int, model: Any) -> PhotoObject | None:
             found: _Model = convert(model, _Model)
@@ -178,24 +178,24 @@ def _object(
     camera: Camera,
     folders: Iterable[Path],
 ) -> PhotoObject | None:
-    """An object of the scan as a photo shows it; None where its box is not in the image."""
+    """Convert an object of the scan to a photo's object; None if its box misses the image."""
     world_from_model = found.trs.alignment()
-    cam_from_model = _composed(cam_from_world, world_from_model)
+    cam_from_model = _compose(cam_from_world, world_from_model)
     center, half = np.array(found.center), np.array(found.bbox)
     distance = float(np.linalg.norm(cam_from_model.apply(center[None])))
     if distance > _FARTHEST:
-        what = f"the object lies {distance:.3g} m from the camera, as with millimetres for metres"
-        fix = "give the frame's pose and the annotations in metres, such as divided by 1000"
+        what = f"the object lies {distance:.3g} m from the camera, likely millimetres for metres"
+        fix = "convert the frame's pose and the annotations to metres"
         raise InputError(what, where="trs.translation", fix=fix)
     if found.sym not in _FOLDS:
-        known = ", ".join(_FOLDS)
-        raise InputError(f"{quote(found.sym)} is no symmetry", where="sym", fix=f"known: {known}")
+        what, fix = f"{quote(found.sym)} is not a symmetry", f"known are {', '.join(_FOLDS)}"
+        raise InputError(what, where="sym", fix=fix)
     bounds = np.array([center - half, center + half])
     box = Box.from_model(bounds, cam_from_model)
     bbox = _rectangle(box, camera)
     if bbox is None:
         return None
-    mesh = first_existing(
+    mesh = find_first_file(
         place / file
         for folder in folders
         for place in (folder / found.catid_cad / found.id_cad, folder / found.id_cad)
@@ -216,7 +216,7 @@ def _object(
 def _keypoints(
     found: _Model, world_from_model: Alignment, cam_from_world: Alignment, camera: Camera
 ) -> tuple[PhotoKeypoints | None, NamedPoints | None]:
-    """The annotators' pairs: on the scan as pixels, where in the image; and on the CAD model."""
+    """The annotators' point pairs: pixels of those in the image, and points on the CAD model."""
     if found.keypoints_cad is None or found.keypoints_scan is None:
         return None, None
     on_model, on_scan = found.keypoints_cad.xyz(), found.keypoints_scan.xyz()
@@ -232,7 +232,7 @@ def _keypoints(
 
 
 def _rectangle(box: Box, camera: Camera) -> FloatArray | None:
-    """The image's part of the rectangle around a box; None where there is no such part."""
+    """The bounding rectangle of a box, clipped to the image; None if it is outside."""
     corners = box.corners[box.corners[:, 2] > _NEAR]
     if box.center[2] <= 0 or not len(corners):
         return None
@@ -242,13 +242,13 @@ def _rectangle(box: Box, camera: Camera) -> FloatArray | None:
     return np.concatenate([low, high]) if (low < high).all() else None
 
 
-def _composed(second: Alignment, first: Alignment) -> Alignment:
-    """The alignment of one after another, where the second stretches all axes alike."""
+def _compose(second: Alignment, first: Alignment) -> Alignment:
+    """Compose ``second`` after ``first``; ``second`` must scale all axes equally."""
     (moved,) = second.apply(first.translation[None])
     return Alignment(second.rotation @ first.rotation, moved, second.scale * first.scale)
 
 
-def _inverse(alignment: Alignment) -> Alignment:
+def _invert(alignment: Alignment) -> Alignment:
     scale = alignment.scale
     if np.ptp(scale) > 1e-9 * scale.max():
         raise InputError(f"the scan has unequal scales {scale.tolist()}", where="trs.scale")
@@ -259,22 +259,20 @@ def _inverse(alignment: Alignment) -> Alignment:
 
 # Frames of ScanNet -----------------------------------------------------------------------------
 
-# The intrinsics of the colour images, as SensReader and as scannet_frames_25k name them.
+# Intrinsics files of colour images, as SensReader and scannet_frames_25k name them.
 _INTRINSICS = (Path("intrinsic", "intrinsic_color.txt"), Path("intrinsics_color.txt"))
 _IMAGES = (".jpg", ".jpeg", ".png")
 
 
 @dataclass(frozen=True)
 class _Frame:
-    """One frame of a ScanNet scene."""
-
-    frame_id: str  # its number, as its file writes it
+    frame_id: str  # its number in the file's name
     image_path: Path
-    pose_path: Path  # (4, 4), the scan's coordinates from the camera's
-    intrinsics_path: Path  # (4, 4), of photos of this size
+    pose_path: Path  # (4, 4), scan from camera
+    intrinsics_path: Path  # (4, 4), for the photo's size
 
     def camera(self) -> Camera:
-        """Read the intrinsics; integer pixels are taken for pixel centres."""
+        """Read the intrinsics; integers are taken as pixel centres."""
         matrix = read_matrix(self.intrinsics_path, (4, 4))
         width, height = photo_size(self.image_path)
         (fx, _, cx), (_, fy, cy) = matrix[:2, :3].tolist()
@@ -282,10 +280,9 @@ class _Frame:
             return Camera(width, height, fx, fy, cx, cy)
 
     def cam_from_scan(self) -> Alignment:
-        """Read the pose: the camera's coordinates from the scan's [m].
+        """Read the pose, camera from scan [m].
 
-        Raises DataError if it is no pose, such as ScanNet's -inf of a frame whose tracking was
-        lost.
+        Raises DataError if it is invalid: ScanNet writes -inf for frames with lost tracking.
         """
         pose = read_matrix(self.pose_path, (4, 4))
         with in_file(self.pose_path):
@@ -293,17 +290,17 @@ class _Frame:
         return Alignment(rotation, -rotation @ pose[:3, 3], np.ones(3))
 
 
-def _frames_of(scene: str, folders: Iterable[Path]) -> tuple[_Frame, ...]:
-    """A scene's frames, in the first folder that has any, in order of their numbers."""
+def _find_frames(scene: str, folders: Iterable[Path]) -> tuple[_Frame, ...]:
+    """Find a scene's frames in the first folder that has any, sorted by number."""
     for folder in folders:
-        found = (*_in_scene_folder(folder / scene), *_beside_each_other(folder, scene))
+        found = (*_scene_folder_frames(folder / scene), *_flat_folder_frames(folder, scene))
         if found:
             return tuple(sorted(found, key=lambda frame: (len(frame.frame_id), frame.frame_id)))
     return ()
 
 
-def _in_scene_folder(folder: Path) -> Iterator[_Frame]:
-    intrinsics = first_existing(folder / name for name in _INTRINSICS)
+def _scene_folder_frames(folder: Path) -> Iterator[_Frame]:
+    intrinsics = find_first_file(folder / name for name in _INTRINSICS)
     if intrinsics is None:
         return
     for image in listed(folder / "color", "*"):
@@ -311,7 +308,7 @@ def _in_scene_folder(folder: Path) -> Iterator[_Frame]:
             yield _Frame(image.stem, image, folder / "pose" / f"{image.stem}.txt", intrinsics)
 
 
-def _beside_each_other(folder: Path, scene: str) -> Iterator[_Frame]:
+def _flat_folder_frames(folder: Path, scene: str) -> Iterator[_Frame]:
     prefix = f"scannet_{scene.removeprefix('scene')}_"
     intrinsics = folder / f"{prefix}intr.txt"
     if not existing(intrinsics):
@@ -319,5 +316,5 @@ def _beside_each_other(folder: Path, scene: str) -> Iterator[_Frame]:
     for pose in folder.glob(f"{prefix}*_pose.txt"):
         stem = pose.name.removesuffix("_pose.txt")
         images = (folder / f"{stem}{suffix}" for suffix in _IMAGES)
-        image = first_existing(images) or folder / f"{stem}.jpg"
+        image = find_first_file(images) or folder / f"{stem}.jpg"
         yield _Frame(stem.removeprefix(prefix), image, pose, intrinsics)

@@ -1,7 +1,4 @@
-"""ShapeNetCore: its categories and their WordNet synset ids, and its models.
-
-The models lie as they are distributed, a folder per category and per model, or with KeypointNet.
-"""
+"""ShapeNetCore: categories with their WordNet synset ids, and models in its folder layout."""
 
 from __future__ import annotations
 
@@ -34,26 +31,26 @@ SYNSETS: dict[str, str] = {
     "telephone": "04401088", "tower": "04460130", "train": "04468005", "trash bin": "02747177",
     "vessel": "04530566", "washer": "04554684",
 }  # fmt: skip
-"""The synset id of each category of ShapeNetCore, named as KeypointNet does where it has it."""
+"""Synset ids of ShapeNetCore's categories by name; KeypointNet's names where it has them."""
 
-# Where a model's mesh lies in its folder: version 2, then version 1.
+# Path of the mesh in a model's folder: version 2, then version 1.
 MESH_FILES = (Path("models", "model_normalized.obj"), Path("model.obj"))
 _SYNSET_DIGITS = 8
 _NAMES = {synset: name for name, synset in SYNSETS.items()}
 
 
 def name_of_synset(synset: str) -> str:
-    """The category's name, or the synset id itself where it is not one of ShapeNetCore's."""
+    """Return the category's name; a synset id that is not ShapeNetCore's is returned unchanged."""
     return _NAMES.get(synset, synset)
 
 
 def synset_of_name(name: str) -> str:
-    """The category's synset id; what is not a known name is returned as it is."""
+    """Return the category's synset id; an unknown name is returned unchanged."""
     return SYNSETS.get(name, name)
 
 
 def require_category(name: str, known: Iterable[str], *, where: str) -> str:
-    """Return the category's name if it, or the category with this synset id, is in ``known``."""
+    """Return the name of a category, given by name or synset id; it must be in ``known``."""
     names = sorted(known)
     for candidate in (name, name_of_synset(name)):
         if candidate in names:
@@ -68,23 +65,23 @@ class ShapeNetModel:
     category: str
     """The category's name, such as "chair"."""
     class_id: str
-    """Its synset id, such as "03001627"."""
+    """The category's synset id, such as "03001627"."""
     model_id: str
     """The model's id."""
     mesh_path: Path
     """Its OBJ file."""
 
     def load_mesh(self) -> Mesh:
-        """Read its mesh; see `cadalign.load_mesh`."""
+        """Read the mesh; see `cadalign.load_mesh`."""
         return load_mesh(self.mesh_path)
 
 
 class ShapeNet:
     """The models of ShapeNetCore, version 1 or 2.
 
-    Version 1 lies in ``<synset>/<model id>/model.obj``, version 2 in
-    ``<synset>/<model id>/models/model_normalized.obj``; which it is, is found out model by model.
-    A category's folder is listed when it is first asked for.
+    Meshes are ``<synset>/<model id>/model.obj`` (version 1) or
+    ``<synset>/<model id>/models/model_normalized.obj`` (version 2, preferred if both exist).
+    A category's folder is listed on first access.
 
     Parameters
     ----------
@@ -94,7 +91,7 @@ class ShapeNet:
     Raises
     ------
     DataError
-        If there is no such folder.
+        If the folder is missing.
 
     Examples
     --------
@@ -112,7 +109,7 @@ class ShapeNet:
 
     @cached_property
     def categories(self) -> tuple[str, ...]:
-        """The categories there are folders of, sorted; a synset of unknown name keeps its id."""
+        """Names of the categories that have a folder, sorted; unknown synsets keep their id."""
         folders = [entry.name for entry in os.scandir(self.root) if entry.is_dir()]
         synsets = [name for name in folders if name.isdigit() and len(name) == _SYNSET_DIGITS]
         return tuple(sorted(map(name_of_synset, synsets)))
@@ -148,7 +145,7 @@ class ShapeNet:
             self._models[name] = {
                 model_id: ShapeNetModel(name, synset, model_id, folder / model_id / file)
                 for model_id in sorted(os.listdir(folder))
-                for file in MESH_FILES[::-1]  # version 2 counts where there are both
+                for file in MESH_FILES[::-1]  # version 2 replaces version 1
                 if (folder / model_id / file).is_file()
             }
         return self._models[name]

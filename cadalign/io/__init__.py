@@ -1,4 +1,4 @@
-"""Read and write files: whole or not at all, with errors that say what is wrong and where."""
+"""Read files, with errors that name the place of a problem, and write files atomically."""
 
 from typing import TYPE_CHECKING
 

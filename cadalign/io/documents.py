@@ -1,10 +1,10 @@
-"""Reading JSON documents against declared types, with errors that name the file and the field.
+"""Read JSON documents of declared types, with errors that name the file and the field.
 
 A format is declared as a `Document`: its fields, their types, meaning and defaults. `convert`
-checks data against it without coercion (``true`` is no number, ``"1"`` is no number) and refuses
-unknown fields. Formats of other programs are a `ForeignDocument`, whose further fields are ignored.
-What the types cannot express is checked in ``__post_init__``, which raises
-`cadalign.errors.InputError`; its place is completed here.
+checks data against it without coercion (neither ``true`` nor ``"1"`` is a number) and refuses
+unknown fields. Formats of other programs are declared as a `ForeignDocument`, whose unknown fields
+are ignored. Further checks are made in ``__post_init__``, which raises
+`cadalign.errors.InputError`; `convert` completes the place in the error.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 _PATH = r"\A[^\0]+\Z"
 _FILE_NAME = r"\A(?!\.{1,2}\Z)[^/\\\0]+\Z"
 _FIELD_END = b'":'
-_HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]")
-_HALF_REASON = r"a text has half of a character, such as \ud800 without its second half"
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
+_SURROGATE_ERROR = r"a text has an unpaired surrogate, such as \ud800"
 Text = Annotated[str, Meta(pattern=r"\S")]
 PathText = Annotated[str, Meta(pattern=_PATH)]
-Id = Annotated[str, Meta(pattern=_FILE_NAME)]  # becomes a part of paths and must not leave a folder
+Id = Annotated[str, Meta(pattern=_FILE_NAME)]  # a part of paths, which must not leave a folder
 Point2 = tuple[Finite, Finite]
 Point3 = tuple[Finite, Finite, Finite]
 
@@ -47,11 +47,11 @@ T = TypeVar("T")
 
 
 class Document(Struct, forbid_unknown_fields=True):
-    """Base of declared formats; unknown fields are refused."""
+    """Base of cadalign's formats; unknown fields are refused."""
 
 
 def require_unique(keypoints: Sequence[Any], field: str) -> None:
-    """Refuse a field's value, other than None, that two of the keypoints have."""
+    """Raise InputError if two keypoints have the same value of a field, other than None."""
     first: dict[Any, int] = {}
     for row, keypoint in enumerate(keypoints):
         value = getattr(keypoint, field)
@@ -61,13 +61,13 @@ def require_unique(keypoints: Sequence[Any], field: str) -> None:
 
 
 class ForeignDocument(Struct):
-    """Base of declared formats of other programs; unknown fields are ignored."""
+    """Base of other programs' formats; unknown fields are ignored."""
 
 
 def read_json(path: Path, wanted: str | None = None) -> Any:
     """Read a JSON file; errors name the file and the line.
 
-    A file of another known kind than ``wanted``, of `cadalign.io.kinds`, is refused by its kind.
+    ``wanted`` is a kind of `cadalign.io.kinds`; a file of another known kind raises DataError.
     """
     try:
         data = parse_json(read_text(path), str(path))
@@ -81,75 +81,76 @@ def read_json(path: Path, wanted: str | None = None) -> Any:
 
 
 def parse_json(text: str | bytes, where: str) -> Any:
-    """Parse JSON of any content, bytes if it is one line; errors name its place and the line.
+    """Parse JSON; bytes are one line of a file, named by ``where``.
 
-    Raises DataError if it is no valid JSON, or a field stands twice in one object.
+    Raises DataError, with ``where`` and the line, if the JSON is not valid or a field occurs twice
+    in one object.
     """
     is_line = isinstance(text, bytes)
-    if isinstance(text, bytes):  # of hundreds of thousands, several times as fast
+    if isinstance(text, bytes):  # several times faster, for files of many lines
         with suppress(msgspec.MsgspecError, UnicodeError, RecursionError):
             line = msgspec.json.decode(text)
             if msgspec.json.encode(line).count(_FIELD_END) == text.count(_FIELD_END):
-                return line  # no field stands twice
+                return line  # no field occurs twice
     try:
         with in_file(where):
             text = str(text, "utf-8") if isinstance(text, bytes) else text
-            data = json.loads(text, object_pairs_hook=_distinct)
-        if _HALF_CHARACTER.search(text):  # perhaps one half of two
+            data = json.loads(text, object_pairs_hook=_unique_fields)
+        if _SURROGATE.search(text):  # may be one of a pair
             json.dumps(data, ensure_ascii=False).encode("utf-8")
         return data
     except json.JSONDecodeError as error:
         where = where if is_line else f"{where}, line {error.lineno}"
         reason = error.msg
     except UnicodeEncodeError:
-        reason = _HALF_REASON
+        reason = _SURROGATE_ERROR
     except RecursionError:
         reason = "nested too deeply"
-    except ValueError as error:  # a whole number of thousands of digits, or bytes that are no text
+    except ValueError as error:  # an integer of thousands of digits, or bytes that are not UTF-8
         reason = brief(error)
     raise DataError(f"not valid JSON: {reason}", where=where)
 
 
-def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of fields, none of which may stand twice."""
+def _unique_fields(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Build an object; raises DataError if a field occurs twice."""
     fields = dict(pairs)
     if len(fields) != len(pairs):
         names = [name for name, _ in pairs]
         twice = next(name for name in names if names.count(name) > 1)
-        what = f"the field {quote(twice)} stands twice in one object"
-        raise DataError(what, fix="leave one of the two out")
+        what = f"the field {quote(twice)} occurs twice in one object"
+        raise DataError(what, fix="remove one of them")
     return fields
 
 
 def convert(
     data: Any, kind: type[T] | Any, where: str = "", *, folder: Path | None = None
 ) -> T | Any:
-    """Convert parsed JSON to a `Document`, or to any type of which its fields can be.
+    """Convert parsed JSON to a `Document`, or to any type of a document's field.
 
-    ``where`` is the place of ``data``: a `DataError` names the path of the field below it, as
-    ``keypoints[3].uv``. Declared paths are relative to ``folder``.
+    ``where`` is the place of ``data``; a `DataError` adds the path of the field, such as
+    ``keypoints[3].uv``. Paths in ``data`` are relative to ``folder``.
     """
 
-    def read(_: type, text: Any) -> Path:  # a path is the only declared type that JSON lacks
+    def read(_: type, text: Any) -> Path:  # Path is the only declared type that JSON lacks
         if not isinstance(text, str) or not text or "\0" in text:
             raise InputError(f"{quote(text)} is not a path")
         return path_from(text, folder)
 
     try:
-        with suppress(msgspec.ValidationError):  # perhaps of NumPy's arrays and numbers
+        with suppress(msgspec.ValidationError):  # raised also by NumPy arrays and numbers
             return msgspec.convert(data, kind, dec_hook=read)
         with suppress(TypeError, RecursionError):
-            data = msgspec.to_builtins(data, enc_hook=_plain)
+            data = msgspec.to_builtins(data, enc_hook=_to_builtin)
         return msgspec.convert(data, kind, dec_hook=read)
     except msgspec.ValidationError as error:
-        raise _located(error, data, kind, where) from None
+        raise _convert_error(error, data, kind, where) from None
     except UnicodeEncodeError:
-        raise DataError(_HALF_REASON, where=where or None) from None
+        raise DataError(_SURROGATE_ERROR, where=where or None) from None
 
 
 @contextmanager
 def in_file(path: Path | str) -> Iterator[None]:
-    """Let errors about a file's content name the file, or the file and a line."""
+    """Add the file, or file and line, to the place of errors about its content."""
     try:
         yield
     except CadalignError as error:
@@ -161,7 +162,7 @@ def in_file(path: Path | str) -> Iterator[None]:
 
 @contextmanager
 def within(place: str) -> Iterator[None]:
-    """Let errors about a part of a file's content name the part, as ``frames[3]``."""
+    """Add a part of a file, such as ``frames[3]``, to the place of errors about its content."""
     try:
         yield
     except CadalignError as error:
@@ -170,14 +171,14 @@ def within(place: str) -> Iterator[None]:
 
 
 def path_from(text: str, folder: Path | None) -> Path:
-    """The path that a file in a folder writes relative to the folder."""
+    """Convert a path written in a file, which is relative to the file's folder."""
     path = Path(text) if folder is None else folder / text
-    # Such that a path outside the folder is the one that was written, with no ".." in its midst.
+    # Resolve "..", so that a path outside the folder equals the path that was written.
     return path.resolve() if ".." in Path(text).parts and folder is not None else path
 
 
 def written_path(path: Path, *, folder: Path | None) -> str:
-    """A path as it is written into a file: relative to the folder that it is read relative to."""
+    """Convert a path to the text for a file in a folder: relative to the folder."""
     if folder is None:
         return str(path)
     for base in (folder, folder.resolve()):
@@ -200,15 +201,14 @@ _WORDS = {
 _PATTERN_WORDS = {repr(_PATH): "a path", repr(_FILE_NAME): "an id"}
 
 
-def _plain(value: Any) -> Any:
-    """NumPy's array or number as Python's."""
+def _to_builtin(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     raise TypeError(type(value))
 
 
-def _located(error: msgspec.ValidationError, data: Any, kind: Any, where: str) -> DataError:
-    """The library's error as ours: the value and its problem, its path, the remedy."""
+def _convert_error(error: msgspec.ValidationError, data: Any, kind: Any, where: str) -> DataError:
+    """Convert msgspec's error: name the value and its problem, its place, the fix."""
     text, _, path = str(error).removesuffix("`").partition(" - at `$")
     value = data
     for step in _STEP.finditer(path):
@@ -233,20 +233,20 @@ def _located(error: msgspec.ValidationError, data: Any, kind: Any, where: str) -
     if text.startswith("Invalid enum value"):
         allowed = ", ".join(map(repr, _parts_at(kind, path, "values")))
         return DataError(f"{quote(value)} is not one of {allowed}", where=where or None)
-    return DataError(f"{quote(value)} is not {_wanted(text)}", where=where or None)
+    return DataError(f"{quote(value)} is not {_translate_expectation(text)}", where=where or None)
 
 
 def _entry(value: Any, step: re.Match[str]) -> Any:
     try:
         return value[int(step["row"])] if step["row"] else value[step["name"]]
-    except (KeyError, IndexError, TypeError, ValueError):  # the key of a map is not told
+    except (KeyError, IndexError, TypeError, ValueError):  # msgspec does not name a map's key
         return value
 
 
-def _wanted(text: str) -> str:
-    """The library's "Expected ..." in this project's words."""
+def _translate_expectation(text: str) -> str:
+    """Translate msgspec's "Expected ..."."""
     found = _EXPECTED.fullmatch(text)
-    if found is None:  # a number beyond all floats
+    if found is None:  # a number too large for a float
         return "a finite number"
     kinds = [kind for kind in found["kinds"].split(" | ") if kind != "null"]
     words = " or ".join(_WORDS.get(kind, kind) for kind in kinds)
@@ -260,7 +260,7 @@ def _wanted(text: str) -> str:
 
 
 def _parts_at(kind: Any, path: str, name: str) -> list[Any]:
-    """The fields or values of the types declared at a path; none within a hostile field name."""
+    """Fields or enum values of the types at a path; empty if a field's name mimics a path."""
     kind = msgspec.inspect.type_info(kind)
     for step in _STEP.finditer(path):
         if isinstance(kind, msgspec.inspect.UnionType):  # an optional type

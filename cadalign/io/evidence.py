@@ -1,6 +1,6 @@
-"""One image of an object: keypoints, evidence beyond them, and the fields of both in a file.
+"""Keypoints and further evidence of an object in one image, and their fields in a file.
 
-The format is described in docs/formats/observation.md.
+docs/formats/observation.md describes the format.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from cadalign.io.files import as_path
 
 LENGTHS = ("width", "height", "length")
 """Names of the lengths along the model's x, y and z."""
-_LISTED = 8  # rows of keypoints in a message
+_LISTED = 8  # maximum number of rows in a message
 _Row4 = tuple[Finite, Finite, Finite, Finite]
 
 
 class ImageEvidence(Document, kw_only=True, eq=False):
-    """Evidence of an image beyond keypoints, with the file of a mask; None where unknown.
+    """Evidence in an image beyond keypoints; None for unknown values. The mask is a file.
 
-    `cadalign.View` describes the fields, and checks arrays.
+    `cadalign.View` describes the fields.
 
     Raises
     ------
@@ -52,7 +52,7 @@ class ImageEvidence(Document, kw_only=True, eq=False):
 
     mask: Path | None = None
     mask_sigma: Positive | None = None
-    depth_sigma: Positive | None = None  # of depths that keypoints have
+    depth_sigma: Positive | None = None  # of the keypoints' depths
     up: Point3 | None = None
     up_sigma_deg: Positive | None = None
     camera_height: Positive | None = None
@@ -70,13 +70,13 @@ class ImageEvidence(Document, kw_only=True, eq=False):
 
     @property
     def given(self) -> dict[str, Any]:
-        """The fields that are known, by name."""
+        """The known fields, by name."""
         names = ImageEvidence.__struct_fields__
         return {name: value for name in names if (value := getattr(self, name)) is not None}
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Names of the fields that are known and are evidence by themselves."""
+        """Names of the known fields, without standard deviations."""
         return tuple(name for name in self.given if "_sigma" not in name)
 
 
@@ -86,9 +86,9 @@ class Size(Struct, frozen=True, eq=False, omit_defaults=True, forbid_unknown_fie
     Parameters
     ----------
     width, height, length : float, optional
-        Along x, y, z [the unit in which pose and size are wanted].
+        Lengths along x, y, z; the estimated pose and size have the same unit.
     sigma : float
-        Standard deviation of the lengths, relative: 0.01 is 1 %.
+        Relative standard deviation of the lengths: 0.01 is 1 %.
 
     Raises
     ------
@@ -126,7 +126,7 @@ class Size(Struct, frozen=True, eq=False, omit_defaults=True, forbid_unknown_fie
 
 @dataclass(frozen=True, eq=False)
 class ObservedImage:
-    """Keypoints of the object in one image, and further evidence of the image.
+    """Keypoints of an object in one image, and further evidence in the image.
 
     Parameters
     ----------
@@ -135,23 +135,24 @@ class ObservedImage:
     points_2d : (n, 2) float
         Image points [px].
     camera : Camera
+        The photo's camera.
     sigma : (n,) float, optional
         Standard deviation of each image point [px].
     ids : (n,) int, optional
-        Meaning of each keypoint; the same number on all models of a category.
+        Semantic id of each keypoint, the same on all models of a category.
     names : tuple of n str, optional
         Name of each keypoint.
     scores : (n,) float, optional
-        Trust in each keypoint, for the ``scores`` of `cadalign.fit`.
+        Confidence in each keypoint, for the ``scores`` of `cadalign.fit`.
     image : Path, optional
         The photo.
     depths : (n,) float, optional
         Depth of each keypoint [model units]; NaN where unknown.
     evidence : ImageEvidence
-        What is known beyond keypoints.
+        Further evidence.
     not_found : tuple of int
-        Rows of the file's keypoints that are left out here: their pixels are no measurements, see
-        `cadalign.geometry.pixels.unmeasured`.
+        Rows of the file's keypoints that are left out because their pixels are not measurements;
+        see `cadalign.geometry.pixels.unmeasured`.
 
     Raises
     ------
@@ -187,7 +188,7 @@ class ObservedImage:
 
     @property
     def labels(self) -> tuple[str | int, ...]:
-        """Names of the keypoints in messages, or else their rows in the file."""
+        """Labels of the keypoints in messages: unique names, or rows in the file."""
         count = len(self.points_2d) + len(self.not_found)
         if self.names is not None and len(set(self.names)) == len(self.names):
             return self.names
@@ -195,14 +196,14 @@ class ObservedImage:
 
     @property
     def text_of_not_found(self) -> str:
-        """A note about the keypoints that are left out; empty where none is."""
+        """A note about keypoints that are left out; empty if there are none."""
         if not self.not_found:
             return ""
         count, rows = len(self.not_found), ", ".join(map(str, self.not_found[:_LISTED]))
         rows += ", ..." if count > _LISTED else ""
         return (
             f"{count} of {count + len(self.points_2d)} keypoints are not found and left out "
-            f"(rows {rows}): their pixels are missing, (0, 0), or one and the same"
+            f"(rows {rows}): their pixels are missing, (0, 0), or identical"
         )
 
 
@@ -212,8 +213,8 @@ class ObservedImage:
 class KeypointFields(Document, kw_only=True):
     """One entry of ``keypoints``."""
 
-    xyz: Point3 | None = None  # needed with a mesh
-    uv: tuple[float | None, float | None] | None  # null where it was not found
+    xyz: Point3 | None = None  # required with a mesh
+    uv: tuple[float | None, float | None] | None  # null if not found
     name: Text | None = None
     semantic_id: Index | None = None
     sigma: Positive | None = None
@@ -231,10 +232,10 @@ class ViewFields(ImageEvidence, kw_only=True):
 
 
 def read_image_fields(read: ViewFields, *, needs_xyz: bool = True) -> ObservedImage:
-    """An image from its checked fields.
+    """Convert an image's checked fields.
 
-    A missing ``xyz`` is zero, or refused where it is needed. Raises InputError if the camera is
-    invalid, or fields contradict each other.
+    A missing ``xyz`` becomes zero, or raises DataError if ``needs_xyz``. Raises InputError if the
+    camera is invalid, or fields contradict each other.
     """
     for name in ("name", "semantic_id"):
         require_unique(read.keypoints, name)
@@ -267,7 +268,7 @@ def read_image_fields(read: ViewFields, *, needs_xyz: bool = True) -> ObservedIm
 
 
 def _camera(form: Any) -> Camera:
-    """The camera of a form in a file, which most images of a run share."""
+    """Convert a camera's fields; the result is cached, since many images share a camera."""
     try:
         return _camera_of(json.dumps(form))
     except (TypeError, ValueError, RecursionError):  # of NumPy's arrays
@@ -280,7 +281,7 @@ def _camera_of(text: str) -> Camera:
 
 
 def _column(keypoints: Mapping[int, KeypointFields], name: str) -> Any:
-    """One optional field of all keypoints, by rows, as a list; None where none has it."""
+    """One optional field of all keypoints as a list; None if no keypoint has it."""
     values = [getattr(keypoint, name) for keypoint in keypoints.values()]
     missing = [row for row, value in zip(keypoints, values, strict=True) if value is None]
     if len(missing) == len(values):
@@ -295,7 +296,7 @@ def _column(keypoints: Mapping[int, KeypointFields], name: str) -> Any:
 
 
 def write_image_fields(image: ObservedImage, folder: Path | None) -> dict[str, Any]:
-    """Camera, keypoints, photo and evidence of an image as they are written."""
+    """Convert camera, keypoints, photo and evidence of an image to the fields of a file."""
     columns = {
         "xyz": image.points_3d,
         "uv": image.points_2d,

@@ -1,4 +1,4 @@
-"""Kinds of files: a reader that gets a file of another kind says what the file is."""
+"""Recognise kinds of files, so that a reader can name the kind of a wrong file."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ FIT = "the result of a fit"
 CAMERA = "a camera"
 
 LINES = (".jsonl", ".ndjson")
-"""Endings of files with an observation in every line."""
+"""Endings of files with one observation per line."""
 TABLE = ".csv"
 MESH_ENDINGS = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
 PHOTO_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
-_MOST_BYTES = 2**26  # of a JSON file that is read to name its kind
+_MOST_BYTES = 2**26  # size limit of a JSON file that is read to find its kind
 CAMERA_FIX = (
     "give 3 x 3 numbers, or a JSON file with model, width, height and params as COLMAP does"
 )
@@ -38,7 +38,7 @@ _FIXES = {
     MESH: f"give a file that ends in {', '.join(MESH_ENDINGS)}",
     PHOTO: "give a picture, such as a PNG or a JPEG",
 }
-_FIXES_OF = {
+_SPECIAL_FIXES = {
     (FIT, OBSERVATION): "give the observation that was fitted",
     (OBSERVATION, FIT): "fit it first, `cadalign fit {}`, and give the fit.json that this writes",
     (MESH, OBSERVATION): "mark keypoints with `cadalign annotate PHOTO {}`, which writes one",
@@ -48,12 +48,12 @@ _FIXES_OF = {
 
 
 def kind_of(data: object) -> str | None:
-    """Kind of the parsed form of a JSON file, by its fields; None where these tell none."""
+    """Find the kind of parsed JSON by its fields; None if it is unknown."""
     if isinstance(data, list):
         first = data[0] if data else {}
         if not isinstance(first, dict):
             return None
-        return MODEL_KEYPOINTS if "model_id" in first else DETECTOR  # the former KeypointNet's
+        return MODEL_KEYPOINTS if "model_id" in first else DETECTOR  # "model_id": KeypointNet
     if not isinstance(data, dict):
         return None
     fields = set(data)
@@ -72,7 +72,7 @@ def kind_of(data: object) -> str | None:
 
 
 def kind_of_file(path: Path) -> str | None:
-    """Kind of a file that is there: that of its content as JSON, or else by its ending."""
+    """Find the kind of an existing file by its ending, or by its content if it is JSON."""
     suffix, data = path.suffix.lower(), None
     if os.path.isfile(path) and suffix in (*MESH_ENDINGS, *PHOTO_ENDINGS):
         return MESH if suffix in MESH_ENDINGS else PHOTO
@@ -83,21 +83,21 @@ def kind_of_file(path: Path) -> str | None:
 
 
 def refuse_other(wanted: str, found: str | None, path: Path | None = None) -> None:
-    """Raise a DataError for a file, or its parsed form, of another known kind than is wanted."""
+    """Raise a DataError if the kind that was found is known and not the wanted kind."""
     if found in (None, wanted):
         return
     where, name = (None, "") if path is None else (str(path), path.name)
-    special = _FIXES_OF.get((found, wanted))
+    special = _SPECIAL_FIXES.get((found, wanted))
     fix = _FIXES.get(wanted) if special is None else special.format(name)
     raise DataError(f"{found}, not {wanted}", where=where, fix=fix)
 
 
 def refuse_other_file(path: Path, wanted: str) -> None:
-    """Raise a DataError for a file of another known kind than the wanted one."""
+    """Raise a DataError if a file's kind is known and not the wanted kind."""
     refuse_other(wanted, kind_of_file(path), path)
 
 
 def is_of_many(path: Path, data: object = None) -> bool:
-    """True for an input that may hold many observations; ``data`` is the content of a JSON file."""
+    """True if an input may hold several observations; ``data`` is the content of a JSON file."""
     is_container = os.path.isdir(path) or path.suffix.lower() in (*LINES, TABLE)
     return is_container or kind_of(data) == DETECTOR

@@ -1,7 +1,7 @@
-"""Observations: one object's keypoints in one or more images, as a JSON file; files of cameras.
+"""Observation files (one object's keypoints in one or more images) and camera files.
 
-The file is described in docs/formats/observation.md. A camera is a calibration matrix as text, or
-JSON in COLMAP's form.
+docs/formats/observation.md describes the observation file. A camera file is a calibration matrix as
+text, or JSON in COLMAP's form.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class FocalPriorFields(Document, omit_defaults=True):
 
 
 class FitFields(Document):
-    """The entry ``fit``; fields that are not given keep the defaults of `cadalign.fit`."""
+    """The entry ``fit``; missing fields have the defaults of `cadalign.fit`."""
 
     method: Text | UnsetType = UNSET
     sigma: Positive | list[Positive] | UnsetType | None = UNSET
@@ -73,7 +73,7 @@ class FitFields(Document):
 
 
 class ObservationFields(ViewFields, kw_only=True):
-    """A file: fields of its only image, or ``views``, and what is known of the object."""
+    """A file: the fields of its only image, or ``views``, and the fields of the object."""
 
     camera: Any = UNSET
     views: Annotated[list[ViewFields], Meta(min_length=1)] | None = None
@@ -89,7 +89,7 @@ class ObservationFields(ViewFields, kw_only=True):
 
 
 def _read_fields(data: Any, folder: Path | None) -> tuple[ObservationFields, Sequence[ViewFields]]:
-    """Check the parsed form of a file; returns its fields and those of its views.
+    """Check the parsed form of a file; returns its fields and the fields of its views.
 
     Raises DataError if a field is missing, unknown or invalid.
     """
@@ -99,9 +99,9 @@ def _read_fields(data: Any, folder: Path | None) -> tuple[ObservationFields, Seq
         for name in ViewFields.__struct_fields__:
             if name in data:
                 fix = "give it in each of the views"
-                raise DataError("given beside `views`", where=name, fix=fix)
+                raise DataError("not allowed beside `views`", where=name, fix=fix)
         if isinstance(sigma, list):
-            fix = "give one for all, or `sigma` of every keypoint"
+            fix = "give one number for all, or `sigma` of every keypoint"
             raise DataError("a list, but there are several views", where="fit.sigma", fix=fix)
         return read, read.views
     if read.camera is UNSET:
@@ -116,32 +116,32 @@ def _read_fields(data: Any, folder: Path | None) -> tuple[ObservationFields, Seq
 
 @dataclass(frozen=True, eq=False)
 class Observation(ObservedImage):
-    """An object in one image, or in several: this is the first one.
+    """An object in one or several images; it extends the first image.
 
     Parameters
     ----------
     points_3d, points_2d, camera, sigma, ids, names, scores, image, depths, evidence
-        Camera of the first image, as for `ObservedImage`.
+        The first image, as for `ObservedImage`.
     model : Path, optional
         The CAD model.
     fit_options : mapping
-        Keyword arguments for `cadalign.fit` where they are not its defaults, as the file has them.
+        Keyword arguments for `cadalign.fit`, as in the file.
     others : tuple of ObservedImage
         The other images.
     size : Size, optional
         Known lengths of the object.
     shape : Path, optional
-        File of the learned shape that takes the model's place.
+        File of a learned shape that replaces the model.
     symmetry : Symmetry, optional
         Symmetry of the model.
     init : Alignment, optional
-        Where to start, as for `cadalign.align`.
+        Initial alignment, as for `cadalign.align`.
     object_name : str, optional
         Name of the object.
     up_axis : {"y", "x", "z"} or None
         The model's axis that points up, as for `cadalign.Model`.
     unfinished : mapping, optional
-        What is marked and cannot be used yet, for the annotator.
+        Annotator state that is not usable as evidence yet.
     """
 
     model: Path | None = None
@@ -162,7 +162,7 @@ class Observation(ObservedImage):
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The files that it names, and the materials beside the model."""
+        """The files that the observation names, and the materials beside the model."""
         named = [self.model, self.shape]
         if self.model is not None:
             named.append(Path(f"{os.path.splitext(self.model)[0]}.mtl"))
@@ -172,7 +172,7 @@ class Observation(ObservedImage):
 
     @property
     def is_plain(self) -> bool:
-        """True where nothing but keypoints in one image is known."""
+        """True if the observation has only keypoints in one image."""
         further = self.others, self.size, self.init, self.evidence.given
         return self.depths is None and not any(map(bool, further))
 
@@ -183,9 +183,10 @@ class Observation(ObservedImage):
         Parameters
         ----------
         path : str or Path
+            The file.
         needs_xyz : bool, optional
-            False where keypoints may lack ``xyz``, which is zero then; by default where the file
-            names a learned shape.
+            Whether every keypoint must have ``xyz``; a missing one becomes zero otherwise. By
+            default True unless the file names a learned shape.
 
         Raises
         ------
@@ -202,9 +203,9 @@ class Observation(ObservedImage):
     def from_dict(
         cls, data: Mapping[str, Any], *, folder: Path | None = None, needs_xyz: bool | None = None
     ) -> Observation:
-        """Read the parsed form of an observation file; paths are relative to ``folder``.
+        """Convert the parsed form of an observation file; paths are relative to ``folder``.
 
-        ``needs_xyz`` is that of `load`.
+        `load` describes ``needs_xyz``.
         """
         refuse_other(OBSERVATION, kind_of(data))
         read, fields = _read_fields(data, folder)
@@ -234,9 +235,9 @@ class Observation(ObservedImage):
         )
 
     def to_dict(self, *, folder: Path | None = None) -> dict[str, Any]:
-        """The parsed form of an observation file, its paths relative to ``folder``.
+        """Convert to the parsed form of an observation file; paths are relative to ``folder``.
 
-        Every ``pixel_origin`` is stated.
+        Every ``pixel_origin`` is written.
         """
         written = [write_image_fields(view, folder) for view in self.views]
         data: dict[str, Any] = {"views": written} if self.others else written[0]
@@ -254,37 +255,37 @@ class Observation(ObservedImage):
         return data if self.up_axis == "y" else data | {"up_axis": self.up_axis}
 
     def save(self, path: str | Path) -> None:
-        """Write an observation file; paths are written relative to it."""
+        """Write an observation file, with paths relative to it."""
         path = as_path(path)
         write_json(path, self.to_dict(folder=path.parent))
 
 
 @dataclass(frozen=True)
 class ObservationChanges:
-    """A camera in the place of those of observations."""
+    """A camera or focal length that replaces an observation's."""
 
     camera: Path | None = None  # file of the calibrated camera, see `read_camera`
     focal: Positive | None = None  # focal length of all cameras [px]
 
     def read_camera(self, size: tuple[int, int] | None) -> Camera | None:
-        """The camera, if there is one; ``size`` is the photo's, for a file of a matrix alone."""
+        """Read the camera, or None; ``size`` is the photo's, for a file with only a matrix."""
         return None if self.camera is None else read_camera(self.camera, size=size)
 
     def applied_to(self, observation: Observation, where: str | None = None) -> Observation:
-        """The observation with all of this in the place of its own; ``where`` is its file.
+        """Replace an observation's camera and focal length; ``where`` is the observation's file.
 
-        Raises InputError if the observation has several views, which one camera does not fit.
+        Raises InputError if a camera is given and the observation has several views.
         """
         own = observation.camera
         camera = self.read_camera((own.width, own.height))
         if camera is not None and observation.others:
-            what = f"the file has {len(observation.views)} views, the camera is for one"
+            what = f"the file has {len(observation.views)} views, but the camera is for one"
             raise InputError(what, where=where, fix="write cameras into its `views`")
         changed = observation if camera is None else replace(observation, camera=camera)
         focal = self.focal
         if focal is None:
             return changed
-        # Options of the fit about the focal length are left out.
+        # The new focal length replaces the file's options about it.
         kept = {key: given for key, given in changed.fit_options.items() if "focal" not in key}
         others = [replace(view, camera=view.camera.with_focal(focal)) for view in changed.others]
         camera = changed.camera.with_focal(focal)
@@ -293,29 +294,29 @@ class ObservationChanges:
 
 @dataclass(frozen=True, kw_only=True)
 class DetectorOptions:
-    """Complements of a detector's file of keypoints, and which of its keypoints count."""
+    """Model and photos for a detector's keypoints, and the selection of keypoints."""
 
     model: Path | None = None
-    """The model, whose keypoints those of a detector's file are paired with, by name, otherwise by
-    semantic id, otherwise by order: NAME.keypoints.json, or the mesh that this lies beside. With
-    --shape, the shape's by default."""
+    """The model's NAME.keypoints.json, or the mesh that it lies beside, for a detector's file.
+    Keypoints are paired by name, otherwise by semantic id, otherwise by order. With --shape, the
+    shape's keypoints by default."""
     images: Path | None = None
     """Folder of the photos that a detector's file names."""
     min_score: float = 0.0
-    """Least score of a detector's keypoint that is kept."""
+    """Lowest score of a detector's keypoints that are used."""
     ignore_unknown: bool = False
     """Leave out a detector's keypoints that the model does not have."""
 
 
-@once_per_file(64)  # which many observations may name
+@once_per_file(64)  # many observations may share a camera file
 def read_camera(path: str | os.PathLike[str], *, size: tuple[int, int] | None = None) -> Camera:
     """Read a camera from a file.
 
     Parameters
     ----------
     path : path-like
-        A camera in the form of `Camera.from_dict` as JSON, a matrix possibly without width and
-        height; otherwise text of 3 x 3 numbers, a calibration matrix by rows.
+        JSON in the form of `Camera.from_dict`, where a matrix may lack width and height; or text
+        of 3 x 3 numbers, the rows of a calibration matrix.
     size : tuple of 2 int, optional
         Width and height of the photo [px], for a matrix whose file lacks them.
 
@@ -336,8 +337,8 @@ def read_camera(path: str | os.PathLike[str], *, size: tuple[int, int] | None = 
             raise DataError("not a calibration matrix", where=str(path), fix=CAMERA_FIX) from None
     if isinstance(form, dict) and "matrix" in form and not {"width", "height"} <= set(form):
         if size is None:
-            what = "the file has a matrix alone, and the size of the image is unknown"
-            raise DataError(what, where=str(path), fix="give the photo, or width and height in it")
+            what = "the file has only a matrix, and the size of the image is unknown"
+            raise DataError(what, where=str(path), fix="give the photo, or add width and height")
         form |= {"width": size[0], "height": size[1]}
     with in_file(path):
         return Camera.from_dict(form)

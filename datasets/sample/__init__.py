@@ -21,8 +21,8 @@ from cadalign.io.files import as_path, dense_json, writing_folder
 from cadalign.io.meshes.files import write_mesh
 
 MAKERS = {"chair": chair, "bottle": bottle, "car": car, "vessel": vessel}
-"""By category: draws and builds the model with a number; the styles take turns with the number."""
-_SPLITS = ("train", "train", "train", "train", "val", "test")  # take turns by number
+"""Builders of a model by category; the style cycles with the model's index."""
+_SPLITS = ("train", "train", "train", "train", "val", "test")  # cycle with the index
 _MARKER = "sample_dataset.json"
 
 
@@ -34,20 +34,20 @@ def write_sample_dataset(
 ) -> Path:
     """Write the sample data set in KeypointNet's layout.
 
-    That is ``annotations/<category>.json``, ``ShapeNetCore.v2.ply/<synset>/<model id>.ply`` and
-    ``splits/{train,val,test}.txt``. A model depends on its category and its number alone, and the
-    same arguments give the same bytes. Everything is written beside ``root`` first and then
-    renamed, so that an interrupted run leaves no half a data set.
+    The files are ``annotations/<category>.json``, ``ShapeNetCore.v2.ply/<synset>/<model id>.ply``
+    and ``splits/{train,val,test}.txt``. A model depends only on its category and index, and the
+    same arguments give the same bytes. The folder is written beside ``root`` and then renamed, so
+    an interrupted run leaves no incomplete data set.
 
     Parameters
     ----------
     root : path
-        The folder to make. It may exist if it is empty, or holds the same data set, which is
-        kept.
+        The folder to create. An existing folder must be empty or hold the same data set, which
+        is kept.
     per_category : int
-        Models of each category, at least 1.
+        Number of models per category, at least 1.
     categories : sequence of str, optional
-        Some of chair, bottle, car, vessel; by default all.
+        Any of chair, bottle, car, vessel; by default all.
 
     Returns
     -------
@@ -59,7 +59,7 @@ def write_sample_dataset(
     InputError
         If the number is out of range or a category is unknown.
     DataError
-        If ``root`` holds anything else, or cannot be written.
+        If ``root`` has other content or cannot be written.
     """
     require_counts(per_category=per_category)
     target, names = as_path(root, "root"), list(dict.fromkeys(categories or MAKERS))
@@ -92,20 +92,20 @@ def write_sample_dataset(
 
 
 def make_model(category: str, index: int) -> tuple[Mesh, dict[str, Any]]:
-    """Build a model: its mesh, and its entry in KeypointNet's annotations.
+    """Build a model; returns its mesh and its entry in KeypointNet's annotations.
 
-    The front is at -z, the bounding box has a diagonal of 1; coordinates are exact in single
+    The front is at -z, the bounding box has a diagonal of 1, and coordinates are exact in single
     precision.
     """
     rng = np.random.default_rng([0, int(SYNSETS[category]), index])
-    # Real models are not centred either; but planes and axes of symmetry stay at 0.
+    # Real models are off-centre, too. Planes and axes of symmetry stay at 0.
     offset = rng.uniform(-0.08, 0.08, size=3) * (0, 1, category != "bottle")
     draft, model_id = MAKERS[category](rng, index), f"sample_{category}_{index:03d}"
     whole = join(draft.parts, f"{category} {model_id}")
     center, diagonal = whole.bounds.mean(axis=0), np.linalg.norm(np.ptp(whole.bounds, axis=0))
-    # The file holds single precision: the mesh and what is computed from it agree with that.
+    # The file has single precision; the mesh and the keypoints must agree with it.
     scaled = ((whole.vertices - center) / diagonal + offset).astype(np.float32).astype(np.float64)
-    faces = whole.faces[has_area(scaled[whole.faces])]  # rounding flattens some
+    faces = whole.faces[has_area(scaled[whole.faces])]  # rounding can flatten faces
     mesh = Mesh(scaled, faces, vertex_colors=whole.vertex_colors, source=whole.source)
     ids = sorted(draft.places)
     places = (np.array([draft.places[number] for number in ids]) - center) / diagonal + offset
@@ -116,15 +116,15 @@ def make_model(category: str, index: int) -> tuple[Mesh, dict[str, Any]]:
         {"xyz": at, "semantic_id": number, "mesh_info": {"face_index": face, "face_uv": uv}}
         for number, at, face, uv in zip(*columns, strict=True)
     ]
-    reflection = [{"kp_indexes": list(map(ids.index, pair))} for pair in draft.mirrored]
+    reflection = [{"kp_indexes": list(map(ids.index, pair))} for pair in draft.mirror_pairs]
     rotation: list[dict[str, Any]] = []
-    for group in draft.turned:
+    for group in draft.rotation_groups:
         rows, circle = list(map(ids.index, group)), {}
-        if draft.round:
-            # The axis is that of the model, not the mean of points on a polygon.
+        if draft.is_round:
+            # The model's axis; the mean of the keypoints deviates from it.
             middle = np.where([1, 0, 1], mesh.bounds.mean(axis=0), xyz[rows].mean(axis=0))
             radius = float(np.linalg.norm(xyz[rows] - middle, axis=1).mean())
             circle = {"center": middle.tolist(), "radius": radius, "normal": [0.0, 1.0, 0.0]}
-        rotation.append({"kp_indexes": rows, "is_circle": draft.round, "circle": circle})
+        rotation.append({"kp_indexes": rows, "is_circle": draft.is_round, "circle": circle})
     entry = {"class_id": SYNSETS[category], "model_id": model_id, "keypoints": keypoints}
     return mesh, entry | {"symmetries": {"reflection": reflection, "rotation": rotation}}

@@ -1,4 +1,4 @@
-"""Parametric chairs, bottles, cars and vessels, each drawn from a random stream and built."""
+"""Builders of parametric chairs, bottles, cars and vessels with random measures."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from cadalign.datasets.sample.parts import (
     Draft,
     beam,
     box,
-    chosen,
     lathe,
     loft,
     read_designs,
+    select_kind,
     stack,
 )
 
@@ -23,14 +23,14 @@ _EDGE = 0.022  # radius of the rounded edge of a bottle's bottom
 
 
 def chair(rng: np.random.Generator, index: int) -> Draft:
-    """Draw and build a chair.
+    """Draw the measures of a chair and build it.
 
-    Semantic ids are those of KeypointNet's chairs: 0, 1 top corners of the back; 2, 3 rear and
-    4, 5 front corners of the seat; 6 to 9 ends of the armrests; 10 to 14 tips of a swivel base;
-    17 to 20 feet. Three more are this data set's own: 21, 22 the sides of the back and 23 the
-    middle of its top.
+    Semantic ids follow KeypointNet's chairs: 0, 1 top corners of the back; 2, 3 rear and 4, 5 front
+    corners of the seat; 6 to 9 ends of the armrests; 10 to 14 tips of a swivel base; 17 to 20
+    feet. Three are specific to this data set: 21, 22 the sides of the back and 23 the middle of
+    its top.
     """
-    style = chosen(_CHAIR.kinds, index)
+    style = select_kind(_CHAIR.kinds, index)
     measures = rng.uniform(_CHAIR.least, _CHAIR.most).tolist()
     width, depth, seat, thickness, tall, tilt, leg = measures
     bars, is_cushioned, is_wooden = rng.integers(3, 6), rng.random() < 0.6, style.base != "swivel"
@@ -47,7 +47,7 @@ def chair(rng: np.random.Generator, index: int) -> Draft:
     draft.mark_pair(4, 5, (half, seat, -depth / 2))
 
     def at(share: float, x: float, hollow: float = 0.0) -> tuple[float, float, float]:
-        """A point of the back at a share of its height."""
+        """A point of the back at a fraction of its height."""
         slope, along = np.radians(tilt), share * tall
         z = depth / 2 - 0.025 + along * np.sin(slope) + hollow
         return x, seat + along * np.cos(slope), z
@@ -95,8 +95,8 @@ def chair(rng: np.random.Generator, index: int) -> Draft:
     column = [(0.045, 0.06), (0.045, 0.13), (0.03, 0.15), (0.03, 0.24), (0.018, 0.245)]
     plate = [(0.018, seat - 0.08), (0.09, seat - 0.05), (0.09, seat - 0.01)]
     draft.add(lathe(column + plate, frame, count=20))
-    draft.turned.append((10, 11, 12, 13, 14))
-    for number, degrees in zip(*draft.turned, (144, 72, 0, -72, -144), strict=True):
+    draft.rotation_groups.append((10, 11, 12, 13, 14))
+    for number, degrees in zip(*draft.rotation_groups, (144, 72, 0, -72, -144), strict=True):
         angle = np.radians(degrees)  # from +z towards +x
         x, z = 0.58 * width * np.sin(angle), 0.58 * width * np.cos(angle)
         castor = (0.96 * x, 0.03, 0.96 * z)
@@ -107,13 +107,13 @@ def chair(rng: np.random.Generator, index: int) -> Draft:
 
 
 def bottle(rng: np.random.Generator, index: int) -> Draft:
-    """Draw and build a bottle.
+    """Draw the measures of a bottle and build it.
 
-    Semantic ids are those of KeypointNet's bottles: 0 to 3 around the base, 4 to 7 around the
-    shoulder, 8 the middle of the top, 9 to 12 around the top's rim, 13 to 16 around the beginning
-    of the neck.
+    Semantic ids follow KeypointNet's bottles: 0 to 3 around the base, 4 to 7 around the shoulder,
+    8 the middle of the top, 9 to 12 around the top's rim, 13 to 16 around the lower end of the
+    neck.
     """
-    color, b = rng.choice(_BOTTLE.cap_colors), chosen(_BOTTLE.kinds, index)
+    color, b = rng.choice(_BOTTLE.cap_colors), select_kind(_BOTTLE.kinds, index)
     b.radius *= rng.uniform(0.9, 1.14)
     b.shoulder += rng.uniform(-0.03, 0.03)
     b.neck += rng.uniform(-0.02, 0.02)
@@ -124,7 +124,7 @@ def bottle(rng: np.random.Generator, index: int) -> Draft:
     heights = np.interp(np.arange(-4, 33), [0, 15, 29, 32], knots)
     heights[:4] = _EDGE * (1 - np.cos(np.linspace(0, np.pi / 2, 5)))[:4]
     paper = np.linspace(b.low, min(b.high, b.shoulder - 0.04), 9)
-    draft = Draft(round=True)
+    draft = Draft(is_round=True)
     draft.add(
         lathe(_profile(b, heights), rng.choice(_BOTTLE.glass[b.glass]), count=40),
         lathe(cap, color, count=40),
@@ -138,13 +138,13 @@ def bottle(rng: np.random.Generator, index: int) -> Draft:
         around = (first, first + 1, first + 2, first + 3)
         corners = ((x, y, -z), (x, y, z), (-x, y, z), (-x, y, -z))  # KeypointNet's order
         draft.places |= zip(around, corners, strict=True)
-        draft.mirrored += [(around[i - 1], around[i]) for i in range(4)]
-        draft.turned.append(around)
+        draft.mirror_pairs += [(around[i - 1], around[i]) for i in range(4)]
+        draft.rotation_groups.append(around)
     return draft
 
 
 def _profile(b: SimpleNamespace, y: FloatArray) -> FloatArray:
-    """Radii and heights (k, 2) of a bottle's body at heights."""
+    """Radius and height (k, 2) of a bottle's body at the heights ``y``."""
     body = np.clip((y - _EDGE) / (b.shoulder - _EDGE), 0, 1)
     above = np.clip((y - b.shoulder) / (b.neck - b.shoulder), 0, 1)
     # A smooth step from body to neck; the power moves it down (slender) or up (full).
@@ -155,13 +155,13 @@ def _profile(b: SimpleNamespace, y: FloatArray) -> FloatArray:
 
 
 def car(rng: np.random.Generator, index: int) -> Draft:
-    """Draw and build a car.
+    """Draw the measures of a car and build it.
 
-    Semantic ids, right (+x) before left: 0 to 3 front and rear corners of the roof; 4 to 7 middles
+    Semantic ids, right (+x) before left: 0 to 3 front and rear corners of the roof; 4 to 7 centres
     of the front and rear wheels; 8, 9 head lamps; 10, 11 tail lamps; 12, 13 lower corners of the
     windscreen; 14 to 17 ends of the front and rear bumper; 18, 19 mirrors.
     """
-    c, shift = chosen(_CAR.kinds, index), rng.uniform(-0.012, 0.012)
+    c, shift = select_kind(_CAR.kinds, index), rng.uniform(-0.012, 0.012)
     least, most = (0.92, 0.95, 0.96), (1.08, 1.05, 1.06)
     length, width, height = (c.length, c.width, c.height) * rng.uniform(least, most)
     shoulder, wheel = rng.uniform(0.12, 0.2), c.wheel * rng.uniform(0.97, 1.04)
@@ -169,13 +169,13 @@ def car(rng: np.random.Generator, index: int) -> Draft:
     draft, half, end = Draft(), width / 2, length / 2
 
     def level(share: float, grow: float = 0.0) -> tuple[float, float, float, float]:
-        """A section of the glass house, at the belt line for 0 and at the roof for 1."""
+        """A section of the cabin, from the belt line (0) to the roof (1)."""
         front = (c.cowl + shift + share * (c.roof - c.cowl) - 0.5) * length - grow
         rear = (c.deck + share * (c.rear - c.deck) - 0.5) * length + grow
         y = c.belt + share * (height - 0.042 - c.belt)
         return y, width * (0.9 - c.lean * share) + 2 * grow, front, rear
 
-    # The edge of bonnet and boot, from below: how far under it, and how far inside.
+    # The rounded edge of bonnet and boot, from below: depth below the top, and inset.
     edge = ((shoulder, 0.0), (0.35 * shoulder, 0.05), (0.0, 0.14))
     body = [
         (c.sill, width - 0.1, 0.1 - end, end - 0.1),
@@ -224,15 +224,15 @@ def car(rng: np.random.Generator, index: int) -> Draft:
 
 
 def vessel(rng: np.random.Generator, index: int) -> Draft:
-    """Draw and build a vessel.
+    """Draw the measures of a vessel and build it.
 
     Semantic ids, right (+x) before left: 0 top of the bow; 1 bow at the water line; 2, 3 corners of
     the stern; 4, 5 edge of the side amidships, 6, 7 a quarter of the length from the bow; 8, 9
     front and 10, 11 rear upper corners of the deck house; 12 the highest point; 13, 14 stern at the
-    water line; 15 the funnel's top, where there is one.
+    water line; 15 the top of the funnel, if there is one.
     """
     turn, number = divmod(index, len(_VESSEL.kinds["kind"]))
-    v = chosen(_VESSEL.kinds, number)
+    v = select_kind(_VESSEL.kinds, number)
     v.beam, v.side = (v.beam, v.side) * rng.uniform((0.92, 0.88), (1.08, 1.12))
     variant, tall = turn % 3, rng.uniform(0.92, 1.1)
     draft, accents = Draft(), _VESSEL.accents
@@ -293,7 +293,7 @@ def vessel(rng: np.random.Generator, index: int) -> Draft:
 
 
 def _outline(v: SimpleNamespace, level: float) -> FloatArray:
-    """A closed line around the hull, from the middle of the stern over the right side.
+    """A closed line around the hull, starting at the middle of the stern, right side first.
 
     The level is -1 at the keel, 0 at the water line, 1 at the edge of the deck.
     """

@@ -1,7 +1,7 @@
 """Parts of sample models: closed surfaces of one colour.
 
-All but sharp boxes are lofts, surfaces through a row of closed outlines, because a part around the
-plane x = 0 must be exactly mirror symmetric, also in its tessellation.
+All parts are lofts: surfaces through a sequence of closed outlines. They make a part across the
+plane x = 0 exactly mirror symmetric, also in its tessellation.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ Place = Sequence[float] | FloatArray
 
 
 def read_designs(*categories: str) -> list[SimpleNamespace]:
-    """The measures and colours of categories, from designs.toml."""
+    """Read measures and colours of categories from designs.toml."""
     designs = tomllib.loads(Path(__file__).with_name("designs.toml").read_text(encoding="utf-8"))
     return [SimpleNamespace(**designs[category]) for category in categories]
 
 
-def chosen(kinds: dict[str, list[Any]], index: int) -> SimpleNamespace:
-    """The measures of one kind out of lists over all, which take turns."""
+def select_kind(kinds: dict[str, list[Any]], index: int) -> SimpleNamespace:
+    """Select the measures of one kind from lists of all kinds; the index cycles through them."""
     return SimpleNamespace(**{name: each[index % len(each)] for name, each in kinds.items()})
 
 
 def part(vertices: npt.ArrayLike, faces: npt.ArrayLike, color: Color) -> Mesh:
-    """Weld coinciding vertices, drop triangles without area, turn the surface outward."""
+    """Build a mesh: merge equal vertices, drop triangles without area, orient it outward."""
     points = np.round(np.asarray(vertices, dtype=float), 8) + 0.0
     welded, inverse = np.unique(points, axis=0, return_inverse=True)
     triangles = inverse.reshape(-1)[np.asarray(faces, dtype=np.int64)]
@@ -54,21 +54,21 @@ def has_area(triangles: FloatArray) -> BoolArray:
 
 
 def loft(outlines: npt.ArrayLike, color: Color) -> Mesh:
-    """Join a row of closed outlines (k, n, 3), n even, by a surface and close its two ends.
+    """Build a closed surface through a sequence of closed outlines (k, n, 3), n even.
 
-    Point ``j`` of one is joined with point ``j`` of the next. An end is closed by strips between
-    the points ``j`` and ``n - j`` and a spine in the middle of them, so outlines should be
-    symmetric in that order. An outline may shrink to a line or a point.
+    Point ``j`` of an outline is connected with point ``j`` of the next. Each end is closed by
+    strips from the outline to a spine, the midpoints of the points ``j`` and ``n - j``. Outlines
+    should therefore be symmetric in this order. An outline may be a line or a point.
     """
     rings = np.asarray(outlines, dtype=float)
-    # An end is one more outline that has collapsed onto its spine.
+    # An end is an outline that has collapsed onto its spine.
     spines = (rings[[0, -1]] + rings[[0, -1]][:, -np.arange(rings.shape[1])]) / 2
     rings = np.concatenate([spines[:1], rings, spines[1:]])
     index = np.arange(rings.shape[0] * rings.shape[1]).reshape(rings.shape[:2])
     after = np.roll(index, -1, axis=1)
     a, b, c, d = (each.reshape(-1) for each in (index[:-1], after[:-1], after[1:], index[1:]))
     vertices = rings.reshape(-1, 3)
-    # Quads are cut along the other diagonal on the other side of x = 0.
+    # The two sides of x = 0 use opposite diagonals of the quads.
     right = (vertices[a] + vertices[b] + vertices[c] + vertices[d])[:, 0] > 0
     first = np.stack([a, b, np.where(right, d, c)], axis=1)
     second = np.stack([np.where(right, b, a), c, d], axis=1)
@@ -76,7 +76,7 @@ def loft(outlines: npt.ArrayLike, color: Color) -> Mesh:
 
 
 def rectangle(width: float, height: float, *, radius: float, steps: int) -> FloatArray:
-    """An outline (n, 2) with round corners of ``steps`` pieces, from the middle of its top."""
+    """A rectangular outline (n, 2) from the middle of its top, each corner in ``steps`` pieces."""
     radius = max(min(radius, 0.499 * width, 0.499 * height), 0.0)
     angle = np.linspace(0, np.pi / 2, steps + 1)
     arc = np.stack([np.sin(angle), np.cos(angle)], axis=1)
@@ -87,7 +87,7 @@ def rectangle(width: float, height: float, *, radius: float, steps: int) -> Floa
 
 
 def stack(levels: Iterable[Sequence[Any]], color: Color, *, radius: float) -> Mesh:
-    """A body through rectangles: a height, or those of front and rear, a width, z of both ends."""
+    """Loft rectangles, each (height or heights of front and rear, width, front z, rear z)."""
     rings = []
     for height, width, front, rear in levels:
         x, z = rectangle(width, rear - front, radius=radius, steps=3).T
@@ -98,7 +98,7 @@ def stack(levels: Iterable[Sequence[Any]], color: Color, *, radius: float) -> Me
 
 
 def box(center: Place, size: Place, color: Color, *, radius: float = 0.0) -> Mesh:
-    """A box, its edges rounded by a radius."""
+    """Build a box with edges rounded by a radius."""
     width, height, depth = size
     radius = min(radius, 0.49 * height, 0.45 * width, 0.45 * depth)
     angle = np.linspace(0, np.pi / 2, 4 if radius else 1)
@@ -117,9 +117,9 @@ def beam(
     scales: npt.ArrayLike = (1.0,),
     radius: float | None = None,
 ) -> Mesh:
-    """Extrude a rectangle along a path (k, 3), ``scales`` (k,) or (k, 2) times as large.
+    """Extrude a rectangle along a path (k, 3), scaled by ``scales`` (k,) or (k, 2) at its points.
 
-    Its first side is along x, or along z where the path runs along x.
+    The first side is along x, or along z if the path runs along x.
     """
     points = np.asarray(path, dtype=float)
     tangent = trimesh.unitize(np.gradient(points, axis=0))
@@ -140,9 +140,10 @@ def lathe(
     count: int = 24,
     sideways: bool = False,
 ) -> Mesh:
-    """Turn a profile (k, 2) of radius and height around a vertical axis, in ``count`` = 4 i points.
+    """Revolve a profile (k, 2) of radius and height about a vertical axis.
 
-    The axis of a ``sideways`` part is along x, its heights are distances outward.
+    ``count``, the number of points around the axis, is a multiple of 4. If ``sideways``, the axis
+    is along x.
     """
     radius, height = np.asarray(profile, dtype=float).T[..., None]
     angle = 2 * np.pi * np.arange(count) / count
@@ -154,16 +155,16 @@ def lathe(
 
 @dataclass
 class Draft:
-    """A model that is being built, in its builder's units, y up and the front at -z."""
+    """A model under construction, in its builder's units, y up and the front at -z."""
 
     parts: list[Mesh] = field(default_factory=list)
-    # By semantic id: keypoints land on the surface's nearest point.
+    # Keypoints by semantic id; they are projected to the surface's nearest point.
     places: dict[int, Place] = field(default_factory=dict)
-    # Semantic ids that a mirror plane exchanges, and that a rotation about y permutes.
-    mirrored: list[tuple[int, int]] = field(default_factory=list)
-    turned: list[tuple[int, ...]] = field(default_factory=list)
-    # Any rotation about y is one: each group that is turned lies on a circle.
-    round: bool = False
+    # Semantic ids that a reflection exchanges, and that a rotation about y permutes.
+    mirror_pairs: list[tuple[int, int]] = field(default_factory=list)
+    rotation_groups: list[tuple[int, ...]] = field(default_factory=list)
+    # True if any rotation about y is a symmetry: each rotation group lies on a circle.
+    is_round: bool = False
 
     def add(self, *parts: Mesh) -> None:
         self.parts += parts
@@ -175,7 +176,7 @@ class Draft:
             self.parts += [right, replace(right, vertices=vertices, faces=faces)]
 
     def mark_pair(self, right: int, left: int, place: Place) -> None:
-        """Set the places of two semantic ids: the given one and its mirror image."""
+        """Set the place of a semantic id, and its mirror image as the place of another."""
         x, y, z = place
         self.places |= {right: (x, y, z), left: (-x, y, z)}
-        self.mirrored.append((right, left))
+        self.mirror_pairs.append((right, left))

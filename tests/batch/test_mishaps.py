@@ -125,7 +125,7 @@ def test_no_page_is_written_over_what_it_is_made_from(
     before = (run / "run.json").read_bytes()
     capsys.readouterr()
     assert main(["report", str(run), "--out", str(run / "run.json")]) == 1
-    assert "run.json: what is to be written is made from this file" in capsys.readouterr().err
+    assert "run.json: this file is an input and would be overwritten" in capsys.readouterr().err
     assert (run / "run.json").read_bytes() == before
 
 
@@ -188,7 +188,9 @@ def test_objects_of_a_detector_that_cannot_be_read_fail_alone(
     source = coco(tmp_path / "found.json", {}, *bad, {"category_id": 5}, {"score": "high"})
     rows = detected(tmp_path, source)
     assert [row["status"] for row in rows] == ["ok"] * 3 + ["failed"] * len(bad)
-    assert rows[3]["reason"].startswith(f"{source}: annotations[1]: keypoints: keypoint 0 is at ")
+    assert rows[3]["reason"].startswith(
+        f"{source}: annotations[1]: keypoints: keypoint 0 has the invalid pixel "
+    )
     assert "failed 1: " in capsys.readouterr().err
 
 
@@ -214,7 +216,7 @@ def test_a_detectors_file_without_a_good_object_is_refused(
 ) -> None:
     source = coco(tmp_path / "found.json", {"keypoints": [float("inf")] * 24})
     assert main(["fit", str(source), "--model", "m.keypoints.json"]) == 1
-    reason = f"{source}: annotations[0]: keypoints: keypoint 0 is at [inf, inf]"
+    reason = f"{source}: annotations[0]: keypoints: keypoint 0 has the invalid pixel [inf, inf]"
     assert reason in capsys.readouterr().err
 
 
@@ -227,4 +229,4 @@ def test_photo_of_another_size_than_its_camera_is_warned_of(tmp_path: Path) -> N
     run_many(FitRunOptions(inputs=(tmp_path / "seen.json",)), tmp_path / "run")
     (row,) = rows_of(tmp_path / "run")
     assert row["warning_kinds"].split("; ")[-1] == "camera"
-    assert "photo.png: the image has 1280 x 960 pixels, that of its camera 640 x" in row["warnings"]
+    assert "photo.png: the image has 1280 x 960 pixels, but its camera has 640 x" in row["warnings"]

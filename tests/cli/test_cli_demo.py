@@ -171,7 +171,7 @@ def too_few_keypoints(root: Path, category: str) -> None:
     ("spoil", "reason"),
     [
         (cut_short, r"\.ply: "),
-        (displaced, r"keypoints\[\d+\] lies .* off the place that its face and barycentric"),
+        (displaced, r"keypoints\[\d+\] lies .* from the point that its face and barycentric"),
         (too_few_keypoints, r"keypoints"),
     ],
 )

@@ -79,7 +79,7 @@ def test_inputs_are_not_overwritten(
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
     fit = tmp_path / "photo_fit" / "fit.json"
     said = refusal(capsys, fit, "--to", tmp_path / "wedge.obj")
-    assert "what is to be written is made from this file; give another name" in said
+    assert "this file is an input and would be overwritten; give another name" in said
     assert before == {path: path.read_bytes() for path in before}
 
 

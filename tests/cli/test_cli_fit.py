@@ -159,7 +159,7 @@ def test_the_photo_is_not_drawn_over(tmp_path: Path, capsys: pytest.CaptureFixtu
     (tmp_path / "model.obj").write_text(TETRAHEDRON)
     path = write_observation(tmp_path / "chair.json", image=photo, model=tmp_path / "model.obj")
     line = refusal_line(capsys, "fit", path, "--out", tmp_path)
-    assert line == f"{photo}: what is to be written is made from this file; give another name"
+    assert line == f"{photo}: this file is an input and would be overwritten; give another name"
     assert photo.read_bytes() == before
 
 
@@ -200,8 +200,8 @@ def test_photo_that_cannot_be_used(tmp_path: Path, capsys: pytest.CaptureFixture
     assert line.startswith(f"{photo}: not an image that can be read (")
     cv2.imwrite(str(photo), np.zeros((10, 20, 3), dtype=np.uint8))
     assert refusal_line(capsys, "fit", path) == (
-        f"{photo}: the image has 20 x 10 pixels, that of its camera 640 x 480; "
-        "give keypoints, photo and camera of one image"
+        f"{photo}: the image has 20 x 10 pixels, but its camera has 640 x 480; "
+        "give keypoints, photo and camera of the same image"
     )
 
 

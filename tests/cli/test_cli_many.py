@@ -147,7 +147,7 @@ def test_reasons_of_failures_name_the_options(
     arguments = ["--camera", str(folder / "K.txt"), "--model", str(path), "--no-picture"]
     assert main(["fit", str(folder / "found.json"), *arguments]) == 1
     said = capsys.readouterr().err
-    assert "it has corner 0; --ignore-unknown leaves out what it has not\n" in said
+    assert "it has corner 0; --ignore-unknown leaves out unknown keypoints\n" in said
 
 
 def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -166,13 +166,13 @@ def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
         (["fit", "{folder}/empty"], "{folder}/empty: the folder holds no observation; "),
         (
             ["observe", "{folder}/found.json", "{folder}/model.keypoints.json", "--image", "a.png"],
-            "--object: 2 objects in the image, and no scores to choose by; choose one, 0 to 1",
+            "--object: the image has 2 objects, and no scores to choose by; choose one, 0 to 1",
         ),
         (
             ["observe", "{folder}/found.json", "{folder}/other.keypoints.json", "--image", "b.png"],
             "{folder}/found.json: annotations[2]: the model has no keypoint 'corner 4'; "
-            "it has corner 0, corner 1, corner 2, corner 3; --ignore-unknown leaves out what "
-            "it has not",
+            "it has corner 0, corner 1, corner 2, corner 3; --ignore-unknown leaves out "
+            "unknown keypoints",
         ),
     ],
 )  # fmt: skip

@@ -85,7 +85,7 @@ def test_the_detectors_file_is_not_written_over(
     found, photo = folder / "found.json", folder / "photo.jpg"
     before = found.read_bytes()
     line = refusal_line(capsys, *observing(folder, "--image", str(photo), "--out", str(found)))
-    assert line == f"{found}: what is to be written is made from this file; give another name"
+    assert line == f"{found}: this file is an input and would be overwritten; give another name"
     assert found.read_bytes() == before
 
 
@@ -151,7 +151,10 @@ def test_focal_length_is_given_in_the_command(
             ["--camera", "{folder}/found.json"],
             "{folder}/found.json: a detector's keypoints, not a camera; give 3 x 3 numbers",
         ),
-        (["--image", "{folder}/photo.jpg", "--object", "3"], "--object: object 3 of 1; "),
+        (
+            ["--image", "{folder}/photo.jpg", "--object", "3"],
+            "--object: there is no object 3 of 1; ",
+        ),
     ],
 )
 def test_what_cannot_be_used_is_refused_in_one_line(
@@ -233,9 +236,9 @@ def test_observe_and_fit_refuse_a_photo_of_another_size_alike(
     found, model = coco(folder, width=size[0], height=size[1]), folder / "model.keypoints.json"
     photo = folder / "photo.jpg"
     line = refusal_line(capsys, "observe", str(found), str(model), "--image", str(photo))
-    what = f"the image has {size[0]} x {size[1]} pixels, that of {photo} 640 x 480"
+    what = f"the image has {size[0]} x {size[1]} pixels, but {photo} has 640 x 480"
     assert line.startswith(f"{found}: annotations[0]: {what}")
-    assert ("EXIF data say that it was held on its side" in line) == says_exif
+    assert ("by its EXIF orientation" in line) == says_exif
     assert main(["fit", str(found), "--model", str(model), "--no-picture"]) == 1
     assert line in capsys.readouterr().err
 

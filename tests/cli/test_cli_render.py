@@ -141,5 +141,5 @@ def test_textures_of_the_model_are_not_written_over(model, capsys) -> None:
     Image.new("RGB", (4, 4), (200, 30, 30)).save(texture)
     before = texture.read_bytes()
     line = refusal_line(capsys, "render", model, "--out", texture, "--resolution", "32x24")
-    assert line == f"{texture}: what is to be written is made from this file; give another name"
+    assert line == f"{texture}: this file is an input and would be overwritten; give another name"
     assert texture.read_bytes() == before

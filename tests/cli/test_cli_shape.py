@@ -47,9 +47,9 @@ def test_refusals(sample_root: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     before = annotations.read_bytes()
     for path in (annotations, sample_root / "splits" / "train.txt"):
         line = refusal_line(capsys, *learning, "--out", path)
-        assert line == f"{path}: what is to be written is made from this file; give another name"
+        assert line == f"{path}: this file is an input and would be overwritten; give another name"
         line = refusal_line(capsys, "library", "build", sample_root, "--out", path)
-        assert line == f"{path}: what is to be written is made from this file; give another name"
+        assert line == f"{path}: this file is an input and would be overwritten; give another name"
     assert annotations.read_bytes() == before
     wrong = tmp_path / "wrong.shape"
     wrong.write_text("no shape")

@@ -1,4 +1,4 @@
-"""Symmetries of KeypointNet's annotation in the form that fits and metrics take."""
+"""Symmetries computed from KeypointNet's annotation."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_annotated_quarters_make_a_group_of_four():
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_square_is_turned_by_quarters_about_its_own_axis_alone(axis):
-    """Where equivalent keypoints alternate, half a turn is left."""
+    """If equivalent keypoints alternate, only half turns are symmetries."""
     corners = np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
     xyz = np.roll(corners, (axis + 1) % 3, axis=1) + [[0.1, 0.2, 0.3]]
     for groups, angles in ((((0, 1, 2, 3),), [90, 180, 270]), (((0, 2), (1, 3)), [180])):

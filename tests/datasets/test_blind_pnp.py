@@ -1,4 +1,4 @@
-"""Blind PnP's pickles arrive as correspondences."""
+"""Correspondences from blind PnP's pickles."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Samples:
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_matches_arrive(tmp_path, dtype):
+def test_matches_are_read(tmp_path, dtype):
     samples = Samples(dtype)
     loaded = BlindPnP(samples.write(tmp_path / "nyu_train"))
     assert loaded.names == ("0", "1", "2", "3")
@@ -69,7 +69,7 @@ def test_matches_arrive(tmp_path, dtype):
     assert loaded["2"].id == loaded[2].id == "2"
 
 
-def test_inlier_matches_say_what_belongs_together(tmp_path):
+def test_inlier_matches_pair_points(tmp_path):
     samples = Samples()
     data = samples.matches()
     data["inlier_matches"] = []
@@ -117,7 +117,7 @@ def test_focal_lengths_come_from_the_file_or_the_default(tmp_path):
     assert [(c.fx, c.fy) for c in cameras] == [(525, 525), (300, 300), (500, 510), (400, 400)]
 
 
-def test_the_virtual_image_just_holds_the_points(tmp_path):
+def test_the_virtual_image_has_the_smallest_size_that_holds_the_points(tmp_path):
     for sample in BlindPnP(Samples().write(tmp_path)):
         assert sample.camera.contains(sample.points_2d).all()
         centred = np.abs(sample.points_2d - (sample.camera.cx, sample.camera.cy)).max(axis=0)
@@ -132,7 +132,7 @@ def test_the_virtual_image_just_holds_the_points(tmp_path):
     [
         ("matches", np.zeros((9, 4)), r"matches: shape \(9, 4\), expected \(n, 5\)"),
         ("matches", np.full((9, 5), np.nan), "matches: NaN or infinite"),
-        ("matches", np.zeros((0, 5)), "names row 0 of 0 in matches"),
+        ("matches", np.zeros((0, 5)), "names row 0, but matches has 0"),
         ("inlier_matches", np.zeros((0, 2)), "there are no correspondences"),
         ("matches", None, "matches: "),
         ("t", [[1], [1, 2]], "t: not an array of numbers"),
@@ -140,8 +140,8 @@ def test_the_virtual_image_just_holds_the_points(tmp_path):
         ("R", np.diag([1.0, 1.0, -1.0]), "not a rotation matrix"),
         ("t", np.zeros(2), "translation: shape"),
         ("t", [], "translation: shape"),
-        ("focal", -5.0, r"focal: \[-5.0\] are no focal lengths"),
-        ("inlier_matches", np.array([[0, 10]]), "names row 10 of 10 in matches"),
+        ("focal", -5.0, r"focal: \[-5.0\] are not focal lengths"),
+        ("inlier_matches", np.array([[0, 10]]), "names row 10, but matches has 10"),
     ],
 )
 def test_a_bad_sample_is_named_and_spoils_no_other(tmp_path, name, value, message):
@@ -163,14 +163,14 @@ def test_shuffled_points_are_refused(tmp_path):
     samples = Samples()
     data = samples.matches()
     data["matches"][0] = np.hstack([samples.p2d[0][::-1], samples.p3d[0]])
-    with pytest.raises(DataError, match=r"under the true pose .* apart.*inlier_matches.pkl"):
+    with pytest.raises(DataError, match=r"apart under the true pose.*inlier_matches.pkl"):
         BlindPnP(samples.write(tmp_path, data))[0]
 
 
 def test_files_of_different_length_are_refused(tmp_path):
     samples = Samples()
     folder = samples.write(tmp_path, samples.matches() | {"R": samples.R[:3]})
-    with pytest.raises(DataError, match=r"R.pkl: holds 3 samples, t.pkl 4"):
+    with pytest.raises(DataError, match=r"R.pkl: holds 3 samples, but t.pkl has 4"):
         BlindPnP(folder)
 
 

@@ -1,4 +1,4 @@
-"""Masks beside COCO keypoints: polygons and run lengths, against pycocotools."""
+"""Masks of COCO annotations, as polygons and run lengths, compared with pycocotools."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def random_mask(seed: int) -> np.ndarray:
 
 @pytest.mark.long
 @given(st.integers(0, 10**6))
-def test_run_lengths_are_those_of_pycocotools(seed: int) -> None:
+def test_run_lengths_agree_with_pycocotools(seed: int) -> None:
     mask = random_mask(seed)
     compressed: Any = coco.encode(np.asfortranarray(mask.astype(np.uint8)))
     text = {"size": compressed["size"], "counts": compressed["counts"].decode()}
@@ -65,8 +65,8 @@ def test_a_polygon_may_leave_the_image() -> None:
     [
         (7, "segmentation: 7 is not a list"),
         ([[1.0, 2.0]], "segmentation[0]: [1.0, 2.0] is not a polygon of three or more points"),
-        ([[1.0] * 7], "segmentation[0]: 7 numbers are not x, y of points; "),
-        ([[0.0, 0, 1e9, 0, 1e9, 9]], "segmentation[0]: has points far outside of the image; "),
+        ([[1.0] * 7], "segmentation[0]: expected x, y of each point, got 7 numbers; "),
+        ([[0.0, 0, 1e9, 0, 1e9, 9]], "segmentation[0]: has points far outside the image; "),
         ([[0.0, 0, 1, float("nan"), 3, 4]], "segmentation[0][3]: nan is not a finite number"),
         ([], "segmentation: the mask is empty; "),
         ({"size": [23, 37]}, "segmentation.counts: missing"),
@@ -76,16 +76,16 @@ def test_a_polygon_may_leave_the_image() -> None:
         ),
         (
             {"size": [23, 37], "counts": [1, 2]},
-            "segmentation.counts: the runs have 3 pixels, the image 851; ",
+            "segmentation.counts: the runs have 3 pixels, the image has 851; ",
         ),
         ({"size": [23, 37], "counts": [851]}, "segmentation: the mask is empty; "),
         *(
-            ({"size": [23, 37], "counts": text}, "segmentation.counts: is not the text of a whole")
+            ({"size": [23, 37], "counts": text}, "segmentation.counts: the compressed run")
             for text in ("b\x00", "o", "o" * 99, "", "22", "22o")
         ),
     ],
 )
-def test_what_is_no_mask_is_refused(segmentation: Any, text: str) -> None:
+def test_invalid_masks_are_refused(segmentation: Any, text: str) -> None:
     assert refusal_text(
         lambda: decode_segmentation(segmentation, width=WIDTH, height=HEIGHT)
     ).startswith(text)
@@ -102,8 +102,8 @@ def test_any_text_is_decoded_or_refused(text: str) -> None:
     assert mask.shape == (2, 3)
 
 
-def test_a_polygon_of_two_points_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_polygon_of_two_points_is_ignored(caplog: pytest.LogCaptureFixture) -> None:
     square = [1.0, 0.0, 3.0, 0.0, 3.0, 2.0, 1.0, 2.0]
     mask = decode_segmentation([[1, 1, 2, 2], square], width=4, height=2)
     assert mask.tolist() == decode_segmentation([square], width=4, height=2).tolist()
-    assert "1 of 2 polygons have fewer than three points; left out" in caplog.text
+    assert "1 of 2 polygons have fewer than three points; ignored" in caplog.text

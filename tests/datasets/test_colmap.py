@@ -1,4 +1,4 @@
-"""COLMAP models: what they say arrives, real ones reproject, bad images are named."""
+"""COLMAP models: their content, reprojection of a real one, errors that name bad images."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Model:
 
     def __init__(self, models: list[str], *, points: int = 30) -> None:
         rng = np.random.default_rng(4)
-        # Numbers with gaps and out of order, as COLMAP leaves them.
+        # Ids with gaps and out of order, as in COLMAP's files.
         ids = rng.permutation(np.arange(7, 7 + 3 * points, 3))
         self.points = {int(i): rng.uniform(-1, 1, 3) for i in ids}
         self.cameras = {
@@ -89,7 +89,7 @@ def assert_same(one: Correspondences, other: Correspondences) -> None:
 # --- what the files say
 
 
-def test_what_was_written_arrives(tmp_path):
+def test_written_models_are_read(tmp_path):
     model = Model(["PINHOLE", "OPENCV"])
     _, _, translation, _, name, observations = model.images[1]
     seen = Colmap(model.write(tmp_path))[name]
@@ -111,7 +111,7 @@ def test_quaternions_are_scalar_first_and_cam_from_world(tmp_path):
 
 
 @pytest.mark.parametrize("folder", ["", "sparse/0"])
-def test_a_model_is_found_below_the_folder(tmp_path, folder):
+def test_a_model_is_found_in_subfolders(tmp_path, folder):
     Model(["PINHOLE"]).write(tmp_path / folder)
     assert Colmap(tmp_path).names == ("0.jpg",)
 
@@ -186,7 +186,7 @@ def test_a_text_file_cut_short_names_the_image(tmp_path):
     file.write_text("\n".join([*lines[:-1], lines[-1].rsplit(maxsplit=1)[0]]))
     images = Colmap(tmp_path)
     assert images[1].id == "1.jpg"
-    with pytest.raises(DataError, match=r"image 0.jpg: the observations are 77 values"):
+    with pytest.raises(DataError, match=r"image 0.jpg: the observations have 77 values"):
         images[0]
     file.write_text("\n".join(lines[:-1]) + "\n")
     with pytest.raises(DataError, match=r"image 0.jpg: the file ends before its observations"):

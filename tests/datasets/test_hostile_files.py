@@ -1,4 +1,4 @@
-"""Hostile files: memory and time are bounded by the file's size; every error is in the family."""
+"""Hostile files: memory and time are bounded by the file's size; all errors are CadalignError."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_time_for_continued_lines_grows_with_the_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("options", ["-s 1 1", "-s 1", "-o", "-s", "-mm 1", ""])
-def test_texture_options_without_a_file_are_passed_over(tmp_path: Path, options: str) -> None:
+def test_texture_options_without_a_file_are_ignored(tmp_path: Path, options: str) -> None:
     (tmp_path / "a.obj").write_text(f"mtllib a.mtl\nusemtl a\n{TRIANGLE}f 1 2 3\n")
     (tmp_path / "a.mtl").write_text(f"newmtl a\nmap_Kd {options}\n")
     assert load_mesh(tmp_path / "a.obj").materials[0].texture is None
@@ -145,9 +145,7 @@ def test_materials_share_the_texture_that_they_name(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("name", ["matches", "R", "t", "inlier_matches"])
 @pytest.mark.parametrize("value", [1e308, 1e30, -1e30, 10**400, float("nan")])
-def test_numbers_beyond_all_bounds_concern_one_sample(
-    tmp_path: Path, name: str, value: float
-) -> None:
+def test_huge_numbers_affect_one_sample(tmp_path: Path, name: str, value: float) -> None:
     rows = np.array([[0.1, 0.2, 0.1, 0.2, 1.0]] * 4)
     samples: dict[str, Any] = {
         "matches": rows.tolist(),
@@ -173,11 +171,11 @@ def test_numbers_beyond_all_bounds_concern_one_sample(
 
 
 @pytest.mark.parametrize("name", [r"\ud800", r"x\udfff", r"\udc00\ud800"])
-def test_half_characters_are_refused(tmp_path: Path, name: str) -> None:
+def test_unpaired_surrogates_are_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / "a.json"
     path.write_text(f'{{"keypoints": [], "image": "{name}"}}')
     for read in (Observation.load, read_json):
-        with pytest.raises(DataError, match="half of a character"):
+        with pytest.raises(DataError, match="unpaired surrogate"):
             read(path)
     path.write_text(r'{"image": "\ud83e\ude91"}')
     assert read_json(path) == {"image": "\N{CHAIR}"}

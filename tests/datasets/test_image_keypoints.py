@@ -1,4 +1,4 @@
-"""Keypoints from detectors: what is read, how it is paired with a model, what is refused."""
+"""Detectors' keypoints: supported files, pairing with a model, errors."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_detectors_files_are_read(tmp_path: Path, entry: Any, score: float | Non
         ([0.5, 1.0, 2.0], [0.5, 1.0, 2.0]),
     ],
 )
-def test_flags_are_told_from_scores(
+def test_flags_are_distinguished_from_scores(
     tmp_path: Path, third: list[float], scores: list[float]
 ) -> None:
     (found,) = read(tmp_path, [{"keypoints": flat(third)}])
@@ -126,18 +126,18 @@ AT = "annotations[0].keypoints"
 @pytest.mark.parametrize(
     ("data", "text"),
     [
-        (3, "3 is not an object or a list; is it COCO's keypoint JSON"),
+        (3, "3 is not an object or a list; give COCO's keypoint JSON"),
         (
             {"frames": []},
-            "annotations: missing; is it COCO's keypoint JSON, or a detector's? see cadalign's "
-            "page on keypoints of detectors",
+            "annotations: missing; give COCO's keypoint JSON, or a detector's; see the page on "
+            "detectors in cadalign's docs",
         ),
         ([], "there are no keypoints"),
-        ([{"bbox": [1, 2, 3, 4]}], "[0].keypoints: missing; is it COCO's keypoint JSON"),
-        (changed("annotations.0.keypoints", []), f"{AT}: 0 numbers are not x, y and visib"),
+        ([{"bbox": [1, 2, 3, 4]}], "[0].keypoints: missing; give COCO's keypoint JSON"),
+        (changed("annotations.0.keypoints", []), f"{AT}: expected x, y and visib"),
         (
             changed("annotations.0.keypoints", [1, 2, 2, 3]),
-            f"{AT}: 4 numbers are not x, y and visibility or score of keypoints",
+            f"{AT}: expected x, y and visibility or score of each keypoint, got 4 numbers",
         ),
         (
             changed("annotations.0.keypoints", [1, 2, 2]),
@@ -154,12 +154,12 @@ AT = "annotations[0].keypoints"
             changed("categories.0.keypoints.2", "nose"),
             "categories[0].keypoints[2]: 'nose' occurs twice",
         ),
-        (changed("images.1.id", 3), "images[1].id: 3 is the id of another entry, too; "),
+        (changed("images.1.id", 3), "images[1].id: the id 3 occurs twice; "),
         ([{"keypoints": {"x": [1, 2], "y": [1]}}], "[0].keypoints.y: 1 values, but x has 2"),
         ([{"keypoints": [[1, 2, 3]]}], "[0].keypoints[0]: [1, 2, 3] is not a finite number"),
         (
             [{"keypoints": {"x": [1], "y": [1], "visible": [1, 2]}}],
-            "[0].keypoints: 2 scores of 1 keypoints",
+            "[0].keypoints: 2 scores for 1 keypoints",
         ),
         ([{"keypoints": [1, 2, -1]}], "[0]: scores: keypoint 0 has the value -1, which is nega"),
     ],
@@ -174,7 +174,7 @@ def test_malformed_json_is_refused_by_file_and_field(tmp_path: Path, data: Any, 
 # --- CSV --------------------------------------------------------------------------------------
 
 
-def test_csv_columns_arrive(tmp_path: Path) -> None:
+def test_csv_columns_are_read(tmp_path: Path) -> None:
     (found,) = read(tmp_path, CSV, "keypoints.csv")
     assert found.names == ("nose", "left ear")
     assert found.points_2d.tolist() == POINTS[:2]
@@ -216,7 +216,7 @@ def test_csv_of_several_images_gives_an_object_each(tmp_path: Path) -> None:
         ("u,v\n1,2\n3,four\n", "{path}, line 3: v: 'four' is not a finite number"),
         ("u,v\n1,nan\n", "{path}, line 2: v: 'nan' is not a finite number"),
         ("u,v\n1,\n", "{path}, line 2: v: '' is not a finite number"),
-        ("u,v,name\n1,2,\n", "{path}, line 2: name: '' is not a text"),
+        ("u,v,name\n1,2,\n", "{path}, line 2: name: the name is empty"),
         ("u,v,semantic_id\n1,2,3.5\n", "{path}, line 2: semantic_id: 3.5 is not a whole number"),
         ("u,v,score\n1,2,1\n1,2,null\n", "{path}, line 3: score: 'null' is not a finite number"),
         ("u,v,sigma\n1,2,0\n", "{path}: sigma: keypoint 0 has the value 0, which is not positive"),
@@ -260,7 +260,7 @@ def test_object_is_chosen_by_image_number_and_score() -> None:
     assert choose_object([seen(None)], image="other.jpg").image is None
 
 
-def test_photos_of_one_name_in_several_folders_are_told_apart(tmp_path: Path) -> None:
+def test_photos_of_one_name_in_several_folders_are_distinguished(tmp_path: Path) -> None:
     objects = [seen("left/1.jpg", 0.9), seen("right/1.jpg", 0.5)]
     assert choose_object(objects, image="photos/right/1.jpg") is objects[1]
     (tmp_path / "right").mkdir()
@@ -286,25 +286,29 @@ def test_photos_of_one_name_in_several_folders_are_told_apart(tmp_path: Path) ->
         (
             [seen("x/a.jpg", 0.5), seen("y/a.jpg", 0.9)],
             {"image": "a.jpg"},
-            "image: 2 images are called 'a.jpg'; give its path, one that ends with one of "
+            "image: 2 images are called 'a.jpg'; give a path that ends with one of "
             "x/a.jpg, y/a.jpg",
         ),
-        ([seen("a"), seen("b")], {}, "image: 2 images; choose one of a, b"),
-        ([seen(name) for name in "abcde"], {}, "image: 5 images; choose one of a, b, c, d, e"),
+        ([seen("a"), seen("b")], {}, "image: the file has 2 images; choose one of a, b"),
+        (
+            [seen(name) for name in "abcde"],
+            {},
+            "image: the file has 5 images; choose one of a, b, c, d, e",
+        ),
         (
             [seen(name) for name in "abcdefg"],
             {"image": "z"},
-            "image: 7 images, none of which is 'z'; choose one of a, b, c, d, e, ...",
+            "image: the file has 7 images, none is called 'z'; choose one of a, b, c, d, e, ...",
         ),
-        ([seen("a"), seen("a")], {"number": 2}, "number: object 2 of 2; count from 0"),
+        ([seen("a"), seen("a")], {"number": 2}, "number: there is no object 2 of 2; count from 0"),
         (
             [seen("a"), seen("a", 0.5)],
             {},
-            "number: 2 objects in the image, and no scores to choose by; choose one, 0 to 1",
+            "number: the image has 2 objects, and no scores to choose by; choose one, 0 to 1",
         ),
     ],
 )
-def test_choices_that_are_none_are_refused(
+def test_invalid_choices_are_refused(
     objects: list[ImageKeypoints], options: dict[str, Any], text: str
 ) -> None:
     with pytest.raises(InputError) as caught:
@@ -363,13 +367,13 @@ def test_model_keypoints_without_ids_give_none() -> None:
             {"names": ("nose", "tail", "left ear")},
             {},
             "photo.json: the model has no keypoint 'tail'; "
-            "it has left ear, right ear, nose; ignore_unknown leaves out what it has not",
+            "it has left ear, right ear, nose; ignore_unknown leaves out unknown keypoints",
         ),
         (
             {"ids": (0, 4, 9)},
             {},
             "photo.json: the model has no keypoint 9; "
-            "it has left ear, right ear, nose; ignore_unknown leaves out what it has not",
+            "it has left ear, right ear, nose; ignore_unknown leaves out unknown keypoints",
         ),
         (
             {"names": ("nose", "Nose", "left ear")},
@@ -392,7 +396,7 @@ def test_model_keypoints_without_ids_give_none() -> None:
             {"points_2d": np.zeros((4, 2))},
             {},
             "photo.json: 4 keypoints without names, but the model has 3; "
-            "give names, or as many keypoints as the model has, in its order",
+            "give names, or all of the model's keypoints in its order",
         ),
     ],
 )
@@ -423,13 +427,13 @@ def test_fields_that_do_not_match_are_refused(fields: dict[str, Any], text: str)
 # --- what does not belong together ------------------------------------------------------------
 
 
-def test_photo_without_keypoints_does_not_get_those_of_another(tmp_path: Path) -> None:
+def test_photo_without_keypoints_does_not_get_keypoints_of_another(tmp_path: Path) -> None:
     data = changed("annotations.2", ...)
-    with pytest.raises(InputError, match=r"2 images, and no keypoints in 'b\.jpg'.*cats/a\.jpg"):
+    with pytest.raises(InputError, match=r"2 images, but no keypoints in 'b\.jpg'.*cats/a\.jpg"):
         choose_object(read(tmp_path, data), image="b.jpg")
 
 
-def test_whole_numbers_beyond_all_floats_are_refused(tmp_path: Path) -> None:
+def test_integers_too_large_for_a_float_are_refused(tmp_path: Path) -> None:
     huge = changed("annotations.0.keypoints.0", 10**400)
     with pytest.raises(CadalignError, match=r"keypoints\[0\]: 10+\.\.\.0+ is not a finite"):
         read(tmp_path, huge)
@@ -437,7 +441,7 @@ def test_whole_numbers_beyond_all_floats_are_refused(tmp_path: Path) -> None:
         read(tmp_path, '{"annotations": ' + "1" * 5000 + "}")
 
 
-def test_a_wrong_score_or_size_leaves_itself_out(
+def test_an_invalid_score_or_size_is_ignored(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     found = {"image_id": 1, "keypoints": [10, 20, 2, 30, 40, 2], "score": "high"}
@@ -446,5 +450,5 @@ def test_a_wrong_score_or_size_leaves_itself_out(
     (read,) = read_image_keypoints(path)
     assert read.points_2d.tolist() == [[10, 20], [30, 40]]
     assert (read.score, read.size) == (None, None)
-    assert "annotations[0].score: 'high' is not a number; left out" in caplog.text
-    assert "images: -5 x 480 is not a size; left out" in caplog.text
+    assert "annotations[0].score: 'high' is not a number; ignored" in caplog.text
+    assert "images: -5 x 480 is not an image size; ignored" in caplog.text

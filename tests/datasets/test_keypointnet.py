@@ -1,4 +1,4 @@
-"""KeypointNet: what the files say arrives, and one bad model spoils no other."""
+"""KeypointNet: content of its files; a malformed model does not affect others."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_models_come_sorted_by_category_and_in_file_order(root):
     assert dataset["03001627", "a"] is dataset["chair", "a"]
 
 
-def test_keypoints_and_symmetries_arrive(root):
+def test_keypoints_and_symmetries_are_read(root):
     model = KeypointNet(root)["chair", "a"]
     assert model.class_id == CHAIR
     keypoints = model.keypoints
@@ -176,7 +176,7 @@ def test_mesh_that_does_not_belong_to_the_annotation_is_refused(root):
     path = root / f"models/{CHAIR}/a/models/model_normalized.obj"
     model = KeypointNet(root)["chair", "a"]
     path.write_text(TETRAHEDRON.replace("v 0 0 1", "v 0 0 2"))
-    with pytest.raises(DataError, match=r"model a: keypoints\[\d\] lies 0\.5 off"):
+    with pytest.raises(DataError, match=r"model a: keypoints\[\d\] lies 0\.5 from"):
         model.load_mesh()
     assert model.load_mesh(check=False).bounds[1, 2] == 2
     path.write_text("\n".join(TETRAHEDRON.splitlines()[:-1]))
@@ -195,7 +195,7 @@ def test_annotations_may_be_a_thousandth_of_the_diagonal_off(tmp_path, off, is_r
     path.write_text("\n".join([*rows, *(r for r in TETRAHEDRON.splitlines() if r[0] == "f")]))
     model = KeypointNet(tmp_path)["chair", "a"]
     if is_refused:
-        with pytest.raises(DataError, match=r"keypoints\[2\] lies 0\.003 off"):
+        with pytest.raises(DataError, match=r"keypoints\[2\] lies 0\.003 from"):
             model.load_mesh()
     else:
         assert len(model.load_mesh().faces) == 4
@@ -217,11 +217,15 @@ def test_annotations_may_be_a_thousandth_of_the_diagonal_off(tmp_path, off, is_r
         (
             "symmetries.reflection.0.kp_indexes",
             [0, 4],
-            "reflection[0].kp_indexes: 4 is not the row",
+            "reflection[0].kp_indexes: there is no row 4",
         ),
         ("symmetries.reflection.0.kp_indexes", [0], "[0].kp_indexes: [0] is not a list of 2"),
         ("symmetries.rotation.0.circle", {}, "rotation[0].circle.center: missing"),
-        ("symmetries.rotation.0.circle.normal", [0, 0, 0], "circle.normal: has no length"),
+        (
+            "symmetries.rotation.0.circle.normal",
+            [0, 0, 0],
+            "circle.normal: the vector has length 0",
+        ),
         ("class_id", "../../etc", "class_id: '../../etc' is not an id"),
     ],
 )
@@ -264,7 +268,7 @@ def test_file_that_is_no_annotation_is_named(root, text):
     assert len(dataset["mug"]) == 1
 
 
-def test_wrong_roots_are_told(root, tmp_path):
+def test_wrong_roots_are_refused(root, tmp_path):
     with pytest.raises(DataError, match="no such folder"):
         KeypointNet(tmp_path / "gone")
     with pytest.raises(DataError, match=r"no annotations/\*\.json"):
@@ -295,7 +299,7 @@ def test_real_annotations_load_whole(real):
 
 
 @pytest.mark.long
-def test_real_keypoints_lie_where_their_faces_say(real):
+def test_real_keypoints_lie_on_their_faces(real):
     checked = set()
     for root in (None, real.root / "models"):
         for model in KeypointNet(real.root, shapenet_root=root).subset(with_mesh=True):

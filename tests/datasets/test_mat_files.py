@@ -1,4 +1,4 @@
-"""MATLAB's files: numbers and texts as they were written; damaged files are refused by name."""
+"""MATLAB's files: numbers and texts as written; errors name damaged files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from cadalign.datasets.pascal3d import read_structs, structs_of
+from cadalign.datasets.pascal3d import list_structs, read_structs
 from cadalign.errors import DataError
 
 TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
@@ -45,12 +45,12 @@ def test_fields_are_as_they_were_written(tmp_path: Path, compressed: bool) -> No
     assert (record["filename"], record["names"]) == ("2008_000001.jpg", ["a", "bc"])
     for kind in TYPES:
         np.testing.assert_array_equal(record[kind], [[1, 2], [3, 4]])
-    assert structs_of(record["size"]) == [{"width": 500.0, "height": 375.0}]
-    chair, sofa = structs_of(record["objects"])
+    assert list_structs(record["size"]) == [{"width": 500.0, "height": 375.0}]
+    chair, sofa = list_structs(record["objects"])
     assert (chair["class"], sofa["class"]) == ("chair", "sofa \u00e9")
     assert chair["difficult"] == 0.0
     assert sofa["bbox"] is sofa["view"] is None
-    assert structs_of(record["names"]) == structs_of(None) == []
+    assert list_structs(record["names"]) == list_structs(None) == []
 
 
 @pytest.mark.filterwarnings("error")
@@ -83,7 +83,7 @@ def assert_refused_or_whole(path: Path) -> None:
         (lambda data: data[:128] + bomb(), "a variable is cut short, or has more than"),
     ],
 )
-def test_files_that_are_none_are_refused(tmp_path: Path, change: Any, reason: str) -> None:
+def test_other_files_are_refused(tmp_path: Path, change: Any, reason: str) -> None:
     path = tmp_path / "a.mat"
     path.write_bytes(change(write(path)))
     with pytest.raises(DataError, match=rf"not a MATLAB file that can be read \({reason}") as error:

@@ -1,4 +1,4 @@
-"""Files of a model's named keypoints: a round trip, and every way in which one can be wrong."""
+"""Files of a model's named keypoints: round trip and errors."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def write(path: Path, data: Any = DATA) -> Path:
     return write_json(path, data)
 
 
-def test_fields_arrive(tmp_path: Path) -> None:
+def test_fields_are_read(tmp_path: Path) -> None:
     keypoints = ModelKeypoints.load(write(tmp_path / "a.keypoints.json"))
     assert keypoints.names == ("top", "floor", "slope")
     assert keypoints.ids == (7, None, 2)

@@ -1,4 +1,4 @@
-"""Keypoints that a detector did not find: no measurements, whatever score stands beside them."""
+"""Keypoints that a detector did not find are no measurements, whatever their score."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ NOT_FOUND = [(0.0, 0.0), (-1.0, -1.0), (None, None), (float("nan"), float("nan")
 
 
 def pixels_with(placeholder: tuple[Any, Any]) -> list[list[Any]]:
-    """Pixels of which the first seven were found."""
+    """Pixels; the first seven were found."""
     return [*PROBLEM.points_2d[:FOUND].tolist(), *([list(placeholder)] * (COUNT - FOUND))]
 
 
@@ -66,7 +66,7 @@ def observation(pixels: list[list[Any]]) -> Any:
 
 @pytest.mark.parametrize("placeholder", NOT_FOUND, ids=str)
 @pytest.mark.parametrize("form", [ultralytics, coco_results, csv, observation])
-def test_what_was_not_found_is_left_out_and_counted(
+def test_keypoints_not_found_are_left_out_and_counted(
     tmp_path: Path, form: Any, placeholder: tuple[Any, Any]
 ) -> None:
     content = form(pixels_with(placeholder))
@@ -101,11 +101,11 @@ def test_one_placeholder_of_a_detector_is_enough() -> None:
 
 
 def test_half_of_a_pixel_is_refused() -> None:
-    with pytest.raises(DataError, match=r"keypoint 1 is at \[nan, 4\.0\]"):
+    with pytest.raises(DataError, match=r"keypoint 1 has the invalid pixel \[nan, 4\.0\]"):
         ImageKeypoints(np.array([[1.0, 2], [np.nan, 4]]))
 
 
-def test_sigmas_of_the_file_stay_those_of_their_keypoints() -> None:
+def test_sigmas_stay_with_their_keypoints() -> None:
     data = observation(pixels_with((0, 0))) | {"fit": {"sigma": list(range(1, COUNT + 1))}}
     assert Observation.from_dict(data).fit_options["sigma"] == list(range(1, FOUND + 1))
 

@@ -1,4 +1,4 @@
-"""What all data sets of photos have in common, and their recognition."""
+"""Common behaviour of all data sets of photos, and recognition of their format."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_problems_are_counted_once_and_few_are_logged(tmp_path, caplog):
         assert list(dataset) == []
     assert len(dataset.problems) == 50
     assert len(caplog.records) == 21
-    assert "counted only" in caplog.records[-1].message
+    assert "not logged" in caplog.records[-1].message
 
 
 def test_files_may_begin_with_a_byte_order_mark(tmp_path):
@@ -55,7 +55,7 @@ def test_files_may_begin_with_a_byte_order_mark(tmp_path):
 
 
 @pytest.mark.parametrize("kind", WRITERS)
-def test_hidden_files_of_archives_made_on_a_mac_are_passed_over(tmp_path, kind):
+def test_hidden_files_of_mac_archives_are_ignored(tmp_path, kind):
     WRITERS[kind](tmp_path)
     names = cadalign.datasets.open(tmp_path).names
     for path in [path for path in tmp_path.rglob("*") if path.is_file()]:
@@ -66,7 +66,7 @@ def test_hidden_files_of_archives_made_on_a_mac_are_passed_over(tmp_path, kind):
     assert found.problems == {}
 
 
-def test_what_is_missing_is_told(tmp_path):
+def test_missing_files_are_named(tmp_path):
     found = PhotoObject("3", "chair")
     with pytest.raises(DataError, match="object 3: this object has no mask"):
         found.read_mask()
@@ -78,7 +78,7 @@ def test_what_is_missing_is_told(tmp_path):
         PhotoKeypoints(np.zeros((2, 2)), ("a",))
 
 
-def test_folders_are_recognised_or_what_is_known_is_told(tmp_path):
+def test_folders_are_recognised_or_known_formats_are_listed(tmp_path):
     with pytest.raises(DataError, match="no such folder"):
         cadalign.datasets.open(tmp_path / "gone")
     with pytest.raises(DataError, match="no such folder"):
@@ -91,14 +91,14 @@ def test_folders_are_recognised_or_what_is_known_is_told(tmp_path):
 
 @pytest.mark.parametrize("bad", ["[" * 9999 + "]" * 9999, '"\\ud800"', "1e999", "9" * 5000, "nul"])
 @pytest.mark.parametrize("name", ["pix3d.json", "full_annotations.json"])
-def test_hostile_entries_are_told(tmp_path, name, bad):
+def test_hostile_entries_are_reported(tmp_path, name, bad):
     write_text(tmp_path / name, f"[{bad}]")
     with pytest.raises(DataError, match=name) as caught:
         cadalign.datasets.open(tmp_path)[0]
     assert len(str(caught.value)) < 2000
 
 
-def test_what_can_be_read_is_given_and_the_rest_is_told(tmp_path):
+def test_readable_objects_are_returned_and_others_reported(tmp_path):
     write_scan2cad(tmp_path, scenes=2, frames=2)
     (tmp_path / "scans/scene0001_00/pose/1.txt").write_text("x")
     dataset = cadalign.datasets.open(tmp_path)

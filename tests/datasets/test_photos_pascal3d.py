@@ -163,18 +163,18 @@ def test_faces_are_numbers_of_vertices(root, number):
         cad_model(root, "chair", 1).load_mesh()
 
 
-def test_angles_beyond_all_measure_are_no_failure(root):
+def test_huge_angles_are_valid(root):
     path = root / "Annotations" / "chair_pascal" / "2008_000001.mat"
     write_record(path, annotated(viewpoint={**VIEW, "azimuth": 1e300}))
     (chair,) = Pascal3D(root)[0].objects
     assert np.isfinite(chair.truth.rotation).all()
 
 
-def test_damaged_files_are_told(root):
+def test_damaged_files_are_reported(root):
     assert_damage_is_told(root)
 
 
-def test_nothing_there_is_told(tmp_path):
+def test_an_empty_folder_is_refused(tmp_path):
     with pytest.raises(DataError, match="there are no Annotations"):
         Pascal3D(tmp_path)
 

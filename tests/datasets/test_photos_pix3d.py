@@ -58,7 +58,7 @@ def test_keypoints_are_the_mean_of_those_who_marked_them(root):
     assert chair.read_mask().all()
 
 
-def test_what_is_missing_is_none(root):
+def test_missing_parts_are_none(root):
     thin = entry(img="none.png", model="gone.obj", mask="gone.png")
     del thin["2d_keypoints"], thin["3d_keypoints"], thin["rot_mat"]
     write_json(root / "pix3d.json", [thin])
@@ -91,7 +91,7 @@ def test_bad_records_do_not_stop_the_others(root):
         assert number in str(error)
 
 
-def test_damaged_files_are_told(root):
+def test_damaged_files_are_reported(root):
     write_text(root / "model/chair/a/3d_keypoints.txt", "0 0\n1 x 0\n")
     with pytest.raises(DataError, match=r"3d_keypoints\.txt"):
         Pix3D(root)[0].objects[0].model.load_keypoints()
@@ -105,7 +105,7 @@ def test_damaged_files_are_told(root):
         Pix3D(root)
 
 
-def test_any_damage_is_told(root):
+def test_any_damage_is_reported(root):
     assert_damage_is_told(root)
 
 

@@ -90,7 +90,7 @@ def test_millimetres_for_metres_are_named(root):
     photo = Scan2CAD(root)[0]
     assert photo.objects == ()
     (problem,) = photo.problems
-    assert "m from the camera, as with millimetres for metres" in str(problem)
+    assert "m from the camera, likely millimetres for metres" in str(problem)
     assert str(problem).startswith(f"{root / 'full_annotations.json'}, scene0000_00/0, object 0: ")
 
 
@@ -155,7 +155,7 @@ def test_folders_of_frames_and_models_may_be_links(root, tmp_path):
     elsewhere = write_text(
         tmp_path / "b" / "full_annotations.json", (root / "full_annotations.json").read_text()
     ).parent
-    with pytest.raises(DataError, match="no frame of the 1 annotated scans"):
+    with pytest.raises(DataError, match="no frames of the 1 annotated scans"):
         Scan2CAD(elsewhere)
     for name in ("scans", "ShapeNetCore.v2"):
         (elsewhere / name).symlink_to(root / name)
@@ -163,14 +163,14 @@ def test_folders_of_frames_and_models_may_be_links(root, tmp_path):
 
 
 @pytest.mark.parametrize("content", ["", "[{", "{}", '[{"id_scan": "scene0000_00"', "\x00", "nul"])
-def test_annotations_cut_short_are_told(root, content):
+def test_annotations_cut_short_are_reported(root, content):
     path = root / "full_annotations.json"
     path.write_text(content)
     with pytest.raises(DataError, match=r"full_annotations\.json"):
         Scan2CAD(root)
 
 
-def test_damaged_files_are_told(tmp_path):
+def test_damaged_files_are_reported(tmp_path):
     write_scan2cad(tmp_path, frames=1)
     assert_damage_is_told(tmp_path)
 

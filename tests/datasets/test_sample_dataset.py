@@ -1,4 +1,4 @@
-"""The data set that cadalign makes itself: what is on disk, and that the models are sound."""
+"""The sample data set: its files and the validity of its models."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_the_same_data_set_is_kept_and_another_one_refused(tmp_path: Path) -> No
     ("error", "told"),
     [(OSError(28, "No space left"), DataError), (KeyboardInterrupt(), KeyboardInterrupt)],
 )
-def test_what_stops_the_writing_leaves_nothing_behind(
+def test_an_interrupted_write_leaves_no_files(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     error: BaseException,

@@ -1,4 +1,4 @@
-"""ShapeNet's two layouts, found model by model and listed when asked for."""
+"""ShapeNet's two layouts, recognised per model and listed on access."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_meshes_are_read_only_when_asked_for(root):
         models[0].load_mesh()
 
 
-def test_what_is_not_there_is_told(root):
+def test_missing_models_and_folders_are_named(root):
     shapenet = ShapeNet(root)
     with pytest.raises(InputError, match=r"unknown category 'chiar', did you mean 'chair'.*mug"):
         shapenet["chiar"]

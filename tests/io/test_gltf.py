@@ -65,7 +65,7 @@ def test_colours_of_vertices_without_a_material_are_not_tinted(tmp_path: Path) -
 @pytest.mark.parametrize("mode", [0, 1, 3])
 def test_points_and_lines_are_no_faces(tmp_path: Path, mode: int) -> None:
     assert refusal(tmp_path, meshes=primitive(mode=mode)) == (
-        "FILE: the file has no faces; is it whole?"
+        "FILE: the file has no faces; is it complete?"
     )
 
 
@@ -102,28 +102,29 @@ def test_vertices_that_primitives_share_are_not_repeated(tmp_path: Path) -> None
     [
         (
             {"nodes": [{"children": [1, 2]}, {"children": [2]}, {"mesh": 0}]},
-            "nodes[2]: the node has two parents, or is its own ancestor; the nodes of a scene are "
-            "a tree",
+            "nodes[2]: the node has two parents, or is its own ancestor; nodes must form a tree",
         ),
         (
             {"nodes": [{"children": [1]}, {"children": [0], "mesh": 0}]},
-            "nodes[0]: the node has two parents, or is its own ancestor; the nodes of a scene are "
-            "a tree",
+            "nodes[0]: the node has two parents, or is its own ancestor; nodes must form a tree",
         ),
         (
             {"extensionsRequired": ["KHR_materials_unlit", "KHR_draco_mesh_compression"]},
-            "extensionsRequired: KHR_draco_mesh_compression is needed to read this file, and not "
-            "known; export it without this extension; of compressed geometry, uncompressed",
+            "extensionsRequired: the file requires KHR_draco_mesh_compression, which is not "
+            "supported; export it without this extension, such as without compressed geometry",
         ),
         (
             {"meshes": primitive(mode=5)},
-            "meshes: strips and fans of triangles are not read; export single triangles",
+            "meshes: triangle strips and fans are not supported; export single triangles",
         ),
-        ({"asset": {"version": "1.0"}}, "asset: version '1.0' of glTF; only version 2 is read"),
+        (
+            {"asset": {"version": "1.0"}},
+            "asset: the file has glTF version '1.0'; only version 2 is supported",
+        ),
         (
             {"nodes": [{"mesh": 7}]},
-            "meshes[7]: named, but there are 1 meshes; the file is cut short or damaged; get it "
-            "again",
+            "meshes[7]: does not exist; there are 1 meshes; the file is cut short or damaged; get "
+            "it again",
         ),
         (
             {"accessors": [POSITIONS | {"count": 5}, CORNERS]},
@@ -132,7 +133,8 @@ def test_vertices_that_primitives_share_are_not_repeated(tmp_path: Path) -> None
         ),
         (
             {"accessors": [POSITIONS | {"sparse": {"count": 1}}, CORNERS]},
-            "accessors[0]: sparse values, or none, are not read; export it without them",
+            "accessors[0]: sparse accessors, and accessors without data, are not supported; export "
+            "the file without them",
         ),
         (
             {"accessors": [POSITIONS, CORNERS | {"count": "many"}]},
@@ -147,15 +149,15 @@ def test_files_that_are_wrong_are_refused_by_the_place(
     assert refusal(tmp_path, **changes) == f"FILE: {message}"
 
 
-def test_extension_that_is_used_but_not_required_is_passed_over(tmp_path: Path) -> None:
+def test_optional_extensions_are_ignored(tmp_path: Path) -> None:
     assert len(read(tmp_path, extensionsUsed=["KHR_draco_mesh_compression"]).faces) == 2
 
 
-def test_buffers_that_are_no_files_are_refused(tmp_path: Path) -> None:
+def test_invalid_buffers_are_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for uri, reason in (
-        ("pipe", "not a regular file; give a file, no pipe and no device"),
-        ("/dev/zero", "not a regular file; give a file, no pipe and no device"),
+        ("pipe", "not a regular file; give a regular file, not a pipe or device"),
+        ("/dev/zero", "not a regular file; give a regular file, not a pipe or device"),
         ("nothing.bin", "no such file"),
     ):
         message = refusal(tmp_path, buffers=[{"byteLength": 60, "uri": uri}])
@@ -179,8 +181,8 @@ def test_meshes_that_nodes_repeat_are_bounded_by_the_file(tmp_path: Path) -> Non
     with pytest.raises(DataError) as caught:
         load_mesh(path)
     assert str(caught.value) == (
-        f"{path}: its nodes repeat meshes to 60000000 faces, from 60060 bytes; "
-        "simplify it, or leave copies out"
+        f"{path}: its nodes repeat meshes to 60000000 faces, too many for 60060 bytes; "
+        "simplify the meshes, or remove copies"
     )
 
 

@@ -1,4 +1,4 @@
-"""Photos are read upright, and what their EXIF data say of the focal length is taken with care."""
+"""Photos are read upright; implausible EXIF focal lengths are ignored."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def test_pixels_that_the_file_cannot_hold_are_refused(tmp_path: Path) -> None:
         read(small)
 
 
-def test_errors_of_the_reader_are_not_taken_for_the_photos(tmp_path: Path) -> None:
+def test_errors_in_the_block_are_not_reported_as_errors_of_the_photo(tmp_path: Path) -> None:
     path = write_photo(tmp_path / "photo.jpg")
     with pytest.raises(ZeroDivisionError), open_photo(path):
         raise ZeroDivisionError
@@ -161,17 +161,17 @@ def test_focal_length_is_read(tmp_path: Path, tags: dict[str, Any], focal: float
 
 
 @pytest.mark.parametrize("tags", [{}, {"equivalent": 0}, {"focal": 4.0}])
-def test_photo_that_says_nothing_gives_no_prior(
+def test_photo_without_focal_length_gives_no_prior(
     tmp_path: Path, tags: dict[str, Any], caplog: pytest.LogCaptureFixture
 ) -> None:
     assert FocalPrior.from_exif(write_photo(tmp_path / "photo.jpg", **tags)) is None
     assert not caplog.records
 
 
-def test_focal_length_that_cannot_be_right_is_ignored_with_a_warning(
+def test_implausible_focal_length_is_ignored_with_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    text = "the EXIF data state a focal length of 1.109e+06 px, which no camera has; ignored"
+    text = "the EXIF focal length of 1.109e+06 px is implausible and ignored"
     path = write_photo(tmp_path / "photo.jpg", equivalent=60000)
     with caplog.at_level(logging.WARNING, logger="cadalign"):
         assert FocalPrior.from_exif(path) is None
@@ -181,7 +181,7 @@ def test_focal_length_that_cannot_be_right_is_ignored_with_a_warning(
 @pytest.mark.parametrize(
     "value", [0, -3.0, math.nan, math.inf, "900", None, True, 10**400, np.complex128(1 + 2j)]
 )
-def test_priors_that_are_none_are_refused(value: Any) -> None:
+def test_invalid_priors_are_refused(value: Any) -> None:
     with pytest.raises(InputError) as caught:
         FocalPrior(value)
     assert str(caught.value) == f"focal_prior.focal: {quote(value)} is not positive and finite"

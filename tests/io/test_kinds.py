@@ -1,4 +1,4 @@
-"""Files of a kind that is not wanted, fields that are missing or stand twice."""
+"""Files of the wrong kind; fields that are missing or occur twice."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def written(folder: Path, kind: str) -> Path:
 
 @pytest.mark.parametrize("wanted", READERS)
 @pytest.mark.parametrize("kind", CONTENTS)
-def test_readers_name_what_a_file_is(tmp_path: Path, kind: str, wanted: str) -> None:
+def test_readers_name_the_kind_of_a_wrong_file(tmp_path: Path, kind: str, wanted: str) -> None:
     if kind == wanted:
         return
     path = written(tmp_path, kind)
@@ -65,9 +65,9 @@ def test_readers_name_what_a_file_is(tmp_path: Path, kind: str, wanted: str) -> 
     assert str(caught.value).startswith(f"{path}: {kind}, not {wanted}; ")
 
 
-def test_a_field_that_stands_twice_is_named() -> None:
+def test_a_field_that_occurs_twice_is_named() -> None:
     text = '{"keypoints": [{}, {"uv": [1, 2], "uv": [3, 4]}]}'
-    wanted = "o.json: the field 'uv' stands twice in one object; leave one of the two out"
+    wanted = "o.json: the field 'uv' occurs twice in one object; remove one of them"
     assert refusal_text(lambda: parse_json(text, "o.json")) == wanted
     assert refusal_text(lambda: parse_json(text.encode(), "o.json")) == wanted  # a line of a file
     assert parse_json(b'{"a": {"b": "x\\":"}, "c" : 1}', "") == {"a": {"b": 'x":'}, "c": 1}

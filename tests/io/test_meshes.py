@@ -1,4 +1,4 @@
-"""Mesh files: faces keep the order of the file, colours survive, damage is told."""
+"""Mesh files: faces in file order, colours, errors for damaged files."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_obj_negative_indices_count_back_from_their_own_line(write):
     assert load_mesh(write(text)).faces.tolist() == [[0, 1, 2], [3, 4, 5], [0, 1, 5]]
 
 
-def test_a_mark_of_utf_8_takes_no_line_away(write):
+def test_first_line_is_read_after_a_byte_order_mark(write):
     text = trimesh.creation.box().export(file_type="ply", encoding="ascii")
     for name, content in (("a.obj", f"{SQUARE}f 1 2 3\n".encode()), ("a.ply", text)):
         expected = load_mesh(write(content, name))
@@ -74,7 +74,7 @@ def test_a_mark_of_utf_8_takes_no_line_away(write):
         np.testing.assert_array_equal(found.faces, expected.faces)
 
 
-def test_a_mark_of_utf_8_hides_no_material(write):
+def test_mtl_first_line_is_read_after_a_byte_order_mark(write):
     write(b"\xef\xbb\xbfnewmtl red\nKd 1 0 0\n", "a.mtl")
     mesh = load_mesh(write(f"mtllib a.mtl\n{SQUARE}usemtl red\nf 1 2 3\n"))
     assert mesh.materials[0].color[:3] == (1, 0, 0)
@@ -180,7 +180,7 @@ def test_missing_materials_are_warned_of_and_become_plain(write, caplog, library
         (f"{SQUARE}f 1 2 -5\n", "names vertex -5"),
         (f"{SQUARE}vt 0 0\nf 1/1 2/2 3/1\n", "names texture coordinate 2"),
         (f"{SQUARE}f 1/1 2/1 3/1\n", "names texture coordinate 1, but there are 0"),
-        (f"{SQUARE}l 1 2\n", "no faces; 4 vertices"),
+        (f"{SQUARE}l 1 2\n", "4 vertices, but no faces"),
         ("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "NaN or infinite"),
         (f"{SQUARE}f 1 2 3\n\0\0\0\0\n", "line 6: holds binary data"),
         ("", "is empty"),
@@ -324,7 +324,7 @@ def test_polygons_of_off_keep_their_number(write):
 
 
 def test_faces_without_area_are_refused(write):
-    with pytest.raises(DataError, match="no face of the mesh has an area"):
+    with pytest.raises(DataError, match="all faces of the mesh have zero area"):
         load_mesh(write(f"{SQUARE}f 1 2 2\n"))
 
 
@@ -332,7 +332,7 @@ def test_faces_without_area_are_refused(write):
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_flat_models_are_told_by_their_axis(axis):
+def test_errors_of_flat_models_name_the_axis(axis):
     box = trimesh.creation.box(extents=(1, 2, 3))
     thin = np.array(box.vertices)
     thin[:, axis] *= 1e-7
@@ -376,25 +376,25 @@ def test_forms_of_off_give_the_same_cube(write, header, vertex, face):
     [
         ("OFF\n8 13 0\n", "the header announces 13 faces, but only 12 are there; the file is cut"),
         ("OFF\n30 1 0\n", "the header announces 30 vertices, but only 20 are there; the file is"),
-        ("OFF\n7 13 0\n", "face 0 is '0.5 0.5 0.5', behind the 7 vertices announced; the file is"),
+        ("OFF\n7 13 0\n", "face 0 is '0.5 0.5 0.5', after the announced 7 vertices; the file is"),
         ("OFF\n-8 12 0\n", "the header announces -8 vertices and 12 faces; the file is cut short"),
-        ("4OFF\n8 12 0\n", "not an OFF file of text and of three dimensions; does it begin"),
-        ("OFF BINARY\n8 12 0\n", "not an OFF file of text and of three dimensions; does it begin"),
+        ("4OFF\n8 12 0\n", "not an OFF file of text with three dimensions; give a file"),
+        ("OFF BINARY\n8 12 0\n", "not an OFF file of text with three dimensions; give a file"),
     ],
 )
-def test_counts_of_off_that_lie_are_named(write, text, message):
+def test_wrong_counts_of_off_are_named(write, text, message):
     path = write(text + VERTICES + FACES, "a.off")
     assert refusal_text(lambda: load_mesh(path)).startswith(f"{path}: {message}")
 
 
 @pytest.mark.parametrize("kind", ["off", "stl", "stl_ascii", "glb", "ply"])
-def test_surplus_behind_a_mesh_is_warned_of(write, kind, caplog):
+def test_surplus_bytes_after_a_mesh_cause_a_warning(write, kind, caplog):
     content = CUBE.export(file_type=kind)
     content = content if isinstance(content, bytes) else content.encode()
     surplus = {"off": b"\n3 0 1 2\n", "stl_ascii": b"\nmore\n"}.get(kind, b"\n")
     mesh = load_mesh(write(content + surplus, f"a.{kind.removesuffix('_ascii')}"))
     np.testing.assert_allclose(mesh.triangles, CUBE.triangles)
-    assert "bytes behind its data are left out" in caplog.text
+    assert "bytes after its data are ignored" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -410,7 +410,7 @@ def test_surplus_behind_a_mesh_is_warned_of(write, kind, caplog):
         ("glb", 15, r"the header announces \d+ bytes, but only 15 are there"),
     ],
 )
-def test_what_is_cut_short_says_what_is_there(write, kind, cut, message):
+def test_errors_of_files_cut_short_name_the_counts(write, kind, cut, message):
     if kind == "ply_ascii":
         content = CUBE.export(file_type="ply", encoding="ascii").rstrip()
     else:

@@ -1,4 +1,4 @@
-"""Observation files: a round trip, and every way in which one can be wrong."""
+"""Observation files: round trip and errors."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def changed(path: str, value: Any) -> dict[str, Any]:
     return replaced(DATA, path, value)
 
 
-def test_fields_arrive() -> None:
+def test_fields_are_read() -> None:
     observation = Observation.from_dict(DATA)
     assert observation.points_3d.tolist() == [k["xyz"] for k in DATA["keypoints"]]
     assert observation.points_2d.tolist() == [k["uv"] for k in DATA["keypoints"]]
@@ -212,7 +212,7 @@ def test_saved_paths_outside_the_files_folder_name_the_same_files(
         ("", None, "cannot be read (Is a directory)"),
     ],
 )
-def test_what_is_no_text_file_is_refused(
+def test_missing_and_binary_files_are_refused(
     tmp_path: Path, name: str, content: bytes | None, text: str
 ) -> None:
     path = tmp_path / name

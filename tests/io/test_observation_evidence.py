@@ -62,7 +62,7 @@ _SHARED: dict[str, Any] = {
 SEVERAL = json.loads(json.dumps(_SHARED))  # in which no two views share a list
 
 
-def test_evidence_of_one_image_arrives(tmp_path: Path) -> None:
+def test_evidence_of_one_image_is_read(tmp_path: Path) -> None:
     observation = Observation.load(write_json(tmp_path / "a.json", ONE))
     evidence = observation.evidence
     assert (evidence.mask, evidence.mask_sigma) == (tmp_path / "masks/a.png", 1.5)
@@ -74,7 +74,7 @@ def test_evidence_of_one_image_arrives(tmp_path: Path) -> None:
     assert not observation.is_plain
 
 
-def test_views_arrive(tmp_path: Path) -> None:
+def test_views_are_read(tmp_path: Path) -> None:
     observation = Observation.load(write_json(tmp_path / "a.json", SEVERAL))
     assert [len(view.points_2d) for view in observation.views] == [4, 1, 0]
     assert observation.model == tmp_path / "chair.obj"
@@ -83,7 +83,7 @@ def test_views_arrive(tmp_path: Path) -> None:
         np.testing.assert_array_equal(view.evidence.cam_from_rig, np.eye(4))
 
 
-def test_start_arrives_and_needs_no_keypoints() -> None:
+def test_init_is_read_and_needs_no_keypoints() -> None:
     data = ONE | {"keypoints": []}
     for given in (data, replaced(data, "keypoints", ...)):
         observation = Observation.from_dict(given)
@@ -171,13 +171,13 @@ def test_views_need_no_xyz_where_a_shape_has_them(tmp_path: Path) -> None:
         (SEVERAL | {"views": []}, "{path}: views: [] is not a list of at least 1"),
         (
             SEVERAL | {"camera": CAMERA},
-            "{path}: camera: given beside `views`; give it in each of the views",
+            "{path}: camera: not allowed beside `views`; give it in each of the views",
         ),
         (replaced(SEVERAL, "views.1.camera", ...), "{path}: views[1].camera: missing"),
         (
             replaced(SEVERAL, "views.2.mask", ...) | {"fit": {"sigma": [1.0]}},
             "{path}: fit.sigma: a list, but there are several views; "
-            "give one for all, or `sigma` of every keypoint",
+            "give one number for all, or `sigma` of every keypoint",
         ),
         (
             replaced(SEVERAL, "views.1.up_sigma_deg", 3),

@@ -1,4 +1,4 @@
-"""Pictures are decoded by one reader, of plain raster formats: none starts a program."""
+"""One reader decodes all pictures; it supports only raster formats and starts no program."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_no_picture_starts_a_program(
     tmp_path: Path, started: Path, read: Callable[[Path], object], name: str
 ) -> None:
     (tmp_path / name).write_bytes(EPS)
-    with pytest.raises(DataError, match=r"not an image that can be read \(it begins like none of"):
+    with pytest.raises(DataError, match=r"not an image that can be read \(its content is none of"):
         read(tmp_path / name)
     assert not started.exists()
 
@@ -128,11 +128,9 @@ def test_formats_that_are_promised_are_read(tmp_path: Path, ending: str) -> None
     assert read_photo(path)[3, 3, 0] > 200
 
 
-def test_a_photo_is_no_mask(tmp_path: Path) -> None:
+def test_photos_are_refused_as_masks(tmp_path: Path) -> None:
     Image.new("RGB", (64, 48)).save(tmp_path / "a.png")
-    with pytest.raises(
-        DataError, match=r"the image is a PNG of the mode RGB; give a PNG of one grey"
-    ):
+    with pytest.raises(DataError, match=r"the image is a PNG of mode RGB; give a PNG of one grey"):
         read_mask(tmp_path / "a.png")
 
 
@@ -150,5 +148,5 @@ def test_masks_are_not_zero_and_no_jpegs(tmp_path: Path) -> None:
     Image.fromarray(mask).save(tmp_path / "mask.png")
     assert np.array_equal(read_mask(tmp_path / "mask.png"), mask > 0)
     Image.fromarray(255 * mask).save(tmp_path / "mask.jpg")
-    with pytest.raises(DataError, match=r"a JPEG of the mode L, whose compression changes values"):
+    with pytest.raises(DataError, match=r"a JPEG of mode L, whose compression changes values"):
         read_mask(tmp_path / "mask.jpg")

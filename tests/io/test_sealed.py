@@ -1,4 +1,4 @@
-"""Sealed files are given back whole, or refused with what is wrong with them."""
+"""Sealed files: round trip, and errors for damaged files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def written(folder: Path, payload: bytes = b"some payload") -> bytes:
 
 
 @pytest.mark.parametrize("payload", [b"", b"some payload", bytes(range(256))])
-def test_payloads_come_back(tmp_path: Path, payload: bytes) -> None:
+def test_payloads_round_trip(tmp_path: Path, payload: bytes) -> None:
     assert bytes(SEAL.unwrap(written(tmp_path, payload), "sealed")) == payload
 
 
@@ -39,4 +39,4 @@ def test_lengths_are_checked(tmp_path: Path, caplog: pytest.LogCaptureFixture) -
     with pytest.raises(DataError, match="announces 12 bytes, but only 11 are there"):
         SEAL.unwrap(content[:-1], "sealed")
     assert bytes(SEAL.unwrap(content + b"x", "sealed")) == b"some payload"
-    assert caplog.messages == ["sealed: 1 bytes behind its data are left out"]
+    assert caplog.messages == ["sealed: 1 bytes after its data are ignored"]

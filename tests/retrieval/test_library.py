@@ -166,7 +166,7 @@ def test_another_version_is_refused_and_both_are_named(file: Path) -> None:
     content = bytearray(file.read_bytes())
     struct.pack_into("<I", content, 16, 7)
     file.write_bytes(content)
-    with pytest.raises(DataError, match="of version 7, but this cadalign reads version 2; build"):
+    with pytest.raises(DataError, match="has version 7, but this cadalign reads version 2; build"):
         Library.open(file)
 
 

@@ -223,7 +223,7 @@ def test_an_observation_is_not_retrieved_into_its_own_folder(
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
     query = tmp_path / "match_02.json"
     assert main(["retrieve", str(query), *case.arguments[1:], "--out", str(tmp_path)]) == 1
-    assert f"{query}: what is to be written is made from this file" in capsys.readouterr().err
+    assert f"{query}: this file is an input and would be overwritten" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
 
 

@@ -264,7 +264,7 @@ def test_a_mesh_is_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.Mon
     assert Example("m", IDS, TABLE, mesh_path="a.obj").mesh_path == tmp_path / "a.obj"  # type: ignore[arg-type]
     odd = Path(os.fsdecode(b"caf\xe9.obj"))
     text = refusal_text(lambda: Example("m", IDS, TABLE, mesh_path=odd))
-    assert text.endswith("the path is not UTF-8; rename it, or the folder that it is in")
+    assert text.endswith("the path is not UTF-8; rename the file or its folder")
 
 
 def test_a_saved_model_is_the_same(learned: ShapeModel, tmp_path: Path) -> None:
@@ -315,7 +315,7 @@ def test_files_that_are_none_are_refused(content: bytes, tmp_path: Path) -> None
     assert refusal_text(lambda: ShapeModel.open(path)) == f"{path}: not a shape file; {again}"
     Seal(SEAL.magic, 9, SEAL.noun, SEAL.fix).write(path, content[64:])
     assert refusal_text(lambda: ShapeModel.open(path)) == (
-        f"{path}: the shape file is of version 9, but this cadalign reads version 1; {again}"
+        f"{path}: the shape file has version 9, but this cadalign reads version 1; {again}"
     )
     path.write_bytes(content[:-1])
     assert "bytes, but only" in refusal_text(lambda: ShapeModel.open(path))

@@ -1,1 +1,1 @@
-"""Mesh files: OBJ with its materials, PLY, GLB, STL, with their faces in file order."""
+"""Read and write mesh files, with faces in file order."""

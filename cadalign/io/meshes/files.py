@@ -1,4 +1,4 @@
-"""Mesh files: reading several formats, checks of what is in them, writing OBJ and PLY."""
+"""Read mesh files of several formats, check them, and write OBJ and PLY."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from cadalign.io.kinds import MESH, refuse_other_file
 from cadalign.io.meshes.gltf import read_gltf
 from cadalign.io.meshes.polygons import read_obj, read_off, read_ply, read_stl
 
-# Coordinates in ShapeNet's files have 6 decimals; less than ten of these steps is rounding.
+# ShapeNet's coordinates have 6 decimals; an extent below ten of these steps is rounding.
 _FLAT = 1e-5
-_DIGITS = 12  # behind the point, in OBJ files
-_FAR = 1000.0  # distance from the origin of a mesh in a PLY file [its extent]
+_DIGITS = 12  # decimals in OBJ files
+_FAR = 1000.0  # largest distance of a PLY mesh from the origin [its extent]
 
 _READERS = {
     ".obj": read_obj,
@@ -45,12 +45,12 @@ _READERS = {
 def load_mesh(path: str | os.PathLike[str]) -> Mesh:
     """Read a mesh with its faces in file order.
 
-    ``Mesh.polygon`` of OBJ and PLY files holds each triangle's face number in the file, which is
-    what keypoint annotations refer to. In GLB and glTF scenes every node is placed by its
-    transform and all become one mesh.
+    ``Mesh.polygon`` of OBJ and PLY files holds each triangle's face number in the file, to which
+    keypoint annotations refer. The nodes of a GLB or glTF scene are transformed and joined to one
+    mesh.
 
-    A material library or texture that is missing or unreadable is warned of (logger "cadalign"),
-    and the surface becomes plain.
+    A missing or unreadable material library or texture causes a warning (logger "cadalign"), and
+    the surface becomes plain.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
     Raises
     ------
     DataError
-        If the file is missing, empty, cut short, of an unknown or another format, or has no faces.
+        If the file is missing, empty, cut short, of an unknown format, or has no faces.
 
     Examples
     --------
@@ -93,11 +93,11 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
         data = read_bytes(path)
         if not data:
             raise DataError("the mesh file is empty", where=str(path), fix="get it again")
-        with in_file(path), np.errstate(all="ignore"):  # what is not finite, Mesh refuses
+        with in_file(path), np.errstate(all="ignore"):  # Mesh refuses values that are not finite
             mesh = reader(data.removeprefix(BOM_UTF8), path)
             if not np.linalg.norm(face_normals(mesh.triangles), axis=1).any():
-                raise DataError("no face of the mesh has an area")
-    except Exception as error:  # of damaged content any kind
+                raise DataError("all faces of the mesh have zero area")
+    except Exception as error:  # damaged content can raise any error
         refuse_other_file(path, MESH)
         if isinstance(error, CadalignError):
             raise
@@ -108,9 +108,9 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
 
 
 def check_keypoints(points_3d: FloatArray, model: Path | None, *, where: str) -> None:
-    """Refuse keypoints (k, 3) that lie far from the mesh in a file, see `check_near`.
+    """Raise an error if keypoints (k, 3) lie far from the mesh in a file; see `check_near`.
 
-    A file that is missing or no mesh is passed over here.
+    A file that is missing or not a mesh is not checked.
     """
     if model is None or not model.is_file():
         return
@@ -120,19 +120,19 @@ def check_keypoints(points_3d: FloatArray, model: Path | None, *, where: str) ->
 
 
 mesh_at = once_per_file(16)(load_mesh)
-"""As `load_mesh`, and remembers the last meshes: many objects of a run may share one."""
+"""`load_mesh` with a cache of the last meshes, which objects of a run may share."""
 
 
 def check_solid(mesh: Mesh) -> None:
-    """Refuse a mesh that has no thickness along an axis: less than 1e-5 of its box's diagonal.
+    """Refuse a mesh without thickness along an axis: less than 1e-5 of its box's diagonal.
 
-    Such a model has no volume, no stretch along that axis can be told, and boxes around it have no
-    overlap to measure.
+    The stretch of such a model along the axis cannot be estimated, and the overlap of its boxes is
+    not defined.
 
     Raises
     ------
     DataError
-        Naming the mesh's source and the axes.
+        If the mesh is flat; it names the mesh's source and the axes.
 
     Examples
     --------
@@ -149,19 +149,19 @@ def check_solid(mesh: Mesh) -> None:
 
 
 def write_mesh(path: Path, mesh: Mesh, *, kind: Literal["obj", "ply"]) -> None:
-    """Write a mesh as OBJ or binary PLY, its faces in their order, with colours of its vertices.
+    """Write a mesh as OBJ or binary PLY, with faces in order and vertex colours.
 
-    A surface without vertex colours has its materials', those of textures on average. Folders are
-    made.
+    A mesh without vertex colours gets the colours of its materials; a texture becomes its mean
+    colour. Missing folders are created.
 
-    Raises DataError if the file cannot be written, or the mesh is too far from its origin for PLY.
+    Raises DataError if the file cannot be written, or the mesh is too far from the origin for PLY.
     """
     import trimesh  # takes time
 
     extents = np.ptp(mesh.bounds, axis=0)
     if kind == "ply" and np.abs(mesh.bounds).max() > _FAR * extents.max():
         what = f"the mesh lies more than {_FAR:g} times its size from its origin; PLY has 7 digits"
-        raise DataError(what, where=str(path), fix="write OBJ, or in another frame")
+        raise DataError(what, where=str(path), fix="write OBJ, or move the mesh to the origin")
     colors = np.round(255 * spread_colors(mesh, _palette(mesh))).astype(np.uint8)
     written = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
     options: dict[str, Any] = {"digits": _DIGITS, "header": None} if kind == "obj" else {}
@@ -172,7 +172,7 @@ def write_mesh(path: Path, mesh: Mesh, *, kind: Literal["obj", "ply"]) -> None:
 
 
 def _palette(mesh: Mesh) -> FloatArray:
-    """Colours (k, 4) of materials, those of textures on average."""
+    """Colours (k, 4) of materials; a texture becomes its mean colour."""
     palette = np.array([each.color for each in mesh.materials])
     for row, each in enumerate(mesh.materials):
         if each.texture is not None:

@@ -1,11 +1,10 @@
-"""glTF 2.0 files, text or binary, as one mesh.
+"""Read glTF 2.0 files, text or binary, as one mesh.
 
-After the Khronos Group's specification of glTF 2.0 and of the extensions that are named. A part
-that is missing or of another type ends in one of Python's errors, which `cadalign.load_mesh` turns
-into a DataError.
+See the Khronos Group's specification of glTF 2.0 and of its extensions. A part that is missing or
+has another type raises one of Python's errors, which `cadalign.load_mesh` converts to DataError.
 
-trimesh takes normalized integers as they stand and sparse values without their changes, and makes
-room for arrays without data: what has to be checked before it sees a file is all but its reading.
+trimesh is not used: it does not scale normalized integers, ignores the changes of sparse accessors,
+and allocates arrays without data.
 """
 
 from __future__ import annotations
@@ -26,30 +25,30 @@ from cadalign.geometry.mesh import GREY, Material, Mesh, join
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.io.documents import parse_json
 from cadalign.io.files import damaged, read_bytes, reading, require_count
-from cadalign.io.meshes.materials import WHITE, Texture, Textures, beside, vertex_colors
+from cadalign.io.meshes.materials import WHITE, Texture, Textures, find_reference, vertex_colors
 
 _Part = dict[str, Any]
 _NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-# What they add is read here, or is nothing but the look of surfaces and their light.
+# Extensions that are supported here, or affect only shading and light.
 _EXTENSIONS = (
     *("EXT_texture_webp", "KHR_lights_", "KHR_materials_", "KHR_mesh_quantization"),
     *("KHR_texture_transform", "KHR_xmp_json_ld"),
 )
-_TRIANGLES, _STRIP, _FAN = 4, 5, 6  # a primitive's modes; points and lines have others
-_FREE_FACES = 2**20  # of a scene; each takes up to 256 bytes
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6  # modes of primitives; others are points and lines
+_FREE_FACES = 2**20  # always allowed in a scene; a face takes up to 256 bytes
 
 
 def read_gltf(data: bytes, path: Path) -> Mesh:
-    """Read the content of a glTF or GLB file as one mesh, each node placed by its transform.
+    """Read the content of a glTF or GLB file; its nodes are transformed and joined to one mesh.
 
-    Skins and morph targets have no effect.
+    Skins and morph targets are ignored.
 
-    Raises DataError if it is no glTF 2.0 file, has no faces, is no tree of nodes, needs an
-    extension that is not read, or repeats its meshes to more than a million faces and one for every
+    Raises DataError if the file is not glTF 2.0, has no faces, its nodes form no tree, it requires
+    an unsupported extension, or its nodes repeat meshes to more than a million faces plus one per
     two bytes of its buffers.
     """
-    text, binary = _chunks(data, path) if data[:4] == b"glTF" else (data, b"")
+    text, binary = _split_chunks(data, path) if data[:4] == b"glTF" else (data, b"")
     with reading(path):
         document = parse_json(str(text, "utf-8-sig"), str(path))
     _check(document)
@@ -57,23 +56,23 @@ def read_gltf(data: bytes, path: Path) -> Mesh:
     placed = [
         (primitive, transform)
         for number, transform in _placements(document)
-        for primitive in _nth(document, "meshes", number)["primitives"]
+        for primitive in _get_part(document, "meshes", number)["primitives"]
         if _count_faces(document, primitive)
     ]
     if not placed:
-        raise DataError("the file has no faces", fix="is it whole?")
-    # A node of some 20 bytes repeats a whole mesh.
+        raise DataError("the file has no faces", fix="is it complete?")
+    # A node of 20 bytes can repeat a whole mesh.
     faces = sum(_count_faces(document, primitive) for primitive, _ in placed)
     if faces > _FREE_FACES + file.size // 2:
-        what = f"its nodes repeat meshes to {faces} faces, from {file.size} bytes"
-        raise DataError(what, fix="simplify it, or leave copies out")
+        what = f"its nodes repeat meshes to {faces} faces, too many for {file.size} bytes"
+        raise DataError(what, fix="simplify the meshes, or remove copies")
     distinct = {id(primitive): primitive for primitive, _ in placed}
     surfaces = {key: file.surface(primitive) for key, primitive in distinct.items()}
-    return join([_moved(surfaces[id(primitive)], at) for primitive, at in placed], str(path))
+    return join([_transform(surfaces[id(primitive)], at) for primitive, at in placed], str(path))
 
 
 class _GltfFile:
-    """The document of a file, and what its buffers hold; ``size`` is their bytes."""
+    """A file's document and buffers; ``size`` is the buffers' number of bytes."""
 
     def __init__(self, path: Path, document: _Part, binary: bytes) -> None:
         self.path, self.document = path, document
@@ -85,15 +84,15 @@ class _GltfFile:
         self._materials = [self._material(part) for part in document.get("materials", [])]
 
     def _resource(self, uri: str) -> bytes:
-        """The bytes that stand in the text of a ``data:`` URI, or in the file of a name."""
+        """Decode a ``data:`` URI, or read the file that the URI names."""
         if uri.startswith("data:"):
             return base64.b64decode(uri.partition("base64,")[2])
         return read_bytes(self.path.parent / unquote(uri))
 
     def _view(self, number: int) -> memoryview:
         """The bytes of a buffer view."""
-        part = _nth(self.document, "bufferViews", number)
-        announced = _nth(self.document, "buffers", part["buffer"])["byteLength"]
+        part = _get_part(self.document, "bufferViews", number)
+        announced = _get_part(self.document, "buffers", part["buffer"])["byteLength"]
         data = self._buffers[part["buffer"]]
         start, length = part.get("byteOffset", 0), part["byteLength"]
         if len(data) < announced or not 0 <= start <= start + length <= len(data):
@@ -102,11 +101,11 @@ class _GltfFile:
         return memoryview(data)[start : start + length]
 
     def _array(self, number: int) -> npt.NDArray[Any]:
-        """The array (n, width) of an accessor; of normalized integers as fractions."""
-        accessor = _nth(self.document, "accessors", number)
+        """Read an accessor's array (n, width); normalized integers become fractions."""
+        accessor = _get_part(self.document, "accessors", number)
         if "sparse" in accessor or "bufferView" not in accessor:
-            what = "sparse values, or none, are not read"
-            raise DataError(what, where=f"accessors[{number}]", fix="export it without them")
+            what = "sparse accessors, and accessors without data, are not supported"
+            raise DataError(what, where=f"accessors[{number}]", fix="export the file without them")
         dtype, width = np.dtype(_NUMBERS[accessor["componentType"]]), _WIDTHS[accessor["type"]]
         data, row = self._view(accessor["bufferView"]), width * dtype.itemsize
         stride = self.document["bufferViews"][accessor["bufferView"]].get("byteStride", row)
@@ -122,7 +121,7 @@ class _GltfFile:
         return values
 
     def _material(self, part: _Part) -> tuple[Material, _Part]:
-        """A material, and its reference to its texture."""
+        """Convert a material; returns it with its reference to a texture."""
         metallic = part.get("pbrMetallicRoughness", {})
         older = part.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
         factor = metallic.get("baseColorFactor") or older.get("diffuseFactor")
@@ -130,27 +129,27 @@ class _GltfFile:
         texture = self._texture(use["index"]) if use else None
         material = Material(str(part.get("name", "")), GREY if texture is None else WHITE, texture)
         if factor is not None:
-            red, green, blue, opacity = _encoded(np.clip(factor, 0, 1)).tolist()
+            red, green, blue, opacity = _to_srgb(np.clip(factor, 0, 1)).tolist()
             material = replace(material, color=(red, green, blue, opacity))
         return material, use
 
     def _texture(self, number: int) -> Texture | None:
-        part = _nth(self.document, "textures", number)
+        part = _get_part(self.document, "textures", number)
         source = part.get("extensions", {}).get("EXT_texture_webp", part).get("source")
         if source is None:
             return None
-        image = _nth(self.document, "images", source)
+        image = _get_part(self.document, "images", source)
         picture: Path | bytes = b""
         if "uri" not in image:
             picture = bytes(self._view(image["bufferView"]))
         elif image["uri"].startswith("data:"):
             picture = self._resource(image["uri"])
         else:
-            picture = beside(self.path, unquote(image["uri"]))
+            picture = find_reference(self.path, unquote(image["uri"]))
         return self._textures.read(picture, name=f"images[{source}]", within=self.path)
 
     def surface(self, primitive: _Part) -> Mesh:
-        """The mesh of a primitive in its own frame."""
+        """Read a primitive as a mesh in its own frame."""
         attributes, material, colors, uv = primitive["attributes"], Material(), None, None
         if "material" in primitive:
             material, use = self._materials[primitive["material"]]
@@ -162,10 +161,10 @@ class _GltfFile:
         faces = corners[: len(corners) // 3 * 3].reshape(-1, 3)
         if "COLOR_0" in attributes:
             values = self._array(attributes["COLOR_0"])
-            # Exporters leave out that integers are normalized.
+            # Exporters omit the flag that integers are normalized.
             scale = 1.0 if values.dtype.kind == "f" else np.iinfo(values.dtype).max
-            colors = _encoded(vertex_colors(values / scale))
-        if len(vertices) > faces.size:  # they are shared with other primitives
+            colors = _to_srgb(vertex_colors(values / scale))
+        if len(vertices) > faces.size:  # vertices are shared with other primitives
             kept, faces = np.unique(faces, return_inverse=True)
             vertices, faces = vertices[kept], faces.reshape(-1, 3)
             uv, colors = (None if each is None else each[kept] for each in (uv, colors))
@@ -175,7 +174,7 @@ class _GltfFile:
         return Mesh(vertices, faces, vertex_colors=colors, corner_uv=uv, materials=(material,))
 
     def _texture_coordinates(self, attributes: _Part, use: _Part) -> FloatArray | None:
-        """Texture coordinates (n, 2) from the bottom left, which glTF has from the top left."""
+        """Texture coordinates (n, 2), converted from glTF's origin top left to bottom left."""
         change = use.get("extensions", {}).get("KHR_texture_transform", {})
         name = f"TEXCOORD_{change.get('texCoord', use.get('texCoord', 0))}"
         if name not in attributes:
@@ -186,17 +185,17 @@ class _GltfFile:
         return np.asarray(turned * (1, -1) + (0, 1))
 
 
-def _nth(document: _Part, name: str, number: int) -> _Part:
-    """The part of a list of the document by its number; raises DataError where there is none."""
+def _get_part(document: _Part, name: str, number: int) -> _Part:
+    """Return a numbered part of one of the document's lists; raises DataError if missing."""
     parts = document.get(name, [])
     if not 0 <= number < len(parts):
-        raise damaged(f"named, but there are {len(parts)} {name}", f"{name}[{number}]")
+        raise damaged(f"does not exist; there are {len(parts)} {name}", f"{name}[{number}]")
     found: _Part = parts[number]
     return found
 
 
-def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes]:
-    """The document of a GLB file, and its binary part."""
+def _split_chunks(data: bytes, path: Path) -> tuple[bytes, bytes]:
+    """Split a GLB file into its document and its binary part."""
     found = {b"JSON": b"", b"BIN\0": b""}
     place = 12
     for kind in found:
@@ -209,37 +208,37 @@ def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes]:
 
 
 def _check(document: _Part) -> None:
-    """Refuse other versions, and extensions without which the file means something else."""
+    """Raise DataError for another version or an unsupported required extension."""
     version = document["asset"]["version"]
     if not version.startswith("2."):
-        what = f"version {quote(version)} of glTF; only version 2 is read"
+        what = f"the file has glTF version {quote(version)}; only version 2 is supported"
         raise DataError(what, where="asset")
     required = document.get("extensionsRequired", [])
     if unknown := [name for name in required if not name.startswith(_EXTENSIONS)]:
-        what = f"{brief(', '.join(unknown))} is needed to read this file, and not known"
-        fix = "export it without this extension; of compressed geometry, uncompressed"
+        what = f"the file requires {brief(', '.join(unknown))}, which is not supported"
+        fix = "export it without this extension, such as without compressed geometry"
         raise DataError(what, where="extensionsRequired", fix=fix)
 
 
 def _placements(document: _Part) -> Iterator[tuple[int, FloatArray]]:
-    """Meshes and their transforms, in the order of the nodes from the scene's roots down."""
-    roots = _nth(document, "scenes", document.get("scene", 0)).get("nodes", [])
+    """Yield mesh numbers and transforms, in depth-first order of the scene's nodes."""
+    roots = _get_part(document, "scenes", document.get("scene", 0)).get("nodes", [])
     waiting = [(root, np.eye(4)) for root in reversed(roots)]
     seen: set[int] = set()
     while waiting:
         number, parent = waiting.pop()
         if number in seen:
             what = "the node has two parents, or is its own ancestor"
-            raise DataError(what, where=f"nodes[{number}]", fix="the nodes of a scene are a tree")
+            raise DataError(what, where=f"nodes[{number}]", fix="nodes must form a tree")
         seen.add(number)
-        node = _nth(document, "nodes", number)
-        transform = parent @ _local(node)
+        node = _get_part(document, "nodes", number)
+        transform = parent @ _local_transform(node)
         if "mesh" in node:
             yield node["mesh"], transform
         waiting += [(child, transform) for child in reversed(node.get("children", []))]
 
 
-def _local(node: _Part) -> FloatArray:
+def _local_transform(node: _Part) -> FloatArray:
     """A node's transform (4, 4) in its parent's frame."""
     if "matrix" in node:
         return np.array(node["matrix"], dtype=float).reshape(4, 4).T
@@ -253,26 +252,26 @@ def _local(node: _Part) -> FloatArray:
 
 
 def _count_faces(document: _Part, primitive: _Part) -> int:
-    """The number of a primitive's triangles; 0 of points and lines."""
+    """Number of a primitive's triangles; 0 for points and lines."""
     position, mode = primitive["attributes"].get("POSITION"), primitive.get("mode", _TRIANGLES)
     if mode in (_STRIP, _FAN):
-        what = "strips and fans of triangles are not read"
+        what = "triangle strips and fans are not supported"
         raise DataError(what, where="meshes", fix="export single triangles")
     if position is None or mode != _TRIANGLES:
         return 0
-    count: int = _nth(document, "accessors", primitive.get("indices", position))["count"]
+    count: int = _get_part(document, "accessors", primitive.get("indices", position))["count"]
     return count // 3
 
 
-def _encoded(colors: FloatArray) -> FloatArray:
-    """glTF's factors and vertex colours (..., 4), which are linear light, as sRGB."""
+def _to_srgb(colors: FloatArray) -> FloatArray:
+    """Convert linear colour factors and vertex colours (..., 4) to sRGB."""
     from trimesh.visual.color import linear_to_srgb  # takes time to import
 
     return np.concatenate([linear_to_srgb(colors[..., :3]), colors[..., 3:]], axis=-1)
 
 
-def _moved(mesh: Mesh, transform: FloatArray) -> Mesh:
-    """A mesh at the transform (4, 4) of a node; mirrored, its triangles are turned round."""
+def _transform(mesh: Mesh, transform: FloatArray) -> Mesh:
+    """Transform a mesh by a matrix (4, 4); a mirroring one reverses the triangles."""
     vertices = mesh.vertices @ transform[:3, :3].T + transform[:3, 3]
     if np.linalg.det(transform[:3, :3]) >= 0:
         return replace(mesh, vertices=vertices)

@@ -1,4 +1,4 @@
-"""Materials of mesh files: MTL libraries, and the pictures that materials name or hold."""
+"""Materials of mesh files: MTL libraries, and textures in files or in the mesh's file."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ Texture = npt.NDArray[np.uint8]
 _Entry = dict[str, list[str]]
 
 WHITE = (1.0, 1.0, 1.0, 1.0)
-_MOST_BYTES = 2**30  # of the pixels of a mesh's textures
+_MOST_BYTES = 2**30  # limit of a mesh's decoded textures
 
 
 def load_materials(
     obj_path: Path, libraries: Iterable[str], names: Iterable[str]
 ) -> dict[str, Material]:
-    """Read the named materials; what is missing is warned of and becomes grey.
+    """Read materials by name; a missing one becomes grey with a warning.
 
-    ``libraries`` is what the OBJ file's ``mtllib`` lines name; only the textures of ``names`` are
-    read.
+    ``libraries`` are the names in the OBJ file's ``mtllib`` lines. Only textures of the named
+    materials are read.
     """
     entries: dict[str, tuple[Path, _Entry]] = {}
     for library in dict.fromkeys(libraries):
-        path = beside(obj_path, library)
+        path = find_reference(obj_path, library)
         try:
             parsed = _parse_library(read_text(path, errors="replace"))
         except DataError as error:
@@ -62,9 +62,9 @@ def load_materials(
 
 
 def _parse_library(text: str) -> dict[str, _Entry]:
-    """The materials of a library by name: of each, the words that follow its keywords."""
+    """Parse a library: materials by name, each with the words after its keywords."""
     entries: dict[str, _Entry] = {}
-    current: _Entry = {}  # of what stands before the first name
+    current: _Entry = {}  # lines before the first material
     for line in text.splitlines():
         key, *words = line.split() or [""]
         if key.lower() == "newmtl":
@@ -80,20 +80,20 @@ def _material(name: str, library: Path, entry: _Entry, textures: Textures) -> Ma
     alpha = opacity[-1] if opacity else 1.0 - transparency[-1] if transparency else 1.0
     texture = None
     if words := entry.get("map_kd"):
-        # Options, such as "-s 1 1 1", stand before the file, whose name may have blanks.
-        files = [beside(library, " ".join(words[start:])) for start in range(len(words))]
+        # Options, such as "-s 1 1 1", precede the file's name, which may have blanks.
+        files = [find_reference(library, " ".join(words[start:])) for start in range(len(words))]
         file = next((each for each in files if _is_file(each)), files[0])
         texture = textures.read(file, name=file.name, within=library)
         if texture is None:
             red, green, blue, _ = GREY
         elif not red and not green and not blue:
-            # Exporters write a black Kd beside a texture; multiplied, the texture would vanish.
+            # Exporters write a black Kd beside a texture; the product would be black.
             red, green, blue, _ = WHITE
     return Material(name=name, color=(red, green, blue, alpha), texture=texture)
 
 
 def _fractions(words: Sequence[str]) -> list[float]:
-    """The finite numbers among words, such as those of ``d -halo 0.5``, cut to 0 and 1."""
+    """Parse the finite numbers among words, such as ``-halo 0.5``, clipped to 0 and 1."""
     found: list[float] = []
     for word in words:
         with suppress(ValueError):
@@ -103,22 +103,22 @@ def _fractions(words: Sequence[str]) -> list[float]:
 
 @dataclass
 class Textures:
-    """The textures of one mesh, each read once, of at most a gigabyte of pixels in all."""
+    """Textures of one mesh, each read once, with at most a gigabyte of pixels in total."""
 
     _known: dict[Path | str, Texture | None] = field(default_factory=dict)
     _bytes_left: int = _MOST_BYTES
 
     def read(self, picture: Path | bytes, *, name: str, within: Path) -> Texture | None:
-        """Read a picture, (h, w, 3 or 4) uint8, from a file or as a part of the mesh's file.
+        """Read a texture, (h, w, 3 or 4) uint8, from a file or from bytes of the mesh's file.
 
-        What is missing or cannot be read is warned of (logger "cadalign") and becomes None.
+        A texture that is missing or cannot be read becomes None with a warning (logger "cadalign").
         """
         key = picture if isinstance(picture, Path) else name
         if key not in self._known:
             self._known[key] = None
             try:
                 self._known[key] = self._pixels(picture, within)
-            except Exception as error:  # Pillow's decoders raise what they like on damaged files
+            except Exception as error:  # Pillow's decoders raise any error on damaged files
                 reason = error.what if isinstance(error, CadalignError) else brief(error)
                 given = within, brief(name), reason
                 logger.warning("%s: the texture %s cannot be read (%s); drawn grey", *given)
@@ -139,10 +139,10 @@ class Textures:
             return np.asarray(image.convert(mode))
 
 
-def beside(path: Path, name: str) -> Path:
-    r"""The file that another file names, relative to its folder.
+def find_reference(path: Path, name: str) -> Path:
+    r"""Find the file that another file names relative to its folder.
 
-    Also if its folders are written with ``\``, or the file lies beside it instead.
+    The name may have ``\`` for ``/``; its folders are ignored if only the plain name exists.
     """
     plain = name.replace("\\", "/")
     places = [path.parent / each for each in (name, plain, PurePosixPath(plain).name)]
@@ -156,7 +156,7 @@ def _is_file(path: Path) -> bool:
 
 
 def vertex_colors(values: FloatArray) -> FloatArray:
-    """Colours (n, 4) from 0 to 1, of colours (n, 3 or 4) of a file; white where one is NaN."""
+    """Convert a file's colours (n, 3 or 4) to (n, 4) in 0 to 1; NaN becomes 1."""
     colors = np.ones((len(values), 4))
     colors[:, : values.shape[1]] = np.nan_to_num(np.clip(values, 0, 1), nan=1.0)
     return colors

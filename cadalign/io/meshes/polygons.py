@@ -1,11 +1,11 @@
-"""OBJ, PLY, STL and OFF files, with their faces in file order.
+"""Read OBJ, PLY, STL and OFF files, with faces in file order.
 
-Keypoint annotations name faces by the number of their ``f`` line. Readers that group faces by
-material lose that order, so the one here keeps it. OBJ is read after Wavefront's "Object Files
-(.obj)", appendix B1 of the Advanced Visualizer manual; PLY after Greg Turk, "The PLY polygon file
-format", 1994, its text as binary data whose numbers are all double. trimesh reads no binary PLY
-whose faces differ in their numbers of corners, and puts the quads of text and of OFF files behind
-the triangles.
+Keypoint annotations number faces in file order. Readers that group faces by material lose this
+order. trimesh also moves quads behind triangles in text PLY and OFF files, and does not read binary
+PLY files that mix polygon sizes.
+
+References: Wavefront, "Object Files (.obj)", appendix B1 of the Advanced Visualizer manual; Greg
+Turk, "The PLY polygon file format", 1994.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ _NO_COLOR = (np.nan, np.nan, np.nan)
 
 
 def read_obj(data: bytes, path: Path) -> Mesh:
-    """Read the content of an OBJ file; `cadalign.load_mesh` is the public way to it.
+    """Read the content of an OBJ file; users call `cadalign.load_mesh`.
 
-    Polygons are cut into fans of triangles, and `Mesh.polygon` holds the number of the ``f`` line
-    that a triangle comes from. Lines and points (``l``, ``p``) have no number. Normals, groups,
-    curves and surfaces are not read.
+    Polygons become fans of triangles; `Mesh.polygon` holds the number of each triangle's ``f``
+    line. Lines and points (``l``, ``p``) are not counted. Normals, groups, curves and surfaces are
+    ignored.
     """
     vertices = list[list[float]]()  # with their colours
-    coordinates = [[0.0, 0.0]]  # the first is that of corners that name none
+    coordinates = [[0.0, 0.0]]  # the first is for corners without texture coordinates
     corners, before = list[tuple[int, int]](), list[tuple[int, int]]()
     sizes, looks = list[int](), list[int]()
     libraries, numbers, look = list[str](), {"": 0}, 0  # numbers of materials, by name
@@ -56,10 +56,10 @@ def read_obj(data: bytes, path: Path) -> Mesh:
             elif key == b"f":
                 if len(words) < 3:
                     raise ValueError("a face has fewer than 3 corners")
-                corners += map(_corner, words)
+                corners += map(_parse_corner, words)
                 sizes.append(len(words))
                 looks.append(look)
-                # Negative indices count back from here.
+                # Negative indices count back from the current line.
                 before.append((len(vertices) + 1, len(coordinates)))
             elif key == b"usemtl":
                 look = numbers.setdefault(_text(body), len(numbers))
@@ -71,10 +71,10 @@ def read_obj(data: bytes, path: Path) -> Mesh:
             shown = line[:60].decode("ascii", errors="replace")
             raise damaged(f"cannot read {shown!r}", f"line {number}") from None
     if not sizes:
-        what = f"no faces; {len(vertices)} vertices were found"
-        raise DataError(what, fix="is it an OBJ file, and whole?")
+        what = f"the file has {len(vertices)} vertices, but no faces"
+        raise DataError(what, fix="is it a complete OBJ file?")
     if not vertices:
-        raise damaged(f"{len(sizes)} faces, but no vertices")
+        raise damaged(f"the file has {len(sizes)} faces, but no vertices")
     named = np.array(corners)
     indices = np.where(named < 0, np.repeat(before, sizes, axis=0) + named, named)
     counts = len(vertices), len(coordinates) - 1
@@ -106,9 +106,9 @@ def read_obj(data: bytes, path: Path) -> Mesh:
 
 
 def _lines(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Lines with their numbers, without blanks at their ends; one that ends in a backslash goes on.
+    """Yield stripped lines with their numbers; a backslash at the end continues a line.
 
-    The keyword is followed by a blank.
+    Tabs become blanks, so a blank follows the keyword.
     """
     number = 0
     text = (data + b"\n").replace(b"\t", b" ").replace(b"\r\n", b"\n").replace(b"\\\n", b" \v")
@@ -119,9 +119,9 @@ def _lines(data: bytes) -> Iterator[tuple[int, bytes]]:
             yield number, line
 
 
-@lru_cache(maxsize=2**16)  # each is named by several faces
-def _corner(word: bytes) -> tuple[int, int]:
-    """A corner of a face as (vertex, texture coordinate or 0): ``v``, ``v/vt``, ``v//vn``, ...."""
+@lru_cache(maxsize=2**16)  # several faces share a corner
+def _parse_corner(word: bytes) -> tuple[int, int]:
+    """Parse a corner (``v``, ``v/vt``, ``v//vn``, ...) to (vertex, texture coordinate or 0)."""
     vertex, *others = word.split(b"/")
     values = [int(each or b"0") for each in others]
     if len(values) > 2:
@@ -134,10 +134,10 @@ def _text(body: bytes) -> str:
 
 
 _HEADER_END = re.compile(rb"^end_header[ \t]*(?:\r?\n|\Z)", re.MULTILINE)
-_LENGTH = "length of "  # of a list, a field beside it
+_LENGTH = "length of "  # prefix of the field with a list's length
 _INDICES = ("vertex_indices", "vertex_index")
 _ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
-# PLY's names of numbers, as NumPy has them.
+# NumPy's type codes by PLY's type names.
 _CODES = {
     "char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I",
     "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I",
@@ -153,7 +153,7 @@ _OFF_WORD = re.compile(rb"(?:ST)?C?N?OFF(.*)", re.IGNORECASE)
 
 @dataclass
 class _Element:
-    """An element: its name and number; by the name of a property its code, a list's also before."""
+    """An element; ``properties`` maps names to (type,) or, for a list, (length type, type)."""
 
     name: str
     count: int
@@ -161,12 +161,13 @@ class _Element:
 
 
 def read_ply(data: bytes, path: Path) -> Mesh:
-    """Read the content of a PLY file; `cadalign.load_mesh` is the public way to it.
+    """Read the content of a PLY file; users call `cadalign.load_mesh`.
 
-    Colours of vertices are read; textures, and colours of faces, are not.
+    Vertex colours are read; textures and face colours are ignored. Text is first converted to
+    binary data of doubles.
     """
     if data[:100].split(maxsplit=1)[:1] not in ([b"ply"], [b"PLY"]):
-        raise DataError("not a PLY file", fix="does it begin with 'ply'?")
+        raise DataError("not a PLY file", fix="give a file that begins with 'ply'")
     end = _HEADER_END.search(data)
     if end is None:
         raise damaged("the PLY header has no end")
@@ -200,7 +201,7 @@ def read_ply(data: bytes, path: Path) -> Mesh:
 
 
 def _header(text: str) -> tuple[str, list[_Element]]:
-    """The format and the elements."""
+    """Parse the header; returns the format and the elements."""
     form, elements = "", list[_Element]()
     for line in text.splitlines():
         match line.split():
@@ -218,7 +219,7 @@ def _header(text: str) -> tuple[str, list[_Element]]:
 def _blocks(
     data: bytes, place: int, element: _Element, form: str, path: Path
 ) -> tuple[list[Any], int]:
-    """The rows of an element, in arrays of rows with equal lengths of lists, and their end."""
+    """Read an element's rows; returns arrays of rows with equal list lengths, and the end."""
     blocks, left, wanted = list[Any](), element.count if element.properties else 0, element.count
     while left > 0:
         kind = _row_type(data, place, element, form)
@@ -236,7 +237,7 @@ def _blocks(
 
 
 def _row_type(data: bytes, place: int, element: _Element, form: str) -> np.dtype[Any]:
-    """The type of the row at a place, by the lengths of its lists, 0 where the data end."""
+    """The type of the row at a place, with its list lengths; 0 beyond the end of the data."""
     fields: list[tuple[Any, ...]] = []
     for name, codes in element.properties.items():
         kinds = [_ORDERS[form] + ("d" if form == "ascii" else code) for code in codes]
@@ -251,12 +252,12 @@ def _row_type(data: bytes, place: int, element: _Element, form: str) -> np.dtype
 
 
 def _columns(blocks: list[Any], names: Iterable[str]) -> npt.NDArray[Any]:
-    """Properties of all rows (n, k)."""
+    """Stack properties of all rows, (n, k)."""
     return np.stack([np.concatenate([block[name] for block in blocks]) for name in names], axis=1)
 
 
 def read_stl(data: bytes, path: Path) -> Mesh:
-    """Read the content of an STL file, text or binary; each face has vertices of its own."""
+    """Read the content of an STL file, text or binary; faces do not share vertices."""
     found = _STL_CORNER.findall(data) if data.lstrip()[:5].lower() == b"solid" else []
     if found:
         announced, end = len(_STL_FACET.findall(data)), data.lower().rfind(b"endsolid")
@@ -278,12 +279,12 @@ def read_stl(data: bytes, path: Path) -> Mesh:
 
 
 def read_off(data: bytes, path: Path) -> Mesh:
-    """Read the content of an OFF file; colours of its vertices and faces are not read."""
+    """Read the content of an OFF file; colours are ignored."""
     rows = [row for line in data.splitlines() if (row := line.partition(b"#")[0].split())]
     found = _OFF_WORD.fullmatch(rows[0][0]) if rows else None
     if found is None or rows[0][1:2] == [b"BINARY"]:
-        what = "not an OFF file of text and of three dimensions"
-        raise DataError(what, fix="does it begin with 'OFF'?")
+        what = "not an OFF file of text with three dimensions"
+        raise DataError(what, fix="give a file that begins with 'OFF'")
     # Some files have the counts in the first line, even without a blank before them.
     counts = [each for each in (found[1], *rows[0][1:]) if each]
     if not counts:
@@ -299,7 +300,7 @@ def read_off(data: bytes, path: Path) -> Mesh:
     for number, row in enumerate(polygons):
         if not row[0].isdigit() or len(row) <= int(row[0]):
             what = f"face {number} is {brief(b' '.join(row).decode('ascii', 'replace'))!r}"
-            raise damaged(f"{what}, behind the {vertices} vertices announced")
+            raise damaged(f"{what}, after the announced {vertices} vertices")
     sizes = np.array([int(row[0]) for row in polygons], dtype=np.int64)
     corners = b" ".join(b" ".join(row[1 : 1 + int(row[0])]) for row in polygons)
     coordinates = b" ".join(b" ".join(row[:3]) for row in points)

@@ -284,7 +284,7 @@ MISTAKES: dict[str, Made] = {
     "flipped, file": in_file(FLIPPED, Sighting.flipped),
     "swapped, robust file": in_file(SWAPPED, Sighting.swapped, "--robust"),
     "photo of another size": Made(
-        "the image has 1280 x 960 pixels, that of its camera 640 x 480", photo_of_another_size
+        "the image has 1280 x 960 pixels, but its camera has 640 x 480", photo_of_another_size
     ),
     "ids forgotten": Made("no ids are given", forgotten_ids),
     "ids in another order": Made("no ids are given", forgotten_order),

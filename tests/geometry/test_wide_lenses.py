@@ -101,7 +101,7 @@ def test_beyond_the_fold_nothing_is_seen() -> None:
     with pytest.raises(InputError) as caught:
         camera.project(points)
     assert str(caught.value) == (
-        "points_cam: 1 of 2 points lie outside the lens's field, the first is point 1; "
+        "points_cam: 1 of 2 points lie outside the lens's field of view, the first is point 1; "
         "only points less than 104.6 degrees off the axis have a projection"
     )
     assert np.isinf(camera.project_where_ahead(points)[1]).all()
@@ -152,12 +152,12 @@ def test_files_of_wide_lenses_want_a_focal_length() -> None:
 
 
 def test_a_turned_frame_is_not_written() -> None:
-    with pytest.raises(InputError, match="a camera in a turned frame has no form in files"):
+    with pytest.raises(InputError, match="a camera with a turned frame cannot be written"):
         LENSES["opencv"].turned(np.eye(3)).to_dict()
 
 
 def test_a_pinhole_is_not_turned() -> None:
-    with pytest.raises(InputError, match="the frame of a pinhole is its own"):
+    with pytest.raises(InputError, match="a perspective camera cannot be turned"):
         Camera(640, 480, 500, 500, 320, 240).turned(np.eye(3))
 
 

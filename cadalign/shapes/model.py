@@ -218,7 +218,7 @@ class ShapeModel:
         mean : (m, 3) float
             Keypoints of the mean shape.
         modes : (K, m, 3) float
-            Directions of deformation.
+            Directions of deformation; ``mean * [1, 0, 0]`` is a stretch along x.
         deviations : (K,) float
             Standard deviations of their coefficients, 0 or more.
         ids : (m,) int or str, optional

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cadalign.errors import InputError
-from cadalign.shapes.calibration import excesses_of, learn_margins
+from cadalign.shapes.calibration import box_excesses, learn_margins
 from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.parts import (
     FEW,
@@ -42,7 +42,7 @@ def test_margins_and_errors_are_learned() -> None:
     vectors = rows.reshape(len(rows), -1)
     covariance = np.cov(vectors.T) + 1e-6 * np.eye(vectors.shape[1])
     mixture = Gaussians(np.ones(1), vectors.mean(axis=0)[None], covariance[None])
-    excesses = excesses_of(rows, mixture)
+    excesses = box_excesses(rows, mixture)
     learned = learn_margins(rows, excesses)
     assert learned is not None
     assert np.allclose(learned.margins, [[0.02] * 3, [0.03] * 3])

@@ -389,7 +389,7 @@ def test_refusals(learned: ShapeModel) -> None:
         ({"ids": ["a"]}, "ids: 1 for 7 keypoints"),
         ({"ids": ["a"] * 7}, "ids: 'a' occurs twice"),
         ({"box": [[1, 0, 0], [0, 1, 1]]}, "box: the least corner [1.0, 0.0, 0.0] exceeds"),
-        ({"up_axis": "w"}, "up_axis: 'w' is no axis; give x, y or z"),
+        ({"up_axis": "w"}, "up_axis: 'w' is not an axis; give x, y or z"),
         ({"residual_sigma": -1}, "residual_sigma: -1 is not a standard deviation"),
     ],
 )

@@ -341,10 +341,7 @@ def deviation_text(relative: float) -> str:
 
 
 def why_open(name: str, points_3d: FloatArray, alignment: Alignment) -> str:
-    """Explain an uncertain stretch by the keypoints (n, 3); empty if there is no explanation.
-
-    ``name`` is from `uncertain_of`. The text is in brackets, to append to the name.
-    """
+    """Explain an uncertain stretch, in brackets, to append to its name; empty if unexplained."""
     axis = {"s_x": 0, "s_y": 1, "s_z": 2}.get(name)
     if axis is None or not len(points_3d):
         return ""

@@ -361,10 +361,7 @@ def turned_poses(packed: FloatArray, rotation: FloatArray) -> FloatArray:
 
 
 def turned_covariance(covariance: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Transform a covariance (..., m, m) by the ``rotation`` (3, 3) to a new camera frame.
-
-    Its first six entries are the rotation vector and the translation; the others do not change.
-    """
+    """Transform a pose's covariance (..., m, m), m >= 6, by the ``rotation`` (3, 3)."""
     turn = np.eye(covariance.shape[-1])
     turn[:3, :3] = turn[3:6, 3:6] = rotation
     return np.asarray(turn @ covariance @ turn.T)

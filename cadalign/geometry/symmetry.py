@@ -284,8 +284,6 @@ def _nearest(
 ) -> FloatArray:
     """The rotation of a branch that brings the alignment's rotation nearest to the reference.
 
-    Later references are for ties.
-
     With N = P T' R the trace of T' R Rot(a, angle) P is A cos(angle) + B sin(angle) + a'N a
     with A = tr N - a'N a, B = -a . vee(N - N').
     """

@@ -101,11 +101,7 @@ def calibrate(
 
 
 def _coverage_errors(squares: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
-    """Squared differences of coverage from nominal probabilities, over the tolerances.
-
-    Returns the sum over rotations and keypoints, by degrees of freedom and factor. For ``squares``
-    see `_squared_errors`.
-    """
+    """Squared differences of coverage from nominal, by degrees of freedom and factor."""
     turned = np.array([each for each, _ in squares])
     moved = np.concatenate([each for _, each in squares], axis=1).T
     found = np.zeros((len(_DEGREES_OF_FREEDOM), len(_FACTORS)))
@@ -153,8 +149,7 @@ class _Posterior(NamedTuple):
 def _posterior(view: _View, mean: FloatArray, covariance: FloatArray, sigma: float) -> _Posterior:
     """Estimate the pose, with a flat prior, by generalised least squares, then the shape.
 
-    In the eigenbasis of the shape's covariance in the image, the covariances for all factors,
-    including noise, are diagonal.
+    In the eigenbasis of the shape's covariance in the image, covariances are diagonal.
     """
     n, squares = len(mean) // 3, _FACTORS**2
     across = view.by_shape @ covariance

@@ -165,9 +165,9 @@ def _check_names(examples: Sequence[Example]) -> None:
     seen: set[str] = set()
     for each, kind in zip(examples, kinds, strict=True):
         if kind != first:
-            what = f"its keypoints have {kind} as ids, those of model {examples[0].model_id} have "
+            what = f"keypoint ids are {kind}, but {first} in model {examples[0].model_id}"
             where, fix = f"model {each.model_id}", "use one kind in all models"
-            raise InputError(what + first, where=where, fix=fix)
+            raise InputError(what, where=where, fix=fix)
         if each.model_id in seen:
             raise InputError("occurs twice", where=f"model {quote(each.model_id)}")
         seen.add(each.model_id)
@@ -185,7 +185,7 @@ def _check_shared(examples: Sequence[Example]) -> None:
         groups.append((first, set(each.ids).union(*(ids for _, ids in joined))))
     if len(groups) > 1:
         one, other = (quote(first.model_id) for first, _ in groups[:2])
-        what = f"{len(groups)} groups of them share no keypoint, such as those of {one} and {other}"
+        what = f"{len(groups)} groups share no keypoint, for example those of {one} and {other}"
         fix = "give the same keypoint the same id in all models"
         raise InputError(what, where="models", fix=fix)
 
@@ -203,10 +203,7 @@ def _warn_of_units(examples: Sequence[Example]) -> None:
 
 
 def _warn_of_axes(examples: Sequence[Example], rows: FloatArray) -> None:
-    """Warn of models that fit the others only if axes are exchanged or reversed.
-
-    ``rows`` (N, m, 3) are keypoints, NaN if missing.
-    """
+    """Warn of models that fit the others only if axes are exchanged or reversed."""
     count = np.isfinite(rows[..., 0]).sum(axis=1)
     some = np.flatnonzero(count >= _LEAST_TO_TURN)
     if not len(some):

@@ -148,10 +148,7 @@ class _CrossValidation:
         self._held_out = [models.subset(self._folds == fold) for fold in range(folds)]
 
     def choose(self, components: int | None) -> tuple[_Recipe, int | None, dict[str, Any]]:
-        """Choose a recipe and the number of modes, and calibrate; returns also the fields for it.
-
-        With few models only the strength of the prior is chosen.
-        """
+        """Choose a recipe and the number of modes, and calibrate them; returns also the fields."""
         count = len(self._models.rows)
         is_few, modes = count < _LEAST_TO_CHOOSE, None
         strengths = _STRENGTHS_OF_FEW if is_few else _STRENGTHS

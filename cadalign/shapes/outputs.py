@@ -48,10 +48,7 @@ def write_shape(path: str | os.PathLike[str], model: Any) -> None:
 
 
 def read_shape(path: str | os.PathLike[str], kind: type[Kind]) -> Kind:
-    """Read and check a shape model's file.
-
-    ``kind`` is `cadalign.ShapeModel`, passed to avoid a circular import.
-    """
+    """Read and check a shape model's file; ``kind`` is `cadalign.ShapeModel`."""
     file = as_path(path)
     payload = SEAL.unwrap(read_bytes(file, most=_MAX_BYTES), str(file))
     try:

@@ -188,7 +188,7 @@ def test_models_without_a_common_keypoint_are_refused() -> None:
         Example(f"{row}", [f"{row // 2} {label}" for label in IDS], TABLE + row)
         for row in range(40)
     ]
-    with pytest.raises(InputError, match="20 groups of them share no keypoint, such as those of"):
+    with pytest.raises(InputError, match="20 groups share no keypoint, for example those of"):
         ShapeModel.learn(models)
 
 
@@ -360,7 +360,7 @@ def test_refusals(learned: ShapeModel) -> None:
         "models of object: 3 are too few to learn a shape from; give at least 4"
     )
     assert learn(*some, named) == (
-        "model named: its keypoints have names as ids, those of model table 0 have numbers; "
+        "model named: keypoint ids are names, but numbers in model table 0; "
         "use one kind in all models"
     )
     assert learn(*some, some[0]) == "model 'table 0': occurs twice"
